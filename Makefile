@@ -1,0 +1,37 @@
+# Two commands do everything: `make demo` and `make test`. Each makes its own environment in .venv first.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test test-all bench release clean
+
+demo: $(VENV)/installed
+	$(BIN)/isocharge demo
+
+test: $(VENV)/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest
+
+test-all: $(VENV)/installed
+	$(BIN)/python -m pytest -m "slow or not slow"
+
+bench: $(VENV)/installed
+	$(BIN)/python tests/benchmarks/bench_solve.py
+	$(BIN)/python tests/benchmarks/bench_predictor.py
+	$(BIN)/python tests/benchmarks/bench_stream.py
+
+# The released model, made anew; fails if it is there already.
+release: $(VENV)/installed
+	$(BIN)/isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
+
+$(VENV)/installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	touch $@
+
+clean:
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,0 +1,38 @@
+"""The command `isocharge`: the composition root, the only part that sees all stages.
+
+Each stage has its sub-commands in a module here; a sub-command imports its stage when it runs, so that help is instant.
+Data go to stdout, words for people to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage or input.
+"""
+
+import sys
+
+import typer
+
+from isocharge.cli.demo import demo_command
+from isocharge.cli.serve import serve_app
+from isocharge.cli.simulate import simulate_app
+from isocharge.cli.train import train_app
+from isocharge.errors import InputError, IsochargeError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Where a piezoelectric tactile film is touched and how hard, from three or four charges.",
+)
+app.command("demo")(demo_command)
+app.add_typer(simulate_app, name="simulate")
+app.add_typer(train_app, name="train")
+app.add_typer(serve_app, name="serve")
+
+
+def main() -> None:
+    """Run the command line; the one place that maps errors to exit codes."""
+    try:
+        app()
+    except IsochargeError as error:
+        typer.echo(f"{type(error).__name__}: {error}", err=True)
+        sys.exit(2 if isinstance(error, InputError) else 1)
+    except OSError as error:
+        typer.echo(f"{type(error).__name__}: {error}", err=True)
+        sys.exit(1)

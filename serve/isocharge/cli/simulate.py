@@ -1,0 +1,126 @@
+"""`isocharge simulate ...`: one press, or a dataset of many."""
+
+import json as json_module
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from isocharge.cli.extras import require
+from isocharge.cli.terminal import progress, say
+from isocharge.errors import InputError
+
+if TYPE_CHECKING:
+    from isocharge.simulate import Equilibrium, Sensor
+    from isocharge.simulate.arrays import Array
+
+simulate_app = typer.Typer(no_args_is_help=True, help="From a press to the charges of the electrodes.")
+
+SensorArgument = Annotated[str, typer.Argument(metavar="SENSOR", help="Built-in sensor, or a TOML file.")]
+
+
+class Orientation(StrEnum):
+    """How probes are turned in a sweep."""
+
+    fixed = "fixed"
+    random = "random"
+
+
+@simulate_app.command("point")
+def point_command(
+    sensor: SensorArgument,
+    probe: Annotated[str, typer.Option("--probe", help="What presses: circle:R, R in mm.")] = "circle:1.0",
+    at: Annotated[str, typer.Option("--at", metavar="X,Y", help="Where, mm from the film's centre.")] = "0,0",
+    force: Annotated[float, typer.Option("--force", help="How hard, N, positive pushes.")] = 1.0,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object instead of a table.")] = False,
+) -> None:
+    """Charges (pC) and deflection (mm) under one press.
+
+    Example: isocharge simulate point three-25um-biaxial --probe circle:1.0 --at 3,-2 --force 1.0
+    """
+    with require("simulate"):
+        from isocharge.simulate import load_sensor, parse_probe, press, touch_charge
+    film_sensor = load_sensor(sensor)
+    equilibrium = press(film_sensor.film, parse_probe(probe), _position(at), force)
+    report = _report(film_sensor, equilibrium, touch_charge(film_sensor, equilibrium))
+    typer.echo(json_module.dumps(report) if json else _table(report))
+    if report["estimated_error"] > 0.02:
+        say(
+            f"caution: bending is left out and carries about {report['estimated_error']:.0%} of what this film does; "
+            "the charges are no better than that"
+        )
+
+
+def _position(text: str) -> tuple[float, float]:
+    try:
+        x, y = (float(part) * 1e-3 for part in text.split(","))
+    except ValueError as error:
+        raise InputError(f"--at: expected two numbers in mm like '3,-2', got {text!r}") from error
+    return x, y
+
+
+def _report(sensor: "Sensor", equilibrium: "Equilibrium", charge: "Array") -> dict[str, Any]:
+    """The object that `--json` prints."""
+    import numpy as np
+
+    return {
+        "charge_pC": dict(zip(sensor.electrode_names, (charge * 1e12).tolist(), strict=True)),
+        "deflection_mm": float(equilibrium.deflection(np.array([equilibrium.at]))[0] * 1e3),
+        "theory": equilibrium.theory,
+        "status": equilibrium.status,
+        "iterations": equilibrium.iterations,
+        "residual": equilibrium.residual,
+        "seconds": equilibrium.seconds,
+        "estimated_error": equilibrium.estimated_error,
+    }
+
+
+def _table(report: dict[str, Any]) -> str:
+    charges = [f"charge {name:<10} {charge:10.2f} pC" for name, charge in report["charge_pC"].items()]
+    return "\n".join(
+        [
+            *charges,
+            f"deflection        {report['deflection_mm']:10.4f} mm",
+            f"theory            {report['theory']}, estimated error {report['estimated_error']:.2%}",
+            f"solver            {report['status']} in {report['iterations']} steps, residual "
+            f"{report['residual']:.1e}, {report['seconds'] * 1e3:.0f} ms CPU",
+        ]
+    )
+
+
+@simulate_app.command("sweep")
+def sweep_command(
+    sensor: SensorArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Dataset folder to make.")],
+    probe: Annotated[
+        list[str] | None, typer.Option("--probe", help="What presses; may be given again. (default: circle:1.0)")
+    ] = None,
+    radius: Annotated[float, typer.Option("--radius", help="Largest distance of a press from the centre, mm.")] = 8.0,
+    force: Annotated[
+        tuple[float, float], typer.Option("--force", metavar="MIN MAX", help="Smallest and largest force, N.")
+    ] = (0.05, 2.0),
+    samples: Annotated[int, typer.Option("--samples", help="How many presses.")] = 20_000,
+    orientation: Annotated[
+        Orientation, typer.Option("--orientation", help="Turn the probe in each press.")
+    ] = Orientation.fixed,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the presses.")] = 0,
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes; the data do not depend on it.")] = 1,
+) -> None:
+    """Simulate many presses, spread over the working area and the forces, and write them as a dataset.
+
+    Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
+    """
+    with require("simulate"):
+        from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
+    film_sensor, probes = load_sensor(sensor), tuple(parse_probe(text) for text in probe or ["circle:1.0"])
+    sweep = Sweep(radius * 1e-3, force, samples, seed, orientation.value)
+    with progress("solving the film") as advance, _pool(workers) as executor:
+        folder = run_sweep(output, film_sensor, probes, sweep, executor=executor, progress=advance)
+    say(f"{samples} presses in {folder}")
+
+
+def _pool(workers: int) -> AbstractContextManager[Executor | None]:
+    return ProcessPoolExecutor(workers) if workers > 1 else nullcontext()

@@ -1,0 +1,65 @@
+"""The one tree of exceptions; each is also the built-in that fits it, so plain Python code can catch it.
+
+A message says what was expected, what was got, where, and what to do. The command line maps the tree to exit codes in
+`isocharge.cli`: wrong input is 2, everything else is 1.
+"""
+
+
+class IsochargeError(Exception):
+    """Root of all errors that isocharge raises on purpose."""
+
+
+class InputError(IsochargeError, ValueError):
+    """What the caller gave cannot be used as it is; nothing was computed."""
+
+
+class SensorError(InputError):
+    """A sensor description is wrong: unknown key, electrode off the film, impossible material."""
+
+
+class SceneError(InputError):
+    """A press cannot exist: probe off the film, negative force, unknown probe notation."""
+
+
+class ConfigError(InputError):
+    """A training configuration is wrong."""
+
+
+class ChargeError(InputError):
+    """Charges do not fit the model: wrong number, NaN, infinite."""
+
+
+class DatasetError(InputError):
+    """A folder is not a dataset, or a damaged one."""
+
+
+class ModelError(InputError):
+    """A model is missing, damaged, or of another format."""
+
+
+class OutputExists(IsochargeError, FileExistsError):
+    """The output is already there; nothing is overwritten unasked."""
+
+
+class SolveError(IsochargeError, ArithmeticError):
+    """No equilibrium was found to the asked tolerance."""
+
+
+class TrainingError(IsochargeError, ArithmeticError):
+    """Training produced no usable network."""
+
+
+class PortError(IsochargeError, ConnectionError):
+    """A port cannot be opened."""
+
+
+class PortLost(PortError):
+    """A port went away while it was read."""
+
+
+class TareError(IsochargeError, RuntimeError):
+    """The film was not left alone while it was tared."""
+
+
+class MissingExtra(IsochargeError, ImportError):
+    """A part of isocharge needs packages that are not installed; the message names the install command."""

@@ -1,0 +1,55 @@
+"""From charges to contacts: models, the predictor, and the live path from a port to prediction records.
+
+    >>> from isocharge.serve import Predictor
+    >>> touch = Predictor("three-25um-biaxial")
+    >>> contact = touch.predict([850.0, 840.0, 846.0])  # pC on A, B, C
+
+`serve/README.md` says what is in which module.
+"""
+
+from isocharge.serve.chain import Chain, Tare, TareRule, TouchRule
+from isocharge.serve.domain import Domain
+from isocharge.serve.frames import Frame, FrameCounts, FrameParser, SequenceGaps, encode_frame
+from isocharge.serve.metadata import ModelMetadata
+from isocharge.serve.model import Model, check_golden, load_model, write_model
+from isocharge.serve.port import Chunk, Port
+from isocharge.serve.predictor import Contact, Contacts, Predictor
+from isocharge.serve.record import PredictionRecord
+from isocharge.serve.repository import find_model
+from isocharge.serve.script import Script, wander
+from isocharge.serve.stream import stream
+from isocharge.serve.table import read_charges, table_records, write_contacts
+from isocharge.serve.virtual import Truth, VirtualSensor
+
+__all__ = [
+    "Chain",
+    "Chunk",
+    "Contact",
+    "Contacts",
+    "Domain",
+    "Frame",
+    "FrameCounts",
+    "FrameParser",
+    "Model",
+    "ModelMetadata",
+    "Port",
+    "PredictionRecord",
+    "Predictor",
+    "Script",
+    "SequenceGaps",
+    "Tare",
+    "TareRule",
+    "TouchRule",
+    "Truth",
+    "VirtualSensor",
+    "check_golden",
+    "encode_frame",
+    "find_model",
+    "load_model",
+    "read_charges",
+    "stream",
+    "table_records",
+    "wander",
+    "write_contacts",
+    "write_model",
+]

@@ -1,0 +1,61 @@
+"""What counts as charges for a model: the right number of finite numbers, in the order of its electrodes."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from isocharge.errors import ChargeError
+from isocharge.serve.arrays import Singles
+
+
+def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
+    """The charges of one press as an array of shape (electrodes,), float32, pC.
+
+    Raises:
+        ChargeError: If the number of charges is another, or one is not finite; the electrode is named.
+    """
+    charges = _as_numbers(charge_pC, electrodes)
+    if charges.shape != (len(electrodes),):
+        raise ChargeError(f"expected {_charges(electrodes)}, got an array of shape {charges.shape}")
+    press: Singles = _as_singles(charges[np.newaxis], electrodes, one_press=True)[0]
+    return press
+
+
+def as_batch(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
+    """The charges of n presses as a contiguous array of shape (n, electrodes), float32, pC.
+
+    Raises:
+        ChargeError: If the shape is another, or a charge is not finite; the electrode and the row are named.
+    """
+    charges = _as_numbers(charge_pC, electrodes)
+    if charges.ndim != 2 or charges.shape[1] != len(electrodes):
+        raise ChargeError(
+            f"expected rows of {_charges(electrodes)}, shape (n, {len(electrodes)}), "
+            f"got an array of shape {charges.shape}"
+        )
+    return _as_singles(charges, electrodes, one_press=False)
+
+
+def _charges(electrodes: tuple[str, ...]) -> str:
+    return f"{len(electrodes)} charges {electrodes}"
+
+
+def _as_numbers(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> NDArray[np.number]:
+    try:
+        charges = np.asarray(charge_pC)
+    except ValueError as error:  # rows of different lengths
+        raise ChargeError(f"expected {_charges(electrodes)} in each row, got {charge_pC!r:.200} ({error})") from error
+    if charges.dtype.kind not in "fiu":
+        raise ChargeError(f"expected {_charges(electrodes)} as numbers (pC), got {charge_pC!r:.200}")
+    return charges
+
+
+def _as_singles(charges: NDArray[np.number], electrodes: tuple[str, ...], *, one_press: bool) -> Singles:
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused below
+        singles = np.ascontiguousarray(charges, dtype=np.float32)
+    rows, columns = np.nonzero(~np.isfinite(singles))
+    if rows.size:
+        row = rows[0]
+        bad = [f"{electrodes[column]!r} ({charges[row, column]})" for column in columns[rows == row]]
+        where = "" if one_press else f" in row {row} (rows count from 0)"
+        raise ChargeError(f"expected finite charges (pC), got{where} for electrode {', '.join(bad)}")
+    return singles

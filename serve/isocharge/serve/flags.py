@@ -1,0 +1,22 @@
+"""The words in a record's `flags`.
+
+| word | meaning |
+|---|---|
+| `tare` | not tared yet: no contact is looked for |
+| `outside` | the position is outside the working area, or the force outside the range, that the model was trained for |
+| `misfit` | the charges fit no single contact: the misfit is above `isocharge.serve.domain.MISFIT_LIMIT` |
+| `gap` | frames are missing before this one |
+| `repeat` | this frame has the number of the one before |
+| `restart` | the frame numbers went back: the device began anew |
+| `saturated` | the device says that an amplifier is at its limit |
+| `invalid` | the device sent a charge that is not a number; nothing was computed |
+"""
+
+TARE = "tare"
+OUTSIDE = "outside"
+MISFIT = "misfit"
+GAP = "gap"
+REPEAT = "repeat"
+RESTART = "restart"
+SATURATED = "saturated"
+INVALID = "invalid"

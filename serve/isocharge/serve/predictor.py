@@ -1,0 +1,164 @@
+"""From charges to contacts in process.
+
+One press goes through buffers that are bound to the session once: writing three numbers, running, reading seven back
+allocates nothing and is faster than a plain `session.run`. Batches go through `session.run`.
+"""
+
+import math
+import struct
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import ArrayLike
+
+from isocharge.errors import ModelError
+from isocharge.serve.arrays import Array, Singles
+from isocharge.serve.charges import as_batch, as_press
+from isocharge.serve.metadata import ModelMetadata
+from isocharge.serve.model import Model, load_model
+from isocharge.serve.repository import find_model
+from isocharge.serve.session import INPUT, OUTPUTS, run
+
+
+class Contact(NamedTuple):
+    """Where and how hard one press is, and how sure that is.
+
+    Attributes:
+        x_mm, y_mm: Position in the sensor's frame, mm.
+        force_N: Force, N, positive when pushing.
+        x_std_mm, y_std_mm, force_std_N: Standard deviations.
+        misfit: Distance of the charges from the nearest single contact the model knows, in standard deviations.
+    """
+
+    x_mm: float
+    y_mm: float
+    force_N: float
+    x_std_mm: float
+    y_std_mm: float
+    force_std_N: float
+    misfit: float
+
+
+class Contacts(NamedTuple):
+    """Contacts of n presses: the fields of `Contact`, each an array of shape (n,), float32."""
+
+    x_mm: Singles
+    y_mm: Singles
+    force_N: Singles
+    x_std_mm: Singles
+    y_std_mm: Singles
+    force_std_N: Singles
+    misfit: Singles
+
+
+class Predictor:
+    """A loaded model. Its buffers serve one press at a time: use one Predictor per thread.
+
+    `predict_batch` touches no buffer of the predictor and may be called from any thread.
+
+    Example:
+        >>> from isocharge.serve import Predictor
+        >>> touch = Predictor("three-25um-biaxial")
+        >>> touch.predict([812.0, 790.0, 801.0])  # doctest: +SKIP
+        Contact(x_mm=0.1, ...)
+    """
+
+    def __init__(self, model: str | Path, *, models: Path | None = None) -> None:
+        """Load a model.
+
+        Args:
+            model: Name or path, as `find_model` takes it.
+            models: Repository in which a name is looked up first.
+
+        Raises:
+            ModelError: If it is missing, damaged or of another format.
+        """
+        loaded = load_model(find_model(model, models))
+        self._metadata = loaded.metadata
+        self._session = loaded.session
+        self._press = _BoundPress(loaded.session, len(loaded.metadata.electrodes))
+        _check_shared(self._press, loaded)
+
+    @property
+    def metadata(self) -> ModelMetadata:
+        """What the model says about itself: sensor, electrodes, working area, measured errors."""
+        return self._metadata
+
+    def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
+        """The contact of one press.
+
+        Args:
+            charge_pC: Touch charges, shape (electrodes,), pC, in the order of `metadata.electrodes`.
+
+        Raises:
+            ChargeError: If the number of charges is another, or one is not finite.
+        """
+        try:
+            values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else tuple(charge_pC)
+            self._press.write(*values)
+            usable = math.isfinite(sum(values))
+        except (struct.error, TypeError, ValueError, OverflowError):
+            usable = False
+        if not usable:  # off the fast path: raises what is wrong, or converts
+            self._press.write(*as_press(charge_pC, self._metadata.electrodes))
+        self._press.run()
+        return Contact(*self._press.read())
+
+    def predict_batch(self, charge_pC: ArrayLike) -> Contacts:
+        """The contacts of n presses.
+
+        Args:
+            charge_pC: Touch charges, shape (n, electrodes), pC; n may be 0.
+
+        Raises:
+            ChargeError: If the shape is another, or a charge is not finite; its electrode and row are named.
+        """
+        outputs = run(self._session, as_batch(charge_pC, self._metadata.electrodes))
+        return Contacts(*np.concatenate([outputs[name] for name in OUTPUTS], axis=1).T)
+
+
+class _BoundPress:
+    """Input and output memory of one press, bound to a session.
+
+    `write(q1, q2, ...)` puts the charges in, `run()` computes, `read()` gives the seven numbers of a Contact.
+    """
+
+    def __init__(self, session: ort.InferenceSession, electrodes: int) -> None:
+        charges = np.zeros((1, electrodes), dtype=np.float32)
+        answers = np.zeros(sum(OUTPUTS.values()), dtype=np.float32)
+        # The session sees only addresses: the views in `write` and `read` keep the arrays alive.
+        self.run: Callable[[], None] = partial(session.run_with_iobinding, _bind(session, charges, answers))
+        self.write = partial(struct.Struct(f"={electrodes}f").pack_into, charges.data.cast("B"), 0)
+        self.read = partial(struct.Struct(f"={answers.size}f").unpack, answers.data.cast("B"))
+
+
+def _bind(session: ort.InferenceSession, charges: Singles, answers: Singles) -> ort.IOBinding:
+    """Bind the input (1, electrodes) and the outputs, one after the other in `answers`, by address."""
+    binding = session.io_binding()
+    binding.bind_input(INPUT, "cpu", 0, np.float32, charges.shape, charges.ctypes.data)
+    start = 0
+    for name, width in OUTPUTS.items():
+        binding.bind_output(name, "cpu", 0, np.float32, (1, width), answers[start:].ctypes.data)
+        start += width
+    return binding
+
+
+def _check_shared(press: _BoundPress, model: Model) -> None:
+    """Make sure that this onnxruntime computes in the bound memory and not in copies of it.
+
+    Raises:
+        ModelError: If the bound press and a plain run disagree.
+    """
+    charges = model.golden.charge_pC[:1]
+    press.write(*charges[0])
+    press.run()
+    plain = np.concatenate([rows[0] for rows in run(model.session, charges).values()])
+    if not np.allclose(press.read(), plain, rtol=1e-4, atol=1e-4):
+        raise ModelError(
+            f"{model.folder}: onnxruntime {ort.__version__} answers {press.read()} through bound memory and "
+            f"{tuple(plain.tolist())} without; report this with the version and the machine"
+        )

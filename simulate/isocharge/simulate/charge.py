@@ -1,0 +1,141 @@
+"""Charge collected by an electrode on a stretched piezoelectric film.
+
+The electrodes are held at virtual ground by the charge amplifiers, so the field vanishes and an electrode of area A
+collects only what the in-plane stress polarises (Mirbagheri et al. 2007, eq. 2),
+
+    Q = A * mean(d31 * s11 + d32 * s22),
+
+with s the mid-surface stress in the film's axes, 1 = drawn direction = x. The area readout takes the mean over the
+electrode; the edge readout is the paper's eq. 3: s11 averaged over the left and right edges, s22 over the lower and
+upper. Touch charge is the reading under load minus the reading without: a uniform pretension cancels.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from isocharge.errors import SensorError
+from isocharge.simulate.arrays import Array
+from isocharge.simulate.equilibrium import Equilibrium
+from isocharge.simulate.sensor import Electrode, Sensor
+
+FINE, COARSE = 12, 5
+"""Gauss points per side of an electrode, near the probe and away: the stress has a kink on the footprint's edge."""
+
+NEAR = 3e-3
+"""Distance (m) between an electrode's nearest corner and the probe's edge below which the fine rule is used."""
+
+
+@dataclass(frozen=True)
+class ReadoutPoints:
+    """How charges follow from the stress at points of the film.
+
+    Attributes:
+        points: (x, y), shape (n_electrode, n_point, 2), m.
+        weights: Charge per stress (s11, s22, s12), shape (n_electrode, n_point, 3), C/Pa.
+    """
+
+    points: Array
+    weights: Array
+
+    @classmethod
+    def of(cls, sensor: Sensor, per_side: int) -> "ReadoutPoints":
+        """Integration points for a sensor's electrodes and readout.
+
+        Raises:
+            SensorError: If the sensor asks for an effect that is not modelled.
+        """
+        _check_supported(sensor)
+        rule = _edge_rule if sensor.readout == "edge" else _area_rule
+        parts = [rule(electrode, per_side) for electrode in sensor.electrodes]
+        most = max(share.shape[0] for _, share in parts)
+        points = np.stack([np.pad(at, ((0, most - len(at)), (0, 0)), mode="edge") for at, _ in parts])
+        shares = np.stack([np.pad(share, ((0, most - len(share)), (0, 0))) for _, share in parts])
+        areas = np.array([electrode.area for electrode in sensor.electrodes])
+        per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 0.0])
+        weights = (sensor.gains * areas)[:, None, None] * shares * per_stress
+        return cls(sensor.calibration.place(points), weights)
+
+    def charge(self, stress: Array) -> Array:
+        """Charges, shape (..., n_electrode), C, from stress at the points, shape (..., n_electrode, n_point, 3), Pa."""
+        charge: Array = np.einsum("...epc,epc->...e", stress, self.weights)
+        return charge
+
+
+def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
+    """Touch charge of every electrode.
+
+    Args:
+        sensor: Its electrodes, coefficients and readout are used; its film must be the one that was solved.
+        equilibrium: The solved press.
+
+    Returns:
+        Shape (n_electrode,), C, in the order of `sensor.electrode_names`. Positive for tension along a direction with a
+        positive coefficient.
+
+    Raises:
+        SensorError: If the film is another one or the sensor asks for an effect that is not modelled.
+    """
+    if sensor.film != equilibrium.film:
+        raise SensorError(f"the equilibrium belongs to another film: expected {sensor.film}, got {equilibrium.film}")
+    readout = ReadoutPoints.of(sensor, FINE)
+    stress = equilibrium.touch_stress(readout.points.reshape(-1, 2))
+    return readout.charge(stress.reshape(*readout.points.shape[:2], 3))
+
+
+def _check_supported(sensor: Sensor) -> None:
+    if sensor.surface != "middle":
+        raise SensorError(f"surface {sensor.surface!r} needs bending, which this version does not model; use 'middle'")
+    if sensor.piezo.d33 != 0.0:
+        raise SensorError(
+            f"piezo d33 = {sensor.piezo.d33 * 1e12:g} pC/N: this version does not model contact pressure; use 0"
+        )
+
+
+def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
+    """Points (n, 2) and shares of the mean (n, 3) for a mean over the electrode."""
+    if electrode.square:
+        unit, share = _gauss_square(per_side)
+        low, high = np.array(electrode.corners[0]), np.array(electrode.corners[2])
+        points = low + unit * (high - low)
+    else:
+        points, share = _gauss_polygon(np.array(electrode.corners), per_side)
+    return points, np.repeat(share[:, None], 3, axis=1)
+
+
+def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
+    """Points and shares for s11 over the left and right edges and s22 over the lower and upper ones (eq. 3)."""
+    at, share = _gauss_line(2 * per_side)
+    lower, right, upper, left = (
+        np.array(start) + at[:, None] * (np.array(end) - np.array(start))
+        for start, end in zip(electrode.corners, electrode.corners[1:] + electrode.corners[:1], strict=True)
+    )
+    half, none = 0.5 * share, np.zeros_like(share)
+    first, second = np.stack([half, none, none], axis=1), np.stack([none, half, none], axis=1)
+    return np.concatenate([left, right, lower, upper]), np.concatenate([first, first, second, second])
+
+
+def _gauss_line(count: int) -> tuple[Array, Array]:
+    """Gauss points and shares on [0, 1]."""
+    at, weight = np.polynomial.legendre.leggauss(count)
+    return 0.5 * (at + 1.0), 0.5 * weight
+
+
+def _gauss_square(count: int) -> tuple[Array, Array]:
+    at, share = _gauss_line(count)
+    x, y = np.meshgrid(at, at)
+    return np.stack([x.ravel(), y.ravel()], axis=1), np.outer(share, share).ravel()
+
+
+def _gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
+    """A fan of triangles from the first corner, each a square folded onto a triangle (Duffy 1982)."""
+    unit, share = _gauss_square(count)
+    s, t = unit[:, :1], unit[:, 1:]
+    points, shares = [], []
+    for second, third in pairwise(corners[1:]):
+        one, two = second - corners[0], third - corners[0]
+        points.append(corners[0] + s * ((1.0 - t) * one + t * two))
+        shares.append(share * s[:, 0] * (one[0] * two[1] - one[1] * two[0]))
+    total = np.concatenate(shares)
+    return np.concatenate(points), total / total.sum()

@@ -1,0 +1,59 @@
+"""The noise model: what the measuring chain adds to the charges. Training, limits and the virtual sensor use this one.
+
+The levels so far are memoryless and independent between channels and readings:
+
+    sigma^2 = white^2 + (gain * Q)^2.
+"""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from isocharge.errors import InputError
+from isocharge.simulate.arrays import Array
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Independent Gaussian noise of each reading.
+
+    Attributes:
+        name: Level.
+        white: Standard deviation that every reading has, C.
+        gain: Standard deviation in proportion to the charge, dimensionless.
+    """
+
+    name: str
+    white: float
+    gain: float
+
+    def sigma(self, charge: Array) -> Array:
+        """Standard deviation for charges of any shape, C; the same shape."""
+        return np.hypot(self.white, self.gain * np.asarray(charge))
+
+    def add(self, charge: Array, rng: np.random.Generator) -> Array:
+        """Noisy readings of charges of any shape, C."""
+        noisy: Array = charge + self.sigma(charge) * rng.standard_normal(np.shape(charge))
+        return noisy
+
+    def to_dict(self) -> dict[str, float | str]:
+        """For metadata: white in pC."""
+        table = asdict(self)
+        return {"name": table["name"], "white_pC": float(f"{self.white * 1e12:.12g}"), "gain": self.gain}
+
+
+LEVELS = {
+    "clean": NoiseModel("clean", 0.0, 0.0),
+    "reference": NoiseModel("reference", 1e-12, 2e-3),
+}
+
+
+def noise_model(level: str) -> NoiseModel:
+    """A noise level by name.
+
+    Raises:
+        InputError: If there is no such level.
+    """
+    if level not in LEVELS:
+        raise InputError(f"noise level: expected one of {', '.join(LEVELS)}, got {level!r}")
+    return LEVELS[level]

@@ -1,0 +1,134 @@
+"""A sensor whose physics has a closed-form inverse, and a real model file of it.
+
+On the linear film, an electrode in the direction u has the charge Q = 800 pC/N * F * (1 + u.p / 20 mm). The sum of the
+charges then gives the force and their weighted mean the position, exactly, and an ONNX graph of seven nodes is its
+perfect model: what the serving path answers can be compared with what was pressed.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from isocharge.serve import ModelMetadata, Predictor, write_model
+
+NAMES = ("A", "B", "C", "D")
+PC_PER_N, LEVER_MM, RADIUS_MM = 800.0, 20.0, 8.0
+
+
+@dataclass(frozen=True)
+class LinearFilm:
+    """The sensor, its forward map and its model."""
+
+    directions: np.ndarray
+
+    @classmethod
+    def with_electrodes(cls, n: int) -> "LinearFilm":
+        angle = 2 * np.pi * np.arange(n) / n - np.pi / 2
+        return cls(np.column_stack([np.cos(angle), np.sin(angle)]))
+
+    @property
+    def electrodes(self) -> tuple[str, ...]:
+        return NAMES[: len(self.directions)]
+
+    def charge_pC(self, x_mm: np.ndarray, y_mm: np.ndarray, force_N: np.ndarray) -> np.ndarray:
+        lever = np.column_stack([x_mm, y_mm]) @ self.directions.T / LEVER_MM
+        return PC_PER_N * np.asarray(force_N)[:, None] * (1.0 + lever)
+
+    def metadata(self, **changes: object) -> ModelMetadata:
+        angle = 2 * np.pi * np.arange(64) / 64
+        values = {
+            "name": "linear",
+            "version": 1,
+            "sensor": {"name": "linear-film", "film": {"radius_mm": 45.0}},
+            "electrodes": self.electrodes,
+            "working_area_mm": tuple((RADIUS_MM * np.cos(a), RADIUS_MM * np.sin(a)) for a in angle.tolist()),
+            "probes": ("circle:1.0",),
+            "force_range_N": (0.05, 2.0),
+            "noise": {"name": "reference", "white_pC": 1.0, "gain": 0.002},
+            "dataset_sha256": "0" * 64,
+            "errors": {"position_median_mm": 0.0},
+            "made_with": {"command": "pytest"},
+        }
+        return ModelMetadata(**(values | changes))
+
+    def onnx(self, props: dict[str, str], *, renamed: dict[str, str] | None = None, batch: int | str = "n") -> bytes:
+        """The model; `renamed` and `batch` spoil its interface."""
+        n = len(self.directions)
+        constants = {
+            "lever": 2.0 * LEVER_MM * self.directions,
+            "pC_per_N": [[PC_PER_N * n]],
+            "std_scale": [[50.0, 50.0, 0.0]],
+            "std_floor": [[0.0, 0.0, 7e-4]],
+        }
+        node, names = helper.make_node, {name: name for name in ("charge_pC", "contact", "contact_std", "misfit")}
+        names |= renamed or {}
+        nodes = [
+            node("ReduceSum", [names["charge_pC"], "axes"], ["sum"], keepdims=1),
+            node("MatMul", [names["charge_pC"], "lever"], ["moment"]),
+            node("Div", ["moment", "sum"], ["position"]),
+            node("Div", ["sum", "pC_per_N"], ["force"]),
+            node("Concat", ["position", "force"], [names["contact"]], axis=1),
+            node("Div", ["std_scale", "sum"], ["std_position"]),
+            node("Add", ["std_position", "std_floor"], [names["contact_std"]]),
+            node("Neg", [names["charge_pC"]], ["negated"]),
+            node("Relu", ["negated"], ["negative"]),
+            node("ReduceSum", ["negative", "axes"], [names["misfit"]], keepdims=1),
+        ]
+        value = helper.make_tensor_value_info
+        graph = helper.make_graph(
+            nodes,
+            "linear film",
+            [value(names["charge_pC"], TensorProto.FLOAT, [batch, n])],
+            [
+                value(names[k], TensorProto.FLOAT, [batch, w])
+                for k, w in (("contact", 3), ("contact_std", 3), ("misfit", 1))
+            ],
+            [
+                numpy_helper.from_array(np.array([1], dtype=np.int64), "axes"),
+                *(numpy_helper.from_array(np.array(c, dtype=np.float32), name) for name, c in constants.items()),
+            ],
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+        helper.set_model_props(model, props)
+        return model.SerializeToString()
+
+    def golden_pC(self) -> np.ndarray:
+        rng = np.random.default_rng(0)
+        return self.charge_pC(rng.uniform(-5, 5, 8), rng.uniform(-5, 5, 8), rng.uniform(0.1, 2, 8)).astype(np.float32)
+
+    def write(self, models: Path, **changes: object) -> Path:
+        """Write the model into a repository; the version folder."""
+        metadata = self.metadata(**changes)
+        return write_model(
+            models / metadata.name, self.onnx(metadata.to_props()), metadata, self.golden_pC(), "# The linear film\n"
+        )
+
+
+@pytest.fixture(scope="session")
+def film() -> LinearFilm:
+    """The linear film with three electrodes."""
+    return LinearFilm.with_electrodes(3)
+
+
+@pytest.fixture(scope="session")
+def make_film() -> Callable[[int], LinearFilm]:
+    """Linear films with another number of electrodes."""
+    return LinearFilm.with_electrodes
+
+
+@pytest.fixture(scope="session")
+def models(film: LinearFilm, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model repository that holds `linear/1`; not to be written to."""
+    root = tmp_path_factory.mktemp("models")
+    film.write(root)
+    return root
+
+
+@pytest.fixture(scope="session")
+def predictor(models: Path) -> Predictor:
+    """The model of the linear film with three electrodes."""
+    return Predictor("linear", models=models)

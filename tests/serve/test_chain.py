@@ -1,0 +1,120 @@
+"""The signal chain: what is tared, what counts as touch."""
+
+import numpy as np
+import pytest
+
+from isocharge.errors import TareError
+from isocharge.serve import Chain, TareRule, TouchRule
+from isocharge.serve.chain import ChainState, Touch, advance, measure_tare, next_touch
+
+RULE, OFFSET = TareRule(), np.array([12.0, -7.0, 3.0])
+ONE_PC = np.ones(3)
+
+
+def rest(n, seed=0, sigma=1.0):
+    return OFFSET + sigma * np.random.default_rng(seed).standard_normal((n, 3))
+
+
+def run(frames, chain=None):
+    """All readings of raw frames, shape (n, 3)."""
+    state, readings = ChainState.start(3), []
+    for raw in frames:
+        state, reading = advance(chain or Chain(), state, raw)
+        readings.append(reading)
+    return readings
+
+
+def test_tare_is_mean_and_noise():
+    tare = measure_tare(RULE, rest(10_000))
+    np.testing.assert_allclose(tare.charge_pC, OFFSET, atol=0.05)
+    np.testing.assert_allclose(tare.noise_pC, 1.0, rtol=0.03)
+    assert tare.frames == 10_000
+
+
+def test_tare_on_a_touched_film_is_refused():
+    frames = rest(100)
+    frames[60:] += 100.0
+    with pytest.raises(TareError, match=r"varies by 4\d.* pC rms, expected at most 5 pC; leave the film alone"):
+        measure_tare(RULE, frames)
+
+
+def test_tare_under_a_resting_weight_is_refused():
+    with pytest.raises(TareError, match=r"rests at 81\d.* pC, expected at most 100 pC; take off"):
+        measure_tare(RULE, rest(100) + 800.0)
+
+
+def test_tare_takes_the_first_hundred_frames():
+    readings = run(rest(150))
+    assert [r.tare is None for r in readings] == [True] * 100 + [False] * 50
+    assert {r.flags for r in readings[:100]} == {("tare",)}
+    np.testing.assert_allclose(readings[100].tare.charge_pC, rest(150)[:100].mean(axis=0))
+    np.testing.assert_allclose(np.mean([r.charge_pC for r in readings[100:]], axis=0), 0.0, atol=0.5)
+
+
+def test_tare_waits_for_quiet():
+    frames = rest(400)
+    frames[:220] += np.linspace(900.0, 300.0, 220)[:, None]  # a finger that leaves after 220 frames
+    readings = run(frames)
+    first = next(i for i, r in enumerate(readings) if r.tare is not None)
+    assert 300 < first <= 321
+    np.testing.assert_allclose(readings[-1].tare.charge_pC, OFFSET, atol=2.0)
+
+
+def test_tare_gives_up_with_the_reason():
+    with pytest.raises(TareError, match="varies by"):
+        run(rest(300, sigma=50.0), Chain(tare=TareRule(patience=250)))
+
+
+def touches(totals, rule=None, noise=ONE_PC):
+    touch, seen = Touch(), []
+    for total in totals:
+        touch = next_touch(rule or TouchRule(), touch, total, noise)
+        seen.append(touch.contact)
+    return seen
+
+
+def test_touch_threshold_is_floor_plus_noise():
+    threshold = 10.0 + 6.0 * np.sqrt(3.0)
+    assert touches([threshold - 0.1, threshold + 0.1]) == [False, True]
+    assert touches([9.9, 10.1], noise=np.zeros(3)) == [False, True]
+
+
+def test_hysteresis():
+    assert touches([15.0, 25.0, 15.0, 11.0, 9.0, 15.0]) == [False, True, True, True, False, False]
+
+
+def test_release_at_a_share_of_the_peak():
+    assert touches([1000.0, 4000.0, 201.0, 199.0]) == [True, True, True, False]
+
+
+def test_a_drifted_base_releases_and_is_no_new_touch():
+    """An absolute release threshold under the drift of 60 pC never would release."""
+    assert touches([2060.0, 60.0, 62.0, 58.0, 60.0, 75.0, 100.0]) == [True] + [False] * 5 + [True]
+
+
+def test_a_press_that_softens_to_the_smallest_force_is_held():
+    assert all(touches([4040.0, 340.0]))
+
+
+def test_smallest_press_is_felt_at_once():
+    frames = rest(400)
+    frames[200:300] += 340.0 / 3.0
+    contact = [r.contact for r in run(frames)]
+    assert contact == [False] * 200 + [True] * 100 + [False] * 100
+
+
+def test_negative_charges_touch_as_well():
+    frames = rest(200)
+    frames[150:] -= 200.0
+    assert [r.contact for r in run(frames)] == [False] * 150 + [True] * 50
+
+
+def test_no_false_touch_in_two_and_a_half_minutes_of_noise():
+    assert not any(r.contact for r in run(rest(30_000, seed=3)))
+
+
+def test_advance_leaves_its_input_alone():
+    state = ChainState.start(3)
+    after, _ = advance(Chain(), state, OFFSET)
+    assert (state.frames, len(state.waiting_pC)) == (0, 0)
+    assert (after.frames, len(after.waiting_pC)) == (1, 1)

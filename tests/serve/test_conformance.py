@@ -1,0 +1,68 @@
+"""What holds for every model in the top-level `models/` folder, released ones above all."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from isocharge.errors import ChargeError
+from isocharge.serve import Predictor, check_golden, find_model, load_model
+from isocharge.serve.repository import model_names
+
+MODELS = Path(__file__).parents[2] / "models"
+NAMES = model_names(MODELS)
+
+
+def test_a_model_is_released():
+    assert "three-25um-biaxial" in NAMES
+
+
+@pytest.fixture(params=NAMES)
+def model(request):
+    return load_model(find_model(MODELS / request.param))
+
+
+@pytest.fixture
+def released(model):
+    return Predictor(model.folder)
+
+
+def test_folder_says_what_the_metadata_say(model):
+    assert (model.folder.parent.name, model.folder.name) == (model.metadata.name, str(model.metadata.version))
+    assert (model.folder / "card.md").read_text().strip()
+    assert f'name: "{model.metadata.name}"' in (model.folder.parent / "config.pbtxt").read_text()
+
+
+def test_golden_vectors_are_reproduced(model):
+    check_golden(model)
+
+
+def test_answers_are_finite_and_deviations_positive(model, released):
+    """Over all charges a film may give, and some it may not."""
+    rng = np.random.default_rng(0)
+    charges = 10.0 ** rng.uniform(0, 4, (2000, len(model.metadata.electrodes)))
+    contacts = released.predict_batch(charges * rng.choice([-0.1, 1.0, 1.0, 1.0], charges.shape))
+    assert all(np.isfinite(column).all() for column in contacts)
+    assert min(contacts.x_std_mm.min(), contacts.y_std_mm.min(), contacts.force_std_N.min()) > 0.0
+    assert contacts.misfit.min() >= 0.0
+
+
+def test_one_press_equals_the_batch(model, released):
+    batch = released.predict_batch(model.golden.charge_pC)
+    for row, charge_pC in enumerate(model.golden.charge_pC):
+        assert released.predict(charge_pC) == pytest.approx([c[row] for c in batch], rel=1e-4, abs=1e-4)
+
+
+def test_wrong_width_names_the_electrodes(model, released):
+    electrodes = model.metadata.electrodes
+    with pytest.raises(ChargeError) as caught:
+        released.predict(np.ones(len(electrodes) + 1))
+    assert str(electrodes) in str(caught.value)
+
+
+def test_nan_names_its_electrode(model, released):
+    for column, name in enumerate(model.metadata.electrodes):
+        charges = np.full(len(model.metadata.electrodes), 800.0)
+        charges[column] = np.nan
+        with pytest.raises(ChargeError, match=f"'{name}'"):
+            released.predict(charges)

@@ -1,0 +1,47 @@
+"""The domain check against shapes whose inside is known without it."""
+
+import numpy as np
+import pytest
+
+from isocharge.serve import Contact, Contacts, Domain
+from isocharge.serve.domain import MISFIT_LIMIT, inside_polygon
+
+GOOD = Contact(1.0, -2.0, 0.5, 0.1, 0.1, 0.01, 0.3)
+
+
+def test_inside_of_a_disk():
+    angle, rng = 2 * np.pi * np.arange(720) / 720, np.random.default_rng(1)
+    x, y = rng.uniform(-2, 2, (2, 5000))
+    r = np.hypot(x, y)
+    clear = np.abs(r - 1.0) > 1e-4
+    inside = inside_polygon(x, y, np.column_stack([np.cos(angle), np.sin(angle)]))
+    np.testing.assert_array_equal(inside[clear], r[clear] < 1.0)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_inside_of_a_notched_square(closed):
+    corners = np.array([[0, 0], [4, 0], [4, 4], [2, 1], [0, 4]] + [[0, 0]] * closed, dtype=float)
+    inside = inside_polygon(np.array([2.0, 2.0, 0.5, 3.5, -1.0]), np.array([0.5, 2.0, 2.0, 2.0, 0.0]), corners)
+    assert inside.tolist() == [True, False, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("changes", "flags"),
+    [
+        ({}, ()),
+        ({"x_mm": 8.1}, ("outside",)),
+        ({"force_N": 0.04}, ("outside",)),
+        ({"force_N": 2.1}, ("outside",)),
+        ({"misfit": MISFIT_LIMIT * 1.01}, ("misfit",)),
+        ({"misfit": 99.0, "y_mm": -9.0}, ("outside", "misfit")),
+    ],
+)
+def test_flags(film, changes, flags):
+    assert Domain.of(film.metadata()).flags(GOOD._replace(**changes)) == flags
+
+
+def test_batch_flags_equal_one_by_one(film):
+    domain, rng = Domain.of(film.metadata()), np.random.default_rng(2)
+    columns = rng.uniform(-3, 10, (7, 50)).astype(np.float32)
+    one_by_one = [domain.flags(Contact(*row)) for row in columns.T.tolist()]
+    assert domain.batch_flags(Contacts(*columns)) == one_by_one

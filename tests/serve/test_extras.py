@@ -1,0 +1,27 @@
+"""A missing extra says how to get it; any other failed import is not dressed up as one."""
+
+import pytest
+
+from isocharge.cli.extras import require
+from isocharge.errors import MissingExtra
+
+
+@pytest.mark.parametrize(
+    ("extra", "module"), [("simulate", "scipy"), ("simulate", "scipy.sparse"), ("train", "torch"), ("train", "scipy")]
+)
+def test_missing_package_of_an_extra(extra, module):
+    with (
+        pytest.raises(MissingExtra, match=rf"'{module.partition('.')[0]}'.*pip install 'isocharge\[{extra}\]'"),
+        require(extra),
+    ):
+        raise ModuleNotFoundError(f"No module named {module!r}", name=module)
+
+
+def test_other_missing_package_passes():
+    with pytest.raises(ModuleNotFoundError, match="nowhere"), require("simulate"):
+        import nowhere  # noqa: F401
+
+
+def test_nothing_missing():
+    with require("train"):
+        pass

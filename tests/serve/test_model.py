@@ -1,0 +1,253 @@
+"""The model folder: written whole or not at all, and read with suspicion."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
+
+from isocharge.errors import ChargeError, ModelError, OutputExists
+from isocharge.files import sha256_of
+from isocharge.serve import check_golden, load_model, write_model
+from isocharge.serve.golden import make_golden
+
+
+@pytest.fixture
+def own_model(models, tmp_path):
+    """A copy of the model's version folder, to be damaged."""
+    return shutil.copytree(models / "linear" / "1", tmp_path / "linear" / "1")
+
+
+def test_written_model_reads_back(film, models):
+    model = load_model(models / "linear" / "1")
+    assert model.metadata == film.metadata()
+    check_golden(model)
+
+
+def test_files_of_a_model(models):
+    folder = models / "linear"
+    assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} == {
+        "config.pbtxt",
+        "1/model.onnx",
+        "1/golden.json",
+        "1/card.md",
+    }
+
+
+def test_golden_file_has_all_it_needs(film, models):
+    golden = json.loads((models / "linear/1/golden.json").read_text())
+    assert golden["sha256"] == sha256_of((models / "linear/1/model.onnx").read_bytes())
+    assert golden["tolerance"]["relative"] == 1e-5
+    assert golden["tolerance"]["floor"]["contact"] == [1.0, 1.0, 0.1]
+    np.testing.assert_array_equal(np.float32(golden["inputs"]["charge_pC"]), film.golden_pC())
+    assert {name: np.shape(rows) for name, rows in golden["outputs"].items()} == {
+        "contact": (8, 3),
+        "contact_std": (8, 3),
+        "misfit": (8, 1),
+    }
+
+
+def triton_model_config():
+    """Triton's `inference.ModelConfig`, as far as we use it: field names and types, from its model_config.proto."""
+    file = descriptor_pb2.FileDescriptorProto(name="config.proto", package="inference", syntax="proto3")
+    types = file.enum_type.add(name="DataType")
+    for number, name in enumerate(["TYPE_INVALID", "TYPE_FP32"]):
+        types.value.add(name=name, number=number)
+    field = descriptor_pb2.FieldDescriptorProto
+    one, many = field.LABEL_OPTIONAL, field.LABEL_REPEATED
+    tensor = file.message_type.add(name="Tensor")
+    tensor.field.add(name="name", number=1, type=field.TYPE_STRING, label=one)
+    tensor.field.add(name="data_type", number=2, type=field.TYPE_ENUM, type_name=".inference.DataType", label=one)
+    tensor.field.add(name="dims", number=3, type=field.TYPE_INT64, label=many)
+    config = file.message_type.add(name="ModelConfig")
+    config.field.add(name="name", number=1, type=field.TYPE_STRING, label=one)
+    config.field.add(name="platform", number=2, type=field.TYPE_STRING, label=one)
+    config.field.add(name="max_batch_size", number=3, type=field.TYPE_INT32, label=one)
+    for number, name in ((4, "input"), (5, "output")):
+        config.field.add(name=name, number=number, type=field.TYPE_MESSAGE, type_name=".inference.Tensor", label=many)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("inference.ModelConfig"))()
+
+
+def test_triton_config_is_protobuf_text(models):
+    config = text_format.Parse((models / "linear/config.pbtxt").read_text(), triton_model_config())
+    assert (config.name, config.platform) == ("linear", "onnxruntime_onnx")
+    assert config.max_batch_size > 1
+    assert [(t.name, t.data_type, list(t.dims)) for t in config.input] == [("charge_pC", 1, [3])]
+    assert [(t.name, t.data_type, list(t.dims)) for t in config.output] == [
+        ("contact", 1, [3]),
+        ("contact_std", 1, [3]),
+        ("misfit", 1, [1]),
+    ]
+
+
+def test_second_version_stands_beside_the_first(film, tmp_path):
+    film.write(tmp_path)
+    assert film.write(tmp_path, version=2) == tmp_path / "linear" / "2"
+    assert load_model(tmp_path / "linear/2").metadata.version == 2
+    assert load_model(tmp_path / "linear/1").metadata.version == 1
+
+
+def test_existing_version_is_not_overwritten(film, tmp_path):
+    film.write(tmp_path)
+    before = (tmp_path / "linear/1/model.onnx").stat().st_mtime_ns
+    with pytest.raises(OutputExists, match="linear/1 is already there and is not overwritten"):
+        film.write(tmp_path)
+    assert (tmp_path / "linear/1/model.onnx").stat().st_mtime_ns == before
+
+
+def test_a_file_with_the_name_of_the_model(film, tmp_path):
+    (tmp_path / "linear").write_text("mine")
+    with pytest.raises(OutputExists, match="linear: expected a folder or nothing, got a file"):
+        film.write(tmp_path)
+
+
+def write(film, folder, *, onnx=None, metadata=None, golden=None):
+    metadata = metadata or film.metadata()
+    onnx = film.onnx(film.metadata().to_props()) if onnx is None else onnx
+    return write_model(folder, onnx, metadata, film.golden_pC() if golden is None else golden, "card")
+
+
+def spoilt(film):
+    """Arguments of `write` that cannot work, by what is wrong."""
+    props = film.metadata().to_props()
+    return {
+        "no graph": {"onnx": b"not a graph"},
+        "no metadata": {"onnx": film.onnx({})},
+        "other metadata": {"metadata": film.metadata(probes=("circle:2.0",))},
+        "other output": {"onnx": film.onnx(props, renamed={"misfit": "m"})},
+        "golden too narrow": {"golden": film.golden_pC()[:, :2]},
+        "no answer": {"golden": np.zeros((1, 3))},
+        "no golden": {"golden": np.zeros((0, 3))},
+    }
+
+
+@pytest.mark.parametrize("beside", [False, True], ids=["new folder", "beside version 7"])
+@pytest.mark.parametrize(
+    ("wrong", "error", "said"),
+    [
+        ("no graph", ModelError, "cannot read these 11 bytes"),
+        ("no metadata", ModelError, "no 'format_version'"),
+        ("other metadata", ModelError, "disagree on 'probes'"),
+        ("other output", ModelError, "expected the outputs"),
+        ("golden too narrow", ChargeError, "'A', 'B', 'C'"),
+        ("no answer", ModelError, "answers contact = .*nan"),
+        ("no golden", ModelError, "n > 0"),
+    ],
+)
+def test_unusable_model_leaves_nothing_behind(film, tmp_path, wrong, error, said, beside):
+    if beside:
+        film.write(tmp_path, version=7)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(error, match=said):
+        write(film, tmp_path / "linear", **spoilt(film)[wrong])
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_interrupted_writing_leaves_nothing_behind(film, tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("isocharge.files._rename", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write(film, tmp_path / "linear")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_golden_vectors_are_checked_before_a_version_appears(film, tmp_path, monkeypatch):
+    def wrong(*arguments):
+        golden = make_golden(*arguments)
+        golden.outputs["contact"][0] += 1.0
+        return golden
+
+    monkeypatch.setattr("isocharge.serve.model.make_golden", wrong)
+    with pytest.raises(ModelError, match=r"contact\[0, .\] is"):
+        write(film, tmp_path / "linear")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folder_and_model_have_one_name(film, tmp_path):
+    with pytest.raises(ModelError, match="expected a folder named 'linear'"):
+        write(film, tmp_path / "other")
+
+
+def test_other_electrodes_need_another_name(film, make_film, tmp_path):
+    film.write(tmp_path)
+    with pytest.raises(ModelError, match=r"config.pbtxt: describes a model other than .*'D'"):
+        make_film(4).write(tmp_path, version=2)
+
+
+def test_damaged_model_file(own_model):
+    path = own_model / "model.onnx"
+    path.write_bytes(path.read_bytes()[:-10])
+    with pytest.raises(ModelError, match=r"model.onnx: expected sha256 .* the file is damaged or changed"):
+        load_model(own_model)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x00" * 100, b"PK\x03\x04 not ONNX", None], ids=["empty", "zeros", "zip", "half"]
+)
+def test_not_a_model_is_chained_from_its_cause(own_model, data):
+    path, golden = own_model / "model.onnx", own_model / "golden.json"
+    data = path.read_bytes()[:200] if data is None else data
+    golden.write_text(golden.read_text().replace(sha256_of(path.read_bytes()), sha256_of(data)))
+    path.write_bytes(data)
+    with pytest.raises(ModelError, match=f"these {len(data)} bytes") as caught:
+        load_model(own_model)
+    assert caught.value.__cause__ is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [(None, "not there"), ("{", "damaged .JSONDecodeError"), ("{}", "damaged .KeyError"), ("[]", "damaged .TypeError")],
+)
+def test_missing_or_damaged_golden(own_model, text, said):
+    golden = own_model / "golden.json"
+    golden.unlink()
+    if text is not None:
+        golden.write_text(text)
+    with pytest.raises(ModelError, match=f"golden.json: {said}"):
+        load_model(own_model)
+
+
+def test_golden_of_another_width(own_model):
+    golden = own_model / "golden.json"
+    content = json.loads(golden.read_text())
+    content["inputs"]["charge_pC"] = [[1.0, 2.0]]
+    golden.write_text(json.dumps(content))
+    with pytest.raises(ModelError, match=r"expected charges of shape \(n, 3\)"):
+        load_model(own_model)
+
+
+def test_missing_model_file(own_model):
+    (own_model / "model.onnx").unlink()
+    with pytest.raises(ModelError, match=r"model.onnx: cannot be read \(No such file"):
+        load_model(own_model)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        ({"renamed": {"contact": "touch"}}, "expected the outputs contact"),
+        ({"renamed": {"charge_pC": "x"}}, "expected the input charge_pC"),
+        ({"batch": 1}, "expected the input"),
+    ],
+)
+def test_other_interface_is_refused(film, own_model, spoil, said):
+    data = film.onnx(film.metadata().to_props(), **spoil)
+    golden = own_model / "golden.json"
+    golden.write_text(json.dumps(json.loads(golden.read_text()) | {"sha256": sha256_of(data)}))
+    (own_model / "model.onnx").write_bytes(data)
+    with pytest.raises(ModelError, match=said):
+        load_model(own_model)
+
+
+def test_golden_check_sees_a_change_of_2e_5(own_model):
+    golden = own_model / "golden.json"
+    content = json.loads(golden.read_text())
+    content["outputs"]["contact"][3][0] += 2e-5 * max(1.0, abs(content["outputs"]["contact"][3][0]))
+    golden.write_text(json.dumps(content))
+    with pytest.raises(ModelError, match=r"contact\[3, 0\] is .*golden.json says"):
+        check_golden(load_model(own_model))

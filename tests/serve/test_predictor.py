@@ -1,0 +1,137 @@
+"""The predictor answers what the session answers, quickly, and refuses what are no charges."""
+
+import math
+from decimal import Decimal
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from isocharge.errors import ChargeError, ModelError
+from isocharge.serve import Predictor
+from isocharge.serve.predictor import _BoundPress
+
+PRESSES = st.lists(st.floats(0.0, 5000.0, width=32), min_size=3, max_size=3).filter(lambda q: sum(q) > 1.0)
+
+
+@pytest.fixture(scope="module")
+def bare(models):
+    """The same file in a session with nothing of ours around it."""
+    return ort.InferenceSession(str(models / "linear/1/model.onnx"), providers=["CPUExecutionProvider"])
+
+
+def bare_answer(session, charge_pC):
+    return np.concatenate(session.run(None, {"charge_pC": np.atleast_2d(np.float32(charge_pC))}), axis=1)
+
+
+def test_feels_what_was_pressed(film, predictor):
+    contact = predictor.predict(film.charge_pC(np.array([3.0]), np.array([-4.0]), np.array([0.5]))[0])
+    assert contact[:3] == pytest.approx((3.0, -4.0, 0.5), rel=1e-5)
+    assert contact.x_std_mm == pytest.approx(50.0 / 1200.0)
+    assert contact.misfit == 0.0
+
+
+@settings(derandomize=True)
+@given(PRESSES)
+def test_answers_equal_a_bare_session(bare, predictor, charge_pC):
+    assert predictor.predict(charge_pC) == pytest.approx(bare_answer(bare, charge_pC)[0], rel=1e-6, abs=1e-6)
+
+
+def test_answers_do_not_change_afterwards(predictor):
+    first = predictor.predict([100.0, 200.0, 300.0])
+    kept = tuple(first)
+    predictor.predict([900.0, 800.0, 700.0])
+    assert tuple(first) == kept
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        list,
+        tuple,
+        np.float32,
+        np.float64,
+        np.int64,
+        lambda q: [Decimal(v) for v in q],
+        lambda q: np.float64(q + q)[::2],
+    ],
+)
+def test_any_kind_of_numbers(predictor, kind):
+    assert predictor.predict(kind([100, 100, 100])) == predictor.predict([100.0, 100.0, 100.0])
+
+
+def test_batch_equals_one_by_one(film, predictor):
+    charges = film.golden_pC()
+    batch = predictor.predict_batch(charges)
+    for row, charge_pC in enumerate(charges):
+        assert predictor.predict(charge_pC) == pytest.approx([column[row] for column in batch], rel=1e-6)
+
+
+@pytest.mark.parametrize("n", [0, 1, 5000])
+def test_batches_of_any_size(predictor, n):
+    contacts = predictor.predict_batch(np.full((n, 3), 100.0))
+    assert [column.shape for column in contacts] == [(n,)] * 7
+    assert all(np.isfinite(column).all() for column in contacts)
+
+
+@pytest.mark.parametrize(
+    ("charge_pC", "said"),
+    [
+        ([1.0, 2.0, 3.0, 4.0], r"expected 3 charges \('A', 'B', 'C'\), got an array of shape \(4,\)"),
+        ([], r"got an array of shape \(0,\)"),
+        (np.zeros((1, 3)), r"got an array of shape \(1, 3\)"),
+        (np.zeros((3, 1)), r"got an array of shape \(3, 1\)"),
+        (5.0, r"got an array of shape \(\)"),
+        ("123", "as numbers .pC., got '123'"),
+        (["1", "2", "3"], "as numbers"),
+        ({"A": 1.0, "B": 2.0, "C": 3.0}, "got {'A': 1.0"),
+        ([1.0, None, 3.0], "as numbers"),
+        ([1.0, [2.0], 3.0], "inhomogeneous"),
+        ([1.0, math.nan, 3.0], r"expected finite charges \(pC\), got for electrode 'B' \(nan\)"),
+        ([math.inf, 0.0, -math.inf], r"'A' \(inf\), 'C' \(-inf\)"),
+        ([1.0, 2.0, 1e39], r"'C' \(1e\+39\)"),
+        (np.array([1.0, 2.0, 1e39]), r"'C' \(1e\+39\)"),
+        ((q for q in (1.0, 2.0, math.nan)), "as numbers"),
+    ],
+)
+def test_no_charges(predictor, charge_pC, said):
+    with pytest.raises(ChargeError, match=said):
+        predictor.predict(charge_pC)
+
+
+@pytest.mark.parametrize(
+    ("charge_pC", "said"),
+    [
+        (np.zeros((2, 4)), r"rows of 3 charges \('A', 'B', 'C'\), shape \(n, 3\), got an array of shape \(2, 4\)"),
+        (np.zeros(3), r"got an array of shape \(3,\)"),
+        ([[1.0, 2.0, 3.0], [1.0, 2.0]], "in each row"),
+        ([[1.0, 2.0, 3.0], [1.0, math.nan, math.inf]], r"in row 1 .* for electrode 'B' \(nan\), 'C' \(inf\)"),
+    ],
+)
+def test_no_batch(predictor, charge_pC, said):
+    with pytest.raises(ChargeError, match=said):
+        predictor.predict_batch(charge_pC)
+
+
+def test_goes_on_after_an_error(predictor):
+    before = predictor.predict([100.0, 200.0, 300.0])
+    with pytest.raises(ChargeError):
+        predictor.predict([1.0, math.nan, 3.0])
+    assert predictor.predict([100.0, 200.0, 300.0]) == before
+
+
+def test_memory_that_is_not_shared_is_noticed(models, monkeypatch):
+    monkeypatch.setattr(_BoundPress, "__init__", _unshared)
+    with pytest.raises(ModelError, match=r"through bound memory and .* without"):
+        Predictor("linear", models=models)
+
+
+def _unshared(press, session, electrodes):  # noqa: ARG001
+    press.write, press.run, press.read = lambda *_: None, lambda: None, lambda: (0.0,) * 7
+
+
+def test_missing_model(models):
+    with pytest.raises(ModelError, match="no model 'cubic'"):
+        Predictor("cubic", models=models)

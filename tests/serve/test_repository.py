@@ -1,0 +1,90 @@
+"""Models are found by name, version and path, in the order that is promised."""
+
+from pathlib import Path
+
+import pytest
+
+from isocharge.errors import ModelError
+from isocharge.serve import find_model
+from isocharge.serve.repository import model_names
+
+
+@pytest.fixture
+def roots(tmp_path, monkeypatch):
+    """Three repositories - given, from the environment, of the working folder - and nothing shipped."""
+    given, variable, here = (tmp_path / name for name in ("given", "variable", "work/models"))
+    monkeypatch.setenv("ISOCHARGE_MODELS", str(variable))
+    here.mkdir(parents=True)
+    monkeypatch.chdir(here.parent)
+    monkeypatch.setattr("isocharge.serve.repository._shipped", lambda: tmp_path / "shipped")
+    return {"given": given, "variable": variable, "here": here, "shipped": tmp_path / "shipped"}
+
+
+def put(root: Path, name: str = "m", version: str = "1") -> Path:
+    folder = root / name / version
+    folder.mkdir(parents=True)
+    (folder / "model.onnx").touch()
+    return folder.resolve()
+
+
+def test_first_repository_wins(roots):
+    found = []
+    for name in ("shipped", "here", "variable", "given"):
+        put(roots[name])
+        found.append(find_model("m", roots["given"]).resolve().parents[1])
+    assert found == [roots[name].resolve() for name in ("shipped", "here", "variable", "given")]
+
+
+def test_highest_version_is_by_number(roots):
+    for version in ("1", "10", "9", "011", "draft", ".11.abcd"):
+        put(roots["given"], version=version)
+    assert find_model("m", roots["given"]).name == "10"
+
+
+def test_version_by_name(roots):
+    put(roots["given"], version="1")
+    put(roots["given"], version="2")
+    assert find_model("m/1", roots["given"]).name == "1"
+
+
+def test_every_kind_of_path(roots):
+    folder = put(roots["given"])
+    for path in (folder.parent, folder, folder / "model.onnx"):
+        assert find_model(path) == find_model(str(path)) == folder
+
+
+def test_path_beside_us_is_found_when_no_model_has_the_name(roots):
+    folder = put(roots["here"].parent, "mine")
+    assert find_model("mine").resolve() == folder
+    shadow = put(roots["here"], "mine")
+    assert find_model("mine").resolve() == shadow
+    assert find_model("./mine").resolve() == folder
+    assert find_model(Path("mine")).resolve() == folder
+
+
+def test_what_is_no_model_is_ignored(roots):
+    put(roots["given"])
+    (roots["given"] / "README.md").touch()
+    (roots["given"] / "notes").mkdir()
+    assert model_names(roots["given"]) == ["m"]
+
+
+def test_missing_name_says_where_and_what(roots):
+    put(roots["given"], "three")
+    with pytest.raises(ModelError) as caught:
+        find_model("four", roots["given"])
+    message = str(caught.value)
+    assert "no model 'four'" in message
+    assert f"{roots['given']} (three)" in message
+    assert f"{roots['variable']} (no models)" in message
+
+
+def test_missing_path_says_what_was_expected(roots):
+    with pytest.raises(ModelError, match=r"nowhere/model.onnx: no model there; expected a model folder"):
+        find_model("nowhere/model.onnx", roots["given"])
+
+
+def test_folder_without_a_version_is_no_model(roots):
+    (roots["given"] / "m").mkdir(parents=True)
+    with pytest.raises(ModelError, match="no model 'm'"):
+        find_model("m", roots["given"])

@@ -1,0 +1,84 @@
+"""What a virtual sensor is told to press stays where it is allowed, and is smooth."""
+
+import numpy as np
+import pytest
+
+from isocharge.errors import SceneError
+from isocharge.serve import Script, wander
+
+
+@pytest.fixture(scope="module")
+def script():
+    return wander(seed=5, seconds=120.0, rate_Hz=200.0, radius_mm=8.0, force_range_N=(0.05, 2.0))
+
+
+def runs(touching):
+    """(start, end) of each stretch of frames with touch."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], touching.astype(int), [0]])))
+    return edges.reshape(-1, 2)
+
+
+def test_begins_with_a_second_of_rest(script):
+    assert not script.touching[:200].any()
+    assert script.touching[200:210].any()
+
+
+def test_stays_inside_radius_and_forces(script):
+    on = script.touching
+    assert np.hypot(script.x_mm[on], script.y_mm[on]).max() < 8.0
+    assert script.force_N[on].min() == pytest.approx(0.05)
+    assert 1.0 < script.force_N[on].max() <= 2.0 * (1 + 1e-12)
+    assert np.isnan(script.x_mm[~on]).all()
+    assert np.isnan(script.y_mm[~on]).all()
+
+
+def test_presses_and_pauses_last_as_promised(script):
+    presses = runs(script.touching)
+    assert len(presses) > 30
+    lengths = np.diff(presses[:-1], axis=1) / 200.0
+    pauses = (presses[1:, 0] - presses[:-1, 1]) / 200.0
+    assert (lengths.min(), lengths.max()) == (pytest.approx(1.0, abs=0.1), pytest.approx(3.0, abs=0.1))
+    assert (pauses.min(), pauses.max()) == (pytest.approx(0.6, abs=0.1), pytest.approx(1.2, abs=0.1))
+
+
+def test_moves_smoothly(script):
+    for start, end in runs(script.touching):
+        steps = np.hypot(np.diff(script.x_mm[start:end]), np.diff(script.y_mm[start:end]))
+        assert steps.max() * 200.0 < 40.0  # mm/s
+        assert np.abs(np.diff(np.log(script.force_N[start:end]))).max() < 0.25
+
+
+def test_covers_the_area_and_the_forces(script):
+    on = script.touching
+    assert np.hypot(script.x_mm[on], script.y_mm[on]).min() < 2.0
+    assert (np.abs(script.x_mm[on]).max(), np.abs(script.y_mm[on]).max()) > (6.0, 6.0)
+    low, middle, high = np.quantile(script.force_N[on], (0.2, 0.5, 0.8))
+    assert low < 0.2 < middle < 0.7 < high
+
+
+def test_seed_decides():
+    one, same, other = (wander(seed=seed, seconds=5.0).force_N for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"force_range_N": (0.0, 2.0)},
+        {"force_range_N": (2.0, 1.0)},
+        {"radius_mm": -1.0},
+        {"rate_Hz": 0.0},
+        {"seconds": 0.0},
+    ],
+)
+def test_impossible_scripts(wrong):
+    with pytest.raises(SceneError, match="wander: expected 0 < smallest"):
+        wander(seed=0, **wrong)
+
+
+def test_script_arrays_agree():
+    with pytest.raises(SceneError, match="three arrays of one length"):
+        Script(np.zeros(2), np.zeros(2), np.zeros(3), 200.0)
+    with pytest.raises(SceneError, match=r"a positive rate, got 0.0 Hz"):
+        Script(np.zeros(2), np.zeros(2), np.zeros(2), 0.0)

@@ -1,0 +1,130 @@
+"""Bytes in, records out, without a port."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+
+from isocharge.errors import ChargeError, PortError, TareError
+from isocharge.serve import Chain, Chunk, Frame, FrameParser, SequenceGaps, TareRule, encode_frame, stream
+
+OFFSET = np.array([12.0, -7.0, 3.0])
+CHAIN = Chain(tare=TareRule(frames=10))
+
+
+def chunk(*frames):
+    return Chunk(b"".join(map(encode_frame, frames)), time.time(), time.perf_counter_ns())
+
+
+def frames(rows, first=0):
+    return [Frame((first + i) % 65536, 5000 * i, tuple(row)) for i, row in enumerate(np.asarray(rows).tolist())]
+
+
+@pytest.fixture
+def play(predictor):
+    """Records of raw charges, after ten frames of rest."""
+
+    def play(*later, **options):
+        rest = frames(np.tile(OFFSET, (10, 1)))
+        return list(stream([chunk(*rest), *(chunk(f) for f in later)], predictor, CHAIN, **options))[10:]
+
+    return play
+
+
+def pressed(film, x_mm=2.0, y_mm=-3.0, force_N=0.5):
+    return film.charge_pC(np.array([x_mm]), np.array([y_mm]), np.array([force_N]))[0]
+
+
+def test_a_press(film, play):
+    raw = pressed(film) + OFFSET
+    (record,) = play(Frame(10, 50_000, tuple(raw.tolist())))
+    assert (record.x_mm, record.y_mm, record.force_N) == pytest.approx((2.0, -3.0, 0.5), rel=1e-5)
+    assert (record.contact, record.flags, record.seq, record.t_device_us) == (True, (), 10, 50_000)
+    assert record.charge_pC == pytest.approx(dict(zip("ABC", pressed(film), strict=True)), rel=1e-5)
+    assert record.charge_raw_pC == pytest.approx(dict(zip("ABC", raw, strict=True)), rel=1e-6)
+    assert record.tare_pC == {"A": 12.0, "B": -7.0, "C": 3.0}
+    assert (record.model, record.frame_id) == ("linear/1", "linear-film")
+    assert abs(record.timestamp - time.time()) < 5.0
+    assert 0.0 < record.latency_us < 5e6
+
+
+def test_out_of_contact(play):
+    (record,) = play(Frame(10, 50_000, tuple((OFFSET + 1.0).tolist())))
+    assert (record.contact, record.force_N, record.flags) == (False, 0.0, ())
+    assert {record.x_mm, record.y_mm, record.x_std_mm, record.y_std_mm, record.force_std_N, record.misfit} == {None}
+    assert record.charge_pC == {"A": 1.0, "B": 1.0, "C": 1.0}
+
+
+def test_while_it_tares(predictor):
+    records = list(stream([chunk(*frames(np.tile(OFFSET, (10, 1))))], predictor, CHAIN))
+    assert {(r.flags, r.contact, r.force_N, r.charge_pC, r.tare_pC) for r in records} == {
+        (("tare",), False, 0.0, None, None)
+    }
+    assert records[0].charge_raw_pC == {"A": 12.0, "B": -7.0, "C": 3.0}
+
+
+@pytest.mark.parametrize(
+    ("press", "flags"),
+    [({"x_mm": 9.0}, ("outside",)), ({"force_N": 2.5}, ("outside",)), ({"force_N": 0.049}, ("outside",)), ({}, ())],
+)
+def test_outside_what_the_model_knows(film, play, press, flags):
+    assert play(Frame(10, 0, tuple((pressed(film, **press) + OFFSET).tolist())))[0].flags == flags
+
+
+def test_charges_of_no_single_contact(play):
+    assert play(Frame(10, 0, (900.0, 900.0, -200.0)))[0].flags[-1] == "misfit"
+
+
+def test_flags_of_the_frame(film, play):
+    charges = tuple((pressed(film) + OFFSET).tolist())
+    gaps = SequenceGaps()
+    records = play(
+        Frame(10, 0, charges), Frame(13, 0, charges, flags=1), Frame(13, 0, charges), Frame(2, 0, charges), gaps=gaps
+    )
+    assert [r.flags for r in records] == [(), ("gap", "saturated"), ("repeat",), ("restart",)]
+    assert (gaps.lost, gaps.repeated, gaps.restarts) == (2, 1, 1)
+
+
+def test_a_charge_that_is_no_number(film, play):
+    good = tuple((pressed(film) + OFFSET).tolist())
+    records = play(Frame(10, 0, good), Frame(11, 0, (good[0], math.nan, good[2])), Frame(12, 0, good))
+    assert [r.contact for r in records] == [True, False, True]
+    assert (records[1].flags, records[1].force_N, records[1].charge_pC) == (("invalid",), None, None)
+    assert records[1].charge_raw_pC["B"] is None
+    assert "NaN" not in records[1].to_json()
+
+
+def test_another_number_of_charges(play):
+    with pytest.raises(ChargeError, match=r"model linear/1 expects 3 charges \('A', 'B', 'C'\), frame 10 has 4"):
+        play(Frame(10, 0, (1.0, 2.0, 3.0, 4.0)))
+
+
+def test_film_that_is_not_left_alone(predictor):
+    rows = np.cumsum(np.ones((60, 3)), axis=0) * 20.0
+    with pytest.raises(TareError):
+        list(stream([chunk(f) for f in frames(rows)], predictor, Chain(tare=TareRule(frames=10, patience=50))))
+
+
+def test_bytes_that_are_no_frames(predictor):
+    lines = [Chunk(b"801.2,799.5,803.3\r\n" * 20, 0.0, 0)] * 50
+    with pytest.raises(PortError, match=r"no intact frame among the first \d+ bytes .*check baud rate"):
+        list(stream(lines, predictor))
+
+
+def test_damage_costs_only_itself(film, play):
+    good = Frame(11, 0, tuple((pressed(film) + OFFSET).tolist()))
+    parser = FrameParser()
+    damaged = bytearray(encode_frame(Frame(10, 0, good.charge_pC)))
+    damaged[5] ^= 0x40
+    parser.feed(bytes(damaged))
+    assert [r.contact for r in play(good, parser=parser)] == [True]
+    assert parser.counts.crc_errors + parser.counts.malformed == 1
+
+
+def test_order_of_records_does_not_depend_on_chunks(film, predictor):
+    rows = np.vstack([np.tile(OFFSET, (10, 1)), np.tile(pressed(film) + OFFSET, (10, 1))])
+    data = b"".join(map(encode_frame, frames(rows)))
+    bytewise = stream((Chunk(data[i : i + 1], 0.0, 0) for i in range(len(data))), predictor, CHAIN)
+    whole = stream([Chunk(data, 0.0, 0)], predictor, CHAIN)
+    assert [(r.seq, r.x_mm) for r in bytewise] == [(r.seq, r.x_mm) for r in whole]

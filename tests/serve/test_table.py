@@ -1,0 +1,82 @@
+"""CSV of charges in any reasonable dress, and every unreasonable one refused with its line."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+
+from isocharge.errors import ChargeError
+from isocharge.serve import read_charges, table_records, write_contacts
+
+NAMES = ("A", "B", "C")
+
+
+def read(text):
+    return read_charges(io.StringIO(text, newline=""), NAMES, "presses.csv")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "A,B,C\n1,2,3\n4,5,6.5\n",
+        "A,B,C\r\n1,2,3\r\n4,5,6.5\r\n\r\n\r\n",
+        "C,A,B\n3,1,2\n6.5,4,5",
+        "\n A , B,C \n1, 2,3\n,,\n4,5,65e-1\n",
+        '"A","B","C"\n"1",2,3\n4,5,6.5\n',
+    ],
+)
+def test_every_dress_gives_the_same_charges(text):
+    np.testing.assert_array_equal(read(text), [[1, 2, 3], [4, 5, 6.5]])
+
+
+def test_header_alone_is_no_presses():
+    assert read("A,B,C\n").shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", r"presses.csv: empty; expected a header with the electrodes \('A', 'B', 'C'\)"),
+        ("\n\n", "empty"),
+        ("A,B\n1,2\n", "missing: 'C'"),
+        ("A,B,C,D\n1,2,3,4\n", "unknown: 'D'"),
+        ("A,B,C,C\n1,2,3,4\n", "repeated: 'C'"),
+        ("1,2,3\n4,5,6\n", "unknown: '1', '2', '3'"),
+        ("A;B;C\n1;2;3\n", "unknown: 'A;B;C'"),
+        ("A,B,C\n1,2,3\n\n4,,6\n", "presses.csv, line 4: electrode 'B': expected a charge in pC, got ''"),
+        ("A,B,C\n1,2,x\n", "line 2: electrode 'C': expected a charge in pC, got 'x'"),
+        ("C,B,A\n1,nan,3\n", "line 2: electrode 'B': .* got 'nan'"),
+        ("A,B,C\n1,2,-inf\n", "line 2: electrode 'C': .* got '-inf'"),
+        ("A,B,C\n1,2\n", "line 2: expected 3 cells as in the header, got 2"),
+        ("A,B,C\n1,2,3,4\n", "line 2: expected 3 cells as in the header, got 4"),
+    ],
+)
+def test_what_is_no_table_of_charges(text, said):
+    with pytest.raises(ChargeError, match=said):
+        read(text)
+
+
+def test_bytes_that_are_no_text():
+    lines = io.TextIOWrapper(io.BytesIO(b"A,B,C\n1,2,\xff\xfe\n"), encoding="utf-8")
+    with pytest.raises(ChargeError, match="not CSV text in UTF-8"):
+        read_charges(lines, NAMES, "presses.csv")
+
+
+def test_contacts_as_csv(film, predictor):
+    out = io.StringIO()
+    write_contacts(predictor.predict_batch(film.charge_pC([1.0, -2.0], [0.5, 3.0], [1.0, 0.25])), out)
+    lines = out.getvalue().splitlines()
+    assert lines[0] == "x_mm,y_mm,force_N,x_std_mm,y_std_mm,force_std_N,misfit"
+    np.testing.assert_allclose(np.loadtxt(lines[1:], delimiter=",")[:, :3], [[1, 0.5, 1], [-2, 3, 0.25]], atol=2e-6)
+
+
+def test_contacts_as_records(film, predictor):
+    charges = film.charge_pC([1.0, 9.0], [0.5, 0.0], [1.0, 0.25])
+    first, second = (json.loads(record.to_json()) for record in table_records(charges, predictor))
+    assert (first["x_mm"], first["contact"], first["flags"]) == (pytest.approx(1.0, abs=2e-6), True, [])
+    assert second["flags"] == ["outside"]
+    assert first["charge_pC"] == pytest.approx(dict(zip("ABC", charges[0], strict=True)), abs=1e-6)
+    assert {key for key, value in first.items() if value is None} == {
+        "timestamp", "t_device_us", "seq", "charge_raw_pC", "tare_pC", "latency_us",
+    }  # fmt: skip

@@ -1,0 +1,106 @@
+"""The virtual sensor behaves like a board: on time, whole frames, indifferent to whether anybody reads."""
+
+import time
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from isocharge.errors import PortError, SceneError
+from isocharge.serve import FrameParser, Port, Script, SequenceGaps, VirtualSensor, wander
+
+
+def steady(n=10, rate_Hz=200.0, force_N=1.0):
+    return Script(np.zeros(n), np.zeros(n), np.full(n, force_N), rate_Hz)
+
+
+def read(url, count):
+    """The next frames of a sensor."""
+    parser = FrameParser()
+    with Port(url, silence_s=1.0) as port:
+        frames = list(islice((frame for chunk in port for frame in parser.feed(chunk.data)), count))
+    return frames, parser
+
+
+def test_frames_carry_script_noise_and_offset(film):
+    script = Script(np.array([1.0, np.nan]), np.array([2.0, np.nan]), np.array([0.5, 0.0]), 500.0)
+    noise = lambda charge_pC, rng: charge_pC + rng.integers(1, 2, charge_pC.shape)  # noqa: E731
+    with VirtualSensor(film.charge_pC, script, noise=noise, offset_pC=[10.0, 20.0, 30.0]) as sensor:
+        frames, _ = read(sensor.url, 4)
+    press = film.charge_pC([1.0], [2.0], [0.5])[0]
+    for frame in frames:
+        clean = press if frame.seq % 2 == 0 else np.zeros(3)
+        np.testing.assert_allclose(frame.charge_pC, clean + np.array([11.0, 21.0, 31.0]), rtol=1e-6)
+        assert frame.t_us == frame.seq * 2000
+
+
+def test_keeps_its_rate_without_drift(film):
+    with VirtualSensor(film.charge_pC, steady(rate_Hz=1000.0)) as sensor:
+        begin = time.perf_counter()
+        frames, _ = read(sensor.url, 1000)
+        end = time.perf_counter()
+        sent = np.array([sensor.truth(f.seq).sent_s for f in frames])
+    lateness = sent - sent[0] - np.arange(len(sent)) / 1000.0
+    assert np.median(np.abs(lateness)) < 0.02  # sleeping between frames, not until deadlines, is late by 0.05 here
+    assert begin - 0.1 < sent[0] < sent[-1] < end
+
+
+def test_default_offset_is_there_and_small(film):
+    with VirtualSensor(film.charge_pC, wander(seed=1, seconds=0.5)) as sensor:
+        (frame, *_), _ = read(sensor.url, 1)
+    assert 0.0 < np.abs(frame.charge_pC).max() <= 20.0
+
+
+def test_truth_says_what_was_pressed(film):
+    script = wander(seed=3, seconds=2.0, rate_Hz=1000.0)
+    with VirtualSensor(film.charge_pC, script) as sensor:
+        frames, _ = read(sensor.url, 1200)
+        for frame in frames[::100]:
+            truth = sensor.truth(frame.seq)
+            assert truth.force_N == script.force_N[frame.seq]
+            assert truth.x_mm == pytest.approx(script.x_mm[frame.seq], nan_ok=True)
+            np.testing.assert_allclose(frame.charge_pC, truth.charge_pC, atol=21.0)
+
+
+def test_script_begins_again(film):
+    with VirtualSensor(film.charge_pC, steady(7, rate_Hz=1000.0)) as sensor:
+        frames, _ = read(sensor.url, 30)
+        assert frames[-1].seq >= 29
+        assert sensor.truth(frames[-1].seq).force_N == 1.0
+
+
+def test_truth_of_a_frame_to_come(film):
+    with (
+        VirtualSensor(film.charge_pC, steady()) as sensor,
+        pytest.raises(SceneError, match="no frame 60000 was played"),
+    ):
+        sensor.truth(60_000)
+
+
+def test_nobody_reads_then_somebody_does(film):
+    """What does not fit is withheld whole: a late reader sees a gap at most, and no damaged frame."""
+    with VirtualSensor(film.charge_pC, steady(rate_Hz=2000.0)) as sensor:
+        time.sleep(0.3)
+        assert sensor.withheld > 100
+        for _ in range(3):
+            frames, parser = read(sensor.url, 200)
+            gaps = SequenceGaps()
+            for frame in frames:
+                gaps.update(frame.seq)
+            assert (parser.counts.crc_errors, parser.counts.malformed, gaps.repeated, gaps.restarts) == (0, 0, 0, 0)
+        assert sensor.sent + sensor.withheld > 600
+
+
+def test_plays_again_after_leaving(film):
+    sensor = VirtualSensor(film.charge_pC, steady())
+    for _ in range(2):
+        with sensor:
+            assert read(sensor.url, 3)[0][0].seq < 100
+    with pytest.raises(PortError, match="does not play"):
+        sensor.url  # noqa: B018
+
+
+@pytest.mark.parametrize("charges", [np.zeros(3), np.zeros((2, 3)), np.full((10, 3), np.nan)])
+def test_forward_map_that_is_none(charges):
+    with pytest.raises(SceneError, match=r"forward map: expected finite charges of shape \(10, electrodes\)"):
+        VirtualSensor(lambda *_: charges, steady())

@@ -1,0 +1,25 @@
+"""Training: a dataset in, a small network that gives contacts from charges out, as an ONNX model with its card.
+
+from isocharge.simulate import read_dataset
+from isocharge.train import train_model
+
+release = train_model(read_dataset(Path("presses")), Path("models/mine"))
+print(release.metadata.errors)
+"""
+
+from isocharge.train.config import FitConfig, NetworkConfig, TrainingConfig, load_config
+from isocharge.train.evaluate import measure_errors
+from isocharge.train.fit import Fit, fit_network
+from isocharge.train.release import Release, train_model
+
+__all__ = [
+    "Fit",
+    "FitConfig",
+    "NetworkConfig",
+    "Release",
+    "TrainingConfig",
+    "fit_network",
+    "load_config",
+    "measure_errors",
+    "train_model",
+]

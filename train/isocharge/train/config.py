@@ -1,0 +1,126 @@
+"""Training configuration: a TOML file with two tables, or the defaults below."""
+
+import tomllib
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from isocharge.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of the two perceptrons.
+
+    Attributes:
+        hidden: Widths of the hidden layers of the contact network.
+        nearest_hidden: Widths of the one that proposes the nearest known contact, for the misfit; as many layers.
+    """
+
+    hidden: tuple[int, ...] = (64, 64, 64)
+    nearest_hidden: tuple[int, ...] = (48, 48, 48)
+
+    def __post_init__(self) -> None:
+        for name in ("hidden", "nearest_hidden"):
+            widths = getattr(self, name)
+            if not widths or not all(isinstance(width, int) and 1 <= width <= 4096 for width in widths):
+                raise ConfigError(f"network.{name}: expected widths from 1 to 4096, got {widths}")
+        if len(self.hidden) != len(self.nearest_hidden):
+            raise ConfigError(
+                f"network.nearest_hidden: expected as many layers as network.hidden ({len(self.hidden)}; they run side "
+                f"by side), got {self.nearest_hidden}"
+            )
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How to train.
+
+    Attributes:
+        steps: Optimiser steps of the contact network.
+        nearest_steps: Those of the nearest-contact network.
+        batch: Samples per step.
+        learning_rate: Largest rate of the one-cycle schedule.
+        hold_out: Share of the positions kept for measuring errors.
+        noise: Level of the noise model that is added afresh in every step.
+        seed: Of weights, batches, noise and split.
+        threads: CPU threads.
+    """
+
+    steps: int = 14_000
+    nearest_steps: int = 4_000
+    batch: int = 1024
+    learning_rate: float = 5e-3
+    hold_out: float = 0.1
+    noise: str = "reference"
+    seed: int = 0
+    threads: int = 2
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "nearest_steps", "batch", "threads"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+                raise ConfigError(f"training.{name}: expected a whole number from 1 on, got {value!r}")
+        if not 0.0 < self.learning_rate < 1.0:
+            raise ConfigError(f"training.learning_rate: expected a number between 0 and 1, got {self.learning_rate!r}")
+        if not 0.0 < self.hold_out < 0.9:
+            raise ConfigError(f"training.hold_out: expected a share between 0 and 0.9, got {self.hold_out!r}")
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Everything that fixes a training run, given a dataset."""
+
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As the tables of the file."""
+        return asdict(self)
+
+
+def load_config(path: Path) -> FitConfig:
+    """Read a configuration; keys that are not given keep their defaults.
+
+    Raises:
+        ConfigError: If the file cannot be read, a key is unknown, or a value has the wrong type or range.
+    """
+    try:
+        tables = tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a TOML file: {error}") from error
+    try:
+        _check_keys(tables, {"network": NetworkConfig, "training": TrainingConfig}, "")
+        network = _table(NetworkConfig, tables.get("network", {}), "network.")
+        training = _table(TrainingConfig, tables.get("training", {}), "training.")
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return FitConfig(network, training)
+
+
+def _check_keys(table: dict[str, Any], known: Any, prefix: str) -> None:
+    for key in table:
+        if key not in known:
+            raise ConfigError(f"unknown key {prefix + key!r}; known are {', '.join(known)}")
+
+
+def _table(kind: Any, table: Any, prefix: str) -> Any:
+    if not isinstance(table, dict):
+        raise ConfigError(f"{prefix.rstrip('.')}: expected a table, got {table!r}")
+    defaults = {entry.name: entry for entry in fields(kind)}
+    _check_keys(table, defaults, prefix)
+    values = {key: _typed(value, getattr(kind(), key), prefix + key) for key, value in table.items()}
+    return kind(**values)
+
+
+def _typed(value: Any, default: Any, where: str) -> Any:
+    """The value as the default's type."""
+    if isinstance(default, tuple) and isinstance(value, list):
+        return tuple(value)
+    if isinstance(default, float) and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not type(default):
+        raise ConfigError(f"{where}: expected {type(default).__name__}, got {value!r}")
+    return value

@@ -1,0 +1,56 @@
+"""Errors of a predictor on presses that it never saw. One place for the figures in cards, reports and the demo."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from isocharge.simulate.arrays import Array
+from isocharge.simulate.noise import NoiseModel
+from isocharge.train.split import Presses
+
+Predict = Callable[[Array], tuple[Array, Array, Array]]
+"""Charges (n, n_electrode), pC, to contact (n, 3), contact_std (n, 3) and misfit (n, 1)."""
+
+
+def noisy_charges(presses: Presses, noise: NoiseModel, seed: int) -> Array:
+    """The presses' charges with noise, pC, shape (n, n_electrode)."""
+    noisy: Array = noise.add(presses.charge_pC * 1e-12, np.random.default_rng(seed)) * 1e12
+    return noisy
+
+
+def position_error(contact: Array, truth: Array) -> Array:
+    """Distance between felt and true position, mm, shape (n,), from contacts of shape (n, 3)."""
+    distance: Array = np.hypot(contact[:, 0] - truth[:, 0], contact[:, 1] - truth[:, 1])
+    return distance
+
+
+def measure_errors(predict: Predict, presses: Presses, noise: NoiseModel, seed: int = 1) -> Mapping[str, float]:
+    """Errors with noise and on clean charges.
+
+    Args:
+        predict: The model.
+        presses: Presses that training never saw.
+        noise: Noise level.
+        seed: Of the noise.
+
+    Returns:
+        Position errors in mm, relative force errors in percent, coverage of the 68 and 95 % intervals (share of
+        coordinates, 0 to 1), and the misfit that 1 % of the noisy presses exceed.
+    """
+    contact, std, misfit = predict(noisy_charges(presses, noise, seed))
+    position, force = position_error(contact, presses.contact), contact[:, 2] / presses.contact[:, 2] - 1.0
+    clean = position_error(predict(presses.charge_pC)[0], presses.contact)
+    deviation = np.abs(contact - presses.contact) / std
+    errors = {
+        "position_median_mm": np.median(position),
+        "position_rms_mm": np.sqrt(np.mean(position**2)),
+        "position_p95_mm": np.percentile(position, 95),
+        "force_median_percent": 100.0 * np.median(np.abs(force)),
+        "force_rms_percent": 100.0 * np.sqrt(np.mean(force**2)),
+        "clean_position_median_mm": np.median(clean),
+        "clean_position_p95_mm": np.percentile(clean, 95),
+        "coverage_68": np.mean(deviation < 1.0),
+        "coverage_95": np.mean(deviation < 1.96),
+        "misfit_p99": np.percentile(misfit, 99),
+    }
+    return {name: float(f"{value:.4g}") for name, value in errors.items()}

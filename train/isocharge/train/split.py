@@ -1,0 +1,80 @@
+"""Which samples train and which measure: split by position, so that no press is seen twice under another force."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.errors import DatasetError
+from isocharge.simulate.arrays import Array
+from isocharge.simulate.dataset import Dataset, Samples
+from isocharge.train.charge_field import Domain
+
+FEWEST = 500
+"""Presses below which a fit makes no sense."""
+
+
+@dataclass(frozen=True)
+class Presses:
+    """Contacts and their clean charges.
+
+    Attributes:
+        contact: (x_mm, y_mm, force_N), shape (n, 3).
+        charge_pC: Shape (n, n_electrode).
+    """
+
+    contact: Array
+    charge_pC: Array
+
+    @classmethod
+    def of(cls, samples: Samples) -> "Presses":
+        """From a dataset's columns."""
+        return cls(np.stack([samples.x_mm, samples.y_mm, samples.force_N], axis=1), samples.charge_pC)
+
+    def __getitem__(self, rows: np.ndarray) -> "Presses":
+        return Presses(self.contact[rows], self.charge_pC[rows])
+
+    def __len__(self) -> int:
+        return len(self.contact)
+
+
+def domain_of(dataset: Dataset) -> Domain:
+    """The working area and forces that the dataset covers: as its manifest says, or else as its samples show."""
+    samples, ranges = dataset.samples, dataset.manifest.get("ranges", {})
+    radius = float(ranges.get("radius_mm", np.hypot(samples.x_mm, samples.y_mm).max()))
+    low, high = ranges.get("force_N", (samples.force_N.min(), samples.force_N.max()))
+    return Domain(radius, (float(low), float(high)))
+
+
+def split_by_position(dataset: Dataset, hold_out: float, seed: int) -> tuple[Presses, Presses]:
+    """Training and held-out presses.
+
+    Raises:
+        DatasetError: If the dataset has too few presses or positions, fewer than three electrodes, or charges that are
+            not positive.
+    """
+    presses = Presses.of(dataset.samples)
+    _check(presses)
+    _, position = np.unique(np.round(presses.contact[:, :2], 6), axis=0, return_inverse=True)
+    order = np.random.default_rng(seed).permutation(position.max() + 1)
+    held_positions = order[: max(1, round(hold_out * order.size))]
+    held = np.isin(position.ravel(), held_positions)
+    return presses[~held], presses[held]
+
+
+def _check(presses: Presses) -> None:
+    positions = len(np.unique(np.round(presses.contact[:, :2], 3), axis=0))
+    if len(presses) < FEWEST or positions < 50:
+        raise DatasetError(
+            f"expected at least {FEWEST} presses at 50 positions, got {len(presses)} at {positions}; sweep more samples"
+        )
+    if presses.charge_pC.shape[1] < 3:
+        raise DatasetError(
+            f"expected at least three electrodes to find x, y and force, got {presses.charge_pC.shape[1]}"
+        )
+    wrong = np.flatnonzero((presses.charge_pC <= 0.0).any(axis=1) | (presses.contact[:, 2] <= 0.0))
+    if wrong.size:
+        row = int(wrong[0])
+        raise DatasetError(
+            f"sample {row}: expected positive force and charges (the features are logarithms), got "
+            f"{presses.contact[row, 2]:g} N and {presses.charge_pC[row].tolist()} pC"
+        )
