@@ -1,6 +1,6 @@
 """From a sensor to contacts with public functions only: sweep, fit, what it reached, predict.
 
-    python train/examples/pipeline.py OUTPUT_FOLDER [--quick]
+python train/examples/pipeline.py OUTPUT_FOLDER [--quick]
 """
 
 import sys
@@ -25,7 +25,9 @@ def main(folder: Path, quick: bool = False) -> Contact:
     at, force = (3e-3, -2e-3), 1.0
     charge_pC = 1e12 * touch_charge(sensor, press(sensor.film, probe, at, force))
     contact = Predictor(release.folder).predict(charge_pC)
-    print(f"pressed at (3, -2) mm with 1 N, felt at ({contact.x_mm:.2f}, {contact.y_mm:.2f}) mm with {contact.force_N:.3f} N")
+    print(
+        f"pressed at (3, -2) mm with 1 N, felt at ({contact.x_mm:.2f}, {contact.y_mm:.2f}) mm with {contact.force_N:.3f} N"
+    )
     return contact
 
 

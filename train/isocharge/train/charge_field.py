@@ -31,6 +31,10 @@ DAMPING = 1e-4
 ROWS_PER_TERM = 10
 """Presses used for each coefficient: more would not make the fit better, only slower."""
 
+RIDGE = 1e-4
+"""Weight of the coefficients' own size in the fit, relative: the square's corners lie outside the disk, where nothing
+holds the polynomials, and large coefficients that cancel would cost the digits of float32."""
+
 GOOD_ENOUGH = 3e-4
 """Root-mean-square relative error of the charges at which no higher degree is tried: a sixth of the reference noise."""
 
@@ -137,12 +141,14 @@ class _LeastSquares:
         self.shape = (degree + 1, degree + 1, force_degree + 1)
         self.terms = np.nonzero(np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) <= degree)
         plane = in_x[:, self.terms[0]] * in_y[:, self.terms[1]]
-        self.factor = np.linalg.qr((plane[:, :, None] * in_force[:, None, :]).reshape(len(unit), -1))
+        columns = (plane[:, :, None] * in_force[:, None, :]).reshape(len(unit), -1)
+        ridge = RIDGE * np.sqrt(len(unit)) * np.eye(columns.shape[1])
+        self.factor = np.linalg.qr(np.vstack([columns, ridge]))
 
     def __call__(self, target: Array) -> Array:
         """Series of shape (degree + 1, degree + 1, force_degree + 1, k) for targets of shape (n, k)."""
         orthogonal, triangle = self.factor
-        solution = solve_triangular(triangle, orthogonal.T @ target)
+        solution = solve_triangular(triangle, orthogonal[: len(target)].T @ target)
         series = np.zeros((*self.shape, target.shape[1]))
         series[self.terms] = solution.reshape(self.terms[0].size, self.shape[2], -1)
         return series

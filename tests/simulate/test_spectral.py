@@ -1,0 +1,98 @@
+"""Lobatto basis against what numpy and scipy know of Legendre polynomials, and against polynomials themselves."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.polynomial import Polynomial
+from scipy.interpolate import BarycentricInterpolator
+from scipy.special import legendre
+
+from isocharge.simulate.spectral import (
+    barycentric_weights,
+    basis,
+    chebyshev_nodes,
+    derivative_matrix,
+    lagrange_values,
+    lobatto_nodes,
+    lobatto_weights,
+)
+
+ORDERS = (1, 2, 3, 4, 5, 7, 10, 16)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_nodes_are_the_extrema_of_the_legendre_polynomial_and_the_ends(order):
+    nodes = lobatto_nodes(order)
+    assert nodes.shape == (order + 1,)
+    assert np.all(np.diff(nodes) > 0.0)
+    assert nodes[0] == -1.0
+    assert nodes[-1] == 1.0
+    assert legendre(order).deriv()(nodes[1:-1]) == pytest.approx(0.0, abs=1e-7 * order**4)
+    np.testing.assert_allclose(nodes, -nodes[::-1], atol=1e-14)
+
+
+def test_nodes_of_order_four_by_hand():
+    """Abramowitz and Stegun (1964), table 25.6: 0, sqrt(3/7), 1."""
+    np.testing.assert_allclose(lobatto_nodes(4), [-1.0, -np.sqrt(3 / 7), 0.0, np.sqrt(3 / 7), 1.0], atol=1e-15)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_lobatto_weights_are_the_barycentric_ones(order):
+    """The closed form and the product over differences agree up to a common factor."""
+    ratio = lobatto_weights(order) / barycentric_weights(lobatto_nodes(order))
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-11)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_derivative_of_a_polynomial_is_exact(order):
+    polynomial = Polynomial(np.random.default_rng(order).standard_normal(order + 1))
+    nodes = lobatto_nodes(order)
+    scale = np.abs(polynomial.deriv()(nodes)).max()
+    np.testing.assert_allclose(
+        derivative_matrix(order) @ polynomial(nodes), polynomial.deriv()(nodes), atol=1e-12 * scale
+    )
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_basis_reproduces_a_polynomial_and_its_derivative(order):
+    rng = np.random.default_rng(order)
+    polynomial, at = Polynomial(rng.standard_normal(order + 1)), rng.uniform(-1.0, 1.0, 50)
+    values, derivatives = basis(order, at)
+    nodal = polynomial(lobatto_nodes(order))
+    np.testing.assert_allclose(values @ nodal, polynomial(at), atol=1e-12)
+    np.testing.assert_allclose(derivatives @ nodal, polynomial.deriv()(at), atol=1e-11 * order**2)
+
+
+def test_values_on_the_nodes_are_exactly_one_and_zero():
+    nodes = lobatto_nodes(6)
+    np.testing.assert_array_equal(lagrange_values(nodes, lobatto_weights(6), nodes), np.eye(7))
+
+
+@given(at=st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=8), order=st.integers(1, 12))
+@settings(derandomize=True, deadline=None)
+def test_values_add_up_to_one_everywhere(at, order):
+    """Also one rounding step beside a node, where the barycentric terms are huge."""
+    at = np.concatenate([at, np.nextafter(lobatto_nodes(order), 0.0)])
+    np.testing.assert_allclose(basis(order, at)[0].sum(axis=1), 1.0, atol=1e-12)
+
+
+def test_chebyshev_nodes_are_the_zeros_of_the_chebyshev_polynomial():
+    nodes = chebyshev_nodes(7, -1.0, 1.0)
+    expected = np.sort(np.polynomial.chebyshev.chebpts1(7))
+    np.testing.assert_allclose(nodes, expected, atol=1e-15)
+    np.testing.assert_allclose(chebyshev_nodes(7, 2.0, 5.0), 3.5 + 1.5 * expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("count", [1, 2, 8, 15, 40])
+def test_interpolation_on_chebyshev_nodes_is_scipys(count):
+    nodes, at = chebyshev_nodes(count, 0.0, 8e-3), np.linspace(0.0, 8e-3, 33)
+    values = np.random.default_rng(count).standard_normal(count)
+    ours = lagrange_values(nodes, barycentric_weights(nodes), at) @ values
+    np.testing.assert_allclose(ours, BarycentricInterpolator(nodes, values)(at), rtol=1e-9, atol=1e-9)
+
+
+def test_what_is_cached_cannot_be_changed():
+    for array in (lobatto_nodes(4), lobatto_weights(4), derivative_matrix(4)):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 5.0
