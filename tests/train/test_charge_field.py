@@ -74,8 +74,6 @@ def test_a_known_series_is_recovered():
 
 
 def test_too_few_presses():
-    contact = presses(50, seed=0)
+    contact, charge = presses(50, seed=0), np.ones((50, 3))
     with pytest.raises(TrainingError, match="expected at least 224 presses"):
-        ChargeField.fit(
-            Domain(8.0, FORCES), contact, np.ones((50, 3)), (contact, np.ones((50, 3))), noise_model("reference")
-        )
+        ChargeField.fit(Domain(8.0, FORCES), contact, charge, (contact, charge), noise_model("reference"))

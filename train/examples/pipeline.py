@@ -26,7 +26,7 @@ def main(folder: Path, quick: bool = False) -> Contact:
     charge_pC = 1e12 * touch_charge(sensor, press(sensor.film, probe, at, force))
     contact = Predictor(release.folder).predict(charge_pC)
     print(
-        f"pressed at (3, -2) mm with 1 N, felt at ({contact.x_mm:.2f}, {contact.y_mm:.2f}) mm with {contact.force_N:.3f} N"
+        f"pressed at (3, -2) mm with 1 N, felt at ({contact.x_mm:.2f}, {contact.y_mm:.2f}) mm, {contact.force_N:.3f} N"
     )
     return contact
 

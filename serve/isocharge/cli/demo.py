@@ -48,7 +48,10 @@ def demo_command(
         typer.Option("--output", "-o", metavar="DIR", help="Folder to make. (default: demo-output, or -2, -3, ...)"),
     ] = None,
     seconds: Annotated[float, typer.Option("--seconds", min=3.0, help="How long to feel live, s.")] = 20.0,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of samples, training and presses.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of samples and presses.")] = 0,
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="FILE", help="Training configuration, TOML. (default: built in)")
+    ] = None,
 ) -> None:
     """All of it, once, on this machine: simulate, train, feel live, and show pictures.
 
@@ -56,7 +59,7 @@ def demo_command(
     """
     with require("train"):
         from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, solve_maps, write_sweep
-        from isocharge.train import FitConfig, TrainingConfig, train_model
+        from isocharge.train import load_config, train_model
     from isocharge.files import new_folder
     from isocharge.serve import Predictor
 
@@ -69,10 +72,10 @@ def demo_command(
             dataset = read_dataset(write_sweep(draft / "presses", (film,), sweep))
             say(f"   {len(dataset.samples)} presses from {len(film.table)} solves, interpolated to {film.error:.1e}")
         with clock.step("train", "a small network, with noise, to ONNX"):
-            config = FitConfig(training=TrainingConfig(seed=seed))
+            settings = load_config(config) if config else None
             with progress("training") as advance:
                 release = train_model(
-                    dataset, draft / "models" / SENSOR, config, command="isocharge demo", progress=advance
+                    dataset, draft / "models" / SENSOR, settings, command="isocharge demo", progress=advance
                 )
             say(f"   median position error {release.metadata.errors['position_median_mm']:g} mm with noise")
         with clock.step("serve", f"a virtual sensor on a pseudo-terminal at {RATE_HZ:g} Hz, felt live"):

@@ -130,6 +130,11 @@ def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
     if shapes != expected or len(samples) == 0:
         raise DatasetError(f"{where}: expected columns of shapes {expected}, at least one sample, got {shapes}")
     for name, column in samples.columns().items():
+        kinds = "U" if name == "probe" else "fiu"
+        if column.dtype.kind not in kinds:
+            raise DatasetError(
+                f"{where}: column {name}: expected {'text' if kinds == 'U' else 'numbers'}, got {column.dtype}"
+            )
         if name != "probe" and not np.isfinite(column).all():
             row = int(np.argwhere(~np.isfinite(column))[0][0])
             raise DatasetError(f"{where}: column {name} holds {column[row]} in row {row}; every number must be finite")

@@ -4,6 +4,7 @@ The film is round and its elasticity isotropic, so every press is solved on the 
 read: one equilibrium serves all angles, electrode layouts and piezoelectric coefficients.
 """
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from time import process_time
 from typing import Any, Literal
@@ -29,6 +30,12 @@ DISCRETISATION_ERROR = 3e-4
 _THREADS = ThreadpoolController()
 
 
+def single_threaded_blas() -> AbstractContextManager[object]:
+    """For many small matrices: BLAS threads would spin at barriers, many times slower when the other cores are busy."""
+    limiter: AbstractContextManager[object] = _THREADS.limit(limits=1, user_api="blas")
+    return limiter
+
+
 @dataclass(frozen=True)
 class Equilibrium:
     """The film at rest under a press.
@@ -47,6 +54,7 @@ class Equilibrium:
         residual: Out-of-balance force over load.
         seconds: Process CPU time of mesh and solve.
         theory: What was modelled.
+        mesh_error: Relative error of a charge to expect from the mesh; see `_mesh_error`.
         estimated_error: Relative error of a charge away from the probe to expect from what the theory leaves out
             (bending) and from the mesh.
     """
@@ -64,11 +72,12 @@ class Equilibrium:
     residual: float
     seconds: float
     theory: str = "nonlinear membrane"
+    mesh_error: float = DISCRETISATION_ERROR
 
     @property
     def estimated_error(self) -> float:
         """See the class."""
-        return DISCRETISATION_ERROR + bending_share(self.film, self.groups.amplitude2)
+        return self.mesh_error + bending_share(self.film, self.groups.amplitude2)
 
     @property
     def placement(self) -> Placement:
@@ -158,6 +167,23 @@ def _place(film: Film, probe: Circle, at: tuple[float, float]) -> Placement:
     return Placement.of_circle(float(np.hypot(*at)) / film.radius, probe.radius / film.radius)
 
 
+def _mesh_error(geometry: Geometry, at: tuple[float, float], resolution: Resolution) -> float:
+    """What the mesh does to a charge, from how well it carries the film's own area; it grows towards the rim.
+
+    The square root of the area's relative error is 1 to 4 times the worst charge's up to 18 mm from the centre of a film
+    of 45 mm, 0.4 to 2 times up to 30 mm (probes of 0.5 to 8 mm, orders 4 and 5); `tests/benchmarks/bench_solve.py`.
+
+    Raises:
+        SceneError: If elements are turned inside out.
+    """
+    if geometry.weights.min() <= 0.0:
+        raise SceneError(
+            f"press at ({at[0] * 1e3:.4g}, {at[1] * 1e3:.4g}) mm is too near the rim for a mesh of order "
+            f"{resolution.order} with {resolution.around} elements round the circle: they fold over; press farther inside"
+        )
+    return max(DISCRETISATION_ERROR, float(np.sqrt(abs(geometry.weights.sum() / np.pi - 1.0))))
+
+
 def check_scene(film: Film, probe: Circle, at: tuple[float, float], force: float) -> None:
     """Refuse presses that cannot exist.
 
@@ -202,14 +228,15 @@ def press(
         The equilibrium.
 
     Raises:
-        SceneError: If the press cannot exist.
+        SceneError: If the press cannot exist, or not on this mesh.
         SolveError: If no equilibrium was found and `throw` is set.
     """
     check_scene(film, probe, at, force)
     began = process_time()
     mesh, placement, groups = template(resolution), _place(film, probe, at), dimensionless(film, force)
-    with _THREADS.limit(limits=1, user_api="blas"):
+    with single_threaded_blas():
         membrane = Membrane(Geometry.build(mesh, placement), groups)
+        mesh_error = _mesh_error(membrane.geometry, at, resolution)
         if start is not None and start.resolution == resolution:
             first = start.field
         else:
@@ -229,4 +256,5 @@ def press(
         iterations=found.iterations,
         residual=found.residual,
         seconds=process_time() - began,
+        mesh_error=mesh_error,
     )  # fmt: skip

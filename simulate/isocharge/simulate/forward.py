@@ -23,6 +23,7 @@ from isocharge.simulate.equilibrium import (
     bending_share,
     check_scene,
     press,
+    single_threaded_blas,
     turn_stress,
 )
 from isocharge.simulate.membrane import film_gradient, strain, stress
@@ -155,8 +156,9 @@ class ForwardMap:
         touched = np.flatnonzero(force != 0.0)
         self._check_inside(x[touched], y[touched], force[touched])
         charge = np.zeros((x.size, len(self.sensor.electrodes)))
-        for chunk in np.split(touched, np.arange(CHUNK, touched.size, CHUNK)):
-            charge[chunk] = self._charges(x[chunk] + 1j * y[chunk], force[chunk])
+        with single_threaded_blas():
+            for chunk in np.split(touched, np.arange(CHUNK, touched.size, CHUNK)):
+                charge[chunk] = self._charges(x[chunk] + 1j * y[chunk], force[chunk])
         return charge
 
     def _check_inside(self, x: Array, y: Array, force: Array) -> None:

@@ -70,20 +70,20 @@ class Electrode:
 
     Attributes:
         name: As in the sensor file.
-        corners: Corners of a convex polygon, anticlockwise, m. A square starts at its lower left corner.
-        square: Whether it is a square along the axes; only squares have the edges that the edge readout averages over.
+        corners: Corners of a convex polygon, anticlockwise, m.
+        square: Whether it was made by `of_square`; only squares have the edges that the edge readout averages over.
     """
 
     name: str
     corners: tuple[tuple[float, float], ...]
-    square: bool = True
+    square: bool = False
 
     @classmethod
     def of_square(cls, name: str, centre: tuple[float, float], side: float) -> "Electrode":
-        """A square along the axes, centre and side in m."""
+        """A square along the axes, centre and side in m; the first corner is the lower left one."""
         (x, y), half = centre, 0.5 * side
         corners = ((x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half))
-        return cls(name, corners)
+        return cls(name, corners, square=True)
 
     @property
     def area(self) -> float:
@@ -163,20 +163,41 @@ def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration)
         raise SensorError(
             f"electrode {electrode.name!r}: expected at least three corners (x, y), got {corners.tolist()}"
         )
-    edge = np.roll(corners, -1, axis=0) - corners
-    turn = edge[:, 0] * np.roll(edge[:, 1], -1) - edge[:, 1] * np.roll(edge[:, 0], -1)
-    if np.any(turn <= 0.0):
+    if not _is_convex(corners):
         raise SensorError(
             f"electrode {electrode.name!r}: expected a convex polygon with its corners anticlockwise, "
             f"got {(corners * 1e3).tolist()} mm"
         )
-    reach = float(np.linalg.norm(calibration.place(corners), axis=1).max())
-    if reach >= film.radius:
-        x, y = (1e3 * value for value in electrode.centre)
+    side = float(corners[1, 0] - corners[0, 0])
+    square = Electrode.of_square(electrode.name, electrode.centre, side).corners
+    if electrode.square and not (len(corners) == 4 and np.allclose(corners, square, rtol=0.0, atol=1e-9 * side)):
         raise SensorError(
-            f"electrode {electrode.name!r} lies outside the film: centre ({x:.4g}, {y:.4g}) mm, "
-            f"farthest corner at {reach * 1e3:.4g} mm, film radius {film.radius * 1e3:.4g} mm"
+            f"electrode {electrode.name!r}: expected the corners of a square along the axes, "
+            f"got {(corners * 1e3).tolist()} mm; make squares with Electrode.of_square"
         )
+    placed = calibration.place(corners)
+    if not np.linalg.norm(placed, axis=1).max() < film.radius:
+        x, y = 1e3 * placed.mean(axis=0)
+        reach = 1e3 * np.linalg.norm(placed - placed.mean(axis=0), axis=1).max()
+        size = f"half side {_mm(500.0 * side)} mm" if electrode.square else f"corners up to {_mm(reach)} mm from it"
+        raise SensorError(
+            f"electrode {electrode.name!r} lies outside the film: centre ({_mm(x)}, {_mm(y)}) mm, {size}, "
+            f"film radius {_mm(1e3 * film.radius)} mm"
+        )
+
+
+def _mm(value: float) -> str:
+    """For messages, the value already in mm."""
+    return str(float(f"{value:.6g}"))
+
+
+def _is_convex(corners: Array) -> bool:
+    """Whether a polygon turns left at every corner and no corner lies to the right of any edge (a star's do)."""
+    edge = np.roll(corners, -1, axis=0) - corners
+    turn = edge[:, 0] * np.roll(edge[:, 1], -1) - edge[:, 1] * np.roll(edge[:, 0], -1)
+    way = corners[None, :] - corners[:, None]
+    left = edge[:, None, 0] * way[..., 1] - edge[:, None, 1] * way[..., 0]
+    return bool(np.all(turn > 0.0) and left.min() >= -1e-9 * left.max())
 
 
 def _overlap(first: Array, second: Array) -> bool:

@@ -62,13 +62,6 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
 def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
     """The tables of a sensor's file, ready for JSON: `sensor_from_dict` gives the sensor back to round-off."""
     film, piezo, calibration = sensor.film, sensor.piezo, sensor.calibration
-    electrodes: dict[str, Any] = {}
-    for electrode in sensor.electrodes:
-        corners = [[_tidy(1e3 * value) for value in corner] for corner in electrode.corners]
-        electrodes[electrode.name] = {"polygon_mm": corners}
-        if electrode.square:
-            electrodes["side_mm"] = _tidy(corners[1][0] - corners[0][0])
-            electrodes[electrode.name] = [_tidy(1e3 * value) for value in electrode.centre]
     return {
         "name": sensor.name,
         "readout": sensor.readout,
@@ -86,13 +79,31 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
             "d33": _tidy(piezo.d33 * 1e12),
             "pyro_uC_per_m2_K": _tidy(piezo.pyro * 1e6),
         },
-        "electrodes": electrodes,
+        "electrodes": _electrode_tables(sensor),
         "calibration": {
-            "gain": dict(zip(sensor.electrode_names, sensor.gains.tolist(), strict=True)),
+            "gain": dict(calibration.gain),
             "shift_mm": [_tidy(1e3 * value) for value in calibration.shift],
             "rotation_deg": _tidy(float(np.rad2deg(calibration.rotation))),
         },
     }
+
+
+def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
+    """Squares share one side in the file; those of another side than the first are written as polygons."""
+    sides = {e.name: _tidy(1e3 * (e.corners[1][0] - e.corners[0][0])) for e in sensor.electrodes if e.square}
+    if sensor.readout == "edge" and len(set(sides.values())) > 1:
+        raise SensorError(
+            f"readout 'edge' needs squares, and in a sensor file all squares have one side: got {sides} mm"
+        )
+    shared = next(iter(sides.values()), None)
+    tables: dict[str, Any] = {} if shared is None else {"side_mm": shared}
+    for electrode in sensor.electrodes:
+        if sides.get(electrode.name) == shared is not None:
+            tables[electrode.name] = [_tidy(1e3 * value) for value in electrode.centre]
+        else:
+            corners = [[_tidy(1e3 * value) for value in corner] for corner in electrode.corners]
+            tables[electrode.name] = {"polygon_mm": corners}
+    return tables
 
 
 def _tidy(value: float) -> float:
@@ -182,7 +193,7 @@ def _electrode(section: _Section, name: str) -> Electrode:
         corners = _Section(value, where, ("polygon_mm",)).value("polygon_mm")
         if not isinstance(corners, list):
             raise SensorError(f"{where}.polygon_mm: expected a list of [x, y], got {corners!r}")
-        return Electrode(name, tuple(_pair(corner, f"{where}.polygon_mm") for corner in corners), square=False)
+        return Electrode(name, tuple(_pair(corner, f"{where}.polygon_mm") for corner in corners))
     side = section.number("side_mm")
     if side <= 0.0:
         raise SensorError(f"electrodes.side_mm: expected a positive number, got {side}")

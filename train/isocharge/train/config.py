@@ -75,8 +75,10 @@ class FitConfig:
     training: TrainingConfig = field(default_factory=TrainingConfig)
 
     def to_dict(self) -> dict[str, Any]:
-        """As the tables of the file."""
-        return asdict(self)
+        """As the tables of the file, ready for JSON."""
+        table = asdict(self)
+        table["network"] = {name: list(widths) for name, widths in table["network"].items()}
+        return table
 
 
 def load_config(path: Path) -> FitConfig:

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
+from threadpoolctl import threadpool_limits
 from torch import Tensor, nn
 
 from isocharge.errors import TrainingError
@@ -66,8 +67,10 @@ def fit_network(dataset: Dataset, config: FitConfig, progress: Progress | None =
     training = config.training
     noise = noise_model(training.noise)
     train, held = split_by_position(dataset, training.hold_out, training.seed)
-    field = ChargeField.fit(domain_of(dataset), train.contact, train.charge_pC, (held.contact, held.charge_pC), noise)
-    with _torch_settings(training):
+    with _threads_and_seed(training):
+        field = ChargeField.fit(
+            domain_of(dataset), train.contact, train.charge_pC, (held.contact, held.charge_pC), noise
+        )
         network = InverseNetwork(
             field, Features.fit(train.charge_pC), noise, config.network.hidden, config.network.nearest_hidden
         )
@@ -77,12 +80,15 @@ def fit_network(dataset: Dataset, config: FitConfig, progress: Progress | None =
 
 
 @contextmanager
-def _torch_settings(training: TrainingConfig) -> Iterator[None]:
-    """Seed and thread count for the block, the caller's own restored after it."""
+def _threads_and_seed(training: TrainingConfig) -> Iterator[None]:
+    """Seed and thread count for the block, the caller's own restored after it.
+
+    BLAS is held to the same number: its threads spin at barriers, and a busy second core makes them many times slower.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(training.threads)
     try:
-        with torch.random.fork_rng(devices=[]):
+        with threadpool_limits(training.threads, user_api="blas"), torch.random.fork_rng(devices=[]):
             torch.manual_seed(training.seed)
             yield
     finally:
@@ -141,8 +147,9 @@ class _Training:
             loss = loss_of(step, self.charge[rows], self.unit[rows])
             part.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
-            for stepper in (*optimisers, *schedules):
-                stepper.step()
+            for optimiser, schedule in zip(optimisers, schedules, strict=True):
+                optimiser.step()
+                schedule.step()
             if step % REPORT_EVERY == 0 or step == steps - 1:
                 self._report(loss, position[0] + step + 1, position[1], label)
 

@@ -1,0 +1,5 @@
+"""`python -m isocharge.cli`."""
+
+from isocharge.cli import main
+
+main()

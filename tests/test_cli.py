@@ -1,0 +1,213 @@
+"""The command line as a user meets it: help, exit codes, data on stdout, words on stderr, nothing half-written."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from isocharge.cli import main
+
+SENSOR = "three-25um-biaxial"
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Run `isocharge ...` in this process: (exit code, stdout, stderr)."""
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["isocharge", *map(str, words)])
+        with pytest.raises(SystemExit) as done:
+            main()
+        out, err = capsys.readouterr()
+        return int(done.value.code or 0), out, err
+
+    return run
+
+
+def sensor_file(folder, **changes):
+    from isocharge.simulate import load_sensor, sensor_to_dict
+
+    table = sensor_to_dict(load_sensor(SENSOR))
+    electrodes = table["electrodes"] | changes.get("electrodes", {})
+    lines = ['name = "mine"', *changes.get("top", [])]
+    for section in ("film", "piezo"):
+        lines += [f"[{section}]", *(f"{key} = {value}" for key, value in table[section].items())]
+    lines += ["[electrodes]", *(f"{key} = {value}" for key, value in electrodes.items())]
+    path = folder / "mine.toml"
+    path.write_text("\n".join(lines))
+    return path
+
+
+SUBCOMMANDS = [
+    (),
+    ("simulate",),
+    ("simulate", "point"),
+    ("simulate", "sweep"),
+    ("train",),
+    ("train", "fit"),
+    ("serve",),
+    ("serve", "predict"),
+    ("serve", "stream"),
+    ("serve", "virtual"),
+    ("demo",),
+]
+
+
+@pytest.mark.parametrize("words", SUBCOMMANDS, ids=" ".join)
+def test_every_command_has_help_with_an_example(command, words):
+    code, out, _ = command(*words, "--help")
+    assert code == 0
+    assert "Usage" in out
+    if len(words) == 2 or words == ("demo",):
+        assert f"Example: isocharge {' '.join(words)}" in out
+
+
+def test_help_is_quick():
+    """Not a benchmark: an import of a stage would take seconds, not a fraction of one."""
+    began = time.perf_counter()
+    subprocess.run([sys.executable, "-m", "isocharge.cli", "--help"], capture_output=True, check=True)
+    assert time.perf_counter() - began < 2.0
+
+
+def test_a_point_as_json(command):
+    code, out, _ = command(
+        "simulate", "point", SENSOR, "--probe", "circle:1.0", "--at", "0,0", "--force", "1", "--json"
+    )
+    report = json.loads(out)
+    assert code == 0
+    assert set(report) == {
+        "charge_pC",
+        "deflection_mm",
+        "theory",
+        "status",
+        "iterations",
+        "residual",
+        "seconds",
+        "estimated_error",
+    }
+    assert report["deflection_mm"] == pytest.approx(2.812061, rel=3e-3)  # collocation, tests/data/film_cases.json
+    assert report["charge_pC"]["A"] == pytest.approx(848, rel=5e-3)
+    assert report["status"] == "converged"
+
+
+def test_a_point_as_a_table(command):
+    code, out, err = command("simulate", "point", SENSOR, "--at", "3,-2")
+    assert code == 0
+    assert "charge A" in out
+    assert "pC" in out
+    assert err == ""
+
+
+def test_a_thick_film_is_said_to_be_beyond_the_membrane(command, tmp_path):
+    path = sensor_file(tmp_path)
+    path.write_text(path.read_text().replace("thickness_um = 25.0", "thickness_um = 500.0"))
+    code, _, err = command("simulate", "point", path)
+    assert code == 0
+    assert "caution: bending is left out" in err
+
+
+def test_sweep_fit_predict_one_by_one(command, tmp_path):
+    presses, model, table = tmp_path / "presses", tmp_path / "models" / "mine", tmp_path / "charges.csv"
+    assert command("simulate", "sweep", SENSOR, "--samples", 2000, "--radius", 5, "--workers", 2, "-o", presses)[0] == 0
+    config = tmp_path / "quick.toml"
+    config.write_text(
+        "[network]\nhidden = [32, 32]\nnearest_hidden = [16, 16]\n[training]\nsteps = 300\nnearest_steps = 50\n"
+    )
+    code, _, err = command("train", "fit", presses, "--config", config, "-o", model)
+    assert code == 0
+    assert "position error" in err
+    table.write_text("A,B,C\n848,848,848\n")
+    code, out, _ = command("serve", "predict", model, table)
+    header, row = out.splitlines()
+    assert code == 0
+    assert header.startswith("x_mm,y_mm,force_N")
+    assert [float(value) for value in row.split(",")[:3]] == pytest.approx([0.0, 0.0, 1.0], abs=0.3)
+
+
+BAD = [
+    (("simulate", "point", "no-such-sensor"), 2, "SensorError: no sensor 'no-such-sensor'"),
+    (("simulate", "point", SENSOR, "--force", "-1"), 2, "SceneError: force: expected a positive number of newtons"),
+    (("simulate", "point", SENSOR, "--force", "nan"), 2, "SceneError: force"),
+    (("simulate", "point", SENSOR, "--at", "44.5,0"), 2, "SceneError: probe off the film: centre (44.5, 0) mm"),
+    (("simulate", "point", SENSOR, "--at", "3"), 2, "InputError: --at: expected two numbers in mm"),
+    (("simulate", "point", SENSOR, "--probe", "cube:1"), 2, "SceneError: probe 'cube:1'"),
+    (("simulate", "point", SENSOR, "--probe", "circle:0"), 2, "SceneError: probe radius: expected a positive number"),
+    (("simulate", "point", SENSOR, "--probe", "rectangle:4x2"), 2, "circles only"),
+    (("simulate", "sweep", SENSOR, "--samples", "0", "-o", "OUT"), 2, "SceneError: samples: expected at least 1"),
+    (
+        ("simulate", "sweep", SENSOR, "--force", "2", "1", "-o", "OUT"),
+        2,
+        "SceneError: force range: expected 0 < MIN <= MAX",
+    ),
+    (("simulate", "sweep", SENSOR, "--radius", "44.5", "-o", "OUT"), 2, "SceneError: probe off the film"),
+    (("train", "fit", "-o", "OUT"), 2, "InputError: train fit: expected either a DATASET folder or --sensor"),
+    (("train", "fit", ".", "-o", "OUT"), 2, "DatasetError: . is not a dataset: it has no manifest.json"),
+    (
+        ("train", "fit", "--sensor", SENSOR, "--config", "none.toml", "-o", "OUT"),
+        2,
+        "ConfigError: none.toml: cannot be",
+    ),
+    (("serve", "predict", "no-such-model", "x.csv"), 2, "ModelError"),
+    (("serve", "predict", SENSOR, "none.csv"), 2, "InputError: none.csv: cannot be read"),
+    (("serve", "stream", SENSOR, "--port", "/dev/none"), 1, "PortError"),
+]
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"), BAD, ids=lambda value: " ".join(value) if isinstance(value, tuple) else ""
+)
+def test_bad_input_is_one_clear_line_and_leaves_nothing(command, tmp_path, monkeypatch, words, code, message):
+    monkeypatch.chdir(tmp_path)
+    got, out, err = command(*words)
+    assert (got, out) == (code, "")
+    assert message in err
+    assert "Traceback" not in err
+    assert list(Path().iterdir()) == []
+
+
+def test_an_unknown_option_is_usage(command):
+    assert command("simulate", "point", SENSOR, "--no-such-option")[0] == 2
+
+
+def test_an_unknown_key_in_a_sensor_file(command, tmp_path):
+    path = sensor_file(tmp_path, top=['colour = "red"'])
+    code, _, err = command("simulate", "point", path)
+    assert code == 2
+    assert f"SensorError: {path}: unknown key 'colour'" in err
+
+
+def test_an_electrode_off_the_film(command, tmp_path):
+    path = sensor_file(tmp_path, electrodes={"C": "[40.0, 25.0]"})
+    code, _, err = command("simulate", "point", path)
+    assert code == 2
+    assert "electrode 'C' lies outside the film: centre (40, 25) mm" in err
+
+
+def test_an_existing_output_is_kept(command, tmp_path):
+    (tmp_path / "presses").mkdir()
+    (tmp_path / "presses" / "mine.txt").write_text("keep me")
+    code, _, err = command("simulate", "sweep", SENSOR, "--samples", 100, "-o", tmp_path / "presses")
+    assert code == 1
+    assert "OutputExists" in err
+    assert (tmp_path / "presses" / "mine.txt").read_text() == "keep me"
+
+
+def test_the_demo_end_to_end(command, tmp_path):
+    """The whole path with everything in it but the long training."""
+    out = tmp_path / "first-light"
+    code, table, err = command("demo", "-o", out, "--seconds", 6, "--config", quick(tmp_path))
+    assert code == 0
+    assert (out / "demo.png").stat().st_size > 50_000
+    assert (out / "presses" / "manifest.json").is_file()
+    for row in ("position error", "force error", "model", "one prediction", "seconds"):
+        assert row in table
+    assert "0 lost, 0 repeated" in err
+
+
+def quick(folder):
+    path = folder / "quick.toml"
+    path.write_text("[training]\nsteps = 400\nnearest_steps = 100\n")
+    return path

@@ -1,0 +1,57 @@
+"""A fresh machine: the base install into an empty environment serves a released model, without torch or scipy."""
+
+import json
+import subprocess
+import venv
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def fresh(tmp_path_factory):
+    """The bin folder of an empty environment into which `pip install .` was done, from a copy without a checkout."""
+    folder = tmp_path_factory.mktemp("fresh")
+    venv.create(folder / "env", with_pip=True)
+    python = folder / "env" / "bin" / "python"
+    subprocess.run([python, "-m", "pip", "install", "--quiet", str(ROOT)], check=True, timeout=280)
+    return python.parent
+
+
+def run(fresh, *words, cwd, stdin=None):
+    return subprocess.run(
+        [fresh / words[0], *words[1:]], cwd=cwd, input=stdin, capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+def test_nothing_heavy_came_along(fresh, tmp_path):
+    listed = json.loads(run(fresh, "pip", "list", "--format", "json", cwd=tmp_path).stdout)
+    names = {entry["name"].lower() for entry in listed}
+    assert {"isocharge", "numpy", "onnxruntime"} <= names
+    assert not names & {"torch", "scipy", "scikit-learn", "onnx", "matplotlib"}
+
+
+def test_predict_works_from_any_folder(fresh, tmp_path):
+    table = "A,B,C\n942.9,910.4,690.8\n"
+    done = run(fresh, "isocharge", "serve", "predict", "three-25um-biaxial", "-", "--json", cwd=tmp_path, stdin=table)
+    assert done.returncode == 0, done.stderr
+    record = json.loads(done.stdout)
+    assert [record["x_mm"], record["y_mm"], record["force_N"]] == pytest.approx([3.0, -2.0, 1.0], abs=0.06)
+    assert record["model"] == "three-25um-biaxial/1"
+
+
+def test_python_works_from_any_folder(fresh, tmp_path):
+    code = (
+        "from isocharge.serve import Predictor; print(Predictor('three-25um-biaxial').predict([848, 848, 848]).force_N)"
+    )
+    done = run(fresh, "python", "-c", code, cwd=tmp_path)
+    assert float(done.stdout) == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_missing_extra_says_how_to_get_it(fresh, tmp_path):
+    done = run(fresh, "isocharge", "simulate", "point", "three-25um-biaxial", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "pip install 'isocharge[simulate]'" in done.stderr
+    assert "Traceback" not in done.stderr
