@@ -45,7 +45,7 @@ class ReferenceCase:
         return replace(load_sensor(f"{layout}-25um-{kind}"), film=self.film, readout=readout)
 
 
-def reference_cases(thickness_um: float) -> list[ReferenceCase]:
+def read_cases(thickness_um: float) -> list[ReferenceCase]:
     """The cases with circular probes on films of one thickness."""
     film = REFERENCE["film"]
     return [
@@ -81,7 +81,13 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """`case` runs over the reference cases of the 25 um film, `thicker_case` over those of the 110 um film."""
     for argument, thickness_um in (("case", 25.0), ("thicker_case", 110.0)):
         if argument in metafunc.fixturenames:
-            metafunc.parametrize(argument, reference_cases(thickness_um), ids=name_case)
+            metafunc.parametrize(argument, read_cases(thickness_um), ids=name_case)
+
+
+@pytest.fixture(scope="session")
+def reference_cases() -> Callable[[float], list[ReferenceCase]]:
+    """The reference cases of a thickness in um."""
+    return read_cases
 
 
 @pytest.fixture(scope="session")

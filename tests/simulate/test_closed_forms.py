@@ -52,7 +52,7 @@ def test_schwerin_point_load(share):
 
 
 def green(film: Film, at: complex, points: np.ndarray) -> np.ndarray:
-    """Deflection per force outside the footprint: a uniform disk pulls like a point, for Green's function is harmonic."""
+    """Deflection per force outside the footprint: Green's function is harmonic, so a disk pulls like a point."""
     z, c = (points[:, 0] + 1j * points[:, 1]) / film.radius, at / film.radius
     tension = film.pretension * film.thickness
     return np.log(np.abs((1.0 - np.conj(c) * z) / (z - c))) / (2.0 * np.pi * tension)
@@ -178,7 +178,9 @@ def test_charge_of_a_centred_press_is_the_integral_of_the_boundary_value_problem
     solution = axisymmetric(1.0 / 45.0, amplitude2, 0.34, 0.0, r.ravel()[order] / 45e-3)
     radial, hoop = np.empty(r.size), np.empty(r.size)
     radial[order], hoop[order] = solution.radial, solution.hoop
-    density = 20.0 * (radial * c2.ravel() + hoop * (1 - c2.ravel())) + 2.0 * (radial * (1 - c2.ravel()) + hoop * c2.ravel())
+    density = 20.0 * (radial * c2.ravel() + hoop * (1 - c2.ravel())) + 2.0 * (
+        radial * (1 - c2.ravel()) + hoop * c2.ravel()
+    )
     simpson = np.array([1.0, *([4.0, 2.0] * 19), 4.0, 1.0]) / 120.0
     expected = 9e-6 * 1e-12 * SLACK.young * amplitude2 * (simpson @ density.reshape(41, 41) @ simpson)
     assert charge == pytest.approx(expected, rel=1e-5)

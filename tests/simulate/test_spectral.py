@@ -95,7 +95,9 @@ def test_interpolation_on_chebyshev_nodes_is_scipys(count):
 def test_one_node_is_a_constant():
     nodes = chebyshev_nodes(1, 2.0, 5.0)
     np.testing.assert_array_equal(nodes, [3.5])
-    np.testing.assert_array_equal(lagrange_values(nodes, barycentric_weights(nodes), np.array([2.0, 3.5])), [[1.0], [1.0]])
+    np.testing.assert_array_equal(
+        lagrange_values(nodes, barycentric_weights(nodes), np.array([2.0, 3.5])), [[1.0], [1.0]]
+    )
 
 
 def test_what_is_cached_cannot_be_changed():

@@ -115,7 +115,7 @@ def test_located_points_are_where_they_were(seed, distance, share, resolution):
 
 @pytest.mark.parametrize("resolution", RESOLUTIONS, ids=str)
 def test_nodes_are_located_on_themselves(resolution):
-    """Corners and edges of elements, the rim, the footprint's edge and the centre: every seam of the case distinction."""
+    """Corners and edges of elements, the rim, the footprint's edge, the centre: every seam between the formulas."""
     mesh, rho = template(resolution), 0.07
     z = mesh.node_points(rho)
     element, xi, eta = mesh.locate(z, rho)

@@ -156,3 +156,25 @@ def test_the_misfit_is_the_distance_to_the_nearest_known_contact(film, touch, ga
     assert np.all(misfit[fits] < 1.0)
     assert not fits.any() or np.median(misfit[fits]) < 0.05
     assert np.mean(misfit <= 1.33 * searched + 0.3) > 0.8
+
+
+def test_four_electrodes_have_one_check_to_spare(tmp_path):
+    """Inside the domain the misfit of good presses is the length of one normal deviate; a wrong gain sticks out."""
+    from scipy.stats import halfnorm
+
+    from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, solve_maps, write_sweep
+
+    sweep = Sweep(samples=8_000)
+    maps = solve_maps(load_sensor("four-25um-biaxial"), (Circle(1e-3),), sweep)
+    config = FitConfig(training=TrainingConfig(steps=1_500, nearest_steps=300))
+    release = train_model(read_dataset(write_sweep(tmp_path / "presses", maps, sweep)), tmp_path / "four", config)
+    truth = presses(maps[0], 3000, seed=4)
+    truth = truth[np.hypot(*truth.contact[:, :2].T) < 6.0]
+    charge = 1e12 * noise_model("reference").add(1e-12 * truth.charge_pC, np.random.default_rng(3))
+    touch = Predictor(release.folder)
+    good = touch.predict_batch(charge).misfit
+    for share in (0.5, 0.9, 0.95):
+        assert np.quantile(good, share) == pytest.approx(halfnorm.ppf(share), rel=0.12)
+    hard = truth.contact[:, 2] > 0.8
+    wrong = touch.predict_batch(charge[hard] * [1.0, 1.2, 1.0, 1.0]).misfit
+    assert np.mean(wrong > np.quantile(good, 0.99)) > 0.9

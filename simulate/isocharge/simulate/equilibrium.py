@@ -24,8 +24,20 @@ from isocharge.simulate.template import Placement, Resolution, Template, templat
 STANDARD = Resolution(order=4, around=8, rings=6)
 """Charges within 0.03 % of the membrane's own solution over the working area, in about 0.1 s."""
 
+LADDER = (STANDARD, Resolution(6, 12, 6), Resolution(6, 16, 6), Resolution(6, 24, 8))
+"""Meshes that are tried in turn when none is asked for."""
+
+MESH_TOLERANCE = 2e-3
+"""`mesh_error` at which a mesh is fine enough: the standard one up to some 13 mm from the centre of a film of 45 mm."""
+
+TOO_COARSE = 0.05
+"""`mesh_error` of the finest mesh above which a press is refused, some 2.5 mm from the rim."""
+
 DISCRETISATION_ERROR = 3e-4
 """Relative error of a charge at the standard resolution; `tests/benchmarks/bench_solve.py` measures it."""
+
+BENDING_WEIGHT = 1.5
+"""Worst error of a charge over `bending_share`: at most 1.41 in the solutions of a 25 um film in tests/data."""
 
 _THREADS = ThreadpoolController()
 
@@ -54,9 +66,9 @@ class Equilibrium:
         residual: Out-of-balance force over load.
         seconds: Process CPU time of mesh and solve.
         theory: What was modelled.
-        mesh_error: Relative error of a charge to expect from the mesh; see `_mesh_error`.
-        estimated_error: Relative error of a charge away from the probe to expect from what the theory leaves out
-            (bending) and from the mesh.
+        mesh_error: Relative error of a charge to expect from the mesh; see the function of that name.
+        estimated_error: Bound to expect of a charge's relative error from what the theory leaves out (bending) and from
+            the mesh. On a film thicker than some 25 um it holds away from the probe only: under it bending does more.
     """
 
     film: Film
@@ -77,7 +89,7 @@ class Equilibrium:
     @property
     def estimated_error(self) -> float:
         """See the class."""
-        return self.mesh_error + bending_share(self.film, self.groups.amplitude2)
+        return self.mesh_error + BENDING_WEIGHT * bending_share(self.film, self.groups.amplitude2)
 
     @property
     def placement(self) -> Placement:
@@ -155,8 +167,8 @@ def dimensionless(film: Film, force: float) -> Groups:
 def bending_share(film: Film, amplitude2: float) -> float:
     """How much bending, which the membrane leaves out, would change a charge, roughly.
 
-    Bending matters within l = sqrt(D / (h s)) of rim and probe, s the tension between them; the charge changes by about
-    l / a (0.3 to 1.5 times that in the solutions of films of 25 and 110 um with bending in tests/data).
+    Bending matters within l = sqrt(D / (h s)) of rim and probe, s the tension between them; the worst charge of a press
+    changes by about l / a (0.5 to 1.4 times that in the solutions of a 25 um film with bending in tests/data).
     """
     tension = film.young * amplitude2 * 0.44 + film.pretension
     stiffness = film.young * film.thickness**2 / (12.0 * (1.0 - film.poisson**2))
@@ -167,20 +179,37 @@ def _place(film: Film, probe: Circle, at: tuple[float, float]) -> Placement:
     return Placement.of_circle(float(np.hypot(*at)) / film.radius, probe.radius / film.radius)
 
 
-def _mesh_error(geometry: Geometry, at: tuple[float, float], resolution: Resolution) -> float:
-    """What the mesh does to a charge, from how well it carries the film's own area; it grows towards the rim.
-
-    The square root of the area's relative error is 1 to 4 times the worst charge's up to 18 mm from the centre of a film
-    of 45 mm, 0.4 to 2 times up to 30 mm (probes of 0.5 to 8 mm, orders 4 and 5); `tests/benchmarks/bench_solve.py`.
+def resolution_for(film: Film, probe: Circle, at: tuple[float, float]) -> Resolution:
+    """The coarsest mesh of `LADDER` that carries a press well: towards the rim the template is stretched.
 
     Raises:
-        SceneError: If elements are turned inside out.
+        SceneError: If the press is so near the rim that even the finest mesh carries it badly.
+    """
+    placement = _place(film, probe, at)
+    for resolution in LADDER:
+        error = mesh_error(Geometry.build(template(resolution), placement))
+        if error <= MESH_TOLERANCE:
+            return resolution
+    if error > TOO_COARSE:
+        raise _too_near_the_rim(at, resolution)
+    return resolution
+
+
+def _too_near_the_rim(at: tuple[float, float], resolution: Resolution) -> SceneError:
+    return SceneError(
+        f"press at ({at[0] * 1e3:.4g}, {at[1] * 1e3:.4g}) mm is too near the rim for a mesh of order "
+        f"{resolution.order} with {resolution.around} elements round the circle; press farther inside"
+    )
+
+
+def mesh_error(geometry: Geometry) -> float:
+    """Relative error of a charge to expect from the mesh, infinite where elements are turned inside out.
+
+    From how well the mesh carries the film's own area: the square root of that relative error is about the worst
+    charge's; `tests/benchmarks/bench_solve.py`.
     """
     if geometry.weights.min() <= 0.0:
-        raise SceneError(
-            f"press at ({at[0] * 1e3:.4g}, {at[1] * 1e3:.4g}) mm is too near the rim for a mesh of order "
-            f"{resolution.order} with {resolution.around} elements round the circle: they fold over; press farther inside"
-        )
+        return np.inf
     return max(DISCRETISATION_ERROR, float(np.sqrt(abs(geometry.weights.sum() / np.pi - 1.0))))
 
 
@@ -207,7 +236,7 @@ def press(
     at: tuple[float, float],
     force: float,
     *,
-    resolution: Resolution = STANDARD,
+    resolution: Resolution | None = None,
     start: Equilibrium | None = None,
     tolerance: float = 1e-9,
     throw: bool = True,
@@ -219,7 +248,7 @@ def press(
         probe: The footprint, pressing uniformly, dead load.
         at: Centre of the footprint (x, y), m.
         force: N, positive pushes.
-        resolution: Mesh of the template.
+        resolution: Mesh of the template; the coarsest that carries the press well if absent.
         start: A neighbouring equilibrium of the same resolution to start from: another force, another position.
         tolerance: Out-of-balance force over load.
         throw: Whether a failure raises; if not, look at `status`.
@@ -233,10 +262,13 @@ def press(
     """
     check_scene(film, probe, at, force)
     began = process_time()
+    resolution = resolution or resolution_for(film, probe, at)
     mesh, placement, groups = template(resolution), _place(film, probe, at), dimensionless(film, force)
     with single_threaded_blas():
         membrane = Membrane(Geometry.build(mesh, placement), groups)
-        mesh_error = _mesh_error(membrane.geometry, at, resolution)
+        from_mesh = mesh_error(membrane.geometry)
+        if np.isinf(from_mesh):
+            raise _too_near_the_rim(at, resolution)
         if start is not None and start.resolution == resolution:
             first = start.field
         else:
@@ -256,5 +288,5 @@ def press(
         iterations=found.iterations,
         residual=found.residual,
         seconds=process_time() - began,
-        mesh_error=mesh_error,
+        mesh_error=from_mesh,
     )  # fmt: skip

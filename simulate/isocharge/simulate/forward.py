@@ -17,12 +17,12 @@ from isocharge.errors import SceneError, SolveError
 from isocharge.simulate.arrays import Array, Complexes
 from isocharge.simulate.charge import COARSE, FINE, NEAR, ReadoutPoints, touch_charge
 from isocharge.simulate.equilibrium import (
-    STANDARD,
     Equilibrium,
     amplitude_squared,
     bending_share,
     check_scene,
     press,
+    resolution_for,
     single_threaded_blas,
     turn_stress,
 )
@@ -85,7 +85,8 @@ class ForwardMap:
         resolution: Mesh of the solves.
         nodes: Where it was solved.
         table: Scaled stress C : E' at the nodes of every element, shape (n_solve, n_element * n_local, 3).
-        error: Largest relative error of a charge against the direct solves that the build compared with.
+        error: Largest error of a charge, relative to the press's largest, against the direct solves that the build
+            compared with.
     """
 
     sensor: Sensor
@@ -105,7 +106,7 @@ class ForwardMap:
         radius: float = 8e-3,
         force_range: tuple[float, float] = (0.05, 2.0),
         *,
-        resolution: Resolution = STANDARD,
+        resolution: Resolution | None = None,
         executor: Executor | None = None,
         progress: Progress | None = None,
     ) -> "ForwardMap":
@@ -116,7 +117,7 @@ class ForwardMap:
             probe: The footprint.
             radius: Largest distance of a press from the centre, m.
             force_range: Smallest and largest force, N.
-            resolution: Mesh.
+            resolution: Mesh; the coarsest that carries the outermost press well if absent.
             executor: Where the solves run; here and now if absent. The result does not depend on it.
             progress: Told how many solves are done.
 
@@ -125,6 +126,7 @@ class ForwardMap:
             SolveError: If an equilibrium or the wanted interpolation error was not reached.
         """
         _check_family(sensor.film, probe, radius, force_range)
+        resolution = resolution or resolution_for(sensor.film, probe, (radius, 0.0))
         error = np.inf
         for count in ((8, 3), (11, 5), (15, 8)):
             nodes = Nodes.spread(radius, force_range, count)
@@ -157,7 +159,8 @@ class ForwardMap:
         self._check_inside(x[touched], y[touched], force[touched])
         charge = np.zeros((x.size, len(self.sensor.electrodes)))
         with single_threaded_blas():
-            for chunk in np.split(touched, np.arange(CHUNK, touched.size, CHUNK)):
+            for start in range(0, touched.size, CHUNK):
+                chunk = touched[start : start + CHUNK]
                 charge[chunk] = self._charges(x[chunk] + 1j * y[chunk], force[chunk])
         return charge
 

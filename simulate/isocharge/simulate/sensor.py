@@ -34,10 +34,10 @@ class Film:
     pretension: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("radius", "thickness", "young"):
+        for name, unit in (("radius", "m"), ("thickness", "m"), ("young", "Pa")):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
-                raise SensorError(f"film {name}: expected a positive number, got {value}")
+                raise SensorError(f"film {name}: expected a positive number, got {value:.6g} {unit}")
         if not 0.0 <= self.poisson < 0.5:
             raise SensorError(f"film poisson: expected 0 <= poisson < 0.5, got {self.poisson}")
         if not (np.isfinite(self.pretension) and self.pretension >= 0.0):

@@ -116,7 +116,7 @@ class _Section:
 
     def __init__(self, table: Any, name: str, keys: tuple[str, ...] | None) -> None:
         if not isinstance(table, Mapping):
-            raise SensorError(f"{name}: expected a table, got {table!r}")
+            raise SensorError(f"{name + ': ' if name else ''}expected a table, got {table!r}")
         self.table, self.prefix = table, f"{name}." if name else ""
         unknown = [key for key in table if keys is not None and key not in keys]
         if unknown:

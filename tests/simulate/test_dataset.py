@@ -1,0 +1,280 @@
+"""The dataset format: whole or not at all, and every kind of damage is told."""
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from isocharge.errors import DatasetError, OutputExists
+from isocharge.simulate import Samples, load_sensor, read_dataset, write_dataset
+from isocharge.simulate.dataset import COLUMNS
+
+
+def samples(count: int = 5, seed: int = 0) -> Samples:
+    rng = np.random.default_rng(seed)
+    return Samples(
+        x_mm=rng.uniform(-8, 8, count),
+        y_mm=rng.uniform(-8, 8, count),
+        force_N=rng.uniform(0.05, 2, count),
+        probe=np.array(["circle:1.0"] * count),
+        orientation_deg=np.zeros(count),
+        charge_pC=rng.uniform(100, 2000, (count, 3)),
+    )
+
+
+SENSOR = load_sensor("three-25um-biaxial")
+ABOUT = {"probes": ["circle:1.0"], "ranges": {"radius_mm": 8.0}, "seed": 3, "solver": {"order": 4}}
+
+
+@pytest.fixture
+def dataset(tmp_path) -> Path:
+    """Two shards, 5 and 3 samples."""
+    return write_dataset(tmp_path / "presses", SENSOR, [samples(5, 0), samples(3, 1)], ABOUT)
+
+
+def edit(folder: Path, change) -> None:
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    change(manifest)
+    path.write_text(json.dumps(manifest))
+
+
+def replace_shard(folder: Path, **columns) -> None:
+    """Another content for the first shard, with a checksum that fits."""
+    path = folder / "shard-00000.npz"
+    with np.load(path) as old:
+        arrays = {name: old[name] for name in old} | columns
+    np.savez(path, allow_pickle=True, **{name: array for name, array in arrays.items() if array is not None})
+    checksum = hashlib.sha256(path.read_bytes()).hexdigest()
+    edit(folder, lambda manifest: manifest["shards"][0].update(sha256=checksum))
+
+
+# Round trip
+
+
+def test_round_trip(dataset):
+    read = read_dataset(dataset)
+    assert read.sensor == SENSOR
+    assert len(read.samples) == 8
+    for name in COLUMNS:
+        both = np.concatenate([getattr(samples(5, 0), name), getattr(samples(3, 1), name)])
+        np.testing.assert_array_equal(getattr(read.samples, name), both)
+
+
+def test_manifest_says_everything(dataset):
+    manifest = read_dataset(dataset).manifest
+    assert manifest["format_version"] == 1
+    assert manifest["electrodes"] == ["A", "B", "C"]
+    assert manifest["samples"] == 8
+    assert manifest["seed"] == 3
+    assert manifest["columns"] == COLUMNS
+    assert [(shard["file"], shard["samples"]) for shard in manifest["shards"]] == [
+        ("shard-00000.npz", 5),
+        ("shard-00001.npz", 3),
+    ]
+    for shard in manifest["shards"]:
+        assert shard["sha256"] == hashlib.sha256((dataset / shard["file"]).read_bytes()).hexdigest()
+
+
+def test_folder_holds_what_the_format_says(dataset):
+    assert sorted(path.name for path in dataset.iterdir()) == [
+        "README.md",
+        "manifest.json",
+        "shard-00000.npz",
+        "shard-00001.npz",
+    ]
+
+
+def test_card_is_for_people(dataset):
+    card = (dataset / "README.md").read_text()
+    assert card.startswith("# presses\n")
+    for words in ("8 presses", "`three-25um-biaxial`", "circle:1.0", "| seed | 3 |", "| solver: order | 4 |", *COLUMNS):
+        assert words in card
+
+
+def test_numpy_alone_can_read_a_shard(dataset):
+    with np.load(dataset / "shard-00000.npz", allow_pickle=False) as shard:
+        assert set(shard) == set(COLUMNS)
+        assert shard["charge_pC"].shape == (5, 3)
+
+
+def test_same_samples_same_bytes(dataset, tmp_path):
+    again = write_dataset(tmp_path / "again", SENSOR, [samples(5, 0), samples(3, 1)], ABOUT)
+    assert read_dataset(again).sha256 == read_dataset(dataset).sha256
+    for name in ("manifest.json", "shard-00000.npz", "shard-00001.npz"):
+        assert (again / name).read_bytes() == (dataset / name).read_bytes()
+
+
+def test_measured_data_needs_no_solver(tmp_path):
+    """A rig knows no seed and no mesh; integers are numbers too."""
+    measured = replace(samples(2), force_N=np.array([1, 2]))
+    assert len(read_dataset(write_dataset(tmp_path / "rig", SENSOR, [measured], {})).samples) == 2
+
+
+# Damage
+
+
+def test_not_a_dataset(tmp_path):
+    with pytest.raises(DatasetError, match=f"{tmp_path} is not a dataset: it has no manifest.json; make one with"):
+        read_dataset(tmp_path)
+    with pytest.raises(DatasetError, match="is not a dataset"):
+        read_dataset(tmp_path / "nothing")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DatasetError, match="is not a dataset"):
+        read_dataset(tmp_path / "file")
+
+
+def test_missing_manifest(dataset):
+    (dataset / "manifest.json").unlink()
+    with pytest.raises(DatasetError, match=r"it has no manifest\.json"):
+        read_dataset(dataset)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", "null", '"text"', "{}", "\xff"])
+def test_broken_manifest(dataset, text):
+    (dataset / "manifest.json").write_text(text, encoding="latin-1")
+    with pytest.raises(DatasetError, match=r"manifest\.json: not a manifest of a dataset"):
+        read_dataset(dataset)
+
+
+def test_other_format_version(dataset):
+    edit(dataset, lambda manifest: manifest.update(format_version=2))
+    with pytest.raises(
+        DatasetError, match=r"format version 2 is not supported \(this version reads 1\); make the dataset"
+    ):
+        read_dataset(dataset)
+
+
+@pytest.mark.parametrize("key", ["sensor", "shards"])
+def test_manifest_without_a_key(dataset, key):
+    edit(dataset, lambda manifest: manifest.pop(key))
+    with pytest.raises(DatasetError, match=rf"manifest\.json: key '{key}' is missing"):
+        read_dataset(dataset)
+
+
+@pytest.mark.parametrize("value", [None, 3, "text", [3], [{}], [{"file": 3, "sha256": ""}]])
+def test_manifest_with_odd_shards(dataset, value):
+    edit(dataset, lambda manifest: manifest.update(shards=value))
+    with pytest.raises(DatasetError):
+        read_dataset(dataset)
+
+
+def test_manifest_with_no_shards(dataset):
+    edit(dataset, lambda manifest: manifest.update(shards=[]))
+    with pytest.raises(DatasetError, match="lists no shards"):
+        read_dataset(dataset)
+
+
+def test_manifest_with_a_wrong_sensor(dataset):
+    edit(dataset, lambda manifest: manifest["sensor"]["film"].update(colour="red"))
+    with pytest.raises(DatasetError, match=r"manifest\.json: unknown key 'film\.colour'"):
+        read_dataset(dataset)
+
+
+def test_missing_shard(dataset):
+    (dataset / "shard-00001.npz").unlink()
+    with pytest.raises(DatasetError, match=r"shard-00001\.npz: the manifest lists this shard, but it is not there"):
+        read_dataset(dataset)
+
+
+@pytest.mark.parametrize("where", [0, 100, 1000, -1])
+def test_one_damaged_byte(dataset, where):
+    path = dataset / "shard-00000.npz"
+    data = bytearray(path.read_bytes())
+    data[where] ^= 1
+    path.write_bytes(bytes(data))
+    with pytest.raises(DatasetError, match=r"shard-00000\.npz is damaged: expected sha256 [0-9a-f]{12}\.\.\., got"):
+        read_dataset(dataset)
+
+
+def test_truncated_shard(dataset):
+    path = dataset / "shard-00000.npz"
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DatasetError, match="damaged"):
+        read_dataset(dataset)
+
+
+def test_shard_outside_the_folder_is_not_read(dataset, tmp_path):
+    """A manifest cannot point elsewhere."""
+    shutil.move(dataset / "shard-00000.npz", tmp_path / "shard-00000.npz")
+    edit(dataset, lambda manifest: manifest["shards"][0].update(file="../shard-00000.npz"))
+    with pytest.raises(DatasetError, match="it is not there"):
+        read_dataset(dataset)
+
+
+WRONG_COLUMNS = {
+    "missing": ({"force_N": None}, "not a shard with the columns x_mm, y_mm"),
+    "too long": ({"x_mm": np.zeros(6)}, r"expected columns of shapes .* got .*'x_mm': \(6,\)"),
+    "too many electrodes": ({"charge_pC": np.zeros((5, 4))}, r"got .*'charge_pC': \(5, 4\)"),
+    "no samples": ({n: np.zeros((0, 3) if n == "charge_pC" else 0) for n in COLUMNS}, "at least one sample"),
+    "NaN": ({"x_mm": np.array([0, 1, np.nan, 3, 4])}, "column x_mm holds nan in row 2; every number must be finite"),
+    "text": ({"x_mm": np.array(list("abcde"))}, "column x_mm: expected numbers, got <U1"),
+    "objects": ({"x_mm": np.array([None] * 5)}, "not a shard"),
+    "probe of numbers": ({"probe": np.zeros(5)}, "column probe: expected text, got float64"),
+}
+
+
+@pytest.mark.parametrize(("columns", "message"), WRONG_COLUMNS.values(), ids=WRONG_COLUMNS.keys())
+def test_wrong_columns(dataset, columns, message):
+    replace_shard(dataset, **columns)
+    with pytest.raises(DatasetError, match=rf"shard-00000\.npz: .*{message}"):
+        read_dataset(dataset)
+
+
+def test_shard_that_is_no_archive(dataset):
+    (dataset / "shard-00000.npz").write_bytes(b"hello")
+    checksum = hashlib.sha256(b"hello").hexdigest()
+    edit(dataset, lambda manifest: manifest["shards"][0].update(sha256=checksum))
+    with pytest.raises(DatasetError, match="not a shard with the columns"):
+        read_dataset(dataset)
+
+
+# Writing: whole or not at all
+
+
+def broken_shards():
+    yield samples()
+    raise ZeroDivisionError("half-way")
+
+
+def test_an_exception_half_way_leaves_nothing(tmp_path):
+    with pytest.raises(ZeroDivisionError):
+        write_dataset(tmp_path / "presses", SENSOR, broken_shards(), ABOUT)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_visible_before_the_end(tmp_path):
+    def looking():
+        yield samples()
+        assert not (tmp_path / "presses").exists()
+        yield samples()
+
+    assert write_dataset(tmp_path / "presses", SENSOR, looking(), ABOUT).is_dir()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"charge_pC": np.full((5, 3), np.inf)}, r"column charge_pC holds \[inf inf inf\] in row 0"),
+        ({"x_mm": np.zeros(4)}, r"expected columns of shapes"),
+        ({"charge_pC": np.zeros((5, 4))}, r"expected columns of shapes"),
+        ({"force_N": np.array(["a"] * 5)}, "column force_N: expected numbers"),
+    ],
+)
+def test_wrong_samples_are_not_written(tmp_path, changes, message):
+    with pytest.raises(DatasetError, match=rf"shard-00001\.npz: {message}"):
+        write_dataset(tmp_path / "presses", SENSOR, [samples(), replace(samples(), **changes)], ABOUT)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_existing_folder_is_kept(tmp_path):
+    (tmp_path / "presses").mkdir()
+    (tmp_path / "presses" / "mine.txt").write_text("mine")
+    with pytest.raises(OutputExists, match="presses is already there and is not overwritten"):
+        write_dataset(tmp_path / "presses", SENSOR, [samples()], ABOUT)
+    assert (tmp_path / "presses" / "mine.txt").read_text() == "mine"
+    assert len(list(tmp_path.iterdir())) == 1
