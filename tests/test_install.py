@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def fresh(tmp_path_factory):
-    """The bin folder of an empty environment into which `pip install .` was done, from a copy without a checkout."""
+    """The bin folder of an empty environment into which `pip install .` was done, with nothing else in it."""
     folder = tmp_path_factory.mktemp("fresh")
     venv.create(folder / "env", with_pip=True)
     python = folder / "env" / "bin" / "python"

@@ -29,17 +29,18 @@ def test_command_line_example_runs_line_by_line(tmp_path):
     (example,) = (block for block in blocks(README, "sh") if "simulate point" in block)
     (tmp_path / "train").symlink_to(ROOT / "train")
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    script = f"set -e\n{example.replace('stream models', 'stream --count 5 models')}"
-    waiting = script.replace(
-        "isocharge serve stream",
-        "for i in $(seq 100); do [ -e film ] && break; sleep 0.1; done\nisocharge serve stream",
-    )
     run = subprocess.run(
-        ["bash", "-c", waiting], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120, check=False
+        ["bash", "-ec", example],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert run.returncode == 0, run.stderr
     assert '"charge_pC"' in run.stdout
-    assert run.stdout.count('"frame_id": "three-25um-biaxial"') == 5
+    assert run.stdout.count('"frame_id": "three-25um-biaxial"') > 800  # 5 s at 200 Hz
     assert (tmp_path / "models/mine/1/model.onnx").is_file()
 
 

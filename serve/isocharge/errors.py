@@ -41,6 +41,10 @@ class OutputExists(IsochargeError, FileExistsError):
     """The output is already there; nothing is overwritten unasked."""
 
 
+class OutputError(IsochargeError, OSError):
+    """The file system refuses an output; nothing is left of it."""
+
+
 class SolveError(IsochargeError, ArithmeticError):
     """No equilibrium was found to the asked tolerance."""
 

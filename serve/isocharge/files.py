@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from isocharge.errors import OutputExists
+from isocharge.errors import IsochargeError, OutputError, OutputExists
 
 
 def sha256_of(data: bytes) -> str:
@@ -47,6 +47,7 @@ def new_folder(path: Path) -> Iterator[Path]:
 
     Raises:
         OutputExists: If `path` is already there, or another process makes it meanwhile.
+        OutputError: If the file system refuses.
     """
     refuse_existing(path)
     missing = [parent for parent in path.parents if not parent.exists()]
@@ -57,15 +58,17 @@ def new_folder(path: Path) -> Iterator[Path]:
         _sync_folder(draft)
         _rename(draft, path)
         _sync_folder(path.parent)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(draft, ignore_errors=True)
         for parent in missing:
             _remove_empty(parent)
+        if isinstance(error, OSError) and not isinstance(error, IsochargeError):
+            raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another output") from error
         raise
 
 
 def _draft_of(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    return path.with_name(f".{secrets.token_hex(4)}.draft")
 
 
 def _rename(draft: Path, path: Path) -> None:

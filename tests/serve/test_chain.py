@@ -83,13 +83,19 @@ def test_hysteresis():
     assert touches([15.0, 25.0, 15.0, 11.0, 9.0, 15.0]) == [False, True, True, True, False, False]
 
 
+@pytest.mark.parametrize("before", [[], [850.0], [850.0] * 5])
+def test_a_spike_is_no_peak(before):
+    """One absurd frame, at the first touch too, neither releases the press nor hides it."""
+    assert touches([*before, 3e38, *[850.0] * 4])[-4:] == [True] * 4
+
+
 def test_release_at_a_share_of_the_peak():
-    assert touches([1000.0, 4000.0, 201.0, 199.0]) == [True, True, True, False]
+    assert touches([1000.0, 4000.0, 4000.0, 201.0, 199.0]) == [True, True, True, True, False]
 
 
 def test_a_drifted_base_releases_and_is_no_new_touch():
     """An absolute release threshold under the drift of 60 pC never would release."""
-    assert touches([2060.0, 60.0, 62.0, 58.0, 60.0, 75.0, 100.0]) == [True] + [False] * 5 + [True]
+    assert touches([2060.0, 2060.0, 60.0, 62.0, 58.0, 60.0, 75.0, 100.0]) == [True] * 2 + [False] * 5 + [True]
 
 
 def test_a_press_that_softens_to_the_smallest_force_is_held():

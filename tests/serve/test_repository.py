@@ -15,6 +15,7 @@ def roots(tmp_path, monkeypatch):
     given, variable, here = (tmp_path / name for name in ("given", "variable", "work/models"))
     monkeypatch.setenv("ISOCHARGE_MODELS", str(variable))
     here.mkdir(parents=True)
+    given.mkdir()
     monkeypatch.chdir(here.parent)
     monkeypatch.setattr("isocharge.serve.repository._shipped", lambda: tmp_path / "shipped")
     return {"given": given, "variable": variable, "here": here, "shipped": tmp_path / "shipped"}
@@ -84,7 +85,13 @@ def test_missing_path_says_what_was_expected(roots):
         find_model("nowhere/model.onnx", roots["given"])
 
 
+def test_a_repository_that_was_named_must_be_there(roots):
+    put(roots["here"])
+    with pytest.raises(ModelError, match="nope: expected a folder of models"):
+        find_model("m", roots["given"] / "nope")
+
+
 def test_folder_without_a_version_is_no_model(roots):
-    (roots["given"] / "m").mkdir(parents=True)
+    (roots["given"] / "m").mkdir()
     with pytest.raises(ModelError, match="no model 'm'"):
         find_model("m", roots["given"])

@@ -8,8 +8,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.errors import SceneError
-from isocharge.simulate import STANDARD, Circle, Film, Resolution, load_sensor, press, touch_charge
-from isocharge.simulate.equilibrium import DISCRETISATION_ERROR, bending_share, turn_stress
+from isocharge.simulate import (
+    STANDARD,
+    Circle,
+    Film,
+    Resolution,
+    built_in_sensors,
+    load_sensor,
+    press,
+    touch_charge,
+)
+from isocharge.simulate.equilibrium import (
+    DISCRETISATION_ERROR,
+    MESH_TOLERANCE,
+    bending_share,
+    resolution_for,
+    turn_stress,
+)
 from isocharge.simulate.membrane import stress
 
 
@@ -21,7 +36,7 @@ from isocharge.simulate.membrane import stress
         ((0.0, 0.0), 45.0, "probe off the film"),
         ((60.0, 0.0), 1.0, "probe off the film"),
         ((np.nan, 0.0), 1.0, r"position: expected two finite numbers, got \(nan, 0\.0\)"),
-        ((43.5, 0.0), 1.0, r"press at \(43\.5, 0\) mm is too near the rim for a mesh of order 6 with 24 elements"),
+        ((43.5, 0.0), 1.0, r"press at \(43\.5, 0\) mm is too near the rim for a mesh of order 8 with 8 elements"),
     ],
 )
 def test_impossible_places_are_refused(film, at_mm, radius_mm, message):
@@ -137,26 +152,35 @@ def test_result_says_what_was_solved(film):
     assert solved.seconds > 0.0
 
 
-def test_mesh_error_grows_towards_the_rim(film):
-    """A floor inside, and honest about a press far out: against a refined solve of the worst charge."""
-    sensors = [load_sensor(f"four-25um-{kind}") for kind in ("biaxial", "uniaxial")]
-    for distance, at_least in ((4e-3, DISCRETISATION_ERROR), (20e-3, 5e-3), (25e-3, 1e-2)):
-        at = (distance * np.cos(1.0), distance * np.sin(1.0))
-        solved = press(film, Circle(1e-3), at, 1.0, resolution=STANDARD)
-        refined = press(film, Circle(1e-3), at, 1.0, resolution=Resolution(6, 16, 6))
-        error = max(np.abs(touch_charge(s, solved) / touch_charge(s, refined) - 1.0).max() for s in sensors)
-        assert error < solved.mesh_error
-        assert solved.mesh_error >= at_least
-        assert solved.estimated_error > solved.mesh_error
+@pytest.mark.parametrize("resolution", [STANDARD, None], ids=["standard", "chosen"])
+@pytest.mark.parametrize("distance", [4e-3, 13e-3, 20e-3, 25e-3])
+def test_mesh_error_is_honest(film, distance, resolution):
+    """A bound for the worst charge, against a refined solve: of the standard mesh anywhere, and of the mesh chosen."""
+    sensors = [load_sensor(name) for name in built_in_sensors()]
+    at = (distance * np.cos(1.0), distance * np.sin(1.0))
+    solved = press(film, Circle(1e-3), at, 1.0, resolution=resolution)
+    refined = press(film, Circle(1e-3), at, 1.0, resolution=Resolution(8, 8, 8))
+    error = max(np.abs(touch_charge(s, solved) / touch_charge(s, refined) - 1.0).max() for s in sensors)
+    assert error < solved.mesh_error < solved.estimated_error
+    assert solved.mesh_error >= DISCRETISATION_ERROR
 
 
-def test_a_press_far_out_gets_a_finer_mesh(film):
-    sensor = load_sensor("four-25um-biaxial")
-    assert press(film, Circle(1e-3), (10e-3, 0.0), 1.0).resolution == STANDARD
-    solved = press(film, Circle(1e-3), (20e-3, 0.0), 1.0)
-    refined = press(film, Circle(1e-3), (20e-3, 0.0), 1.0, resolution=Resolution(8, 16, 8))
-    assert solved.resolution.order > STANDARD.order
-    assert touch_charge(sensor, solved) == pytest.approx(touch_charge(sensor, refined), rel=2e-4)
+def test_mesh_is_chosen_by_place(film):
+    """The standard one up to a quarter of the radius; then as much as the error asks for, until nothing helps."""
+
+    def chosen(distance: float) -> Resolution:
+        return resolution_for(film, Circle(1e-3), (0.0, distance))
+
+    assert chosen(0.0) == chosen(12e-3) == STANDARD
+    orders = [chosen(distance).order for distance in (12e-3, 20e-3, 25e-3, 28e-3, 36e-3)]
+    assert orders == [4, 5, 6, 7, 8]
+    assert press(film, Circle(1e-3), (20e-3, 0.0), 1.0).mesh_error < MESH_TOLERANCE
+    assert press(film, Circle(1e-3), (20e-3, 0.0), 1.0, resolution=STANDARD).mesh_error > MESH_TOLERANCE
+
+
+def test_mesh_that_folds_is_refused(film):
+    with pytest.raises(SceneError, match=r"too near the rim for a mesh of order 4 with 8 elements"):
+        press(film, Circle(1e-3), (42e-3, 0.0), 1.0, resolution=STANDARD)
 
 
 def test_bending_share_follows_thickness_and_force(film):

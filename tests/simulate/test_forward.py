@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.errors import SceneError, SolveError
-from isocharge.simulate import Circle, ForwardMap, Sensor, load_sensor, press, touch_charge
+from isocharge.simulate import Circle, ForwardMap, Resolution, Sensor, load_sensor, press, touch_charge
 from isocharge.simulate.forward import INTERPOLATION_ERROR, Nodes
 
 
@@ -177,10 +177,21 @@ def test_too_thick_a_film_is_refused():
         ForwardMap.build(thick, Circle(1e-3))
 
 
+def test_a_map_that_interpolates_badly_is_refused():
+    """The stress of a mesh too coarse is no smooth function of the place, and more solves do not help."""
+    family = {"radius": 4e-3, "force_range": (0.5, 1.0), "resolution": Resolution(3, 8, 2)}
+    with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to 0\.\d+ only, expected 0\.0005"):
+        ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1e-3), **family)
+
+
 @pytest.mark.slow
-def test_too_wide_a_family_is_told():
-    with pytest.raises(SolveError, match=r"up to 30 mm and 2 N interpolates to 0\.\d+ only, expected 0\.0002"):
-        ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1e-3), radius=30e-3)
+def test_map_over_most_of_the_film():
+    """Far out the mesh is finer, and the electrodes are still met."""
+    made = ForwardMap.build(load_sensor("four-25um-biaxial"), Circle(1e-3), radius=22e-3, force_range=(0.5, 1.0))
+    assert made.resolution.order > 4
+    x, y, force = draw(made, 20, seed=9)
+    error = np.abs(made.forward(x, y, force) / direct(made.sensor, x, y, force) - 1.0)
+    assert error.max() < 5e-3
 
 
 def test_result_does_not_depend_on_the_executor(two_processes):

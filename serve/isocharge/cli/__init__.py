@@ -4,6 +4,7 @@ Each stage has its sub-commands in a module here; a sub-command imports its stag
 Data go to stdout, words for people to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage or input.
 """
 
+import signal
 import sys
 
 import typer
@@ -27,12 +28,10 @@ app.add_typer(serve_app, name="serve")
 
 
 def main() -> None:
-    """Run the command line; the one place that maps errors to exit codes."""
+    """Run the command line; the one place that maps errors to exit codes. SIGTERM ends a command as Ctrl-C does."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         app()
-    except IsochargeError as error:
+    except (IsochargeError, OSError, MemoryError) as error:
         typer.echo(f"{type(error).__name__}: {error}", err=True)
         sys.exit(2 if isinstance(error, InputError) else 1)
-    except OSError as error:
-        typer.echo(f"{type(error).__name__}: {error}", err=True)
-        sys.exit(1)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from isocharge.cli.extras import require
-from isocharge.cli.terminal import progress, say
+from isocharge.cli.terminal import progress, say, this_command
 from isocharge.cli.virtual import virtual_sensor
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def demo_command(
         Path | None,
         typer.Option("--output", "-o", metavar="DIR", help="Folder to make. (default: demo-output, or -2, -3, ...)"),
     ] = None,
-    seconds: Annotated[float, typer.Option("--seconds", min=3.0, help="How long to feel live, s.")] = 20.0,
+    seconds: Annotated[float, typer.Option("--seconds", min=3.0, max=3600.0, help="How long to feel live, s.")] = 20.0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of samples and presses.")] = 0,
     config: Annotated[
         Path | None, typer.Option("--config", metavar="FILE", help="Training configuration, TOML. (default: built in)")
@@ -63,6 +63,7 @@ def demo_command(
     from isocharge.files import new_folder
     from isocharge.serve import Predictor
 
+    settings = load_config(config) if config else None
     folder, clock = output or _free_name(Path("demo-output")), Clock()
     sweep = Sweep(samples=SAMPLES, seed=seed)
     with new_folder(folder) as draft:
@@ -72,17 +73,17 @@ def demo_command(
             dataset = read_dataset(write_sweep(draft / "presses", (film,), sweep))
             say(f"   {len(dataset.samples)} presses from {len(film.table)} solves, interpolated to {film.error:.1e}")
         with clock.step("train", "a small network, with noise, to ONNX"):
-            settings = load_config(config) if config else None
             with progress("training") as advance:
                 release = train_model(
-                    dataset, draft / "models" / SENSOR, settings, command="isocharge demo", progress=advance
+                    dataset, draft / "models" / SENSOR, settings, command=this_command(), progress=advance
                 )
             say(f"   median position error {release.metadata.errors['position_median_mm']:g} mm with noise")
         with clock.step("serve", f"a virtual sensor on a pseudo-terminal at {RATE_HZ:g} Hz, felt live"):
             live = _feel(film, Predictor(release.folder), seconds, seed)
             say(f"   {live.frames} frames, {live.lost} lost, {live.repeated} repeated")
-        with clock.step("show", "one page of pictures"):
+        with clock.step("show", "one page of pictures"), progress("drawing") as advance:
             error_mm, force_N = _draw(film, release, live, sweep, draft / "demo.png")
+            advance(1, 2)
             latency_us = _latency(Predictor(release.folder), dataset.samples.charge_pC)
     say(f"   {folder / 'demo.png'}")
     typer.echo(_closing_table(error_mm, force_N, live, release, latency_us, clock, folder))

@@ -86,6 +86,7 @@ def stream_command(
     count: Annotated[
         int | None, typer.Option("--count", min=1, help="Stop after so many records. (default: never)")
     ] = None,
+    wait: Annotated[float, typer.Option("--wait", min=0.0, max=3600.0, help="Wait so long for the port, s.")] = 0.0,
     baud: Annotated[int, typer.Option("--baud", min=1, help="Bits per second; USB ports ignore it.")] = 115200,
     offset_limit_pC: Annotated[
         float, typer.Option("--offset-limit-pC", min=0.0, help="Largest charge of an untouched electrode, pC.")
@@ -102,13 +103,21 @@ def stream_command(
     predictor, parser, gaps = Predictor(model, models=models), FrameParser(), SequenceGaps()
     chain = Chain(tare=TareRule(offset_limit_pC=offset_limit_pC))
     latencies: deque[float] = deque(maxlen=LATENCIES)
-    with _until_stopped(), Port(port, baud=baud) as source:
+    with _until_stopped(), Port(_awaited(port, wait), baud=baud) as source:
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         records = _limited(stream(source, predictor, chain, parser=parser, gaps=gaps), seconds, count)
         try:
             _print_lines(record.to_json() for record in _watched(records, latencies))
         finally:
             say(_closing_line(parser, gaps, latencies))
+
+
+def _awaited(port: str, wait: float) -> str:
+    """The port, as soon as there is something under its path, or when the time is over."""
+    end = time.monotonic() + wait
+    while "://" not in port and not Path(port).exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    return port
 
 
 def _limited(
@@ -159,7 +168,8 @@ class NoiseLevel(StrEnum):
 def virtual_command(
     sensor: Annotated[str, typer.Argument(metavar="SENSOR", help="Built-in sensor, or a TOML file.")],
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0.0, help="Play for so many seconds. (default: until Ctrl-C)")
+        float | None,
+        typer.Option("--seconds", min=0.0, max=1e6, help="Play for so many seconds. (default: until Ctrl-C)"),
     ] = None,
     rate_Hz: Annotated[float, typer.Option("--rate-Hz", min=1.0, max=5000.0, help="Frames per second, Hz.")] = 200.0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of presses, noise and offsets.")] = 0,

@@ -1,9 +1,12 @@
 """`isocharge simulate ...`: one press, or a dataset of many."""
 
 import json as json_module
+import signal
+from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import contextmanager
 from enum import StrEnum
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +14,7 @@ import typer
 
 from isocharge.cli.extras import require
 from isocharge.cli.terminal import progress, say
-from isocharge.errors import InputError
+from isocharge.errors import InputError, SceneError
 
 if TYPE_CHECKING:
     from isocharge.simulate import Equilibrium, Sensor
@@ -46,6 +49,11 @@ def point_command(
     film_sensor = load_sensor(sensor)
     equilibrium = press(film_sensor.film, parse_probe(probe), _position(at), force)
     report = _report(film_sensor, equilibrium, touch_charge(film_sensor, equilibrium))
+    if not isfinite(report["estimated_error"]):
+        raise SceneError(
+            f"a film of {film_sensor.film.thickness * 1e6:g} um under {force:g} N is mostly bent, and this version "
+            "models no bending; use a thinner film or more force"
+        )
     typer.echo(json_module.dumps(report) if json else _table(report))
     if report["estimated_error"] > 0.02:
         say(
@@ -107,7 +115,9 @@ def sweep_command(
         Orientation, typer.Option("--orientation", help="Turn the probe in each press.")
     ] = Orientation.fixed,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the presses.")] = 0,
-    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes; the data do not depend on it.")] = 1,
+    workers: Annotated[
+        int, typer.Option("--workers", min=1, max=64, help="Processes; the data do not depend on them.")
+    ] = 1,
 ) -> None:
     """Simulate many presses, spread over the working area and the forces, and write them as a dataset.
 
@@ -122,5 +132,19 @@ def sweep_command(
     say(f"{samples} presses in {folder}")
 
 
-def _pool(workers: int) -> AbstractContextManager[Executor | None]:
-    return ProcessPoolExecutor(workers) if workers > 1 else nullcontext()
+@contextmanager
+def _pool(workers: int) -> Iterator[Executor | None]:
+    """Worker processes that end with the command, whatever ends it; none for one worker."""
+    if workers == 1:
+        yield None
+        return
+    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts_to_the_parent)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _leave_interrupts_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)

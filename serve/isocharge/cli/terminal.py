@@ -1,5 +1,7 @@
 """Words, numbers and progress bars for people, on stderr; bars only where a terminal shows them."""
 
+import shlex
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -12,6 +14,11 @@ Advance = Callable[..., None]
 def say(words: str) -> None:
     """Words for people to stderr."""
     typer.echo(words, err=True)
+
+
+def this_command() -> str:
+    """The command line as it was given, for cards that say how to make a thing again."""
+    return shlex.join(["isocharge", *sys.argv[1:]])
 
 
 @contextmanager
@@ -36,7 +43,7 @@ def progress(title: str) -> Iterator[Advance]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[words]}"),
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task(title, total=None, words="")
 
         def advance(done: int, total: int, words: str = "") -> None:

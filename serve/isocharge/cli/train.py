@@ -1,15 +1,14 @@
 """`isocharge train ...`: a dataset, or a sensor, to a model."""
 
-import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from isocharge.cli.extras import require
-from isocharge.cli.terminal import progress, say
+from isocharge.cli.terminal import progress, say, this_command
 from isocharge.errors import InputError
+from isocharge.files import refuse_existing
 
 if TYPE_CHECKING:
     from isocharge.simulate import Dataset
@@ -47,10 +46,11 @@ def fit_command(
         raise InputError("train fit: expected either a DATASET folder or --sensor SENSOR, not both and not neither")
     with require("train"):
         from isocharge.train import load_config, train_model
+    refuse_existing(output / str(version))
     settings = load_config(config) if config else None
     presses = _read(dataset) if dataset else _simulate(str(sensor))
     with progress("training") as advance:
-        release = train_model(presses, output, settings, command=_this_command(), version=version, progress=advance)
+        release = train_model(presses, output, settings, command=this_command(), version=version, progress=advance)
     say(_summary(release))
 
 
@@ -71,10 +71,6 @@ def _simulate(sensor: str) -> "Dataset":
         return read_dataset(
             run_sweep(Path(folder) / "presses", load_sensor(sensor), probes, Sweep(samples=24_000), progress=advance)
         )
-
-
-def _this_command() -> str:
-    return shlex.join(["isocharge", *sys.argv[1:]])
 
 
 def _summary(release: "Release") -> str:

@@ -76,12 +76,14 @@ class Touch:
 
     Attributes:
         contact: Whether it does.
-        peak_pC: Largest total charge of this press so far, pC.
+        peak_pC: Largest total charge of this press so far, pC, that two frames in a row reached: a spike is no peak.
+        last_pC: Total charge of the latest frame, pC.
         base_pC: Smallest total charge since the last release, pC: a drifted base must not count as the next touch.
     """
 
     contact: bool = False
     peak_pC: float = 0.0
+    last_pC: float = 0.0
     base_pC: float = 0.0
 
 
@@ -194,9 +196,9 @@ def next_touch(rule: TouchRule, touch: Touch, total_pC: float, noise_pC: Array) 
     """
     threshold = rule.floor_pC + rule.sigmas * float(np.sqrt(np.dot(noise_pC, noise_pC)))
     if touch.contact:
-        peak = max(touch.peak_pC, total_pC)
+        peak = max(touch.peak_pC, min(total_pC, touch.last_pC))
         released = total_pC < max(rule.release_share * peak, 0.5 * threshold)
-        return Touch(base_pC=total_pC) if released else Touch(True, peak)
+        return Touch(last_pC=total_pC, base_pC=total_pC) if released else Touch(True, peak, total_pC)
     if total_pC > touch.base_pC + threshold:
-        return Touch(True, total_pC)
-    return Touch(base_pC=min(touch.base_pC, total_pC))
+        return Touch(True, min(total_pC, touch.last_pC), total_pC)
+    return Touch(last_pC=total_pC, base_pC=min(touch.base_pC, total_pC))

@@ -10,7 +10,7 @@ from isocharge.serve.metadata import ModelMetadata
 from isocharge.serve.predictor import Contact, Contacts
 
 MISFIT_LIMIT = 5.0
-"""Standard deviations; a single contact and Gaussian noise exceed it once in a million readings or less."""
+"""Standard deviations, for a model that does not say what misfit one good press in a thousand exceeds."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ class Domain:
     @classmethod
     def of(cls, metadata: ModelMetadata) -> "Domain":
         """The domain that a model's metadata state."""
-        return cls(np.array(metadata.working_area_mm), metadata.force_range_N)
+        limit = max(MISFIT_LIMIT, metadata.errors.get("misfit_p999", MISFIT_LIMIT))
+        return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit)
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """The words that one contact earns."""

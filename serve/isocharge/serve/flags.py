@@ -4,7 +4,7 @@
 |---|---|
 | `tare` | not tared yet: no contact is looked for |
 | `outside` | the position is outside the working area, or the force outside the range, that the model was trained for |
-| `misfit` | the charges fit no single contact: the misfit is above `isocharge.serve.domain.MISFIT_LIMIT` |
+| `misfit` | the charges fit no single contact: misfit above 5, and above what one good press in a thousand has |
 | `gap` | frames are missing before this one |
 | `repeat` | this frame has the number of the one before |
 | `restart` | the frame numbers went back: the device began anew |

@@ -155,7 +155,7 @@ def _pair(value: Any) -> tuple[float, float]:
 
 def _range(value: Any) -> tuple[float, float]:
     low, high = _pair(value)
-    _expect(low < high, "a smaller and a larger number", value)
+    _expect(low <= high, "a smaller and a larger number", value)
     return low, high
 
 

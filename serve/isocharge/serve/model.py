@@ -9,6 +9,7 @@ A version appears whole or not at all: it is written under a temporary name, rea
 only then renamed.
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,9 @@ from isocharge.serve.golden import Golden, check_answers, make_golden, read_gold
 from isocharge.serve.metadata import ModelMetadata
 from isocharge.serve.session import check_interface, open_session, run
 from isocharge.serve.triton import triton_config
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+"""Model names: safe in paths, URLs and config.pbtxt."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,9 @@ def write_model(
             nothing is left behind.
     """
     target = folder / str(metadata.version)
-    _check_target(target, metadata)
+    check_target(folder, metadata.version, metadata.electrodes)
+    if folder.resolve().name != metadata.name:
+        raise ModelError(f"{folder}: expected a folder named {metadata.name!r}, as the metadata names the model")
     where = f"the new model {metadata.label}"
     session = open_session(onnx_model, where)
     check_interface(session, len(metadata.electrodes), where)
@@ -122,17 +128,28 @@ def write_model(
     return target
 
 
-def _check_target(target: Path, metadata: ModelMetadata) -> None:
-    refuse_existing(target)
-    if target.parent.exists() and not target.parent.is_dir():
-        raise OutputExists(f"{target.parent}: expected a folder or nothing, got a file; choose another place")
-    if target.parent.resolve().name != metadata.name:
-        raise ModelError(f"{target.parent}: expected a folder named {metadata.name!r}, as the metadata names the model")
-    config, wanted = target.parent / "config.pbtxt", triton_config(metadata.name, len(metadata.electrodes))
+def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> None:
+    """Refuse a place where a model version cannot be written; worth doing before the work, too.
+
+    Args:
+        folder: The model's folder, named as the model.
+        version: Number of the version to write.
+        electrodes: Of the model.
+
+    Raises:
+        OutputExists: If the version, or a file in the folder's place, is there already.
+        ModelError: If the folder's name is no model name, or the folder holds a model with other electrodes.
+    """
+    refuse_existing(folder / str(version))
+    if folder.exists() and not folder.is_dir():
+        raise OutputExists(f"{folder}: expected a folder or nothing, got a file; choose another place")
+    name = folder.resolve().name
+    if not NAME.fullmatch(name):
+        raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; name the folder so")
+    config, wanted = folder / "config.pbtxt", triton_config(name, len(electrodes))
     if config.exists() and config.read_text(encoding="utf-8") != wanted:
         raise ModelError(
-            f"{config}: describes a model other than one with the electrodes {metadata.electrodes}; "
-            "use another model name"
+            f"{config}: describes a model other than one with the electrodes {electrodes}; use another model name"
         )
 
 

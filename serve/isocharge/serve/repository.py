@@ -36,7 +36,13 @@ def find_model(model: str | Path, models: Path | None = None) -> Path:
 
 
 def repositories(models: Path | None = None) -> list[Path]:
-    """The folders in which names are looked up, first come, first served; some may not exist."""
+    """The folders in which names are looked up, first come, first served.
+
+    Raises:
+        ModelError: If `models` is not there; the others need not be.
+    """
+    if models is not None and not models.is_dir():
+        raise ModelError(f"{models}: expected a folder of models, found none there; correct --models or leave it out")
     variable = os.environ.get("ISOCHARGE_MODELS")
     given = [models] if models is not None else []
     return [*given, *([Path(variable)] if variable else []), Path("models"), _shipped()]

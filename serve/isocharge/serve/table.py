@@ -76,7 +76,7 @@ def _charge(cell: str, electrode: str, where: str) -> float:
         value = float(cell)
     except ValueError:
         value = np.nan
-    if not np.isfinite(value):
+    if not abs(value) <= float(np.finfo(np.float32).max):
         raise ChargeError(f"{where}: electrode {electrode!r}: expected a charge in pC, got {cell!r}")
     return value
 

@@ -147,9 +147,15 @@ def read_dataset(folder: Path) -> Dataset:
         DatasetError: If the folder is not a dataset, of another format version, damaged or incomplete; the message
             names the file and what to do.
     """
+    folder = Path(folder)
     manifest, checksum = _read_manifest(folder)
     try:
         sensor = sensor_from_dict(manifest["sensor"], f"{folder}/manifest.json")
+        if manifest["electrodes"] != list(sensor.electrode_names):
+            raise DatasetError(
+                f"{folder}/manifest.json: expected the sensor's electrodes in its order, "
+                f"{list(sensor.electrode_names)}, got {manifest['electrodes']}"
+            )
         shards = [_read_shard(folder, entry, sensor) for entry in manifest["shards"]]
     except (KeyError, TypeError) as error:
         raise DatasetError(f"{folder}/manifest.json: key {error} is missing or of another type") from error
@@ -211,7 +217,7 @@ def _card(name: str, manifest: dict[str, Any]) -> str:
         f"electrode ({', '.join(manifest['electrodes'])}).",
         "",
         f"Made by isocharge {manifest['package_version']}. Touch charge is the reading under load minus the reading "
-        "without load; no noise is added.",
+        "without load.",
         "",
         "| column | meaning |",
         "|---|---|",
@@ -220,7 +226,8 @@ def _card(name: str, manifest: dict[str, Any]) -> str:
         "| what | value |",
         "|---|---|",
         f"| probes | {', '.join(manifest.get('probes', []))} |",
-        *(f"| {key} | {value} |" for key, value in {**ranges, "seed": manifest.get("seed")}.items()),
+        *(f"| {key} | {value} |" for key, value in ranges.items()),
+        *(f"| {key} | {manifest[key]} |" for key in ("sampling", "noise", "seed") if key in manifest),
         *(f"| solver: {key} | {value} |" for key, value in solver.items()),
         "",
         "Read it with `isocharge.simulate.read_dataset(folder)`, which checks every shard's checksum.",

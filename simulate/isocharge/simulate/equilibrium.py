@@ -22,22 +22,33 @@ from isocharge.simulate.sensor import Film
 from isocharge.simulate.template import Placement, Resolution, Template, template
 
 STANDARD = Resolution(order=4, around=8, rings=6)
-"""Charges within 0.03 % of the membrane's own solution over the working area, in about 0.1 s."""
+"""Charges within 0.03 % of the membrane's own solution up to 10 mm from the centre, 0.05 % with the probe on an
+electrode, in 0.06 s (`tests/benchmarks/bench_solve.py`)."""
 
-LADDER = (STANDARD, Resolution(6, 12, 6), Resolution(6, 16, 6), Resolution(6, 24, 8))
-"""Meshes that are tried in turn when none is asked for."""
+LADDER = (STANDARD, Resolution(5, 8, 6), Resolution(6, 8, 6), Resolution(7, 8, 8), Resolution(8, 8, 8))
+"""Meshes that are tried in turn when none is asked for: a higher order pays more than more elements round the circle,
+and keeps `mesh_error` true, which does not see rings that are too few."""
 
 MESH_TOLERANCE = 2e-3
 """`mesh_error` at which a mesh is fine enough: the standard one up to some 13 mm from the centre of a film of 45 mm."""
 
 TOO_COARSE = 0.05
-"""`mesh_error` of the finest mesh above which a press is refused, some 2.5 mm from the rim."""
+"""`mesh_error` of the finest mesh above which a press is refused: some 5 mm from the rim of a film of 45 mm."""
 
 DISCRETISATION_ERROR = 3e-4
-"""Relative error of a charge at the standard resolution; `tests/benchmarks/bench_solve.py` measures it."""
+"""Relative error of a charge that any mesh is taken to make: what the standard one makes up to 8 mm from the centre."""
 
 BENDING_WEIGHT = 1.5
 """Worst error of a charge over `bending_share`: at most 1.41 in the solutions of a 25 um film in tests/data."""
+
+MOSTLY_BENT = 0.3
+"""`bending_share` above which a membrane says nothing about a real film; its error is then given as infinite."""
+
+LARGEST_AMPLITUDE2 = 0.1
+"""A^2, the size of the strains, above which St. Venant-Kirchhoff elasticity is out of its range: 100 N at 25 um."""
+
+SMALLEST_PROBE = 1e-5
+"""Probe radius over film radius below which the template's grading runs out of digits."""
 
 _THREADS = ThreadpoolController()
 
@@ -89,6 +100,8 @@ class Equilibrium:
     @property
     def estimated_error(self) -> float:
         """See the class."""
+        if bending_share(self.film, self.groups.amplitude2) > MOSTLY_BENT:
+            return np.inf
         return self.mesh_error + BENDING_WEIGHT * bending_share(self.film, self.groups.amplitude2)
 
     @property
@@ -128,7 +141,12 @@ class Equilibrium:
         return turn_stress(scale * local, np.arctan2(self.at[1], self.at[0]))
 
     def _find(self, points: Array) -> tuple[Template, np.ndarray, Array, Array]:
-        """Template, element of each point, basis and its local derivatives there."""
+        """Template, element of each point, basis and its local derivatives there; a SceneError off the film."""
+        points = np.asarray(points, dtype=float)
+        off = ~(np.hypot(points[:, 0], points[:, 1]) <= self.film.radius * (1.0 + 1e-9))
+        if off.any():
+            x, y = 1e3 * points[np.argmax(off)]
+            raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {self.film.radius * 1e3:.4g} mm")
         mesh, placement = template(self.resolution), self.placement
         z = placement.to_template(_on_axis(points, self.at) / self.film.radius)
         element, xi, eta = mesh.locate(z, placement.rho)
@@ -205,8 +223,9 @@ def _too_near_the_rim(at: tuple[float, float], resolution: Resolution) -> SceneE
 def mesh_error(geometry: Geometry) -> float:
     """Relative error of a charge to expect from the mesh, infinite where elements are turned inside out.
 
-    From how well the mesh carries the film's own area: the square root of that relative error is about the worst
-    charge's; `tests/benchmarks/bench_solve.py`.
+    From how well the mesh carries the film's own area: for the meshes of `LADDER` and probes of 0.5 mm or more, the
+    worst charge's error is at most 1.2 times the square root of the area's, up to 33 mm from the centre of a film of
+    45 mm; 2.2 times for a probe of 0.2 mm (`tests/benchmarks/bench_solve.py`).
     """
     if geometry.weights.min() <= 0.0:
         return np.inf
@@ -214,19 +233,31 @@ def mesh_error(geometry: Geometry) -> float:
 
 
 def check_scene(film: Film, probe: Circle, at: tuple[float, float], force: float) -> None:
-    """Refuse presses that cannot exist.
+    """Refuse presses that cannot exist, and those outside of what St. Venant-Kirchhoff elasticity says anything about.
 
     Raises:
-        SceneError: If the footprint is not wholly on the film or the force is not positive and finite.
+        SceneError: If the footprint is not wholly on the film or hardly there, the force is not positive and finite, or
+            the film is stretched beyond small strains.
     """
     if not (np.isfinite(force) and force > 0.0):
         raise SceneError(f"force: expected a positive number of newtons (F > 0 pushes), got {force}")
     if not np.isfinite(at).all():
         raise SceneError(f"position: expected two finite numbers, got {at}")
+    if probe.radius < SMALLEST_PROBE * film.radius:
+        raise SceneError(
+            f"probe radius: expected at least {SMALLEST_PROBE:g} of the film's ({film.radius * 1e3:.4g} mm), "
+            f"got {probe.radius * 1e3:.4g} mm"
+        )
     if np.hypot(*at) + probe.radius >= film.radius * (1.0 - 1e-6):
         raise SceneError(
             f"probe off the film: centre ({at[0] * 1e3:.4g}, {at[1] * 1e3:.4g}) mm, probe radius "
             f"{probe.radius * 1e3:.4g} mm, film radius {film.radius * 1e3:.4g} mm"
+        )
+    amplitude2 = amplitude_squared(film, force)
+    if amplitude2 > LARGEST_AMPLITUDE2:
+        raise SceneError(
+            f"force {force:.4g} N stretches a film of {film.thickness * 1e6:.4g} um beyond small strains: expected "
+            f"(F / (E h a))^(2/3) up to {LARGEST_AMPLITUDE2:g}, got {amplitude2:.3g}"
         )
 
 

@@ -4,7 +4,7 @@ Frame: origin at the film's centre, x along the drawn direction (1), y transvers
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -62,6 +62,8 @@ class Piezo:
         for name in ("d31", "d32", "d33", "pyro"):
             if not np.isfinite(getattr(self, name)):
                 raise SensorError(f"piezo {name}: expected a finite number, got {getattr(self, name)}")
+        if self.d31 == 0.0 and self.d32 == 0.0:
+            raise SensorError("piezo d31 and d32 are both 0: such a film gives no charge")
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,14 @@ class Sensor:
     calibration: Calibration = field(default_factory=Calibration)
 
     def __post_init__(self) -> None:
+        for value, options in ((self.readout, get_args(Readout)), (self.surface, get_args(Surface))):
+            if value not in options:
+                raise SensorError(f"expected one of {options}, got {value!r}")
+        names = self.electrode_names
+        if len(set(names)) < len(names) or not all(names) or "side_mm" in names:
+            raise SensorError(f"electrodes: expected different names, none empty or 'side_mm', got {names}")
+        if not all(np.isfinite(gain) and gain > 0.0 for gain in self.calibration.gain.values()):
+            raise SensorError(f"calibration gain: expected positive numbers, got {self.calibration.gain}")
         if not self.electrodes:
             raise SensorError("electrodes: expected at least one, got none")
         for electrode in self.electrodes:

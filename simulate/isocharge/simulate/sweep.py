@@ -17,6 +17,9 @@ from isocharge.simulate.forward import ForwardMap, Progress
 from isocharge.simulate.probe import Circle
 from isocharge.simulate.sensor import Sensor
 
+MOST_SAMPLES = 10_000_000
+"""Largest sweep: about 600 MB on disk."""
+
 SHARD = 16384
 """Samples per shard."""
 
@@ -40,8 +43,11 @@ class Sweep:
     orientation: Literal["fixed", "random"] = "fixed"
 
     def __post_init__(self) -> None:
-        if self.samples < 1:
-            raise SceneError(f"samples: expected at least 1, got {self.samples}")
+        if not 1 <= self.samples <= MOST_SAMPLES:
+            bound = "at least 1" if self.samples < 1 else f"at most {MOST_SAMPLES}"
+            raise SceneError(f"samples: expected {bound}, got {self.samples}")
+        if self.orientation not in ("fixed", "random"):
+            raise SceneError(f"orientation: expected 'fixed' or 'random', got {self.orientation!r}")
 
     def presses(self) -> tuple[Array, Array, Array, Array]:
         """x, y (m), force (N) and orientation (rad) of every sample, each of shape (samples,).

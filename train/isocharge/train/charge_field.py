@@ -22,21 +22,21 @@ from isocharge.errors import TrainingError
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.noise import NoiseModel
 
-CANDIDATES = ((6, 1), (10, 2), (14, 2), (18, 2))
+CANDIDATES = ((6, 1), (10, 1), (14, 1), (18, 1), (22, 1), (22, 2), (22, 3))
 """Degrees tried in turn, in position and in force."""
 
 DAMPING = 1e-4
 """Levenberg damping of the inverse, relative to the mean diagonal: bounds it where the map nearly folds."""
 
-ROWS_PER_TERM = 10
-"""Presses used for each coefficient: more would not make the fit better, only slower."""
+ROWS_PER_TERM = 40
+"""Presses used for each coefficient at most. Near the edge of the disk, where the series is worst, more help most."""
 
 RIDGE = 1e-4
 """Weight of the coefficients' own size in the fit, relative: the square's corners lie outside the disk, where nothing
 holds the polynomials, and large coefficients that cancel would cost the digits of float32."""
 
-GOOD_ENOUGH = 3e-4
-"""Root-mean-square relative error of the charges at which no higher degree is tried: a sixth of the reference noise."""
+GOOD_ENOUGH = 2e-4
+"""Root-mean-square relative error of the charges at which no higher degree is tried: a tenth of the reference noise."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,15 @@ from typing import Any
 
 from isocharge.errors import ConfigError
 
+LIMITS = {
+    "steps": (1, 10_000_000),
+    "nearest_steps": (1, 10_000_000),
+    "batch": (1, 1_000_000),
+    "seed": (0, 2**31 - 1),
+    "threads": (1, 64),
+}
+"""Smallest and largest value of the whole numbers under [training]."""
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -23,7 +32,7 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         for name in ("hidden", "nearest_hidden"):
             widths = getattr(self, name)
-            if not widths or not all(isinstance(width, int) and 1 <= width <= 4096 for width in widths):
+            if not widths or not all(type(width) is int and 1 <= width <= 4096 for width in widths):
                 raise ConfigError(f"network.{name}: expected widths from 1 to 4096, got {widths}")
         if len(self.hidden) != len(self.nearest_hidden):
             raise ConfigError(
@@ -57,10 +66,10 @@ class TrainingConfig:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("steps", "nearest_steps", "batch", "threads"):
+        for name, (low, high) in LIMITS.items():
             value = getattr(self, name)
-            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-                raise ConfigError(f"training.{name}: expected a whole number from 1 on, got {value!r}")
+            if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+                raise ConfigError(f"training.{name}: expected a whole number from {low} to {high}, got {value!r}")
         if not 0.0 < self.learning_rate < 1.0:
             raise ConfigError(f"training.learning_rate: expected a number between 0 and 1, got {self.learning_rate!r}")
         if not 0.0 < self.hold_out < 0.9:

@@ -14,7 +14,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor, nn
 
-from isocharge.errors import TrainingError
+from isocharge.errors import ConfigError, TrainingError
 from isocharge.simulate.dataset import Dataset
 from isocharge.simulate.noise import noise_model
 from isocharge.train.charge_field import ChargeField
@@ -61,11 +61,16 @@ def fit_network(dataset: Dataset, config: FitConfig, progress: Progress | None =
         progress: Told about steps and loss.
 
     Raises:
+        ConfigError: If the noise level is unknown or has no noise.
         DatasetError: If the dataset cannot train an inverse.
         TrainingError: If the loss is not finite.
     """
     training = config.training
     noise = noise_model(training.noise)
+    if noise.white <= 0.0:
+        raise ConfigError(
+            f"training.noise: expected a level with noise (the misfit is in its units), got {noise.name!r}"
+        )
     train, held = split_by_position(dataset, training.hold_out, training.seed)
     with _threads_and_seed(training):
         field = ChargeField.fit(

@@ -38,11 +38,24 @@ class Presses:
 
 
 def domain_of(dataset: Dataset) -> Domain:
-    """The working area and forces that the dataset covers: as its manifest says, or else as its samples show."""
+    """The working area and forces that the dataset covers: as its manifest says, or else as its samples show.
+
+    Raises:
+        DatasetError: If the manifest's ranges are no numbers or do not hold the samples.
+    """
     samples, ranges = dataset.samples, dataset.manifest.get("ranges", {})
-    radius = float(ranges.get("radius_mm", np.hypot(samples.x_mm, samples.y_mm).max()))
-    low, high = ranges.get("force_N", (samples.force_N.min(), samples.force_N.max()))
-    return Domain(radius, (float(low), float(high)))
+    reach, forces = np.hypot(samples.x_mm, samples.y_mm).max(), (samples.force_N.min(), samples.force_N.max())
+    try:
+        radius = float(ranges.get("radius_mm", reach))
+        low, high = (float(force) for force in ranges.get("force_N", forces))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise DatasetError(f"manifest ranges: expected radius_mm and force_N [MIN, MAX], got {ranges!r}") from error
+    if not (reach <= radius * (1 + 1e-9) and 0.0 < low <= forces[0] * (1 + 1e-9) and forces[1] <= high * (1 + 1e-9)):
+        raise DatasetError(
+            f"manifest ranges: radius_mm {radius:g} and force_N [{low:g}, {high:g}] do not hold the samples, which "
+            f"reach {reach:g} mm and {forces[0]:g} to {forces[1]:g} N"
+        )
+    return Domain(radius, (low, high))
 
 
 def split_by_position(dataset: Dataset, hold_out: float, seed: int) -> tuple[Presses, Presses]:
