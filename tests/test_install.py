@@ -50,6 +50,13 @@ def test_python_works_from_any_folder(fresh, tmp_path):
     assert float(done.stdout) == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.parametrize("stage", ["simulate", "train"])
+def test_a_missing_extra_says_so_in_python_too(fresh, tmp_path, stage):
+    done = run(fresh, "python", "-c", f"import isocharge.{stage}", cwd=tmp_path)
+    assert "isocharge.errors.MissingExtra" in done.stderr
+    assert f"pip install 'isocharge[{stage}]'" in done.stderr
+
+
 def test_a_missing_extra_says_how_to_get_it(fresh, tmp_path):
     done = run(fresh, "isocharge", "simulate", "point", "three-25um-biaxial", cwd=tmp_path)
     assert done.returncode == 1

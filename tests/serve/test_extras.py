@@ -2,8 +2,8 @@
 
 import pytest
 
-from isocharge.cli.extras import require
 from isocharge.errors import MissingExtra
+from isocharge.extras import require
 
 
 @pytest.mark.parametrize(

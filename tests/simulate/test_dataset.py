@@ -175,6 +175,15 @@ def test_manifest_with_a_wrong_sensor(dataset):
         read_dataset(dataset)
 
 
+def test_manifest_with_electrodes_in_another_order(dataset):
+    """The columns of charge_pC would be read as each other's."""
+    edit(dataset, lambda manifest: manifest.update(electrodes=["B", "A", "C"]))
+    with pytest.raises(
+        DatasetError, match=r"expected the sensor's electrodes in its order, \['A', 'B', 'C'\], got \['B'"
+    ):
+        read_dataset(dataset)
+
+
 def test_missing_shard(dataset):
     (dataset / "shard-00001.npz").unlink()
     with pytest.raises(DatasetError, match=r"shard-00001\.npz: the manifest lists this shard, but it is not there"):

@@ -45,6 +45,28 @@ def test_impossible_places_are_refused(film, at_mm, radius_mm, message):
         press(film, Circle(radius_mm * 1e-3), at, 1.0)
 
 
+def test_scenes_beyond_the_theory_are_refused(film):
+    """Strains too large for St. Venant-Kirchhoff, and a probe that the grading of the mesh cannot reach."""
+    with pytest.raises(SceneError, match=r"force 200 N stretches a film of 25 um beyond small strains: .* got 0\.152"):
+        press(film, Circle(1e-3), (0.0, 0.0), 200.0)
+    with pytest.raises(
+        SceneError, match=r"probe radius: expected at least 1e-05 of the film's \(45 mm\), got 0\.0004 mm"
+    ):
+        press(film, Circle(4e-7), (0.0, 0.0), 1.0)
+    assert press(film, Circle(5e-7), (0.0, 0.0), 1e-3).status == "converged"
+
+
+@pytest.mark.parametrize("point", [(46e-3, 0.0), (-40e-3, 30e-3), (np.nan, 0.0)])
+def test_points_off_the_film_are_refused(film, point):
+    solved = press(film, Circle(1e-3), (0.0, 0.0), 1.0)
+    points = np.array([(0.0, 0.0), (0.0, 45e-3), point])
+    with pytest.raises(SceneError, match=rf"point \({point[0] * 1e3:.4g}, .*\) mm is off the film of radius 45 mm"):
+        solved.deflection(points)
+    with pytest.raises(SceneError, match="is off the film"):
+        solved.touch_stress(points)
+    solved.touch_stress(points[:2])
+
+
 @pytest.mark.parametrize("force", [0.0, -1.0, np.inf, np.nan])
 def test_impossible_forces_are_refused(film, force):
     with pytest.raises(SceneError, match=f"force: expected a positive number of newtons .* got {force}"):
@@ -191,4 +213,5 @@ def test_bending_share_follows_thickness_and_force(film):
 
 
 def test_equilibrium_of_a_thick_film_admits_it(film: Film):
-    assert press(replace(film, thickness=1e-3), Circle(1e-3), (0.0, 0.0), 1.0).estimated_error > 0.3
+    """The membrane is wrong by factors there, so no number is given."""
+    assert press(replace(film, thickness=1e-3), Circle(1e-3), (0.0, 0.0), 1.0).estimated_error == np.inf

@@ -132,6 +132,30 @@ def test_edge_readout_needs_squares(three):
         replace(three, electrodes=(*three.electrodes, triangle), readout="edge")
 
 
+@pytest.mark.parametrize(("changes", "got"), [({"readout": "mean"}, "mean"), ({"surface": "inside"}, "inside")])
+def test_unknown_readout_or_surface(three, changes, got):
+    with pytest.raises(SensorError, match=rf"expected one of \(.*\), got '{got}'"):
+        replace(three, **changes)
+
+
+@pytest.mark.parametrize("name", ["A", "", "side_mm"])
+def test_electrodes_have_names_of_their_own(three, name):
+    electrodes = (*three.electrodes, Electrode.of_square(name, (0.0, 0.0), 1e-3))
+    with pytest.raises(SensorError, match=rf"expected different names, none empty or 'side_mm', got .*'{name}'"):
+        replace(three, electrodes=electrodes)
+
+
+@pytest.mark.parametrize("gain", [0.0, -1.0, np.nan, np.inf])
+def test_gains_are_positive(three, gain):
+    with pytest.raises(SensorError, match=f"calibration gain: expected positive numbers, got .*{gain}"):
+        replace(three, calibration=Calibration(gain={"A": gain}))
+
+
+def test_a_film_without_any_effect():
+    with pytest.raises(SensorError, match="piezo d31 and d32 are both 0: such a film gives no charge"):
+        Piezo(d31=0.0, d32=0.0, d33=-30e-12)
+
+
 def test_a_sensor_has_electrodes(three):
     with pytest.raises(SensorError, match="electrodes: expected at least one, got none"):
         replace(three, electrodes=())

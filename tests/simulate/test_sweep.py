@@ -83,6 +83,16 @@ def test_no_samples_is_an_error(samples):
         Sweep(samples=samples)
 
 
+def test_too_many_samples():
+    with pytest.raises(SceneError, match="samples: expected at most 10000000, got 10000001"):
+        Sweep(samples=10_000_001)
+
+
+def test_unknown_orientation():
+    with pytest.raises(SceneError, match="orientation: expected 'fixed' or 'random', got 'Random'"):
+        Sweep(orientation="Random")
+
+
 # What is written
 
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from isocharge.cli.extras import require
 from isocharge.cli.terminal import progress, say, this_command
 from isocharge.cli.virtual import virtual_sensor
 
@@ -57,11 +56,10 @@ def demo_command(
 
     Example: isocharge demo -o first-light
     """
-    with require("train"):
-        from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, solve_maps, write_sweep
-        from isocharge.train import load_config, train_model
     from isocharge.files import new_folder
     from isocharge.serve import Predictor
+    from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, solve_maps, write_sweep
+    from isocharge.train import load_config, train_model
 
     settings = load_config(config) if config else None
     folder, clock = output or _free_name(Path("demo-output")), Clock()

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.extras import require
 from isocharge.cli.terminal import progress, say
 from isocharge.errors import InputError, OutputExists
 
@@ -188,9 +187,8 @@ def virtual_command(
 
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
-    with require("simulate"):
-        from isocharge.cli.virtual import virtual_sensor
-        from isocharge.simulate import ForwardMap, load_sensor, parse_probe
+    from isocharge.cli.virtual import virtual_sensor
+    from isocharge.simulate import ForwardMap, load_sensor, parse_probe
 
     scene = load_sensor(sensor), parse_probe(probe)
     with progress("solving the film") as advance:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from isocharge.cli.extras import require
 from isocharge.cli.terminal import progress, say
 from isocharge.errors import InputError, SceneError
 
@@ -44,8 +43,8 @@ def point_command(
 
     Example: isocharge simulate point three-25um-biaxial --probe circle:1.0 --at 3,-2 --force 1.0
     """
-    with require("simulate"):
-        from isocharge.simulate import load_sensor, parse_probe, press, touch_charge
+    from isocharge.simulate import load_sensor, parse_probe, press, touch_charge
+
     film_sensor = load_sensor(sensor)
     equilibrium = press(film_sensor.film, parse_probe(probe), _position(at), force)
     report = _report(film_sensor, equilibrium, touch_charge(film_sensor, equilibrium))
@@ -123,8 +122,8 @@ def sweep_command(
 
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
-    with require("simulate"):
-        from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
+    from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
+
     film_sensor, probes = load_sensor(sensor), tuple(parse_probe(text) for text in probe or ["circle:1.0"])
     sweep = Sweep(radius * 1e-3, force, samples, seed, orientation.value)
     with progress("solving the film") as advance, _pool(workers) as executor:

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.extras import require
 from isocharge.cli.terminal import progress, say, this_command
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing
@@ -44,8 +43,8 @@ def fit_command(
     """
     if (dataset is None) == (sensor is None):
         raise InputError("train fit: expected either a DATASET folder or --sensor SENSOR, not both and not neither")
-    with require("train"):
-        from isocharge.train import load_config, train_model
+    from isocharge.train import load_config, train_model
+
     refuse_existing(output / str(version))
     settings = load_config(config) if config else None
     presses = _read(dataset) if dataset else _simulate(str(sensor))

@@ -7,16 +7,19 @@ equilibrium = press(sensor.film, Circle(radius=1e-3), at=(2e-3, 3e-3), force=1.0
 charge = touch_charge(sensor, equilibrium)  # C, in the order of sensor.electrode_names
 """
 
-from isocharge.simulate.charge import touch_charge
-from isocharge.simulate.dataset import Dataset, Samples, read_dataset, write_dataset
-from isocharge.simulate.equilibrium import STANDARD, Equilibrium, press
-from isocharge.simulate.forward import ForwardMap
-from isocharge.simulate.noise import NoiseModel, noise_model
-from isocharge.simulate.probe import Circle, parse_probe
-from isocharge.simulate.sensor import Calibration, Electrode, Film, Piezo, Sensor
-from isocharge.simulate.sensor_file import built_in_sensors, load_sensor, sensor_from_dict, sensor_to_dict
-from isocharge.simulate.sweep import Sweep, run_sweep, solve_maps, write_sweep
-from isocharge.simulate.template import Resolution
+from isocharge.extras import require
+
+with require("simulate"):
+    from isocharge.simulate.charge import touch_charge
+    from isocharge.simulate.dataset import Dataset, Samples, read_dataset, write_dataset
+    from isocharge.simulate.equilibrium import STANDARD, Equilibrium, press
+    from isocharge.simulate.forward import ForwardMap
+    from isocharge.simulate.noise import NoiseModel, noise_model
+    from isocharge.simulate.probe import Circle, parse_probe
+    from isocharge.simulate.sensor import Calibration, Electrode, Film, Piezo, Sensor
+    from isocharge.simulate.sensor_file import built_in_sensors, load_sensor, sensor_from_dict, sensor_to_dict
+    from isocharge.simulate.sweep import Sweep, run_sweep, solve_maps, write_sweep
+    from isocharge.simulate.template import Resolution
 
 __all__ = [
     "STANDARD",

@@ -7,10 +7,13 @@ release = train_model(read_dataset(Path("presses")), Path("models/mine"))
 print(release.metadata.errors)
 """
 
-from isocharge.train.config import FitConfig, NetworkConfig, TrainingConfig, load_config
-from isocharge.train.evaluate import measure_errors
-from isocharge.train.fit import Fit, fit_network
-from isocharge.train.release import Release, train_model
+from isocharge.extras import require
+
+with require("train"):
+    from isocharge.train.config import FitConfig, NetworkConfig, TrainingConfig, load_config
+    from isocharge.train.evaluate import measure_errors
+    from isocharge.train.fit import Fit, fit_network
+    from isocharge.train.release import Release, train_model
 
 __all__ = [
     "Fit",

@@ -26,10 +26,11 @@ def require(extra: str) -> Iterator[None]:
     """
     try:
         yield
-    except ModuleNotFoundError as error:
+    except (ModuleNotFoundError, MissingExtra) as error:
         package = (error.name or "").partition(".")[0]
         if package not in PACKAGES[extra]:
             raise
         raise MissingExtra(
-            f"this needs the package {package!r}, which is not installed; pip install 'isocharge[{extra}]'"
+            f"this needs the package {package!r}, which is not installed; pip install 'isocharge[{extra}]'",
+            name=package,
         ) from error
