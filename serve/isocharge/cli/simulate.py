@@ -14,6 +14,7 @@ import typer
 
 from isocharge.cli.terminal import progress, say
 from isocharge.errors import InputError, SceneError
+from isocharge.files import refuse_existing
 
 if TYPE_CHECKING:
     from isocharge.simulate import Equilibrium, Sensor
@@ -122,12 +123,14 @@ def sweep_command(
 
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
-    from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
+    from isocharge.simulate import Sweep, load_sensor, parse_probe, solve_maps, write_sweep
 
+    refuse_existing(output)
     film_sensor, probes = load_sensor(sensor), tuple(parse_probe(text) for text in probe or ["circle:1.0"])
     sweep = Sweep(radius * 1e-3, force, samples, seed, orientation.value)
     with progress("solving the film") as advance, _pool(workers) as executor:
-        folder = run_sweep(output, film_sensor, probes, sweep, executor=executor, progress=advance)
+        maps = solve_maps(film_sensor, probes, sweep, executor=executor, progress=advance)
+    folder = write_sweep(output, maps, sweep)
     say(f"{samples} presses in {folder}")
 
 
