@@ -214,6 +214,14 @@ def test_progress_is_told():
     assert told[-count:] == [(i, count) for i in range(1, count + 1)]
 
 
+def test_nodes_are_chebyshevs_in_the_distance_and_in_the_logarithm_of_the_force():
+    nodes = Nodes.spread(8e-3, (0.05, 2.0), (8, 3))
+    low, high = np.log([0.05, 2.0])
+    np.testing.assert_allclose(nodes.distance, 4e-3 * (1.0 + np.polynomial.chebyshev.chebpts1(8)), rtol=1e-12)
+    expected = 0.5 * (low + high) + 0.5 * (high - low) * np.polynomial.chebyshev.chebpts1(3)
+    np.testing.assert_allclose(np.log(nodes.force), expected, rtol=1e-12)
+
+
 def test_nodes_interpolate_what_charges_look_like():
     """A power of the force times a smooth function of the distance, at the first and at the last number of nodes."""
     rng = np.random.default_rng(9)
