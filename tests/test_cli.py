@@ -105,7 +105,7 @@ def test_a_stopped_sweep_leaves_nothing_behind(tmp_path, signal_name, workers):
     deadline = time.monotonic() + 60
     while not any(tmp_path.iterdir()) and time.monotonic() < deadline:
         time.sleep(0.05)
-    for _ in range(5):  # Python may lose one in a destructor
+    for _ in range(5):  # a library may swallow one
         process.send_signal(getattr(signal, signal_name))
         try:
             _, err = process.communicate(timeout=5)

@@ -1,6 +1,6 @@
 """One press: CPU time against error, for several meshes; and what the mesh that `press` chooses does.
 
-    python tests/benchmarks/bench_solve.py [--positions 20] [--seed 1] [--json]        (seven minutes; two with 3)
+    python tests/benchmarks/bench_solve.py [--positions 20] [--seed 1] [--json]        (seven minutes; four with 3)
 
 Time is the process CPU time of `press` (mesh, Newton) and `touch_charge` (readout) with imports, templates and symbolic
 work done, from flat ("cold") and from a press 0.5 mm away with a tenth more force ("warm"). Errors are of each charge,

@@ -124,7 +124,8 @@ def write_sweep(folder: Path, maps: tuple[ForwardMap, ...], sweep: Sweep) -> Pat
         "noise": "clean",
         "solver": _solver(maps),
     }
-    return write_dataset(folder, maps[0].sensor, _shards(maps, sweep), about)
+    presses = sweep.presses()  # before anything is written: scipy's Sobol tables swallow an interrupt
+    return write_dataset(folder, maps[0].sensor, _shards(maps, presses), about)
 
 
 def _solver(maps: tuple[ForwardMap, ...]) -> dict[str, Any]:
@@ -139,11 +140,11 @@ def _solver(maps: tuple[ForwardMap, ...]) -> dict[str, Any]:
     }
 
 
-def _shards(maps: tuple[ForwardMap, ...], sweep: Sweep) -> Iterator[Samples]:
-    x, y, force, turned = sweep.presses()
-    which = np.arange(sweep.samples) % len(maps)
+def _shards(maps: tuple[ForwardMap, ...], presses: tuple[Array, Array, Array, Array]) -> Iterator[Samples]:
+    x, y, force, turned = presses
+    which = np.arange(x.size) % len(maps)
     notation = np.array([made.probe.notation for made in maps])
-    for start in range(0, sweep.samples, SHARD):
+    for start in range(0, x.size, SHARD):
         part = slice(start, start + SHARD)
         charge = np.empty((len(x[part]), len(maps[0].sensor.electrodes)))
         for number, made in enumerate(maps):
