@@ -14,7 +14,7 @@ from isocharge.files import refuse_existing
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.dataset import Samples, write_dataset
 from isocharge.simulate.forward import ForwardMap, Progress
-from isocharge.simulate.probe import Circle
+from isocharge.simulate.probe import Probe
 from isocharge.simulate.sensor import Sensor
 
 MOST_SAMPLES = 10_000_000
@@ -66,7 +66,7 @@ class Sweep:
 def run_sweep(
     folder: Path,
     sensor: Sensor,
-    probes: tuple[Circle, ...],
+    probes: tuple[Probe, ...],
     sweep: Sweep,
     *,
     executor: Executor | None = None,
@@ -95,7 +95,7 @@ def run_sweep(
 
 def solve_maps(
     sensor: Sensor,
-    probes: tuple[Circle, ...],
+    probes: tuple[Probe, ...],
     sweep: Sweep,
     *,
     executor: Executor | None = None,
@@ -131,10 +131,11 @@ def write_sweep(folder: Path, maps: tuple[ForwardMap, ...], sweep: Sweep) -> Pat
 def _solver(maps: tuple[ForwardMap, ...]) -> dict[str, Any]:
     resolution = maps[0].resolution
     return {
-        "theory": "nonlinear membrane",
+        "theory": maps[0].theory.name,
         "order": resolution.order,
         "around": resolution.around,
         "rings": resolution.rings,
+        "rim": resolution.rim,
         "solves": sum(len(made.table) for made in maps),
         "interpolation_error": max(made.error for made in maps),
     }
@@ -149,7 +150,7 @@ def _shards(maps: tuple[ForwardMap, ...], presses: tuple[Array, Array, Array, Ar
         charge = np.empty((len(x[part]), len(maps[0].sensor.electrodes)))
         for number, made in enumerate(maps):
             mine = which[part] == number
-            charge[mine] = made.forward(x[part][mine], y[part][mine], force[part][mine])
+            charge[mine] = made.forward(x[part][mine], y[part][mine], force[part][mine], turned[part][mine])
         yield Samples(
             x_mm=x[part] * 1e3,
             y_mm=y[part] * 1e3,
