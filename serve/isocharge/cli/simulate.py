@@ -5,15 +5,15 @@ import signal
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import asdict
 from enum import StrEnum
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from isocharge.cli.terminal import progress, say
-from isocharge.errors import InputError, SceneError
+from isocharge.errors import InputError
 from isocharge.files import refuse_existing
 
 if TYPE_CHECKING:
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from isocharge.simulate.arrays import Array
 
 simulate_app = typer.Typer(no_args_is_help=True, help="From a press to the charges of the electrodes.")
+
+PROBE_HELP = "What presses, mm: circle:R, rectangle:WxH, triangle:SIDE, polygon:X,Y;X,Y;..., each turned by @DEGREES."
 
 SensorArgument = Annotated[str, typer.Argument(metavar="SENSOR", help="Built-in sensor, or a TOML file.")]
 
@@ -35,31 +37,35 @@ class Orientation(StrEnum):
 @simulate_app.command("point")
 def point_command(
     sensor: SensorArgument,
-    probe: Annotated[str, typer.Option("--probe", help="What presses: circle:R, R in mm.")] = "circle:1.0",
+    probe: Annotated[str, typer.Option("--probe", help=PROBE_HELP)] = "circle:1.0",
     at: Annotated[str, typer.Option("--at", metavar="X,Y", help="Where, mm from the film's centre.")] = "0,0",
     force: Annotated[float, typer.Option("--force", help="How hard, N, positive pushes.")] = 1.0,
+    accuracy: Annotated[
+        float, typer.Option("--accuracy", help="Relative error of a charge that is wanted; chooses theory and mesh.")
+    ] = 1e-3,
+    theory: Annotated[
+        str, typer.Option("--theory", help="auto, or 'nonlinear membrane + bending', 'linear plate', ...")
+    ] = "auto",
+    temperature: Annotated[
+        float, typer.Option("--temperature", metavar="K", help="Add the charge of a uniform temperature step.")
+    ] = 0.0,
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of a table.")] = False,
 ) -> None:
     """Charges (pC) and deflection (mm) under one press.
 
-    Example: isocharge simulate point three-25um-biaxial --probe circle:1.0 --at 3,-2 --force 1.0
+    Example: isocharge simulate point three-25um-biaxial --probe triangle:4.0@30 --at 3,-2 --force 1.0
     """
-    from isocharge.simulate import load_sensor, parse_probe, press, touch_charge
+    from isocharge.simulate import load_sensor, parse_probe, press, theory_for, thermal_charge, touch_charge
+    from isocharge.simulate.theory import named
 
     film_sensor = load_sensor(sensor)
-    equilibrium = press(film_sensor.film, parse_probe(probe), _position(at), force)
-    report = _report(film_sensor, equilibrium, touch_charge(film_sensor, equilibrium))
-    if not isfinite(report["estimated_error"]):
-        raise SceneError(
-            f"a film of {film_sensor.film.thickness * 1e6:g} um under {force:g} N is mostly bent, and this version "
-            "models no bending; use a thinner film or more force"
-        )
+    terms = theory_for(film_sensor, (force, force), accuracy) if theory == "auto" else named(theory, film_sensor.film)
+    equilibrium = press(film_sensor.film, parse_probe(probe), _position(at), force, theory=terms, accuracy=accuracy)
+    charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
+    report = _report(film_sensor, equilibrium, charge)
     typer.echo(json_module.dumps(report) if json else _table(report))
-    if report["estimated_error"] > 0.02:
-        say(
-            f"caution: bending is left out and carries about {report['estimated_error']:.0%} of what this film does; "
-            "the charges are no better than that"
-        )
+    for warning in report["warnings"]:
+        say(f"caution: {warning}")
 
 
 def _position(text: str) -> tuple[float, float]:
@@ -77,12 +83,14 @@ def _report(sensor: "Sensor", equilibrium: "Equilibrium", charge: "Array") -> di
     return {
         "charge_pC": dict(zip(sensor.electrode_names, (charge * 1e12).tolist(), strict=True)),
         "deflection_mm": float(equilibrium.deflection(np.array([equilibrium.at]))[0] * 1e3),
-        "theory": equilibrium.theory,
+        "theory": equilibrium.theory.name,
         "status": equilibrium.status,
         "iterations": equilibrium.iterations,
         "residual": equilibrium.residual,
         "seconds": equilibrium.seconds,
         "estimated_error": equilibrium.estimated_error,
+        "groups": {**asdict(equilibrium.groups), "bending_length": equilibrium.bending_length},
+        "warnings": list(equilibrium.warnings),
     }
 
 

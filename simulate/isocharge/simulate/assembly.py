@@ -66,9 +66,9 @@ class Assembly:
         Returns:
             (U1, U2, W), shape (n_node, 3), zero where fixed.
         """
-        flat = np.zeros(self.free.shape)
-        flat[:, :3] = right
-        flat = flat.ravel()
+        padded = np.zeros(self.free.shape)
+        padded[:, :3] = right
+        flat = padded.ravel()
         inner, outer = self._inner, self._outer
         size = matrix.shape[1] * self.components
         matrix = matrix.reshape(-1, size, size)

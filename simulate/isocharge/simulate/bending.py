@@ -60,7 +60,10 @@ class Bending:
         return forces
 
     def extend(self, tangent: Array) -> Array:
-        """Element matrices over (U1, U2, W, mu) from those over (U1, U2, W), shape (n_element, n_local, 4, n_local, 4)."""
+        """Element matrices over (U1, U2, W, mu) from those over (U1, U2, W).
+
+        Shape (n_element, n_local, 4, n_local, 4).
+        """
         n_element, n_local = self.geometry.nodes.shape
         matrix = np.zeros((n_element, n_local, 4, n_local, 4))
         matrix[:, :, :3, :, :3] = tangent

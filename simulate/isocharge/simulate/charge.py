@@ -22,7 +22,7 @@ from isocharge.simulate.polygon import area_in_disk, shared_area
 from isocharge.simulate.probe import Circle, Probe
 from isocharge.simulate.sensor import Electrode, Sensor
 
-FINE, COARSE = 12, 5
+FINE, COARSE = 12, 4
 """Gauss points per side of an electrode, near the probe and away: the stress has a kink on the footprint's edge."""
 
 NEAR = 3e-3
@@ -72,19 +72,20 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
         positive coefficient.
 
     Raises:
-        SensorError: If the film is another one, or the sensor reads a surface of a film that was solved without bending.
+        SensorError: If the film is another one, or the sensor reads a surface and bending was left out.
     """
     if sensor.film != equilibrium.film:
         raise SensorError(f"the equilibrium belongs to another film: expected {sensor.film}, got {equilibrium.film}")
     if sensor.surface != "middle" and not equilibrium.theory.bending:
         raise SensorError(
-            f"surface {sensor.surface!r} needs bending, but the film was solved as a {equilibrium.theory.name}; solve it "
-            "with theory=theory_for(sensor, (force, force))"
+            f"surface {sensor.surface!r} needs bending, but the film was solved as a {equilibrium.theory.name}; solve "
+            "it with theory=theory_for(sensor, (force, force))"
         )
     readout = ReadoutPoints.of(sensor, FINE)
     stress = equilibrium.touch_stress(readout.points.reshape(-1, 2), sensor.surface)
     charge = readout.charge(stress.reshape(*readout.points.shape[:2], 3))
-    return charge + contact_charge(sensor, equilibrium.probe, equilibrium.at, equilibrium.force)
+    charge += contact_charge(sensor, equilibrium.probe, equilibrium.at, equilibrium.force)
+    return charge
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
@@ -95,7 +96,8 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     if sensor.piezo.d33 == 0.0:
         return np.zeros(len(sensor.electrodes))
     covered = [_covered(sensor.calibration.place(np.array(e.corners)), probe, complex(*at)) for e in sensor.electrodes]
-    return -sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered)
+    pressed: Array = -sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered)
+    return pressed
 
 
 def _covered(corners: Array, probe: Probe, at: complex) -> float:
@@ -108,14 +110,19 @@ def _covered(corners: Array, probe: Probe, at: complex) -> float:
 
 def pretension_charge(sensor: Sensor) -> Array:
     """Reading without load, from the uniform pretension: what a touch charge is counted from; (n_electrode,), C."""
-    areas = np.array([electrode.area for electrode in sensor.electrodes])
-    return sensor.gains * areas * (sensor.piezo.d31 + sensor.piezo.d32) * sensor.film.pretension
+    per_area = (sensor.piezo.d31 + sensor.piezo.d32) * sensor.film.pretension
+    return _per_area(sensor, per_area)
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:
     """Pyroelectric charge of a uniform temperature step (K), shape (n_electrode,), C: the same on equal electrodes."""
-    areas = np.array([electrode.area for electrode in sensor.electrodes])
-    return sensor.gains * areas * sensor.piezo.pyro * step
+    return _per_area(sensor, sensor.piezo.pyro * step)
+
+
+def _per_area(sensor: Sensor, density: float) -> Array:
+    """Reading of a uniform charge density (C/m^2), shape (n_electrode,), C."""
+    reading: Array = sensor.gains * np.array([electrode.area for electrode in sensor.electrodes]) * density
+    return reading
 
 
 def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:

@@ -19,9 +19,9 @@ from isocharge.simulate.placement import Placement
 from isocharge.simulate.probe import Probe
 from isocharge.simulate.scaling import Groups
 from isocharge.simulate.sensor import Film, Surface
-from isocharge.simulate.spectral import tensor_basis
+from isocharge.simulate.spectral import tensor_basis, tensor_values
 from isocharge.simulate.template import Resolution, Template
-from isocharge.simulate.theory import Theory, left_out
+from isocharge.simulate.theory import Theory, bending_length, left_out
 
 LINEAR_STRESS = 40e6
 """Stress (Pa) up to which PVDF is taken to be linear."""
@@ -73,6 +73,11 @@ class Equilibrium:
         Infinite where the theory says nothing about this film.
         """
         return self.mesh_error + left_out(self.film, self.force, self.theory)
+
+    @property
+    def bending_length(self) -> float:
+        """How far a clamped edge bends the film, over the film's radius."""
+        return bending_length(self.film, self.force)
 
     @cached_property
     def mesh_error(self) -> float:
@@ -128,7 +133,7 @@ class Equilibrium:
             Shape (n,), m, positive the way the probe pushes.
         """
         element, xi, eta, _ = self._find(points)
-        values, _ = tensor_basis(self.resolution.order, xi, eta)
+        values = tensor_values(self.resolution.order, xi, eta)
         scaled = np.einsum("pn,pn->p", values, self.field[self.mesh.nodes[element], 2])
         deflection: Array = self.film.radius * np.sqrt(self.groups.amplitude2) * scaled
         return deflection
@@ -166,7 +171,7 @@ class Equilibrium:
         return stress(strained, self.groups.poisson)
 
     def _bent_strain(self, hessian: Array) -> Array:
-        """Scaled strain (E11, E22, 2 E12) of bending at the side that the probe touches, from second derivatives of W."""
+        """Scaled strain (E11, E22, 2 E12) of bending at the side that the probe touches; `hessian` of W, (..., 2, 2)."""
         half = 0.5 * self.film.thickness / (self.film.radius * np.sqrt(self.groups.amplitude2))
         bent: Array = half * np.stack(
             [hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1] + hessian[..., 1, 0]], axis=-1
@@ -203,7 +208,7 @@ class Equilibrium:
         return (flat @ self.field[self.mesh.nodes]).reshape(*gradient.shape[:3], 3)
 
     def _find(self, points: Array) -> tuple[Integers, Array, Array, np.ndarray]:
-        """Element, xi, eta of each point, and whether it was mirrored into a half template; a SceneError off the film."""
+        """Element, xi, eta of each point and whether it was mirrored into a half template; SceneError off the film."""
         points = np.asarray(points, dtype=float)
         off = ~(np.hypot(points[:, 0], points[:, 1]) <= self.film.radius * (1.0 + 1e-9))
         if off.any():
@@ -212,7 +217,8 @@ class Equilibrium:
         film = _on_axis(points, self.at) / self.film.radius
         mirrored = (film.imag < 0.0) & self.mesh.half
         film = np.where(self.mesh.half, film.real + 1j * np.abs(film.imag), film)
-        return *self.placement.spread(film.size).locate(self.mesh, film), mirrored
+        element, xi, eta = self.placement.batch().locate(self.mesh, film[None])
+        return element[0], xi[0], eta[0], mirrored
 
 
 def _on_axis(points: Array, at: tuple[float, float]) -> Complexes:

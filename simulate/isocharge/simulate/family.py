@@ -10,7 +10,7 @@ from isocharge.simulate.membrane import turn_stress
 from isocharge.simulate.spectral import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.template import Template
 
-TURNS = 9
+TURNS = 7
 """Orientations at least: the film's rim, far from the probe, is felt by its first few harmonics only."""
 
 

@@ -28,7 +28,7 @@ from isocharge.simulate.probe import Probe
 from isocharge.simulate.scaling import amplitude_squared
 from isocharge.simulate.sensor import Film, Sensor, Surface
 from isocharge.simulate.solve import check_scene, press
-from isocharge.simulate.spectral import tensor_basis
+from isocharge.simulate.spectral import tensor_values
 from isocharge.simulate.template import Resolution
 from isocharge.simulate.theory import ACCURACY, Theory, theory_for
 
@@ -110,7 +110,7 @@ class ForwardMap:
         layer = layer_for(film, float(np.sqrt(force_range[0] * force_range[1])))
         resolution = resolution or resolution_for(film, probe, (radius, 0.0), theory, accuracy, layer)
         error = np.inf
-        for count in ((8, 3), (11, 5), (15, 8)):
+        for count in ((5, 3), (8, 5), (13, 8)):
             family = Family.spread(radius, force_range, count, probe.period)
             table = _solve_family(film, probe, sensor.surface, family, theory, resolution, layer, executor, progress)
             made = cls(sensor, probe, family, theory, resolution, layer, table, error)
@@ -131,6 +131,11 @@ class ForwardMap:
     def force_range(self) -> tuple[float, float]:
         """Smallest and largest force covered, N."""
         return self.family.force_range
+
+    @property
+    def solves(self) -> int:
+        """How many equilibria the map was made from."""
+        return self.family.distance.size * self.family.force.size * self.family.solved_turns.size
 
     def forward(self, x: Array, y: Array, force: Array, orientation: Array | float = 0.0) -> Array:
         """Touch charges.
@@ -223,17 +228,13 @@ class ForwardMap:
         film = points * np.exp(-1j * angle)[:, None]
         mirrored = (film.imag < 0.0) & mesh.half
         film = np.where(mesh.half, film.real + 1j * np.abs(film.imag), film)
-        which = np.repeat(press_index, film.shape[1])
-        element, xi, eta = placement[which].locate(mesh, film.ravel())
-        values, _ = tensor_basis(self.resolution.order, xi, eta)
-        nodal = field.reshape(len(field), mesh.n_element, -1, 3)[which, element]
-        local = np.matmul(values[:, None, :], nodal).reshape(*film.shape, 3)
-        if mesh.half:
-            local[mirrored, 2] *= -1.0
-            turned = angle
-        else:
-            turned = angle + frame[press_index]
-        charge: Array = np.einsum("kpc,kpc->k", turn_stress(local, turned[:, None]), readout.weights[electrode])
+        element, xi, eta = placement[press_index].locate(mesh, film)
+        values = tensor_values(self.resolution.order, xi.ravel(), eta.ravel())
+        nodal = field.reshape(len(field), mesh.n_element, -1, 3)[press_index[:, None], element]
+        local = np.matmul(values[:, None, :], nodal.reshape(*values.shape, 3)).reshape(*film.shape, 3)
+        local[mirrored, 2] *= -1.0
+        stress = turn_stress(local, (angle if mesh.half else angle + frame[press_index])[:, None])
+        charge: Array = np.einsum("kpc,kpc->k", stress, readout.weights[electrode])
         return charge
 
 

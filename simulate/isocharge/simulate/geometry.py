@@ -40,10 +40,10 @@ class Geometry:
         mass = jacobian_at(at_nodes[:, None], points) * node_weights
         return cls(template.nodes, gradient, area, load / (template.copies * area[inner].sum()), mass)
 
-
     def gather(self, local: Array) -> Array:
         """Add up element contributions of shape (n_element, n_local) at the nodes, shape (n_node,)."""
-        return np.bincount(self.nodes.ravel(), local.ravel(), self.load.size)
+        gathered: Array = np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64)
+        return gathered
 
 
 @lru_cache(maxsize=16)

@@ -85,7 +85,7 @@ class Membrane:
 
     def _stretch(self, slope: Array) -> Array:
         """F with index (..., derivative, component)."""
-        stretch = slope * self._scale
+        stretch: Array = slope * self._scale
         stretch[..., 0, 0] += 1.0
         stretch[..., 1, 1] += 1.0
         return stretch
@@ -144,6 +144,7 @@ class Membrane:
         block[..., 0, 1] = plane * poisson * a * d + shear * b * c
         block[..., 1, 0] = plane * poisson * b * c + shear * a * d
         return block
+
 
 def _tensor(total: Array) -> Array:
     """(S11, S22, S12) as matrices, shape (..., 2, 2)."""

@@ -85,9 +85,7 @@ def too_near_the_rim(film: Film, probe: Probe, at: tuple[float, float], resoluti
     )
 
 
-def _ladder(
-    film: Film, probe: Probe, at: tuple[float, float], theory: Theory, accuracy: float
-) -> Iterator[Resolution]:
+def _ladder(film: Film, probe: Probe, at: tuple[float, float], theory: Theory, accuracy: float) -> Iterator[Resolution]:
     """Meshes from coarse to fine; the first is enough in the inner half of the film."""
     placement = place(film, probe, at, Resolution(2, 8, 1), 0.1)
     stretch = float((1.0 + placement.c) / (1.0 - placement.c))

@@ -15,7 +15,7 @@ from isocharge.simulate.elastic import ElasticFilm
 from isocharge.simulate.scaling import Groups
 
 GUARD_TENSION = 0.4
-"""Tension added to the tangent at a relative residual of one, over a slack film's under the load (5 MPa at 25 um, 1 N)."""
+"""Tension added to the tangent at a relative residual of one, over a slack film's own (5 MPa at 25 um and 1 N)."""
 
 GUARD_BELOW = 1e-2
 """Relative residual below which the tangent is left as it is."""

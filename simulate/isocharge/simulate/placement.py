@@ -17,7 +17,7 @@ of the film are found in the mesh by closed formulas and, inside the circle, a f
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -88,17 +88,18 @@ class Placement:
             centre, radius = _enclosing(corners, at)
         c, rho = _conformal(centre, radius)
         start = _sectors(mesh, corners, centre, radius, c * rho)
-        return cls(c, rho, corners, start, _graded(start, c, rho), _rings(mesh.resolution, rho, layer * (1.0 + c) / (1.0 - c)))
+        depth = _rings(mesh.resolution, rho, layer * (1.0 + c) / (1.0 - c))
+        return cls(c, rho, corners, start, _graded(start, c, rho), depth)
 
     def __getitem__(self, which: Integers) -> "Placement":
         """Some of the placements."""
         return Placement(*(value[which] for value in self._values()))
 
-    def spread(self, count: int) -> "Placement":
-        """One placement as one for each of `count` points."""
-        return Placement(*(np.broadcast_to(value, (count, *np.shape(value))) for value in self._values()))
+    def batch(self) -> "Placement":
+        """One placement as a batch of one."""
+        return Placement(*(np.asarray(value)[None] for value in self._values()))
 
-    def _values(self) -> tuple[Array, ...]:
+    def _values(self) -> tuple[Any, ...]:
         return self.c, self.rho, self.corners, self.start, self.end, self.depth
 
     def to_film(self, z: Complexes) -> Complexes:
@@ -112,11 +113,6 @@ class Placement:
         c = self.c[..., None]
         z: Complexes = (film - c) / (1.0 - c * film)
         return z
-
-    def _on_circle(self, sector: Integers, t: Array) -> Complexes:
-        """Film points on the circle at the share t of a sector, shape (..., n)."""
-        low, high = (np.take_along_axis(self.start, sector + i, axis=-1) for i in (0, 1))
-        return self.to_film(self.rho[..., None] * np.exp(1j * (low + t * (high - low))))
 
     def element_points(self, mesh: Template) -> Complexes:
         """Film points of every element's nodes for one placement, shape (n_element, (order + 1)^2), unit radius."""
@@ -134,35 +130,49 @@ class Placement:
         return np.concatenate([inner, outside.reshape(-1, v.size)])
 
     def locate(self, mesh: Template, film: Complexes) -> tuple[Integers, Array, Array]:
-        """Find film points in the mesh; one placement per point.
+        """Find film points in the mesh, so many for each placement.
 
         Args:
             mesh: The template.
-            film: Points (unit radius), shape (n,); in the upper half for a half template. The attributes have that
-                leading axis too.
+            film: Points (unit radius), shape (k, n) where the attributes have one leading axis of length k; in the
+                upper half for a half template.
 
         Returns:
-            Element, xi and eta, each of shape (n,).
+            Element, xi and eta, each of shape (k, n).
         """
-        z = self.to_template(film[:, None])[:, 0]
-        outside = np.abs(z) > self.rho
-        element = np.empty(z.shape, dtype=np.intp)
-        v, t = np.empty(z.shape), np.empty(z.shape)
-        element[outside], v[outside], t[outside] = self[outside]._locate_rings(mesh, z[outside])
-        element[~outside], v[~outside], t[~outside] = self[~outside]._locate_inner(mesh, film[~outside])
+        z = self.to_template(film)
+        element, v, t = self._locate_rings(mesh, z)
+        inside = np.nonzero(np.abs(z) <= self.rho[:, None])
+        if inside[0].size:
+            element[inside], v[inside], t[inside] = self[inside[0]]._locate_inner(mesh, film[inside])
         return element, 2.0 * v - 1.0, 2.0 * t - 1.0
 
     def _locate_rings(self, mesh: Template, z: Complexes) -> tuple[Integers, Array, Array]:
-        depth = np.clip(1.0 - np.log(np.abs(z)) / np.log(self.rho), 0.0, 1.0)
-        ring, v = _interval(self.depth, depth)
-        edges = (1.0 - depth)[:, None] * self.start + depth[:, None] * self.end
+        with np.errstate(divide="ignore"):
+            depth = np.clip(1.0 - np.log(np.abs(z)) / np.log(self.rho)[:, None], 0.0, 1.0)
+        ring = np.sum(self.depth[:, None, 1:-1] <= depth[..., None], axis=-1)
+        low, high = (np.take_along_axis(self.depth, ring + i, axis=1) for i in (0, 1))
+
+        def edge(number: Integers) -> Array:
+            start, end = (np.take_along_axis(angles, number, axis=1) for angles in (self.start, self.end))
+            at: Array = start + depth * (end - start)
+            return at
+
         angle = np.angle(z)
         if not mesh.half:
-            angle = edges[:, 0] + np.mod(angle - edges[:, 0], 2.0 * np.pi)
-        sector, t = _interval(edges, angle)
-        return mesh.n_inner + ring * mesh.n_sector + sector, v, t
+            first = edge(np.zeros_like(ring))
+            angle = first + np.mod(angle - first, 2.0 * np.pi)
+        turn = (self.end - self.start)[:, None, 1:-1]
+        sector = np.sum(self.start[:, None, 1:-1] + depth[..., None] * turn <= angle[..., None], axis=-1)
+        before, after = edge(sector), edge(sector + 1)
+        return (
+            mesh.n_inner + ring * mesh.n_sector + sector,
+            (depth - low) / (high - low),
+            (angle - before) / (after - before),
+        )
 
     def _locate_inner(self, mesh: Template, film: Complexes) -> tuple[Integers, Array, Array]:
+        """Points inside the circle, one for each placement; all of shape (n,)."""
         a, b, c, d = np.moveaxis(np.einsum("ekn,pn->pek", mesh.straight, self.corners), -1, 0)
         circle = self.to_film(self.rho[:, None] * np.exp(1j * self.start))
         c[:, mesh.n_quad :], d[:, mesh.n_quad :] = circle[:, :-1], circle[:, 1:]
@@ -176,7 +186,7 @@ class Placement:
     def _invert(
         self, mesh: Template, film: Complexes, element: Integers, a: Complexes, b: Complexes, c: Complexes, d: Complexes
     ) -> tuple[Array, Array]:
-        """(v, t) of points in given elements inside the circle: Newton on two equations, to round-off in a few steps."""
+        """(v, t) of points in given elements inside the circle: Newton on two equations, to round-off in a few."""
         arc = element >= mesh.n_quad
         sector = np.where(arc, element - mesh.n_quad, 0)
         v, t = np.full(film.shape, 0.5), np.full(film.shape, 0.5)
@@ -277,13 +287,6 @@ def _rings(resolution: Resolution, rho: Array, layer: Array) -> Array:
     outer = 1.0 - thin * 3.0 ** -np.arange(1.0, resolution.rim + 1)
     outer[..., -1] = 1.0
     return np.concatenate([inner, outer], axis=-1)
-
-
-def _interval(edges: Array, at: Array) -> tuple[Integers, Array]:
-    """Interval number and share within it; edges ascending, shape (n, n_interval + 1), at of shape (n,)."""
-    index = np.clip(np.sum(edges[:, 1:-1] <= at[:, None], axis=1), 0, edges.shape[1] - 2)
-    low, high = (np.take_along_axis(edges, (index + i)[:, None], axis=1)[:, 0] for i in (0, 1))
-    return index, (at - low) / (high - low)
 
 
 def _left(start: Complexes, end: Complexes, at: Complexes) -> Array:

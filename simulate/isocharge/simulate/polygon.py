@@ -1,5 +1,7 @@
 """Convex polygons and disks in the plane: area, centroid, convexity, and how much of one lies in another."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from isocharge.simulate.arrays import Array, Complexes
@@ -80,6 +82,6 @@ def _sector_of_edge(start: complex, end: complex, radius: float) -> float:
     half = np.sqrt(max(radius**2 - height**2, 0.0))
     inside = np.clip([low, high], -half, half)
     points = [start, *((inside + 1j * height) * along), end]
-    turns = [np.angle(b * np.conj(a)) if a != 0.0 and b != 0.0 else 0.0 for a, b in zip(points, points[1:], strict=False)]
+    turns = [np.angle(b * np.conj(a)) if a != 0.0 and b != 0.0 else 0.0 for a, b in pairwise(points)]
     triangle = -0.5 * height * (inside[1] - inside[0])
     return float(triangle + 0.5 * radius**2 * (turns[0] + turns[2]))

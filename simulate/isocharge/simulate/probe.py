@@ -5,6 +5,7 @@
 a probe is the centroid of its footprint.
 """
 
+import math
 import re
 from dataclasses import dataclass, replace
 from typing import TypeAlias
@@ -152,8 +153,8 @@ class Polygon:
         for step in range(1, z.size):
             turn = np.exp(2j * np.pi * step / z.size)
             if z.size % step == 0 and np.allclose(np.roll(z, -step), z * turn, rtol=0.0, atol=1e-9 * self.reach):
-                return 2.0 * np.pi * step / z.size
-        return 2.0 * np.pi
+                return math.tau * step / z.size
+        return math.tau
 
     def turned(self, angle: float) -> "Polygon":
         """The footprint turned about its centroid by a further angle (rad)."""

@@ -122,9 +122,7 @@ def press(
     return solved
 
 
-def _layer(
-    film: Film, force: float, probe: Probe, resolution: Resolution | None, start: Equilibrium | None
-) -> float:
+def _layer(film: Film, force: float, probe: Probe, resolution: Resolution | None, start: Equilibrium | None) -> float:
     """Width of the thin rings: the scene's own, or the start's where that will do."""
     own = layer_for(film, force)
     if start is None or not LAYER_REUSE[0] < start.layer / own < LAYER_REUSE[1]:

@@ -36,7 +36,7 @@ def lobatto_weights(order: int) -> Array:
 @lru_cache(maxsize=32)
 def lobatto_quadrature(order: int) -> Array:
     """Weights of the Gauss-Lobatto rule on `lobatto_nodes`, shape (order + 1,): exact up to degree 2 order - 1."""
-    weights: Array = 2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2)
+    weights: Array = np.asarray(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2))
     weights.flags.writeable = False
     return weights
 
@@ -44,7 +44,7 @@ def lobatto_quadrature(order: int) -> Array:
 @lru_cache(maxsize=32)
 def modal_matrix(order: int) -> Array:
     """Matrix from values on `lobatto_nodes` to Legendre coefficients, shape (order + 1, order + 1)."""
-    matrix: Array = np.linalg.inv(np.polynomial.legendre.legvander(lobatto_nodes(order), order))
+    matrix: Array = np.linalg.inv(np.polynomial.legendre.legvander(lobatto_nodes(order), order)).astype(np.float64)
     matrix.flags.writeable = False
     return matrix
 
@@ -104,16 +104,18 @@ def basis(order: int, at: Array) -> tuple[Array, Array]:
     return values, values @ derivative_matrix(order)
 
 
-def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
-    """Basis on the square [-1, 1]^2, nodes in tensor order (xi fast).
+def tensor_values(order: int, xi: Array, eta: Array) -> Array:
+    """Basis on the square [-1, 1]^2, nodes in tensor order (xi fast), at points of shape (n,): (n, (order + 1)^2)."""
+    nodes, weights = lobatto_nodes(order), lobatto_weights(order)
+    return _product(lagrange_values(nodes, weights, xi), lagrange_values(nodes, weights, eta))
 
-    Returns:
-        Values (n, (order + 1)^2) and derivatives by xi and eta (2, n, (order + 1)^2) at points of shape (n,).
-    """
+
+def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
+    """Values as `tensor_values` and derivatives by xi and eta, shape (2, n, (order + 1)^2)."""
     in_xi, d_xi = basis(order, xi)
     in_eta, d_eta = basis(order, eta)
+    return _product(in_xi, in_eta), np.stack([_product(d_xi, in_eta), _product(in_xi, d_eta)])
 
-    def product(a: Array, b: Array) -> Array:
-        return (b[:, :, None] * a[:, None, :]).reshape(len(a), b.shape[1] * a.shape[1])
 
-    return product(in_xi, in_eta), np.stack([product(d_xi, in_eta), product(in_xi, d_eta)])
+def _product(a: Array, b: Array) -> Array:
+    return (b[:, :, None] * a[:, None, :]).reshape(len(a), b.shape[1] * a.shape[1])

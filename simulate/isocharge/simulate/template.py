@@ -13,6 +13,7 @@ symmetric about the line through the film's centre, only the upper half is meshe
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -101,7 +102,7 @@ class Template:
         for i in range(self.n_meshed):
             stops += [unit[i], middle[i]]
         share = np.arange(self.split)[:, None] / self.split
-        parts = [a + share * (b - a) for a, b in zip(stops, stops[1:], strict=False)]
+        parts = [a + share * (b - a) for a, b in pairwise(stops)]
         return np.concatenate([*parts, stops[-1][None]])
 
     @cached_property
@@ -114,11 +115,19 @@ class Template:
         k, hub = self.split, np.full(self.n_corner, 1.0 / self.n_corner)
         parts = []
         for i in range(self.n_meshed):
-            before, corner, after = self.boundary[2 * k * i], self.boundary[2 * k * i + k], self.boundary[2 * k * (i + 1)]
-            grid = np.array([[_bilinear(hub, after, before, corner, v / k, t / k) for t in range(k + 1)] for v in range(k + 1)])
-            parts += [[grid[v, t], grid[v, t + 1], grid[v + 1, t], grid[v + 1, t + 1]] for v in range(k) for t in range(k)]
+            before, corner, after = (
+                self.boundary[2 * k * i],
+                self.boundary[2 * k * i + k],
+                self.boundary[2 * k * (i + 1)],
+            )
+            grid = np.array(
+                [[_bilinear(hub, after, before, corner, v / k, t / k) for t in range(k + 1)] for v in range(k + 1)]
+            )
+            parts += [
+                [grid[v, t], grid[v, t + 1], grid[v + 1, t], grid[v + 1, t + 1]] for v in range(k) for t in range(k)
+            ]
         void = np.zeros(self.n_corner)
-        parts += [[a, b, void, void] for a, b in zip(self.boundary, self.boundary[1:], strict=False)]
+        parts += [[a, b, void, void] for a, b in pairwise(self.boundary)]
         return np.array(parts)
 
     def turned(self, fold: int, folds: int) -> Integers:

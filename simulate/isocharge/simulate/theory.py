@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.errors import SceneError
-from isocharge.simulate.scaling import Groups, slenderness
+from isocharge.simulate.scaling import Groups
 from isocharge.simulate.sensor import Film, Sensor
 
 ACCURACY = 1e-3
