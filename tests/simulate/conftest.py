@@ -34,8 +34,8 @@ from isocharge.simulate.scaling import Groups
 from isocharge.simulate.template import Template
 
 DATA = Path(__file__).parents[1] / "data"
+TURNED = Polygon.rectangle(4e-3, 2e-3, 0.3)
 FULL = Theory(stretching=True, bending=True, pretensioned=False)
-MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
 
 
 # The independent reference cases
@@ -165,9 +165,7 @@ PROBES = {
     "circle": Circle(0.11),
     "triangle": Polygon.triangle(0.2, 0.4),
     "rectangle": Polygon.rectangle(0.2, 0.1, 0.7),
-    "pentagon": Polygon.of(
-        0.1 * np.array([(1.0, 0.0), (0.3, 1.0), (-0.8, 0.6), (-0.9, -0.5), (0.2, -0.8)]), angle=0.2
-    ),
+    "pentagon": Polygon.of(0.1 * np.array([(1.0, 0.0), (0.3, 1.0), (-0.8, 0.6), (-0.9, -0.5), (0.2, -0.8)]), angle=0.2),
 }
 
 
@@ -191,7 +189,7 @@ def made_up() -> Callable[..., Equilibrium]:
         *,
         amplitude2: float = 0.1,
         of: Film | None = None,
-        probe: Probe = Polygon.rectangle(4e-3, 2e-3, 0.3),
+        probe: Probe = TURNED,
         theory: Theory = FULL,
     ) -> Equilibrium:
         of = of or load_sensor("three-25um-biaxial").film

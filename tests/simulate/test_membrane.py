@@ -65,7 +65,8 @@ def test_energy_of_a_smooth_field_is_scipys_integral(mesh_of, probe):
     scene, odd = groups(0.2, 0.4), 0.0 if isinstance(probe, Circle) else 1.0
     mesh = mesh_of(probe, (0.3, 0.0), Resolution(8, 8, 4))
     x, y = mesh.points.T
-    field = np.stack([0.3 * x * x + odd * 0.3 * x * y, 0.2 * x * y - odd * 0.2 * x, 0.5 * x**2 - odd * 0.3 * x * y], axis=1)
+    xy = odd * x * y
+    field = np.stack([0.3 * x * x + 0.3 * xy, 0.2 * x * y - odd * 0.2 * x, 0.5 * x**2 - 0.3 * xy], axis=1)
 
     def density(r: float, t: float) -> float:
         x, y = r * np.cos(t), r * np.sin(t)

@@ -106,7 +106,10 @@ def test_wrong_notation_is_shown(text):
         parse_probe(text)
 
 
-@given(text=st.text(max_size=12) | st.from_regex(r"(circle|rectangle|triangle|polygon):[0-9.,;x@e+-]{0,14}", fullmatch=True))
+NEARLY = st.from_regex(r"(circle|rectangle|triangle|polygon):[0-9.,;x@e+-]{0,14}", fullmatch=True)
+
+
+@given(text=st.text(max_size=12) | NEARLY)
 @COMMON
 def test_any_text_is_a_probe_or_a_scene_error(text):
     with suppress(SceneError):
