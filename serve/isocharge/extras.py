@@ -6,7 +6,11 @@ from contextlib import contextmanager
 from isocharge.errors import MissingExtra
 
 SIMULATE = frozenset({"scipy", "threadpoolctl", "matplotlib"})
-PACKAGES = {"simulate": SIMULATE, "train": SIMULATE | {"torch", "onnx"}}
+PACKAGES = {
+    "simulate": SIMULATE,
+    "train": SIMULATE | {"torch", "onnx"},
+    "cluster": frozenset({"dask", "distributed"}),
+}
 """Import names that come with an extra of pyproject.toml."""
 
 

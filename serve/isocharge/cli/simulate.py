@@ -1,10 +1,7 @@
 """`isocharge simulate ...`: one press, or a dataset of many."""
 
 import json as json_module
-import signal
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
@@ -12,17 +9,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from isocharge.cli.terminal import progress, say
+from isocharge.cli.terminal import progress_rows, say
 from isocharge.errors import InputError
-from isocharge.files import refuse_existing
 
 if TYPE_CHECKING:
     from isocharge.simulate import Equilibrium, Sensor
     from isocharge.simulate.arrays import Array
+    from isocharge.simulate.workers import Workers
 
 simulate_app = typer.Typer(no_args_is_help=True, help="From a press to the charges of the electrodes.")
 
 PROBE_HELP = "What presses, mm: circle:R, rectangle:WxH, triangle:SIDE, polygon:X,Y;X,Y;..., each turned by @DEGREES."
+
+MOST_WORKERS = 64
+
+SWEEP_ROWS = (("solving the film", "solves"), ("pressing", "presses"))
+"""Titles and units of a sweep's progress."""
 
 SensorArgument = Annotated[str, typer.Argument(metavar="SENSOR", help="Built-in sensor, or a TOML file.")]
 
@@ -32,6 +34,14 @@ class Orientation(StrEnum):
 
     fixed = "fixed"
     random = "random"
+
+
+class Sampling(StrEnum):
+    """How the presses of a sweep are spread."""
+
+    sobol = "sobol"
+    random = "random"
+    grid = "grid"
 
 
 @simulate_app.command("point")
@@ -120,41 +130,57 @@ def sweep_command(
     ] = (0.05, 2.0),
     samples: Annotated[int, typer.Option("--samples", help="How many presses.")] = 20_000,
     orientation: Annotated[
-        Orientation, typer.Option("--orientation", help="Turn the probe in each press.")
+        Orientation, typer.Option("--orientation", help="Turn the probe further in each press.")
     ] = Orientation.fixed,
+    sampling: Annotated[
+        Sampling, typer.Option("--sampling", help="How the presses are spread; a grid takes at most --samples.")
+    ] = Sampling.sobol,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the presses.")] = 0,
     workers: Annotated[
-        int, typer.Option("--workers", min=1, max=64, help="Processes; the data do not depend on them.")
-    ] = 1,
+        int | None,
+        typer.Option(
+            "--workers", min=1, max=MOST_WORKERS, help="Processes; the data do not depend on them. (default: cores)"
+        ),
+    ] = None,
+    cluster: Annotated[
+        str | None, typer.Option("--cluster", metavar="ADDR", help="Dask cluster instead, as tcp://10.0.0.1:8786.")
+    ] = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Throw away what a stopped run left.")] = False,
 ) -> None:
     """Simulate many presses, spread over the working area and the forces, and write them as a dataset.
 
+    A run that was stopped or killed leaves DIR.part; the same command goes on from there and writes the same bytes.
+
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
-    from isocharge.simulate import Sweep, load_sensor, parse_probe, solve_maps, write_sweep
+    from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
 
-    refuse_existing(output)
-    film_sensor, probes = load_sensor(sensor), tuple(parse_probe(text) for text in probe or ["circle:1.0"])
-    sweep = Sweep(radius * 1e-3, force, samples, seed, orientation.value)
-    with progress("solving the film") as advance, _pool(workers) as executor:
-        maps = solve_maps(film_sensor, probes, sweep, executor=executor, progress=advance)
-    folder = write_sweep(output, maps, sweep)
-    say(f"{samples} presses in {folder}")
-
-
-@contextmanager
-def _pool(workers: int) -> Iterator[Executor | None]:
-    """Worker processes that end with the command, whatever ends it; none for one worker."""
-    if workers == 1:
-        yield None
-        return
-    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts_to_the_parent)
+    if workers and cluster:
+        raise InputError("expected either --workers or --cluster, got both")
+    film_sensor, probes = load_sensor(sensor), [parse_probe(text) for text in probe or ["circle:1.0"]]
+    sweep = Sweep(radius * 1e-3, force, samples, seed, orientation.value, sampling.value)
     try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
+        with _crew(workers, cluster) as crew, progress_rows(*SWEEP_ROWS) as (solving, sampled):
+            run_sweep(
+                output,
+                film_sensor,
+                probes,
+                sweep,
+                executor=crew.executor,
+                ahead=crew.ahead,
+                fresh=fresh,
+                progress=solving,
+                sampled=sampled,
+                warn=say,
+            )
+    except KeyboardInterrupt:
+        if (part := output.with_name(f"{output.name}.part")).exists():
+            say(f"stopped; what is done is kept in {part}, and the same command goes on")
+        raise
+    say(f"{json_module.loads((output / 'manifest.json').read_text())['samples']} presses in {output}")
 
 
-def _leave_interrupts_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+def _crew(workers: int | None, cluster: str | None) -> AbstractContextManager["Workers"]:
+    from isocharge.simulate.workers import cores, dask_workers, local_workers
+
+    return dask_workers(cluster) if cluster else local_workers(workers or min(cores(), MOST_WORKERS))
