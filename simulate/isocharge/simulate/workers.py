@@ -30,7 +30,7 @@ Result = TypeVar("Result")
 AHEAD = 16
 """Tasks handed out before the first is back."""
 
-CONNECT_S = 20.0
+CONNECT_S = 10.0
 """How long a cluster may take to answer."""
 
 
