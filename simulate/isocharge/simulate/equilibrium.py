@@ -171,7 +171,7 @@ class Equilibrium:
         return stress(strained, self.groups.poisson)
 
     def _bent_strain(self, hessian: Array) -> Array:
-        """Scaled strain (E11, E22, 2 E12) of bending at the side that the probe touches; `hessian` of W, (..., 2, 2)."""
+        """Scaled strain (E11, E22, 2 E12) of bending at the side that the probe touches, `hessian` that of W."""
         half = 0.5 * self.film.thickness / (self.film.radius * np.sqrt(self.groups.amplitude2))
         bent: Array = half * np.stack(
             [hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1] + hessian[..., 1, 0]], axis=-1

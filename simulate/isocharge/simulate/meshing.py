@@ -94,7 +94,8 @@ def _ladder(film: Film, probe: Probe, at: tuple[float, float], theory: Theory, a
     base = Resolution(
         order=(5 if theory.bending else 4) + sharper,
         around=16 if crowded else 8,
-        rings=max(3, math.ceil(-1.3 * math.log(float(placement.rho)) + 2.0 * math.log(stretch))) + sharper // 2,
+        rings=max(3, math.ceil(-1.3 * math.log(float(placement.rho)) + min(2.0 * math.log(stretch), 4.0)))
+        + sharper // 2,
         rim=1 + (stretch > 2.5) + (stretch > 8.0) if theory.bending else 0,
     )
     for order, around in FINER:
@@ -131,7 +132,7 @@ def decay(mesh: Template, geometry: Geometry, slope: Array) -> float:
     total = power.sum(axis=(1, 2))
     top = total - power[:, :-1, :-1].sum(axis=(1, 2))
     area = geometry.weights.sum(axis=1)
-    return float(np.sum(area * np.sqrt(top * total)) / max(np.sum(area * total), 1e-300))
+    return float(np.sum(area * np.sqrt(np.maximum(top, 0.0) * total)) / max(np.sum(area * total), 1e-300))
 
 
 def mesh_error(mesh: Template, geometry: Geometry, slope: Array) -> float:

@@ -34,7 +34,7 @@ DIAGONALS = np.array([0.25, 0.75, 1.25, 1.75])
 CLEARANCE = 0.4
 """Room between a polygon's farthest corner and the circle round it, in units of that corner's distance."""
 
-GRADING = 0.5
+GRADING = 0.65
 """How much of the map's stretching round the rim the sectors take up there: none 0, all 1."""
 
 NEWTON_STEPS = 20
