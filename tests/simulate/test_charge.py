@@ -6,7 +6,20 @@ import numpy as np
 import pytest
 
 from isocharge.errors import SensorError
-from isocharge.simulate import Circle, Electrode, Piezo, Sensor, load_sensor, press, touch_charge
+from isocharge.simulate import (
+    Calibration,
+    Circle,
+    Electrode,
+    Piezo,
+    Polygon,
+    Sensor,
+    contact_charge,
+    load_sensor,
+    press,
+    pretension_charge,
+    thermal_charge,
+    touch_charge,
+)
 from isocharge.simulate.charge import COARSE, FINE, ReadoutPoints
 
 AREA, D31, D32 = 9e-6, 20e-12, 2e-12
@@ -30,9 +43,10 @@ def test_uniform_stress(sensor, per_side):
     np.testing.assert_allclose(charge, AREA * (D31 * 10e6 + D32 * 4e6), rtol=1e-13)
 
 
-def test_uniform_stress_through_the_public_function(sensor, linear_equilibrium):
+def test_uniform_stress_through_the_public_function(sensor, made_up):
     """The same, from a linear displacement field: strain e11 = 0.3 A^2, nothing else."""
-    stretched = linear_equilibrium(np.array([[0.3, 0.0, 0.0], [0.0, 0.0, 0.0]]), amplitude2=1e-9)
+    gradient = np.array([[0.3, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    stretched = made_up(lambda x: x @ gradient, amplitude2=1e-9)
     s11 = sensor.film.young * 1e-9 * 0.3 / (1.0 - 0.34**2)
     np.testing.assert_allclose(touch_charge(sensor, stretched), AREA * (D31 + D32 * 0.34) * s11, rtol=1e-8)
 
@@ -128,22 +142,77 @@ def test_fine_and_coarse_rules_agree_away_from_the_probe(film):
     np.testing.assert_allclose(stress[0], stress[1], rtol=3e-5)
 
 
-@pytest.mark.parametrize("surface", ["top", "bottom"])
-def test_surface_readout_is_refused(film, surface):
-    sensor = replace(load_sensor("three-25um-biaxial"), surface=surface)
-    with pytest.raises(SensorError, match=f"surface '{surface}' needs bending, .* use 'middle'"):
-        touch_charge(sensor, press(film, Circle(1e-3), (0.0, 0.0), 1.0))
-
-
-def test_contact_pressure_is_refused(film):
-    sensor = load_sensor("three-25um-biaxial")
-    sensor = replace(sensor, piezo=replace(sensor.piezo, d33=-30e-12))
-    with pytest.raises(SensorError, match="piezo d33 = -30 pC/N: this version does not model contact pressure; use 0"):
-        touch_charge(sensor, press(film, Circle(1e-3), (0.0, 0.0), 1.0))
-
-
 def test_another_film_is_refused(film):
     sensor = load_sensor("three-25um-biaxial")
     other = press(replace(film, young=2.5e9), Circle(1e-3), (0.0, 0.0), 1.0)
     with pytest.raises(SensorError, match=r"another film: expected Film\(.*young=3000000000.*got .*young=2500000000"):
         touch_charge(sensor, other)
+
+
+# Contact pressure, d33
+
+
+def with_d33(name: str = "four-25um-uniaxial", d33: float = -30e-12, **changes) -> Sensor:
+    sensor = load_sensor(name)
+    return replace(sensor, piezo=replace(sensor.piezo, d33=d33), **changes)
+
+
+@pytest.mark.parametrize(
+    ("probe", "at_mm", "covered_mm2"),
+    [
+        (Circle(1e-3), (10.0, 0.0), np.pi),  # the whole footprint on A
+        (Circle(5e-3), (10.0, 0.0), 9.0),  # the whole electrode under it
+        (Circle(1e-3), (8.5, 0.0), 0.5 * np.pi),  # about an edge
+        (Circle(1e-3), (8.5, 1.5), 0.25 * np.pi),  # about a corner
+        (Circle(1e-3), (5.0, 0.0), 0.0),
+        (Polygon.rectangle(2e-3, 1e-3), (8.5, 0.0), 1.0),
+        (Polygon.rectangle(2e-3, 1e-3, np.pi / 2), (8.5, 1.5), 0.5),
+        (Polygon.rectangle(2e-3, 2e-3, np.pi / 4), (8.5, 0.0), 2.0),
+        (Polygon.triangle(1e-3), (10.0, 0.0), np.sqrt(3) / 4),
+    ],
+)
+def test_contact_pressure_counts_where_it_lies_on_the_electrode(probe, at_mm, covered_mm2):
+    """Q = -d33 F / (footprint) * overlap: positive for PVDF's negative d33; nothing on the others."""
+    at = (at_mm[0] * 1e-3, at_mm[1] * 1e-3)
+    charge = contact_charge(with_d33(), probe, at, 0.7)
+    assert charge[0] == pytest.approx(30e-12 * 0.7 / probe.area * covered_mm2 * 1e-6, rel=1e-9, abs=1e-24)
+    np.testing.assert_allclose(charge[1:], 0.0, atol=1e-24)
+
+
+def test_contact_charge_is_in_the_touch_charge(film):
+    solved = press(film, Polygon.triangle(3e-3, 0.3), (9e-3, 1e-3), 0.5)
+    plain = touch_charge(with_d33(d33=0.0), solved)
+    extra = contact_charge(with_d33(), solved.probe, solved.at, 0.5)
+    np.testing.assert_allclose(touch_charge(with_d33(), solved) - plain, extra, rtol=1e-9, atol=1e-22)
+    assert extra[0] > 1e-12
+
+
+def test_contact_charge_follows_gain_and_place_of_the_electrodes():
+    """A layout that is shifted to where the probe is, read with a gain of two."""
+    calibration = Calibration(gain={"A": 2.0}, shift=(2e-3, 0.0))
+    still = contact_charge(with_d33(), Circle(1e-3), (8.5e-3, 0.2e-3), 1.0)
+    moved = contact_charge(with_d33(calibration=calibration), Circle(1e-3), (10.5e-3, 0.2e-3), 1.0)
+    np.testing.assert_allclose(moved, [2.0 * still[0], 0.0, 0.0, 0.0], rtol=1e-9, atol=1e-24)
+
+
+# Charges without a touch
+
+
+@pytest.mark.parametrize("readout", ["area", "edge"])
+def test_pretension_charge(film, readout):
+    """1 MPa both ways on 9 mm^2: (20 + 2) pC/N; with gains."""
+    sensor = replace(load_sensor("four-25um-uniaxial"), film=replace(film, pretension=1e6), readout=readout)
+    sensor = replace(sensor, calibration=Calibration(gain={"B": 1.5}))
+    np.testing.assert_allclose(pretension_charge(sensor), 198e-12 * np.array([1.0, 1.5, 1.0, 1.0]), rtol=1e-12)
+    assert not pretension_charge(load_sensor("four-25um-uniaxial")).any()
+
+
+def test_thermal_charge():
+    """30 uC/(m^2 K) on 9 mm^2: 27 pC per 0.1 K (design, section 6), the same on every electrode; more on a larger."""
+    sensor = load_sensor("three-25um-biaxial")
+    sensor = replace(sensor, piezo=replace(sensor.piezo, pyro=30e-6))
+    np.testing.assert_allclose(thermal_charge(sensor, 0.1), 27e-12, rtol=1e-12)
+    np.testing.assert_allclose(thermal_charge(sensor, -0.2), -54e-12, rtol=1e-12)
+    triangle = Electrode("T", ((-12e-3, 4e-3), (-8e-3, 4e-3), (-10e-3, 8e-3)))
+    both = replace(sensor, electrodes=(sensor.electrodes[0], triangle), calibration=Calibration(gain={"T": 0.5}))
+    np.testing.assert_allclose(thermal_charge(both, 0.1), [27e-12, 0.5 * 30e-6 * 8e-6 * 0.1], rtol=1e-12)

@@ -1,21 +1,51 @@
 """Rungs 5 and 6 of the ladder: how fast the error falls, for the energy, the deflection and the charge."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from isocharge.simulate import Circle, Equilibrium, Resolution, load_sensor, press, touch_charge
-from isocharge.simulate.membrane import Geometry, Membrane
-from isocharge.simulate.template import template
+from isocharge.simulate import (
+    Circle,
+    Equilibrium,
+    Film,
+    Polygon,
+    Probe,
+    Resolution,
+    Theory,
+    load_sensor,
+    press,
+    touch_charge,
+)
+from isocharge.simulate.elastic import ElasticFilm
+from isocharge.simulate.geometry import Geometry
 
-ORDERS = (3, 4, 5, 6, 7, 8)
-PRESSES = ((5e-3, 3e-3), (9e-3, -1e-3))
-"""Off centre; the second with its footprint on electrode A of four."""
+ORDERS = (3, 4, 5, 6)
+PROBES = {"circle": Circle(1e-3), "rectangle": Polygon.rectangle(4e-3, 2e-3, 0.5)}
+THEORIES = {
+    "membrane": (25e-6, Theory(stretching=True, bending=False, pretensioned=False)),
+    "membrane + bending": (110e-6, Theory(stretching=True, bending=True, pretensioned=False)),
+    "plate": (1e-3, Theory(stretching=False, bending=True, pretensioned=False)),
+}
+PLACES = np.array([(5e-3, 3e-3), (0.0, 0.0), (-20e-3, 10e-3), (0.0, 40e-3)])
 
 
-@pytest.fixture(scope="module", params=PRESSES, ids=str)
-def solves(film, request) -> list[Equilibrium]:
-    """One press at growing order, the last one as the reference."""
-    return [press(film, Circle(1e-3), request.param, 1.0, resolution=Resolution(n, 8, 6)) for n in (*ORDERS, 10)]
+@pytest.fixture(scope="module", params=PROBES.values(), ids=PROBES.keys())
+def probe(request) -> Probe:
+    return request.param
+
+
+@pytest.fixture(scope="module", params=THEORIES.values(), ids=THEORIES.keys())
+def solves(film, probe, request) -> list[Equilibrium]:
+    """One press off the centre at growing order, the last one as the reference."""
+    thickness, theory = request.param
+    film = replace(film, thickness=thickness)
+
+    def solve(order: int) -> Equilibrium:
+        resolution = Resolution(order, 8, 5, 2 if theory.bending else 0)
+        return press(film, probe, (5e-3, 3e-3), 1.0, theory=theory, resolution=resolution)
+
+    return [solve(order) for order in (*ORDERS, 8)]
 
 
 def rate(errors: list[float]) -> float:
@@ -24,32 +54,71 @@ def rate(errors: list[float]) -> float:
 
 
 def test_deflection_converges_exponentially_with_the_order(solves):
-    points = np.array([solves[0].at, (0.0, 0.0), (-20e-3, 10e-3), (0.0, 40e-3)])
-    *values, reference = (solved.deflection(points) for solved in solves)
-    errors = [np.abs(value / reference - 1.0).max() for value in values]
-    assert rate(errors) > 0.9
-    assert errors[1] < 3e-5
-    assert errors[-1] < 1e-8
+    *values, reference = (solved.deflection(PLACES) for solved in solves)
+    errors = [np.abs(value - reference).max() / reference.max() for value in values]
+    assert rate(errors) > 0.5
+    assert errors[2] < 5e-5
+    assert errors[-1] < 1e-5
 
 
 @pytest.mark.parametrize("name", ["three-25um-biaxial", "four-25um-uniaxial"])
-def test_charge_converges_exponentially_with_the_order(solves, name):
-    *values, reference = (touch_charge(load_sensor(name), solved) for solved in solves)
-    errors = [np.abs(value / reference - 1.0).max() for value in values]
-    assert rate(errors) > 0.9
-    assert errors[1] < 3e-4
-    assert errors[-1] < 1e-7
+@pytest.mark.parametrize("readout", ["area", "edge"])
+def test_charge_converges_exponentially_with_the_order(solves, name, readout):
+    sensor = replace(load_sensor(name), film=solves[0].film, readout=readout)
+    *values, reference = (touch_charge(sensor, solved) for solved in solves)
+    errors = [np.abs(value - reference).max() / np.abs(reference).max() for value in values]
+    assert rate(errors) > 0.4
+    assert errors[2] < 3e-4
+    assert errors[-1] < 5e-5
+
+
+def test_charge_of_a_surface_converges(solves):
+    """Second derivatives: two orders behind."""
+    sensor = replace(load_sensor("four-25um-uniaxial"), film=solves[0].film, surface="top")
+    if not solves[0].theory.bending:
+        return
+    *values, reference = (touch_charge(sensor, solved) for solved in solves)
+    errors = [np.abs(value - reference).max() / np.abs(reference).max() for value in values]
+    assert rate(errors) > 0.3
+    assert errors[-1] < 5e-3
+
+
+# Every element in half, and half again; the block round the footprint keeps its depth, so not for ever
+
+
+def refined(film: Film, probe: Probe, theory: Theory, order: int, times: int) -> Equilibrium:
+    resolution = Resolution(order, 8 * times, 3 * times)
+    return press(film, probe, (6e-3, 3e-3), 1.0, theory=theory, resolution=resolution, layer=0.1)
+
+
+SMALL = {"circle": Circle(1e-3), "rectangle": Polygon.rectangle(2e-3, 1e-3, 0.5)}
+
+
+@pytest.mark.parametrize("probe", SMALL.values(), ids=SMALL.keys())
+@pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.parametrize("name", ["membrane", "membrane + bending"])
+def test_charge_converges_with_the_order_of_the_elements(film, probe, order, name):
+    """Halving every element divides the error of the charge, a functional of the gradient, by at least 2^order."""
+    theory = THEORIES[name][1]
+    film = replace(film, thickness=300e-6) if theory.bending else film
+    sensor = replace(load_sensor("four-25um-uniaxial"), film=film)
+    finest = press(film, probe, (6e-3, 3e-3), 1.0, theory=theory, resolution=Resolution(8, 8, 6), layer=0.1)
+    reference = touch_charge(sensor, finest)
+    coarse, fine = (
+        np.abs(touch_charge(sensor, refined(film, probe, theory, order, k)) - reference).max() for k in (1, 2)
+    )
+    assert np.log2(coarse / fine) > order
 
 
 @pytest.mark.parametrize("order", [2, 3])
 def test_energy_converges_with_twice_the_order_of_the_elements(film, order):
-    """Halving every element divides the error of the energy by 2^(2 order): the known rate of a smooth problem."""
+    """The known rate of a smooth problem, for the membrane."""
+    theory = THEORIES["membrane"][1]
 
-    def energy(resolution: Resolution) -> float:
-        solved = press(film, Circle(4e-3), (12e-3, 0.0), 1.0, resolution=resolution)
-        geometry = Geometry.build(template(resolution), solved.placement)
-        return Membrane(geometry, solved.groups).energy(solved.field)
+    def energy(solved: Equilibrium) -> float:
+        geometry = Geometry.build(solved.mesh, solved.placement.element_points(solved.mesh))
+        return ElasticFilm(geometry, solved.groups).energy(solved.field)
 
-    reference = energy(Resolution(9, 8, 4))
-    coarse, fine = (abs(energy(Resolution(order, 8 * k, 4 * k)) - reference) for k in (1, 2))
+    reference = energy(press(film, Circle(1e-3), (6e-3, 3e-3), 1.0, theory=theory, resolution=Resolution(8, 8, 6)))
+    coarse, fine = (abs(energy(refined(film, Circle(1e-3), theory, order, k)) - reference) for k in (1, 2))
     assert np.log2(coarse / fine) == pytest.approx(2 * order, abs=0.8)

@@ -1,113 +1,124 @@
-"""A flat, slack film converges for every force; failures are told, never hidden."""
+"""A flat film converges for every force, thin or thick; failures are told, never hidden."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from isocharge.errors import SolveError
-from isocharge.simulate import STANDARD, Circle, Resolution, press
-from isocharge.simulate.equilibrium import dimensionless
+from isocharge.errors import SceneError, SolveError
+from isocharge.simulate import Circle, Polygon, Resolution, Theory, load_sensor, press, touch_charge
 from isocharge.simulate.newton import schwerin_start
-from isocharge.simulate.template import Placement, template
+from isocharge.simulate.scaling import Groups
 
-FORCES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 5.0)
-RADII_MM = (0.2, 1.0, 5.0)
+FORCES = (1e-5, 1e-3, 0.1, 1.0, 10.0)
+MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+FULL = Theory(stretching=True, bending=True, pretensioned=False)
+PROBES = {"circle": Circle(1e-3), "rectangle": Polygon.rectangle(4e-3, 2e-3, 0.4)}
+FAILING = {"resolution": Resolution(4, 8, 3), "theory": MEMBRANE, "tolerance": 1e-30}
 
 
-@pytest.mark.parametrize("radius_mm", RADII_MM)
-@pytest.mark.parametrize("distance_mm", [0.0, 8.0, 13.0, 20.0])
-def test_every_force_converges_from_flat(film, distance_mm, radius_mm):
+@pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES.keys())
+@pytest.mark.parametrize("thickness_um", [25.0, 1000.0])
+@pytest.mark.parametrize("theory", [MEMBRANE, FULL], ids=["membrane", "full"])
+def test_every_force_converges_from_flat(film, thickness_um, probe, theory):
     """No help from the user: no force steps, no tension, no start."""
     for force in FORCES:
-        solved = press(film, Circle(radius_mm * 1e-3), (0.0, distance_mm * 1e-3), force)
+        solved = press(replace(film, thickness=thickness_um * 1e-6), probe, (5e-3, 3e-3), force, theory=theory)
         assert solved.status == "converged"
-        assert solved.residual <= 1e-9
-        assert solved.iterations <= 7
+        assert solved.residual <= 1e-7 or "round-off" in solved.message
+        assert solved.iterations <= 20
 
 
-@pytest.mark.parametrize("distance_mm", [30.0, 36.0])
-def test_near_the_rim(film, distance_mm):
-    for force in (1e-4, 5.0):
-        assert press(film, Circle(1e-3), (0.0, distance_mm * 1e-3), force).iterations <= 10
+@pytest.mark.parametrize(("distance_mm", "force"), [(30.0, 5.0), (38.0, 1e-3), (42.0, 1e-3)])
+def test_near_the_rim(film, distance_mm, force):
+    solved = press(film, Circle(1e-3), (0.0, distance_mm * 1e-3), force)
+    assert solved.status == "converged"
+    assert solved.iterations <= 20
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("radius_mm", RADII_MM)
-@pytest.mark.parametrize("distance_mm", [25.0, 30.0, 34.0, 36.0])
-def test_every_force_near_the_rim(film, distance_mm, radius_mm):
-    for force in FORCES:
-        assert press(film, Circle(radius_mm * 1e-3), (0.0, distance_mm * 1e-3), force).iterations <= 12
-
-
-@pytest.mark.slow
-def test_where_the_membrane_wants_to_wrinkle(film):
-    """At nine tenths of the radius the equations are hardly well-posed any more; still solved, and doubted."""
-    for force in FORCES:
-        solved = press(film, Circle(1e-3), (40e-3, 0.0), force)
-        assert solved.status == "converged"
-        assert solved.estimated_error > 0.04
-
-
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+@pytest.mark.parametrize("share", [0.3, 0.9])
 def test_large_probes_converge(film, share):
     for force in (1e-4, 5.0):
-        assert press(film, Circle(share * film.radius), (1e-3, 1e-3), force).iterations <= 8
+        assert press(film, Circle(share * film.radius), (1e-3, 1e-3), force).iterations <= 12
 
 
-@pytest.mark.parametrize("pretension", [1e3, 1e5, 1e6, 1e7])
+@pytest.mark.parametrize("pretension", [1e3, 1e5, 1e6, 2e7])
 def test_every_pretension_converges(film, pretension):
     """From hardly any to one that makes the film linear."""
     for force in FORCES:
-        assert press(replace(film, pretension=pretension), Circle(1e-3), (5e-3, 2e-3), force).iterations <= 12
+        solved = press(replace(film, pretension=pretension), Circle(1e-3), (5e-3, 2e-3), force, theory=FULL)
+        assert solved.iterations <= 20
 
 
-@pytest.mark.parametrize(
-    "resolution", [Resolution(2, 8, 3), Resolution(3, 8, 4), Resolution(6, 8, 6), Resolution(5, 16, 8)]
-)
+@pytest.mark.parametrize("resolution", [Resolution(2, 8, 3), Resolution(6, 8, 6, 1), Resolution(5, 16, 8)], ids=str)
 def test_every_mesh_converges(film, resolution):
-    assert press(film, Circle(1e-3), (8e-3, 0.0), 1.0, resolution=resolution).iterations <= 8
+    assert press(film, Circle(1e-3), (8e-3, 0.0), 1.0, resolution=resolution, theory=FULL).iterations <= 12
 
 
-def test_end_of_newton_is_quadratic(film):
-    """Each of the last steps squares the residual: the tangent is the true one at the end."""
+@pytest.mark.parametrize("theory", [MEMBRANE, FULL], ids=["membrane", "full"])
+def test_end_of_newton_is_quadratic(film, theory):
+    """The last step nearly squares the residual: the tangent is the true one at the end."""
     residuals = [
-        press(film, Circle(1e-3), (3e-3, 0.0), 1.0, tolerance=tolerance).residual for tolerance in (1e-1, 1e-2, 1e-4)
+        press(film, Circle(1e-3), (3e-3, 0.0), 1.0, tolerance=tolerance, theory=theory).residual
+        for tolerance in (1e-1, 1e-2, 1e-4)
     ]
     assert residuals[2] < 10.0 * residuals[1] ** 1.5
 
 
-def test_neighbour_is_a_better_start(film):
-    first = press(film, Circle(1e-3), (5e-3, 0.0), 1.0)
-    near = press(film, Circle(1e-3), (5.2e-3, 1e-3), 1.1, start=first)
-    cold = press(film, Circle(1e-3), (5.2e-3, 1e-3), 1.1)
-    assert near.iterations <= 3 < cold.iterations
-    np.testing.assert_allclose(near.field, cold.field, atol=1e-7)
+@pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES.keys())
+def test_neighbour_is_a_better_start(film, probe):
+    first = press(film, probe, (5e-3, 0.0), 1.0)
+    same = {"resolution": first.resolution, "layer": first.layer}
+    near = press(film, probe, (5.2e-3, 1e-3), 1.1, start=first, **same)
+    cold = press(film, probe, (5.2e-3, 1e-3), 1.1, **same)
+    assert near.iterations <= 4 < cold.iterations
+    sensor = load_sensor("three-25um-uniaxial")
+    np.testing.assert_allclose(touch_charge(sensor, near), touch_charge(sensor, cold), rtol=1e-6)
 
 
 def test_start_of_another_mesh_is_not_used(film):
     coarse = press(film, Circle(1e-3), (5e-3, 0.0), 1.0, resolution=Resolution(3, 8, 4))
-    assert press(film, Circle(1e-3), (5e-3, 0.0), 1.0, start=coarse).status == "converged"
+    other = press(film, PROBES["rectangle"], (5e-3, 0.0), 1.0)
+    cold = press(film, Circle(1e-3), (5e-3, 0.0), 1.0)
+    for start in (coarse, other):
+        solved = press(film, Circle(1e-3), (5e-3, 0.0), 1.0, start=start, resolution=cold.resolution)
+        np.testing.assert_array_equal(solved.field, cold.field)
+
+
+def test_start_of_a_much_thicker_film_still_converges(film):
+    thick = press(replace(film, thickness=1e-3), Circle(1e-3), (5e-3, 0.0), 1.0, theory=FULL)
+    solved = press(film, Circle(1e-3), (5e-3, 0.0), 1e-3, theory=FULL, start=thick)
+    assert solved.status == "converged"
 
 
 def test_failure_raises_a_full_sentence(film):
-    with pytest.raises(
-        SolveError, match=r"no equilibrium at 1\.5 N, position \(2, -3\) mm: .*; residual .* > 1e-30 after \d+ steps"
-    ):
-        press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, tolerance=1e-30)
+    message = r"no equilibrium at 1\.5 N, position \(2, -3\) mm: .*; residual .* > 1e-30 after \d+ steps"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("isocharge.simulate.newton.ROUND_OFF", 0.0)
+        with pytest.raises(SolveError, match=message):
+            press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, **FAILING)
 
 
-def test_failure_is_told_if_asked_not_to_raise(film):
-    failed = press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, tolerance=1e-30, throw=False)
+def test_failure_is_told_if_asked_not_to_raise(film, monkeypatch):
+    monkeypatch.setattr("isocharge.simulate.newton.ROUND_OFF", 0.0)
+    failed = press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, throw=False, **FAILING)
     assert failed.status == "failed"
-    assert failed.message == "no step lowers the energy any more"
     assert 0.0 < failed.residual < 1e-9
+    assert failed.iterations < 60
+
+
+def test_round_off_is_not_a_failure(film):
+    """A tolerance that no arithmetic reaches: as good as it gets, and said so."""
+    solved = press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, **FAILING)
+    assert solved.status == "converged"
+    assert solved.message == f"converged to round-off in {solved.iterations} steps"
 
 
 def test_steps_are_limited(film, monkeypatch):
     monkeypatch.setattr("isocharge.simulate.newton.MAX_ITERATIONS", 2)
     failed = press(film, Circle(1e-3), (0.0, 0.0), 1.0, throw=False)
-    assert (failed.status, failed.message, failed.iterations) == ("failed", "stopped after 2 steps", 2)
+    assert (failed.status, failed.message, failed.iterations) == ("failed", "no progress any more after 2 steps", 2)
 
 
 def test_a_start_that_is_not_finite_is_told(film):
@@ -117,12 +128,47 @@ def test_a_start_that_is_not_finite_is_told(film):
     assert (failed.status, failed.message) == ("failed", "the residual is not a finite number")
 
 
+WRINKLES = r"no equilibrium at .* N, position \(.*\) mm: .* it wrinkles, which has many solutions; press farther"
+
+
+def test_a_film_that_wrinkles_is_told(film, monkeypatch):
+    """Stopped early, beside the rim, where it is compressed: the message says so. In the middle it does not."""
+    monkeypatch.setattr("isocharge.simulate.newton.MAX_ITERATIONS", 3)
+    mesh = {"theory": FULL, "resolution": Resolution(5, 8, 6, 1)}
+    with pytest.raises(SolveError, match=WRINKLES):
+        press(film, Circle(1e-3), (0.0, 42e-3), 5.0, **mesh)
+    with pytest.raises(SolveError, match=r"after 3 steps$"):
+        press(film, Circle(1e-3), (0.0, 0.0), 5.0, **mesh)
+
+
+@pytest.mark.slow
+def test_a_thinner_film_that_wrinkles_is_told_in_time(film):
+    began = time.process_time()
+    with pytest.raises(SolveError, match=WRINKLES):
+        press(replace(film, thickness=7e-6), Polygon.rectangle(0.4e-3, 0.12e-3), (44.3e-3, 0.0), 3.5)
+    assert time.process_time() - began < 60.0
+
+
+def test_too_near_the_rim_is_told(film):
+    with pytest.raises(
+        SceneError, match=r"press at \(44, 0\) mm comes within 0\.0001 mm of the rim, too near for a mesh"
+    ):
+        press(film, Circle(0.9999e-3), (44e-3, 0.0), 1.0)
+
+
 @pytest.mark.parametrize("pretension", [0.0, 1e5, 1e7])
-def test_start_has_about_the_right_height(film, pretension):
-    """Within a factor of two of the solution in slack and taut films alike; flat on the rim."""
-    film = replace(film, pretension=pretension)
-    solved, place = press(film, Circle(1e-3), (0.0, 0.0), 0.1), Placement.of_circle(0.0, 1.0 / 45.0)
-    z = template(STANDARD).node_points(place.rho)
-    start = schwerin_start(z, place.rho, 1.0 / 45.0, dimensionless(film, 0.1))
+@pytest.mark.parametrize("thickness", [25e-6, 1e-3])
+def test_start_has_about_the_right_height(film, pretension, thickness):
+    """Within a factor of two of the solution in slack, taut and thick films alike; flat on the rim."""
+    film = replace(film, pretension=pretension, thickness=thickness)
+    solved = press(film, Circle(1e-3), (0.0, 0.0), 0.1, theory=FULL)
+    z = solved.placement.to_template(solved.placement.element_points(solved.mesh).ravel()[solved.mesh.first_seen])
+    start = schwerin_start(z, float(solved.placement.rho), Groups.of(film, 0.1, bending=True))
     assert 0.5 < start[:, 2].max() / solved.field[:, 2].max() < 2.0
-    assert not start[np.abs(z) > 1.0 - 1e-9].any()
+    assert not start[solved.mesh.on_rim].any()
+
+
+def test_linear_theories_need_one_matrix(film):
+    solved = press(replace(film, thickness=2e-3), Circle(1e-3), (5e-3, 0.0), 1e-3)
+    assert (solved.theory.name, solved.iterations, solved.residual) == ("linear plate", 2, 0.0)
+    assert "linear" in solved.message

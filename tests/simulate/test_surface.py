@@ -1,0 +1,131 @@
+"""Stress at the film's surfaces: plates on paper, the sign, and what a sensor that reads them needs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.errors import SensorError
+from isocharge.simulate import (
+    Circle,
+    Electrode,
+    Polygon,
+    Resolution,
+    Theory,
+    load_sensor,
+    press,
+    theory_for,
+    touch_charge,
+)
+
+PLATE = Theory(stretching=False, bending=True, pretensioned=False)
+MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+FINE = Resolution(8, 8, 6, 2)
+FORCE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def thick(film):
+    return replace(film, thickness=1e-3)
+
+
+def outer(film, force: float, c: float, r: float) -> tuple[float, float]:
+    """(s_r, s_theta) of bending at the touched side of a clamped plate, r >= c, a disk of radius c pressing.
+
+    w = F / (16 pi D) (a^2 - r^2 - 2 r^2 ln(a / r) - c^2 (ln(a / r) - (1 - (r / a)^2) / 2)) from Michell's function and
+    its mean over the disk; curvatures w'' and w' / r; touched side: s = E h / 2 (1 - nu^2) (w'' + nu w' / r).
+    """
+    a, h, nu = film.radius, film.thickness, film.poisson
+    k = force / (16.0 * np.pi * film.young * h**3 / (12.0 * (1.0 - nu**2)))
+    log = np.log(a / r)
+    slope = k * (-4.0 * r * log + c**2 / r - c**2 * r / a**2)
+    second = k * (4.0 - 4.0 * log - c**2 / r**2 - c**2 / a**2)
+    scale = 0.5 * h * film.young / (1.0 - nu**2)
+    return scale * (second + nu * slope / r), scale * (slope / r + nu * second)
+
+
+def surface_stress(solved, surface: str, points: np.ndarray) -> np.ndarray:
+    return solved.touch_stress(points, surface) - solved.touch_stress(points)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_bending_stress_outside_the_footprint(thick, share):
+    """Radial and hoop stress of a clamped plate on the touched side, to the rim."""
+    c = share * thick.radius
+    solved = press(thick, Circle(c), (0.0, 0.0), FORCE, theory=PLATE, resolution=FINE)
+    for r in (1.5 * c, 0.6 * thick.radius, 0.99 * thick.radius):
+        points = np.array([(r, 0.0), (0.0, r), (-r, 0.0)])
+        found = surface_stress(solved, "top", points)
+        radial, hoop = outer(thick, FORCE, c, r)
+        scale = max(abs(radial), abs(hoop))
+        np.testing.assert_allclose(found[[0, 2], 0], radial, atol=2e-3 * scale)
+        np.testing.assert_allclose(found[[0, 2], 1], hoop, atol=2e-3 * scale)
+        np.testing.assert_allclose(found[1, :2], [hoop, radial], atol=2e-3 * scale)
+        np.testing.assert_allclose(found[:, 2], 0.0, atol=2e-3 * scale)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.9])
+def test_bending_stress_under_the_middle(thick, share):
+    """M = F (1 + nu) / 4 pi (ln(a / c) + c^2 / 4 a^2) compresses the touched side (Timoshenko, art. 19), 6 M / h^2."""
+    c = share * thick.radius
+    solved = press(thick, Circle(c), (0.0, 0.0), FORCE, theory=PLATE, resolution=FINE)
+    moment = FORCE * (1.0 + thick.poisson) / (4.0 * np.pi) * (np.log(1.0 / share) + 0.25 * share**2)
+    found = surface_stress(solved, "top", np.array([(1e-9, 0.0)]))[0]
+    np.testing.assert_allclose(found[:2], -6.0 * moment / thick.thickness**2, rtol=1e-3)
+
+
+@pytest.mark.parametrize("probe", [Circle(2e-3), Polygon.rectangle(4e-3, 2e-3, 0.5)], ids=["circle", "rectangle"])
+def test_sides_are_opposite(thick, probe):
+    """The touched side is compressed under the probe and stretched at the rim; the other the other way round."""
+    solved = press(thick, probe, (6e-3, 4e-3), FORCE)
+    points = np.array([(6e-3, 4e-3), (0.0, -44.9e-3), (10e-3, 10e-3)])
+    top, bottom = (surface_stress(solved, surface, points) for surface in ("top", "bottom"))
+    np.testing.assert_allclose(top, -bottom, rtol=1e-9, atol=1e-12 * np.abs(top).max())
+    assert np.all(top[0, :2] < 0.0)
+    assert top[1, 1] > 0.0
+
+
+def test_curvature_of_a_made_up_field_is_read_exactly(film, made_up):
+    """W = (3 x^2 + 2 x y - y^2) / 2 in the frame of the press: bending strain h / 2 times the second derivatives."""
+    at, amplitude2 = (5e-3, -4e-3), 1e-4
+
+    def field(x: np.ndarray) -> np.ndarray:
+        w = 1.5 * x[:, 0] ** 2 + x[:, 0] * x[:, 1] - 0.5 * x[:, 1] ** 2
+        return np.stack([0.0 * w, 0.0 * w, w], axis=1)
+
+    solved = made_up(field, at, amplitude2=amplitude2)
+    points = at + np.random.default_rng(0).uniform(-4e-3, 4e-3, (20, 2))
+    half = 0.5 * film.thickness / film.radius * np.sqrt(amplitude2) * film.young / (1.0 - film.poisson**2)
+    local = half * np.array([3.0 - film.poisson, -1.0 + 3.0 * film.poisson, (1.0 - film.poisson) / 2.0 * 2.0])
+    angle = np.arctan2(at[1], at[0])
+    q = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    tensor = q @ np.array([[local[0], local[2]], [local[2], local[1]]]) @ q.T
+    expected = [tensor[0, 0], tensor[1, 1], tensor[0, 1]]
+    found = surface_stress(solved, "top", points)
+    np.testing.assert_allclose(found - expected, 0.0, atol=5e-3 * np.abs(expected).max())
+
+
+def test_charge_of_a_surface_is_the_integral_of_its_stress(thick):
+    """A small electrode reads A (d31 s11 + d32 s22) of its own side."""
+    probe, corner = Circle(2e-3), np.array([(12e-3, 0.0), (12.1e-3, 0.0), (12.1e-3, 0.1e-3), (12e-3, 0.1e-3)])
+    sensor = replace(load_sensor("four-25um-uniaxial"), film=thick)
+    sensor = replace(sensor, electrodes=(Electrode("A", tuple((float(x), float(y)) for x, y in corner)),))
+    solved = press(thick, probe, (0.0, 0.0), FORCE, theory=PLATE, resolution=FINE)
+    for surface, sign in (("top", 1.0), ("bottom", -1.0)):
+        charge = touch_charge(replace(sensor, surface=surface), solved) - touch_charge(sensor, solved)
+        radial, hoop = outer(thick, FORCE, 2e-3, 12.05e-3)
+        assert charge[0] == pytest.approx(sign * 1e-8 * (20e-12 * radial + 2e-12 * hoop), rel=5e-3)
+
+
+@pytest.mark.parametrize("surface", ["top", "bottom"])
+def test_surface_needs_bending(film, surface):
+    sensor = replace(load_sensor("three-25um-biaxial"), surface=surface)
+    solved = press(film, Circle(1e-3), (0.0, 0.0), 1.0, theory=MEMBRANE)
+    message = (
+        rf"surface '{surface}' needs bending, but the film was solved as a nonlinear membrane; solve it with theory="
+    )
+    with pytest.raises(SensorError, match=message):
+        touch_charge(sensor, solved)
+    bent = press(film, Circle(1e-3), (0.0, 0.0), 1.0, theory=theory_for(sensor, (1.0, 1.0)))
+    middle = touch_charge(replace(sensor, surface="middle"), bent)
+    assert np.abs(touch_charge(sensor, bent) / middle - 1.0).max() > 1e-5
