@@ -152,7 +152,9 @@ def tables(result: dict[str, Any]) -> str:
         lines.append(f"  {status}: {sum(entry['status'] == status for entry in entries)}")
     for name in ("iterations", "residual", "seconds", "estimated_error"):
         values = np.array([entry[name] for entry in solved])
-        lines.append(f"{name}: median {np.median(values):.3g}, 95 % {np.quantile(values, 0.95):.3g}, worst {values.max():.3g}")
+        lines.append(
+            f"{name}: median {np.median(values):.3g}, 95 % {np.quantile(values, 0.95):.3g}, worst {values.max():.3g}"
+        )
     for theory in sorted({entry["theory"] for entry in solved}):
         lines.append(f"  {theory}: {sum(entry['theory'] == theory for entry in solved)}")
     sample = [e for e in solved if e["number"] in set(result["random"]) and "error" in e]
@@ -163,7 +165,9 @@ def tables(result: dict[str, Any]) -> str:
             f"error of {len(sample)} at random: median {np.median(errors):.1e}, 95 % {np.quantile(errors, 0.95):.1e}, "
             f"worst {errors.max():.1e}; within its estimate {kept:.0%}"
         )
-    header = f"{'um':>6} {'MPa':>6} {'nu':>4} {'N':>8} {'reach':>5} {'at':>5} mm  {'mesh':14} steps residual estimate error"
+    header = (
+        f"{'um':>6} {'MPa':>6} {'nu':>4} {'N':>8} {'reach':>5} {'at':>5} mm  {'mesh':14} steps residual estimate error"
+    )
     for title, key in (("error against a refined solve", "error"), ("steps", "iterations"), ("residual", "residual")):
         lines += ["", f"worst by {title}", header]
         ranked = sorted((e for e in solved if key in e), key=lambda entry: -entry[key])[:12]

@@ -126,6 +126,6 @@ def test_surface_needs_bending(film, surface):
     )
     with pytest.raises(SensorError, match=message):
         touch_charge(sensor, solved)
-    bent = press(film, Circle(1e-3), (0.0, 0.0), 1.0, theory=theory_for(sensor, (1.0, 1.0)))
+    bent = press(film, Circle(1e-3), (0.0, 0.0), 1.0, theory=theory_for(sensor, Circle(1e-3), (1.0, 1.0)))
     middle = touch_charge(replace(sensor, surface="middle"), bent)
     assert np.abs(touch_charge(sensor, bent) / middle - 1.0).max() > 1e-5

@@ -73,13 +73,13 @@ def test_unknown_name_is_shown(film):
 )
 def test_choice(film, thickness_um, pretension_MPa, force, accuracy, name):
     film = thick(film, thickness_um, pretension_MPa)
-    assert choose(film, force, accuracy).name == name
+    assert choose(film, PROBE, force, accuracy).name == name
     assert press(film, PROBE, AT, force, accuracy=max(accuracy, 1e-4)).theory.pretensioned == (pretension_MPa > 0.0)
 
 
 def test_taut_thin_film_under_a_feather_is_linear(film):
     for thickness_um in (2.0, 25.0, 200.0):
-        assert not choose(thick(film, thickness_um, 10.0), 1e-6, 1e-3).stretching
+        assert not choose(thick(film, thickness_um, 10.0), PROBE, 1e-6, 1e-3).stretching
 
 
 @given(
@@ -92,10 +92,10 @@ def test_taut_thin_film_under_a_feather_is_linear(film):
 def test_choice_is_within_the_accuracy_or_everything(thickness, pretension, force, accuracy):
     """And asking for more never takes a term away."""
     film = Film(45e-3, thickness, 3e9, 0.34, pretension)
-    theory, finer = choose(film, force, accuracy), choose(film, force, 0.1 * accuracy)
-    assert theory.name.endswith("+ bending") or left_out(film, force, theory) <= accuracy
-    assert left_out(film, force, finer) <= left_out(film, force, theory)
-    assert left_out(film, force, Theory(True, True, pretension > 0.0)) == 0.0
+    theory, finer = choose(film, PROBE, force, accuracy), choose(film, PROBE, force, 0.1 * accuracy)
+    assert theory.name.endswith("+ bending") or left_out(film, PROBE, force, theory) <= accuracy
+    assert left_out(film, PROBE, force, finer) <= left_out(film, PROBE, force, theory)
+    assert left_out(film, PROBE, force, Theory(True, True, pretension > 0.0)) == 0.0
 
 
 @given(
@@ -132,12 +132,12 @@ def test_bending_length_follows_thickness_and_force(film):
 def test_theory_for_a_sensor_serves_all_forces_and_the_surface(film):
     """Linear at the small end, nonlinear at the other: nonlinear; a surface needs bending."""
     sensor = replace(load_sensor("three-25um-biaxial"), film=thick(film, 300.0))
-    assert choose(sensor.film, 1e-4, 1e-3).name == "linear plate"
-    assert theory_for(sensor, (1e-4, 1e-4)).name == "linear plate"
-    assert theory_for(sensor, (1e-4, 5.0)).name == "nonlinear membrane + bending"
+    assert choose(sensor.film, PROBE, 1e-4, 1e-3).name == "linear plate"
+    assert theory_for(sensor, PROBE, (1e-4, 1e-4)).name == "linear plate"
+    assert theory_for(sensor, PROBE, (1e-4, 5.0)).name == "nonlinear membrane + bending"
     thin = replace(sensor, film=thick(film, 1.0))
-    assert theory_for(thin, (1.0, 1.0)).name == "nonlinear membrane"
-    assert theory_for(replace(thin, surface="top"), (1.0, 1.0)).name == "nonlinear membrane + bending"
+    assert theory_for(thin, PROBE, (1.0, 1.0)).name == "nonlinear membrane"
+    assert theory_for(replace(thin, surface="top"), PROBE, (1.0, 1.0)).name == "nonlinear membrane + bending"
 
 
 def test_theory_can_be_overridden(film):
@@ -168,12 +168,12 @@ def draw(rng: np.random.Generator) -> tuple[Film, Circle | Polygon, tuple[float,
 def difference(scene: tuple, accuracy: float) -> tuple[float, float, str]:
     """Real error of what is left out (of the worst charge, over the press's largest), its estimate, and the theory."""
     film, probe, at, force = scene
-    theory = choose(film, force, accuracy)
+    theory = choose(film, probe, force, accuracy)
     sensor = replace(load_sensor("three-25um-uniaxial"), film=film)
     full = press(film, probe, at, force, theory=Theory(True, True, film.pretension > 0.0))
     simple = press(film, probe, at, force, theory=theory, resolution=full.resolution, layer=full.layer)
     exact, charge = touch_charge(sensor, full), touch_charge(sensor, simple)
-    return float(np.abs(charge - exact).max() / np.abs(exact).max()), left_out(film, force, theory), theory.name
+    return float(np.abs(charge - exact).max() / np.abs(exact).max()), left_out(film, probe, force, theory), theory.name
 
 
 def scenes(seed: int, count: int, accuracy: float) -> list[tuple]:
@@ -181,7 +181,7 @@ def scenes(seed: int, count: int, accuracy: float) -> list[tuple]:
     rng, found = np.random.default_rng(seed), []
     while len(found) < count:
         scene = draw(rng)
-        if left_out(scene[0], scene[3], choose(scene[0], scene[3], accuracy)) > 0.0:
+        if left_out(scene[0], scene[1], scene[3], choose(scene[0], scene[1], scene[3], accuracy)) > 0.0:
             found.append(scene)
     return found
 

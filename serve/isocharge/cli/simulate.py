@@ -68,9 +68,10 @@ def point_command(
     from isocharge.simulate import load_sensor, parse_probe, press, theory_for, thermal_charge, touch_charge
     from isocharge.simulate.theory import named
 
-    film_sensor = load_sensor(sensor)
-    terms = theory_for(film_sensor, (force, force), accuracy) if theory == "auto" else named(theory, film_sensor.film)
-    equilibrium = press(film_sensor.film, parse_probe(probe), _position(at), force, theory=terms, accuracy=accuracy)
+    film_sensor, pressing = load_sensor(sensor), parse_probe(probe)
+    terms = named(theory, film_sensor.film) if theory != "auto" else None
+    terms = terms or theory_for(film_sensor, pressing, (force, force), accuracy)
+    equilibrium = press(film_sensor.film, pressing, _position(at), force, theory=terms, accuracy=accuracy)
     charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
     report = _report(film_sensor, equilibrium, charge)
     typer.echo(json_module.dumps(report) if json else _table(report))

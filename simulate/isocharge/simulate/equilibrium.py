@@ -72,7 +72,7 @@ class Equilibrium:
 
         Infinite where the theory says nothing about this film.
         """
-        return self.mesh_error + left_out(self.film, self.force, self.theory)
+        return self.mesh_error + left_out(self.film, self.probe, self.force, self.theory)
 
     @property
     def bending_length(self) -> float:

@@ -106,7 +106,7 @@ class ForwardMap:
         """
         film = sensor.film
         _check_family(film, probe, radius, force_range)
-        theory = theory or theory_for(sensor, force_range, accuracy)
+        theory = theory or theory_for(sensor, probe, force_range, accuracy)
         layer = layer_for(film, float(np.sqrt(force_range[0] * force_range[1])))
         resolution = resolution or resolution_for(film, probe, (radius, 0.0), theory, accuracy, layer)
         error = np.inf

@@ -153,7 +153,7 @@ class Polygon:
         for step in range(1, z.size):
             turn = np.exp(2j * np.pi * step / z.size)
             if z.size % step == 0 and np.allclose(np.roll(z, -step), z * turn, rtol=0.0, atol=1e-9 * self.reach):
-                return math.tau * (step / z.size)
+                return float(math.tau * step / z.size)
         return math.tau
 
     def turned(self, angle: float) -> "Polygon":

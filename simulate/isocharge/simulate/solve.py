@@ -104,7 +104,7 @@ def press(
     """
     check_scene(film, probe, at, force)
     began = process_time()
-    theory = theory or choose(film, force, accuracy)
+    theory = theory or choose(film, probe, force, accuracy)
     layer = layer or _layer(film, force, probe, resolution, start)
     with single_threaded_blas():
         resolution = resolution or resolution_for(film, probe, at, theory, accuracy, layer)

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.errors import SceneError
-from isocharge.simulate.scaling import Groups
+from isocharge.simulate.probe import Probe
+from isocharge.simulate.scaling import Groups, slenderness
 from isocharge.simulate.sensor import Film, Sensor
 
 ACCURACY = 1e-3
@@ -31,6 +32,9 @@ BENDING_WEIGHT = 1.5
 
 MOSTLY_BENT = 0.3
 """Bending length over film radius above which a membrane says nothing about a film; its error is then infinite."""
+
+PROBE_WEIGHT = 4.0
+"""Relative error of a taut film's charge without bending over the squared bending length at the probe by its reach."""
 
 INDUCED_STRAIN = 0.44
 """Radial strain that a slack membrane's rim is stretched by, over A^2."""
@@ -66,7 +70,21 @@ def bending_length(film: Film, force: float) -> float:
     return float(np.sqrt(groups.bending / tension))
 
 
-def left_out(film: Film, force: float, theory: Theory) -> float:
+def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
+    """Relative change of a charge by bending at the footprint, where pretension and no induced tension holds the film.
+
+    It goes with the square of the bending length over the footprint's reach. The tension at the footprint is the
+    pretension and what a slack membrane under this load has there, S = E W'^2 / 2 with S W' in balance with the load,
+    W'^3 = F / (pi R h E); where the latter rules, the deflection gives way and charges hardly change.
+    """
+    slope2 = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young)) ** 2
+    pretension = film.pretension / film.young
+    strain = pretension + 0.5 * slope2
+    length2 = slenderness(film) / strain * (film.radius / probe.reach) ** 2
+    return PROBE_WEIGHT * float(length2 * pretension / strain)
+
+
+def left_out(film: Film, probe: Probe, force: float, theory: Theory) -> float:
     """Relative error of a charge to expect from what a theory leaves out; infinite where it has no meaning."""
     error = 0.0
     if not theory.stretching:
@@ -75,11 +93,12 @@ def left_out(film: Film, force: float, theory: Theory) -> float:
         error += LINEAR_WEIGHT * Groups.of(film, force, bending=theory.bending).induced
     if not theory.bending:
         length = bending_length(film, force)
-        error += BENDING_WEIGHT * length if length <= MOSTLY_BENT else np.inf
+        error += BENDING_WEIGHT * length + bending_at_probe(film, probe, force)
+        error += np.inf if length > MOSTLY_BENT else 0.0
     return error
 
 
-def choose(film: Film, force: float, accuracy: float) -> Theory:
+def choose(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
     """The cheapest theory whose error stays within the wanted accuracy, the full one if none does."""
     tense = film.pretension > 0.0
     cheap_first = (
@@ -88,14 +107,14 @@ def choose(film: Film, force: float, accuracy: float) -> Theory:
         Theory(stretching=True, bending=False, pretensioned=tense),
     )
     for theory in cheap_first:
-        if left_out(film, force, theory) <= 0.5 * accuracy:
+        if left_out(film, probe, force, theory) <= 0.5 * accuracy:
             return theory
     return Theory(stretching=True, bending=True, pretensioned=tense)
 
 
-def theory_for(sensor: Sensor, force_range: tuple[float, float], accuracy: float = ACCURACY) -> Theory:
+def theory_for(sensor: Sensor, probe: Probe, force_range: tuple[float, float], accuracy: float = ACCURACY) -> Theory:
     """The fewest terms that serve every force (N) of a range and the surface that a sensor reads."""
-    ends = [choose(sensor.film, force, accuracy) for force in force_range]
+    ends = [choose(sensor.film, probe, force, accuracy) for force in force_range]
     return Theory(
         stretching=any(end.stretching for end in ends),
         bending=any(end.bending for end in ends) or sensor.surface != "middle",
