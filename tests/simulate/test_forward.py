@@ -6,8 +6,29 @@ import numpy as np
 import pytest
 
 from isocharge.errors import SceneError, SolveError
-from isocharge.simulate import Circle, ForwardMap, Resolution, Sensor, load_sensor, press, touch_charge
-from isocharge.simulate.forward import INTERPOLATION_ERROR, Nodes
+from isocharge.simulate import (
+    Circle,
+    ForwardMap,
+    Polygon,
+    Probe,
+    Resolution,
+    Sensor,
+    Theory,
+    load_sensor,
+    parse_probe,
+    press,
+    touch_charge,
+)
+from isocharge.simulate.family import Family
+from isocharge.simulate.forward import INTERPOLATION_ERROR
+
+MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+QUICK = {"radius": 4e-3, "force_range": (0.6, 1.0), "theory": MEMBRANE, "resolution": Resolution(4, 8, 4)}
+"""A small family without bending: few and cheap solves."""
+PROBES = {
+    "triangle": Polygon.triangle(4e-3),
+    "turned rectangle": parse_probe("rectangle:4x2@30"),
+}
 
 
 @pytest.fixture(scope="module")
@@ -16,36 +37,85 @@ def four_map() -> ForwardMap:
     return ForwardMap.build(load_sensor("four-25um-biaxial"), Circle(1e-3), radius=10e-3)
 
 
-def direct(sensor: Sensor, x: np.ndarray, y: np.ndarray, force: np.ndarray, radius: float = 1e-3) -> np.ndarray:
-    presses = zip(x.tolist(), y.tolist(), force.tolist(), strict=True)
-    return np.array([touch_charge(sensor, press(sensor.film, Circle(radius), (a, b), f)) for a, b, f in presses])
+@pytest.fixture(scope="module", params=PROBES.values(), ids=PROBES.keys())
+def turned_map(request) -> ForwardMap:
+    """A probe whose orientation matters; on the electrodes, for these are moved inwards."""
+    return ForwardMap.build(near_electrodes(), request.param, **QUICK)
 
 
-def draw(made: ForwardMap, count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Presses over all that the map covers."""
+def near_electrodes(**changes) -> Sensor:
+    """Uniaxial, the electrodes 5 mm from the centre."""
+    sensor = load_sensor("four-25um-uniaxial")
+    inward = tuple(
+        replace(e, corners=tuple((x - 0.5 * e.centre[0], y - 0.5 * e.centre[1]) for x, y in e.corners))
+        for e in sensor.electrodes
+    )
+    return replace(sensor, electrodes=inward, **changes)
+
+
+def direct(
+    made: ForwardMap, x: np.ndarray, y: np.ndarray, force: np.ndarray, turn: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """The same presses solved one by one, on the map's mesh and with its theory."""
+    sensor, how = made.sensor, {"theory": made.theory, "resolution": made.resolution}
+    presses = zip(x.tolist(), y.tolist(), force.tolist(), np.broadcast_to(turn, x.shape).tolist(), strict=True)
+    return np.array(
+        [touch_charge(sensor, press(sensor.film, made.probe.turned(t), (a, b), f, **how)) for a, b, f, t in presses]
+    )
+
+
+def errors(made: ForwardMap, *presses: np.ndarray | float) -> np.ndarray:
+    """Relative errors of all charges, small ones counted against a tenth of their press's largest."""
+    expected = direct(made, *presses)
+    scale = np.maximum(np.abs(expected), 0.1 * np.abs(expected).max(axis=1, keepdims=True))
+    return np.abs(made.forward(*presses) - expected) / scale
+
+
+def draw(made: ForwardMap, count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Presses over all that the map covers: x, y, force, turn."""
     rng = np.random.default_rng(seed)
     z = made.radius * np.sqrt(rng.random(count)) * np.exp(2j * np.pi * rng.random(count))
-    return z.real, z.imag, np.exp(rng.uniform(*np.log(made.force_range), count))
+    force = np.exp(rng.uniform(*np.log(made.force_range), count))
+    return z.real, z.imag, force, rng.uniform(-np.pi, np.pi, count)
 
 
 def test_three_electrodes(three_map):
-    x, y, force = draw(three_map, 40, seed=0)
-    error = np.abs(three_map.forward(x, y, force) / direct(three_map.sensor, x, y, force) - 1.0)
+    error = errors(three_map, *draw(three_map, 12, seed=0))
     assert np.quantile(error, 0.95) < 1e-3
     assert error.max() < 5e-3
 
 
 def test_four_electrodes_with_the_probe_on_them_too(four_map):
     """Half of the presses within 2 mm of an electrode's centre."""
-    x, y, force = draw(four_map, 40, seed=1)
+    x, y, force, turn = draw(four_map, 12, seed=1)
     rng = np.random.default_rng(2)
-    on = rng.uniform(8e-3, 10e-3, 20) * np.exp(
-        1j * (0.5 * np.pi * rng.integers(0, 4, 20) + rng.uniform(-0.15, 0.15, 20))
-    )
-    x[:20], y[:20] = on.real, on.imag
-    error = np.abs(four_map.forward(x, y, force) / direct(four_map.sensor, x, y, force) - 1.0)
+    on = rng.uniform(8e-3, 10e-3, 6) * np.exp(1j * (0.5 * np.pi * rng.integers(0, 4, 6) + rng.uniform(-0.15, 0.15, 6)))
+    x[:6], y[:6] = on.real, on.imag
+    error = errors(four_map, x, y, force, turn)
     assert np.quantile(error, 0.95) < 1e-3
     assert error.max() < 5e-3
+
+
+def test_random_orientations(turned_map):
+    """Over electrodes and beside them."""
+    error = errors(turned_map, *draw(turned_map, 10, seed=10))
+    assert np.quantile(error, 0.95) < 1e-3
+    assert error.max() < 5e-3
+
+
+def test_orientation_matters_and_has_the_probes_period(turned_map):
+    x, y, force, turn = draw(turned_map, 50, seed=11)
+    charge = turned_map.forward(x, y, force, turn)
+    np.testing.assert_allclose(turned_map.forward(x, y, force, turn + turned_map.probe.period), charge, rtol=1e-6)
+    assert np.abs(turned_map.forward(x, y, force, turn + 0.5 * turned_map.probe.period) / charge - 1.0).max() > 1e-2
+
+
+def test_orientation_adds_to_the_probes_own_angle():
+    """A probe given at an angle is the probe turned by it."""
+    probe, family = Polygon.triangle(2e-3), {**QUICK, "radius": 2e-3}
+    plain, turned = (ForwardMap.build(near_electrodes(), each, **family) for each in (probe, probe.turned(0.6)))
+    x, y, force, turn = draw(plain, 20, seed=12)
+    np.testing.assert_allclose(turned.forward(x, y, force, turn), plain.forward(x, y, force, turn + 0.6), rtol=2e-3)
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
@@ -53,56 +123,76 @@ def test_ends_of_the_range(four_map, share):
     """At the centre and at the very edge, with the smallest and the largest force."""
     distance = share * four_map.radius
     x, y, force = np.array([distance, -distance]), np.zeros(2), np.array(four_map.force_range)
-    np.testing.assert_allclose(four_map.forward(x, y, force), direct(four_map.sensor, x, y, force), rtol=1e-3)
+    assert errors(four_map, x, y, force).max() < 1e-3
 
 
 def test_error_that_the_map_knows_of_is_small_and_true(four_map):
-    x, y, force = draw(four_map, 30, seed=3)
-    found = np.abs(four_map.forward(x, y, force) / direct(four_map.sensor, x, y, force) - 1.0)
+    x, y, force, _ = draw(four_map, 8, seed=3)
     assert 0.0 < four_map.error <= INTERPOLATION_ERROR
-    assert found.max() < 3.0 * four_map.error
+    assert errors(four_map, x, y, force).max() < 3.0 * four_map.error
 
 
 @pytest.mark.parametrize("changes", [{"readout": "edge"}, {"name": "uniaxial"}])
 def test_one_family_of_solves_serves_every_readout(four_map, changes):
     sensor = load_sensor("four-25um-uniaxial") if "name" in changes else replace(four_map.sensor, **changes)
-    x, y, force = draw(four_map, 8, seed=4)
-    other = replace(four_map, sensor=sensor)
-    np.testing.assert_allclose(other.forward(x, y, force), direct(sensor, x, y, force), rtol=1e-3)
+    x, y, force, _ = draw(four_map, 5, seed=4)
+    assert errors(replace(four_map, sensor=sensor), x, y, force).max() < 1e-3
 
 
 def test_calibrated_sensor(four_map):
     """Gains, shift and rotation reach the map as they reach a direct solve."""
     calibration = replace(four_map.sensor.calibration, gain={"A": 1.1}, shift=(0.5e-3, -1e-3), rotation=0.2)
     sensor = replace(four_map.sensor, calibration=calibration)
-    x, y, force = draw(four_map, 8, seed=5)
-    other = replace(four_map, sensor=sensor)
-    np.testing.assert_allclose(other.forward(x, y, force), direct(sensor, x, y, force), rtol=1e-3)
+    x, y, force, _ = draw(four_map, 5, seed=5)
+    assert errors(replace(four_map, sensor=sensor), x, y, force).max() < 1e-3
 
 
-def test_another_probe():
-    made = ForwardMap.build(load_sensor("three-25um-uniaxial"), Circle(2e-3), radius=5e-3, force_range=(0.5, 1.0))
-    x, y, force = draw(made, 8, seed=6)
-    np.testing.assert_allclose(made.forward(x, y, force), direct(made.sensor, x, y, force, 2e-3), rtol=1e-3)
+def test_contact_pressure(four_map, turned_map):
+    """d33 counts on the electrode under the probe, whichever way the probe is turned."""
+    for made in (four_map, turned_map):
+        sensor = replace(made.sensor, piezo=replace(made.sensor.piezo, d33=-30e-12))
+        presses = draw(made, 40, seed=6)
+        distance = np.min(
+            [np.hypot(presses[0] - e.centre[0], presses[1] - e.centre[1]) for e in sensor.electrodes], axis=0
+        )
+        nearest = np.argsort(distance)[:4]
+        near = tuple(values[nearest] for values in presses)
+        with_d33 = replace(made, sensor=sensor)
+        assert errors(with_d33, *near).max() < 1e-3
+        extra = with_d33.forward(*near) - made.forward(*near)
+        assert extra.max() > 1e-12
+
+
+FILMS = {
+    "pretension": ({"pretension": 0.5e6}, {"theory": Theory(stretching=True, bending=False, pretensioned=True)}),
+    "plate": ({"thickness": 1e-3}, {"theory": Theory(stretching=False, bending=True, pretensioned=False)}),
+    "110 um": ({"thickness": 110e-6}, {"theory": None, "resolution": None, "radius": 2e-3}),
+}
+
+
+@pytest.mark.parametrize(("film", "how"), FILMS.values(), ids=FILMS.keys())
+def test_other_films(film, how):
+    sensor = near_electrodes()
+    sensor = replace(sensor, film=replace(sensor.film, **film))
+    made = ForwardMap.build(sensor, Circle(1e-3), **{**QUICK, **how})
+    x, y, force, _ = draw(made, 6, seed=7)
+    assert errors(made, x, y, force).max() < 1e-3
+
+
+def test_surface():
+    """Bending is in though nobody asked for it."""
+    sensor = replace(load_sensor("four-25um-uniaxial"), surface="top")
+    sensor = replace(sensor, film=replace(sensor.film, thickness=110e-6))
+    made = ForwardMap.build(sensor, Circle(1e-3), **{**QUICK, "theory": None, "resolution": None, "radius": 2e-3})
+    assert made.theory.bending
+    x, y, force, _ = draw(made, 6, seed=8)
+    assert np.quantile(errors(made, x, y, force), 0.9) < 2e-3
 
 
 def test_one_force():
-    made = ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1e-3), radius=4e-3, force_range=(0.7, 0.7))
+    made = ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(2e-3), **{**QUICK, "force_range": (0.7, 0.7)})
     x, y, force = np.array([1e-3, 0.0]), np.array([2e-3, -3e-3]), np.full(2, 0.7)
-    np.testing.assert_allclose(made.forward(x, y, force), direct(made.sensor, x, y, force), rtol=1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pretension", [0.1e6, 0.5e6, 1.5e6])
-def test_pretensioned_film(pretension):
-    """No power law in the force any more: more solves, the same accuracy."""
-    sensor = load_sensor("four-25um-biaxial")
-    sensor = replace(sensor, film=replace(sensor.film, pretension=pretension))
-    made = ForwardMap.build(sensor, Circle(1e-3), radius=10e-3)
-    x, y, force = draw(made, 40, seed=7)
-    error = np.abs(made.forward(x, y, force) / direct(sensor, x, y, force) - 1.0)
-    assert np.quantile(error, 0.95) < 1e-3
-    assert error.max() < 5e-3
+    np.testing.assert_allclose(made.forward(x, y, force), direct(made, x, y, force), rtol=1e-3)
 
 
 def test_zero_force_is_no_charge(three_map):
@@ -114,16 +204,16 @@ def test_zero_force_is_no_charge(three_map):
     assert np.all(charge[3] > 0.0)
 
 
-def test_many_presses_are_each_of_them(three_map):
+def test_many_presses_are_each_of_them(three_map, turned_map):
     """More than a chunk, and the order kept; untouched rows among them."""
-    x, y, force = draw(three_map, 600, seed=8)
-    force[::7] = 0.0
-    charge = three_map.forward(x, y, force)
-    assert charge.shape == (600, 3)
-    for i in (0, 1, 255, 256, 300, 512, 599):
-        np.testing.assert_allclose(
-            charge[i], three_map.forward(x[i : i + 1], y[i : i + 1], force[i : i + 1])[0], rtol=1e-12
-        )
+    for made in (three_map, turned_map):
+        x, y, force, turn = draw(made, 600, seed=8)
+        force[::7] = 0.0
+        charge = made.forward(x, y, force, turn)
+        assert charge.shape == (600, len(made.sensor.electrodes))
+        for i in (0, 1, 255, 256, 300, 512, 599):
+            one = made.forward(*(values[i : i + 1] for values in (x, y, force, turn)))[0]
+            np.testing.assert_allclose(charge[i], one, rtol=1e-11)
 
 
 def test_no_presses_and_one_force_for_all(three_map):
@@ -159,9 +249,13 @@ def test_press_outside_is_shown(three_map, x, force, shown):
         ({"force_range": (2.0, 1.0)}, "force range"),
         ({"force_range": (0.1, np.inf)}, "force range"),
         ({"force_range": (np.nan, 1.0)}, "force range"),
-        ({"radius": 0.0}, "radius: expected a positive number, got 0.0 mm"),
+        ({"radius": 0.0}, r"radius: expected a positive number, got 0\.0 mm"),
         ({"radius": np.nan}, "radius: expected a positive number"),
-        ({"radius": 44.5e-3}, r"probe off the film: centre \(44\.5, 0\) mm"),
+        (
+            {"radius": 44.5e-3},
+            r"radius: presses up to 44\.5 mm from the centre with circle:1\.0, which reaches",
+        ),
+        ({"force_range": (0.1, 500.0)}, "beyond small strains"),
     ],
 )
 def test_impossible_families_are_refused(arguments, message):
@@ -169,70 +263,89 @@ def test_impossible_families_are_refused(arguments, message):
         ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1e-3), **arguments)
 
 
-def test_too_thick_a_film_is_refused():
-    sensor = load_sensor("three-25um-biaxial")
-    thick = replace(sensor, film=replace(sensor.film, thickness=110e-6))
-    with pytest.raises(SceneError, match=r"a film of 110 um at 0\.05 N carries about 8% of its load by bending"):
-        ForwardMap.build(thick, Circle(1e-3))
-
-
-def test_a_map_that_interpolates_badly_is_refused():
-    """The stress of a mesh too coarse is no smooth function of the place, and more solves do not help."""
-    family = {"radius": 4e-3, "force_range": (0.5, 1.0), "resolution": Resolution(3, 8, 2)}
-    with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to 0\.\d+ only, expected 0\.0005"):
-        ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1e-3), **family)
+def test_a_map_that_interpolates_badly_is_refused(monkeypatch):
+    """An error that cannot be reached is not passed over."""
+    monkeypatch.setattr("isocharge.simulate.forward.INTERPOLATION_ERROR", 1e-13)
+    with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to .* only, expected 1e-13"):
+        ForwardMap.build(
+            load_sensor("three-25um-biaxial"), Circle(1e-3), **{**QUICK, "resolution": Resolution(3, 8, 2)}
+        )
 
 
 @pytest.mark.slow
 def test_map_over_most_of_the_film():
     """Far out the mesh is finer, and the electrodes are still met."""
     made = ForwardMap.build(load_sensor("four-25um-biaxial"), Circle(1e-3), radius=22e-3, force_range=(0.5, 1.0))
-    assert made.resolution.order > 4
-    x, y, force = draw(made, 20, seed=9)
-    error = np.abs(made.forward(x, y, force) / direct(made.sensor, x, y, force) - 1.0)
+    x, y, force, _ = draw(made, 20, seed=9)
+    assert errors(made, x, y, force).max() < 5e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES.keys())
+def test_the_issues_ranges(probe):
+    """0.05 to 2 N, r <= 10 mm, random orientation, with bending: 95 % within 0.1 %, all within 0.5 %."""
+    made = ForwardMap.build(load_sensor("four-25um-uniaxial"), probe, radius=10e-3)
+    error = errors(made, *draw(made, 40, seed=13))
+    assert np.quantile(error, 0.95) < 1e-3
     assert error.max() < 5e-3
 
 
-def test_result_does_not_depend_on_the_executor(two_processes):
-    sensor, family = load_sensor("three-25um-biaxial"), {"radius": 4e-3, "force_range": (0.5, 1.0)}
-    here = ForwardMap.build(sensor, Circle(1e-3), **family)
-    there = ForwardMap.build(sensor, Circle(1e-3), **family, executor=two_processes)
+@pytest.mark.parametrize("probe", [Circle(1e-3), Polygon.triangle(4e-3)], ids=["circle", "triangle"])
+def test_result_does_not_depend_on_the_executor(two_processes, probe: Probe):
+    sensor, family = load_sensor("three-25um-biaxial"), {**QUICK, "force_range": (0.9, 1.0), "radius": 1e-3}
+    here = ForwardMap.build(sensor, probe, **family)
+    there = ForwardMap.build(sensor, probe, **family, executor=two_processes)
     assert here.table.tobytes() == there.table.tobytes()
     assert here.error == there.error
 
 
 def test_progress_is_told():
     told = []
-    made = ForwardMap.build(
+    ForwardMap.build(
         load_sensor("three-25um-biaxial"),
         Circle(1e-3),
-        radius=4e-3,
-        force_range=(0.9, 1.0),
+        **QUICK,
         progress=lambda done, total: told.append((done, total)),
     )
-    count = made.nodes.distance.size
-    assert told[-count:] == [(i, count) for i in range(1, count + 1)]
+    _, total = told[-1]
+    assert total > 1
+    assert told[-total:] == [(i, total) for i in range(1, total + 1)]
+
+
+# Where a family is solved
 
 
 def test_nodes_are_chebyshevs_in_the_distance_and_in_the_logarithm_of_the_force():
-    nodes = Nodes.spread(8e-3, (0.05, 2.0), (8, 3))
+    family = Family.spread(8e-3, (0.05, 2.0), (8, 3), 0.0)
     low, high = np.log([0.05, 2.0])
-    np.testing.assert_allclose(nodes.distance, 4e-3 * (1.0 + np.polynomial.chebyshev.chebpts1(8)), rtol=1e-12)
+    np.testing.assert_allclose(family.distance, 4e-3 * (1.0 + np.polynomial.chebyshev.chebpts1(8)), rtol=1e-12)
     expected = 0.5 * (low + high) + 0.5 * (high - low) * np.polynomial.chebyshev.chebpts1(3)
-    np.testing.assert_allclose(np.log(nodes.force), expected, rtol=1e-12)
+    np.testing.assert_allclose(np.log(family.force), expected, rtol=1e-12)
+    assert family.turn.tolist() == [0.0]
 
 
-def test_nodes_interpolate_what_charges_look_like():
-    """A power of the force times a smooth function of the distance, at the first and at the last number of nodes."""
+@pytest.mark.parametrize("folds", [1, 2, 3, 4, 5])
+def test_orientations_are_spread_evenly_and_solved_once_each(folds):
+    family = Family.spread(8e-3, (0.05, 2.0), (3, 2), 2.0 * np.pi / folds)
+    assert family.folds == folds
+    assert family.turn.size % folds == 0
+    np.testing.assert_allclose(np.diff(family.turn), 2.0 * np.pi / family.turn.size, rtol=1e-12)
+    assert np.all(family.solved_turns < 2.0 * np.pi / folds - 1e-9)
+    assert family.solved_turns.size * folds == family.turn.size
+
+
+@pytest.mark.parametrize("period", [2 * np.pi, np.pi, 2 * np.pi / 3])
+def test_nodes_interpolate_what_charges_look_like(period):
+    """A power of the force, a smooth function of the distance, the first harmonics of the orientation."""
     rng = np.random.default_rng(9)
     distance, force = 8e-3 * np.sqrt(rng.random(200)), np.exp(rng.uniform(np.log(0.05), np.log(2.0), 200))
+    turn = rng.uniform(-7.0, 7.0, 200)
 
-    def smooth(d: np.ndarray, f: np.ndarray) -> np.ndarray:
-        return f**0.02 / (1.0 + (d / 12e-3) ** 2)
+    def smooth(d: np.ndarray, f: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return f**0.02 / (1.0 + (d / 12e-3) ** 2) + 0.1 * np.cos(t - 0.3) + 0.05 * np.sin(3.0 * t)
 
     for count, expected in (((8, 3), 1e-4), ((15, 8), 1e-7)):
-        nodes = Nodes.spread(8e-3, (0.05, 2.0), count)
-        values = smooth(nodes.distance[:, None], nodes.force[None, :]).ravel()
-        np.testing.assert_allclose(nodes.weights(distance, force) @ values, smooth(distance, force), rtol=expected)
-        assert nodes.distance.min() > 0.0
-        assert nodes.force.max() < 2.0
+        family = Family.spread(8e-3, (0.05, 2.0), count, period)
+        grid = np.meshgrid(family.distance, family.force, family.turn, indexing="ij")
+        found = family.weights(distance, force, turn) @ smooth(*grid).ravel()
+        np.testing.assert_allclose(found, smooth(distance, force, turn), rtol=expected)
