@@ -207,4 +207,5 @@ def test_bending_matters_at_a_small_probe_on_a_taut_film(film):
     """The bending length is as long as the probe is wide: a membrane's slopes there are not the film's."""
     scene = (thick(film, 20.0, 10.0), Circle(0.1e-3), (5e-3, 3e-3), 1e-4)
     error, bound, name = difference(scene, 1e-2)
-    assert error <= max(bound, 1e-6), (name, error, bound)
+    assert error <= max(bound, 1e-5), (name, error, bound)
+    assert left_out(scene[0], scene[1], scene[3], Theory(True, False, True)) > 0.1

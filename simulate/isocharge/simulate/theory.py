@@ -24,8 +24,11 @@ from isocharge.simulate.sensor import Film, Sensor
 ACCURACY = 1e-3
 """Relative error of a charge that is good enough where nothing else is asked for."""
 
-LINEAR_WEIGHT = 1.5
+LINEAR_WEIGHT = 2.0
 """Relative error of a charge of the linear theories over the share of the load that induced stress carries."""
+
+LOCAL_WEIGHT = 0.4
+"""The same over the strain that a taut film's slope induces at the footprint, by that of the pretension."""
 
 BENDING_WEIGHT = 1.5
 """Worst relative error of a charge without bending over the bending length: 1.41 in the solutions of tests/data."""
@@ -84,6 +87,18 @@ def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
     return PROBE_WEIGHT * float(length2 * pretension / strain)
 
 
+def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
+    """Strain that the slope F / (2 pi R h T) of a taut film induces at the footprint, over that of the pretension T.
+
+    Where the bending length exceeds the footprint, bending keeps the slope smaller.
+    """
+    if film.pretension == 0.0:
+        return 0.0
+    slope = force / (2.0 * np.pi * probe.reach * film.thickness * film.pretension)
+    length2 = slenderness(film) * film.young / film.pretension * (film.radius / probe.reach) ** 2
+    return float(0.5 * slope**2 * film.young / film.pretension / (1.0 + length2) ** 2)
+
+
 def left_out(film: Film, probe: Probe, force: float, theory: Theory) -> float:
     """Relative error of a charge to expect from what a theory leaves out; infinite where it has no meaning."""
     error = 0.0
@@ -91,6 +106,7 @@ def left_out(film: Film, probe: Probe, force: float, theory: Theory) -> float:
         if not theory.bending and film.pretension == 0.0:
             return np.inf
         error += LINEAR_WEIGHT * Groups.of(film, force, bending=theory.bending).induced
+        error += LOCAL_WEIGHT * induced_at_probe(film, probe, force)
     if not theory.bending:
         length = bending_length(film, force)
         error += BENDING_WEIGHT * length + bending_at_probe(film, probe, force)
