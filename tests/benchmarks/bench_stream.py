@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from bench_predictor import machine
 
-from isocharge.serve import FrameParser, Port, Predictor, SequenceGaps, VirtualSensor, stream, wander
+from isocharge.serve import BinaryParser, Port, Predictor, SequenceGaps, VirtualSensor, stream, wander
 
 
 def reference_noise(charge_pC: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -33,7 +33,7 @@ def play(predictor: Predictor, seconds: float, rate_Hz: float, seed: int) -> dic
         return 800.0 * force_N[:, None] * (1.0 + ((x_mm + 1j * y_mm)[:, None] * direction.conj()).real / 20.0)
 
     script = wander(seed=seed, seconds=min(seconds, 60.0), rate_Hz=rate_Hz)
-    parser, gaps, latencies = FrameParser(), SequenceGaps(), []
+    parser, gaps, latencies = BinaryParser(), SequenceGaps(), []
     with VirtualSensor(charge_pC, script, noise=reference_noise, seed=seed) as sensor, Port(sensor.url) as port:
         for record in islice(stream(port, predictor, parser=parser, gaps=gaps), round(seconds * rate_Hz)):
             written = sensor.truth(record.seq).sent_s
@@ -42,7 +42,7 @@ def play(predictor: Predictor, seconds: float, rate_Hz: float, seed: int) -> dic
     return summary(np.array(latencies, dtype=float), parser, gaps, withheld)
 
 
-def summary(latencies: np.ndarray, parser: FrameParser, gaps: SequenceGaps, withheld: int) -> dict[str, Any]:
+def summary(latencies: np.ndarray, parser: BinaryParser, gaps: SequenceGaps, withheld: int) -> dict[str, Any]:
     """Counters and percentiles; latencies has the columns write to record, last byte to record (us), contact."""
     touched = latencies[latencies[:, 2] == 1.0]
     return {

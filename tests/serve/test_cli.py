@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from isocharge.cli.serve import serve_app
 from isocharge.errors import ChargeError, InputError, ModelError, OutputExists, PortError, PortLost, SensorError
-from isocharge.serve import FrameParser, Port, VirtualSensor, wander
+from isocharge.serve import BinaryParser, Port, VirtualSensor, wander
 
 PROGRAM = [sys.executable, "-c", "from isocharge.cli.serve import serve_app; serve_app()"]
 
@@ -164,14 +164,14 @@ def test_virtual_sensor_plays_and_cleans_up(start, tmp_path):
     process = start("virtual", "three-25um-biaxial", "--link", link, "--noise", "clean", "--force-max", "0.5")
     url = process.stdout.readline().strip()
     assert str(link.readlink()) == url
-    parser, frames = FrameParser(), []
+    parser, frames = BinaryParser(), []
     with Port(str(link)) as port:
         for chunk in port:
             frames += parser.feed(chunk.data)
             if len(frames) > 300:
                 break
-    assert {len(frame.charge_pC) for frame in frames} == {3}
-    assert max(sum(frame.charge_pC) for frame in frames) > 300.0
+    assert {len(frame.values) for frame in frames} == {3}
+    assert max(sum(frame.values) for frame in frames) > 300.0
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=20)
     assert (process.returncode, link.is_symlink()) == (0, False)

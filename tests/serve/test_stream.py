@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from isocharge.errors import ChargeError, PortError, TareError
-from isocharge.serve import Chain, Chunk, Frame, FrameParser, SequenceGaps, TareRule, encode_frame, stream
+from isocharge.serve import BinaryParser, Chain, Chunk, Frame, SequenceGaps, TareRule, encode_frame, stream
 
 OFFSET = np.array([12.0, -7.0, 3.0])
 CHAIN = Chain(tare=TareRule(frames=10))
@@ -114,8 +114,8 @@ def test_bytes_that_are_no_frames(predictor):
 
 def test_damage_costs_only_itself(film, play):
     good = Frame(11, 0, tuple((pressed(film) + OFFSET).tolist()))
-    parser = FrameParser()
-    damaged = bytearray(encode_frame(Frame(10, 0, good.charge_pC)))
+    parser = BinaryParser()
+    damaged = bytearray(encode_frame(Frame(10, 0, good.values)))
     damaged[5] ^= 0x40
     parser.feed(bytes(damaged))
     assert [r.contact for r in play(good, parser=parser)] == [True]

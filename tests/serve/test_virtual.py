@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from isocharge.errors import PortError, SceneError
-from isocharge.serve import FrameParser, Port, Script, SequenceGaps, VirtualSensor, wander
+from isocharge.serve import BinaryParser, Port, Script, SequenceGaps, VirtualSensor, wander
 
 
 def steady(n=10, rate_Hz=200.0, force_N=1.0):
@@ -16,7 +16,7 @@ def steady(n=10, rate_Hz=200.0, force_N=1.0):
 
 def read(url, count):
     """The next frames of a sensor."""
-    parser = FrameParser()
+    parser = BinaryParser()
     with Port(url, silence_s=1.0) as port:
         frames = list(islice((frame for chunk in port for frame in parser.feed(chunk.data)), count))
     return frames, parser
@@ -30,7 +30,7 @@ def test_frames_carry_script_noise_and_offset(film):
     press = film.charge_pC([1.0], [2.0], [0.5])[0]
     for frame in frames:
         clean = press if frame.seq % 2 == 0 else np.zeros(3)
-        np.testing.assert_allclose(frame.charge_pC, clean + np.array([11.0, 21.0, 31.0]), rtol=1e-6)
+        np.testing.assert_allclose(frame.values, clean + np.array([11.0, 21.0, 31.0]), rtol=1e-6)
         assert frame.t_us == frame.seq * 2000
 
 
@@ -48,7 +48,7 @@ def test_keeps_its_rate_without_drift(film):
 def test_default_offset_is_there_and_small(film):
     with VirtualSensor(film.charge_pC, wander(seed=1, seconds=0.5)) as sensor:
         (frame, *_), _ = read(sensor.url, 1)
-    assert 0.0 < np.abs(frame.charge_pC).max() <= 20.0
+    assert 0.0 < np.abs(frame.values).max() <= 20.0
 
 
 def test_truth_says_what_was_pressed(film):
@@ -59,7 +59,7 @@ def test_truth_says_what_was_pressed(film):
             truth = sensor.truth(frame.seq)
             assert truth.force_N == script.force_N[frame.seq]
             assert truth.x_mm == pytest.approx(script.x_mm[frame.seq], nan_ok=True)
-            np.testing.assert_allclose(frame.charge_pC, truth.charge_pC, atol=21.0)
+            np.testing.assert_allclose(frame.values, truth.charge_pC, atol=21.0)
 
 
 def test_script_begins_again(film):

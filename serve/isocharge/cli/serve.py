@@ -22,7 +22,7 @@ from isocharge.cli.terminal import progress, say
 from isocharge.errors import InputError, OutputExists
 
 if TYPE_CHECKING:
-    from isocharge.serve import FrameParser, PredictionRecord, SequenceGaps
+    from isocharge.serve import BinaryParser, PredictionRecord, SequenceGaps
 
 LATENCIES = 100_000
 """The closing line's percentiles are over so many latest records at most."""
@@ -97,9 +97,9 @@ def stream_command(
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
-    from isocharge.serve import Chain, FrameParser, Port, Predictor, SequenceGaps, TareRule, stream
+    from isocharge.serve import BinaryParser, Chain, Port, Predictor, SequenceGaps, TareRule, stream
 
-    predictor, parser, gaps = Predictor(model, models=models), FrameParser(), SequenceGaps()
+    predictor, parser, gaps = Predictor(model, models=models), BinaryParser(), SequenceGaps()
     chain = Chain(tare=TareRule(offset_limit_pC=offset_limit_pC))
     latencies: deque[float] = deque(maxlen=LATENCIES)
     with _until_stopped(), Port(_awaited(port, wait), baud=baud) as source:
@@ -142,7 +142,7 @@ def _watched(records: "Iterable[PredictionRecord]", latencies: deque[float]) -> 
         yield record
 
 
-def _closing_line(parser: "FrameParser", gaps: "SequenceGaps", latencies: deque[float]) -> str:
+def _closing_line(parser: "BinaryParser", gaps: "SequenceGaps", latencies: deque[float]) -> str:
     counts = parser.counts
     said = (
         f"{counts.frames} frames, {gaps.lost} lost, {gaps.repeated} repeated, {gaps.restarts} restarts; "

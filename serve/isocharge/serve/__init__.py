@@ -7,31 +7,39 @@
 `serve/README.md` says what is in which module.
 """
 
+from isocharge.serve.binary import BinaryParser, encode_frame
 from isocharge.serve.chain import Chain, Tare, TareRule, TouchRule
+from isocharge.serve.described import DescribedParser, FrameLayout, frame_layout
 from isocharge.serve.domain import Domain
-from isocharge.serve.frames import Frame, FrameCounts, FrameParser, SequenceGaps, encode_frame
+from isocharge.serve.frames import Frame, FrameCounts, Parser, SequenceGaps
 from isocharge.serve.metadata import ModelMetadata
 from isocharge.serve.model import Model, check_golden, load_model, write_model
 from isocharge.serve.port import Chunk, Port
 from isocharge.serve.predictor import Contact, Contacts, Predictor
+from isocharge.serve.recognise import AutoParser
 from isocharge.serve.record import PredictionRecord
 from isocharge.serve.repository import find_model
 from isocharge.serve.script import Script, wander
 from isocharge.serve.stream import stream
 from isocharge.serve.table import read_charges, table_records, write_contacts
+from isocharge.serve.text import TextParser, encode_text
 from isocharge.serve.virtual import Truth, VirtualSensor
 
 __all__ = [
+    "AutoParser",
+    "BinaryParser",
     "Chain",
     "Chunk",
     "Contact",
     "Contacts",
+    "DescribedParser",
     "Domain",
     "Frame",
     "FrameCounts",
-    "FrameParser",
+    "FrameLayout",
     "Model",
     "ModelMetadata",
+    "Parser",
     "Port",
     "PredictionRecord",
     "Predictor",
@@ -39,12 +47,15 @@ __all__ = [
     "SequenceGaps",
     "Tare",
     "TareRule",
+    "TextParser",
     "TouchRule",
     "Truth",
     "VirtualSensor",
     "check_golden",
     "encode_frame",
+    "encode_text",
     "find_model",
+    "frame_layout",
     "load_model",
     "read_charges",
     "stream",

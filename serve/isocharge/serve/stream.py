@@ -10,10 +10,11 @@ import numpy as np
 
 from isocharge.errors import ChargeError, PortError
 from isocharge.serve.arrays import Array
+from isocharge.serve.binary import BinaryParser
 from isocharge.serve.chain import Chain, ChainState, Reading, advance
 from isocharge.serve.domain import Domain
 from isocharge.serve.flags import INVALID, SATURATED
-from isocharge.serve.frames import SATURATED_BIT, Frame, FrameParser, SequenceGaps
+from isocharge.serve.frames import SATURATED_BIT, Frame, SequenceGaps
 from isocharge.serve.port import Chunk
 from isocharge.serve.predictor import Predictor
 from isocharge.serve.record import OUT_OF_CONTACT, UNKNOWN, Charges, PredictionRecord
@@ -28,7 +29,7 @@ def stream(
     predictor: Predictor,
     chain: Chain | None = None,
     *,
-    parser: FrameParser | None = None,
+    parser: BinaryParser | None = None,
     gaps: SequenceGaps | None = None,
 ) -> Iterator[PredictionRecord]:
     """A record for every intact frame.
@@ -46,7 +47,7 @@ def stream(
         PortError: If the bytes are no frames.
         PortLost: If the port goes away.
     """
-    chain, parser, gaps = chain or Chain(), parser or FrameParser(), gaps or SequenceGaps()
+    chain, parser, gaps = chain or Chain(), parser or BinaryParser(), gaps or SequenceGaps()
     scribe = _Scribe.of(predictor)
     state = ChainState.start(len(scribe.electrodes))
     for chunk in chunks:
@@ -63,10 +64,10 @@ def _frame_flags(frame: Frame, gaps: SequenceGaps) -> tuple[str, ...]:
     flags = gaps.update(frame.seq)
     if frame.flags & SATURATED_BIT:
         flags += (SATURATED,)
-    return flags if math.isfinite(sum(frame.charge_pC)) else (*flags, INVALID)
+    return flags if math.isfinite(sum(frame.values)) else (*flags, INVALID)
 
 
-def _check_recognised(parser: FrameParser) -> None:
+def _check_recognised(parser: BinaryParser) -> None:
     counts = parser.counts
     if counts.frames == 0 and counts.bytes_dropped > BYTES_TO_RECOGNISE:
         raise PortError(
@@ -92,12 +93,12 @@ class _Scribe:
 
     def raw_charges(self, frame: Frame) -> Array:
         """Charges of a frame, shape (electrodes,), pC; a ChargeError if there are too many or too few."""
-        if len(frame.charge_pC) != len(self.electrodes):
+        if len(frame.values) != len(self.electrodes):
             raise ChargeError(
                 f"model {self.model} expects {len(self.electrodes)} charges {self.electrodes}, frame {frame.seq} "
-                f"has {len(frame.charge_pC)}; choose the model of this sensor"
+                f"has {len(frame.values)}; choose the model of this sensor"
             )
-        return np.array(frame.charge_pC)
+        return np.array(frame.values)
 
     def record(self, chunk: Chunk, frame: Frame, reading: Reading, flags: tuple[str, ...]) -> PredictionRecord:
         """What one reading means."""
@@ -109,7 +110,7 @@ class _Scribe:
             **felt,
             contact=reading.contact,
             charge_pC=self._named(reading.charge_pC),
-            charge_raw_pC=self._named(np.array(frame.charge_pC)),
+            charge_raw_pC=self._named(np.array(frame.values)),
             tare_pC=self._named(reading.tare.charge_pC if reading.tare else None),
             flags=flags,
             latency_us=(time.perf_counter_ns() - chunk.clock_ns) / 1e3,

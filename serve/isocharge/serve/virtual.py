@@ -16,7 +16,8 @@ import numpy as np
 
 from isocharge.errors import PortError, SceneError
 from isocharge.serve.arrays import Array
-from isocharge.serve.frames import SEQ_MODULUS, T_US_MODULUS, Frame, encode_frame
+from isocharge.serve.binary import encode_frame
+from isocharge.serve.frames import SEQ_MODULUS, T_US_MODULUS, Frame
 from isocharge.serve.pseudo_port import PseudoPort
 from isocharge.serve.script import Script
 
