@@ -5,9 +5,12 @@ import pytest
 
 from isocharge.errors import TareError
 from isocharge.serve import Chain, TareRule, TouchRule
-from isocharge.serve.chain import ChainState, Touch, advance, measure_tare, next_touch
+from isocharge.serve.chain import ChainState, advance
+from isocharge.serve.tare import measure_tare
+from isocharge.serve.touching import Touch, next_touch
 
 RULE, OFFSET = TareRule(), np.array([12.0, -7.0, 3.0])
+RATE_HZ = 200.0
 ONE_PC = np.ones(3)
 
 
@@ -18,8 +21,8 @@ def rest(n, seed=0, sigma=1.0):
 def run(frames, chain=None):
     """All readings of raw frames, shape (n, 3)."""
     state, readings = ChainState.start(3), []
-    for raw in frames:
-        state, reading = advance(chain or Chain(), state, raw)
+    for k, raw in enumerate(frames):
+        state, reading = advance(chain or Chain(), state, raw, k / RATE_HZ, 1 / RATE_HZ)
         readings.append(reading)
     return readings
 
@@ -121,6 +124,6 @@ def test_no_false_touch_in_two_and_a_half_minutes_of_noise():
 
 def test_advance_leaves_its_input_alone():
     state = ChainState.start(3)
-    after, _ = advance(Chain(), state, OFFSET)
+    after, _ = advance(Chain(), state, OFFSET, 0.0, 0.0)
     assert (state.frames, len(state.waiting_pC)) == (0, 0)
     assert (after.frames, len(after.waiting_pC)) == (1, 1)

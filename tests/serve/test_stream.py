@@ -107,9 +107,11 @@ def test_film_that_is_not_left_alone(predictor):
 
 
 def test_bytes_that_are_no_frames(predictor):
-    lines = [Chunk(b"801.2,799.5,803.3\r\n" * 20, 0.0, 0)] * 50
-    with pytest.raises(PortError, match=r"no intact frame among the first \d+ bytes .*check baud rate"):
-        list(stream(lines, predictor))
+    noise = [Chunk(bytes(range(128, 256)) * 4, 0.0, 0)] * 50
+    with pytest.raises(
+        PortError, match=r"no intact frame among the first \d+ bytes .*nothing recognised yet: check baud"
+    ):
+        list(stream(noise, predictor))
 
 
 def test_damage_costs_only_itself(film, play):

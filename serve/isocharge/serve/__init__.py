@@ -8,10 +8,14 @@
 """
 
 from isocharge.serve.binary import BinaryParser, encode_frame
-from isocharge.serve.chain import Chain, Tare, TareRule, TouchRule
+from isocharge.serve.chain import Chain
 from isocharge.serve.described import DescribedParser, FrameLayout, frame_layout
+from isocharge.serve.device import Device, load_device
+from isocharge.serve.device_clock import DeviceClock
 from isocharge.serve.domain import Domain
 from isocharge.serve.frames import Frame, FrameCounts, Parser, SequenceGaps
+from isocharge.serve.hum import HumRule
+from isocharge.serve.leak import LeakRule
 from isocharge.serve.metadata import ModelMetadata
 from isocharge.serve.model import Model, check_golden, load_model, write_model
 from isocharge.serve.port import Chunk, Port
@@ -20,9 +24,12 @@ from isocharge.serve.recognise import AutoParser
 from isocharge.serve.record import PredictionRecord
 from isocharge.serve.repository import find_model
 from isocharge.serve.script import Script, wander
-from isocharge.serve.stream import stream
+from isocharge.serve.source import open_source
+from isocharge.serve.stream import Policy, TouchStream, stream
 from isocharge.serve.table import read_charges, table_records, write_contacts
+from isocharge.serve.tare import Tare, TareRule
 from isocharge.serve.text import TextParser, encode_text
+from isocharge.serve.touching import TouchRule
 from isocharge.serve.virtual import Truth, VirtualSensor
 
 __all__ = [
@@ -33,13 +40,18 @@ __all__ = [
     "Contact",
     "Contacts",
     "DescribedParser",
+    "Device",
+    "DeviceClock",
     "Domain",
     "Frame",
     "FrameCounts",
     "FrameLayout",
+    "HumRule",
+    "LeakRule",
     "Model",
     "ModelMetadata",
     "Parser",
+    "Policy",
     "Port",
     "PredictionRecord",
     "Predictor",
@@ -49,6 +61,7 @@ __all__ = [
     "TareRule",
     "TextParser",
     "TouchRule",
+    "TouchStream",
     "Truth",
     "VirtualSensor",
     "check_golden",
@@ -56,7 +69,9 @@ __all__ = [
     "encode_text",
     "find_model",
     "frame_layout",
+    "load_device",
     "load_model",
+    "open_source",
     "read_charges",
     "stream",
     "table_records",

@@ -8,7 +8,8 @@
 | `gap` | frames are missing before this one |
 | `repeat` | this frame has the number of the one before |
 | `restart` | the frame numbers went back: the device began anew |
-| `saturated` | the device says that an amplifier is at its limit |
+| `saturated` | an amplifier is at its limit, or was in this press: the device says so, or the device file's limit |
+| `reconnected` | the first frame after the port was away; the film is tared anew |
 | `invalid` | the device sent a charge that is not a number; nothing was computed |
 """
 
@@ -19,4 +20,5 @@ GAP = "gap"
 REPEAT = "repeat"
 RESTART = "restart"
 SATURATED = "saturated"
+RECONNECTED = "reconnected"
 INVALID = "invalid"

@@ -23,8 +23,9 @@ class PredictionRecord:
     """One reading of a sensor and what the model makes of it.
 
     Attributes:
-        timestamp: Host time at which the reading arrived, unix seconds.
-        t_device_us: The device's clock, us, as sent.
+        timestamp: Host time of the reading, unix seconds: the device's clock fitted to the arrivals; the arrival itself
+            where the device sends no clock.
+        t_device_us: The device's clock, us, without its wraps.
         seq: The device's sequence number, as sent.
         x_mm, y_mm: Position in the frame `frame_id`, mm; None out of contact.
         force_N: Force, N; 0 out of contact.
@@ -32,7 +33,7 @@ class PredictionRecord:
         misfit: Distance from the nearest single contact the model knows, in standard deviations; None out of contact.
         contact: Whether something touches.
         charge_pC: Touch charges, as the model got them.
-        charge_raw_pC: Charges as they came from the device.
+        charge_raw_pC: Charges as they came from the device, after its gain.
         tare_pC: What was subtracted.
         flags: Short words, see `isocharge.serve.flags`.
         latency_us: From the arrival of the reading's last byte to this record, us.
