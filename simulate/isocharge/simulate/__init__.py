@@ -10,6 +10,7 @@ charge = touch_charge(sensor, equilibrium)  # C, in the order of sensor.electrod
 from isocharge.extras import require
 
 with require("simulate"):
+    from isocharge.simulate.amplifier import Amplifier, Measurement, load_amplifier
     from isocharge.simulate.charge import touch_charge
     from isocharge.simulate.dataset import Dataset, Samples, read_dataset, write_dataset
     from isocharge.simulate.equilibrium import STANDARD, Equilibrium, press
@@ -23,6 +24,7 @@ with require("simulate"):
 
 __all__ = [
     "STANDARD",
+    "Amplifier",
     "Calibration",
     "Circle",
     "Dataset",
@@ -30,6 +32,7 @@ __all__ = [
     "Equilibrium",
     "Film",
     "ForwardMap",
+    "Measurement",
     "NoiseModel",
     "Piezo",
     "Resolution",
@@ -37,6 +40,7 @@ __all__ = [
     "Sensor",
     "Sweep",
     "built_in_sensors",
+    "load_amplifier",
     "load_sensor",
     "noise_model",
     "parse_probe",
