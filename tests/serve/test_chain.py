@@ -112,10 +112,15 @@ def test_smallest_press_is_felt_at_once():
     assert contact == [False] * 200 + [True] * 100 + [False] * 100
 
 
-def test_negative_charges_touch_as_well():
+def test_negative_charges_are_no_touch_and_are_flagged():
+    """A press stretches the film: charges that fall say that an amplifier inverts, which the device file can mend."""
     frames = rest(200)
     frames[150:] -= 200.0
-    assert [r.contact for r in run(frames)] == [False] * 150 + [True] * 50
+    readings = run(frames)
+    assert not any(r.contact for r in readings)
+    assert [r.flags for r in readings[100:]] == [()] * 50 + [("negative",)] * 50
+    inverted = run(frames, Chain(gain_pC=-ONE_PC))
+    assert [r.contact for r in inverted] == [False] * 150 + [True] * 50
 
 
 def test_no_false_touch_in_two_and_a_half_minutes_of_noise():

@@ -11,12 +11,13 @@ stage whose rule is None is switched off.
 6. touch: contact with hysteresis (`isocharge.serve.touching`).
 """
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from isocharge.serve.arrays import Array
-from isocharge.serve.flags import SATURATED, TARE
+from isocharge.serve.flags import NEGATIVE, SATURATED, TARE
 from isocharge.serve.hum import Hum, HumRule, remove_hum
 from isocharge.serve.leak import Leak, LeakRule, undo_leak
 from isocharge.serve.tare import Tare, TareRule, look_for_tare
@@ -113,10 +114,10 @@ def advance(chain: Chain, state: ChainState, values: Array, t_s: float, dt_s: fl
         return _look_for_tare(chain, state, hum, quiet_pC), _untared(raw_pC, limited)
     output_pC = quiet_pC - state.tare.charge_pC
     leak, charge_pC = _charge(chain, state, state.tare, output_pC, dt_s)
-    touch = _touch(chain, state, charge_pC, state.tare)
+    touch = _touch(chain, state, charge_pC, state.tare, dt_s)
     saturated = limited or (state.saturated and touch.contact)
     after = ChainState(state.waiting_pC, hum, state.frames, state.tare, leak, touch, saturated)
-    flags = (SATURATED,) if saturated else ()
+    flags = (SATURATED,) * saturated + (NEGATIVE,) * touch.below
     return after, Reading(raw_pC, charge_pC, state.tare, touch.contact, flags)
 
 
@@ -145,7 +146,8 @@ def _charge(chain: Chain, state: ChainState, tare: Tare, output_pC: Array, dt_s:
     return leak, leak.charge_pC
 
 
-def _touch(chain: Chain, state: ChainState, charge_pC: Array, tare: Tare) -> Touch:
+def _touch(chain: Chain, state: ChainState, charge_pC: Array, tare: Tare, dt_s: float) -> Touch:
     if chain.touch is None:
         return Touch(contact=True)
-    return next_touch(chain.touch, state.touch, abs(float(charge_pC.sum())), tare.noise_pC)
+    keep = 1.0 if chain.leak is None else math.exp(-dt_s / chain.leak.relax_s)
+    return next_touch(chain.touch, state.touch, float(charge_pC.sum()), tare.noise_pC, keep)

@@ -9,6 +9,7 @@
 | `repeat` | this frame has the number of the one before |
 | `restart` | the frame numbers went back: the device began anew |
 | `saturated` | an amplifier is at its limit, or was in this press: the device says so, or the device file's limit |
+| `negative` | the charges are well below zero: an amplifier that inverts (see `[gain]`), or what a long press left |
 | `reconnected` | the first frame after the port was away; the film is tared anew |
 | `invalid` | the device sent a charge that is not a number; nothing was computed |
 """
@@ -21,4 +22,5 @@ REPEAT = "repeat"
 RESTART = "restart"
 SATURATED = "saturated"
 RECONNECTED = "reconnected"
+NEGATIVE = "negative"
 INVALID = "invalid"
