@@ -41,6 +41,10 @@ class ModelError(InputError):
     """A model is missing, damaged, or of another format."""
 
 
+class RecordingError(InputError):
+    """A file is no recording, or a damaged one."""
+
+
 class OutputExists(IsochargeError, FileExistsError):
     """The output is already there; nothing is overwritten unasked."""
 

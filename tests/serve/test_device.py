@@ -114,7 +114,7 @@ def test_wrong_files(device, text, said):
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(DeviceError, match="none.toml: cannot be read"):
+    with pytest.raises(DeviceError, match=r"none\.toml: cannot be read"):
         load_device(tmp_path / "none.toml")
 
 
