@@ -130,7 +130,12 @@ def test_sends_text(film, notation):
 def test_amplifier_takes_the_script_in_order_and_over_and_over(film):
     """One with a memory: it counts the rows that it has been given."""
     seen = []
-    noise = lambda q, rng: seen.append(q) or q + np.arange(sum(map(len, seen)) - len(q), sum(map(len, seen)))[:, None]  # noqa: E731
+
+    def noise(charge_pC, _):
+        first = sum(map(len, seen))
+        seen.append(charge_pC)
+        return charge_pC + np.arange(first, first + len(charge_pC))[:, None]
+
     with VirtualSensor(film.charge_pC, steady(7, 1000.0), noise=noise, offset_pC=[0.0] * 3) as sensor:
         frames, _ = read(sensor.url, 1200)
     clean = film.charge_pC([0.0], [0.0], [1.0])[0]
