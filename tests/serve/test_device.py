@@ -87,7 +87,7 @@ def test_formats(device):
 
 
 WRONG = [
-    ("[gane]\n", r"expected the sections channels, frames.*got \['gane'\]"),
+    ("[gane]\n", r"expected the sections channels, common_mode, frames.*got \['gane'\]"),
     ("[tare]\nframe = 50\n", r"tare: expected the keys .*, got \['frame'\]"),
     ("[tare]\nframes = 50.5\n", "tare: frames: expected a whole number, got 50.5"),
     ("[tare]\non = 1\n", "tare: on: expected true or false, got 1"),
@@ -100,6 +100,7 @@ WRONG = [
     ('[frames]\nformat = "morse"\n', "format auto, binary, text or described, got 'morse'"),
     ('[frames]\nformat = "binary"\ncolumns = ["A"]\n', r"expected the keys format, got \['columns'\]"),
     ('[frames]\nformat = "described"\nsync = "55"\n', "the keys sync, length and fields"),
+    ("[common_mode]\nevery = 1\n", "common_mode: expected the keys blind_pC"),
     ("[channels]\nA = 0\n", "names of channels"),
     ("channels = 3\n", "expected a section, got 3"),
     ("frames =", "not TOML"),
@@ -157,3 +158,11 @@ def test_saturation_is_flagged_until_the_press_is_over(device):
         state, reading = advance(chain, state, np.full(3, total), 0.005 * k, 0.005)
         flags.append("saturated" in reading.flags)
     assert flags == [False] * 7 + [True] * 3 + [False] * 3
+
+
+def test_warming_needs_four_electrodes(device):
+    board = device("[common_mode]\nevery_s = 0.1\n")
+    assert board.common_mode(("A", "B", "C", "D")).every_s == 0.1
+    with pytest.raises(DeviceError, match="expected four electrodes or more"):
+        board.common_mode(ELECTRODES)
+    assert device("[common_mode]\non = false\n").common_mode(ELECTRODES) is None

@@ -7,7 +7,19 @@ import numpy as np
 import pytest
 
 from isocharge.errors import ChargeError, PortError, TareError
-from isocharge.serve import BinaryParser, Chain, Chunk, Frame, SequenceGaps, TareRule, encode_frame, stream
+from isocharge.serve import (
+    BinaryParser,
+    Chain,
+    Chunk,
+    Frame,
+    Predictor,
+    SequenceGaps,
+    TareRule,
+    TouchStream,
+    device_from_table,
+    encode_frame,
+    stream,
+)
 
 OFFSET = np.array([12.0, -7.0, 3.0])
 CHAIN = Chain(tare=TareRule(frames=10))
@@ -130,3 +142,36 @@ def test_order_of_records_does_not_depend_on_chunks(film, predictor):
     bytewise = stream((Chunk(data[i : i + 1], 0.0, 0) for i in range(len(data))), predictor, CHAIN)
     whole = stream([Chunk(data, 0.0, 0)], predictor, CHAIN)
     assert [(r.seq, r.x_mm) for r in bytewise] == [(r.seq, r.x_mm) for r in whole]
+
+
+@pytest.fixture
+def four(make_film, tmp_path):
+    """The linear film with four electrodes, and its model."""
+    film = make_film(4)
+    film.write(tmp_path)
+    return film, Predictor("linear", models=tmp_path)
+
+
+def test_warming_is_looked_for_in_contact_only(four):
+    """This model's misfit says nothing about a common charge: the record says that it is blind."""
+    film, predictor = four
+    board = device_from_table({"tare": {"frames": 10}, "common_mode": {"every_s": 0.01}}, "test")
+    press = film.charge_pC(np.array([2.0]), np.array([1.0]), np.array([0.5]))[0]
+    path = TouchStream(predictor, board)
+    records = [r for f in frames([np.zeros(4)] * 15 + [press] * 15 + [np.zeros(4)] * 5) for r in path.feed(chunk(f))]
+    assert ["blind" in record.flags for record in records] == [False] * 16 + [True] * 14 + [False] * 5
+
+
+def test_warming_that_is_told_is_taken_out(four, monkeypatch):
+    """A misfit that knows the press: the common charge goes into the tare, and the record says so."""
+    film, predictor = four
+    press = film.charge_pC(np.array([2.0]), np.array([1.0]), np.array([0.5]))[0]
+    path = TouchStream(predictor, device_from_table({"tare": {"frames": 10}, "common_mode": {}}, "test"))
+    monkeypatch.setattr(path, "_misfit", lambda q: np.abs(q - press).max(axis=1))
+    rows = [np.zeros(4)] * 15 + [press + 40.0 * k / 200 for k in range(400)] + [np.full(4, 80.0)] * 5
+    records = [record for frame in frames(rows) for record in path.feed(chunk(frame))]
+    assert "thermal" not in records[20].flags
+    assert "thermal" in records[400].flags
+    assert records[414].force_N == pytest.approx(0.5, rel=0.02)
+    assert records[414].tare_pC["A"] == pytest.approx(80.0, abs=8.0)
+    assert not records[-1].contact

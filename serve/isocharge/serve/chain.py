@@ -74,6 +74,13 @@ class ChainState:
         """What is known about hum stays; the film is tared anew, and given up for being touched no more."""
         return ChainState(self.waiting_pC[:0], replace(self.hum, raw_pC=None), frames=-(1 << 62))
 
+    def shifted(self, charge_pC: float) -> "ChainState":
+        """The same charge taken from every electrode from here on: by the leak's charge, or by the tare."""
+        if self.leak is not None:
+            return replace(self, leak=self.leak._replace(charge_pC=self.leak.charge_pC - charge_pC))
+        assert self.tare is not None
+        return replace(self, tare=replace(self.tare, charge_pC=self.tare.charge_pC + charge_pC))
+
 
 @dataclass(frozen=True, slots=True)
 class Reading:

@@ -27,6 +27,8 @@
     [touch]
     floor_pC = 10.0
 
+    [common_mode]                  # warming told from force by the model; four electrodes or more
+
 Each stage also takes the settings of its rule (see the modules), and `on = false`, which switches it off. Tare and
 touch are on without a section. An unknown key is an error.
 """
@@ -43,6 +45,7 @@ from isocharge.errors import DeviceError
 from isocharge.serve.arrays import Array
 from isocharge.serve.binary import BinaryParser
 from isocharge.serve.chain import Chain
+from isocharge.serve.common_mode import CommonModeRule
 from isocharge.serve.described import DescribedParser, FrameLayout, frame_layout
 from isocharge.serve.frames import Parser
 from isocharge.serve.hum import HumRule
@@ -52,7 +55,7 @@ from isocharge.serve.tare import TareRule
 from isocharge.serve.text import TextParser
 from isocharge.serve.touching import TouchRule
 
-SECTIONS = {"frames", "channels", "gain", "saturation", "hum", "tare", "leak", "touch"}
+SECTIONS = {"frames", "channels", "gain", "saturation", "hum", "tare", "leak", "touch", "common_mode"}
 STAGES: dict[str, type] = {"hum": HumRule, "tare": TareRule, "touch": TouchRule}
 
 
@@ -109,6 +112,21 @@ class Device:
             leak=self._leak(electrodes),
             touch=rules["touch"],
         )
+
+    def common_mode(self, electrodes: tuple[str, ...]) -> CommonModeRule | None:
+        """How warming is followed; None if it is not.
+
+        Raises:
+            DeviceError: If there are too few electrodes.
+        """
+        if not self._is_on("common_mode"):
+            return None
+        if len(electrodes) < 4:
+            raise DeviceError(
+                f"{self.where}: common_mode: expected four electrodes or more, the model has {electrodes}; with three "
+                "every charge triple fits some contact, and temperature cannot be told from force"
+            )
+        return CommonModeRule(**{key: value for key, value in self.table["common_mode"].items() if key != "on"})
 
     def _is_on(self, stage: str) -> bool:
         return stage in self.table and bool(self.table[stage].get("on", True))
@@ -249,4 +267,5 @@ _CHECKS: dict[str, Callable[[Mapping[str, Any], str], None]] = {
     "tare": _check_rule(TareRule),
     "leak": _check_each("tau_s", _types(LeakRule), positive=True),
     "touch": _check_rule(TouchRule),
+    "common_mode": _check_rule(CommonModeRule),
 }

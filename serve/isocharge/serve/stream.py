@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from isocharge.errors import PortError
-from isocharge.serve.arrays import Array
+from isocharge.serve.arrays import Array, Reals
 from isocharge.serve.chain import Chain, ChainState, Reading, advance
 from isocharge.serve.channels import ChannelPicker
+from isocharge.serve.common_mode import NO_WARMING, CommonModeRule, follow_warming
 from isocharge.serve.device import ANY_BOARD, Device
 from isocharge.serve.device_clock import DeviceClock, ReadingTime
 from isocharge.serve.domain import Domain
-from isocharge.serve.flags import INVALID, RECONNECTED, SATURATED
+from isocharge.serve.flags import BLIND, INVALID, RECONNECTED, SATURATED, THERMAL
 from isocharge.serve.frames import SATURATED_BIT, Frame, Parser, SequenceGaps
 from isocharge.serve.port import Chunk
 from isocharge.serve.predictor import Predictor
@@ -122,6 +123,8 @@ class TouchStream:
         self._now_ns = now_ns
         self._news: tuple[str, ...] = ()
         self._since_s = 0.0
+        self._warming_rule = device.common_mode(electrodes)
+        self._warming = NO_WARMING
 
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
@@ -170,10 +173,29 @@ class TouchStream:
             return Reading(values * gain, None, None, contact=False), when, (*flags, INVALID)
         device_s = when.host_s if when.device_us is None else when.device_us * 1e-6
         self._state, reading = advance(self._chain, self._state, values, device_s, self._since_s)
+        if self._warming_rule is not None:
+            flags += self._follow_warming(self._warming_rule, reading, self._since_s)
         self._since_s = 0.0
         if frame.flags & SATURATED_BIT and SATURATED not in reading.flags:
             flags += (SATURATED,)
         return reading, when, flags
+
+    def _follow_warming(self, rule: CommonModeRule, reading: Reading, dt_s: float) -> tuple[str, ...]:
+        """Take what is found from the charges of the next frames on; the flags that it earns."""
+        before = self._warming
+        if not reading.contact or reading.charge_pC is None:
+            self._warming = NO_WARMING
+            return ()
+        if SATURATED in reading.flags:  # a clipped charge fits no contact, whatever the temperature
+            return ()
+        self._warming = now = follow_warming(rule, before, reading.charge_pC, self._misfit, dt_s)
+        if now.charge_pC != before.charge_pC:
+            self._state = self._state.shifted(now.charge_pC - before.charge_pC)
+        return (THERMAL,) * (abs(now.charge_pC) >= rule.tell_pC) + (BLIND,) * now.blind
+
+    def _misfit(self, charge_pC: Array) -> Reals:
+        """Of the model, shape (n,), for charges of shape (n, electrodes), pC."""
+        return self._scribe.predictor.predict_batch(charge_pC).misfit
 
 
 def _check_recognised(parser: Parser) -> None:
