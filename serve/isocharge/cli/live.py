@@ -21,7 +21,16 @@ import typer
 from isocharge.cli.terminal import say, until_stopped
 
 if TYPE_CHECKING:
-    from isocharge.serve import Chunk, Device, Examination, PredictionRecord, Recorder, Recording, TouchStream
+    from isocharge.serve import (
+        Chunk,
+        Device,
+        Examination,
+        PredictionRecord,
+        RecordedClock,
+        Recorder,
+        Recording,
+        TouchStream,
+    )
 
 LATENCIES = 100_000
 """The closing line's percentiles are over so many latest records at most."""
@@ -252,12 +261,12 @@ def _follow(
 
 
 def _replayed(
-    recording: "Recording", path: "TouchStream", clock: "Callable[[], int]", real_time: bool
+    recording: "Recording", path: "TouchStream", clock: "RecordedClock", real_time: bool
 ) -> "Iterator[tuple[PredictionRecord, str]]":
     """Records with their lines; as many for each chunk as there were."""
     ahead_s: float | None = None
     for event in recording.events():
-        clock.set(event)  # type: ignore[attr-defined]
+        clock.set(event)
         if event.chunk is None:
             path.tare()
             continue
