@@ -82,23 +82,43 @@ def board(process: Measurement, electrodes: tuple[str, ...], gain_error: float, 
 
 def feel(
     predictor: Predictor,
-    film: ForwardMap,
-    script: Script,
+    charge: np.ndarray,
+    rate_Hz: float,
     part: Amplifier,
     gain_error: float,
     seed: int,
     *,
     warm: bool = False,
 ) -> list[Any]:
-    """Records of a script."""
+    """Records of touch charges (n, electrodes), C, behind an amplifier."""
     electrodes = predictor.metadata.electrodes
-    process = part.start(len(electrodes), script.rate_Hz, np.random.default_rng(seed))
-    readings = process(charges(film, script)) * 1e12
+    process = part.start(len(electrodes), rate_Hz, np.random.default_rng(seed))
+    readings = process(charge) * 1e12
     path, records = TouchStream(predictor, board(process, electrodes, gain_error, seed, warm=warm)), []
     for k, row in enumerate(readings.tolist()):
-        frame = Frame(k % 65536, round(1e6 * k / script.rate_Hz) % 2**32, tuple(row))
-        records += path.feed(Chunk(encode_frame(frame), 1e9 + k / script.rate_Hz, time.perf_counter_ns()))
+        frame = Frame(k % 65536, round(1e6 * k / rate_Hz) % 2**32, tuple(row))
+        records += path.feed(Chunk(encode_frame(frame), 1e9 + k / rate_Hz, time.perf_counter_ns()))
     return records
+
+
+def held_presses(predictor: Predictor, part: Amplifier, rate_Hz: float, seed: int) -> dict[str, Any]:
+    """400 pC for 8 s and 300 pC for 10 s on every electrode: the worst electrode's error at the end, 8 boards each."""
+    t, out = np.arange(round(36.0 * rate_Hz)) / rate_Hz, {}
+    presses_of = ((6.0, 8.0, 400.0), (20.0, 10.0, 300.0))
+    total = sum(h * np.clip(np.minimum(t - at, at + length - t) / RAMP_S, 0, 1) for at, length, h in presses_of)
+    charge = np.repeat(total[:, None], len(predictor.metadata.electrodes), axis=1) * 1e-12
+    for tau in (10.0, 1.0):
+        for name, rms in (("no thermal drift", 0.0), ("with it", part.temperature_rms)):
+            worst = []
+            for k in range(8):
+                records = feel(predictor, charge, rate_Hz, replace(part, tau=tau, temperature_rms=rms), 0.002, seed + k)
+                for at, length, height in presses_of:
+                    end = round((at + length - 0.2) * rate_Hz)
+                    ends = np.mean([list(r.charge_pC.values()) for r in records[end - 20 : end]], axis=0)
+                    worst.append(np.abs(ends - height).max())
+                assert not records[-1].contact
+            out[f"tau {tau:g} s, {name}, pC"] = percentiles(np.array(worst))
+    return out
 
 
 def accuracy(
@@ -107,7 +127,7 @@ def accuracy(
     """Errors on the plateaus of n presses, delay of the first reading."""
     radius_mm = min(np.hypot(*np.array(predictor.metadata.working_area_mm).T))
     script = presses(n, rate_Hz, float(radius_mm), seed)
-    records = feel(predictor, film, script, part, gain_error, seed)
+    records = feel(predictor, charges(film, script), rate_Hz, part, gain_error, seed)
     plateau = np.flatnonzero(script.force_N >= 1.0)
     felt = [k for k in plateau if records[k].contact]
     error = np.array([np.hypot(records[k].x_mm - script.x_mm[k], records[k].y_mm - script.y_mm[k]) for k in felt])
@@ -130,7 +150,7 @@ def nothing(predictor: Predictor, film: ForwardMap, part: Amplifier, rate_Hz: fl
     """Ten minutes without a touch."""
     n = round(600 * rate_Hz)
     script = Script(np.full(n, np.nan), np.full(n, np.nan), np.zeros(n), rate_Hz)
-    records = feel(predictor, film, script, part, 0.002, seed)
+    records = feel(predictor, charges(film, script), rate_Hz, part, 0.002, seed)
     return {"false_contacts": sum(record.contact for record in records), "seconds": 600}
 
 
@@ -144,8 +164,9 @@ def warming(
         for k in range(6):
             script = held(14.0, rate_Hz, radius_mm * np.exp(2j * np.pi * rng.uniform()), force_N)
             before, after = (round((REST_S + t) * rate_Hz) for t in (2.5, 12.0))
-            records = feel(predictor, film, script, part, 0.002, seed + k, warm=True)
-            plain = feel(predictor, film, script, part, 0.002, seed + k)
+            pressed = charges(film, script)
+            records = feel(predictor, pressed, rate_Hz, part, 0.002, seed + k, warm=True)
+            plain = feel(predictor, pressed, rate_Hz, part, 0.002, seed + k)
             for kept, made in ((moved, records), (raw, plain)):
                 force = [np.mean([r.force_N for r in made[at - 100 : at]]) for at in (before, after)]
                 kept.append(100 * abs(force[1] / force[0] - 1))
@@ -231,6 +252,7 @@ def main() -> None:
         "gains to 0.2 %": accuracy(*common, asked.presses, asked.rate_Hz, 0.002, asked.seed),
         "gains off by 1 % rms": accuracy(*common, asked.presses, asked.rate_Hz, 0.0, asked.seed),
         "nothing": nothing(*common, asked.rate_Hz, asked.seed),
+        "held": held_presses(predictor, part, asked.rate_Hz, asked.seed),
     }
     if asked.warm:
         result["warming"] = warming(*common, asked.rate_Hz, asked.warm_force, asked.seed)

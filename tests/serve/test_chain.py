@@ -68,6 +68,18 @@ def test_tare_gives_up_with_the_reason():
         run(rest(300, sigma=50.0), Chain(tare=TareRule(patience=250)))
 
 
+def test_a_new_tare_is_waited_for_for_ever():
+    """In the middle of a live run, a finger that rests on the film is no reason to stop."""
+    chain, state = Chain(tare=TareRule(frames=20, patience=50)), ChainState.start(3)
+    for k, raw in enumerate(rest(60)):
+        state, _ = advance(chain, state, raw, k / RATE_HZ, 1 / RATE_HZ)
+    state, tared = state.without_tare(), []
+    for k, raw in enumerate(np.concatenate([rest(200, sigma=100.0), rest(30)])):
+        state, reading = advance(chain, state, raw, k / RATE_HZ, 1 / RATE_HZ)
+        tared.append(reading.tare is not None)
+    assert tared.index(True) == 220
+
+
 def touches(totals, rule=None, noise=ONE_PC):
     touch, seen = Touch(), []
     for total in totals:

@@ -94,7 +94,8 @@ def test_flags_of_the_frame(film, play):
     records = play(
         Frame(10, 0, charges), Frame(13, 0, charges, flags=1), Frame(13, 0, charges), Frame(2, 0, charges), gaps=gaps
     )
-    assert [r.flags for r in records] == [(), ("gap", "saturated"), ("repeat",), ("restart",)]
+    late = "saturated"  # until the press is over
+    assert [r.flags for r in records] == [(), ("gap", late), ("repeat", late), ("restart", late)]
     assert (gaps.lost, gaps.repeated, gaps.restarts) == (2, 1, 1)
 
 

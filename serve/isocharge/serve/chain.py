@@ -52,6 +52,7 @@ class ChainState:
     Attributes:
         waiting_pC: The latest charges while there is no tare, shape (k, electrodes), pC.
         frames: Frames seen while looking for a tare.
+        patient: Whether looking for it is never given up.
         tare: None until quiet frames were found.
         hum, leak, touch: Of the stages; no leak before the tare.
         saturated: Whether a charge was at the limit in this press.
@@ -60,6 +61,7 @@ class ChainState:
     waiting_pC: Array
     hum: Hum
     frames: int = 0
+    patient: bool = False
     tare: Tare | None = None
     leak: Leak | None = None
     touch: Touch = field(default_factory=Touch)
@@ -71,8 +73,8 @@ class ChainState:
         return cls(np.empty((0, electrodes)), Hum.start(electrodes))
 
     def without_tare(self) -> "ChainState":
-        """What is known about hum stays; the film is tared anew, and given up for being touched no more."""
-        return ChainState(self.waiting_pC[:0], replace(self.hum, raw_pC=None), frames=-(1 << 62))
+        """The film is tared anew, however long that takes; what is known about hum stays."""
+        return ChainState(self.waiting_pC[:0], replace(self.hum, raw_pC=None), patient=True)
 
     def shifted(self, charge_pC: float) -> "ChainState":
         """The same charge taken from every electrode from here on: by the leak's charge, or by the tare."""
@@ -101,7 +103,9 @@ class Reading:
     flags: tuple[str, ...] = ()
 
 
-def advance(chain: Chain, state: ChainState, values: Array, t_s: float, dt_s: float) -> tuple[ChainState, Reading]:
+def advance(
+    chain: Chain, state: ChainState, values: Array, t_s: float, dt_s: float, *, limited: bool = False
+) -> tuple[ChainState, Reading]:
     """Take the next frame through all stages.
 
     Args:
@@ -110,12 +114,13 @@ def advance(chain: Chain, state: ChainState, values: Array, t_s: float, dt_s: fl
         values: As they came, in the device's unit, shape (electrodes,).
         t_s: The device's clock, s.
         dt_s: Since the frame before, s.
+        limited: Whether the device says that an amplifier is at its limit.
 
     Raises:
         TareError: If the film is not left alone for long enough to tare.
     """
     raw_pC = values if chain.gain_pC is None else values * chain.gain_pC
-    limited = chain.limit_pC is not None and bool((np.abs(raw_pC) >= chain.limit_pC).any())
+    limited = limited or (chain.limit_pC is not None and bool((np.abs(raw_pC) >= chain.limit_pC).any()))
     hum, quiet_pC = (state.hum, raw_pC) if chain.hum is None else remove_hum(chain.hum, state.hum, raw_pC, t_s, dt_s)
     if state.tare is None:
         return _look_for_tare(chain, state, hum, quiet_pC), _untared(raw_pC, limited)
@@ -123,7 +128,7 @@ def advance(chain: Chain, state: ChainState, values: Array, t_s: float, dt_s: fl
     leak, charge_pC = _charge(chain, state, state.tare, output_pC, dt_s)
     touch = _touch(chain, state, charge_pC, state.tare, dt_s)
     saturated = limited or (state.saturated and touch.contact)
-    after = ChainState(state.waiting_pC, hum, state.frames, state.tare, leak, touch, saturated)
+    after = ChainState(state.waiting_pC, hum, state.frames, state.patient, state.tare, leak, touch, saturated)
     flags = (SATURATED,) * saturated + (NEGATIVE,) * touch.below
     return after, Reading(raw_pC, charge_pC, state.tare, touch.contact, flags)
 
@@ -137,9 +142,9 @@ def _look_for_tare(chain: Chain, state: ChainState, hum: Hum, quiet_pC: Array) -
     if chain.tare is None:
         return ChainState(state.waiting_pC, hum, tare=Tare.none(quiet_pC.size))
     waiting = np.vstack([state.waiting_pC, quiet_pC])[-chain.tare.frames :]
-    frames = state.frames + 1
+    frames = 0 if state.patient else state.frames + 1
     tare = look_for_tare(chain.tare, waiting, frames)
-    return ChainState(waiting if tare is None else waiting[:0], hum, frames, tare)
+    return ChainState(waiting if tare is None else waiting[:0], hum, frames, state.patient, tare)
 
 
 def _charge(chain: Chain, state: ChainState, tare: Tare, output_pC: Array, dt_s: float) -> tuple[Leak | None, Array]:

@@ -172,12 +172,11 @@ class TouchStream:
             gain = 1.0 if self._chain.gain_pC is None else self._chain.gain_pC
             return Reading(values * gain, None, None, contact=False), when, (*flags, INVALID)
         device_s = when.host_s if when.device_us is None else when.device_us * 1e-6
-        self._state, reading = advance(self._chain, self._state, values, device_s, self._since_s)
+        limited = bool(frame.flags & SATURATED_BIT)
+        self._state, reading = advance(self._chain, self._state, values, device_s, self._since_s, limited=limited)
         if self._warming_rule is not None:
             flags += self._follow_warming(self._warming_rule, reading, self._since_s)
         self._since_s = 0.0
-        if frame.flags & SATURATED_BIT and SATURATED not in reading.flags:
-            flags += (SATURATED,)
         return reading, when, flags
 
     def _follow_warming(self, rule: CommonModeRule, reading: Reading, dt_s: float) -> tuple[str, ...]:

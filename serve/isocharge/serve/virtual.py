@@ -171,9 +171,14 @@ class VirtualSensor:
             self._folder = self._link = None
 
     def _plug(self) -> None:
-        self._port = PseudoPort()
-        if self._link:
-            self._link.symlink_to(self._port.url)
+        port = PseudoPort()
+        try:
+            if self._link:
+                self._link.symlink_to(port.url)
+        except OSError:
+            port.close()
+            raise
+        self._port = port
 
     def _unplug(self) -> None:
         if self._port is None:
