@@ -144,3 +144,18 @@ def test_advance_leaves_its_input_alone():
     after, _ = advance(Chain(), state, OFFSET, 0.0, 0.0)
     assert (state.frames, len(state.waiting_pC)) == (0, 0)
     assert (after.frames, len(after.waiting_pC)) == (1, 1)
+
+
+def test_a_base_that_relaxes_to_zero_is_no_touch():
+    """A long press may leave the charge below zero; as it relaxes, so does the base that a touch is measured from."""
+    totals, keep = -100.0 * np.exp(-np.arange(1000) / 200.0), float(np.exp(-1.0 / 200.0))
+
+    def contacts(keep):
+        touch, seen = Touch(last_pC=-100.0, base_pC=-100.0), False
+        for total in totals.tolist():
+            touch = next_touch(TouchRule(), touch, total, ONE_PC, keep)
+            seen |= touch.contact
+        return seen
+
+    assert not contacts(keep)
+    assert contacts(1.0)

@@ -5,6 +5,7 @@ import pytest
 
 from isocharge.serve import Chain, LeakRule, TareRule
 from isocharge.serve.chain import ChainState, advance
+from isocharge.serve.leak import Leak, undo_leak
 
 RATE_HZ, TAU_S = 200.0, 2.0
 
@@ -88,3 +89,30 @@ def test_a_slow_common_warming_is_no_touch():
     got, contact = undo(output)
     assert not contact.any()
     assert np.abs(got[1000:]).max() < 4.0
+
+
+def leak_after(surplus_pC, noise_pC=1.0, **state):
+    """What is known after one frame of 5 ms in which so much came, nothing touching."""
+    rule = LeakRule(np.full(3, TAU_S))
+    leak = Leak.start(np.zeros(3))._replace(learned_s=10.0, **state)
+    return undo_leak(rule, leak, np.full(3, surplus_pC), np.full(3, noise_pC), 0.005, contact=False)
+
+
+def test_a_spike_counts_up_to_a_limit():
+    """Four standard deviations of an innovation, sqrt(2) pC each, over 3 s of settling."""
+    assert leak_after(1.0).inflow_pC_per_s == pytest.approx(np.full(3, 1.0 / 3.0))
+    assert leak_after(1000.0).inflow_pC_per_s == pytest.approx(np.full(3, 4.0 * np.sqrt(2.0) / 3.0))
+    assert leak_after(-1000.0, noise_pC=0.0).inflow_pC_per_s == pytest.approx(np.full(3, -0.1 / 3.0))
+
+
+def test_learning_holds_off_after_a_release():
+    """A finger that leaves takes the last twentieth of its charge after the release."""
+    rule = LeakRule(np.full(3, TAU_S))
+    leak = Leak.start(np.zeros(3))._replace(learned_s=10.0)
+    leak = undo_leak(rule, leak, np.full(3, 40.0), np.ones(3), 0.005, contact=True)
+    for k in range(99):
+        leak = undo_leak(rule, leak, np.full(3, 40.0 - 0.4 * k), np.ones(3), 0.005, contact=False)
+    assert not leak.inflow_pC_per_s.any()
+    for k in range(20):
+        leak = undo_leak(rule, leak, np.full(3, -0.4 * k), np.ones(3), 0.005, contact=False)
+    assert leak.inflow_pC_per_s.any()
