@@ -33,16 +33,16 @@ class DeviceError(InputError):
     """The description of a device is wrong: unknown key, frame whose parts do not add up, unknown checksum."""
 
 
+class RecordingError(InputError):
+    """A file is no recording, or a damaged one."""
+
+
 class DatasetError(InputError):
     """A folder is not a dataset, or a damaged one."""
 
 
 class ModelError(InputError):
     """A model is missing, damaged, or of another format."""
-
-
-class RecordingError(InputError):
-    """A file is no recording, or a damaged one."""
 
 
 class OutputExists(IsochargeError, FileExistsError):

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.terminal import say, until_stopped
+from isocharge.cli.stopping import until_stopped
+from isocharge.cli.terminal import say
 
 if TYPE_CHECKING:
     from isocharge.serve import (

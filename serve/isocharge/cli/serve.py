@@ -13,7 +13,7 @@ import typer
 
 from isocharge.cli.doctor import doctor_command
 from isocharge.cli.live import ModelsOption, replay_command, stream_command
-from isocharge.cli.terminal import until_stopped
+from isocharge.cli.stopping import until_stopped
 from isocharge.cli.virtual import virtual_command
 from isocharge.errors import InputError
 

@@ -1,8 +1,6 @@
 """Words, numbers and progress bars for people, on stderr; bars only where a terminal shows them."""
 
-import os
 import shlex
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -52,18 +50,3 @@ def progress(title: str) -> Iterator[Advance]:
             bar.update(task, completed=done, total=total, words=words)
 
         yield advance
-
-
-@contextmanager
-def until_stopped() -> Iterator[None]:
-    """Ctrl-C, a SIGTERM and a reader that closes the pipe all mean: enough, and well done."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    except KeyboardInterrupt:
-        pass
-    except BrokenPipeError:
-        # What is still in stdout's buffer goes nowhere, without a complaint at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    finally:
-        signal.signal(signal.SIGTERM, before)

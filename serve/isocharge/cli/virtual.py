@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from isocharge.cli.terminal import progress, say, until_stopped
+from isocharge.cli.stopping import until_stopped
+from isocharge.cli.terminal import progress, say
 from isocharge.errors import InputError, OutputExists
 
 if TYPE_CHECKING:
