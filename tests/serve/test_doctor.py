@@ -42,7 +42,7 @@ def test_a_healthy_board(film):
     device = device_from_table({"leak": {"tau_s": 10.0}}, "test")
     noise = lambda charge_pC, rng: charge_pC + rng.normal(0, 0.3, charge_pC.shape)  # noqa: E731
     with board(film, noise=noise) as sensor:
-        found = examine(sensor.url, seconds=1.5, device=device, electrodes=film.electrodes)
+        found = examine(sensor.url, seconds=0.9, device=device, electrodes=film.electrodes)
     assert (found.baud, found.format, found.missing) == (115200, "binary frames of isocharge", ())
     assert found.rate_Hz == pytest.approx(200.0, rel=0.02)
     assert (found.lost, found.repeated, found.device_clock) == (0, 0, True)
@@ -52,7 +52,7 @@ def test_a_healthy_board(film):
 def test_text_in_counts(film):
     device = device_from_table({"gain": {"pC_per_unit": {"A": 2.0, "B": -1.0, "C": 1.0}}}, "test")
     with board(film, encode=partial(encode_text, notation="pairs")) as sensor:
-        found = examine(sensor.url, bauds=BAUD, seconds=1.0, device=device)
+        found = examine(sensor.url, bauds=BAUD, seconds=0.6, device=device)
     assert "name:value: seq, t_us, A, B, C" in found.format
     assert [(channel.name, round(channel.offset_pC)) for channel in found.channels] == [("A", 10), ("B", 6), ("C", 7)]
 
@@ -64,7 +64,7 @@ def missing(found):
 def test_what_is_missing(film):
     hum = lambda q, rng: q + 9.0 * np.sin(2 * np.pi * 50 * np.arange(len(q))[:, None] / 200.0 + 0.5)  # noqa: E731, ARG005
     with board(film, noise=hum) as sensor:
-        found = examine(sensor.url, bauds=BAUD, seconds=1.5, electrodes=("A", "B", "C", "D"))
+        found = examine(sensor.url, bauds=BAUD, seconds=0.9, electrodes=("A", "B", "C", "D"))
     assert "3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')" in missing(found)
     assert "[hum] frequency_Hz = 50" in missing(found)
     assert "time constants ([leak] tau_s" in missing(found)

@@ -8,8 +8,8 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from enum import StrEnum
 from itertools import islice
 from pathlib import Path
@@ -128,9 +128,11 @@ def stream_command(
         write = _writer(stack, output, udp, predictor.metadata.electrodes)
         if recorder:
             stack.enter_context(recorder)
+        # Closed before the recorder is, so that what was begun is written.
+        records = stack.enter_context(closing(_follow(path, source, recorder, wishes)))
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
-            _pass_on(islice(_follow(path, source, recorder, wishes), count), write, latencies)
+            _pass_on(islice(records, count), write, latencies)
         finally:
             say(_closing_line(path, latencies))
     if recorder is not None and recorder.failed:
@@ -194,7 +196,7 @@ def _awaited(port: str, wait: float) -> str:
 
 def _follow(
     path: "TouchStream", source: "Iterable[Chunk]", recorder: "Recorder | None", wishes: list[bool]
-) -> "Iterator[tuple[PredictionRecord, str]]":
+) -> "Generator[tuple[PredictionRecord, str]]":
     """Records with their lines of JSON; chunks and records go into the recording as they come."""
     for chunk in source:
         if wishes:
