@@ -22,6 +22,7 @@ bench: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_solve.py
 	$(BIN)/python tests/benchmarks/bench_predictor.py
 	$(BIN)/python tests/benchmarks/bench_stream.py
+	$(BIN)/python tests/benchmarks/bench_touch.py
 
 # The released model, made anew; fails if it is there already.
 release: $(VENV)/installed

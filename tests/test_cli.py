@@ -56,6 +56,8 @@ SUBCOMMANDS = [
     ("serve", "predict"),
     ("serve", "stream"),
     ("serve", "virtual"),
+    ("serve", "replay"),
+    ("serve", "doctor"),
     ("demo",),
 ]
 

@@ -29,6 +29,14 @@ class ChargeError(InputError):
     """Charges do not fit the model: wrong number, NaN, infinite."""
 
 
+class DeviceError(InputError):
+    """The description of a device is wrong: unknown key, frame whose parts do not add up, unknown checksum."""
+
+
+class RecordingError(InputError):
+    """A file is no recording, or a damaged one."""
+
+
 class DatasetError(InputError):
     """A folder is not a dataset, or a damaged one."""
 

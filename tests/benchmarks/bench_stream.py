@@ -1,22 +1,30 @@
-"""The live path over a pseudo-terminal: frames lost and repeated, and how long a prediction takes to come.
+"""The live path over a pseudo-terminal: frames lost and repeated, how long a record takes, and how much of a core.
 
-    python tests/benchmarks/bench_stream.py [--model NAME|PATH] [--seconds 60] [--rate-Hz 200] [--json]
+    python tests/benchmarks/bench_stream.py [--model NAME|PATH] [--seconds 60] [--rate-Hz 1000] [--corrupt 0] [--json]
 
-Two latencies: from the virtual sensor's write to the record (kernel, port, parser, chain, model), and from the arrival
-of the last byte to the record, as the record itself says. Sensor and reader share this process and its interpreter
-lock. The charges are those of a made-up linear film: nothing here depends on what the model answers.
+The virtual sensor plays in a process of its own; the reader's processor time is its own alone, all stages of the signal
+chain on, each record turned into a line of JSON. The latency is that of the record itself: from the arrival of the last
+byte. The charges are those of a made-up linear film: nothing here depends on what the model answers.
 """
 
 import argparse
 import json
+import multiprocessing
 import time
-from itertools import islice
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 from bench_predictor import machine
 
-from isocharge.serve import FrameParser, Port, Predictor, SequenceGaps, VirtualSensor, stream, wander
+from isocharge.serve import Faults, Port, Predictor, TouchStream, VirtualSensor, device_from_table, wander
+
+BOARD = {
+    "gain": {"pC_per_unit": 1.0},
+    "saturation": {"limit_pC": 1e5},
+    "hum": {"frequency_Hz": 50.0},
+    "leak": {"tau_s": 1e6},
+}
 
 
 def reference_noise(charge_pC: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -24,37 +32,64 @@ def reference_noise(charge_pC: np.ndarray, rng: np.random.Generator) -> np.ndarr
     return charge_pC + np.hypot(1.0, 0.002 * charge_pC) * rng.standard_normal(charge_pC.shape)
 
 
-def play(predictor: Predictor, seconds: float, rate_Hz: float, seed: int) -> dict[str, Any]:
-    """Follow a virtual sensor for a while."""
-    electrodes = len(predictor.metadata.electrodes)
+def linear_film(electrodes: int) -> Any:
+    """Charges of a film on which they are proportional to the force."""
     direction = np.exp(2j * np.pi * np.arange(electrodes) / electrodes)
 
     def charge_pC(x_mm: np.ndarray, y_mm: np.ndarray, force_N: np.ndarray) -> np.ndarray:
         return 800.0 * force_N[:, None] * (1.0 + ((x_mm + 1j * y_mm)[:, None] * direction.conj()).real / 20.0)
 
-    script = wander(seed=seed, seconds=min(seconds, 60.0), rate_Hz=rate_Hz)
-    parser, gaps, latencies = FrameParser(), SequenceGaps(), []
-    with VirtualSensor(charge_pC, script, noise=reference_noise, seed=seed) as sensor, Port(sensor.url) as port:
-        for record in islice(stream(port, predictor, parser=parser, gaps=gaps), round(seconds * rate_Hz)):
-            written = sensor.truth(record.seq).sent_s
-            latencies.append(((time.perf_counter() - written) * 1e6, record.latency_us, record.contact))
-        withheld = sensor.withheld
-    return summary(np.array(latencies, dtype=float), parser, gaps, withheld)
+    return charge_pC
 
 
-def summary(latencies: np.ndarray, parser: FrameParser, gaps: SequenceGaps, withheld: int) -> dict[str, Any]:
-    """Counters and percentiles; latencies has the columns write to record, last byte to record (us), contact."""
-    touched = latencies[latencies[:, 2] == 1.0]
+def board(pipe: Connection, electrodes: int, rate_Hz: float, faults: Faults, seed: int) -> None:
+    """Play until the other end says so; then tell what was played."""
+    script = wander(seed=seed, seconds=60.0, rate_Hz=rate_Hz)
+    options = {"noise": reference_noise, "faults": faults, "seed": seed}
+    with VirtualSensor(linear_film(electrodes), script, **options) as sensor:
+        pipe.send(sensor.url)
+        pipe.recv()
+    pipe.send({name: getattr(sensor, name) for name in ("sent", "withheld", "lost", "corrupted", "unplugged")})
+
+
+def play(predictor: Predictor, seconds: float, rate_Hz: float, faults: Faults, seed: int) -> dict[str, Any]:
+    """Follow a virtual sensor for a while."""
+    pipe, far = multiprocessing.Pipe()
+    process = multiprocessing.get_context("spawn").Process(
+        target=board, args=(far, len(predictor.metadata.electrodes), rate_Hz, faults, seed)
+    )
+    process.start()
+    path, latencies = TouchStream(predictor, device_from_table(BOARD, "bench")), []
+    with Port(pipe.recv(), reconnect=True) as port:
+        began, used = time.perf_counter(), time.process_time()
+        for chunk in port:
+            for record in path.feed(chunk):
+                record.to_json()
+                latencies.append((record.latency_us, record.contact))
+            if time.perf_counter() - began >= seconds:
+                break
+        wall, used = time.perf_counter() - began, time.process_time() - used
+    pipe.send("enough")
+    played = pipe.recv()
+    process.join()
+    return summary(np.array(latencies, dtype=float), path, played) | {"core_share": round(used / wall, 3)}
+
+
+def summary(latencies: np.ndarray, path: TouchStream, played: dict[str, int]) -> dict[str, Any]:
+    """Counters and percentiles; latencies has the columns last byte to record (us), contact."""
+    counts, touched = path.parser.counts, latencies[latencies[:, 1] == 1.0]
     return {
-        "frames": parser.counts.frames,
-        "lost": gaps.lost,
-        "repeated": gaps.repeated,
-        "withheld": withheld,
-        "crc_errors": parser.counts.crc_errors,
-        "malformed": parser.counts.malformed,
+        "frames": counts.frames,
+        "missing_by_number": path.gaps.lost,
+        "repeated": path.gaps.repeated,
+        "crc_errors": counts.crc_errors,
+        "malformed": counts.malformed,
+        "resynchronisations": counts.resyncs,
+        "outages": path.counts.outages,
+        "board": played,
         "in_contact": len(touched),
-        "write_to_record_us": percentiles(touched[:, 0]),
-        "last_byte_to_record_us": percentiles(touched[:, 1]),
+        "last_byte_to_record_us": percentiles(latencies[:, 0]),
+        "in_contact_us": percentiles(touched[:, 0]),
     }
 
 
@@ -66,16 +101,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", default="three-25um-biaxial", help="model name or path")
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--rate-Hz", type=float, default=200.0)
+    parser.add_argument("--rate-Hz", type=float, default=1000.0)
+    parser.add_argument("--corrupt", type=float, default=0.0, help="share of bytes")
+    parser.add_argument("--lose", type=float, default=0.0, help="share of frames")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true", help="one JSON object")
     asked = parser.parse_args()
-    result = play(Predictor(asked.model), asked.seconds, asked.rate_Hz, asked.seed)
+    faults = Faults(corrupt_share=asked.corrupt, lose_share=asked.lose)
+    result = play(Predictor(asked.model), asked.seconds, asked.rate_Hz, faults, asked.seed)
     if asked.json:
         print(json.dumps({"benchmark": "stream", **vars(asked), "machine": machine(), "results": result}))
         return
     print(", ".join(f"{name} {value}" for name, value in machine().items()))
-    print(f"{asked.model}: {asked.seconds:g} s at {asked.rate_Hz:g} Hz, seed {asked.seed}; latencies in contact")
+    print(f"{asked.model}: {asked.seconds:g} s at {asked.rate_Hz:g} Hz, seed {asked.seed}")
     for name, value in result.items():
         print(f"{name:24s} {value}")
 

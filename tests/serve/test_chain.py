@@ -5,9 +5,12 @@ import pytest
 
 from isocharge.errors import TareError
 from isocharge.serve import Chain, TareRule, TouchRule
-from isocharge.serve.chain import ChainState, Touch, advance, measure_tare, next_touch
+from isocharge.serve.chain import ChainState, advance
+from isocharge.serve.tare import measure_tare
+from isocharge.serve.touching import Touch, next_touch
 
 RULE, OFFSET = TareRule(), np.array([12.0, -7.0, 3.0])
+RATE_HZ = 200.0
 ONE_PC = np.ones(3)
 
 
@@ -18,8 +21,8 @@ def rest(n, seed=0, sigma=1.0):
 def run(frames, chain=None):
     """All readings of raw frames, shape (n, 3)."""
     state, readings = ChainState.start(3), []
-    for raw in frames:
-        state, reading = advance(chain or Chain(), state, raw)
+    for k, raw in enumerate(frames):
+        state, reading = advance(chain or Chain(), state, raw, k / RATE_HZ, 1 / RATE_HZ)
         readings.append(reading)
     return readings
 
@@ -63,6 +66,18 @@ def test_tare_waits_for_quiet():
 def test_tare_gives_up_with_the_reason():
     with pytest.raises(TareError, match="varies by"):
         run(rest(300, sigma=50.0), Chain(tare=TareRule(patience=250)))
+
+
+def test_a_new_tare_is_waited_for_for_ever():
+    """In the middle of a live run, a finger that rests on the film is no reason to stop."""
+    chain, state = Chain(tare=TareRule(frames=20, patience=50)), ChainState.start(3)
+    for k, raw in enumerate(rest(60)):
+        state, _ = advance(chain, state, raw, k / RATE_HZ, 1 / RATE_HZ)
+    state, tared = state.without_tare(), []
+    for k, raw in enumerate(np.concatenate([rest(200, sigma=100.0), rest(30)])):
+        state, reading = advance(chain, state, raw, k / RATE_HZ, 1 / RATE_HZ)
+        tared.append(reading.tare is not None)
+    assert tared.index(True) == 220
 
 
 def touches(totals, rule=None, noise=ONE_PC):
@@ -109,10 +124,15 @@ def test_smallest_press_is_felt_at_once():
     assert contact == [False] * 200 + [True] * 100 + [False] * 100
 
 
-def test_negative_charges_touch_as_well():
+def test_negative_charges_are_no_touch_and_are_flagged():
+    """A press stretches the film: charges that fall say that an amplifier inverts, which the device file can mend."""
     frames = rest(200)
     frames[150:] -= 200.0
-    assert [r.contact for r in run(frames)] == [False] * 150 + [True] * 50
+    readings = run(frames)
+    assert not any(r.contact for r in readings)
+    assert [r.flags for r in readings[100:]] == [()] * 50 + [("negative",)] * 50
+    inverted = run(frames, Chain(gain_pC=-ONE_PC))
+    assert [r.contact for r in inverted] == [False] * 150 + [True] * 50
 
 
 def test_no_false_touch_in_two_and_a_half_minutes_of_noise():
@@ -121,6 +141,21 @@ def test_no_false_touch_in_two_and_a_half_minutes_of_noise():
 
 def test_advance_leaves_its_input_alone():
     state = ChainState.start(3)
-    after, _ = advance(Chain(), state, OFFSET)
+    after, _ = advance(Chain(), state, OFFSET, 0.0, 0.0)
     assert (state.frames, len(state.waiting_pC)) == (0, 0)
     assert (after.frames, len(after.waiting_pC)) == (1, 1)
+
+
+def test_a_base_that_relaxes_to_zero_is_no_touch():
+    """A long press may leave the charge below zero; as it relaxes, so does the base that a touch is measured from."""
+    totals, keep = -100.0 * np.exp(-np.arange(1000) / 200.0), float(np.exp(-1.0 / 200.0))
+
+    def contacts(keep):
+        touch, seen = Touch(last_pC=-100.0, base_pC=-100.0), False
+        for total in totals.tolist():
+            touch = next_touch(TouchRule(), touch, total, ONE_PC, keep)
+            seen |= touch.contact
+        return seen
+
+    assert not contacts(keep)
+    assert contacts(1.0)

@@ -1,9 +1,12 @@
 """The commands as a user and a script meet them: data on stdout, words on stderr, a clean end."""
 
+import csv
 import json
 import signal
+import socket
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -11,7 +14,8 @@ from typer.testing import CliRunner
 
 from isocharge.cli.serve import serve_app
 from isocharge.errors import ChargeError, InputError, ModelError, OutputExists, PortError, PortLost, SensorError
-from isocharge.serve import FrameParser, Port, VirtualSensor, wander
+from isocharge.serve import BinaryParser, Port, Script, VirtualSensor, wander
+from isocharge.serve.pseudo_port import PseudoPort
 
 PROGRAM = [sys.executable, "-c", "from isocharge.cli.serve import serve_app; serve_app()"]
 
@@ -57,10 +61,10 @@ def sensor(film):
         yield sensor
 
 
-@pytest.mark.parametrize("command", ["predict", "stream", "virtual"])
+@pytest.mark.parametrize("command", ["predict", "stream", "virtual", "replay", "doctor"])
 def test_help_has_an_example(command):
     text = run(command, "--help").stdout
-    assert f"Example: isocharge serve {command} three-25um-biaxial" in " ".join(text.split())
+    assert f"Example: isocharge serve {command} " in " ".join(text.split())
 
 
 def test_predict_to_csv(presses, models):
@@ -151,7 +155,7 @@ def test_stream_without_a_port(models):
 
 def test_stream_of_a_port_that_vanishes(film, models, start):
     with VirtualSensor(film.charge_pC, wander(seed=2)) as sensor:
-        process = start("stream", "linear", "--port", sensor.url, "--models", models)
+        process = start("stream", "linear", "--port", sensor.url, "--models", models, "--no-reconnect")
         process.stdout.readline()
     _, err = process.communicate(timeout=20)
     assert process.returncode == 1
@@ -164,14 +168,14 @@ def test_virtual_sensor_plays_and_cleans_up(start, tmp_path):
     process = start("virtual", "three-25um-biaxial", "--link", link, "--noise", "clean", "--force-max", "0.5")
     url = process.stdout.readline().strip()
     assert str(link.readlink()) == url
-    parser, frames = FrameParser(), []
+    parser, frames = BinaryParser(), []
     with Port(str(link)) as port:
         for chunk in port:
             frames += parser.feed(chunk.data)
             if len(frames) > 300:
                 break
-    assert {len(frame.charge_pC) for frame in frames} == {3}
-    assert max(sum(frame.charge_pC) for frame in frames) > 300.0
+    assert {len(frame.values) for frame in frames} == {3}
+    assert max(sum(frame.values) for frame in frames) > 300.0
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=20)
     assert (process.returncode, link.is_symlink()) == (0, False)
@@ -196,3 +200,122 @@ def test_virtual_sensor_does_not_overwrite(tmp_path):
 def test_virtual_sensor_that_is_unknown():
     with pytest.raises(SensorError):
         run("virtual", "five-25um-biaxial")
+
+
+def test_stream_to_csv_and_udp(sensor, models):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(5.0)
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
+        words = ["--output", "csv", "--udp", address, "--count", 120, "--models", models]
+        result = run("stream", "linear", "--port", sensor.url, *words)
+        datagrams = [json.loads(listener.recv(65536)) for _ in range(120)]
+    rows = list(csv.DictReader(result.stdout.splitlines()))
+    assert [int(row["seq"]) for row in rows] == [datagram["seq"] for datagram in datagrams]
+    assert float(rows[-1]["charge_pC.A"]) == pytest.approx(datagrams[-1]["charge_pC"]["A"], abs=1e-6)
+
+
+def test_stream_of_nothing_ends_in_time(models):
+    """Also where no record ever comes."""
+    silent = PseudoPort()
+    result = run("stream", "linear", "--port", silent.url, "--seconds", 0.3, "--models", models)
+    silent.close()
+    assert (result.exit_code, result.stdout) == (0, "")
+
+
+def test_record_and_replay(sensor, models, tmp_path):
+    path = tmp_path / "touch.rec"
+    words = ["--record", path, "--count", 300, "--offset-limit-pC", 90, "--models", models]
+    streamed = run("stream", "linear", "--port", sensor.url, *words)
+    replayed = run("replay", path, "--models", models)
+    assert len(streamed.stdout.splitlines()) == 300
+    assert replayed.stdout == streamed.stdout
+    assert " frames, 0 lost" in replayed.stderr
+    began = time.monotonic()
+    assert run("replay", path, "--real-time", "--models", models).stdout == streamed.stdout
+    assert time.monotonic() - began > 1.2  # 300 frames at 200 Hz
+
+
+@pytest.mark.parametrize(("number", "unwritten"), [(signal.SIGINT, 0), (signal.SIGKILL, 30)])
+def test_a_recording_that_was_interrupted_is_readable(sensor, models, start, tmp_path, number, unwritten):
+    """A kill leaves out the records of the chunk that was being made; Ctrl-C leaves out none that was printed."""
+    path = tmp_path / "touch.rec"
+    process = start("stream", "linear", "--port", sensor.url, "--record", path, "--models", models)
+    lines = [process.stdout.readline() for _ in range(150)]
+    process.send_signal(number)
+    lines += process.communicate(timeout=20)[0].splitlines(keepends=True)
+    replayed = run("replay", path, "--models", models).stdout.splitlines(keepends=True)
+    assert len(replayed) >= 150 - unwritten
+    common = min(len(replayed), len(lines) - 1)  # the last line that was printed may have been cut
+    assert replayed[:common] == lines[:common]
+    assert unwritten or len(replayed) >= len(lines) - 1
+
+
+def test_a_new_tare_is_asked_for_by_a_signal(film, models, start):
+    with VirtualSensor(film.charge_pC, rest(seconds=60.0), offset_pC=[5.0, 6.0, 7.0]) as sensor:
+        process = start("stream", "linear", "--port", sensor.url, "--models", models)
+        records = (json.loads(process.stdout.readline()) for _ in range(600))
+        next(record for record in records if record["tare_pC"])
+        process.send_signal(signal.SIGUSR1)
+        flags = [record["flags"] for record in records]
+    assert ["tare"] in flags
+    assert flags[-1] == []
+
+
+def rest(seconds, rate_Hz=200.0):
+    """Nothing touches but at the very end."""
+    n = round(seconds * rate_Hz)
+    return Script(np.zeros(n), np.zeros(n), np.where(np.arange(n) < n - 1, 0.0, 1.0), rate_Hz)
+
+
+def test_doctor_in_words(film, models):
+    hum = lambda q, rng: q + rng.normal(0.0, 0.3, q.shape)  # noqa: E731
+    with VirtualSensor(film.charge_pC, rest(60.0), noise=hum, offset_pC=[5.0, -6.0, 150.0]) as sensor:
+        result = run("doctor", "--port", sensor.url, "--seconds", 1.5, "--model", "linear", "--models", models)
+    assert "at 115200 baud: binary frames of isocharge" in result.stdout
+    assert "0 bad pieces" in result.stdout
+    assert "0 lost, 0 repeated; a device clock" in result.stdout
+    assert "rest near zero on channel 3: 150 pC" in result.stdout
+    assert "the amplifier's time constants" in result.stdout
+
+
+def test_doctor_as_json(film):
+    with VirtualSensor(film.charge_pC, rest(60.0), offset_pC=[5.0, -6.0, 7.0]) as sensor:
+        found = json.loads(run("doctor", "--port", sensor.url, "--seconds", 1.0, "--json").stdout)
+    assert found["rate_Hz"] == pytest.approx(200.0, rel=0.02)
+    assert [round(channel["offset_pC"], 3) for channel in found["channels"]] == [5.0, -6.0, 7.0]
+
+
+def test_scripted_presses_as_text_are_felt(start, tmp_path):
+    link = tmp_path / "film"
+    script = tmp_path / "presses.csv"
+    script.write_text("seconds,x_mm,y_mm,force_N\n0,0,0,0\n1.2,0,0,0\n1.3,1,2,0.5\n9,1,2,0.5\n")
+    words = ["--link", link, "--frames", "teleplot", "--script", script, "--force-max", "0.5", "--noise", "clean"]
+    process = start("virtual", "three-25um-biaxial", *words)
+    process.stdout.readline()
+    result = run("stream", "three-25um-biaxial", "--port", link, "--count", 400)
+    last = json.loads(result.stdout.splitlines()[-1])
+    assert (last["x_mm"], last["y_mm"], last["force_N"]) == pytest.approx((1.0, 2.0, 0.5), abs=0.05)
+
+
+def test_virtual_sensor_of_described_frames_with_faults(start, tmp_path):
+    link, device = tmp_path / "film", tmp_path / "board.toml"
+    device.write_text(
+        '[frames]\nformat = "described"\nsync = "AA 55"\nlength = 14\nchecksum = "crc-16/x-25"\nfields = [\n'
+        '{name = "seq", type = "u16"}, {name = "t_ms", type = "u16"},\n'
+        '{name = "A", type = "i16", scale = 0.1}, {name = "B", type = "i16", scale = 0.1},'
+        '{name = "C", type = "i16", scale = 0.1}]\n'
+    )
+    words = ["--link", link, "--device", device, "--lose", "0.05", "--corrupt", "0.001", "--force-max", "0.5"]
+    process = start("virtual", "three-25um-biaxial", *words, "--unplug-every", "1.4")
+    process.stdout.readline()
+    result = run("stream", "three-25um-biaxial", "--port", link, "--device", device, "--seconds", 3)
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    came_back = sum("reconnected" in line["flags"] for line in lines)
+    assert 1 <= came_back <= 2
+    assert f"{came_back} reconnects" in result.stderr.splitlines()[-1]
+    assert any("gap" in line["flags"] for line in lines)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=20)
+    assert "damaged on purpose" in err.splitlines()[-1]
+    assert not link.is_symlink()

@@ -45,3 +45,16 @@ def test_batch_flags_equal_one_by_one(film):
     columns = rng.uniform(-3, 10, (7, 50)).astype(np.float32)
     one_by_one = [domain.flags(Contact(*row)) for row in columns.T.tolist()]
     assert domain.batch_flags(Contacts(*columns)) == one_by_one
+
+
+def test_one_contact_is_judged_as_in_a_batch():
+    """One contact takes a short cut where it is well inside; it must not show."""
+    rng = np.random.default_rng(0)
+    square = Domain(np.array([[-4.0, -3.0], [6.0, -3.0], [6.0, 5.0], [-4.0, 5.0]]), (0.05, 2.0))
+    away = Domain(square.corners_mm + 20.0, (0.05, 2.0))
+    for x, y, force, misfit in zip(*rng.uniform(-8, 8, (2, 500)), *rng.uniform(0, [[2.5], [6]], (2, 500)), strict=True):
+        contact = Contact(x, y, force, 0.1, 0.1, 0.01, misfit)
+        for domain in (square, away):
+            batch = Contacts(*np.array(contact)[:, np.newaxis])
+            assert domain.flags(contact) == domain.batch_flags(batch)[0]
+    assert (square.safe_mm2, away.safe_mm2) == (9.0, 0.0)

@@ -5,7 +5,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from isocharge.serve import FrameParser, Port, SequenceGaps, VirtualSensor, stream, wander
+from isocharge.serve import BinaryParser, Port, SequenceGaps, VirtualSensor, stream, wander
 
 
 def reference_noise(charge_pC, rng):
@@ -16,7 +16,7 @@ def follow(film, predictor, n):
     """Records of the first n frames with what was pressed, and the counters."""
     # Charges are proportional to the force here: below a twentieth of a press's peak the chain would see a release.
     script = wander(seed=11, force_range_N=(0.2, 2.0))
-    parser, gaps = FrameParser(), SequenceGaps()
+    parser, gaps = BinaryParser(), SequenceGaps()
     with VirtualSensor(film.charge_pC, script, noise=reference_noise) as sensor, Port(sensor.url) as port:
         records = stream(port, predictor, parser=parser, gaps=gaps)
         pairs = [(record, sensor.truth(record.seq)) for record in islice(records, n)]

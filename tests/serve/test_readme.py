@@ -1,11 +1,14 @@
 """What serve/README.md shows is true: its examples run, its frame is a frame, its tables are complete."""
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from isocharge.serve import Frame, encode_frame, flags
+from isocharge.serve import Frame, TextParser, encode_frame, flags, load_device
 from isocharge.serve.cobs import cobs_decode
 
 SERVE = Path(__file__).parents[2] / "serve"
@@ -36,3 +39,48 @@ def test_every_flag_is_explained():
     words = {value for name, value in vars(flags).items() if name.isupper()}
     table = README[README.index("| flag |") : README.index("## Tare")]
     assert words <= set(re.findall(r"`(\w+)`", table))
+
+
+def test_the_device_file_is_one(tmp_path):
+    path = tmp_path / "device.toml"
+    path.write_text(re.search(r"```toml\n(.*?)```", README, re.DOTALL)[1])
+    board = load_device(path)
+    chain = board.chain(("A", "B", "C"))
+    assert board.parser().layout.length == 18
+    stages = (chain.gain_pC, chain.limit_pC, chain.hum, chain.tare, chain.leak, chain.touch)
+    assert not any(stage is None for stage in stages)
+
+
+@pytest.mark.parametrize("row", re.findall(r"^\| .*? \| `(.*)` \|$", README[README.index("## Text") :], re.MULTILINE))
+def test_lines_of_text_are_read(row):
+    line = row.encode() + b"\n"
+    lines = line if ">" not in row else line + line.replace(b">A", b">B") + line.replace(b">A", b">C")
+    (frame, *_) = TextParser().feed(b"\n" + lines * 3)
+    assert frame.values[0] == 801.2
+    assert len(frame.values) == 3
+
+
+def test_recording_example_runs_line_by_line(tmp_path):
+    """The commands as they stand, with a sensor that stops by itself and the files in one folder."""
+    (example,) = (block for block in re.findall(r"```sh\n(.*?)```", README, re.DOTALL) if "doctor" in block)
+    lines = [line.split("  #")[0] for line in example.replace("/tmp/", f"{tmp_path}/").splitlines()]
+    lines = [
+        f"{line[:-1]} --seconds 30 > url &" if line.rstrip().endswith("&") else line for line in map(str.rstrip, lines)
+    ]
+    waiting = f"while [ ! -e {tmp_path}/film ]; do sleep 0.1; done"
+    script = "\n".join([lines[0], lines[1], waiting, *lines[2:-1], f"{lines[-1]} > again.jsonl", "kill %1", "wait"])
+    (tmp_path / "presses.csv").write_text("A,B,C\n850,840,846\n")
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    run = subprocess.run(
+        ["bash", "-ec", script.replace("--seconds 10", "--seconds 2").replace("doctor", "doctor --seconds 1")],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "binary frames of isocharge" in run.stdout
+    assert (tmp_path / "again.jsonl").read_text() == (tmp_path / "touch.jsonl").read_text()
+    assert len((tmp_path / "touch.jsonl").read_text().splitlines()) > 300

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from isocharge.errors import SceneError
-from isocharge.serve import Script, wander
+from isocharge.serve import Script, read_script, wander
 
 
 @pytest.fixture(scope="module")
@@ -82,3 +82,29 @@ def test_script_arrays_agree():
         Script(np.zeros(2), np.zeros(2), np.zeros(3), 200.0)
     with pytest.raises(SceneError, match=r"a positive rate, got 0.0 Hz"):
         Script(np.zeros(2), np.zeros(2), np.zeros(2), 0.0)
+
+
+def test_a_script_from_a_file():
+    lines = ["seconds,x_mm,y_mm,force_N", "0,1,2,0", "1,1,2,0", "1.1,1,2,0.5", "2.1,3,2,0.5", "2.2,3,2,0"]
+    script = read_script(lines, 100.0, "presses.csv")
+    assert (len(script), script.rate_Hz) == (220, 100.0)
+    assert not script.touching[:101].any()
+    assert np.isnan(script.x_mm[50])
+    assert (script.x_mm[160], script.y_mm[160], script.force_N[160]) == pytest.approx((2.0, 2.0, 0.5))
+    assert script.force_N[105] == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["seconds,x_mm,y_mm", "0,1,2"],
+        ["seconds,x_mm,y_mm,force_N", "0,1,2,x"],
+        ["seconds,x_mm,y_mm,force_N", "0,1,2,1"],
+        ["seconds,x_mm,y_mm,force_N", "1,1,2,1", "0,1,2,1"],
+        ["seconds,x_mm,y_mm,force_N", "0,1,2,1", "1,1,2,-1"],
+        [],
+    ],
+)
+def test_scripts_that_are_wrong(lines):
+    with pytest.raises(SceneError, match=r"presses.csv: expected"):
+        read_script(lines, 100.0, "presses.csv")

@@ -1,22 +1,34 @@
 """The virtual sensor behaves like a board: on time, whole frames, indifferent to whether anybody reads."""
 
 import time
+from functools import partial
 from itertools import islice
 
 import numpy as np
 import pytest
 
 from isocharge.errors import PortError, SceneError
-from isocharge.serve import FrameParser, Port, Script, SequenceGaps, VirtualSensor, wander
+from isocharge.serve import (
+    AutoParser,
+    BinaryParser,
+    Faults,
+    Port,
+    Script,
+    SequenceGaps,
+    VirtualSensor,
+    encode_text,
+    wander,
+)
+from isocharge.serve.faults import corrupt
 
 
 def steady(n=10, rate_Hz=200.0, force_N=1.0):
     return Script(np.zeros(n), np.zeros(n), np.full(n, force_N), rate_Hz)
 
 
-def read(url, count):
+def read(url, count, parser=None):
     """The next frames of a sensor."""
-    parser = FrameParser()
+    parser = parser or BinaryParser()
     with Port(url, silence_s=1.0) as port:
         frames = list(islice((frame for chunk in port for frame in parser.feed(chunk.data)), count))
     return frames, parser
@@ -30,7 +42,7 @@ def test_frames_carry_script_noise_and_offset(film):
     press = film.charge_pC([1.0], [2.0], [0.5])[0]
     for frame in frames:
         clean = press if frame.seq % 2 == 0 else np.zeros(3)
-        np.testing.assert_allclose(frame.charge_pC, clean + np.array([11.0, 21.0, 31.0]), rtol=1e-6)
+        np.testing.assert_allclose(frame.values, clean + np.array([11.0, 21.0, 31.0]), rtol=1e-6)
         assert frame.t_us == frame.seq * 2000
 
 
@@ -48,7 +60,7 @@ def test_keeps_its_rate_without_drift(film):
 def test_default_offset_is_there_and_small(film):
     with VirtualSensor(film.charge_pC, wander(seed=1, seconds=0.5)) as sensor:
         (frame, *_), _ = read(sensor.url, 1)
-    assert 0.0 < np.abs(frame.charge_pC).max() <= 20.0
+    assert 0.0 < np.abs(frame.values).max() <= 20.0
 
 
 def test_truth_says_what_was_pressed(film):
@@ -59,7 +71,7 @@ def test_truth_says_what_was_pressed(film):
             truth = sensor.truth(frame.seq)
             assert truth.force_N == script.force_N[frame.seq]
             assert truth.x_mm == pytest.approx(script.x_mm[frame.seq], nan_ok=True)
-            np.testing.assert_allclose(frame.charge_pC, truth.charge_pC, atol=21.0)
+            np.testing.assert_allclose(frame.values, truth.charge_pC, atol=21.0)
 
 
 def test_script_begins_again(film):
@@ -104,3 +116,81 @@ def test_plays_again_after_leaving(film):
 def test_forward_map_that_is_none(charges):
     with pytest.raises(SceneError, match=r"forward map: expected finite charges of shape \(10, electrodes\)"):
         VirtualSensor(lambda *_: charges, steady())
+
+
+@pytest.mark.parametrize("notation", ["csv", "pairs", "teleplot", "json"])
+def test_sends_text(film, notation):
+    encode = partial(encode_text, notation=notation)
+    with VirtualSensor(film.charge_pC, steady(), encode=encode, offset_pC=[1.0, 2.0, 3.0]) as sensor:
+        frames, parser = read(sensor.url, 20, AutoParser())
+    assert parser.counts.malformed <= 1  # the first line may have been cut
+    np.testing.assert_allclose(frames[-1].values, film.charge_pC([0.0], [0.0], [1.0])[0] + [1.0, 2.0, 3.0], rtol=1e-6)
+
+
+def test_amplifier_takes_the_script_in_order_and_over_and_over(film):
+    """One with a memory: it counts the rows that it has been given."""
+    seen = []
+
+    def noise(charge_pC, _):
+        first = sum(map(len, seen))
+        seen.append(charge_pC)
+        return charge_pC + np.arange(first, first + len(charge_pC))[:, None]
+
+    with VirtualSensor(film.charge_pC, steady(7, 1000.0), noise=noise, offset_pC=[0.0] * 3) as sensor:
+        frames, _ = read(sensor.url, 1200)
+    clean = film.charge_pC([0.0], [0.0], [1.0])[0]
+    for frame in frames:
+        np.testing.assert_allclose(frame.values, clean + frame.seq, rtol=1e-6)
+
+
+def test_faults_are_counted(film):
+    faults = Faults(lose_share=0.2, corrupt_share=0.01)
+    with VirtualSensor(film.charge_pC, steady(rate_Hz=1000.0), faults=faults, seed=4) as sensor:
+        frames, parser = read(sensor.url, 400)
+        gaps = SequenceGaps()
+        for frame in frames:
+            gaps.update(frame.seq)
+        lost, corrupted = sensor.lost, sensor.corrupted
+    played = len(frames) + gaps.lost
+    assert lost / played == pytest.approx(0.2, abs=0.07)
+    assert corrupted / played == pytest.approx(0.8 * (1 - 0.99**27), abs=0.07)
+    assert parser.counts.crc_errors + parser.counts.malformed > 50
+    assert all(frame.values == frames[0].values for frame in frames)
+
+
+def test_gaps_come_when_asked(film):
+    faults = Faults(gap_every_s=0.2, gap_s=0.1)
+    with VirtualSensor(film.charge_pC, steady(rate_Hz=500.0), faults=faults) as sensor:
+        frames, _ = read(sensor.url, 150)
+    assert {(frame.seq % 100) < 50 for frame in frames if frame.seq >= 100} == {False}
+
+
+def test_clock_drift(film):
+    with VirtualSensor(film.charge_pC, steady(rate_Hz=1000.0), faults=Faults(clock_ppm=500.0)) as sensor:
+        frames, _ = read(sensor.url, 100)
+    assert frames[-1].t_us == round(frames[-1].seq * 1000.5)
+
+
+def test_unplugging_comes_back_under_the_same_name(film):
+    faults = Faults(unplug_every_s=0.8, unplug_s=0.3)
+    with VirtualSensor(film.charge_pC, steady(rate_Hz=500.0), faults=faults) as sensor:
+        outages_s = []
+        with Port(sensor.url, reconnect=True) as port:
+            while len(outages_s) < 2:
+                outages_s.append(next(chunk.outage_s for chunk in port if chunk.outage_s > 0.0))
+    assert min(outages_s) > 0.2
+    assert port.outages == 2
+
+
+@pytest.mark.parametrize("wrong", [{"lose_share": 1.1}, {"corrupt_share": -0.1}, {"gap_every_s": -1.0}])
+def test_impossible_faults(wrong):
+    with pytest.raises(SceneError, match="expected shares from 0 to 1 and times from 0"):
+        Faults(**wrong)
+
+
+def test_corruption_flips_drops_and_adds():
+    data, rng = bytes(1000), np.random.default_rng(0)
+    lengths = [len(corrupt(data, 0.01, rng)) for _ in range(200)]
+    assert np.mean(lengths) == pytest.approx(1000, abs=1.0)
+    assert np.std(lengths) == pytest.approx(np.sqrt(1000 * 0.01 * 2 / 3), rel=0.2)
+    assert corrupt(data, 0.0, rng) == data

@@ -126,9 +126,9 @@ def _feel(film: "ForwardMap", predictor: "Predictor", seconds: float, seed: int)
     """Play, read through the port, tare, infer, and print both sides twice a second."""
     import numpy as np
 
-    from isocharge.serve import FrameParser, Port, SequenceGaps, stream
+    from isocharge.serve import BinaryParser, Port, SequenceGaps, stream
 
-    parser, gaps = FrameParser(), SequenceGaps()
+    parser, gaps = BinaryParser(), SequenceGaps()
     pressed: list[tuple[float, float, float]] = []
     felt: list[tuple[Any, Any, Any]] = []
     presses: list[int] = []

@@ -1,37 +1,221 @@
-"""A virtual sensor made of the simulator's forward map and noise: serve's pC, mm and N on one side, SI on the other."""
+"""`isocharge serve virtual`: a sensor made of the simulator's forward map and amplifier.
 
-from typing import TYPE_CHECKING
+serve's pC, mm and N are on one side, the simulator's SI on the other.
+"""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from isocharge.cli.stopping import until_stopped
+from isocharge.cli.terminal import progress, say
+from isocharge.errors import InputError, OutputExists
 
 if TYPE_CHECKING:
-    from isocharge.serve import VirtualSensor
-    from isocharge.simulate import ForwardMap
+    from isocharge.serve import Script, VirtualSensor
+    from isocharge.serve.virtual import Encode
+    from isocharge.simulate import Amplifier, ForwardMap
 
 SCRIPT_S = 60.0
 """Length of what a virtual sensor plays before it begins again, s."""
 
+FORCE_MIN_N = 0.05
+"""Smallest force that a virtual sensor plays, N."""
 
-def virtual_sensor(film: "ForwardMap", noise: str, seed: int, rate_Hz: float = 200.0) -> "VirtualSensor":
+
+def virtual_sensor(
+    film: "ForwardMap",
+    noise: "str | Amplifier",
+    seed: int,
+    rate_Hz: float = 200.0,
+    *,
+    script: "Script | None" = None,
+    **options: Any,
+) -> "VirtualSensor":
     """A sensor that plays wandering presses over the whole domain of a forward map.
 
     Args:
         film: The forward map.
-        noise: Level of the noise model.
+        noise: Level of the noise model, or an amplifier.
         seed: Of presses, noise and offsets.
         rate_Hz: Frames per second.
+        script: What is pressed instead.
+        options: Of `VirtualSensor`: format, faults, link.
     """
     from isocharge.serve import VirtualSensor, wander
-    from isocharge.simulate import noise_model
+    from isocharge.simulate import load_amplifier
 
-    amplifier = noise_model(noise)
-    return VirtualSensor(
-        lambda x_mm, y_mm, force_N: film.forward(x_mm * 1e-3, y_mm * 1e-3, force_N) * 1e12,
-        wander(
-            seed=seed,
-            seconds=SCRIPT_S,
-            rate_Hz=rate_Hz,
-            radius_mm=film.radius * 1e3,
-            force_range_N=film.force_range,
-        ),
-        noise=lambda charge_pC, rng: amplifier.add(charge_pC * 1e-12, rng) * 1e12,
-        seed=seed,
+    amplifier = load_amplifier(noise) if isinstance(noise, str) else noise
+    presses = script or wander(
+        seed=seed, seconds=SCRIPT_S, rate_Hz=rate_Hz, radius_mm=film.radius * 1e3, force_range_N=film.force_range
     )
+    return VirtualSensor(
+        partial(_charge_pC, film),
+        presses,
+        noise=_measuring(amplifier, rate_Hz),
+        seed=seed,
+        **options,
+    )
+
+
+def _charge_pC(film: "ForwardMap", x_mm: Any, y_mm: Any, force_N: Any) -> Any:
+    """Charges of presses; below the map's smallest force they fall as a membrane's do, with force to the 2/3."""
+    low = film.force_range[0]
+    share = (force_N.clip(max=low) / low) ** (2.0 / 3.0)
+    return film.forward(x_mm * 1e-3, y_mm * 1e-3, force_N.clip(min=low)) * share[:, None] * 1e12
+
+
+def _measuring(amplifier: "Amplifier", rate_Hz: float) -> Callable[..., Any]:
+    """The amplifier as the virtual sensor calls it, in pC; it is switched on with the first block."""
+    at_work: list[Any] = []
+
+    def measure(charge_pC: Any, rng: Any) -> Any:
+        if not at_work:
+            at_work.append(amplifier.start(charge_pC.shape[1], rate_Hz, rng))
+        return at_work[0](charge_pC * 1e-12) * 1e12
+
+    return measure
+
+
+class FrameFormat(StrEnum):
+    """What the virtual board sends; described frames come with a device file."""
+
+    binary = "binary"
+    csv = "csv"
+    pairs = "pairs"
+    teleplot = "teleplot"
+    json = "json"
+
+
+def virtual_command(
+    sensor: Annotated[str, typer.Argument(metavar="SENSOR", help="Built-in sensor, or a TOML file.")],
+    seconds: Annotated[
+        float | None,
+        typer.Option("--seconds", min=0.0, max=1e6, help="Play for so many seconds. (default: until Ctrl-C)"),
+    ] = None,
+    rate_Hz: Annotated[float, typer.Option("--rate-Hz", min=1.0, max=5000.0, help="Frames per second, Hz.")] = 200.0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of presses, noise and offsets.")] = 0,
+    force_max: Annotated[
+        float, typer.Option("--force-max", min=0.05, help="Largest force, N; the smallest is 0.05 N.")
+    ] = 2.0,
+    noise: Annotated[
+        str, typer.Option("--noise", help="Amplifier: clean, reference, bench, surgery, or a TOML file.")
+    ] = "reference",
+    probe: Annotated[str, typer.Option("--probe", help="What presses; circle:R with the radius in mm.")] = "circle:1.0",
+    link: Annotated[
+        Path | None, typer.Option("--link", metavar="PATH", help="Make a link to the port here. (default: none)")
+    ] = None,
+    script: Annotated[
+        Path | None,
+        typer.Option(
+            "--script", metavar="FILE", help="CSV with seconds, x_mm, y_mm, force_N. (default: random presses)"
+        ),
+    ] = None,
+    frames: Annotated[FrameFormat, typer.Option("--frames", help="What the board sends.")] = FrameFormat.binary,
+    device: Annotated[
+        Path | None,
+        typer.Option("--device", metavar="FILE", help="Send the described frames of this device file. (default: none)"),
+    ] = None,
+    lose: Annotated[float, typer.Option("--lose", min=0.0, max=1.0, help="Share of frames that are lost.")] = 0.0,
+    corrupt: Annotated[
+        float, typer.Option("--corrupt", min=0.0, max=1.0, help="Share of bytes that are flipped, dropped or added.")
+    ] = 0.0,
+    gap_every: Annotated[
+        float, typer.Option("--gap-every", min=0.0, help="Be silent for 0.1 s so often, s; 0 for never.")
+    ] = 0.0,
+    unplug_every: Annotated[
+        float, typer.Option("--unplug-every", min=0.0, help="Vanish for 0.5 s so often, s; 0 for never.")
+    ] = 0.0,
+    clock_ppm: Annotated[float, typer.Option("--clock-ppm", help="How much too fast the board's clock is.")] = 0.0,
+    temperature_step_K: Annotated[
+        float | None,
+        typer.Option("--temperature-step-K", help="Warm the film after 10 s. (default: as the noise says)"),
+    ] = None,
+    drift_pC_per_s: Annotated[
+        float | None, typer.Option("--drift-pC-per-s", min=0.0, help="Bias current. (default: as the noise says)")
+    ] = None,
+    limit_pC: Annotated[
+        float | None, typer.Option("--limit-pC", min=1.0, help="The converter's limit. (default: as the noise says)")
+    ] = None,
+) -> None:
+    """Play a sensor: presses that wander over the film, sent as frames on a pseudo-terminal.
+
+    Prints the path of the port, then plays until Ctrl-C. The presses are simulated; the first second is without touch.
+
+    Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
+    """
+    from isocharge.serve import Faults
+    from isocharge.simulate import ForwardMap, load_amplifier, load_sensor, parse_probe
+
+    scene, amplifier = (load_sensor(sensor), parse_probe(probe)), load_amplifier(noise)
+    wrong: dict[str, Any] = {"step": temperature_step_K, "bias": _pico(drift_pC_per_s), "limit": _pico(limit_pC)}
+    amplifier = replace(amplifier, **{name: value for name, value in wrong.items() if value is not None})
+    faults = Faults(
+        lose_share=lose,
+        corrupt_share=corrupt,
+        gap_every_s=gap_every,
+        unplug_every_s=unplug_every,
+        clock_ppm=clock_ppm,
+    )
+    encode, presses = _encoder(frames, device), _presses(script, rate_Hz)
+    with progress("solving the film") as advance:
+        film = ForwardMap.build(*scene, force_range=(FORCE_MIN_N, force_max), progress=advance)
+    _refuse_taken(link)
+    player = virtual_sensor(film, amplifier, seed, rate_Hz, script=presses, encode=encode, faults=faults, link=link)
+    with until_stopped(), _link_errors(link), player:
+        print(player.port_path, flush=True)
+        say(f"playing {sensor} at {rate_Hz:g} Hz; Ctrl-C stops")
+        threading.Event().wait(seconds)
+    say(
+        f"{player.sent} frames sent, {player.withheld} withheld because nobody read them, {player.lost} lost and "
+        f"{player.corrupted} damaged on purpose, {player.unplugged} times unplugged"
+    )
+
+
+def _pico(value: float | None) -> float | None:
+    return None if value is None else value * 1e-12
+
+
+def _encoder(frames: FrameFormat, device: Path | None) -> "Encode":
+    """What turns a frame into bytes."""
+    from isocharge.serve import encode_frame, encode_text, load_device
+
+    if device is None:
+        return encode_frame if frames is FrameFormat.binary else partial(encode_text, notation=frames.value)
+    layout = load_device(device).layout
+    if layout is None:
+        raise InputError(f'--device {device}: expected a file with described frames: [frames] format = "described"')
+    return layout.encode
+
+
+def _presses(script: Path | None, rate_Hz: float) -> "Script | None":
+    from isocharge.serve import read_script
+
+    if script is None:
+        return None
+    try:
+        return read_script(script.read_text("utf-8").splitlines(), rate_Hz, str(script))
+    except OSError as error:
+        raise InputError(f"--script {script}: cannot be read ({error.strerror})") from error
+
+
+def _refuse_taken(link: Path | None) -> None:
+    if link is not None and (link.exists() or link.is_symlink()):
+        raise OutputExists(f"--link {link}: something is there already; remove it or choose another path")
+
+
+@contextmanager
+def _link_errors(link: Path | None) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if link is None or error.filename2 != str(link):
+            raise
+        raise InputError(f"--link {link}: cannot be made ({error.strerror}); choose another path") from error

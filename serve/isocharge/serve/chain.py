@@ -1,90 +1,48 @@
-"""The signal chain: from raw charges to touch charges and whether something touches.
+"""The signal chain: from what a board counts to touch charges and whether something touches.
 
-Each stage is a rule (frozen settings) and a pure function; `advance` puts them in order and carries their state. So
-far:
+Each stage is a rule (frozen settings) and a pure function; `advance` puts them in order and carries their state. A
+stage whose rule is None is switched off.
 
-1. tare: mean and noise of the first frames in which nothing moves, subtracted from everything after;
-2. contact: touch when the total charge stands out of the noise, release at a share of that press's own peak. An
-   absolute release threshold would never release once the base has drifted.
+1. gain: the device's unit to pC, sign and gain of each channel;
+2. saturation: a charge at the converter's limit, flagged until the press is over;
+3. hum: mains hum, followed and subtracted (`isocharge.serve.hum`);
+4. tare: mean and noise of quiet frames, subtracted from everything after (`isocharge.serve.tare`);
+5. leak: the amplifier's forgetting undone, its offset learned (`isocharge.serve.leak`);
+6. touch: contact with hysteresis (`isocharge.serve.touching`).
 """
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from isocharge.errors import TareError
 from isocharge.serve.arrays import Array
-from isocharge.serve.flags import TARE
-
-
-@dataclass(frozen=True, slots=True)
-class TareRule:
-    """When frames are good for taring.
-
-    Attributes:
-        frames: How many; 100 are 0.5 s at 200 Hz.
-        noise_limit_pC: Largest standard deviation of a quiet electrode, pC. The reference noise is 1 pC.
-        offset_limit_pC: Largest mean of an idle electrode, pC. A press of 0.05 N on a 25 um film gives more than this
-            on the three electrodes' average; so does a larger one that is held still while we tare.
-        patience: Frames after which looking for quiet ones is given up.
-    """
-
-    frames: int = 100
-    noise_limit_pC: float = 5.0
-    offset_limit_pC: float = 100.0
-    patience: int = 2000
-
-
-@dataclass(frozen=True, slots=True)
-class TouchRule:
-    """When something touches.
-
-    The smallest press we care about, 0.05 N on a 25 um film, gives 340 pC in total; reference noise makes the touch
-    threshold 20 pC. A press that falls from 2 N (4000 pC) to 0.05 N keeps 8 % of its peak.
-
-    Attributes:
-        sigmas: The total charge must rise by so many of its standard deviations,
-        floor_pC: plus this, pC, to be a touch.
-        release_share: Release threshold as a share of the press's peak, but at least half the rise of a touch.
-    """
-
-    sigmas: float = 6.0
-    floor_pC: float = 10.0
-    release_share: float = 0.05
+from isocharge.serve.flags import NEGATIVE, SATURATED, TARE
+from isocharge.serve.hum import Hum, HumRule, remove_hum
+from isocharge.serve.leak import Leak, LeakRule, undo_leak
+from isocharge.serve.tare import Tare, TareRule, look_for_tare
+from isocharge.serve.touching import Touch, TouchRule, next_touch
 
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """The rules of all stages."""
-
-    tare: TareRule = field(default_factory=TareRule)
-    touch: TouchRule = field(default_factory=TouchRule)
-
-
-@dataclass(frozen=True, slots=True)
-class Tare:
-    """Charge at rest: `charge_pC` (electrodes,) and its standard deviation `noise_pC` (electrodes,), from `frames`."""
-
-    charge_pC: Array
-    noise_pC: Array
-    frames: int
-
-
-@dataclass(frozen=True, slots=True)
-class Touch:
-    """Whether something touches.
+    """The rules of all stages, in their order; None switches a stage off.
 
     Attributes:
-        contact: Whether it does.
-        peak_pC: Largest total charge of this press so far, pC, that two frames in a row reached: a spike is no peak.
-        last_pC: Total charge of the latest frame, pC.
-        base_pC: Smallest total charge since the last release, pC: a drifted base must not count as the next touch.
+        gain_pC: What one unit of the device is, with sign, shape (electrodes,), pC.
+        limit_pC: Largest charge that the converter can show, pC.
+        hum: How mains hum is followed.
+        tare: When frames are good for taring.
+        leak: The amplifier.
+        touch: When something touches; without, everything does.
     """
 
-    contact: bool = False
-    peak_pC: float = 0.0
-    last_pC: float = 0.0
-    base_pC: float = 0.0
+    gain_pC: Array | None = None
+    limit_pC: float | None = None
+    hum: HumRule | None = None
+    tare: TareRule | None = field(default_factory=TareRule)
+    leak: LeakRule | None = None
+    touch: TouchRule | None = field(default_factory=TouchRule)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,21 +50,38 @@ class ChainState:
     """What the chain remembers between frames.
 
     Attributes:
-        waiting_pC: The latest raw frames while there is no tare, shape (k, electrodes), pC.
-        frames: Frames seen.
+        waiting_pC: The latest charges while there is no tare, shape (k, electrodes), pC.
+        frames: Frames seen while looking for a tare.
+        patient: Whether looking for it is never given up.
         tare: None until quiet frames were found.
-        touch: Contact so far.
+        hum, leak, touch: Of the stages; no leak before the tare.
+        saturated: Whether a charge was at the limit in this press.
     """
 
     waiting_pC: Array
+    hum: Hum
     frames: int = 0
+    patient: bool = False
     tare: Tare | None = None
+    leak: Leak | None = None
     touch: Touch = field(default_factory=Touch)
+    saturated: bool = False
 
     @classmethod
     def start(cls, electrodes: int) -> "ChainState":
         """Before the first frame."""
-        return cls(np.empty((0, electrodes)))
+        return cls(np.empty((0, electrodes)), Hum.start(electrodes))
+
+    def without_tare(self) -> "ChainState":
+        """The film is tared anew, however long that takes; what is known about hum stays."""
+        return ChainState(self.waiting_pC[:0], replace(self.hum, raw_pC=None), patient=True)
+
+    def shifted(self, charge_pC: float) -> "ChainState":
+        """The same charge taken from every electrode from here on: by the leak's charge, or by the tare."""
+        if self.leak is not None:
+            return replace(self, leak=self.leak._replace(charge_pC=self.leak.charge_pC - charge_pC))
+        assert self.tare is not None
+        return replace(self, tare=replace(self.tare, charge_pC=self.tare.charge_pC + charge_pC))
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,91 +89,77 @@ class Reading:
     """One frame after the chain.
 
     Attributes:
+        raw_pC: What the device sent, as charges, shape (electrodes,), pC.
         charge_pC: Touch charges, shape (electrodes,), pC; None while there is no tare.
         tare: What was subtracted.
         contact: Whether something touches.
         flags: Words from `isocharge.serve.flags`.
     """
 
+    raw_pC: Array
     charge_pC: Array | None
     tare: Tare | None
     contact: bool
     flags: tuple[str, ...] = ()
 
 
-def advance(chain: Chain, state: ChainState, raw_pC: Array) -> tuple[ChainState, Reading]:
+def advance(
+    chain: Chain, state: ChainState, values: Array, t_s: float, dt_s: float, *, limited: bool = False
+) -> tuple[ChainState, Reading]:
     """Take the next frame through all stages.
 
     Args:
         chain: The rules.
         state: After the frame before.
-        raw_pC: Charges as they came, shape (electrodes,), pC.
+        values: As they came, in the device's unit, shape (electrodes,).
+        t_s: The device's clock, s.
+        dt_s: Since the frame before, s.
+        limited: Whether the device says that an amplifier is at its limit.
 
     Raises:
         TareError: If the film is not left alone for long enough to tare.
     """
+    raw_pC = values if chain.gain_pC is None else values * chain.gain_pC
+    limited = limited or (chain.limit_pC is not None and bool((np.abs(raw_pC) >= chain.limit_pC).any()))
+    hum, quiet_pC = (state.hum, raw_pC) if chain.hum is None else remove_hum(chain.hum, state.hum, raw_pC, t_s, dt_s)
     if state.tare is None:
-        return _look_for_tare(chain.tare, state, raw_pC), Reading(None, None, contact=False, flags=(TARE,))
-    charge_pC = raw_pC - state.tare.charge_pC
-    touch = next_touch(chain.touch, state.touch, abs(float(charge_pC.sum())), state.tare.noise_pC)
-    after = ChainState(state.waiting_pC, state.frames + 1, state.tare, touch)
-    return after, Reading(charge_pC, state.tare, touch.contact)
+        return _look_for_tare(chain, state, hum, quiet_pC), _untared(raw_pC, limited)
+    output_pC = quiet_pC - state.tare.charge_pC
+    leak, charge_pC = _charge(chain, state, state.tare, output_pC, dt_s)
+    touch = _touch(chain, state, charge_pC, state.tare, dt_s)
+    saturated = limited or (state.saturated and touch.contact)
+    after = ChainState(state.waiting_pC, hum, state.frames, state.patient, state.tare, leak, touch, saturated)
+    flags = (SATURATED,) * saturated + (NEGATIVE,) * touch.below
+    return after, Reading(raw_pC, charge_pC, state.tare, touch.contact, flags)
 
 
-def _look_for_tare(rule: TareRule, state: ChainState, raw_pC: Array) -> ChainState:
+def _untared(raw_pC: Array, limited: bool) -> Reading:
+    return Reading(raw_pC, None, None, contact=False, flags=(TARE, SATURATED) if limited else (TARE,))
+
+
+def _look_for_tare(chain: Chain, state: ChainState, hum: Hum, quiet_pC: Array) -> ChainState:
     """Tare on the latest frames as soon as they are enough and quiet."""
-    waiting = np.vstack([state.waiting_pC, raw_pC])[-rule.frames :]
-    frames = state.frames + 1
-    if len(waiting) < rule.frames:
-        return ChainState(waiting, frames)
-    try:
-        return ChainState(waiting[:0], frames, measure_tare(rule, waiting))
-    except TareError:
-        if frames >= rule.patience:
-            raise
-    return ChainState(waiting, frames)
+    if chain.tare is None:
+        return ChainState(state.waiting_pC, hum, tare=Tare.none(quiet_pC.size))
+    waiting = np.vstack([state.waiting_pC, quiet_pC])[-chain.tare.frames :]
+    frames = 0 if state.patient else state.frames + 1
+    tare = look_for_tare(chain.tare, waiting, frames)
+    return ChainState(waiting if tare is None else waiting[:0], hum, frames, state.patient, tare)
 
 
-def measure_tare(rule: TareRule, raw_pC: Array) -> Tare:
-    """Mean and noise of frames with nothing on the film.
-
-    Args:
-        rule: What is quiet.
-        raw_pC: Charges as they came, shape (n, electrodes), pC.
-
-    Raises:
-        TareError: If the film is touched: a charge varies, or rests far from zero.
-    """
-    tare = Tare(raw_pC.mean(axis=0), raw_pC.std(axis=0), len(raw_pC))
-    noise, offset = float(tare.noise_pC.max()), float(np.abs(tare.charge_pC).max())
-    if noise > rule.noise_limit_pC:
-        raise TareError(
-            f"cannot tare on the last {tare.frames} frames: the charge of an electrode varies by {noise:.3g} pC rms, "
-            f"expected at most {rule.noise_limit_pC:g} pC; leave the film alone and start again"
-        )
-    if offset > rule.offset_limit_pC:
-        raise TareError(
-            f"cannot tare on the last {tare.frames} frames: an electrode rests at {offset:.4g} pC, expected at most "
-            f"{rule.offset_limit_pC:g} pC; take off what lies on the film, or raise the limit if the amplifier "
-            "rests there"
-        )
-    return tare
+def _charge(chain: Chain, state: ChainState, tare: Tare, output_pC: Array, dt_s: float) -> tuple[Leak | None, Array]:
+    """Touch charges: the output above tare, its leak undone if there is one."""
+    if chain.leak is None:
+        return None, output_pC
+    if state.leak is None:
+        leak = Leak.start(output_pC)
+    else:
+        leak = undo_leak(chain.leak, state.leak, output_pC, tare.noise_pC, dt_s, contact=state.touch.contact)
+    return leak, leak.charge_pC
 
 
-def next_touch(rule: TouchRule, touch: Touch, total_pC: float, noise_pC: Array) -> Touch:
-    """Contact with hysteresis.
-
-    Args:
-        rule: The thresholds.
-        touch: After the frame before.
-        total_pC: Total touch charge of this frame, pC, positive.
-        noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
-    """
-    threshold = rule.floor_pC + rule.sigmas * float(np.sqrt(np.dot(noise_pC, noise_pC)))
-    if touch.contact:
-        peak = max(touch.peak_pC, min(total_pC, touch.last_pC))
-        released = total_pC < max(rule.release_share * peak, 0.5 * threshold)
-        return Touch(last_pC=total_pC, base_pC=total_pC) if released else Touch(True, peak, total_pC)
-    if total_pC > touch.base_pC + threshold:
-        return Touch(True, min(total_pC, touch.last_pC), total_pC)
-    return Touch(last_pC=total_pC, base_pC=min(touch.base_pC, total_pC))
+def _touch(chain: Chain, state: ChainState, charge_pC: Array, tare: Tare, dt_s: float) -> Touch:
+    if chain.touch is None:
+        return Touch(contact=True)
+    keep = 1.0 if chain.leak is None else math.exp(-dt_s / chain.leak.relax_s)
+    return next_touch(chain.touch, state.touch, float(charge_pC.sum()), tare.noise_pC, keep)

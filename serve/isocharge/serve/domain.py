@@ -1,6 +1,7 @@
 """Where a model may be trusted: the check of a contact against what the model was trained for."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -33,8 +34,22 @@ class Domain:
         limit = max(MISFIT_LIMIT, metadata.errors.get("misfit_p999", MISFIT_LIMIT))
         return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit)
 
+    @cached_property
+    def safe_mm2(self) -> float:
+        """Square of the radius about the origin that is inside the area for sure, mm^2; 0 if the origin is outside."""
+        zero = np.zeros(1)
+        start, end = self.corners_mm, np.roll(self.corners_mm, -1, axis=0)
+        along = end - start
+        share = np.clip(-(start * along).sum(axis=1) / np.maximum((along * along).sum(axis=1), 1e-30), 0.0, 1.0)
+        nearest = ((start + share[:, np.newaxis] * along) ** 2).sum(axis=1).min()
+        return float(nearest) if inside_polygon(zero, zero, self.corners_mm)[0] else 0.0
+
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """The words that one contact earns."""
+        low, high = self.force_range_N
+        inside = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm < self.safe_mm2
+        if inside and low <= contact.force_N <= high and contact.misfit <= self.misfit_limit:
+            return ()  # nearly all contacts, and without an array
         return self.batch_flags(Contacts(*np.array(contact, dtype=np.float32)[:, np.newaxis]))[0]
 
     def batch_flags(self, contacts: Contacts) -> list[tuple[str, ...]]:

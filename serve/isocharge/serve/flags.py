@@ -8,7 +8,11 @@
 | `gap` | frames are missing before this one |
 | `repeat` | this frame has the number of the one before |
 | `restart` | the frame numbers went back: the device began anew |
-| `saturated` | the device says that an amplifier is at its limit |
+| `saturated` | an amplifier is at its limit, or was in this press: the device says so, or the device file's limit |
+| `negative` | the charges are well below zero: an amplifier that inverts (see `[gain]`), or what a long press left |
+| `thermal` | the film has warmed or cooled in this press by 10 pC or more on every electrode; it was taken out |
+| `blind` | here temperature cannot be told from force: nothing was taken out |
+| `reconnected` | the first frame after the port was away; the film is tared anew |
 | `invalid` | the device sent a charge that is not a number; nothing was computed |
 """
 
@@ -19,4 +23,8 @@ GAP = "gap"
 REPEAT = "repeat"
 RESTART = "restart"
 SATURATED = "saturated"
+THERMAL = "thermal"
+BLIND = "blind"
+RECONNECTED = "reconnected"
+NEGATIVE = "negative"
 INVALID = "invalid"

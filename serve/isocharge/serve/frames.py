@@ -1,30 +1,19 @@
-"""The binary frame: COBS of (version u8, seq u16, t_us u32, n u8, flags u8, n x f32 pC, CRC u16), then a zero byte.
+"""What every frame format shares: the frame, the counters of a parser, what a parser is, and gaps in the numbering.
 
-All little-endian. The CRC is CRC-16/CCITT-FALSE over everything before it. A zero occurs only as the end of a frame, so
-a parser that lost its way is back at the next zero: a damaged frame costs itself and nothing else.
-
-The parser knows no port: bytes in, frames and counters out. However the bytes are cut into chunks, the frames are the
-same.
+Parsers know no port: bytes in, frames and counters out. However the bytes are cut into chunks, the frames and counters
+are the same, and memory is bounded whatever comes.
 """
 
-import binascii
-import struct
 from dataclasses import dataclass
+from typing import Protocol
 
-from isocharge.serve.cobs import cobs_decode, cobs_encode
 from isocharge.serve.flags import GAP, REPEAT, RESTART
 
-FRAME_VERSION = 1
-DELIMITER = b"\0"
 SATURATED_BIT = 0x01
 """In a frame's flags: an amplifier is at its limit. The other bits are reserved and sent as zero."""
 
 SEQ_MODULUS = 1 << 16
 T_US_MODULUS = 1 << 32
-HEAD = struct.Struct("<BHIBB")
-CRC = struct.Struct("<H")
-LONGEST_PAYLOAD = HEAD.size + 255 * 4 + CRC.size
-LONGEST_PIECE = LONGEST_PAYLOAD + 1 + LONGEST_PAYLOAD // 254
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,56 +21,18 @@ class Frame:
     """One reading of a sensor.
 
     Attributes:
-        seq: Counter of frames, 0 to 65535, then 0 again.
-        t_us: The device's clock, us, modulo 2^32.
-        charge_pC: A charge for each electrode, pC, as float32 carries it.
+        seq: Counter of frames, modulo the parser's `seq_modulus`; None if the format has none.
+        t_us: The device's clock, us, modulo the parser's `t_us_modulus`; None if the format has none.
+        values: One for each channel, in the device's own unit; our binary frame has pC.
         flags: Bits; see `SATURATED_BIT`.
+        names: Of the channels; empty if the format does not name them.
     """
 
-    seq: int
-    t_us: int
-    charge_pC: tuple[float, ...]
+    seq: int | None
+    t_us: int | None
+    values: tuple[float, ...]
     flags: int = 0
-
-
-def encode_frame(frame: Frame) -> bytes:
-    """The bytes of a frame, delimiter included.
-
-    Raises:
-        struct.error: If a number does not fit its field.
-    """
-    n = len(frame.charge_pC)
-    payload = HEAD.pack(FRAME_VERSION, frame.seq, frame.t_us, n, frame.flags)
-    payload += struct.pack(f"<{n}f", *frame.charge_pC)
-    return cobs_encode(payload + CRC.pack(crc16(payload))) + DELIMITER
-
-
-def crc16(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, not reflected."""
-    return binascii.crc_hqx(data, 0xFFFF)
-
-
-class CrcError(ValueError):
-    """The checksum does not fit; only the parser sees it, and counts it."""
-
-
-def decode_piece(piece: bytes) -> Frame:
-    """The frame that stands between two delimiters.
-
-    Raises:
-        CrcError: If its checksum does not fit.
-        ValueError: If it is not a frame for another reason.
-    """
-    payload = cobs_decode(piece)
-    if len(payload) < HEAD.size + CRC.size:
-        raise ValueError(f"expected at least {HEAD.size + CRC.size} bytes, got {len(payload)}")
-    body = payload[: -CRC.size]
-    if CRC.pack(crc16(body)) != payload[-CRC.size :]:
-        raise CrcError(f"expected CRC {CRC.pack(crc16(body)).hex()}, got {payload[-CRC.size :].hex()}")
-    version, seq, t_us, n, flags = HEAD.unpack_from(body)
-    if version != FRAME_VERSION or len(body) != HEAD.size + 4 * n:
-        raise ValueError(f"expected version {FRAME_VERSION} and {4 * n} bytes of charges, got {body.hex()}")
-    return Frame(seq, t_us, struct.unpack_from(f"<{n}f", body, HEAD.size), flags)
+    names: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
@@ -91,59 +42,97 @@ class FrameCounts:
     Attributes:
         frames: Intact frames.
         crc_errors: Pieces whose checksum did not fit.
-        malformed: Pieces that were no frame for another reason: stuffing, length, version.
+        malformed: Pieces that were no frame for another reason: stuffing, length, version, not a number.
         bytes_dropped: Bytes of those pieces, delimiters included.
+        resyncs: Times that a good frame was found again after something was dropped.
+        astray: Whether something was dropped since the last good frame.
     """
 
     frames: int = 0
     crc_errors: int = 0
     malformed: int = 0
     bytes_dropped: int = 0
+    resyncs: int = 0
+    astray: bool = False
+
+    def accept(self, frames: int = 1) -> None:
+        """Count intact frames."""
+        self.frames += frames
+        self.resyncs += self.astray
+        self.astray = False
+
+    def refuse(self, size: int, *, damaged: bool = False) -> None:
+        """Count a piece of `size` bytes that is dropped; damaged if its checksum did not fit."""
+        self.crc_errors += damaged
+        self.malformed += not damaged
+        self.drop(size)
+
+    def drop(self, size: int) -> None:
+        """Count bytes that are dropped."""
+        self.bytes_dropped += size
+        self.astray = True
 
 
-class FrameParser:
-    """Bytes in, frames out; `counts` says what was lost. Memory is bounded by the longest possible frame."""
+class Parser(Protocol):
+    """Bytes in, frames out."""
 
-    def __init__(self) -> None:
-        self.counts = FrameCounts()
+    @property
+    def counts(self) -> FrameCounts:
+        """What was seen so far."""
+
+    @property
+    def seq_modulus(self) -> int:
+        """The number at which a frame's `seq` begins again."""
+
+    @property
+    def t_us_modulus(self) -> int:
+        """The time at which a frame's `t_us` begins again, us."""
+
+    @property
+    def format(self) -> str:
+        """The format, in words for people."""
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that end within `data`; what is left is kept for the next call."""
+
+    def forget(self) -> None:
+        """Drop what is unfinished: what comes next is from another connection."""
+
+
+class Splitter:
+    """Cuts bytes at a delimiter; what is longer than any frame is dropped and counted, so memory is bounded."""
+
+    def __init__(self, delimiter: bytes, longest: int, counts: FrameCounts) -> None:
+        self._delimiter, self._longest, self._counts = delimiter, longest, counts
         self._tail = b""
         self._overlong = False
 
-    def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end within `data`; what follows the last delimiter is kept for the next call."""
-        *pieces, self._tail = (self._tail + data).split(DELIMITER)
-        frames = [frame for piece in pieces if (frame := self._take(piece)) is not None]
-        if self._overlong or len(self._tail) > LONGEST_PIECE:
+    def feed(self, data: bytes) -> list[bytes]:
+        """The pieces that end within `data`, without delimiter."""
+        *pieces, self._tail = (self._tail + data).split(self._delimiter)
+        whole = [piece for piece in pieces if self._fits(piece)]
+        if self._overlong or len(self._tail) > self._longest:
             self._overlong = True
-            self.counts.bytes_dropped += len(self._tail)
+            self._counts.drop(len(self._tail))
             self._tail = b""
-        return frames
+        return whole
 
-    def _take(self, piece: bytes) -> Frame | None:
-        """The frame in a piece, or None, counted, if there is none; an empty piece is an idle line."""
-        if not piece and not self._overlong:
-            return None
-        try:
-            if self._overlong or len(piece) > LONGEST_PIECE:
-                raise ValueError("longer than any frame")
-            frame = decode_piece(piece)
-        except ValueError as error:
-            self._count_dropped(piece, error)
-            return None
-        finally:
-            self._overlong = False
-        self.counts.frames += 1
-        return frame
+    def forget(self) -> None:
+        """Drop what is unfinished."""
+        if self._tail:
+            self._counts.drop(len(self._tail))
+        self._tail = b""
 
-    def _count_dropped(self, piece: bytes, error: ValueError) -> None:
-        damaged = isinstance(error, CrcError)
-        self.counts.crc_errors += damaged
-        self.counts.malformed += not damaged
-        self.counts.bytes_dropped += len(piece) + len(DELIMITER)
+    def _fits(self, piece: bytes) -> bool:
+        if not self._overlong and len(piece) <= self._longest:
+            return True
+        self._overlong = False
+        self._counts.refuse(len(piece) + len(self._delimiter))
+        return False
 
 
 class SequenceGaps:
-    """Follows the 16-bit frame numbers.
+    """Follows the frame numbers.
 
     Attributes:
         lost: Frames that are missing between those that came.
@@ -157,16 +146,27 @@ class SequenceGaps:
         self.restarts = 0
         self._last: int | None = None
 
-    def update(self, seq: int) -> tuple[str, ...]:
-        """Count the next frame; the flags that its number earns it (see `isocharge.serve.flags`)."""
-        step = 1 if self._last is None else (seq - self._last) % SEQ_MODULUS
+    def forget(self) -> None:
+        """The next number is the first one of a new connection: whatever it is, it is no gap."""
+        self._last = None
+
+    def update(self, seq: int | None, modulus: int = SEQ_MODULUS) -> tuple[str, ...]:
+        """Count the next frame; the flags that its number earns it (see `isocharge.serve.flags`).
+
+        Args:
+            seq: Its number; None if the format has none.
+            modulus: The number at which counting begins again.
+        """
+        if seq is None:
+            return ()
+        step = 1 if self._last is None else (seq - self._last) % modulus
         self._last = seq
         if step == 1:
             return ()
         if step == 0:
             self.repeated += 1
             return (REPEAT,)
-        if step >= SEQ_MODULUS // 2:
+        if step >= modulus // 2:
             self.restarts += 1
             return (RESTART,)
         self.lost += step - 1

@@ -1,5 +1,7 @@
 """What is pressed, when: the scripts that a virtual sensor plays."""
 
+import csv
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +48,32 @@ class Script:
     def touching(self) -> Booleans:
         """Where something touches, shape (n,)."""
         return self.force_N > 0.0
+
+
+def read_script(lines: Iterable[str], rate_Hz: float, where: str) -> Script:
+    """Presses from a CSV with the columns seconds, x_mm, y_mm, force_N; between rows all go along straight lines.
+
+    Nothing touches where the force is 0; a row's position counts where it or its neighbour has a force.
+
+    Args:
+        lines: Lines of the file.
+        rate_Hz: Frames per second.
+        where: The file, for messages.
+
+    Raises:
+        SceneError: If a column is missing, a cell is no number, a force is negative or time does not go on.
+    """
+    names = ("seconds", "x_mm", "y_mm", "force_N")
+    try:
+        rows = [[float(row[name]) for name in names] for row in csv.DictReader(lines)]
+    except (KeyError, TypeError, ValueError) as error:
+        raise SceneError(f"{where}: expected numbers in the columns {', '.join(names)} ({error})") from error
+    seconds, x_mm, y_mm, force_N = np.array(rows).reshape(-1, 4).T
+    if not (len(rows) > 1 and np.isfinite(rows).all() and (np.diff(seconds) > 0).all() and force_N.min() >= 0):
+        raise SceneError(f"{where}: expected two rows or more, growing seconds and forces from 0, got {rows!r:.200}")
+    t = np.arange(seconds[0], seconds[-1], 1.0 / rate_Hz)
+    x, y, force = (np.interp(t, seconds, values) for values in (x_mm, y_mm, force_N))
+    return Script(np.where(force > 0, x, np.nan), np.where(force > 0, y, np.nan), force, rate_Hz)
 
 
 def wander(

@@ -10,6 +10,7 @@ charge = touch_charge(sensor, equilibrium)  # C, in the order of sensor.electrod
 from isocharge.extras import require
 
 with require("simulate"):
+    from isocharge.simulate.amplifier import Amplifier, Measurement, load_amplifier
     from isocharge.simulate.charge import contact_charge, pretension_charge, thermal_charge, touch_charge
     from isocharge.simulate.dataset import Dataset, Samples, read_dataset, write_dataset
     from isocharge.simulate.equilibrium import Equilibrium
@@ -24,6 +25,7 @@ with require("simulate"):
     from isocharge.simulate.theory import Theory, theory_for
 
 __all__ = [
+    "Amplifier",
     "Calibration",
     "Circle",
     "Dataset",
@@ -31,6 +33,7 @@ __all__ = [
     "Equilibrium",
     "Film",
     "ForwardMap",
+    "Measurement",
     "NoiseModel",
     "Piezo",
     "Polygon",
@@ -42,6 +45,7 @@ __all__ = [
     "Theory",
     "built_in_sensors",
     "contact_charge",
+    "load_amplifier",
     "load_sensor",
     "noise_model",
     "parse_probe",

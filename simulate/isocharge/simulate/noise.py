@@ -1,8 +1,10 @@
 """The noise model: what the measuring chain adds to the charges. Training, limits and the virtual sensor use this one.
 
-The levels so far are memoryless and independent between channels and readings:
+This is its memoryless part, independent between channels and readings:
 
     sigma^2 = white^2 + (gain * Q)^2.
+
+What has a memory - leak, hum, drift, temperature, mismatch, clipping - is `isocharge.simulate.amplifier`.
 """
 
 from dataclasses import asdict, dataclass

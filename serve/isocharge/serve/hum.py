@@ -1,0 +1,75 @@
+"""Mains hum, taken out by an adaptive notch.
+
+A fixed notch rings after every touch: a step of 850 pC through a notch 1 Hz wide takes a second to settle. So the hum
+itself is followed, a sine of known frequency and slowly changing amplitude and phase in each channel, and subtracted
+(Widrow et al., "Adaptive noise cancelling", 1975; normalised least mean squares). It is learned on the *steps* between
+frames, in which a touch is short and the hum is not, and each step counts up to a limit only. Nothing is delayed.
+"""
+
+import cmath
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isocharge.serve.arrays import Array
+
+LEAST_TURN = 0.02
+"""Where the hum hardly turns between two frames, as a phasor's step squared, nothing can be learned."""
+
+
+@dataclass(frozen=True, slots=True)
+class HumRule:
+    """How hum is followed.
+
+    Attributes:
+        frequency_Hz: Of the mains, 50 or 60.
+        settle_s: Time constant of learning, s; the notch is 1 / (pi * settle_s) wide.
+        limit_pC: A step counts up to this much, pC.
+    """
+
+    frequency_Hz: float = 50.0
+    settle_s: float = 0.5
+    limit_pC: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Hum:
+    """What is known of the hum.
+
+    Attributes:
+        phasor_pC: Amplitude and phase in each channel, shape (electrodes,), complex, pC.
+        turn: The unit phasor of the frame before.
+        raw_pC: The charges of the frame before, shape (electrodes,), pC; None before the first.
+    """
+
+    phasor_pC: NDArray[np.complex128]
+    turn: complex = 1.0 + 0.0j
+    raw_pC: Array | None = field(default=None)
+
+    @classmethod
+    def start(cls, electrodes: int) -> "Hum":
+        """Before the first frame."""
+        return cls(np.zeros(electrodes, dtype=complex))
+
+
+def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) -> tuple[Hum, Array]:
+    """The charges without hum, and what is known after this frame.
+
+    Args:
+        rule: How to follow it.
+        hum: After the frame before.
+        raw_pC: Shape (electrodes,), pC.
+        t_s: The device's clock, s.
+        dt_s: Since the frame before, s.
+    """
+    turn = cmath.exp(2j * math.pi * rule.frequency_Hz * t_s)
+    phasor_pC = hum.phasor_pC
+    step = turn - hum.turn
+    norm = step.real * step.real + step.imag * step.imag
+    if hum.raw_pC is not None and norm > LEAST_TURN:
+        error_pC = raw_pC - hum.raw_pC - (phasor_pC * step).real
+        error_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
+        phasor_pC = phasor_pC + error_pC * (min(1.0, 2.0 * dt_s / rule.settle_s) / norm * step.conjugate())
+    return Hum(phasor_pC, turn, raw_pC), raw_pC - (phasor_pC * turn).real

@@ -1,0 +1,87 @@
+"""Tare: the charge of each electrode at rest, mean and noise, from frames in which nothing moves."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.errors import TareError
+from isocharge.serve.arrays import Array
+
+
+@dataclass(frozen=True, slots=True)
+class TareRule:
+    """When frames are good for taring.
+
+    Attributes:
+        frames: How many; 100 are 0.5 s at 200 Hz.
+        noise_limit_pC: Largest standard deviation of a quiet electrode, pC. The reference noise is 1 pC.
+        offset_limit_pC: Largest mean of an idle electrode, pC. A press of 0.05 N on a 25 um film gives more than this
+            on the three electrodes' average; so does a larger one that is held still while we tare.
+        patience: Frames after which looking for quiet ones is given up; 0 for never.
+    """
+
+    frames: int = 100
+    noise_limit_pC: float = 5.0
+    offset_limit_pC: float = 100.0
+    patience: int = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Tare:
+    """Charge at rest: `charge_pC` (electrodes,) and its standard deviation `noise_pC` (electrodes,), from `frames`."""
+
+    charge_pC: Array
+    noise_pC: Array
+    frames: int
+
+    @classmethod
+    def none(cls, electrodes: int) -> "Tare":
+        """Nothing to subtract."""
+        return cls(np.zeros(electrodes), np.zeros(electrodes), 0)
+
+
+def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None:
+    """The tare of the latest frames, if they are enough and quiet.
+
+    Args:
+        rule: What is enough and quiet.
+        waiting_pC: The latest frames, at most `rule.frames`, shape (k, electrodes), pC.
+        frames: Frames seen while looking.
+
+    Raises:
+        TareError: If patience is at its end.
+    """
+    if len(waiting_pC) < rule.frames:
+        return None
+    try:
+        return measure_tare(rule, waiting_pC)
+    except TareError:
+        if rule.patience and frames >= rule.patience:
+            raise
+    return None
+
+
+def measure_tare(rule: TareRule, raw_pC: Array) -> Tare:
+    """Mean and noise of frames with nothing on the film.
+
+    Args:
+        rule: What is quiet.
+        raw_pC: Charges as they came, shape (n, electrodes), pC.
+
+    Raises:
+        TareError: If the film is touched: a charge varies, or rests far from zero.
+    """
+    tare = Tare(raw_pC.mean(axis=0), raw_pC.std(axis=0), len(raw_pC))
+    noise, offset = float(tare.noise_pC.max()), float(np.abs(tare.charge_pC).max())
+    if noise > rule.noise_limit_pC:
+        raise TareError(
+            f"cannot tare on the last {tare.frames} frames: the charge of an electrode varies by {noise:.3g} pC rms, "
+            f"expected at most {rule.noise_limit_pC:g} pC; leave the film alone and start again"
+        )
+    if offset > rule.offset_limit_pC:
+        raise TareError(
+            f"cannot tare on the last {tare.frames} frames: an electrode rests at {offset:.4g} pC, expected at most "
+            f"{rule.offset_limit_pC:g} pC; take off what lies on the film, or raise the limit if the amplifier "
+            "rests there"
+        )
+    return tare

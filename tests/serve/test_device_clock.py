@@ -1,0 +1,66 @@
+"""The device's clock against a device whose rate and jitter are known."""
+
+import numpy as np
+import pytest
+
+from isocharge.serve import DeviceClock
+
+MODULUS, START_S = 2**32, 1_700_000_000.0
+
+
+def follow(t_us, arrived_s, modulus=MODULUS):
+    clock = DeviceClock()
+    times = []
+    for device, host in zip(t_us, arrived_s, strict=True):
+        times.append(clock.read(int(device) % modulus, modulus, host))
+        clock.arrived(host)
+    return clock, times
+
+
+def test_wraps_are_undone():
+    t_us = np.arange(2**32 - 50_000, 2**32 + 50_000, 1000)
+    clock, times = follow(t_us, START_S + t_us * 1e-6)
+    assert [time.device_us for time in times] == t_us.tolist()
+    assert [time.step_s for time in times] == pytest.approx([0.0] + [1e-3] * 99)
+    assert clock.restarts == 0
+
+
+@pytest.mark.parametrize("ppm", [0.0, 150.0, -2000.0])
+def test_the_fit_follows_the_rate_and_smooths_the_jitter(ppm):
+    """Jitter of 1 ms; the fitted time has a fifth of it, and the rate is known to 20 ppm after two minutes."""
+    t_s = np.arange(0.0, 120.0, 0.005)
+    true_s = START_S + t_s * (1 + ppm * 1e-6)
+    arrived_s = true_s + np.random.default_rng(0).normal(0.0, 1e-3, t_s.size)
+    clock, times = follow(t_s * 1e6, arrived_s)
+    fitted_s = np.array([time.host_s for time in times])
+    late = slice(t_s.size // 2, None)
+    assert np.std((fitted_s - true_s)[late]) < 0.2e-3
+    assert abs(np.mean((fitted_s - true_s)[late])) < 0.1e-3
+    assert (clock.rate - 1.0) * 1e6 == pytest.approx(ppm, abs=20.0)
+
+
+def test_a_device_that_begins_anew():
+    t_us = np.concatenate([np.arange(1000) * 1000, np.arange(1000) * 1000])
+    arrived_s = START_S + np.arange(2000) * 1e-3
+    clock, times = follow(t_us, arrived_s)
+    assert clock.restarts == 1
+    assert times[1000].step_s == 0.0
+    assert np.abs(np.array([time.host_s for time in times]) - arrived_s).max() < 1e-3
+
+
+def test_several_readings_in_a_chunk_are_spread_by_the_device_clock():
+    clock, host_s = DeviceClock(), []
+    for chunk in range(200):
+        arrived_s = START_S + 0.016 * (chunk + 1)
+        host_s += [clock.read(1000 * (16 * chunk + k), MODULUS, arrived_s).host_s for k in range(16)]
+        clock.arrived(arrived_s)
+    steps = np.diff(host_s)[160:]
+    np.testing.assert_allclose(steps, 1e-3, rtol=1e-3)
+
+
+def test_without_a_device_clock_arrivals_are_the_time():
+    clock = DeviceClock()
+    times = [clock.read(None, MODULUS, START_S + host) for host in (0.0, 0.01, 0.03)]
+    assert [time.device_us for time in times] == [None] * 3
+    assert [time.host_s - START_S for time in times] == pytest.approx([0.0, 0.01, 0.03])
+    assert [time.step_s for time in times] == pytest.approx([0.0, 0.01, 0.02])

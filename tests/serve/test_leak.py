@@ -1,0 +1,118 @@
+"""The leak undone, against the closed form of a leaky integrator: v decays, q stays."""
+
+import numpy as np
+import pytest
+
+from isocharge.serve import Chain, LeakRule, TareRule
+from isocharge.serve.chain import ChainState, advance
+from isocharge.serve.leak import Leak, undo_leak
+
+RATE_HZ, TAU_S = 200.0, 2.0
+
+
+def integrator(charge_pC):
+    """v[n] = a v[n-1] + q[n] - q[n-1] by its impulse response, from rest, for charges (n,)."""
+    n = np.arange(len(charge_pC))
+    steps = np.diff(charge_pC, prepend=0.0)
+    return np.convolve(steps, np.exp(-n / (RATE_HZ * TAU_S)))[: len(n)]
+
+
+def pressed(*presses, seconds=20.0):
+    """Charge (n,) of presses (start s, seconds, pC) with edges of 50 ms."""
+    t, charge = np.arange(round(seconds * RATE_HZ)) / RATE_HZ, np.zeros(round(seconds * RATE_HZ))
+    for start, length, height in presses:
+        charge += height * np.clip(np.minimum(t - start, start + length - t) / 0.05, 0.0, 1.0)
+    return charge
+
+
+def undo(output_pC, rule=None, every=1):
+    """Touch charges (n, 3) and contact (n,) of one output (n,) on three electrodes; only every so many frames come."""
+    chain = Chain(tare=TareRule(frames=20), leak=rule or LeakRule(np.full(3, TAU_S)))
+    state, charges, contact, last = ChainState.start(3), [], [], 0.0
+    for k, v in enumerate(output_pC):
+        if k % every:
+            continue
+        state, reading = advance(chain, state, np.full(3, v), k / RATE_HZ, k / RATE_HZ - last)
+        last = k / RATE_HZ
+        charges.append(np.full(3, np.nan) if reading.charge_pC is None else reading.charge_pC)
+        contact.append(reading.contact)
+    return np.array(charges), np.array(contact)
+
+
+def test_a_held_press_stays():
+    charge = pressed((3.0, 8.0, 400.0))
+    output = integrator(charge)
+    assert output[2150] < 20.0  # what the amplifier still shows at the end of the press
+    got, contact = undo(output)
+    held = slice(700, 2180)
+    np.testing.assert_allclose(got[held, 0], 400.0, atol=0.5)
+    assert contact[held].all()
+    assert not contact[2250:].any()
+    np.testing.assert_allclose(got[2900:], 0.0, atol=0.05)
+
+
+def test_what_leaks_in_is_learned_out_of_contact():
+    """5 pC/s from the tare on; unlearned, they add 50 pC to each electrode in a press of 10 s."""
+    charge = pressed((8.0, 10.0, 300.0), seconds=22.0)
+    since_s = np.maximum(0.0, np.arange(charge.size) / RATE_HZ - 0.5)
+    output = integrator(charge) + 5.0 * TAU_S * (1.0 - np.exp(-since_s / TAU_S))
+    np.testing.assert_allclose(undo(output)[0][3550, 0], 300.0, atol=8.0)
+    assert undo(output, LeakRule(np.full(3, TAU_S), learn=False))[0][3550, 0] > 340.0
+
+
+def test_two_presses_in_a_row_do_not_spoil_each_other():
+    charge = pressed((3.0, 4.0, 400.0), (7.3, 4.0, 200.0))
+    got, contact = undo(integrator(charge))
+    np.testing.assert_allclose(got[1300, 0], 400.0, atol=0.5)
+    np.testing.assert_allclose(got[2200, 0], 200.0, atol=4.0)  # the foot of the second is lost to the relaxing base
+    assert np.count_nonzero(np.diff(contact.astype(int)) == 1) == 2
+
+
+def test_lost_frames_cost_little():
+    """Every second frame lost while pressed: the step is twice as long, and a is taken for it."""
+    charge = pressed((3.0, 8.0, 400.0))
+    got, _ = undo(integrator(charge), every=2)
+    np.testing.assert_allclose(got[1000, 0], 400.0, atol=3.0)
+
+
+@pytest.mark.parametrize("error", [0.005, 0.05])
+def test_an_error_of_tau_costs_as_much_as_theory_says(error):
+    """q' = q (1 + (tau / tau' - 1)(1 - exp(-t / tau))) in the limit of small steps, for a step held for t."""
+    charge = pressed((3.0, 8.0, 400.0))
+    got, _ = undo(integrator(charge), LeakRule(np.full(3, TAU_S * (1 + error))))
+    expected = 400.0 * (1 + (1 / (1 + error) - 1) * (1 - np.exp(-7.0 / TAU_S)))
+    assert got[2000, 0] == pytest.approx(expected, abs=1.0)
+
+
+def test_a_slow_common_warming_is_no_touch():
+    output = integrator(3.0 * np.arange(4000) / RATE_HZ)  # 3 pC/s on each electrode
+    got, contact = undo(output)
+    assert not contact.any()
+    assert np.abs(got[1000:]).max() < 4.0
+
+
+def leak_after(surplus_pC, noise_pC=1.0, **state):
+    """What is known after one frame of 5 ms in which so much came, nothing touching."""
+    rule = LeakRule(np.full(3, TAU_S))
+    leak = Leak.start(np.zeros(3))._replace(learned_s=10.0, **state)
+    return undo_leak(rule, leak, np.full(3, surplus_pC), np.full(3, noise_pC), 0.005, contact=False)
+
+
+def test_a_spike_counts_up_to_a_limit():
+    """Four standard deviations of an innovation, sqrt(2) pC each, over 3 s of settling."""
+    assert leak_after(1.0).inflow_pC_per_s == pytest.approx(np.full(3, 1.0 / 3.0))
+    assert leak_after(1000.0).inflow_pC_per_s == pytest.approx(np.full(3, 4.0 * np.sqrt(2.0) / 3.0))
+    assert leak_after(-1000.0, noise_pC=0.0).inflow_pC_per_s == pytest.approx(np.full(3, -0.1 / 3.0))
+
+
+def test_learning_holds_off_after_a_release():
+    """A finger that leaves takes the last twentieth of its charge after the release."""
+    rule = LeakRule(np.full(3, TAU_S))
+    leak = Leak.start(np.zeros(3))._replace(learned_s=10.0)
+    leak = undo_leak(rule, leak, np.full(3, 40.0), np.ones(3), 0.005, contact=True)
+    for k in range(99):
+        leak = undo_leak(rule, leak, np.full(3, 40.0 - 0.4 * k), np.ones(3), 0.005, contact=False)
+    assert not leak.inflow_pC_per_s.any()
+    for k in range(20):
+        leak = undo_leak(rule, leak, np.full(3, -0.4 * k), np.ones(3), 0.005, contact=False)
+    assert leak.inflow_pC_per_s.any()

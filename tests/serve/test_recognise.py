@@ -1,0 +1,48 @@
+"""What a board sends is found out from the bytes alone, however they are cut."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from isocharge.serve import AutoParser, Frame, encode_frame, encode_text
+from isocharge.serve.text import TEXT_FORMATS
+
+ENCODERS = {"binary": encode_frame} | {name: lambda frame, name=name: encode_text(frame, name) for name in TEXT_FORMATS}
+
+
+def frames(n):
+    return [Frame(k, 1000 * k, (800.0 + k, -7.5, 3.25)) for k in range(n)]
+
+
+@pytest.mark.parametrize("name", sorted(ENCODERS))
+@pytest.mark.parametrize("start", [0, 1, 7, 19])
+def test_each_format_is_recognised_from_anywhere(name, start):
+    parser = AutoParser()
+    got = parser.feed(b"".join(map(ENCODERS[name], frames(20)))[start:])
+    assert len(got) >= 17
+    assert [frame.values[0] for frame in got] == [frame.values[0] for frame in frames(20)][-len(got) :]
+    assert ("binary" if name == "binary" else "text") in parser.format
+
+
+@settings(derandomize=True)
+@given(
+    st.sampled_from(sorted(ENCODERS)),
+    st.lists(st.one_of(st.integers(0, 5), st.binary(max_size=30)), max_size=15),
+    st.lists(st.integers(0, 600), max_size=10),
+)
+def test_chunking_never_changes_the_frames(name, pieces, cuts):
+    data = b"".join(p if isinstance(p, bytes) else ENCODERS[name](frames(6)[p]) for p in pieces)
+    whole, cut, bytewise = AutoParser(), AutoParser(), AutoParser()
+    expected = whole.feed(data)
+    edges = [0, *sorted(min(c, len(data)) for c in cuts), len(data)]
+    assert [f for a, b in pairwise(edges) for f in cut.feed(data[a:b])] == expected
+    assert [f for i in range(len(data)) for f in bytewise.feed(data[i : i + 1])] == expected
+    assert whole.counts == cut.counts == bytewise.counts
+
+
+def test_before_it_knows_all_bytes_count_as_dropped():
+    parser = AutoParser()
+    parser.feed(b"\xf0\x9f" * 500)
+    assert (parser.counts.frames, parser.counts.bytes_dropped, parser.chosen) == (0, 1000, None)

@@ -1,0 +1,216 @@
+"""Lines of text: documented examples of each notation, recognition, and damage."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from isocharge.serve import Frame, TextParser, encode_text
+from isocharge.serve.text import LONGEST_LINE, TEXT_FORMATS
+from isocharge.serve.text_lines import Notation, parse_line
+
+README_OF_TELEPLOT = [
+    ("myValue:1234", ("myValue",), (1234.0,)),
+    ("myValue:1234|", ("myValue",), (1234.0,)),
+    ("myValue:12.34e+2", ("myValue",), (1234.0,)),
+    ("myValue:1627551892437:1234", ("t_ms", "myValue"), (1627551892437.0, 1234.0)),
+    ("myValue:1234§km²", ("myValue",), (1234.0,)),
+    ("myValue:1627551892444:1;1627551892555:2;1627551892666:3", ("t_ms", "myValue"), (1627551892666.0, 3.0)),
+    ("myValue:1234;5678;9012", ("myValue",), (9012.0,)),
+    ("myValue:1627551892437:1234§km²|g", ("t_ms", "myValue"), (1627551892437.0, 1234.0)),
+]
+
+
+@pytest.mark.parametrize(("text", "names", "values"), README_OF_TELEPLOT)
+def test_documented_teleplot_lines(text, names, values):
+    """On a serial port every telemetry line begins with >, says Teleplot's README."""
+    assert parse_line(f">{text}\r".encode()) == (Notation.teleplot, names, values)
+
+
+@pytest.mark.parametrize("text", [">myValue:hello|t", ">trajectory:12.3:45.67|xy", "", "  \r", "# a comment: 12"])
+def test_lines_that_say_nothing(text):
+    assert parse_line(text.encode()).notation is Notation.nothing
+
+
+@pytest.mark.parametrize(
+    ("text", "names", "values"),
+    [
+        ("801.2,799.5,-803.3", (), (801.2, 799.5, -803.3)),
+        ("801.2, 799.5 , 803.3,", (), (801.2, 799.5, 803.3)),
+        ("801;799;803", (), (801.0, 799.0, 803.0)),
+        ("801\t799 803", (), (801.0, 799.0, 803.0)),
+        ("[801, 799.5, 1e3]", (), (801.0, 799.5, 1000.0)),
+        ("A:801.2,B:-7", ("A", "B"), (801.2, -7.0)),
+        ("A: 801.2  B: 7", ("A", "B"), (801.2, 7.0)),
+        ("A=801.2; B=7", ("A", "B"), (801.2, 7.0)),
+        ('{"seq": 3, "A": 1.5, "note": "x", "ok": true}', ("seq", "A"), (3.0, 1.5)),
+        ('{"charge": {"A": 1, "B": 2}, "q": [3, 4]}', ("charge.A", "charge.B", "q.0", "q.1"), (1.0, 2.0, 3.0, 4.0)),
+        ("seq,t_us,A,B", ("seq", "t_us", "A", "B"), ()),
+    ],
+)
+def test_lines_of_each_notation(text, names, values):
+    assert parse_line(text.encode())[1:] == (names, values)
+
+
+@pytest.mark.parametrize(
+    "text", ["801.2,,803", "1_0,2", "A:1,A:2", "A:1:2,B", ">A", ">A:1:2:3", '{"A": "x"}', "{", "1,two,3", "\xff\xfe"]
+)
+def test_lines_that_are_damaged(text):
+    with pytest.raises(ValueError, match=r"."):
+        parse_line(text.encode("latin-1"))
+
+
+def feed(*lines, parser=None):
+    """Frames of whole lines: they begin with the end of another one."""
+    return (parser or TextParser()).feed("".join(f"\n{line}" for line in lines).encode() + b"\n")
+
+
+def test_a_layout_is_recognised_from_the_first_good_lines():
+    parser = TextParser()
+    assert feed("booting v1.2 ...", "3.3,801.2", "801.0,799.0,803.0", "801.1,799.1,803.1", parser=parser) == []
+    frames = feed("801.2,799.2,803.2", "801.3,799.3,803.3", parser=parser)
+    assert [frame.values[0] for frame in frames] == [801.0, 801.1, 801.2, 801.3]
+    assert parser.format == "text, CSV: 3 columns without names"
+    assert (parser.counts.frames, parser.counts.malformed, parser.counts.resyncs) == (4, 2, 1)
+
+
+def test_a_header_names_the_columns():
+    frames = feed("seq,t_us,A,B,C", *(f"{k},{k * 1000},1,2,3" for k in range(4)))
+    assert frames[0] == Frame(0, 0, (1.0, 2.0, 3.0), names=("A", "B", "C"))
+    assert [(f.seq, f.t_us) for f in frames] == [(0, 0), (1, 1000), (2, 2000), (3, 3000)]
+
+
+def test_a_header_that_comes_again_after_a_reset():
+    frames = feed("A,B", "1,2", "3,4", "5,6", "A,B", "7,8")
+    assert [frame.values for frame in frames] == [(1, 2), (3, 4), (5, 6), (7, 8)]
+
+
+def test_columns_from_outside():
+    frames = feed("7,12.5,801", "8,13.5,801", "9,14.5,801", parser=TextParser(("seq", "t_ms", "A")))
+    assert frames[1] == Frame(8, 13500, (801.0,), names=("A",))
+
+
+def test_a_cycle_of_lines_joined_in_the_middle():
+    """Whoever comes in the middle of A, B, C must not read B, C, A of two readings."""
+    lines = [f">{name}:{1000 + k}:{100 * k + j}" for k in range(6) for j, name in enumerate("ABC")]
+    frames = feed(*lines[1:])
+    assert [frame.values for frame in frames[-3:]] == [(300, 301, 302), (400, 401, 402), (500, 501, 502)]
+    assert [frame.t_us for frame in frames[-3:]] == [1003000, 1004000, 1005000]
+    assert all(frame.values[0] + 2 == frame.values[2] for frame in frames)
+
+
+def test_a_lost_line_of_a_cycle_costs_its_cycle_only():
+    parser = TextParser()
+    lines = [f"{name}:{100 * k + j}" for k in range(6) for j, name in enumerate("ABC")]
+    frames = feed(*lines[:12], *lines[13:], parser=parser)  # the fifth A is lost
+    assert [frame.values[0] for frame in frames] == [0, 100, 200, 300, 500]
+    assert parser.counts.malformed == 1
+
+
+def test_a_line_of_another_layout_is_dropped_and_counted():
+    parser = TextParser()
+    frames = feed("1,2,3", "1,2,3", "1,2,3", "1,2", "A:1", "1,2,3", parser=parser)
+    assert (len(frames), parser.counts.malformed, parser.counts.resyncs) == (4, 2, 1)
+
+
+FRAMES = st.builds(
+    Frame,
+    seq=st.integers(0, 2**16 - 1),
+    t_us=st.integers(0, 2**32 - 1),
+    values=st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 3),
+)
+
+
+@settings(derandomize=True)
+@given(FRAMES, st.sampled_from(sorted(TEXT_FORMATS)))
+def test_round_trip(frame, notation):
+    data = b"\n" + encode_text(frame, notation) * 3
+    got = TextParser().feed(data)
+    assert len(got) == 3
+    assert got[-1].values == pytest.approx(frame.values, rel=1e-6)
+    if notation != "csv":
+        assert got[-1].names == ("A", "B", "C")
+        assert (got[-1].seq, got[-1].t_us) == (frame.seq, frame.t_us)
+
+
+JUNK = st.one_of(
+    st.binary(max_size=30), st.text(max_size=20).map(str.encode), st.sampled_from([b"A,B,C", b"1,2", b"\n"])
+)
+STREAMS = st.tuples(
+    st.sampled_from(sorted(TEXT_FORMATS)),
+    st.lists(st.one_of(FRAMES, FRAMES, JUNK.map(lambda b: b + b"\n")), max_size=14),
+)
+
+
+def joined(notation, pieces):
+    return b"".join(piece if isinstance(piece, bytes) else encode_text(piece, notation) for piece in pieces)
+
+
+@settings(derandomize=True)
+@given(STREAMS, st.lists(st.integers(0, 900), max_size=10))
+def test_chunking_never_changes_the_frames(stream, cuts):
+    data = joined(*stream)
+    whole, cut, bytewise = TextParser(), TextParser(), TextParser()
+    frames = whole.feed(data)
+    edges = [0, *sorted(min(c, len(data)) for c in cuts), len(data)]
+    assert [f for a, b in pairwise(edges) for f in cut.feed(data[a:b])] == frames
+    assert [f for i in range(len(data)) for f in bytewise.feed(data[i : i + 1])] == frames
+    assert whole.counts == cut.counts == bytewise.counts
+
+
+class SkippingParser(TextParser):
+    """The planted fault: it skips a whole line to resynchronise."""
+
+    def _take(self, data):
+        if getattr(self, "skips", False):
+            self.skips = False
+            return []
+        dropped = self.counts.bytes_dropped
+        frames = super()._take(data)
+        self.skips = self.counts.bytes_dropped > dropped
+        return frames
+
+
+def loses_no_intact_line(parser_type):
+    @settings(derandomize=True, database=None, phases=[Phase.generate])
+    @given(st.lists(st.tuples(FRAMES, st.none() | st.binary(min_size=1, max_size=20)), min_size=1, max_size=8))
+    def check(pairs):
+        parser, start = parser_type(), Frame(0, 0, (1.0, 2.0, 3.0))
+        parser.feed(encode_text(start, "json") * 3)
+        data = b"".join(
+            encode_text(f, "json") + (b"\x80" + junk.replace(b"\n", b"\r") + b"\n" if junk else b"")
+            for f, junk in pairs
+        )
+        assert [frame.seq for frame in parser.feed(data)] == [frame.seq for frame, _ in pairs]
+
+    check()
+
+
+def test_no_intact_line_is_lost():
+    loses_no_intact_line(TextParser)
+
+
+def test_a_parser_that_skips_a_line_is_caught():
+    with pytest.raises(AssertionError):
+        loses_no_intact_line(SkippingParser)
+
+
+def test_memory_is_bounded():
+    parser = TextParser()
+    for _ in range(100):
+        assert parser.feed(b"8" * 1000) == []
+        assert len(parser._lines._tail) <= LONGEST_LINE
+    for k in range(3000):
+        parser.feed(f"A{k}:1\n".encode())
+    assert len(parser._history) <= 200
+    assert feed("1,2,3", "1,2,3", "1,2,3", parser=parser)[-1].values == (1.0, 2.0, 3.0)
+
+
+def test_a_number_cut_by_joining_late_is_not_taken():
+    parser = TextParser()
+    frames = parser.feed(b"01.2,799,803\n801.2,799,803\n801.2,799,803\n801.2,799,803\n")
+    assert [frame.values[0] for frame in frames] == [801.2] * 3
+    parser.feed(b"801.2,799,8")
+    parser.forget()
+    assert parser.feed(b"3,9,8\n801.2,799,803\n")[0].values[0] == 801.2

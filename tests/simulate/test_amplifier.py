@@ -1,0 +1,139 @@
+"""The amplifier against closed forms of a leaky integrator and the statistics of what it adds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.errors import InputError
+from isocharge.simulate import Amplifier, load_amplifier, noise_model
+
+CLEAN, RATE = noise_model("clean"), 200.0
+
+
+def measure(amplifier, charge, seed=0, rate=RATE, blocks=1):
+    """Readings of charges (n, electrodes), C, taken in so many blocks."""
+    process = amplifier.start(charge.shape[1], rate, np.random.default_rng(seed))
+    return np.concatenate([process(block) for block in np.array_split(charge, blocks)]), process
+
+
+def step(n=2000, at=200, height=400e-12, electrodes=3):
+    charge = np.zeros((n, electrodes))
+    charge[at:] = height
+    return charge
+
+
+@pytest.mark.parametrize("tau", [1.0, 10.0])
+def test_a_held_step_decays_by_the_closed_form(tau):
+    readings, _ = measure(Amplifier(noise=CLEAN, tau=tau), step())
+    t = np.arange(1800) / RATE
+    np.testing.assert_allclose(readings[200:, 0], 400e-12 * np.exp(-t / tau), rtol=1e-9)
+    np.testing.assert_array_equal(readings[:200], 0.0)
+
+
+def test_a_step_held_for_five_seconds_keeps_61_percent():
+    readings, _ = measure(Amplifier(noise=CLEAN, tau=10.0), step())
+    assert readings[200 + 1000, 0] / 400e-12 == pytest.approx(0.6065, abs=1e-4)
+
+
+def test_a_bias_current_settles_at_current_times_tau():
+    readings, process = measure(Amplifier(noise=CLEAN, tau=2.0, bias=0.5e-12), np.zeros((1000, 3)))
+    np.testing.assert_allclose(readings, np.broadcast_to(process.bias * 2.0, readings.shape), rtol=2e-3)
+
+
+def test_without_a_leak_nothing_decays():
+    readings, _ = measure(load_amplifier("clean"), step())
+    np.testing.assert_allclose(readings, step(), atol=1e-24)
+
+
+def test_reference_is_the_memoryless_model():
+    readings, _ = measure(load_amplifier("reference"), np.full((20_000, 2), 500e-12))
+    np.testing.assert_allclose(readings.std(axis=0), np.hypot(1e-12, 1e-12), rtol=0.03)
+    np.testing.assert_allclose(readings.mean(axis=0), 500e-12, atol=0.05e-12)
+
+
+def test_blocks_do_not_matter_for_what_is_not_drawn():
+    part = replace(load_amplifier("bench"), noise=CLEAN, temperature_rms=0.0)
+    whole, many = (measure(part, step(), blocks=blocks)[0] for blocks in (1, 37))
+    np.testing.assert_allclose(whole, many, atol=0.046e-12)  # one step of the converter
+
+
+def test_hum_has_its_amplitude_and_frequency():
+    readings, _ = measure(Amplifier(noise=CLEAN, hum=1e-12), np.zeros((2000, 1)), rate=1000.0)
+    spectrum = np.abs(np.fft.rfft(readings[:, 0])) * 2 / 2000
+    assert np.argmax(spectrum) / 2.0 == 50.0
+    assert spectrum.max() == pytest.approx(1e-12, rel=1e-6)
+
+
+def test_film_warms_smoothly_and_alike_on_all_electrodes():
+    part = Amplifier(noise=CLEAN, temperature_rms=0.05, temperature_time=20.0)
+    readings, _ = measure(part, np.zeros((400_000, 3)), rate=20.0)
+    np.testing.assert_allclose(readings, readings[:, :1] * np.ones(3), atol=1e-20)
+    change = readings[:, 0] + 0.0
+    assert change.std() == pytest.approx(0.05 * 270e-12, rel=0.15)
+    rate_of_change = np.diff(change)[::10] * 20.0
+    assert rate_of_change.std() == pytest.approx(0.05 * 270e-12 / 20.0, rel=0.1)  # rms / time: a lag behind a lag
+
+
+def test_a_temperature_step():
+    part = Amplifier(noise=CLEAN, step=0.5, step_at=2.0, step_time=5.0)
+    readings, _ = measure(part, np.zeros((2000, 3)))
+    assert readings[400 - 1, 0] == 0.0
+    np.testing.assert_allclose(readings[900, :], 0.25 * 270e-12)
+    np.testing.assert_allclose(readings[-1, :], 135e-12)
+
+
+def test_converter_clips_and_has_steps_of_16_bits():
+    part = Amplifier(noise=CLEAN, limit=1500e-12, bits=16)
+    readings, _ = measure(part, np.linspace(-2000e-12, 2000e-12, 5000)[:, None])
+    assert readings.min() == pytest.approx(-1500e-12)
+    assert 1499.9e-12 < readings.max() < 1500e-12
+    steps = np.diff(np.unique(readings))
+    assert steps.min() == pytest.approx(3000e-12 / 65536)  # 0.046 pC
+
+
+def test_mismatch_is_drawn_once_for_each_channel():
+    process = load_amplifier("bench").start(20_000, RATE, np.random.default_rng(0))
+    assert process.gain.std() == pytest.approx(0.01, rel=0.03)
+    assert process.tau.std() == pytest.approx(0.5, rel=0.03)
+    assert process.offset.std() == pytest.approx(2e-12, rel=0.03)
+    assert set(np.abs(process.bias)) == {0.5e-12}
+
+
+def test_surgery_is_bench_but_worse():
+    bench, surgery = load_amplifier("bench"), load_amplifier("surgery")
+    assert (surgery.noise.white, surgery.hum, surgery.step, surgery.step_time) == (1e-12, 5e-12, 0.5, 5.0)
+    assert replace(surgery, noise=bench.noise, hum=bench.hum, step=0.0) == bench
+
+
+def test_a_file_says_what_differs(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('like = "bench"\nwhite_pC = 0.5\ntau_s = 1\ngain_mismatch = 0.002\nbits = 12\n')
+    part = load_amplifier(str(path))
+    assert (part.noise.name, part.noise.white, part.tau) == ("mine", 0.5e-12, 1.0)
+    assert (part.gain_mismatch, part.bits, part.hum, part.limit) == (0.002, 12, 1e-12, 1500e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("tau = 1", "unknown key 'tau'; expected"),
+        ("tau_s = 0", "tau_s: expected a number in its range, got 0"),
+        ("hum_pC = -1", "hum_pC: expected"),
+        ("bits = 1.5", "bits: expected"),
+        ('like = "kitchen"', "like: expected one of clean, reference, bench, surgery, got 'kitchen'"),
+        ("tau_s", "cannot be read as TOML"),
+    ],
+)
+def test_wrong_files(tmp_path, text, said):
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=said):
+        load_amplifier(str(path))
+
+
+def test_unknown_level():
+    with pytest.raises(
+        InputError, match=r"expected one of clean, reference, bench, surgery, or a TOML file, got 'lab'"
+    ):
+        load_amplifier("lab")

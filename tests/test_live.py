@@ -1,0 +1,110 @@
+"""The live path on what the simulator's amplifier makes of charges: two stages that know nothing of each other."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from isocharge.serve import (
+    Chain,
+    Chunk,
+    Frame,
+    HumRule,
+    LeakRule,
+    Predictor,
+    TouchStream,
+    device_from_table,
+    encode_frame,
+)
+from isocharge.serve.chain import ChainState, advance
+from isocharge.simulate import load_amplifier
+
+RATE_HZ = 200.0
+
+
+def held(*presses, seconds):
+    """Charge (n, 3) of presses (start s, seconds, pC) with edges of 0.1 s."""
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    charge = sum(h * np.clip(np.minimum(t - start, start + length - t) / 0.1, 0, 1) for start, length, h in presses)
+    return np.repeat(charge[:, None], 3, axis=1)
+
+
+def undo(measurement, charge_pC, seed, *, hum=True):
+    """Touch charges and contact, with tau known to 0.5 % and gains to 0.2 %."""
+    rng = np.random.default_rng(seed + 1000)
+    output = measurement(charge_pC * 1e-12) * 1e12
+    gain = measurement.gain * (1 + 0.002 * rng.uniform(-1, 1, 3))
+    tau = measurement.tau * (1 + 0.005 * rng.uniform(-1, 1, 3))
+    chain = Chain(gain_pC=1 / gain, limit_pC=1499.9, hum=HumRule() if hum else None, leak=LeakRule(tau))
+    state, charges, contact = ChainState.start(3), [], []
+    for k, row in enumerate(output):
+        state, reading = advance(chain, state, row, k / RATE_HZ, 1 / RATE_HZ)
+        charges.append(np.full(3, np.nan) if reading.charge_pC is None else reading.charge_pC)
+        contact.append(reading.contact)
+    return np.array(charges), np.array(contact)
+
+
+@pytest.mark.parametrize("tau", [10.0, 1.0])
+def test_two_held_presses(tau):
+    """400 pC for 8 s, 300 pC for 10 s on `bench` without thermal drift: under 5 pC of error at the end; then zero."""
+    part = replace(load_amplifier("bench"), tau=tau, temperature_rms=0.0)
+    charge = held((6.0, 8.0, 400.0), (20.0, 10.0, 300.0), seconds=36.0)
+    for seed in range(4):
+        got, contact = undo(part.start(3, RATE_HZ, np.random.default_rng(seed)), charge, seed)
+        for end_s, height in ((13.8, 400.0), (29.8, 300.0)):
+            at = round(end_s * RATE_HZ)
+            assert np.abs(got[at - 20 : at].mean(axis=0) - height).max() < 5.0
+        touches = np.flatnonzero(np.diff(contact.astype(int)))
+        assert len(touches) == 4
+        assert np.abs(touches / RATE_HZ - [6.0, 14.0, 20.0, 30.0]).max() < 0.15
+        assert np.abs(got[round(34.0 * RATE_HZ) :].mean(axis=0)).max() < 1.0
+
+
+def test_no_false_touch_in_ten_minutes_of_nothing():
+    """The whole of `bench`, film temperature wandering included."""
+    measurement = load_amplifier("bench").start(3, RATE_HZ, np.random.default_rng(0))
+    output = measurement(np.zeros((120_000, 3))) * 1e12
+    chain = Chain(gain_pC=1 / measurement.gain, leak=LeakRule(np.full(3, 10.0)), hum=HumRule())
+    state = ChainState.start(3)
+    for k, row in enumerate(output):
+        state, reading = advance(chain, state, row, k / RATE_HZ, 1 / RATE_HZ)
+        assert not reading.contact
+
+
+def test_the_first_reading_comes_within_50_ms_of_a_touch():
+    """The smallest press, 0.05 N and 340 pC in total, that takes 150 ms to build up."""
+    part = replace(load_amplifier("bench"), tau=10.0)
+    delays_s = []
+    for seed in range(10):
+        charge = held((6.0, 2.0, 113.0), seconds=9.0)
+        _, contact = undo(part.start(3, RATE_HZ, np.random.default_rng(seed)), charge, seed)
+        delays_s.append(np.flatnonzero(contact)[0] / RATE_HZ - 6.0)
+    assert max(delays_s) < 0.05
+
+
+def unplugged(times, rest=200, away_s=1.0):
+    """Chunks of frames at rest and then of a press, with an outage between each of the pieces."""
+    rng, clock, out = np.random.default_rng(0), 1e9, []
+    for piece in range(times + 1):
+        for k in range(rest + 100):
+            charge = rng.normal(10.0, 0.3, 3) + (848.0 if k >= rest else 0.0)
+            frame = Frame(k % 65536, 5000 * k, tuple(charge))
+            out.append(Chunk(encode_frame(frame), clock, 0, away_s if piece and not k else 0.0))
+            clock += 0.005
+        clock += away_s
+    return out
+
+
+def test_unplugging_twenty_times():
+    """Every time tared again, felt again, and visible in the record."""
+    board = device_from_table({"leak": {"tau_s": 1e6}}, "test")
+    path = TouchStream(Predictor("three-25um-biaxial"), board)
+    records = [record for chunk in unplugged(20) for record in path.feed(chunk)]
+    came_back = [at for at, record in enumerate(records) if "reconnected" in record.flags]
+    assert (len(came_back), path.counts.outages, path.gaps.lost) == (20, 20, 0)
+    for start, end in pairwise([*came_back, len(records)]):
+        piece = records[start:end]
+        assert [record.tare_pC is None for record in piece] == [True] * 100 + [False] * 200
+        assert piece[-1].contact
+        assert (piece[-1].x_mm, piece[-1].y_mm, piece[-1].force_N) == pytest.approx((0.0, 0.0, 1.0), abs=0.1)
