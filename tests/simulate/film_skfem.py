@@ -344,7 +344,8 @@ def solve(
     pressed = basis.dx * (beyond(mesh.p[:, mesh.t].mean(axis=1).T, corners) < 0)[:, None]
     if abs(pressed.sum() / area(corners) - 1) > 1e-9:
         raise RuntimeError("the mesh misses the footprint's outline")
-    local = np.stack([np.sum(pressed * np.asarray(shape[0]), axis=1) for shape in basis.basis]) * force_n / area(corners)
+    local = np.stack([np.sum(pressed * np.asarray(shape[0]), axis=1) for shape in basis.basis])
+    local *= force_n / area(corners)
     load = np.zeros(3 * basis.N)
     load[2::3] = np.bincount(basis.element_dofs.ravel(), local.ravel(), basis.N)
     return Solution(basis, Film(basis, thickness, pretension, load).equilibrium())

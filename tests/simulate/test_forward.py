@@ -23,10 +23,10 @@ from isocharge.simulate.family import Family
 from isocharge.simulate.forward import INTERPOLATION_ERROR
 
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
-QUICK = {"radius": 4e-3, "force_range": (0.6, 1.0), "theory": MEMBRANE, "resolution": Resolution(4, 8, 4)}
+QUICK = {"radius": 4e-3, "force_range": (0.7, 1.0), "theory": MEMBRANE, "resolution": Resolution(5, 8, 4)}
 """A small family without bending: few and cheap solves."""
 PROBES = {
-    "triangle": Polygon.triangle(4e-3),
+    "triangle": Polygon.triangle(2.5e-3),
     "turned rectangle": parse_probe("rectangle:4x2@30"),
 }
 

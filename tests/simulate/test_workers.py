@@ -71,7 +71,9 @@ def interrupt_workers() -> None:
     with local_workers(2) as workers:
         assert workers.executor is not None
         assert workers.executor.submit(os.getpid).result() != os.getpid()
-        workers.executor.submit(time.sleep, 600.0)
+        task = workers.executor.submit(time.sleep, 600.0)
+        while not task.running():
+            time.sleep(0.01)
         raise KeyboardInterrupt
 
 
