@@ -1,4 +1,4 @@
-"""One press: `Predictor.predict_into` and `predict` against a bare `session.run` on the same model, in interleaved rounds.
+"""One press: `Predictor.predict_into` and `predict` against a bare `session.run`, same model, in interleaved rounds.
 
     python tests/benchmarks/bench_predictor.py [--model NAME|PATH] [--rounds 30] [--calls 2000] [--json]
 
