@@ -6,7 +6,13 @@ from contextlib import contextmanager
 from isocharge.errors import MissingExtra
 
 SIMULATE = frozenset({"scipy", "threadpoolctl", "matplotlib"})
-PACKAGES = {"simulate": SIMULATE, "train": SIMULATE | {"torch", "onnx"}}
+HTTP = frozenset({"uvicorn", "uvloop", "httptools", "orjson", "markdown_it"})
+PACKAGES = {
+    "simulate": SIMULATE,
+    "train": SIMULATE | {"torch", "onnx"},
+    "http": HTTP,
+    "grpc": HTTP | {"grpc", "google"},
+}
 """Import names that come with an extra of pyproject.toml."""
 
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from isocharge.cli.http import http_command
 from isocharge.cli.terminal import progress, say
 from isocharge.errors import InputError, OutputExists
 
@@ -31,8 +32,9 @@ FORCE_MIN_N = 0.05
 """Smallest force that a virtual sensor plays, N."""
 
 serve_app = typer.Typer(
-    no_args_is_help=True, help="Charges to contacts: from a file, from a port, from a virtual sensor."
+    no_args_is_help=True, help="Charges to contacts: from a file, from a port, over HTTP, from a virtual sensor."
 )
+serve_app.command("http")(http_command)
 
 ModelArgument = Annotated[str, typer.Argument(metavar="MODEL", help="Model name, or path of a model folder.")]
 ModelsOption = Annotated[
