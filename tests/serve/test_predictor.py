@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from isocharge.errors import ChargeError, ModelError
 from isocharge.serve import Predictor
-from isocharge.serve.predictor import _BoundPress
+from isocharge.serve.predictor import BoundPress
 
 PRESSES = st.lists(st.floats(0.0, 5000.0, width=32), min_size=3, max_size=3).filter(lambda q: sum(q) > 1.0)
 
@@ -181,7 +181,7 @@ def test_goes_on_after_an_error(predictor):
 
 
 def test_memory_that_is_not_shared_is_noticed(models, monkeypatch):
-    monkeypatch.setattr(_BoundPress, "__init__", _unshared)
+    monkeypatch.setattr(BoundPress, "__init__", _unshared)
     with pytest.raises(ModelError, match=r"through bound memory and .* without"):
         Predictor("linear", models=models)
 

@@ -82,7 +82,7 @@ class Predictor:
         loaded = load_model(find_model(model, models))
         self._metadata = loaded.metadata
         self._session = loaded.session
-        self._press = _BoundPress(loaded.session, len(loaded.metadata.electrodes))
+        self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
         _check_shared(self._press, loaded)
 
     @property
@@ -146,7 +146,7 @@ class Predictor:
         return Contacts(*np.concatenate([outputs[name] for name in OUTPUTS], axis=1).T)
 
 
-class _BoundPress:
+class BoundPress:
     """Input and output memory of one press, bound to a session.
 
     `write(q1, q2, ...)` puts the charges in, `run()` computes, `read()` gives the seven numbers of a Contact.
@@ -191,7 +191,7 @@ def _bind(session: ort.InferenceSession, charges: Singles, answers: Singles) -> 
     return binding
 
 
-def _check_shared(press: _BoundPress, model: Model) -> None:
+def _check_shared(press: BoundPress, model: Model) -> None:
     """Make sure that this onnxruntime computes in the bound memory and not in copies of it.
 
     Raises:

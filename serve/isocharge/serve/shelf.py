@@ -15,6 +15,7 @@ from types import MappingProxyType
 from isocharge.errors import ModelError, ModelNotFound
 from isocharge.serve.metadata import ModelMetadata
 from isocharge.serve.model import Model, check_golden, load_model
+from isocharge.serve.predictor import BoundPress
 from isocharge.serve.repository import model_names, repositories, version_folders
 from isocharge.serve.statistics import Statistics
 
@@ -27,12 +28,18 @@ class Served:
     """One version of a model that answers requests."""
 
     model: Model
+    metadata: ModelMetadata
+    version: str
     statistics: Statistics = field(default_factory=Statistics)
+    _own: threading.local = field(default_factory=threading.local, repr=False)
 
-    @property
-    def metadata(self) -> ModelMetadata:
-        """What the model says about itself."""
-        return self.model.metadata
+    def press(self) -> BoundPress:
+        """Bound memory for one press, the calling thread's own."""
+        try:
+            return self._own.press  # type: ignore[no-any-return]
+        except AttributeError:
+            self._own.press = BoundPress(self.model.session, len(self.metadata.electrodes))
+            return self._own.press  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)
@@ -191,7 +198,7 @@ def _read(name: str, version: int, folder: Path) -> Served:
             "move it into folders of its own name and version"
         )
     check_golden(model)
-    return Served(model)
+    return Served(model, model.metadata, str(version))
 
 
 def _rows(name: str, entry: Entry) -> list[IndexRow]:

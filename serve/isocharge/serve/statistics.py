@@ -10,54 +10,51 @@ STAGES = ("compute_input", "compute_infer", "compute_output")
 
 
 @dataclass
-class Duration:
-    """How often something happened and how long it took altogether, ns."""
-
-    count: int = 0
-    ns: int = 0
-
-    def add(self, ns: int) -> None:
-        """Once more, ns long."""
-        self.count += 1
-        self.ns += ns
-
-
-@dataclass
 class Statistics:
-    """Counters of one version of a model; any thread may add to them."""
+    """Counters of one version of a model; any thread may add to them.
 
-    inference_count: int = 0
-    execution_count: int = 0
-    last_inference_ms: int = 0
-    success: Duration = field(default_factory=Duration)
-    fail: Duration = field(default_factory=Duration)
-    stages: tuple[Duration, ...] = field(default_factory=lambda: tuple(Duration() for _ in STAGES))
+    Attributes:
+        presses: Rows that were answered.
+        answered, refused: Requests.
+        stages_ns: Time spent on the answered ones in each of STAGES.
+        refused_ns: Time spent on the others.
+        last_ms: When the last one was answered, unix time.
+    """
+
+    presses: int = 0
+    answered: int = 0
+    refused: int = 0
+    stages_ns: list[int] = field(default_factory=lambda: [0] * len(STAGES))
+    refused_ns: int = 0
+    last_ms: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def succeeded(self, rows: int, stages_ns: tuple[int, ...]) -> None:
+    def succeeded(self, presses: int, stages_ns: tuple[int, int, int]) -> None:
         """A request for so many presses was answered; `stages_ns` in the order of STAGES."""
+        spent = self.stages_ns
         with self._lock:
-            self.inference_count += rows
-            self.execution_count += 1
-            self.last_inference_ms = time.time_ns() // 1_000_000
-            self.success.add(sum(stages_ns))
-            for stage, ns in zip(self.stages, stages_ns, strict=True):
-                stage.add(ns)
+            self.presses += presses
+            self.answered += 1
+            spent[0] += stages_ns[0]
+            spent[1] += stages_ns[1]
+            spent[2] += stages_ns[2]
+            self.last_ms = time.time_ns() // 1_000_000
 
     def failed(self, ns: int) -> None:
         """A request was refused after so long."""
         with self._lock:
-            self.fail.add(ns)
+            self.refused += 1
+            self.refused_ns += ns
 
     def to_json(self) -> dict[str, Any]:
-        """The counters as Triton words them; nothing queues here and nothing is cached."""
+        """The counters as Triton words them; nothing queues here."""
         with self._lock:
-            spent = dict(zip(STAGES, self.stages, strict=True))
-            durations = {"success": self.success, "fail": self.fail, "queue": Duration(self.success.count), **spent}
+            spent = dict(zip(STAGES, self.stages_ns, strict=True)) | {"queue": 0, "success": sum(self.stages_ns)}
+            durations = {name: {"count": self.answered, "ns": ns} for name, ns in spent.items()}
             return {
-                "last_inference": self.last_inference_ms,
-                "inference_count": self.inference_count,
-                "execution_count": self.execution_count,
-                "inference_stats": {name: {"count": of.count, "ns": of.ns} for name, of in durations.items()},
+                "last_inference": self.last_ms,
+                "inference_count": self.presses,
+                "execution_count": self.answered,
+                "inference_stats": {**durations, "fail": {"count": self.refused, "ns": self.refused_ns}},
                 "batch_stats": [],
             }

@@ -68,7 +68,7 @@ class Service:
 
     def ModelInfer(self, asked: Any) -> Any:
         served = self._shelf.get(asked.model_name, asked.model_version)
-        read = partial(read_infer, asked, served.metadata.electrodes, self._limits)
+        read = partial(read_infer, asked, served.metadata.electrodes, self._limits.batch)
         return answer_inference(served, read, lambda answer: write_answer(answer, METHODS["ModelInfer"][1]()))
 
     def ModelStreamInfer(self, asked: Any) -> dict[str, Any]:

@@ -6,7 +6,6 @@ import numpy as np
 
 from isocharge.errors import RequestError
 from isocharge.serve.arrays import Singles
-from isocharge.serve.limits import Limits
 from isocharge.serve.v2.infer import InferAnswer, InferRequest
 from isocharge.serve.v2.request import NOT_HERE
 from isocharge.serve.v2.tensors import charges_from_bytes, charges_from_values, check_head, check_outputs
@@ -15,7 +14,7 @@ CONTENTS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
 """Which field of a tensor's contents has its numbers."""
 
 
-def read_infer(message: Any, electrodes: tuple[str, ...], limits: Limits) -> InferRequest:
+def read_infer(message: Any, electrodes: tuple[str, ...], batch: int) -> InferRequest:
     """The request in a ModelInferRequest. Raw numbers are answered with raw numbers, others with others.
 
     Raises:
@@ -26,16 +25,16 @@ def read_infer(message: Any, electrodes: tuple[str, ...], limits: Limits) -> Inf
             if name in holder.parameters:
                 raise RequestError(f"the parameters of {holder.name[:100]!r}: {name!r} is not supported by this server")
     outputs = check_outputs([output.name for output in message.outputs])
-    charges = _charges(message, electrodes, limits)
+    charges = _charges(message, electrodes, batch)
     return InferRequest(message.id, charges, outputs, frozenset(outputs if message.raw_input_contents else ()))
 
 
-def _charges(message: Any, electrodes: tuple[str, ...], limits: Limits) -> Singles:
+def _charges(message: Any, electrodes: tuple[str, ...], batch: int) -> Singles:
     raw = message.raw_input_contents
     if len(message.inputs) != 1 or len(raw) > 1:
         raise RequestError(f"expected one input tensor, got {len(message.inputs)} and {len(raw)} raw contents")
     (tensor,) = message.inputs
-    head = check_head(tensor.name, tensor.datatype, list(tensor.shape), electrodes, limits.batch)
+    head = check_head(tensor.name, tensor.datatype, list(tensor.shape), electrodes, batch)
     fields = {field.name for field, _ in tensor.contents.ListFields()}
     if fields - (set() if raw else {CONTENTS[tensor.datatype]}):
         raise RequestError(f"expected {CONTENTS[tensor.datatype]} or raw_input_contents, got {sorted(fields)}")

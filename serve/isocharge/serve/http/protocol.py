@@ -1,18 +1,29 @@
 """HTTP on one connection, bounded: uvicorn's httptools protocol bounds neither headers nor the time they take.
 
 A timer for each request would cost as much as parsing it. So a connection only notes by when it must have done its next
-step, and the server looks through the connections now and then (`close_overdue`).
+step, and the server looks through the connections now and then (`close_overdue`). A request that arrives in one piece,
+as nearly all do, needs no note but the one for the pause after it.
 """
 
 import asyncio
 import math
 from collections.abc import Iterable
+from enum import Enum
 from typing import Any
 
 import orjson
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
 from isocharge.serve.limits import Limits
+
+
+class Phase(Enum):
+    """What a connection waits for."""
+
+    IDLE = "a request"
+    HEADERS = "the end of the headers"
+    BODY = "the end of the body"
+    ANSWER = "our answer"
 
 
 class BoundedProtocol(HttpToolsProtocol):
@@ -23,38 +34,37 @@ class BoundedProtocol(HttpToolsProtocol):
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
         self.by = math.inf  # the loop's time, s
-        self._in_headers, self._header_bytes = True, 0
-        self._now = self.loop.time
+        self._phase = self._timed = Phase.IDLE
+        self._chunk = self._fed = 0  # bytes of this piece, and of all since the request began
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Take a connection, or say that there are too many."""
         super().connection_made(transport)
-        self.by = self._now() + self.limits.header_seconds
+        self._allow(self.limits.header_seconds)
         if len(self.connections) > self.limits.connections:
             self._refuse(503, f"all {self.limits.connections} connections are taken; try again later")
 
     def data_received(self, data: bytes) -> None:
-        """Parse, then see whether headers are still going on."""
+        """Parse; what is then still unfinished is counted and timed."""
         if self.transport.is_closing():
             return
+        self._chunk = len(data)
+        self._fed += self._chunk
         super().data_received(data)
-        if self._in_headers:
-            self._count(len(data))
+        if self._phase is Phase.HEADERS or self._phase is Phase.BODY:
+            self._unfinished()
 
     def on_message_begin(self) -> None:
-        """A request begins."""
+        """A request begins, somewhere in this piece of data."""
+        self._phase, self._fed = Phase.HEADERS, self._chunk
         super().on_message_begin()
-        self._in_headers, self._header_bytes = True, 0
-        self.by = self._now() + self.limits.header_seconds
 
     def on_headers_complete(self) -> None:
-        """The headers are all there; what came before this call was them."""
-        size = len(self.url) + sum(len(name) + len(value) + 4 for name, value in self.headers)
-        self._in_headers, self._header_bytes = False, 0
-        if self.limits.header_bytes < size:
-            self._refuse(431, self._too_long())
+        """The headers are all there; they are measured if they can be too long at all."""
+        self._phase = Phase.BODY
+        if self._fed > self.limits.header_bytes and self._header_bytes() > self.limits.header_bytes:
+            self._refuse_headers()
         else:
-            self.by = self._now() + self.limits.body_seconds
             super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
@@ -63,15 +73,26 @@ class BoundedProtocol(HttpToolsProtocol):
             super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """The whole request is there; the answer must have been taken by then."""
+        """The whole request is there."""
         if not self.transport.is_closing():
-            self.by = self._now() + self.limits.body_seconds
+            self._phase, self.by = Phase.ANSWER, math.inf
             super().on_message_complete()
 
     def on_response_complete(self) -> None:
-        """Wait for the next request."""
-        self.by = self._now() + self.limits.idle_seconds
-        super().on_response_complete()
+        """Go on with the next request, or wait for it; as in uvicorn, without its timer."""
+        self.server_state.total_requests += 1
+        if self.transport.is_closing():
+            return
+        self._phase = self._timed = Phase.IDLE if self._phase is Phase.ANSWER else self._phase
+        self._allow(self.limits.idle_seconds)
+        self.flow.resume_reading()
+        if self.pipeline:
+            self._start_asgi_task(*self.pipeline.pop())
+
+    def pause_writing(self) -> None:
+        """The client does not take its answer."""
+        self._allow(self.limits.body_seconds)
+        super().pause_writing()
 
     def send_400_response(self, msg: str) -> None:
         """What cannot be parsed at all."""
@@ -79,19 +100,25 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def overdue(self) -> None:
         """End a connection that took too long: with words to one that is sending, without to one that is not."""
-        if self._in_headers and self._header_bytes:
-            self._refuse(408, f"the headers took longer than {self.limits.header_seconds:g} s")
-        elif self.cycle is not None and self.cycle.more_body and not self.cycle.response_started:
-            self._refuse(408, f"the body took longer than {self.limits.body_seconds:g} s")
+        if self._phase in (Phase.HEADERS, Phase.BODY):
+            self._refuse(408, f"waited too long for {self._phase.value}")
         self.transport.abort()
 
-    def _count(self, size: int) -> None:
-        self._header_bytes += size
-        if self._header_bytes > self.limits.header_bytes:
-            self._refuse(431, self._too_long())
+    def _unfinished(self) -> None:
+        if self._phase is Phase.HEADERS and self._fed > self.limits.header_bytes:
+            self._refuse_headers()
+        if self._timed is not self._phase:
+            self._timed = self._phase
+            self._allow(self.limits.header_seconds if self._phase is Phase.HEADERS else self.limits.body_seconds)
 
-    def _too_long(self) -> str:
-        return f"the request line and headers are longer than {self.limits.header_bytes} bytes"
+    def _allow(self, seconds: float) -> None:
+        self.by = self.loop.time() + seconds
+
+    def _header_bytes(self) -> int:
+        return len(self.url) + sum(len(name) + len(value) + 4 for name, value in self.headers)
+
+    def _refuse_headers(self) -> None:
+        self._refuse(431, f"the request line and headers are longer than {self.limits.header_bytes} bytes")
 
     def _refuse(self, status: int, words: str) -> None:
         """Answer without asking the application, and hang up."""

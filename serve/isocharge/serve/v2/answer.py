@@ -30,7 +30,7 @@ def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
 
 def _tensor(name: str, rows: Singles, in_binary: bool) -> dict[str, Any]:
     """One tensor, its numbers flat and row by row, or only their number of bytes."""
-    head = {"name": name, "datatype": "FP32", "shape": rows.shape}
     if in_binary:
-        return {**head, "parameters": {"binary_data_size": rows.nbytes}}
-    return {**head, "data": rows.ravel()}
+        size = {"binary_data_size": rows.nbytes}
+        return {"name": name, "datatype": "FP32", "shape": rows.shape, "parameters": size}
+    return {"name": name, "datatype": "FP32", "shape": rows.shape, "data": rows.ravel()}

@@ -64,7 +64,7 @@ def statistics_of(shelf: Shelf, name: str = "", version: str = "") -> dict[str, 
     models = [shelf.get(name, version)] if version else shelf.named(name) if name else shelf.all()
     return {
         "model_stats": [
-            {"name": served.metadata.name, "version": str(served.metadata.version), **served.statistics.to_json()}
+            {"name": served.metadata.name, "version": served.version, **served.statistics.to_json()}
             for served in models
         ]
     }

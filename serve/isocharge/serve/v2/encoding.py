@@ -51,7 +51,7 @@ def compress(body: bytes, accepted: bytes) -> tuple[bytes, bytes]:
     Returns:
         The body and its Content-Encoding, empty if it stays as it is.
     """
-    names = _accepted(accepted) if accepted and len(body) >= WORTH_BYTES else ()
+    names = _accepted(accepted) if len(body) >= WORTH_BYTES else ()
     if b"gzip" in names:
         return gzip.compress(body, compresslevel=1, mtime=0), b"gzip"
     if b"deflate" in names:

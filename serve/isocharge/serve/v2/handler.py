@@ -6,6 +6,7 @@ largest batch, and may be called from any thread; `blocks` says for which paths 
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import orjson
@@ -16,16 +17,19 @@ from isocharge.serve.shelf import Served, Shelf
 from isocharge.serve.v2 import describe
 from isocharge.serve.v2.answer import write_answer
 from isocharge.serve.v2.encoding import compress, decompress
-from isocharge.serve.v2.infer import InferRequest, answer_inference
+from isocharge.serve.v2.infer import answer_inference
 from isocharge.serve.v2.openapi import openapi
 from isocharge.serve.v2.page import page
-from isocharge.serve.v2.request import read_body, read_infer, read_object
+from isocharge.serve.v2.request import read_infer, read_object
 from isocharge.serve.v2.status import INTERNAL, http_status
 
 log = logging.getLogger(__name__)
 
 Headers = Iterable[tuple[bytes, bytes]]
 """Names in lower case, values as they came."""
+
+KNOWN_PATHS = 64
+"""So many paths that were asked for are remembered with what answers them."""
 
 MODELS, REPOSITORY = "/v2/models/", "/v2/repository/models/"
 
@@ -74,6 +78,7 @@ class Handler:
             "stats": ("GET", lambda asked: _json(describe.statistics_of(shelf, asked.name, asked.version))),
             "infer": ("POST", self._infer),
         }
+        self._route = lru_cache(KNOWN_PATHS)(self._find)
         self._of_repository: dict[str, Route] = {"load": ("POST", self._load), "unload": ("POST", self._unload)}
 
     def blocks(self, path: str) -> bool:
@@ -105,7 +110,7 @@ class Handler:
         except Exception as error:  # the one place where an error becomes an answer
             return error_response(error)
 
-    def _route(self, path: str) -> tuple[Route, str, str]:
+    def _find(self, path: str) -> tuple[Route, str, str]:
         """What answers a path, with the name and version in it."""
         if path in self._fixed:
             return self._fixed[path], "", ""
@@ -125,14 +130,11 @@ class Handler:
         return self.shelf.get(asked.name, asked.version)
 
     def _infer(self, asked: Request) -> Response:
-        served, limits = self._served(asked), self.limits
-
-        def read() -> InferRequest:
-            body = read_body(asked.body, asked.headers.get(b"inference-header-content-length"))
-            return read_infer(body, served.metadata.electrodes, limits)
-
+        served, headers = self.shelf.get(asked.name, asked.version), asked.headers
+        length = headers.get(b"inference-header-content-length")
+        read = partial(read_infer, asked.body, length, served.metadata.electrodes, self.limits.batch)
         body, json_length = answer_inference(served, read, write_answer)
-        return _infer_response(body, json_length, asked.headers.get(b"accept-encoding", b""))
+        return _infer_response(body, json_length, headers.get(b"accept-encoding", b""))
 
     def _ready(self, _: Request) -> Response:
         if not self.shelf.all():
@@ -186,7 +188,7 @@ def _response(status: int, kind: bytes, body: bytes) -> Response:
 
 def _infer_response(body: bytes, json_length: int | None, accepted: bytes) -> Response:
     """The answer to an inference, the only one that is compressed: Triton's asyncio client expects no other so."""
-    body, encoding = compress(body, accepted)
+    body, encoding = compress(body, accepted) if accepted else (body, b"")
     response = _response(200, b"application/json" if json_length is None else b"application/octet-stream", body)
     if json_length is not None:
         response.headers.append((b"inference-header-content-length", b"%d" % json_length))

@@ -2,13 +2,22 @@
 
 import time
 from collections.abc import Callable
+from itertools import accumulate
 from typing import NamedTuple, TypeVar
 
+import numpy as np
+
 from isocharge.serve.arrays import Singles
-from isocharge.serve.session import INPUT
+from isocharge.serve.predictor import BoundPress
+from isocharge.serve.session import INPUT, OUTPUTS
 from isocharge.serve.shelf import Served
 
 Written = TypeVar("Written")
+
+ENDS = tuple(accumulate(OUTPUTS.values()))
+WIDTH = ENDS[-1]
+COLUMNS = {name: slice(end - OUTPUTS[name], end) for name, end in zip(OUTPUTS, ENDS, strict=True)}
+"""Where each output lies in the row of numbers that is bound for one press."""
 
 
 class InferRequest(NamedTuple):
@@ -45,10 +54,19 @@ class InferAnswer(NamedTuple):
 
 def infer(served: Served, request: InferRequest) -> InferAnswer:
     """Run the model; may be called from any thread."""
-    values = served.model.session.run(request.outputs, {INPUT: request.charge_pC})
-    outputs = dict(zip(request.outputs, values, strict=True))
-    metadata = served.metadata
-    return InferAnswer(metadata.name, str(metadata.version), request.id, outputs, request.binary)
+    charges, names = request.charge_pC, request.outputs
+    if len(charges) == 1:
+        outputs = _one_press(served.press(), charges[0], names)
+    else:
+        outputs = dict(zip(names, served.model.session.run(names, {INPUT: charges}), strict=True))
+    return InferAnswer(served.metadata.name, served.version, request.id, outputs, request.binary)
+
+
+def _one_press(press: BoundPress, charge_pC: Singles, names: tuple[str, ...]) -> dict[str, Singles]:
+    """Outputs of shape (1, width) from bound memory, which is faster than a plain run."""
+    row = np.empty((1, WIDTH), np.float32)
+    press.run_into(charge_pC, row[0])
+    return {name: row[:, COLUMNS[name]] for name in names}
 
 
 def answer_inference(
