@@ -115,7 +115,7 @@ class Handler:
         if path in self._fixed:
             return self._fixed[path], "", ""
         try:
-            if path.startswith(MODELS):
+            if path.startswith(MODELS) and not path.endswith("/"):
                 name, *rest = path[len(MODELS) :].split("/")
                 version = rest[1] if rest[:1] == ["versions"] else ""
                 return self._of_model["/".join(rest[2:] if version else rest)], name, version
