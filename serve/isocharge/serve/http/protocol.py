@@ -75,7 +75,8 @@ class BoundedProtocol(HttpToolsProtocol):
     def on_message_complete(self) -> None:
         """The whole request is there."""
         if not self.transport.is_closing():
-            self._phase, self.by = Phase.ANSWER, math.inf
+            self._phase = Phase.ANSWER
+            self._allow(math.inf)
             super().on_message_complete()
 
     def on_response_complete(self) -> None:
@@ -90,9 +91,14 @@ class BoundedProtocol(HttpToolsProtocol):
             self._start_asgi_task(*self.pipeline.pop())
 
     def pause_writing(self) -> None:
-        """The client does not take its answer."""
+        """The client does not take its answer; it has so long to go on."""
         self._allow(self.limits.body_seconds)
         super().pause_writing()
+
+    def resume_writing(self) -> None:
+        """The client has taken what there was."""
+        super().resume_writing()
+        self._allow(self.limits.idle_seconds)
 
     def send_400_response(self, msg: str) -> None:
         """What cannot be parsed at all."""
@@ -112,7 +118,8 @@ class BoundedProtocol(HttpToolsProtocol):
             self._allow(self.limits.header_seconds if self._phase is Phase.HEADERS else self.limits.body_seconds)
 
     def _allow(self, seconds: float) -> None:
-        self.by = self.loop.time() + seconds
+        if not self.flow.write_paused:  # an answer that is not taken leaves no time for anything else
+            self.by = self.loop.time() + seconds
 
     def _header_bytes(self) -> int:
         return len(self.url) + sum(len(name) + len(value) + 4 for name, value in self.headers)
