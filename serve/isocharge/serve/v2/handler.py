@@ -148,7 +148,7 @@ class Handler:
         return _json(describe.repository_index(self.shelf, ready=ready))
 
     def _load(self, asked: Request) -> Response:
-        if read_object(asked.body).get("parameters"):
+        if read_object(asked.body).get("parameters", {}) != {}:
             raise RequestError(
                 "load: parameters are not supported; put the files into the model's folder and load again"
             )

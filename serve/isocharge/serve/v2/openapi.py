@@ -47,8 +47,8 @@ def _paths() -> Json:
         "/v2": _get("Name, version and extensions of the server", "server"),
         "/v2/models/stats": _get("Counters of all models", "stats"),
         "/v2/repository/index": _post("Every version in the repository", "index", _INDEX_BODY),
-        "/v2/repository/models/{model}/load": _post("Read a model's files again and swap it in", "any", {}),
-        "/v2/repository/models/{model}/unload": _post("Take a model off", "any", {}),
+        "/v2/repository/models/{model}/load": _post("Read a model's files again and swap it in", "any", _LOAD_BODY),
+        "/v2/repository/models/{model}/unload": _post("Take a model off", "any", _UNLOAD_BODY),
     }
     for base in (model, versioned):
         paths[base] = _get("Tensors of a model and what its file says about itself", "model")
@@ -69,7 +69,7 @@ def _get(summary: str, answer: str) -> Json:
 
 
 def _post(summary: str, answer: str, body: Json) -> Json:
-    request = {"required": "$ref" in body, "content": _content(body or {"type": "object", "maxProperties": 0})}
+    request = {"required": "$ref" in body, "content": _content(body)}
     return {"post": {**_operation(summary, answer), "requestBody": request}}
 
 
@@ -124,8 +124,9 @@ def _infer(widths: list[int], limits: Limits) -> Json:
 
 _TEXT, _WHOLE = {"type": "string"}, {"type": "integer"}
 _PARAMETERS: Json = {"type": "object"}
-_INDEX_BODY = _object({"ready": {"type": "boolean"}}, [])
-_INDEX_BODY.pop("required")
+_INDEX_BODY: Json = {"type": "object", "properties": {"ready": {"type": "boolean"}}}
+_LOAD_BODY: Json = {"type": "object", "properties": {"parameters": {"type": "object", "maxProperties": 0}}}
+_UNLOAD_BODY: Json = {"type": "object"}
 _TENSORS = _list_of(_object({"name": _TEXT, "datatype": _TEXT, "shape": _list_of(_WHOLE)}))
 _OUTPUT = _object(
     {
