@@ -172,4 +172,5 @@ def running(handler, *, token=None, tls=None, uds=None):
     finally:
         server.stop()
         thread.join(timeout=30)
+        server.close()
         assert not thread.is_alive()

@@ -382,6 +382,7 @@ def test_stopping_finishes_what_is_in_flight(handler, shelf, monkeypatch):
         server.stop()
         assert asked.result() == (200, {})
     thread.join(20)
+    server.close()
     assert not thread.is_alive()
     with pytest.raises(ConnectionRefusedError):
         connect(server)

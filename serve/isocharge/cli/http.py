@@ -1,6 +1,7 @@
 """`isocharge serve http`: the models over HTTP, and over gRPC beside it if a port is given."""
 
-from contextlib import AbstractContextManager, nullcontext, suppress
+import os
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -88,7 +89,7 @@ def http_command(
         say(f"refused: {reason}")
     handler = Handler(shelf, limits)
     server = HttpServer(App(handler, secret), address, limits=limits, tls=tls)
-    with suppress(KeyboardInterrupt), _grpc(handler, host, grpc_port, secret, tls) as grpc_url:
+    with suppress(KeyboardInterrupt), closing(server), _grpc(handler, host, grpc_port, secret, tls) as grpc_url:
         say("serving " + ", ".join(served.metadata.label for served in shelf.all()) + "; Ctrl-C stops")
         for url in filter(None, (server.url, grpc_url)):
             print(url, flush=True)
@@ -101,6 +102,7 @@ def _grpc(
     """The gRPC server beside the other one; its address."""
     if port is None:
         return nullcontext("")
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # its core would say in its own way what our errors say
     with require("grpc"):
         from isocharge.serve.grpc import grpc_server
     return grpc_server(handler, host, port, token, tls)

@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-from contextlib import closing
 
 import uvicorn
 
@@ -27,7 +26,7 @@ class _Uvicorn(uvicorn.Server):
 
 
 class HttpServer:
-    """A server that listens from the moment it is made, and answers while `run` runs."""
+    """A server that listens from the moment it is made until it is closed, and answers while `run` runs."""
 
     def __init__(self, app: App, address: Address, *, limits: Limits, tls: Tls | None = None) -> None:
         """Listen.
@@ -59,12 +58,13 @@ class HttpServer:
     def run(self) -> None:
         """Answer until SIGTERM or SIGINT, or `stop`; then finish what is in flight."""
         logging.getLogger("uvicorn").setLevel(logging.CRITICAL)  # clients' mistakes are told to clients
-        try:
-            with closing(self._socket):
-                self._server.run([self._socket])
-        finally:
-            self._address.release()
+        self._server.run([self._socket])
 
     def stop(self) -> None:
         """Tell `run` to finish; from any thread."""
         self._server.should_exit = True
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._socket.close()
+        self._address.release()
