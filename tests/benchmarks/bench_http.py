@@ -21,7 +21,7 @@ import venv
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from bench_predictor import machine
@@ -133,29 +133,37 @@ def mlserver_folder(folder: Path, port: int, model: Path) -> Path:
 @contextmanager
 def running(words: list[str | Path], address: tuple[str, int] | str, **options: Any) -> Iterator[None]:
     """A server process, from its first accepted connection to the end of the block."""
-    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **options)
-    try:
-        for _ in range(600):
-            try:
-                Connection(address).close()
-                break
-            except OSError:
-                if process.poll() is not None:
-                    raise RuntimeError(f"{words[0]} ended: {process.stderr.read().decode()[-2000:]}") from None
-                time.sleep(0.1)
-        yield
-    finally:
-        process.send_signal(signal.SIGTERM)
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(words, stdout=said, stderr=said, **options)
         try:
-            process.communicate(timeout=15)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
+            _wait_for(process, address, said)
+            yield
+        finally:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(timeout=15)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _wait_for(process: subprocess.Popen[bytes], address: tuple[str, int] | str, said: IO[bytes]) -> None:
+    """Wait until something listens, and a moment more: MLServer listens before it has loaded its model."""
+    for _ in range(600):
+        try:
+            Connection(address).close()
+            time.sleep(2.0)
+            break
+        except OSError:
+            time.sleep(0.1)
+    if process.poll() is not None:
+        said.seek(0)
+        raise RuntimeError(f"{process.args} ended: {said.read().decode()[-3000:]}")
 
 
 def start(stack: ExitStack, model: str, environments: Path | None) -> dict[str, tuple[tuple[str, int] | str, str]]:
     """Start every contender: name to address and path."""
-    folder = find_model(model)
+    folder = find_model(model).resolve()
     file, name = folder / "model.onnx", load_model(folder).metadata.name
     work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
     ours, path = (
@@ -187,14 +195,17 @@ def start(stack: ExitStack, model: str, environments: Path | None) -> dict[str, 
     return made
 
 
-def latencies(connection: Connection, request: bytes, count: int) -> np.ndarray:
-    """Durations of requests one after another, us."""
-    clock, durations = time.perf_counter_ns, np.empty(count)
+def latencies(address: tuple[str, int] | str, request: bytes, count: int) -> np.ndarray:
+    """Durations of requests one after another on a new connection, us; the first one is thrown away."""
+    connection, clock, durations = Connection(address), time.perf_counter_ns, np.empty(count)
+    connection.send(request)
+    connection.receive()
     for i in range(count):
         begin = clock()
         connection.send(request)
         connection.receive()
         durations[i] = clock() - begin
+    connection.close()
     return durations / 1e3
 
 
@@ -220,13 +231,10 @@ def take_turns(
     contenders: dict[str, tuple[tuple[str, int] | str, bytes]], rounds: int, number: int
 ) -> dict[str, np.ndarray]:
     """Durations of each contender, shape (rounds, number), us; the first round only warms up."""
-    connections = {name: Connection(address) for name, (address, _) in contenders.items()}
     kept: dict[str, list[np.ndarray]] = {name: [] for name in contenders}
     for _ in range(rounds + 1):
-        for name, (_, request) in contenders.items():
-            kept[name].append(latencies(connections[name], request, number))
-    for connection in connections.values():
-        connection.close()
+        for name, (address, request) in contenders.items():
+            kept[name].append(latencies(address, request, number))
     return {name: np.array(durations[1:]) for name, durations in kept.items()}
 
 
