@@ -1,5 +1,6 @@
 """The HTTP server on real sockets: bounds, slow and rude clients, token, TLS, Unix socket, a graceful stop."""
 
+import asyncio
 import http.client
 import json
 import os
@@ -386,6 +387,88 @@ def test_stopping_finishes_what_is_in_flight(handler, shelf, monkeypatch):
     assert not thread.is_alive()
     with pytest.raises(ConnectionRefusedError):
         connect(server)
+
+
+def test_answers_come_in_the_order_of_requests(server, shelf, monkeypatch):
+    """What is answered on the spot does not overtake what takes long, on one connection."""
+    load = shelf.load
+    monkeypatch.setattr(shelf, "load", lambda name: (time.sleep(0.3), load(name)))
+    requests = ("POST /v2/repository/models/linear/load", "GET /v2/health/live", "GET /nope", "GET /v2/health/ready")
+    with connect(server) as connection:
+        for request in requests:
+            connection.sendall(f"{request} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+        connection.sendall(b"GET / HTTP/1.1\r\nConnection: close\r\n\r\n")
+        answers = everything(connection).split(b"HTTP/1.1 ")[1:]
+    bodies = [answer.partition(b"\r\n\r\n")[2] for answer in answers]
+    assert [answer[:3] for answer in answers] == [b"200", b"200", b"404", b"200", b"200"]
+    assert (bodies[0], bodies[1], bodies[3]) == (b"{}", b'{"live":true}', b'{"ready":true}')
+
+
+def test_a_client_that_asks_whether_to_go_on(server):
+    with connect(server) as connection:
+        head = b"POST %s HTTP/1.1\r\nExpect: 100-continue\r\nConnection: close\r\nContent-Length: %d\r\n\r\n"
+        connection.sendall(head % (INFER.encode(), len(BODY)))
+        assert connection.recv(100) == b"HTTP/1.1 100 Continue\r\n\r\n"
+        connection.sendall(BODY)
+        assert everything(connection).startswith(b"HTTP/1.1 200")
+
+
+def test_stopping_waits_for_a_request_that_has_begun(handler):
+    server = HttpServer(App(handler), Address(), limits=handler.limits)
+    thread = Thread(target=server.run)
+    thread.start()
+    with connect(server) as begun, connect(server) as idle:
+        request = b"POST %s HTTP/1.1\r\nContent-Length: %d\r\n\r\n%s" % (INFER.encode(), len(BODY), BODY)
+        begun.sendall(request[:-5])
+        idle.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
+        idle.recv(1000)
+        server.stop()
+        assert idle.recv(1000) == b""
+        begun.sendall(request[-5:])
+        data = everything(begun)
+    thread.join(20)
+    server.close()
+    assert data.startswith(b"HTTP/1.1 200")
+    assert b"connection: close" in data
+
+
+async def through_asgi(app, method, path, messages):
+    """What an ASGI application sends in answer to a request that comes in these messages."""
+    sent, coming = [], iter(messages)
+
+    async def receive():
+        return next(coming)
+
+    async def send(message):
+        sent.append(message)
+
+    await app({"type": "http", "method": method, "path": path, "headers": []}, receive, send)
+    return sent
+
+
+def pieces(*bodies, last=True):
+    return [
+        {"type": "http.request", "body": body, "more_body": number < len(bodies) or not last}
+        for number, body in enumerate(bodies, start=1)
+    ]
+
+
+def test_as_an_asgi_application(shelf):
+    """Any ASGI server may run it; a body may come in pieces, never end, or break off."""
+    app = App(Handler(shelf, Limits(body_bytes=1000)), Token("a"))
+    ready, body = asyncio.run(through_asgi(app, "GET", "/v2/health/ready", pieces(b"")))
+    assert (ready["status"], body["body"]) == (200, b'{"ready":true}')
+    start, _ = asyncio.run(through_asgi(app, "GET", "/v2", pieces(b"")))
+    assert start["status"] == 401
+    app = App(Handler(shelf, Limits(body_bytes=1000)))
+    start, body = asyncio.run(through_asgi(app, "POST", INFER, pieces(BODY[:9], BODY[9:20], BODY[20:])))
+    assert (start["status"], json.loads(body["body"])["model_name"]) == (200, "linear")
+    start, _ = asyncio.run(through_asgi(app, "POST", INFER, pieces(*[bytes(300)] * 9, last=False)))
+    assert (start["status"], (b"connection", b"close") in start["headers"]) == (413, True)
+    broken = [*pieces(b"{", last=False), {"type": "http.disconnect"}]
+    assert asyncio.run(through_asgi(app, "POST", INFER, broken)) == []
+    load = "/v2/repository/models/linear/load"
+    assert asyncio.run(through_asgi(app, "POST", load, pieces(b"")))[1]["body"] == b"{}"
 
 
 def test_a_load_holds_nobody_up(server, shelf, monkeypatch):

@@ -39,7 +39,7 @@ class HttpServer:
         config = uvicorn.Config(
             app,
             loop="uvloop",
-            http=bounded(limits),
+            http=bounded(app, limits),
             ws="none",
             lifespan="off",
             log_config=None,
