@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all bench release proto clean
+.PHONY: demo test test-all bench soak release proto clean
 
 demo: $(VENV)/installed
 	$(BIN)/isocharge demo
@@ -22,6 +22,11 @@ bench: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_solve.py
 	$(BIN)/python tests/benchmarks/bench_predictor.py
 	$(BIN)/python tests/benchmarks/bench_stream.py
+	$(BIN)/python tests/benchmarks/bench_http.py
+
+# A million requests; some minutes.
+soak: $(VENV)/installed
+	$(BIN)/python tests/benchmarks/bench_soak.py
 
 # The released model, made anew; fails if it is there already.
 release: $(VENV)/installed

@@ -5,6 +5,7 @@
 FastAPI and MLServer get environments of their own in `--environments`, made once. Client and servers share the cores;
 the client is a plain socket, the same for all. Latency: one request at a time over one open connection, contenders take
 turns within each round. Throughput: 32 connections, each with one request under way. Ratios come from the same rounds.
+A batch of 1024 is measured twice: bytes on a socket, and arrays in and out of Triton's stock client.
 """
 
 import argparse
@@ -24,9 +25,11 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import tritonclient.http
 from bench_predictor import machine
 
 from isocharge.serve import find_model, load_model
+from isocharge.serve.session import OUTPUTS
 
 HERE = Path(__file__).parent
 PACKAGES = {"fastapi": ["fastapi", "uvicorn[standard]", "onnxruntime"], "mlserver": ["mlserver", "onnxruntime"]}
@@ -131,13 +134,15 @@ def mlserver_folder(folder: Path, port: int, model: Path) -> Path:
 
 
 @contextmanager
-def running(words: list[str | Path], address: tuple[str, int] | str, **options: Any) -> Iterator[None]:
+def running(
+    words: list[str | Path], address: tuple[str, int] | str, **options: Any
+) -> Iterator[subprocess.Popen[bytes]]:
     """A server process, from its first accepted connection to the end of the block."""
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen(words, stdout=said, stderr=said, **options)
         try:
             _wait_for(process, address, said)
-            yield
+            yield process
         finally:
             process.send_signal(signal.SIGTERM)
             try:
@@ -253,6 +258,24 @@ def rows(durations: dict[str, np.ndarray], against: str) -> Iterator[dict[str, A
         }
 
 
+def stock_client(address: tuple[str, int], name: str, charges: np.ndarray, count: int) -> dict[str, np.ndarray]:
+    """Arrays in, arrays out through Triton's HTTP client, shape (1, count), us: its own coding included."""
+    client, durations = tritonclient.http.InferenceServerClient(f"{address[0]}:{address[1]}"), {}
+    for kind, binary in (("JSON", False), ("binary", True)):
+        durations[kind] = np.empty((1, count))
+        for i in range(-2, count):
+            begin = time.perf_counter_ns()
+            tensor = tritonclient.http.InferInput("charge_pC", list(charges.shape), "FP32")
+            tensor.set_data_from_numpy(charges, binary_data=binary)
+            outputs = [tritonclient.http.InferRequestedOutput(output, binary_data=binary) for output in OUTPUTS]
+            answer = client.infer(name, [tensor], outputs=outputs)
+            for output in OUTPUTS:
+                answer.as_numpy(output)
+            durations[kind][0, max(i, 0)] = (time.perf_counter_ns() - begin) / 1e3
+    client.close()
+    return durations
+
+
 def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
     """Every table."""
     charges = np.random.default_rng(asked.seed).uniform(300.0, 1500.0, (1024, 3)).astype(np.float32)
@@ -263,7 +286,10 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
         batch = {"JSON": (address, json_request(path, charges)), "binary": (address, binary_request(path, charges))}
         tables = {
             "one press, one request at a time": list(rows(take_turns(one, asked.rounds, asked.requests), "isocharge")),
-            "1024 presses in one request": list(rows(take_turns(batch, asked.rounds, asked.requests // 10), "JSON")),
+            "1024 presses, plain socket": list(rows(take_turns(batch, asked.rounds, asked.requests // 10), "JSON")),
+            "1024 presses, arrays in and out of the stock client": list(
+                rows(stock_client(address, path.split("/")[3], charges, asked.requests // 4), "JSON")
+            ),
         }
         # MLServer's queues drain between turns: each contender is measured alone, twice.
         counts = {name: [throughput(*target, asked.seconds) for _ in range(2)] for name, target in one.items()}
