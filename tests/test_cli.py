@@ -52,6 +52,7 @@ SUBCOMMANDS = [
     ("serve",),
     ("serve", "predict"),
     ("serve", "stream"),
+    ("serve", "http"),
     ("serve", "virtual"),
     ("demo",),
 ]

@@ -20,7 +20,9 @@ dd { margin: 0 } table { border-collapse: collapse; margin: .6rem 0; font-size: 
 td, th { border-bottom: 1px solid var(--line); padding: .25rem 1rem .25rem 0; text-align: left }
 th:empty { padding: 0; border: 0 } summary { cursor: pointer; margin-top: .8rem }
 pre { background: color-mix(in srgb, currentColor 7%, transparent); border-radius: 8px; padding: .8rem 1rem;
-  overflow-x: auto; font-size: .85rem } .refused { border-left: 4px solid #c2410c; padding-left: 1rem }
+  white-space: pre-wrap; overflow-wrap: anywhere; font-size: .85rem } details h1 { font-size: 1.15rem; margin: 1rem 0 }
+details h2 { font-size: 1.05rem; margin: 1.2rem 0 .4rem }
+.refused { border-left: 4px solid #c2410c; padding-left: 1rem }
 @media (prefers-color-scheme: dark) { a { color: #7fb0ff } }
 """
 
@@ -53,14 +55,15 @@ def _article(served: Served) -> str:
     return f"""<article><h2>{escape(metadata.name)} <span class="quiet">version {metadata.version}</span></h2>
 <dl>{rows}</dl><pre>{escape(_example(served, path))}</pre>
 <p><a href="{path}">metadata</a> · <a href="{path}/config">configuration</a> · <a href="{path}/stats">statistics</a></p>
-<details><summary>Model card</summary>{_card(served.model)}</details></article>
+<details open><summary>Model card</summary>{_card(served.model)}</details></article>
 """
 
 
 def _example(served: Served, path: str) -> str:
     press = ", ".join(f"{charge:.1f}" for charge in served.model.golden.charge_pC[0].tolist())
     tensor = f'"name": "charge_pC", "datatype": "FP32", "shape": [1, {len(served.metadata.electrodes)}]'
-    return f'curl $SERVER/{path}/infer -d \'{{"inputs": [{{{tensor}, "data": [{press}]}}]}}\''
+    body = f'{{"inputs": [{{{tensor}, "data": [{press}]}}]}}'
+    return f"SERVER=...  # the address of this page\ncurl $SERVER/{path}/infer -d '{body}'"
 
 
 def _card(model: Model) -> str:
