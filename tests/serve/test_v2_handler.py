@@ -1,6 +1,7 @@
 """The protocol without a transport: routes, tensors both ways, compression, errors - against onnxruntime itself."""
 
 import gzip
+import tracemalloc
 import zlib
 
 import numpy as np
@@ -210,8 +211,11 @@ def test_short_answers_stay_as_they_are():
 def test_unpacking_stops_at_the_limit():
     bomb = gzip.compress(bytes(50_000_000))
     assert len(bomb) < 100_000
+    tracemalloc.start()
     with pytest.raises(InputError, match="unpacks to more than 1000 bytes"):
         decompress(bomb, b"gzip", 1000)
+    (_, peak), _ = tracemalloc.get_traced_memory(), tracemalloc.stop()
+    assert peak < 1_000_000
 
 
 PRESS = [[100.0, 200.0, 300.0]]
