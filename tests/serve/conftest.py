@@ -6,7 +6,6 @@ perfect model: what the serving path answers can be compared with what was press
 """
 
 from collections.abc import Callable
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
@@ -154,23 +153,30 @@ def handler(shelf):
     return Handler(shelf)
 
 
-@pytest.fixture
-def start_http():
-    """Start servers on loopback, in threads, with ports of their own; they end with the test."""
-    with ExitStack() as stack:
-        yield lambda *arguments, **named: stack.enter_context(running(*arguments, **named))
-
-
-@contextmanager
-def running(handler, *, token=None, tls=None, uds=None):
-    """A server while the block lasts; its HttpServer."""
-    server = HttpServer(App(handler, token), Address(uds=uds), limits=handler.limits, tls=tls)
-    thread = Thread(target=server.run)
-    thread.start()
-    try:
-        yield server
-    finally:
-        server.stop()
+@pytest.fixture(scope="session")
+def stopping():
+    """Servers that were told to stop; all of them must have done so in the end. Nobody waits for each."""
+    told = []
+    yield told
+    for server, thread in told:
         thread.join(timeout=30)
         server.close()
         assert not thread.is_alive()
+
+
+@pytest.fixture
+def start_http(stopping):
+    """Start servers on loopback, in threads, with ports of their own; they are told to stop when the test ends."""
+    started = []
+
+    def start(handler, *, token=None, tls=None, uds=None):
+        server = HttpServer(App(handler, token), Address(uds=uds), limits=handler.limits, tls=tls)
+        thread = Thread(target=server.run)
+        thread.start()
+        started.append((server, thread))
+        return server
+
+    yield start
+    for server, _ in started:
+        server.stop()
+    stopping.extend(started)

@@ -29,6 +29,10 @@ UNSENT_BYTES = 1 << 22
 """A client that asks on and on and takes no answer is hung up on when so much waits for it."""
 
 
+LINGER_SECONDS = 2.0
+"""A refused client may go on sending for so long; to hang up at once would take the refusal away from it again."""
+
+
 class Phase(Enum):
     """What a connection waits for."""
 
@@ -50,7 +54,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._phase = self._timed = Phase.IDLE
         self._chunk = self._fed = 0  # bytes of this piece, and of all since the request began
         self._body = bytearray()
-        self._is_last = False
+        self._is_last = self._is_refused = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Take a connection, or say that there are too many."""
@@ -61,7 +65,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Parse; what is then still unfinished is counted and timed."""
-        if self.transport.is_closing():
+        if self._is_refused or self.transport.is_closing():
             return
         self._chunk = len(data)
         self._fed += self._chunk
@@ -85,13 +89,14 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def on_body(self, body: bytes) -> None:
         """A piece of the body, up to the limit."""
-        self._body += body
+        if not self._is_refused:
+            self._body += body
         if len(self._body) > self.limits.body_bytes:
             self._refuse(413, f"the body is larger than the {self.limits.body_bytes} bytes that are read")
 
     def on_message_complete(self) -> None:
         """The whole request is there: answer it, unless it was refused."""
-        if self.transport.is_closing():
+        if self._is_refused or self.transport.is_closing():
             return
         self._phase = Phase.ANSWER
         path = _path(self.url)
@@ -133,14 +138,17 @@ class BoundedProtocol(HttpToolsProtocol):
     def shutdown(self) -> None:
         """The server stops: a request that has begun is still answered, as the last one."""
         self._is_last = True
-        if self._phase not in (Phase.HEADERS, Phase.BODY):
+        if self._is_refused:
+            self.transport.abort()
+        elif self._phase not in (Phase.HEADERS, Phase.BODY):
             super().shutdown()
 
     def overdue(self) -> None:
         """End a connection that took too long: with words to one that is sending, without to one that is not."""
-        if self._phase in (Phase.HEADERS, Phase.BODY):
+        if self._phase in (Phase.HEADERS, Phase.BODY) and not self._is_refused:
             self._refuse(408, f"waited too long for {self._phase.value}")
-        self.transport.abort()
+        else:
+            self.transport.abort()
 
     def _answer_as_asgi(self) -> None:
         """Let uvicorn have the whole request, now that there is something to wait for."""
@@ -173,7 +181,7 @@ class BoundedProtocol(HttpToolsProtocol):
     def _unfinished(self) -> None:
         if self._phase is Phase.HEADERS and self._fed > self.limits.header_bytes:
             self._refuse_headers()
-        if self._timed is not self._phase:
+        if self._timed is not self._phase and not self._is_refused:
             self._timed = self._phase
             self._allow(self.limits.header_seconds if self._phase is Phase.HEADERS else self.limits.body_seconds)
 
@@ -188,13 +196,18 @@ class BoundedProtocol(HttpToolsProtocol):
         self._refuse(431, f"the request line and headers are longer than {self.limits.header_bytes} bytes")
 
     def _refuse(self, status: int, words: str) -> None:
-        """Answer without asking the application, and hang up."""
-        if self.transport.is_closing():
+        """Answer without asking the application, read no more requests, and hang up when the client does or soon."""
+        if self._is_refused or self.transport.is_closing():
             return
+        self._is_refused = True
         body = orjson.dumps({"error": words})
         head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(body)
         self.transport.write(b"".join([STATUS_LINE[status], head, body]))
-        self.transport.close()
+        if self.transport.can_write_eof():
+            self.transport.write_eof()
+            self._allow(LINGER_SECONDS)
+        else:
+            self.transport.close()
 
 
 @lru_cache(64)
