@@ -280,18 +280,18 @@ def rows(durations: dict[str, np.ndarray], against: str) -> Iterator[dict[str, A
 
 def stock_client(address: tuple[str, int], name: str, charges: np.ndarray, count: int) -> dict[str, np.ndarray]:
     """Arrays in, arrays out through Triton's HTTP client, shape (1, count), us: its own coding included."""
-    client, durations = tritonclient.http.InferenceServerClient(f"{address[0]}:{address[1]}"), {}
-    for kind, binary in (("JSON", False), ("binary", True)):
-        durations[kind] = np.empty((1, count))
-        for i in range(-2, count):
+    client = tritonclient.http.InferenceServerClient(f"{address[0]}:{address[1]}")
+    durations = {"JSON": np.empty((1, count)), "binary": np.empty((1, count))}
+    for i in range(-2, count):  # two to warm up
+        for kind, of in durations.items():
             begin = time.perf_counter_ns()
             tensor = tritonclient.http.InferInput("charge_pC", list(charges.shape), "FP32")
-            tensor.set_data_from_numpy(charges, binary_data=binary)
-            outputs = [tritonclient.http.InferRequestedOutput(output, binary_data=binary) for output in OUTPUTS]
+            tensor.set_data_from_numpy(charges, binary_data=kind == "binary")
+            outputs = [tritonclient.http.InferRequestedOutput(o, binary_data=kind == "binary") for o in OUTPUTS]
             answer = client.infer(name, [tensor], outputs=outputs)
             for output in OUTPUTS:
                 answer.as_numpy(output)
-            durations[kind][0, max(i, 0)] = (time.perf_counter_ns() - begin) / 1e3
+            of[0, max(i, 0)] = (time.perf_counter_ns() - begin) / 1e3
     client.close()
     return durations
 

@@ -2,8 +2,6 @@
 
 from html import escape
 
-from markdown_it import MarkdownIt
-
 from isocharge.serve.model import Model
 from isocharge.serve.shelf import Served, Shelf
 from isocharge.serve.v2.describe import server_metadata
@@ -72,4 +70,6 @@ def _card(model: Model) -> str:
         text = (model.folder / "card.md").read_text("utf-8")
     except (OSError, UnicodeDecodeError):
         return "<p>This model has no card.</p>"
+    from markdown_it import MarkdownIt  # a tenth of a second that a server's start is better without
+
     return str(MarkdownIt("commonmark", {"html": False}).enable("table").render(text))
