@@ -47,7 +47,6 @@ class HttpServer:
             server_header=False,
             date_header=False,
             proxy_headers=False,
-            timeout_keep_alive=int(limits.idle_seconds) + 1,
             timeout_graceful_shutdown=GRACE_SECONDS,
             ssl_context_factory=(lambda *_: context) if context else None,
         )
