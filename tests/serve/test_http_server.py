@@ -414,7 +414,7 @@ def test_a_load_holds_nobody_up(server, shelf, monkeypatch):
 
 
 def test_memory_stays_flat(server):
-    """Neither good nor bad requests leave anything behind; 1 MB is far more than noise and far less than a leak."""
+    """Neither good nor bad requests leave anything behind; 2 MB is more than noise, and 700 bytes of each request."""
 
     def resident():
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -429,4 +429,4 @@ def test_memory_stays_flat(server):
     some(1000)
     before = resident()
     some(3000)
-    assert resident() - before < 1_000_000
+    assert resident() - before < 2_000_000
