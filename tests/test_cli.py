@@ -1,6 +1,9 @@
 """The command line as a user meets it: help, exit codes, data on stdout, words on stderr, nothing half-written."""
 
+import io
 import json
+import os
+import re
 import signal
 import subprocess
 import sys
@@ -9,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from isocharge.cli import main
+from isocharge.cli import main, terminal
 
 SENSOR = "three-25um-biaxial"
 
@@ -96,26 +99,123 @@ def test_a_point_as_a_table(command):
     assert err == ""
 
 
-@pytest.mark.parametrize("signal_name", ["SIGTERM", "SIGINT"])
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_stopped_sweep_leaves_nothing_behind(tmp_path, signal_name, workers):
-    words = ["simulate", "sweep", SENSOR, "--samples", "2000000", "--workers", str(workers), "-o", "presses"]
+SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1", "--samples", "17000"]
+"""A sweep of a small family, in two shards."""
+
+
+@pytest.mark.parametrize(
+    ("signal_name", "workers", "awaited"),
+    [
+        ("SIGTERM", 2, "shard-00000"),
+        ("SIGINT", 2, "solve-00-00-0001"),
+        ("SIGTERM", 1, "solve"),
+        ("SIGKILL", 2, "shard"),
+    ],
+)
+def test_a_stopped_sweep_goes_on_and_leaves_no_process(command, tmp_path, signal_name, workers, awaited):
+    """Stopped as soon as a file of that name is there; the same command, with other workers, makes the same bytes."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "isocharge.cli", *words], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "isocharge.cli", *SMALL, "--workers", str(workers), "-o", "presses"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
+    deadline = time.monotonic() + 100
+    while not list(tmp_path.glob(f"presses.part/parts/{awaited}*.sha256")) and time.monotonic() < deadline:
+        time.sleep(0.005)
+    process.send_signal(getattr(signal, signal_name))
+    _, err = process.communicate(timeout=60)
+    assert process.returncode not in (0, None)
+    assert "Traceback" not in err
+    assert signal_name == "SIGKILL" or "stopped; what is done is kept in presses.part, and the same command" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["presses.part"]
+    assert ends(lambda: os.killpg(process.pid, 0))  # no process of the session is left
+    assert command(*SMALL, "--workers", 1, "-o", tmp_path / "presses")[0] == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["presses"]
+    assert files(tmp_path / "presses") == files(whole_sweep(command, tmp_path))
+
+
+def ends(signalled) -> bool:
+    """Whether there is nobody to signal any more, within ten seconds."""
+    for _ in range(500):
+        try:
+            signalled()
+        except ProcessLookupError:
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def whole_sweep(command, folder, known={}):  # noqa: B006
+    """The same without a stop, once."""
+    if not known:
+        known["folder"] = folder.with_name("whole") / "presses"
+        assert command(*SMALL, "--workers", 2, "-o", known["folder"])[0] == 0
+    return known["folder"]
+
+
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_sweep_stopped_at_once_leaves_nothing(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "isocharge.cli", *SMALL, "--workers", "1", "-o", "presses"], cwd=tmp_path, text=True,
+        stderr=subprocess.PIPE,
+    )  # fmt: skip
     deadline = time.monotonic() + 60
     while not any(tmp_path.iterdir()) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    for _ in range(5):  # a library may swallow one
-        process.send_signal(getattr(signal, signal_name))
-        try:
-            _, err = process.communicate(timeout=5)
-            break
-        except subprocess.TimeoutExpired:
-            continue
+        time.sleep(0.001)
+    process.terminate()
+    _, err = process.communicate(timeout=60)
     assert process.returncode not in (0, None)
     assert "Traceback" not in err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unfinished_sweep_of_other_settings_is_kept_unless_fresh(command, tmp_path):
+    part = tmp_path / "presses.part"
+    for folder in ("parts", "data"):
+        (part / folder).mkdir(parents=True)
+    (part / "lock").touch()
+    (part / "run.json").write_text('{"sweep": {"samples": 7}}')
+    code, _, err = command(*SMALL, "-o", tmp_path / "presses")
+    assert code == 1
+    assert "OutputExists" in err
+    assert "presses.part holds the unfinished run of other settings" in err
+    assert "--fresh" in err
+    assert part.exists()
+    words = ["--samples", 300, "--sampling", "grid", "--orientation", "random", "--workers", 1, "--fresh"]
+    code, _, err = command(*SMALL, *words, "-o", tmp_path / "presses")
+    assert code == 0
+    assert f"293 presses in {tmp_path / 'presses'}" in err
+    assert not part.exists()
+
+
+def test_a_progress_bar_says_how_fast_and_how_long(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setenv("TERM", "xterm")
+    with terminal.progress_rows(("solving", "solves"), ("pressing", "presses")) as (solving, pressing):
+        for done in range(1, 4):
+            solving(done, 3)
+        solving(1, 2)
+        for done in range(0, 60, 10):
+            pressing(done, 100)
+            time.sleep(0.05)
+    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", sys.stderr.getvalue())
+    assert "solving" in shown
+    assert re.search(r"pressing .*50/100 .*[0-9]+ presses/s.* 0:00:0", shown)
+
+
+def test_rates():
+    found = [terminal.rate(*one) for one in ((None, "presses"), (3.0, ""), (0.52, "solves"), (12345.6, "presses"))]
+    assert found == ["", "", "0.5 solves/s", "12,346 presses/s"]
 
 
 def test_a_film_that_is_mostly_bent_is_refused(command, tmp_path):
@@ -167,7 +267,14 @@ BAD = [
         2,
         "SceneError: force range: expected 0 < MIN <= MAX",
     ),
-    (("simulate", "sweep", SENSOR, "--radius", "44.5", "-o", "OUT"), 2, "SceneError: probe off the film"),
+    (("simulate", "sweep", SENSOR, "--radius", "44.5", "-o", "OUT"), 2, "leave the film of radius 45 mm"),
+    (
+        ("simulate", "sweep", SENSOR, "--workers", "2", "--cluster", "tcp://127.0.0.1:9", "-o", "OUT"),
+        2,
+        "InputError: expected either --workers or --cluster, got both",
+    ),
+    (("simulate", "sweep", SENSOR, "--cluster", "pigeon://1", "-o", "OUT"), 2, "InputError: cluster 'pigeon://1'"),
+    (("simulate", "sweep", SENSOR, "--probe", "cube:1", "-o", "OUT"), 2, "SceneError: probe 'cube:1'"),
     (("train", "fit", "-o", "OUT"), 2, "InputError: train fit: expected either a DATASET folder or --sensor"),
     (("train", "fit", ".", "-o", "OUT"), 2, "DatasetError: . is not a dataset: it has no manifest.json"),
     (

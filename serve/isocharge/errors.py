@@ -85,6 +85,10 @@ class SolveError(IsochargeError, ArithmeticError):
     """No equilibrium was found to the asked tolerance."""
 
 
+class WorkersLost(IsochargeError, ConnectionError):
+    """Processes or a cluster that did the work ended, do not answer, or run another isocharge."""
+
+
 class TrainingError(IsochargeError, ArithmeticError):
     """Training produced no usable network."""
 

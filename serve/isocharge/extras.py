@@ -12,6 +12,7 @@ PACKAGES = {
     "train": SIMULATE | {"torch", "onnx"},
     "http": HTTP,
     "grpc": HTTP | {"grpc", "google"},
+    "cluster": frozenset({"dask", "distributed"}),
 }
 """Import names that come with an extra of pyproject.toml."""
 

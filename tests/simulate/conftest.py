@@ -1,31 +1,44 @@
-"""What the simulator's tests share: films, random fields, the independent reference cases."""
+"""What the simulator's tests share: films, meshes, random fields, the independent reference cases."""
 
+import importlib.util
 import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
 from isocharge.simulate import (
-    STANDARD,
     Circle,
     Equilibrium,
     Film,
     ForwardMap,
+    Polygon,
+    Probe,
     Resolution,
     Sensor,
     Sweep,
+    Theory,
     load_sensor,
     write_sweep,
 )
-from isocharge.simulate.membrane import Groups
-from isocharge.simulate.template import Placement, Template, template
+from isocharge.simulate.geometry import Geometry
+from isocharge.simulate.meshing import place, template_for
+from isocharge.simulate.placement import Placement
+from isocharge.simulate.scaling import Groups
+from isocharge.simulate.template import Template
 
-REFERENCE = json.loads((Path(__file__).parents[1] / "data/film_cases.json").read_text())
+DATA = Path(__file__).parents[1] / "data"
+TURNED = Polygon.rectangle(4e-3, 2e-3, 0.3)
+FULL = Theory(stretching=True, bending=True, pretensioned=False)
+
+
+# The independent reference cases
 
 
 @dataclass(frozen=True)
@@ -33,7 +46,7 @@ class ReferenceCase:
     """A press that an independent solver solved, with bending."""
 
     film: Film
-    probe: Circle
+    probe: Probe
     at: tuple[float, float]
     force: float
     deflection: float
@@ -45,49 +58,64 @@ class ReferenceCase:
         return replace(load_sensor(f"{layout}-25um-{kind}"), film=self.film, readout=readout)
 
 
-def read_cases(thickness_um: float) -> list[ReferenceCase]:
-    """The cases with circular probes on films of one thickness."""
-    film = REFERENCE["film"]
+def _probe(about: dict[str, Any]) -> Probe:
+    turn = np.deg2rad(about.get("turn_deg", 0.0))
+    if about["shape"] == "circle":
+        return Circle(about["radius_mm"] * 1e-3)
+    if about["shape"] == "rectangle":
+        return Polygon.rectangle(about["width_mm"] * 1e-3, about["height_mm"] * 1e-3, turn)
+    return Polygon.triangle(about["side_mm"] * 1e-3, turn)
+
+
+def _read(name: str) -> list[ReferenceCase]:
+    document = json.loads((DATA / name).read_text("utf-8"))
+    film = document["film"]
     return [
         ReferenceCase(
             film=Film(
                 film["radius_mm"] * 1e-3,
-                thickness_um * 1e-6,
+                case["thickness_um"] * 1e-6,
                 film["young_GPa"] * 1e9,
                 film["poisson"],
                 case["pretension_MPa"] * 1e6,
             ),
-            probe=Circle(case["probe"]["radius_mm"] * 1e-3),
+            probe=_probe(case["probe"]),
             at=(case["at_mm"][0] * 1e-3, case["at_mm"][1] * 1e-3),
             force=case["force_N"],
             deflection=case["deflection_mm"] * 1e-3,
             charges={key: 1e-12 * np.array(list(q.values())) for key, q in case["touch_charge_pC"].items()},
         )
-        for case in REFERENCE["cases"]
-        if case["thickness_um"] == thickness_um and case["probe"]["shape"] == "circle"
+        for case in document["cases"]
     ]
+
+
+CASES, MORE_CASES = _read("film_cases.json"), _read("film_cases_skfem.json")
 
 
 def name_case(case: ReferenceCase) -> str:
     """A test id."""
     x, y = (round(1e3 * value) for value in case.at)
+    turn = f"@{np.rad2deg(case.probe.angle):.0f}" if case.probe.angle else ""
     return (
-        f"{case.film.thickness * 1e6:.0f}um-{case.film.pretension * 1e-6:g}MPa-R{case.probe.radius * 1e3:g}"
+        f"{case.film.thickness * 1e6:.0f}um-{case.film.pretension * 1e-6:g}MPa-{case.probe.notation}{turn}"
         f"-at({x},{y})-{case.force:g}N"
     )
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """`case` runs over the reference cases of the 25 um film, `thicker_case` over those of the 110 um film."""
-    for argument, thickness_um in (("case", 25.0), ("thicker_case", 110.0)):
+    """`case` runs over the cases of film_cases.json, `further_case` over those of film_cases_skfem.json."""
+    for argument, cases in (("case", CASES), ("further_case", MORE_CASES)):
         if argument in metafunc.fixturenames:
-            metafunc.parametrize(argument, read_cases(thickness_um), ids=name_case)
+            metafunc.parametrize(argument, cases, ids=name_case)
 
 
 @pytest.fixture(scope="session")
 def reference_cases() -> Callable[[float], list[ReferenceCase]]:
-    """The reference cases of a thickness in um."""
-    return read_cases
+    """The reference cases of film_cases.json of a thickness in um."""
+    return lambda thickness_um: [case for case in CASES if round(case.film.thickness * 1e6) == thickness_um]
+
+
+# Films and discrete problems
 
 
 @pytest.fixture(scope="session")
@@ -96,44 +124,100 @@ def film() -> Film:
     return load_sensor("three-25um-biaxial").film
 
 
-@pytest.fixture(scope="session")
-def coarse() -> Template:
-    """A small template."""
-    return template(Resolution(order=4, around=8, rings=2))
+@dataclass(frozen=True)
+class Mesh:
+    """A template in its place on a film of unit radius."""
 
+    template: Template
+    placement: Placement
+    geometry: Geometry
+    points: np.ndarray
+    """(X1, X2) of the nodes, shape (n_node, 2)."""
 
-@pytest.fixture(scope="session")
-def off_centre() -> Placement:
-    """A placement far from any symmetry: a footprint of 0.11 film radii at 0.4."""
-    return Placement.of_circle(0.4, 0.11)
+    @property
+    def inside(self) -> np.ndarray:
+        """Which nodes are not on the rim, shape (n_node,)."""
+        return ~self.template.on_rim
 
-
-@pytest.fixture(scope="session")
-def random_field() -> Callable[[Template, int], np.ndarray]:
-    """A field of random nodal values, zero on the rim: as rough as the mesh can carry."""
-
-    def draw(mesh: Template, seed: int) -> np.ndarray:
-        field = 0.1 * np.random.default_rng(seed).standard_normal((mesh.n_node, 3))
-        field[mesh.n_free :] = 0.0
+    def random_field(self, seed: int, components: int = 3) -> np.ndarray:
+        """Random nodal values, fixed where the film is: as rough as the mesh can carry, shape (n_node, components)."""
+        field = 0.1 * np.random.default_rng(seed).standard_normal((self.template.n_node, components))
+        field[self.template.on_rim, :3] = 0.0
+        field[self.template.on_axis, 1:2] = 0.0
         return field
 
-    return draw
+
+def _mesh(probe: Probe, at: tuple[float, float], resolution: Resolution) -> Mesh:
+    template = template_for(probe, resolution)
+    placement = place(Film(1.0, 1e-3, 1.0, 0.3), probe, at, resolution, 0.05)
+    z = placement.element_points(template)
+    points = z.ravel()[template.first_seen]
+    return Mesh(template, placement, Geometry.build(template, z), np.stack([points.real, points.imag], axis=1))
 
 
 @pytest.fixture(scope="session")
-def linear_equilibrium(film: Film) -> Callable[..., Equilibrium]:
-    """A made-up equilibrium whose field is linear over the film: gradient[a, i] = d(U1, U2, W)_i / dX_a, scaled."""
+def mesh_of() -> Callable[[Probe, tuple[float, float], Resolution], Mesh]:
+    """A mesh for a probe, its position (film radii) and a resolution."""
+    return _mesh
+
+
+PROBES = {
+    "circle": Circle(0.11),
+    "triangle": Polygon.triangle(0.2, 0.4),
+    "rectangle": Polygon.rectangle(0.2, 0.1, 0.7),
+    "pentagon": Polygon.of(0.1 * np.array([(1.0, 0.0), (0.3, 1.0), (-0.8, 0.6), (-0.9, -0.5), (0.2, -0.8)]), angle=0.2),
+}
+
+
+@pytest.fixture(scope="session", params=PROBES.values(), ids=PROBES.keys())
+def mesh(request: pytest.FixtureRequest) -> Mesh:
+    """A small mesh far from any symmetry, with thin rings at the rim, for every kind of template."""
+    return _mesh(request.param, (0.4, 0.0), Resolution(3, 8, 2, 1))
+
+
+@pytest.fixture(scope="session")
+def made_up() -> Callable[..., Equilibrium]:
+    """A made-up equilibrium with a given field.
+
+    `field` is a function of (X1, X2), shape (n, 2), in the frame of the press and in film radii, that returns
+    (U1, U2, W), shape (n, 3); polygonal probes have no symmetry to keep.
+    """
 
     def make(
-        gradient: np.ndarray, at: tuple[float, float] = (0.0, 0.0), amplitude2: float = 0.1, of: Film = film
+        field: Callable[[np.ndarray], np.ndarray],
+        at: tuple[float, float] = (0.0, 0.0),
+        *,
+        amplitude2: float = 0.1,
+        of: Film | None = None,
+        probe: Probe = TURNED,
+        theory: Theory = FULL,
     ) -> Equilibrium:
-        mesh, placement = template(STANDARD), Placement.of_circle(np.hypot(*at) / of.radius, 1e-3 / of.radius)
-        points = placement.to_film(mesh.node_points(placement.rho))
-        field = np.stack([points.real, points.imag], axis=1) @ gradient
-        groups = Groups(amplitude2, 1.0, 0.0, of.poisson)
-        return Equilibrium(of, Circle(1e-3), at, 1.0, STANDARD, field, groups, "converged", "made up", 0, 0.0, 0.0)
+        of = of or load_sensor("three-25um-biaxial").film
+        resolution = Resolution(5, 8, 5, 1)
+        template = template_for(probe, resolution)
+        z = place(of, probe, at, resolution, 0.05).element_points(template).ravel()[template.first_seen]
+        values = field(np.stack([z.real, z.imag], axis=1))
+        groups = Groups(amplitude2, 1.0, 0.0, 0.0, of.poisson)
+        return Equilibrium(
+            of, probe, at, 1.0, theory, resolution, 0.05, values, groups, "converged", "made up", 0, 0.0, 0.0
+        )
 
     return make
+
+
+@pytest.fixture(scope="session")
+def skfem() -> ModuleType:
+    """The second solver, tests/simulate/film_skfem.py."""
+    path = Path(__file__).with_name("film_skfem.py")
+    spec = importlib.util.spec_from_file_location("film_skfem", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+# Forward maps and datasets
 
 
 @pytest.fixture(scope="session")

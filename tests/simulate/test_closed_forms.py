@@ -1,16 +1,38 @@
-"""Rung 4 of the ladder: solutions on paper, and the axisymmetric membrane as a boundary value problem for scipy."""
+"""Rung 4 of the ladder: solutions on paper, and the axisymmetric membrane as a boundary value problem for scipy.
 
+For the linear theories Green's function of the disk is known, and a disk or polygon that presses is an integral of it.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_bvp
+from scipy.integrate import dblquad, solve_bvp
+from scipy.special import iv, kv
 
-from isocharge.simulate import Circle, Film, Resolution, load_sensor, press, touch_charge
+from isocharge.simulate import (
+    Circle,
+    Film,
+    Polygon,
+    Probe,
+    Resolution,
+    Theory,
+    load_sensor,
+    press,
+    touch_charge,
+)
+from isocharge.simulate.theory import named
 
 REFINED = Resolution(order=7, around=8, rings=6)
+WITH_RIM = Resolution(order=7, around=8, rings=6, rim=2)
+MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+FULL = Theory(stretching=True, bending=True, pretensioned=False)
 SLACK = Film(radius=45e-3, thickness=25e-6, young=3e9, poisson=0.34)
 TAUT = replace(SLACK, pretension=1e6)
+THICK = replace(SLACK, thickness=1e-3)
+TINY = 1e-6
+"""A force (N) that changes neither a taut film's tension nor a plate."""
 
 
 def ring(radius: float, count: int = 7) -> np.ndarray:
@@ -30,14 +52,19 @@ def radial_and_hoop(stress: np.ndarray, points: np.ndarray) -> tuple[np.ndarray,
     )
 
 
+def plate_stiffness(film: Film) -> float:
+    """D = E h^3 / 12 (1 - nu^2)."""
+    return film.young * film.thickness**3 / (12.0 * (1.0 - film.poisson**2))
+
+
 # Schwerin (1929): point load, Poisson 1/3
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
 def test_schwerin_point_load(share):
     """w = k (1 - (r/a)^(2/3)), N_r = 3 F / (4 pi k) (r/a)^(-2/3), N_theta = N_r / 3, away from a small probe."""
-    film, force = replace(SLACK, poisson=1.0 / 3.0), 1e-6
-    solved = press(film, Circle(2e-5), (0.0, 0.0), force, resolution=Resolution(6, 8, 10))
+    film, force = replace(SLACK, poisson=1.0 / 3.0), TINY
+    solved = press(film, Circle(2e-5), (0.0, 0.0), force, theory=MEMBRANE, resolution=Resolution(6, 8, 10))
     k = np.cbrt(3.0 / np.pi * force * film.radius**2 / (film.young * film.thickness))
     points = ring(share * film.radius)
     np.testing.assert_allclose(solved.deflection(points), k * (1.0 - share ** (2 / 3)), rtol=2e-5)
@@ -48,33 +75,247 @@ def test_schwerin_point_load(share):
     np.testing.assert_allclose(shear, 0.0, atol=1e-5 * expected)
 
 
+# Green's functions of the disk, in film radii; z where it is read, c where a point presses
+
+
+def harmonic(z: np.ndarray, c: complex) -> np.ndarray:
+    """Of a taut membrane, times F / T: the source and its image."""
+    return np.log(np.abs((1.0 - np.conj(c) * z) / (z - c))) / (2.0 * np.pi)
+
+
+def michell(z: np.ndarray, c: complex) -> np.ndarray:
+    """Of a clamped plate, times F a^2 / D (Michell 1902)."""
+    apart = np.abs(z - c) ** 2
+    log = np.log(apart / np.abs(1.0 - np.conj(c) * z) ** 2)
+    return ((1.0 - np.abs(z) ** 2) * (1.0 - abs(c) ** 2) + apart * log) / (16.0 * np.pi)
+
+
+def michell_under_a_disk(z: np.ndarray, c: complex, radius: float) -> np.ndarray:
+    """Its mean over a disk: a function f with lap lap f = 0 has the mean f + R^2 / 8 lap f, exactly."""
+    log = np.log(np.abs((z - c) / (1.0 - np.conj(c) * z)) ** 2)
+    image = 4.0 * 2.0 * ((c - z) * np.conj(z) / (1.0 - np.conj(z) * c)).real
+    laplace = -4.0 * (1.0 - np.abs(z) ** 2) + 8.0 + 4.0 * log + image
+    return michell(z, c) + radius**2 / 8.0 * laplace / (16.0 * np.pi)
+
+
+def over_polygon(green: Callable[[np.ndarray, complex], np.ndarray], z: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Mean of a Green's function over a polygon (x + iy, in film radii), by Gauss points on its triangles."""
+    at, weight = np.polynomial.legendre.leggauss(12)
+    at, weight, hub = 0.5 * (at + 1.0), 0.5 * weight, corners.mean()
+    total, area = np.zeros(z.shape), 0.0
+    for one, two in zip(corners - hub, np.roll(corners, -1) - hub, strict=True):
+        double = (np.conj(one) * two).imag
+        for s, u in zip(at, weight, strict=True):
+            for t, v in zip(at, weight, strict=True):
+                total += u * v * s * double * green(z, hub + s * ((1.0 - t) * one + t * two))
+        area += 0.5 * double
+    return total / area
+
+
+def read_outside(film: Film, probe: Probe, at: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Points (x, y) all over the film but not under the probe, and the same as z in film radii."""
+    rng = np.random.default_rng(0)
+    near = at + 3.0 * probe.reach * rng.uniform(-1.0, 1.0, (30, 2))
+    points = np.concatenate(
+        [ring(0.5 * film.radius), ring(0.95 * film.radius), rng.uniform(-25e-3, 25e-3, (30, 2)), near]
+    )
+    keep = (np.hypot(*(points - at).T) > probe.reach) & (np.hypot(*points.T) < film.radius)
+    return points[keep], points[keep] @ np.array([1.0, 1j]) / film.radius
+
+
+PLACES = [(0.0, 0.0), (8e-3, -5e-3), (-20e-3, 10e-3), (-3e-3, 36e-3)]
+
+
 # The linear membrane: a tension so large that the press does not change it
 
 
-def green(film: Film, at: complex, points: np.ndarray) -> np.ndarray:
-    """Deflection per force outside the footprint: Green's function is harmonic, so a disk pulls like a point."""
-    z, c = (points[:, 0] + 1j * points[:, 1]) / film.radius, at / film.radius
-    tension = film.pretension * film.thickness
-    return np.log(np.abs((1.0 - np.conj(c) * z) / (z - c))) / (2.0 * np.pi * tension)
-
-
-@pytest.mark.parametrize("at", [(0.0, 0.0), (8e-3, -5e-3), (-20e-3, 10e-3)])
+@pytest.mark.parametrize("at", PLACES)
 @pytest.mark.parametrize("radius", [1e-3, 4e-3])
-def test_taut_membrane_outside_the_footprint(at, radius):
-    solved = press(TAUT, Circle(radius), at, 1e-6, resolution=REFINED)
-    rng = np.random.default_rng(0)
-    points = np.concatenate([ring(0.5 * TAUT.radius), ring(0.95 * TAUT.radius), rng.uniform(-25e-3, 25e-3, (30, 2))])
-    points = points[np.hypot(*(points - at).T) > radius]
-    expected = 1e-6 * green(TAUT, complex(*at), points)
-    np.testing.assert_allclose(solved.deflection(points), expected, atol=1e-6 * expected.max())
+def test_taut_membrane_under_a_disk(at, radius):
+    """Green's function is harmonic, so a disk pulls like a point."""
+    probe = Circle(radius)
+    theory = MEMBRANE if at == PLACES[1] else Theory(False, False, True)
+    solved = press(TAUT, probe, at, TINY, theory=theory, accuracy=1e-5)
+    points, z = read_outside(TAUT, probe, at)
+    expected = TINY / (TAUT.pretension * TAUT.thickness) * harmonic(z, complex(*at) / TAUT.radius)
+    np.testing.assert_allclose(solved.deflection(points), expected, atol=1e-5 * expected.max())
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
 def test_taut_membrane_under_a_centred_disk(share):
     """w(0) = F / (2 pi T) (ln(a / R) + 1/2)."""
-    solved = press(TAUT, Circle(share * TAUT.radius), (0.0, 0.0), 1e-6, resolution=REFINED)
-    expected = 1e-6 / (2.0 * np.pi * TAUT.pretension * TAUT.thickness) * (np.log(1.0 / share) + 0.5)
+    solved = press(TAUT, Circle(share * TAUT.radius), (0.0, 0.0), TINY, theory=MEMBRANE, resolution=REFINED)
+    expected = TINY / (2.0 * np.pi * TAUT.pretension * TAUT.thickness) * (np.log(1.0 / share) + 0.5)
     assert solved.deflection(np.zeros((1, 2)))[0] == pytest.approx(expected, rel=1e-7)
+
+
+POLYGONS = [Polygon.rectangle(4e-3, 2e-3, 0.5), Polygon.triangle(6e-3, 1.0)]
+
+
+@pytest.mark.parametrize("at", PLACES[1:])
+@pytest.mark.parametrize("probe", POLYGONS, ids=lambda probe: probe.name)
+def test_taut_membrane_under_a_polygon(at, probe):
+    solved = press(TAUT, probe, at, TINY, theory=Theory(False, False, True), accuracy=1e-5)
+    points, z = read_outside(TAUT, probe, at)
+    mean = over_polygon(harmonic, z, (complex(*at) + probe.outline) / TAUT.radius)
+    expected = TINY / (TAUT.pretension * TAUT.thickness) * mean
+    np.testing.assert_allclose(solved.deflection(points), expected, atol=3e-5 * expected.max())
+
+
+# The clamped plate
+
+
+@pytest.mark.parametrize("at", PLACES)
+@pytest.mark.parametrize("radius", [0.2e-3, 4e-3])
+def test_plate_under_a_disk(at, radius):
+    """Small: Michell's point load. Large: the same, corrected for its size."""
+    probe = Circle(radius)
+    theory = FULL if at == PLACES[1] else Theory(False, True, False)
+    solved = press(THICK, probe, at, TINY, theory=theory, accuracy=1e-4)
+    points, z = read_outside(THICK, probe, at)
+    c = complex(*at) / THICK.radius
+    scale = TINY * THICK.radius**2 / plate_stiffness(THICK)
+    exact = scale * michell_under_a_disk(z, c, radius / THICK.radius)
+    np.testing.assert_allclose(solved.deflection(points), exact, atol=1e-4 * exact.max())
+    if radius < 1e-3:
+        np.testing.assert_allclose(solved.deflection(points), scale * michell(z, c), atol=1e-3 * exact.max())
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
+def test_plate_under_a_centred_disk(share):
+    """w(0) = F (4 a^2 - 4 R^2 ln(a / R) - 3 R^2) / 64 pi D (Timoshenko and Woinowsky-Krieger 1959, art. 16)."""
+    a, c = THICK.radius, share * THICK.radius
+    solved = press(THICK, Circle(c), (0.0, 0.0), TINY, theory=Theory(False, True, False), resolution=WITH_RIM)
+    expected = TINY * (4 * a**2 - 4 * c**2 * np.log(a / c) - 3 * c**2) / (64.0 * np.pi * plate_stiffness(THICK))
+    assert solved.deflection(np.zeros((1, 2)))[0] == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("at", PLACES[1:])
+@pytest.mark.parametrize("probe", POLYGONS, ids=lambda probe: probe.name)
+def test_plate_under_a_polygon(at, probe):
+    solved = press(THICK, probe, at, TINY, theory=Theory(False, True, False), accuracy=1e-4)
+    points, z = read_outside(THICK, probe, at)
+    mean = over_polygon(michell, z, (complex(*at) + probe.outline) / THICK.radius)
+    expected = TINY * THICK.radius**2 / plate_stiffness(THICK) * mean
+    np.testing.assert_allclose(solved.deflection(points), expected, atol=1e-4 * expected.max())
+
+
+@pytest.mark.parametrize("tension_MPa", [0.01, 0.3, 10.0])
+def test_taut_plate_under_a_centred_disk(tension_MPa):
+    """D lap lap w - N lap w = q: logarithm, parabola and modified Bessel functions, joined at the footprint's edge."""
+    film = replace(SLACK, thickness=300e-6, pretension=tension_MPa * 1e6)
+    tension, c = film.pretension * film.thickness, 0.1
+    k = film.radius * np.sqrt(tension / plate_stiffness(film))
+
+    def ladder(r: float) -> tuple[np.ndarray, np.ndarray]:
+        """Value and three derivatives of 1, I0, then of 1, ln, I0, K0 (scaled to one at r = c or r = 1)."""
+        i0, i1, k0, k1 = iv(0, k * r), iv(1, k * r), kv(0, k * r), kv(1, k * r)
+        grow = np.array([i0, k * i1, k**2 * (i0 - i1 / (k * r)), 0.0])
+        grow[3] = k**3 * i1 - grow[2] / r + grow[1] / r**2
+        fall = np.array([k0, -k * k1, k**2 * (k0 + k1 / (k * r)), 0.0])
+        fall[3] = -(k**3) * k1 - fall[2] / r + fall[1] / r**2
+        one, log = np.array([1.0, 0, 0, 0]), np.array([np.log(r), 1 / r, -1 / r**2, 2 / r**3])
+        return (
+            np.stack([one, grow / iv(0, k * c)], axis=1),
+            np.stack([one, log, grow / iv(0, k), fall / kv(0, k * c)], axis=1),
+        )
+
+    inner, outer = ladder(c)
+    _, rim = ladder(1.0)
+    parabola = -np.array([c**2, 2 * c, 2.0, 0.0]) / (4.0 * np.pi * c**2)  # in units of F / N: q a^2 / N = 1 / pi c^2
+    matrix = np.block([[inner, -outer], [np.zeros((2, 2)), rim[:2]]])
+    weights = np.linalg.solve(matrix, np.concatenate([-parabola, [0.0, 0.0]]))
+    scale = TINY / tension
+    for theory in (Theory(False, True, True), Theory(True, True, True)):
+        solved = press(
+            film, Circle(c * film.radius), (0.0, 0.0), TINY, theory=theory, resolution=Resolution(7, 8, 5, 2)
+        )
+        centre = solved.deflection(np.zeros((1, 2)))[0]
+        assert centre == pytest.approx(scale * (weights[0] + weights[1] / iv(0, k * c)), rel=2e-5)
+        for r in (0.2, 0.6, 0.95):
+            expected = scale * (ladder(r)[1][0] @ weights[2:])
+            np.testing.assert_allclose(solved.deflection(ring(r * film.radius)), expected, atol=2e-5 * centre)
+
+
+# What the linear deflection stretches: a uniform load, which a probe over the whole film nearly is
+
+
+def uniform(theory: str, film: Film, force: float) -> tuple[float, Callable[[float], tuple[float, float]]]:
+    """w(0) / a and (s_r, s_theta) at r / a.
+
+    From (r S_r)' = S_theta and the strain's compatibility, r^-1 (r^2 S_r)' = C - E / 2 * integral(w'^2 / r), with
+    w / a = w0 (1 - r^2)^2 for the plate and w0 (1 - r^2) for the membrane; C from u = 0 at the rim.
+    """
+    nu = film.poisson
+    if theory == "linear plate":
+        height = force * film.radius / (64.0 * np.pi * plate_stiffness(film))
+        e = film.young * height**2 / 6.0
+
+        def stress(r: float) -> tuple[float, float]:
+            fill = 1.0 - (1.0 - r**2) ** 4
+            radial = e * ((1 + nu) / (1 - nu) + fill / r**2)
+            return radial, radial + e * (8.0 * (1.0 - r**2) ** 3 - 2.0 * fill / r**2)
+
+    else:
+        height = force / (4.0 * np.pi * film.pretension * film.thickness * film.radius)
+        e = film.young * height**2 / 4.0
+
+        def stress(r: float) -> tuple[float, float]:
+            rim = e * (3.0 - nu) / (1.0 - nu)
+            return rim - e * r**2, rim - 3.0 * e * r**2
+
+    return height, stress
+
+
+@pytest.mark.parametrize(
+    ("name", "film", "force"),
+    [("linear plate", THICK, 1e-3), ("linear membrane", replace(TAUT, pretension=1e5), 1e-6)],
+    ids=["plate", "membrane"],
+)
+def test_stress_and_charge_that_a_uniform_load_induces(name, film, force):
+    probe, sensor = Circle(0.9999 * film.radius), replace(load_sensor("four-25um-uniaxial"), film=film)
+    height, stress = uniform(name, film, force / 0.9999**2)
+    linear = named(name, film)
+    for theory in (linear, replace(linear, stretching=True)):
+        resolution = Resolution(8, 8, 3, 2 if theory.bending else 0)
+        solved = press(film, probe, (0.0, 0.0), force, theory=theory, resolution=resolution, layer=0.02)
+        assert solved.deflection(np.zeros((1, 2)))[0] == pytest.approx(height * film.radius, rel=3e-5)
+        for r in (0.01, 0.3, 0.8):
+            radial, hoop, _ = radial_and_hoop(solved.touch_stress(ring(r * film.radius)), ring(r * film.radius))
+            np.testing.assert_allclose(radial, stress(r)[0], rtol=2e-4)
+            np.testing.assert_allclose(hoop, stress(r)[1], atol=2e-4 * stress(r)[0])
+
+        def density(y: float, x: float) -> float:
+            r, c2 = np.hypot(x, y), x**2 / (x**2 + y**2)
+            radial, hoop = stress(r / film.radius)
+            return 20e-12 * (radial * c2 + hoop * (1 - c2)) + 2e-12 * (radial * (1 - c2) + hoop * c2)
+
+        expected, _ = dblquad(density, 8.5e-3, 11.5e-3, -1.5e-3, 1.5e-3)
+        charge = touch_charge(sensor, solved)
+        np.testing.assert_allclose(charge[[0, 2]], expected, rtol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("film", "theory"),
+    [
+        (replace(SLACK, thickness=2e-3), Theory(False, True, False)),
+        (replace(SLACK, pretension=2e7), Theory(False, False, True)),
+        (replace(THICK, pretension=5e6), Theory(False, True, True)),
+    ],
+    ids=["plate", "membrane", "taut plate"],
+)
+@pytest.mark.parametrize("probe", [Circle(2e-3), POLYGONS[0]], ids=["circle", "rectangle"])
+def test_linear_theories_are_limits_of_the_nonlinear_ones(film, theory, probe):
+    """At a tiny force, charges, not just deflections."""
+    full = replace(theory, stretching=True)
+    sensor = replace(load_sensor("three-25um-uniaxial"), film=film)
+    solved = [
+        press(film, probe, (5e-3, 3e-3), 1e-5, theory=each, resolution=Resolution(5, 8, 5, 1))
+        for each in (theory, full)
+    ]
+    one, two = (touch_charge(sensor, each) for each in solved)
+    np.testing.assert_allclose(one, two, rtol=1e-5)
+    assert solved[0].iterations == 2
 
 
 # The axisymmetric membrane, von Karman's (1910) at a tiny force and Green-Lagrange's at any, integrated by scipy
@@ -143,7 +384,7 @@ def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float
 def test_axisymmetric_membrane(share, force, poisson, tension):
     amplitude2 = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
     film = replace(SLACK, poisson=poisson, pretension=tension * SLACK.young * amplitude2)
-    solved = press(film, Circle(share * film.radius), (0.0, 0.0), force, resolution=REFINED)
+    solved = press(film, Circle(share * film.radius), (0.0, 0.0), force, theory=MEMBRANE, resolution=REFINED)
     at = np.array([0.005, 0.015, 0.1, 0.4, 0.8, 0.97])
     expected = axisymmetric(share, amplitude2, poisson, tension, at)
     for i, r in enumerate(at):
@@ -160,7 +401,7 @@ def test_hencky():
     """A probe over the whole film is a uniform dead pressure q: N_r(0) = b0 / 4 (q^2 a^2 E h)^(1/3) with
     b0 = 1.7244 at Poisson 0.3 (Hencky 1915; digits of Fichter 1997)."""
     film, force, radius = replace(SLACK, poisson=0.3), 1e-6, 0.9999 * SLACK.radius
-    solved = press(film, Circle(radius), (0.0, 0.0), force, resolution=REFINED)
+    solved = press(film, Circle(radius), (0.0, 0.0), force, theory=MEMBRANE, resolution=REFINED)
     pressure = force / (np.pi * radius**2)
     expected = 1.7244 / 4.0 * np.cbrt(pressure**2 * film.radius**2 * film.young * film.thickness)
     centre = solved.touch_stress(np.zeros((1, 2)))[0] * film.thickness
@@ -171,7 +412,8 @@ def test_charge_of_a_centred_press_is_the_integral_of_the_boundary_value_problem
     """The output itself: electrode A integrated over from scipy's stresses, no code of ours but the solve."""
     sensor, force = load_sensor("four-25um-uniaxial"), 1.0
     amplitude2 = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
-    charge = touch_charge(sensor, press(sensor.film, Circle(1e-3), (0.0, 0.0), force, resolution=REFINED))[0]
+    solved = press(sensor.film, Circle(1e-3), (0.0, 0.0), force, theory=MEMBRANE, resolution=REFINED)
+    charge = touch_charge(sensor, solved)[0]
     x, y = np.meshgrid(np.linspace(8.5e-3, 11.5e-3, 41), np.linspace(-1.5e-3, 1.5e-3, 41))
     r, c2 = np.hypot(x, y), x**2 / (x**2 + y**2)
     order = np.argsort(r.ravel())

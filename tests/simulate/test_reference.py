@@ -1,59 +1,95 @@
-"""Rung 8: charges and deflections of independent solvers, with bending, which the membrane leaves out.
+"""Rung 8: charges and deflections of independent solvers.
 
-`tests/data/film_cases.json`: axisymmetric collocation (1e-8) and dolfinx P3 (about 1e-4), errors below 3e-4.
+`film_cases.json`: axisymmetric collocation (1e-8) and dolfinx P3 (about 1e-4), errors below 3e-4.
+`film_cases_skfem.json`: scikit-fem P3, what neither of them has: off-centre polygons, the rim, thick films (3e-5).
 """
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
-from isocharge.simulate import Equilibrium, press, touch_charge
-from isocharge.simulate.equilibrium import bending_share
-from isocharge.simulate.forward import TOO_THICK
+from isocharge.simulate import Equilibrium, Polygon, Theory, load_sensor, press, touch_charge
+
+NEAR = 4e-3
+"""An electrode counts as near the probe if its edge is closer to the footprint's than this (m)."""
 
 
 @cache
 def solve(film, probe, at, force) -> Equilibrium:
-    """Each case once."""
+    """Each press once; all layouts, coefficients and readouts are read from it."""
     return press(film, probe, at, force)
 
 
-def worst(case) -> tuple[float, float, float]:
-    """Largest relative error of a charge, of one 4.5 mm or more from the probe's centre, and of the deflection."""
-    solved, everywhere, away = solve(case.film, case.probe, case.at, case.force), 0.0, 0.0
-    for key, expected in case.charges.items():
-        sensor = case.sensor(key)
-        error = np.abs(touch_charge(sensor, solved) / expected - 1.0)
-        distance = np.hypot(*(np.array([e.centre for e in sensor.electrodes]) - case.at).T)
-        everywhere, away = max(everywhere, error.max()), max(away, error[distance > 4.5e-3].max())
-    deflection = solved.deflection(np.array([case.at]))[0]
-    return everywhere, away, abs(deflection / case.deflection - 1.0)
+def allowed(case, sensor) -> np.ndarray:
+    """Relative error that each electrode may have: 0.1 %; 0.2 % from 1 mm thickness on and near the probe."""
+    gap = [
+        np.hypot(*(np.clip(case.at, low, high) - case.at)) - case.probe.reach
+        for low, high in ((np.min(e.corners, axis=0), np.max(e.corners, axis=0)) for e in sensor.electrodes)
+    ]
+    loose = (np.array(gap) < NEAR) | (case.film.thickness >= 1e-3)
+    return np.where(loose, 2e-3, 1e-3)
 
 
-def test_all_cases_in_scope_are_there(reference_cases):
-    assert len(reference_cases(25.0)) == 28
-    assert sum(case.film.pretension > 0.0 for case in reference_cases(25.0)) == 2
+def test_all_cases_are_there(reference_cases):
+    assert [len(reference_cases(um)) for um in (25, 110, 1000)] == [36, 26, 26]
 
 
 def test_charges_and_deflection(case):
-    """Every charge of every layout, piezo type and readout; from 1 N on tighter, for bending matters less there."""
-    assert len(case.charges) == 8
-    charge, _, deflection = worst(case)
-    assert charge < (5e-3 if case.force >= 1.0 else 1.5e-2)
-    assert deflection < (3e-3 if case.force >= 1.0 else 8e-3)
+    """Every charge of every layout, piezo type and readout; the theory is what the scene gets by itself."""
+    solved = solve(case.film, case.probe, case.at, case.force)
+    assert len(case.charges) in (4, 8)
+    for key, expected in case.charges.items():
+        sensor = case.sensor(key)
+        error = np.abs(touch_charge(sensor, solved) / expected - 1.0)
+        assert np.all(error < allowed(case, sensor)), (key, error)
+    assert solved.deflection(np.array([case.at]))[0] == pytest.approx(case.deflection, rel=1e-3)
+
+
+def test_further_charges_and_deflection(further_case):
+    """Errors relative to the press's largest charge, as the second solver states its own."""
+    case = further_case
+    solved = solve(case.film, case.probe, case.at, case.force)
+    assert len(case.charges) == 4
+    for key, expected in case.charges.items():
+        sensor = case.sensor(key)
+        error = np.abs(touch_charge(sensor, solved) - expected) / np.abs(expected).max()
+        assert np.all(error < allowed(case, sensor)), (key, error)
+    assert solved.deflection(np.array([case.at]))[0] == pytest.approx(case.deflection, rel=1e-3)
 
 
 def test_estimated_error_is_a_bound(case):
-    """For every charge, the probe on an electrode included, and not an idle one: a third of it is reached."""
-    everywhere, _, _ = worst(case)
-    estimate = solve(case.film, case.probe, case.at, case.force).estimated_error
-    assert everywhere <= estimate < 3.5 * everywhere
+    """For the worst charge of a press, beyond what the reference itself may be off."""
+    solved, worst = solve(case.film, case.probe, case.at, case.force), 0.0
+    for key, expected in case.charges.items():
+        if key.endswith("area"):
+            error = np.abs(touch_charge(case.sensor(key), solved) - expected).max() / np.abs(expected).max()
+            worst = max(worst, float(error))
+    assert worst <= solved.estimated_error + 3e-4
 
 
-def test_estimated_error_of_a_thicker_film(thicker_case):
-    """110 um: a bound away from the probe while bending is a small correction, its size beyond."""
-    _, away, _ = worst(thicker_case)
-    solved = solve(thicker_case.film, thicker_case.probe, thicker_case.at, thicker_case.force)
-    small = bending_share(solved.film, solved.groups.amplitude2) < TOO_THICK
-    assert away <= solved.estimated_error * (1.0 if small else 1.2)
-    assert solved.estimated_error < 4.0 * away
+def test_second_library_live(skfem, film):
+    """A turned rectangle off the centre of a 40 um film under 0.3 MPa: no closed form, no symmetry; both solve it."""
+    sensor = load_sensor("three-25um-uniaxial")
+    film = replace(film, thickness=40e-6, pretension=0.3e6)
+    sensor = replace(sensor, film=film)
+    at, force = (4e-3, -3e-3), 0.3
+    probe = Polygon.rectangle(5e-3, 2e-3, 0.6)
+    corners = at + np.stack([probe.outline.real, probe.outline.imag], axis=1)
+    other = skfem.solve(film.thickness, film.pretension, corners, force, 1.0)
+    for theory in (None, Theory(stretching=True, bending=True, pretensioned=True)):
+        solved = press(film, probe, at, force, theory=theory)
+        for readout in ("area", "edge"):
+            charge = touch_charge(replace(sensor, readout=readout), solved)
+            d31, d32 = sensor.piezo.d31, sensor.piezo.d32
+            expected = [
+                other.charge(np.array(e.corners), d31, d32)
+                if readout == "area"
+                else other.edge_charge(e.centre, 3e-3, d31, d32)
+                for e in sensor.electrodes
+            ]
+            np.testing.assert_allclose(charge, expected, rtol=0.0, atol=1e-3 * np.max(expected))
+        points = np.array([at, (0.0, 0.0), (20e-3, 10e-3), (-30e-3, 5e-3)])
+        expected = [other.deflection(point) for point in points]
+        np.testing.assert_allclose(solved.deflection(points), expected, rtol=5e-4)

@@ -1,96 +1,58 @@
-"""A sweep: where its presses lie, what it writes, and that it can be repeated."""
+"""A sweep: what it writes, that it can be repeated, and what it refuses."""
 
+import errno
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
 
-from isocharge.errors import OutputExists, SceneError
+from isocharge.errors import OutputError, OutputExists, SceneError
 from isocharge.simulate import (
     Circle,
     ForwardMap,
+    Polygon,
+    Resolution,
+    Sensor,
     Sweep,
+    Theory,
     load_sensor,
+    parse_probe,
     press,
     read_dataset,
     run_sweep,
     touch_charge,
     write_sweep,
 )
-from isocharge.simulate.sweep import SHARD
+from isocharge.simulate.sweep import SHARD, TASK, Solver
 
-QUICK = {"radius": 3e-3, "force_range": (0.5, 1.0)}
-"""A small family: few solves are enough for it."""
-
-
-def test_presses_are_uniform_over_the_disk():
-    """The square of the distance and the angle are uniform, and independent of each other."""
-    x, y, _, _ = Sweep(samples=4000, seed=1).presses()
-    squared, angle = (x**2 + y**2) / 8e-3**2, np.arctan2(y, x)
-    assert stats.kstest(squared, "uniform").pvalue > 0.05
-    assert stats.kstest(angle, "uniform", args=(-np.pi, 2 * np.pi)).pvalue > 0.05
-    counts = np.histogram2d(squared, angle, bins=(8, 8))[0]
-    assert stats.chisquare(counts.ravel()).pvalue > 0.05
-    assert squared.max() <= 1.0
+SENSOR = load_sensor("three-25um-biaxial")
+MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+QUICK = Solver(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
+"""A coarse membrane: half a second for a small family."""
 
 
-def test_forces_are_uniform_in_the_logarithm():
-    _, _, force, _ = Sweep(samples=4000, seed=2, force_range=(0.05, 2.0)).presses()
-    assert stats.kstest(np.log(force), "uniform", args=(np.log(0.05), np.log(40.0))).pvalue > 0.05
-    assert force.min() >= 0.05
-    assert force.max() <= 2.0
+def small(samples: int = 60, **changes) -> Sweep:
+    return Sweep(**{"radius": 3e-3, "force_range": (1.0, 1.0), "samples": samples, "seed": 7} | changes)
 
 
-def test_force_and_place_are_independent():
-    x, y, force, _ = Sweep(samples=4000, seed=3).presses()
-    assert np.abs(np.corrcoef([x, y, np.hypot(x, y), np.log(force)])[:3, 3]).max() < 0.05
+@dataclass(frozen=True)
+class Spy:
+    """In place of a forward map: its charges are what it was asked for, in pC."""
+
+    probe: Circle | Polygon
+    sensor: Sensor = SENSOR
+    theory: Theory = MEMBRANE
+    resolution: Resolution = QUICK.resolution
+    solves: int = 3
+    error: float = 1e-4
+
+    def forward(self, x, y, _force, orientation):
+        return 1e-12 * np.stack([1e3 * x, 1e3 * y, np.rad2deg(orientation)], axis=1)
 
 
-def test_presses_fill_gaps_better_than_chance():
-    """What the Sobol points are for: a tenth of the discrepancy of independent draws."""
-    x, y, _, _ = Sweep(samples=1024, seed=4).presses()
-    unit = np.stack([(x**2 + y**2) / 8e-3**2, np.mod(np.arctan2(y, x) / (2 * np.pi), 1.0)], axis=1)
-    chance = np.random.default_rng(4).random((1024, 2))
-    assert stats.qmc.discrepancy(unit) < 0.1 * stats.qmc.discrepancy(chance)
-
-
-def test_seed_decides():
-    first, again, other = (Sweep(samples=100, seed=seed).presses() for seed in (5, 5, 6))
-    for a, b, c in zip(first[:3], again[:3], other[:3], strict=True):
-        np.testing.assert_array_equal(a, b)
-        assert np.all(a != c)
-
-
-def test_orientation():
-    assert not Sweep(samples=100).presses()[3].any()
-    turned = Sweep(samples=4000, orientation="random").presses()[3]
-    assert stats.kstest(turned, "uniform", args=(0.0, 2 * np.pi)).pvalue > 0.05
-
-
-@pytest.mark.parametrize("samples", [1, 2, 3, 1000])
-def test_any_number_of_samples(samples):
-    assert {len(column) for column in Sweep(samples=samples).presses()} == {samples}
-
-
-def test_one_force_is_exact():
-    assert set(Sweep(samples=50, force_range=(0.3, 0.3)).presses()[2].tolist()) == {0.3}
-
-
-@pytest.mark.parametrize("samples", [0, -3])
-def test_no_samples_is_an_error(samples):
-    with pytest.raises(SceneError, match=f"samples: expected at least 1, got {samples}"):
-        Sweep(samples=samples)
-
-
-def test_too_many_samples():
-    with pytest.raises(SceneError, match="samples: expected at most 10000000, got 10000001"):
-        Sweep(samples=10_000_001)
-
-
-def test_unknown_orientation():
-    with pytest.raises(SceneError, match="orientation: expected 'fixed' or 'random', got 'Random'"):
-        Sweep(orientation="Random")
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 # What is written
@@ -110,15 +72,15 @@ def test_samples_are_the_presses_and_their_charges(small_dataset):
 
 def test_manifest_of_a_sweep(small_dataset, three_map):
     manifest = read_dataset(small_dataset).manifest
+    mesh = three_map.resolution
     assert manifest["probes"] == ["circle:1.0"]
     assert manifest["ranges"] == {"radius_mm": 8.0, "force_N": [0.05, 2.0], "orientation": "fixed"}
+    assert manifest["sampling"].startswith("scrambled Sobol")
     assert (manifest["seed"], manifest["noise"], manifest["samples"]) == (7, "clean", 500)
     assert manifest["solver"] == {
-        "theory": "nonlinear membrane",
-        "order": 4,
-        "around": 8,
-        "rings": 6,
-        "solves": len(three_map.table),
+        "theory": three_map.theory.name,
+        "mesh": {"circle:1.0": f"order {mesh.order}, around {mesh.around}, rings {mesh.rings}, rim {mesh.rim}"},
+        "solves": three_map.solves,
         "interpolation_error": three_map.error,
     }
 
@@ -130,55 +92,80 @@ def test_same_seed_same_bytes(small_dataset, three_map, tmp_path):
     assert read_dataset(other).sha256 != read_dataset(again).sha256
 
 
-def files(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+def test_a_run_writes_what_its_maps_write(tmp_path):
+    """Whether or not a draft is kept on the way."""
+    maps = [ForwardMap.build(SENSOR, Circle(1e-3), 3e-3, (1.0, 1.0), theory=MEMBRANE, resolution=QUICK.resolution)]
+    plain = write_sweep(tmp_path / "a" / "presses", maps, small())
+    drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (Circle(1e-3),), small(), solver=QUICK)
+    assert files(plain) == files(drafted)
+    assert [path.name for path in drafted.parent.iterdir()] == ["presses"]
 
 
-def test_bytes_do_not_depend_on_the_executor(two_processes, tmp_path):
-    sensor, sweep = load_sensor("three-25um-biaxial"), Sweep(samples=50, **QUICK)
-    here = run_sweep(tmp_path / "a" / "presses", sensor, (Circle(1e-3),), sweep)
-    there = run_sweep(tmp_path / "b" / "presses", sensor, (Circle(1e-3),), sweep, executor=two_processes)
-    assert files(here) == files(there)
+def test_orientation_is_the_whole_turn_against_the_notation(tmp_path):
+    """The angle that the probe was given with and the press's own; the map is asked for the latter only."""
+    probes = [parse_probe(text) for text in ("rectangle:4.0x2.0@30", "triangle:4.0@-30", "circle:1.0@50")]
+    for orientation in ("fixed", "random"):
+        sweep = Sweep(samples=999, orientation=orientation)
+        read = read_dataset(write_sweep(tmp_path / orientation, [Spy(probe) for probe in probes], sweep)).samples
+        assert read.probe.tolist() == ["rectangle:4.0x2.0", "triangle:4.0", "circle:1.0"] * 333
+        own, whole = read.charge_pC[:, 2], read.orientation_deg
+        np.testing.assert_allclose((whole - own - np.tile([30.0, -30.0, 0.0], 333) + 180.0) % 360.0, 180.0, atol=1e-6)
+        assert (whole >= 0.0).all()
+        assert (whole < 360.0).all()
+    assert set(whole[read.probe == "triangle:4.0"].round(3).tolist()) != {330.0}
+    fixed = read_dataset(tmp_path / "fixed").samples
+    assert fixed.orientation_deg[:3].tolist() == [30.0, 330.0, 0.0]
 
 
-def test_probes_take_turns(three_map, tmp_path):
-    """Each gets its own charges; an odd number of samples, and a probe that gets none."""
-    sensor, wide = three_map.sensor, ForwardMap.build(three_map.sensor, Circle(2e-3), **QUICK)
-    sweep = Sweep(samples=5, **QUICK)
-    read = read_dataset(write_sweep(tmp_path / "two", (three_map, wide), sweep))
+@pytest.mark.parametrize("probes", [1, 2, 3])
+def test_shards_and_tasks_keep_the_order(tmp_path, probes):
+    """More than a shard, more than a task in one, and each press with its own charges."""
+    sweep = Sweep(samples=SHARD + 10, orientation="random")
+    maps = [Spy(Polygon.rectangle(side * 1e-3, 2e-3)) for side in (3.0, 4.0, 5.0)[:probes]]
+    read = read_dataset(write_sweep(tmp_path / "large", maps, sweep))
+    assert SHARD > TASK
+    assert [shard["samples"] for shard in read.manifest["shards"]] == [SHARD, 10]
+    presses = sweep.over([made.probe for made in maps])
+    np.testing.assert_allclose(read.samples.x_mm, 1e3 * presses.x)
+    np.testing.assert_allclose(read.samples.charge_pC[:, 0], 1e3 * presses.x)
+    np.testing.assert_allclose(read.samples.charge_pC[:, 1], 1e3 * presses.y)
+    np.testing.assert_allclose(read.samples.charge_pC[:, 2], np.rad2deg(presses.turn))
+
+
+def test_probes_take_turns(tmp_path):
+    """Each with its own charges; an odd number of samples, and a probe that gets none."""
+    probes, sweep = (Circle(1e-3), Circle(2e-3)), small(5)
+    read = read_dataset(run_sweep(tmp_path / "two", SENSOR, probes, sweep, solver=QUICK))
     assert read.samples.probe.tolist() == ["circle:1.0", "circle:2.0", "circle:1.0", "circle:2.0", "circle:1.0"]
     assert read.manifest["probes"] == ["circle:1.0", "circle:2.0"]
     for i in (0, 3):
         at = (1e-3 * read.samples.x_mm[i], 1e-3 * read.samples.y_mm[i])
-        solved = press(sensor.film, Circle((1e-3, 2e-3)[i % 2]), at, read.samples.force_N[i])
-        np.testing.assert_allclose(read.samples.charge_pC[i], 1e12 * touch_charge(sensor, solved), rtol=1e-3)
-    one = read_dataset(write_sweep(tmp_path / "one", (three_map, wide), Sweep(samples=1, **QUICK)))
+        solved = press(SENSOR.film, probes[i % 2], at, read.samples.force_N[i], theory=MEMBRANE)
+        np.testing.assert_allclose(read.samples.charge_pC[i], 1e12 * touch_charge(SENSOR, solved), rtol=1e-3)
+    one = read_dataset(write_sweep(tmp_path / "one", [Spy(probe) for probe in probes], small(1)))
     assert one.samples.probe.tolist() == ["circle:1.0"]
 
 
-def test_large_sweeps_are_cut_into_shards(three_map, tmp_path):
-    folder = write_sweep(tmp_path / "large", (three_map,), Sweep(samples=SHARD + 10))
-    read = read_dataset(folder)
-    assert [shard["samples"] for shard in read.manifest["shards"]] == [SHARD, 10]
-    np.testing.assert_allclose(read.samples.x_mm, 1e3 * Sweep(samples=SHARD + 10).presses()[0])
+def test_a_grid_on_disk(tmp_path):
+    sweep = small(500, sampling="grid", force_range=(0.5, 1.0))
+    read = read_dataset(write_sweep(tmp_path / "grid", [Spy(Circle(1e-3))], sweep))
+    assert len(read.samples) == len(sweep.presses()[0]) < 500
+    assert read.manifest["samples"] == len(read.samples)
+    assert read.manifest["sampling"].startswith("grid: square lattice")
 
 
-def test_an_exception_half_way_leaves_nothing(three_map, tmp_path, monkeypatch):
-    monkeypatch.setattr("isocharge.simulate.sweep.SHARD", 100)
-    calls = []
-    forward = type(three_map).forward
+def test_progress_of_both_phases_is_told(tmp_path):
+    solved, sampled = [], []
+    run_sweep(
+        tmp_path / "presses", SENSOR, (Circle(1e-3),), small(25), solver=QUICK, shard=10,
+        progress=lambda done, total: solved.append((done, total)),
+        sampled=lambda done, total: sampled.append((done, total)),
+    )  # fmt: skip
+    assert solved[-1] == (len(solved), len(solved))
+    assert sampled == [(0, 25), (10, 25), (20, 25), (25, 25)]
 
-    def second_fails(self, *press):
-        calls.append(press)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return forward(self, *press)
 
-    monkeypatch.setattr(type(three_map), "forward", second_fails)
-    with pytest.raises(KeyboardInterrupt):
-        write_sweep(tmp_path / "presses", (three_map,), Sweep(samples=300))
-    assert len(calls) == 2
-    assert list(tmp_path.iterdir()) == []
+# Refused, and failed
 
 
 def test_existing_folder_is_refused_before_any_work(tmp_path):
@@ -186,27 +173,81 @@ def test_existing_folder_is_refused_before_any_work(tmp_path):
     with pytest.raises(OutputExists):
         run_sweep(
             tmp_path / "presses",
-            load_sensor("three-25um-biaxial"),
+            SENSOR,
             (Circle(1e-3),),
             Sweep(),
             progress=lambda done, total: pytest.fail(f"worked: {done} of {total}"),
         )
+    assert [path.name for path in tmp_path.iterdir()] == ["presses"]
 
 
 @pytest.mark.parametrize(
     ("sweep", "message"),
     [
-        (Sweep(radius=44.5e-3), "probe off the film"),
+        (Sweep(radius=44.5e-3), "leave the film of radius 45 mm"),
         (Sweep(radius=-1e-3), "radius: expected a positive number"),
+        (Sweep(radius=float("nan")), "radius: expected a positive number"),
         (Sweep(force_range=(-0.1, 1.0)), "force range: expected 0 < MIN"),
+        (Sweep(force_range=(1.0, float("inf"))), "force range: expected 0 < MIN"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # drawn before they are looked at
 def test_impossible_sweeps_leave_nothing(tmp_path, sweep, message):
     with pytest.raises(SceneError, match=message):
-        run_sweep(tmp_path / "presses", load_sensor("three-25um-biaxial"), (Circle(1e-3),), sweep)
+        run_sweep(tmp_path / "new" / "presses", SENSOR, (Circle(1e-3),), sweep)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_no_probes(tmp_path):
     with pytest.raises(SceneError, match="probes: expected at least one, got none"):
-        run_sweep(tmp_path / "presses", load_sensor("three-25um-biaxial"), (), Sweep())
+        run_sweep(tmp_path / "presses", SENSOR, (), Sweep())
+    with pytest.raises(SceneError, match="probes: expected at least one, got none"):
+        write_sweep(tmp_path / "presses", (), Sweep())
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OutputError, match="file/presses cannot be written: Not a directory; choose another output"):
+        run_sweep(tmp_path / "file" / "presses", SENSOR, (Circle(1e-3),), small(), solver=QUICK)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.fixture
+def _spied(monkeypatch):
+    """Sweeps solve nothing: a build is four jobs whose results do not matter."""
+
+    def build(_sensor, probe, *_ranges, executor, **_options):
+        assert [float(result.sum()) for result in executor.map(np.full, range(1, 5), range(1, 5))] == [1, 4, 9, 16]
+        return Spy(probe)
+
+    monkeypatch.setattr(ForwardMap, "build", build)
+
+
+@pytest.mark.usefixtures("_spied")
+def test_a_full_disk_loses_nothing_that_was_done(tmp_path, monkeypatch):
+    """The n-th file is refused, for every n: a clear error, no dataset; with room again, the same call goes on."""
+    probes = (Circle(1e-3), Circle(2e-3))
+    complete = files(run_sweep(tmp_path / "whole" / "presses", SENSOR, probes, small(), shard=10))
+    for failing in range(1, 100):
+        target, calls = tmp_path / str(failing) / "presses", []
+
+        def full(_handle, calls=calls, failing=failing):
+            calls.append(1)
+            if len(calls) == failing:
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+        with monkeypatch.context() as patched:
+            patched.setattr("os.fsync", full)
+            try:
+                run_sweep(target, SENSOR, probes, small(), shard=10)
+            except OutputError as error:
+                assert "presses cannot be written: No space left on device; " in str(error)  # noqa: PT017
+                assert not target.exists()
+                assert not list(tmp_path.rglob(".*.draft"))
+                assert target.with_name("presses.part").exists() or "choose another output" in str(error)  # noqa: PT017
+                run_sweep(target, SENSOR, probes, small(), shard=10)
+        assert files(target) == complete
+        assert [path.name for path in target.parent.iterdir()] == ["presses"]
+        if len(calls) < failing:
+            break
+    assert failing > 2 * (8 + 6)  # every solve and every shard is two files

@@ -69,7 +69,7 @@ def demo_command(
             with progress("solving the film") as advance:
                 film = solve_maps(load_sensor(SENSOR), (Circle(1e-3),), sweep, progress=advance)[0]
             dataset = read_dataset(write_sweep(draft / "presses", (film,), sweep))
-            say(f"   {len(dataset.samples)} presses from {len(film.table)} solves, interpolated to {film.error:.1e}")
+            say(f"   {len(dataset.samples)} presses from {film.solves} solves, interpolated to {film.error:.1e}")
         with clock.step("train", "a small network, with noise, to ONNX"):
             with progress("training") as advance:
                 release = train_model(

@@ -87,7 +87,7 @@ def _film_in_section(axes: Any, page: Page) -> None:
     w = 1e3 * equilibrium.deflection(1e-3 * along[:, None] * direction)
     axes.plot(along, -w, color=INK, lw=1.5)
     foot = float(1e3 * at @ direction)
-    half = 1e3 * equilibrium.probe.radius
+    half = 1e3 * equilibrium.probe.reach
     axes.plot([foot - half, foot + half], [0.25, 0.25], color=FELT, lw=5, solid_capstyle="butt")
     axes.annotate("", (foot, -w.max()), (foot, 0.2), arrowprops={"arrowstyle": "->", "color": FELT})
     axes.set(

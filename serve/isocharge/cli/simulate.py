@@ -1,26 +1,30 @@
 """`isocharge simulate ...`: one press, or a dataset of many."""
 
 import json as json_module
-import signal
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
+from dataclasses import asdict
 from enum import StrEnum
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from isocharge.cli.terminal import progress, say
-from isocharge.errors import InputError, SceneError
-from isocharge.files import refuse_existing
+from isocharge.cli.terminal import progress_rows, say
+from isocharge.errors import InputError
 
 if TYPE_CHECKING:
     from isocharge.simulate import Equilibrium, Sensor
     from isocharge.simulate.arrays import Array
+    from isocharge.simulate.workers import Workers
 
 simulate_app = typer.Typer(no_args_is_help=True, help="From a press to the charges of the electrodes.")
+
+PROBE_HELP = "What presses, mm: circle:R, rectangle:WxH, triangle:SIDE, polygon:X,Y;X,Y;..., each turned by @DEGREES."
+
+MOST_WORKERS = 64
+
+SWEEP_ROWS = (("solving the film", "solves"), ("pressing", "presses"))
+"""Titles and units of a sweep's progress."""
 
 SensorArgument = Annotated[str, typer.Argument(metavar="SENSOR", help="Built-in sensor, or a TOML file.")]
 
@@ -32,34 +36,46 @@ class Orientation(StrEnum):
     random = "random"
 
 
+class Sampling(StrEnum):
+    """How the presses of a sweep are spread."""
+
+    sobol = "sobol"
+    random = "random"
+    grid = "grid"
+
+
 @simulate_app.command("point")
 def point_command(
     sensor: SensorArgument,
-    probe: Annotated[str, typer.Option("--probe", help="What presses: circle:R, R in mm.")] = "circle:1.0",
+    probe: Annotated[str, typer.Option("--probe", help=PROBE_HELP)] = "circle:1.0",
     at: Annotated[str, typer.Option("--at", metavar="X,Y", help="Where, mm from the film's centre.")] = "0,0",
     force: Annotated[float, typer.Option("--force", help="How hard, N, positive pushes.")] = 1.0,
+    accuracy: Annotated[
+        float, typer.Option("--accuracy", help="Relative error of a charge that is wanted; chooses theory and mesh.")
+    ] = 1e-3,
+    theory: Annotated[
+        str, typer.Option("--theory", help="auto, or 'nonlinear membrane + bending', 'linear plate', ...")
+    ] = "auto",
+    temperature: Annotated[
+        float, typer.Option("--temperature", metavar="K", help="Add the charge of a uniform temperature step.")
+    ] = 0.0,
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of a table.")] = False,
 ) -> None:
     """Charges (pC) and deflection (mm) under one press.
 
-    Example: isocharge simulate point three-25um-biaxial --probe circle:1.0 --at 3,-2 --force 1.0
+    Example: isocharge simulate point three-25um-biaxial --probe triangle:4.0@30 --at 3,-2 --force 1.0
     """
-    from isocharge.simulate import load_sensor, parse_probe, press, touch_charge
+    from isocharge.simulate import load_sensor, parse_probe, press, theory_for, thermal_charge, touch_charge
+    from isocharge.simulate.theory import named
 
     film_sensor = load_sensor(sensor)
-    equilibrium = press(film_sensor.film, parse_probe(probe), _position(at), force)
-    report = _report(film_sensor, equilibrium, touch_charge(film_sensor, equilibrium))
-    if not isfinite(report["estimated_error"]):
-        raise SceneError(
-            f"a film of {film_sensor.film.thickness * 1e6:g} um under {force:g} N is mostly bent, and this version "
-            "models no bending; use a thinner film or more force"
-        )
+    terms = theory_for(film_sensor, (force, force), accuracy) if theory == "auto" else named(theory, film_sensor.film)
+    equilibrium = press(film_sensor.film, parse_probe(probe), _position(at), force, theory=terms, accuracy=accuracy)
+    charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
+    report = _report(film_sensor, equilibrium, charge)
     typer.echo(json_module.dumps(report) if json else _table(report))
-    if report["estimated_error"] > 0.02:
-        say(
-            f"caution: bending is left out and carries about {report['estimated_error']:.0%} of what this film does; "
-            "the charges are no better than that"
-        )
+    for warning in report["warnings"]:
+        say(f"caution: {warning}")
 
 
 def _position(text: str) -> tuple[float, float]:
@@ -77,12 +93,14 @@ def _report(sensor: "Sensor", equilibrium: "Equilibrium", charge: "Array") -> di
     return {
         "charge_pC": dict(zip(sensor.electrode_names, (charge * 1e12).tolist(), strict=True)),
         "deflection_mm": float(equilibrium.deflection(np.array([equilibrium.at]))[0] * 1e3),
-        "theory": equilibrium.theory,
+        "theory": equilibrium.theory.name,
         "status": equilibrium.status,
         "iterations": equilibrium.iterations,
         "residual": equilibrium.residual,
         "seconds": equilibrium.seconds,
         "estimated_error": equilibrium.estimated_error,
+        "groups": {**asdict(equilibrium.groups), "bending_length": equilibrium.bending_length},
+        "warnings": list(equilibrium.warnings),
     }
 
 
@@ -112,41 +130,57 @@ def sweep_command(
     ] = (0.05, 2.0),
     samples: Annotated[int, typer.Option("--samples", help="How many presses.")] = 20_000,
     orientation: Annotated[
-        Orientation, typer.Option("--orientation", help="Turn the probe in each press.")
+        Orientation, typer.Option("--orientation", help="Turn the probe further in each press.")
     ] = Orientation.fixed,
+    sampling: Annotated[
+        Sampling, typer.Option("--sampling", help="How the presses are spread; a grid takes at most --samples.")
+    ] = Sampling.sobol,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the presses.")] = 0,
     workers: Annotated[
-        int, typer.Option("--workers", min=1, max=64, help="Processes; the data do not depend on them.")
-    ] = 1,
+        int | None,
+        typer.Option(
+            "--workers", min=1, max=MOST_WORKERS, help="Processes; the data do not depend on them. (default: cores)"
+        ),
+    ] = None,
+    cluster: Annotated[
+        str | None, typer.Option("--cluster", metavar="ADDR", help="Dask cluster instead, as tcp://10.0.0.1:8786.")
+    ] = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Throw away what a stopped run left.")] = False,
 ) -> None:
     """Simulate many presses, spread over the working area and the forces, and write them as a dataset.
 
+    A run that was stopped or killed leaves DIR.part; the same command goes on from there and writes the same bytes.
+
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
-    from isocharge.simulate import Sweep, load_sensor, parse_probe, solve_maps, write_sweep
+    from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
 
-    refuse_existing(output)
-    film_sensor, probes = load_sensor(sensor), tuple(parse_probe(text) for text in probe or ["circle:1.0"])
-    sweep = Sweep(radius * 1e-3, force, samples, seed, orientation.value)
-    with progress("solving the film") as advance, _pool(workers) as executor:
-        maps = solve_maps(film_sensor, probes, sweep, executor=executor, progress=advance)
-    folder = write_sweep(output, maps, sweep)
-    say(f"{samples} presses in {folder}")
-
-
-@contextmanager
-def _pool(workers: int) -> Iterator[Executor | None]:
-    """Worker processes that end with the command, whatever ends it; none for one worker."""
-    if workers == 1:
-        yield None
-        return
-    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts_to_the_parent)
+    if workers and cluster:
+        raise InputError("expected either --workers or --cluster, got both")
+    film_sensor, probes = load_sensor(sensor), [parse_probe(text) for text in probe or ["circle:1.0"]]
+    sweep = Sweep(radius * 1e-3, force, samples, seed, orientation.value, sampling.value)
     try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
+        with _crew(workers, cluster) as crew, progress_rows(*SWEEP_ROWS) as (solving, sampled):
+            run_sweep(
+                output,
+                film_sensor,
+                probes,
+                sweep,
+                executor=crew.executor,
+                ahead=crew.ahead,
+                fresh=fresh,
+                progress=solving,
+                sampled=sampled,
+                warn=say,
+            )
+    except KeyboardInterrupt:
+        if (part := output.with_name(f"{output.name}.part")).exists():
+            say(f"stopped; what is done is kept in {part}, and the same command goes on")
+        raise
+    say(f"{json_module.loads((output / 'manifest.json').read_text())['samples']} presses in {output}")
 
 
-def _leave_interrupts_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+def _crew(workers: int | None, cluster: str | None) -> AbstractContextManager["Workers"]:
+    from isocharge.simulate.workers import cores, dask_workers, local_workers
+
+    return dask_workers(cluster) if cluster else local_workers(workers or min(cores(), MOST_WORKERS))

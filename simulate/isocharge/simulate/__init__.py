@@ -10,19 +10,20 @@ charge = touch_charge(sensor, equilibrium)  # C, in the order of sensor.electrod
 from isocharge.extras import require
 
 with require("simulate"):
-    from isocharge.simulate.charge import touch_charge
+    from isocharge.simulate.charge import contact_charge, pretension_charge, thermal_charge, touch_charge
     from isocharge.simulate.dataset import Dataset, Samples, read_dataset, write_dataset
-    from isocharge.simulate.equilibrium import STANDARD, Equilibrium, press
+    from isocharge.simulate.equilibrium import Equilibrium
     from isocharge.simulate.forward import ForwardMap
     from isocharge.simulate.noise import NoiseModel, noise_model
-    from isocharge.simulate.probe import Circle, parse_probe
+    from isocharge.simulate.probe import Circle, Polygon, Probe, parse_probe
     from isocharge.simulate.sensor import Calibration, Electrode, Film, Piezo, Sensor
     from isocharge.simulate.sensor_file import built_in_sensors, load_sensor, sensor_from_dict, sensor_to_dict
+    from isocharge.simulate.solve import press
     from isocharge.simulate.sweep import Sweep, run_sweep, solve_maps, write_sweep
     from isocharge.simulate.template import Resolution
+    from isocharge.simulate.theory import Theory, theory_for
 
 __all__ = [
-    "STANDARD",
     "Calibration",
     "Circle",
     "Dataset",
@@ -32,20 +33,27 @@ __all__ = [
     "ForwardMap",
     "NoiseModel",
     "Piezo",
+    "Polygon",
+    "Probe",
     "Resolution",
     "Samples",
     "Sensor",
     "Sweep",
+    "Theory",
     "built_in_sensors",
+    "contact_charge",
     "load_sensor",
     "noise_model",
     "parse_probe",
     "press",
+    "pretension_charge",
     "read_dataset",
     "run_sweep",
     "sensor_from_dict",
     "sensor_to_dict",
     "solve_maps",
+    "theory_for",
+    "thermal_charge",
     "touch_charge",
     "write_dataset",
     "write_sweep",

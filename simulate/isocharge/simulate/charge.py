@@ -18,9 +18,11 @@ import numpy as np
 from isocharge.errors import SensorError
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.equilibrium import Equilibrium
+from isocharge.simulate.polygon import area_in_disk, shared_area
+from isocharge.simulate.probe import Circle, Probe
 from isocharge.simulate.sensor import Electrode, Sensor
 
-FINE, COARSE = 12, 5
+FINE, COARSE = 12, 4
 """Gauss points per side of an electrode, near the probe and away: the stress has a kink on the footprint's edge."""
 
 NEAR = 3e-3
@@ -41,12 +43,7 @@ class ReadoutPoints:
 
     @classmethod
     def of(cls, sensor: Sensor, per_side: int) -> "ReadoutPoints":
-        """Integration points for a sensor's electrodes and readout.
-
-        Raises:
-            SensorError: If the sensor asks for an effect that is not modelled.
-        """
-        _check_supported(sensor)
+        """Integration points for a sensor's electrodes and readout."""
         rule = _edge_rule if sensor.readout == "edge" else _area_rule
         parts = [rule(electrode, per_side) for electrode in sensor.electrodes]
         most = max(share.shape[0] for _, share in parts)
@@ -75,22 +72,57 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
         positive coefficient.
 
     Raises:
-        SensorError: If the film is another one or the sensor asks for an effect that is not modelled.
+        SensorError: If the film is another one, or the sensor reads a surface and bending was left out.
     """
     if sensor.film != equilibrium.film:
         raise SensorError(f"the equilibrium belongs to another film: expected {sensor.film}, got {equilibrium.film}")
-    readout = ReadoutPoints.of(sensor, FINE)
-    stress = equilibrium.touch_stress(readout.points.reshape(-1, 2))
-    return readout.charge(stress.reshape(*readout.points.shape[:2], 3))
-
-
-def _check_supported(sensor: Sensor) -> None:
-    if sensor.surface != "middle":
-        raise SensorError(f"surface {sensor.surface!r} needs bending, which this version does not model; use 'middle'")
-    if sensor.piezo.d33 != 0.0:
+    if sensor.surface != "middle" and not equilibrium.theory.bending:
         raise SensorError(
-            f"piezo d33 = {sensor.piezo.d33 * 1e12:g} pC/N: this version does not model contact pressure; use 0"
+            f"surface {sensor.surface!r} needs bending, but the film was solved as a {equilibrium.theory.name}; solve "
+            "it with theory=theory_for(sensor, (force, force))"
         )
+    readout = ReadoutPoints.of(sensor, FINE)
+    stress = equilibrium.touch_stress(readout.points.reshape(-1, 2), sensor.surface)
+    charge = readout.charge(stress.reshape(*readout.points.shape[:2], 3))
+    charge += contact_charge(sensor, equilibrium.probe, equilibrium.at, equilibrium.force)
+    return charge
+
+
+def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
+    """Charge of the contact pressure on the electrodes, d33 * s33 with s33 = -pressure, shape (n_electrode,), C.
+
+    Only the part of an electrode under the footprint counts; a negative d33, as PVDF has, gives a positive charge.
+    """
+    if sensor.piezo.d33 == 0.0:
+        return np.zeros(len(sensor.electrodes))
+    covered = [_covered(sensor.calibration.place(np.array(e.corners)), probe, complex(*at)) for e in sensor.electrodes]
+    pressed: Array = -sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered)
+    return pressed
+
+
+def _covered(corners: Array, probe: Probe, at: complex) -> float:
+    """Area of an electrode under a footprint, m^2."""
+    electrode = corners @ np.array([1.0, 1j])
+    if isinstance(probe, Circle):
+        return area_in_disk(electrode, at, probe.radius)
+    return shared_area(electrode, at + probe.outline)
+
+
+def pretension_charge(sensor: Sensor) -> Array:
+    """Reading without load, from the uniform pretension: what a touch charge is counted from; (n_electrode,), C."""
+    per_area = (sensor.piezo.d31 + sensor.piezo.d32) * sensor.film.pretension
+    return _per_area(sensor, per_area)
+
+
+def thermal_charge(sensor: Sensor, step: float) -> Array:
+    """Pyroelectric charge of a uniform temperature step (K), shape (n_electrode,), C: the same on equal electrodes."""
+    return _per_area(sensor, sensor.piezo.pyro * step)
+
+
+def _per_area(sensor: Sensor, density: float) -> Array:
+    """Reading of a uniform charge density (C/m^2), shape (n_electrode,), C."""
+    reading: Array = sensor.gains * np.array([electrode.area for electrode in sensor.electrodes]) * density
+    return reading
 
 
 def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ format; it has no solver and no seed.
 import io
 import json
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -32,7 +32,7 @@ COLUMNS = {
     "y_mm": "position of the press across it, mm",
     "force_N": "force of the press, N, positive pushes",
     "probe": "the object that presses, notation without the angle",
-    "orientation_deg": "angle by which the probe is turned, deg, anticlockwise",
+    "orientation_deg": "angle by which the probe is turned against its notation, deg, anticlockwise",
     "charge_pC": "touch charge of each electrode, pC, electrodes in the manifest's order",
 }
 
@@ -99,29 +99,54 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
         DatasetError: If a shard's columns disagree or hold numbers that are not finite.
     """
     with new_folder(folder) as partial:
-        entries = [_write_shard(partial, number, samples, sensor) for number, samples in enumerate(shards)]
-        manifest = {
-            "format_version": FORMAT_VERSION,
-            "package_version": metadata.version("isocharge"),
-            "sensor": sensor_to_dict(sensor),
-            "electrodes": list(sensor.electrode_names),
-            **about,
-            "columns": COLUMNS,
-            "samples": sum(entry["samples"] for entry in entries),
-            "shards": entries,
-        }
-        write_whole(partial / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
-        write_whole(partial / "README.md", _card(folder.name, manifest).encode())
+        entries = []
+        for number, samples in enumerate(shards):
+            name, data = pack_shard(number, samples, sensor)
+            write_whole(partial / name, data)
+            entries.append(shard_entry(name, len(samples), data))
+        write_manifest(partial, folder.name, sensor, entries, about)
     return folder
 
 
-def _write_shard(folder: Path, number: int, samples: Samples, sensor: Sensor) -> dict[str, Any]:
-    name = f"shard-{number:05d}.npz"
+def pack_shard(number: int, samples: Samples, sensor: Sensor) -> tuple[str, bytes]:
+    """A shard's file name and content.
+
+    Raises:
+        DatasetError: If the columns disagree or hold numbers that are not finite.
+    """
+    name = shard_name(number)
     _check_samples(samples, len(sensor.electrodes), name)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **samples.columns())
-    write_whole(folder / name, buffer.getvalue())
-    return {"file": name, "samples": len(samples), "sha256": sha256_of(buffer.getvalue())}
+    return name, buffer.getvalue()
+
+
+def shard_name(number: int) -> str:
+    """File name of a shard."""
+    return f"shard-{number:05d}.npz"
+
+
+def shard_entry(name: str, samples: int, data: bytes) -> dict[str, Any]:
+    """What the manifest says of a shard."""
+    return {"file": name, "samples": samples, "sha256": sha256_of(data)}
+
+
+def write_manifest(
+    folder: Path, name: str, sensor: Sensor, entries: Sequence[dict[str, Any]], about: dict[str, Any]
+) -> None:
+    """Manifest and card of a dataset whose shards are in `folder` and which will be called `name`."""
+    manifest = {
+        "format_version": FORMAT_VERSION,
+        "package_version": metadata.version("isocharge"),
+        "sensor": sensor_to_dict(sensor),
+        "electrodes": list(sensor.electrode_names),
+        **about,
+        "columns": COLUMNS,
+        "samples": sum(entry["samples"] for entry in entries),
+        "shards": list(entries),
+    }
+    write_whole(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
+    write_whole(folder / "README.md", _card(name, manifest).encode())
 
 
 def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
@@ -228,9 +253,17 @@ def _card(name: str, manifest: dict[str, Any]) -> str:
         f"| probes | {', '.join(manifest.get('probes', []))} |",
         *(f"| {key} | {value} |" for key, value in ranges.items()),
         *(f"| {key} | {manifest[key]} |" for key in ("sampling", "noise", "seed") if key in manifest),
-        *(f"| solver: {key} | {value} |" for key, value in solver.items()),
+        *(f"| solver: {key} | {value} |" for key, value in _flat(solver)),
         "",
         "Read it with `isocharge.simulate.read_dataset(folder)`, which checks every shard's checksum.",
         "",
     ]
     return "\n".join(lines)
+
+
+def _flat(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from ((f"{key} {inner}", deep) for inner, deep in _flat(value))
+        else:
+            yield key, value

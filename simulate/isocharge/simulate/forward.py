@@ -1,9 +1,11 @@
 """The forward map: charges for many presses from a few solves.
 
-Presses of one probe form a family in distance from the centre and force; the angle is a turn. The stress at the nodes
-of the template is a smooth function of both, so it is solved on Chebyshev nodes and interpolated as a field, and the
-charge is integrated from the interpolated field for every press anew: exact about the place of the electrode, with the
-probe on it included. How well it does is measured against direct solves when it is built.
+Presses of one probe form a family in distance from the centre, force and, unless the probe is round, orientation; the
+angle of the position is a turn. Seen from the probe, the stress at the nodes of the template is a smooth function of
+all of them. It is solved on Chebyshev nodes in distance and the force's logarithm and on evenly spread orientations,
+interpolated as a field, and the charge is integrated from the interpolated field for every press anew: exact about the
+place of the electrode, with the probe on it included. How well it does is measured against direct solves when it is
+built.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -14,23 +16,21 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.errors import SceneError, SolveError
-from isocharge.simulate.arrays import Array, Complexes
-from isocharge.simulate.charge import COARSE, FINE, NEAR, ReadoutPoints, touch_charge
-from isocharge.simulate.equilibrium import (
-    Equilibrium,
-    amplitude_squared,
-    bending_share,
-    check_scene,
-    press,
-    resolution_for,
-    single_threaded_blas,
-    turn_stress,
-)
-from isocharge.simulate.membrane import film_gradient, strain, stress
-from isocharge.simulate.probe import Circle
-from isocharge.simulate.sensor import Film, Sensor
-from isocharge.simulate.spectral import barycentric_weights, chebyshev_nodes, lagrange_values, lobatto_nodes
-from isocharge.simulate.template import Placement, Resolution, template
+from isocharge.simulate.arrays import Array, Complexes, Integers
+from isocharge.simulate.blas import single_threaded_blas
+from isocharge.simulate.charge import COARSE, FINE, NEAR, ReadoutPoints, contact_charge, touch_charge
+from isocharge.simulate.equilibrium import Equilibrium
+from isocharge.simulate.family import Family
+from isocharge.simulate.membrane import turn_stress
+from isocharge.simulate.meshing import layer_for, resolution_for, template_for
+from isocharge.simulate.placement import Placement
+from isocharge.simulate.probe import Probe
+from isocharge.simulate.scaling import amplitude_squared
+from isocharge.simulate.sensor import Film, Sensor, Surface
+from isocharge.simulate.solve import check_scene, press
+from isocharge.simulate.spectral import tensor_values
+from isocharge.simulate.template import Resolution
+from isocharge.simulate.theory import ACCURACY, Theory, theory_for
 
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
@@ -41,62 +41,35 @@ CHUNK = 256
 INTERPOLATION_ERROR = 5e-4
 """Largest relative error of any charge against direct solves that a forward map may have."""
 
+SMALL = 0.1
+"""Share of a press's largest charge below which an error counts as if the charge were that large."""
+
 CHECKS = 10
 """Direct solves that a forward map is compared with."""
-
-TOO_THICK = 0.05
-"""Share of bending above which a membrane's charges are not worth a dataset."""
-
-
-@dataclass(frozen=True)
-class Nodes:
-    """Where a family is solved.
-
-    Attributes:
-        distance: Distances from the centre, shape (n_distance,), m.
-        force: Forces, shape (n_force,), N; Chebyshev in the logarithm.
-    """
-
-    distance: Array
-    force: Array
-
-    @classmethod
-    def spread(cls, radius: float, force_range: tuple[float, float], count: tuple[int, int]) -> "Nodes":
-        """Chebyshev nodes for distances up to `radius`."""
-        low, high = np.log(force_range)
-        force = np.exp(chebyshev_nodes(count[1], low, high)) if high > low else np.array([force_range[0]])
-        return cls(chebyshev_nodes(count[0], 0.0, radius), force)
-
-    def weights(self, distance: Array, force: Array) -> Array:
-        """Interpolation weights for presses, shape (n, n_distance * n_force)."""
-        by_distance = lagrange_values(self.distance, barycentric_weights(self.distance), distance)
-        logs = np.log(self.force)
-        by_force = lagrange_values(logs, barycentric_weights(logs), np.log(force))
-        weights: Array = (by_distance[:, :, None] * by_force[:, None, :]).reshape(distance.size, -1)
-        return weights
 
 
 @dataclass(frozen=True)
 class ForwardMap:
-    """Touch charges of a sensor under one probe as a function of (x, y, F).
+    """Touch charges of a sensor under one probe as a function of (x, y, F) and orientation.
 
     Attributes:
         sensor: The sensor.
         probe: The footprint.
-        radius: Presses up to this distance from the centre are covered, m.
-        force_range: Smallest and largest force covered, N.
+        family: Where it was solved: distances, forces, orientations.
+        theory: Which terms were in.
         resolution: Mesh of the solves.
-        nodes: Where it was solved.
-        table: Scaled stress C : E' at the nodes of every element, shape (n_solve, n_element * n_local, 3).
+        layer: Width of its thin rings at the rim over the film's radius.
+        table: Scaled stress C : E' at the nodes of every element, in a frame that turns with the probe; shape
+            (n_distance * n_force * n_turn, n_element * n_local * 3).
         error: Largest relative error of a charge against the direct solves that the build compared with.
     """
 
     sensor: Sensor
-    probe: Circle
-    radius: float
-    force_range: tuple[float, float]
+    probe: Probe
+    family: Family
+    theory: Theory
     resolution: Resolution
-    nodes: Nodes
+    layer: float
     table: Array
     error: float
 
@@ -104,10 +77,12 @@ class ForwardMap:
     def build(
         cls,
         sensor: Sensor,
-        probe: Circle,
+        probe: Probe,
         radius: float = 8e-3,
         force_range: tuple[float, float] = (0.05, 2.0),
         *,
+        theory: Theory | None = None,
+        accuracy: float = ACCURACY,
         resolution: Resolution | None = None,
         executor: Executor | None = None,
         progress: Progress | None = None,
@@ -119,36 +94,57 @@ class ForwardMap:
             probe: The footprint.
             radius: Largest distance of a press from the centre, m.
             force_range: Smallest and largest force, N.
+            theory: Which terms to model; the fewest that the accuracy allows over the forces if absent.
+            accuracy: Relative error of a charge that is wanted.
             resolution: Mesh; the coarsest that carries the outermost press well if absent.
             executor: Where the solves run; here and now if absent. The result does not depend on it.
             progress: Told how many solves are done.
 
         Raises:
-            SceneError: If some presses cannot exist or the film is too thick for a membrane.
+            SceneError: If some presses cannot exist.
             SolveError: If an equilibrium or the wanted interpolation error was not reached.
         """
-        _check_family(sensor.film, probe, radius, force_range)
-        resolution = resolution or resolution_for(sensor.film, probe, (radius, 0.0))
+        film = sensor.film
+        _check_family(film, probe, radius, force_range)
+        theory = theory or theory_for(sensor, force_range, accuracy)
+        layer = layer_for(film, float(np.sqrt(force_range[0] * force_range[1])))
+        resolution = resolution or resolution_for(film, probe, (radius, 0.0), theory, accuracy, layer)
         error = np.inf
-        for count in ((8, 3), (11, 5), (15, 8)):
-            nodes = Nodes.spread(radius, force_range, count)
-            table = _solve_family(sensor.film, probe, nodes, resolution, executor, progress)
-            made = cls(sensor, probe, radius, force_range, resolution, nodes, table, error)
+        for count in ((5, 3), (8, 5), (13, 8)):
+            family = Family.spread(radius, force_range, count, probe.period)
+            table = _solve_family(film, probe, sensor.surface, family, theory, resolution, layer, executor, progress)
+            made = cls(sensor, probe, family, theory, resolution, layer, table, error)
             error = _check_against_solves(made)
             if error <= INTERPOLATION_ERROR:
-                return cls(sensor, probe, radius, force_range, resolution, nodes, table, error)
+                return cls(sensor, probe, family, theory, resolution, layer, table, error)
         raise SolveError(
             f"the forward map of {sensor.name} up to {radius * 1e3:g} mm and {force_range[1]:g} N interpolates to "
             f"{error:.2g} only, expected {INTERPOLATION_ERROR:g}; ask for a smaller radius or range of forces"
         )
 
-    def forward(self, x: Array, y: Array, force: Array) -> Array:
+    @property
+    def radius(self) -> float:
+        """Presses up to this distance from the centre are covered, m."""
+        return self.family.radius
+
+    @property
+    def force_range(self) -> tuple[float, float]:
+        """Smallest and largest force covered, N."""
+        return self.family.force_range
+
+    @property
+    def solves(self) -> int:
+        """How many equilibria the map was made from."""
+        return self.family.distance.size * self.family.force.size * self.family.solved_turns.size
+
+    def forward(self, x: Array, y: Array, force: Array, orientation: Array | float = 0.0) -> Array:
         """Touch charges.
 
         Args:
             x: Positions, shape (n,), m.
             y: Positions, shape (n,), m.
             force: Forces, shape (n,), N; where zero the film is untouched and the charges are zero.
+            orientation: How far the probe is turned further, shape (n,) or a number, rad, anticlockwise.
 
         Returns:
             Shape (n, n_electrode), C.
@@ -156,14 +152,16 @@ class ForwardMap:
         Raises:
             SceneError: If a press lies outside the covered radius or forces.
         """
-        x, y, force = np.broadcast_arrays(*(np.asarray(value, dtype=float) for value in (x, y, force)))
+        x, y, force, orientation = np.broadcast_arrays(
+            *(np.asarray(value, dtype=float) for value in (x, y, force, orientation))
+        )
         touched = np.flatnonzero(force != 0.0)
         self._check_inside(x[touched], y[touched], force[touched])
         charge = np.zeros((x.size, len(self.sensor.electrodes)))
         with single_threaded_blas():
             for start in range(0, touched.size, CHUNK):
                 chunk = touched[start : start + CHUNK]
-                charge[chunk] = self._charges(x[chunk] + 1j * y[chunk], force[chunk])
+                charge[chunk] = self._charges(x[chunk] + 1j * y[chunk], force[chunk], orientation[chunk])
         return charge
 
     def _check_inside(self, x: Array, y: Array, force: Array) -> None:
@@ -177,16 +175,25 @@ class ForwardMap:
                 f"map: expected at most {self.radius * 1e3:g} mm from the centre and {low:g} to {high:g} N"
             )
 
-    def _charges(self, at: Complexes, force: Array) -> Array:
+    def _charges(self, at: Complexes, force: Array, orientation: Array) -> Array:
         """Charges of one chunk of presses, shape (n, n_electrode)."""
-        field = self.nodes.weights(np.abs(at), force) @ self.table.reshape(len(self.table), -1)
+        turn = orientation - np.angle(at)
+        field = self.family.weights(np.abs(at), force, turn) @ self.table
+        mesh = template_for(self.probe, self.resolution)
+        placement = Placement.of(mesh, self.probe, np.abs(at), self.sensor.film.radius, self.layer, turn)
         charge = np.empty((at.size, len(self.sensor.electrodes)))
         near, (fine, coarse) = self._near(at), self._readouts
         for readout, chosen in ((fine, near), (coarse, ~near)):
             press_index, electrode = np.nonzero(chosen)
-            charge[press_index, electrode] = self._read(readout, field, at, press_index, electrode)
+            charge[press_index, electrode] = self._read(
+                readout, field, placement, at, turn + self.probe.angle, press_index, electrode
+            )
         scale = self.sensor.film.young * amplitude_squared(self.sensor.film, force)
         scaled: Array = charge * scale[:, None]
+        if self.sensor.piezo.d33 != 0.0:
+            for i, e in zip(*np.nonzero(near), strict=True):
+                probe = self.probe.turned(float(orientation[i]))
+                scaled[i, e] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])[e]
         return scaled
 
     @cached_property
@@ -199,62 +206,73 @@ class ForwardMap:
         corners = [self.sensor.calibration.place(np.array(e.corners)) for e in self.sensor.electrodes]
         centre = np.array([c.mean(axis=0) @ [1.0, 1j] for c in corners])
         reach = np.array([np.linalg.norm(c - c.mean(axis=0), axis=1).max() for c in corners])
-        near: np.ndarray = np.abs(at[:, None] - centre) < reach + self.probe.radius + NEAR
+        near: np.ndarray = np.abs(at[:, None] - centre) < reach + self.probe.reach + NEAR
         return near
 
     def _read(
         self,
         readout: ReadoutPoints,
         field: Array,
+        placement: Placement,
         at: Complexes,
-        press_index: np.ndarray,
-        electrode: np.ndarray,
+        frame: Array,
+        press_index: Integers,
+        electrode: Integers,
     ) -> Array:
-        """Scaled charges of pairs of press and electrode, shape (n_pair,)."""
-        mesh, angle = template(self.resolution), np.angle(at[press_index])
+        """Scaled charges of pairs of press and electrode, shape (n_pair,).
+
+        `frame` is the angle of the probe, and of the field's stress, from the direction of the press, shape (n,).
+        """
+        mesh, angle = template_for(self.probe, self.resolution), np.angle(at[press_index])
         points = readout.points[electrode] @ np.array([1.0, 1j]) / self.sensor.film.radius
-        turned = points * np.exp(-1j * angle)[:, None]
-        placement = Placement.of_circle(
-            np.abs(at[press_index])[:, None] / self.sensor.film.radius,
-            self.probe.radius / self.sensor.film.radius,
-        )
-        z = placement.to_template(turned)
-        element, xi, eta = mesh.locate(z.ravel(), np.broadcast_to(placement.rho, z.shape).ravel())
-        values, _ = mesh.basis_at(xi, eta)
-        nodal = field.reshape(len(field), mesh.n_element, -1, 3)[np.repeat(press_index, z.shape[1]), element]
-        local = np.matmul(values[:, None, :], nodal).reshape(*z.shape, 3)
-        stress_there = turn_stress(local, angle[:, None])
-        charge: Array = np.einsum("kpc,kpc->k", stress_there, readout.weights[electrode])
+        film = points * np.exp(-1j * angle)[:, None]
+        mirrored = (film.imag < 0.0) & mesh.half
+        film = np.where(mesh.half, film.real + 1j * np.abs(film.imag), film)
+        element, xi, eta = placement[press_index].locate(mesh, film)
+        values = tensor_values(self.resolution.order, xi.ravel(), eta.ravel())
+        nodal = field.reshape(len(field), mesh.n_element, -1, 3)[press_index[:, None], element]
+        local = np.matmul(values[:, None, :], nodal.reshape(*values.shape, 3)).reshape(*film.shape, 3)
+        local[mirrored, 2] *= -1.0
+        stress = turn_stress(local, (angle if mesh.half else angle + frame[press_index])[:, None])
+        charge: Array = np.einsum("kpc,kpc->k", stress, readout.weights[electrode])
         return charge
 
 
-def _check_family(film: Film, probe: Circle, radius: float, force_range: tuple[float, float]) -> None:
+def _check_family(film: Film, probe: Probe, radius: float, force_range: tuple[float, float]) -> None:
     low, high = force_range
     if not (0.0 < low <= high and np.isfinite(high)):
         raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {low} to {high}")
     if not (np.isfinite(radius) and radius > 0.0):
         raise SceneError(f"radius: expected a positive number, got {radius * 1e3} mm")
-    check_scene(film, probe, (radius, 0.0), high)
-    share = bending_share(film, amplitude_squared(film, low))
-    if share > TOO_THICK:
+    if radius + probe.reach >= film.radius:
         raise SceneError(
-            f"a film of {film.thickness * 1e6:g} um at {low:g} N carries about {share:.0%} of its load by bending, "
-            f"which this version does not model: expected at most {TOO_THICK:.0%}; use a thinner film or larger forces"
+            f"radius: presses up to {radius * 1e3:.4g} mm from the centre with {probe.notation}, which reaches "
+            f"{probe.reach * 1e3:.4g} mm, leave the film of radius {film.radius * 1e3:.4g} mm"
         )
+    check_scene(film, probe, (radius, 0.0), high)
 
 
 def _solve_family(
     film: Film,
-    probe: Circle,
-    nodes: Nodes,
+    probe: Probe,
+    surface: Surface,
+    family: Family,
+    theory: Theory,
     resolution: Resolution,
+    layer: float,
     executor: Executor | None,
     progress: Progress | None,
 ) -> Array:
-    """Scaled nodal stress of every solve, shape (n_distance * n_force, n_element * n_local, 3)."""
-    jobs = [(film, probe, float(distance), nodes.force, resolution) for distance in nodes.distance]
+    """Scaled nodal stress of every member, shape (n_distance * n_force * n_turn, n_element * n_local * 3)."""
+    jobs = [
+        (film, probe.turned(float(turn)), surface, float(distance), family.force, theory, resolution, layer)
+        for distance in family.distance
+        for turn in family.solved_turns
+    ]
     results: Iterable[Array] = executor.map(_solve_chain, jobs) if executor else map(_solve_chain, jobs)
-    return np.concatenate(list(_report(results, len(jobs), progress)))
+    solved = np.stack(list(_report(results, len(jobs), progress)))
+    shape = (family.distance.size, family.solved_turns.size, family.force.size, -1)
+    return family.unfold(solved.reshape(shape), template_for(probe, resolution))
 
 
 def _report(results: Iterable[Array], total: int, progress: Progress | None) -> Iterator[Array]:
@@ -264,39 +282,29 @@ def _report(results: Iterable[Array], total: int, progress: Progress | None) -> 
         yield result
 
 
-def _solve_chain(job: tuple[Film, Circle, float, Array, Resolution]) -> Array:
-    """One distance, all forces, each solve started from the one before; shape (n_force, n_element * n_local, 3)."""
-    film, probe, distance, forces, resolution = job
+def _solve_chain(job: tuple[Film, Probe, Surface, float, Array, Theory, Resolution, float]) -> Array:
+    """One distance and orientation, all forces, each started from the one before; shape (n_force, ...)."""
+    film, probe, surface, distance, forces, theory, resolution, layer = job
     start: Equilibrium | None = None
     rows = []
     for force in forces:
-        start = press(film, probe, (distance, 0.0), float(force), resolution=resolution, start=start)
-        rows.append(nodal_stress(start).reshape(-1, 3))
+        start = press(
+            film, probe, (distance, 0.0), float(force), theory=theory, resolution=resolution, layer=layer, start=start
+        )
+        rows.append(turn_stress(start.nodal_stress(surface), -probe.angle).ravel())
     return np.stack(rows)
-
-
-def nodal_stress(equilibrium: Equilibrium) -> Array:
-    """Scaled stress C : E' at the nodes of every element, (n_element, n_local, 3), the press turned onto the x axis."""
-    mesh, placement = template(equilibrium.resolution), equilibrium.placement
-    line = lobatto_nodes(equilibrium.resolution.order)
-    xi, eta = np.meshgrid(line, line)
-    _, by_local = mesh.basis_at(xi.ravel(), eta.ravel())
-    gradient, _ = film_gradient(by_local[:, None], placement.to_film(mesh.element_points(placement.rho)))
-    slope = np.einsum("epan,eni->epai", gradient, equilibrium.field[mesh.nodes])
-    return stress(strain(slope, equilibrium.groups.amplitude2), equilibrium.groups.poisson)
 
 
 def _check_against_solves(made: ForwardMap) -> float:
     """Largest relative error of a charge over presses between the nodes and at the edge of the family."""
-    shares = np.sqrt(chebyshev_nodes(CHECKS - 1, 0.0, 1.0))
-    low, high = np.log(made.force_range)
     errors = []
-    for number, share in enumerate([*shares, 1.0]):
-        angle, force = 2.4 * number, float(np.exp(low + (high - low) * ((0.5 + 0.618 * number) % 1.0)))
-        force = min(max(force, made.force_range[0]), made.force_range[1])
-        x, y = made.radius * share * np.cos(angle), made.radius * share * np.sin(angle)
-        solved = press(made.sensor.film, made.probe, (x, y), force, resolution=made.resolution)
+    for distance, angle, force, turn in made.family.probes_between(CHECKS):
+        x, y = distance * np.cos(angle), distance * np.sin(angle)
+        solved = press(
+            made.sensor.film, made.probe.turned(turn), (x, y), force, theory=made.theory, resolution=made.resolution
+        )
         direct = touch_charge(made.sensor, solved)
-        mapped = made.forward(np.array([x]), np.array([y]), np.array([force]))[0]
-        errors.append(np.abs(mapped / direct - 1.0).max())
+        mapped = made.forward(np.array([x]), np.array([y]), np.array([force]), turn)[0]
+        scale = np.maximum(np.abs(direct), SMALL * np.abs(direct).max())
+        errors.append((np.abs(mapped - direct) / scale).max())
     return float(np.max(errors))

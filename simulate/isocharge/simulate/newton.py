@@ -1,4 +1,4 @@
-"""Newton's method for a membrane that may be flat and slack at the start.
+"""Newton's method for a film that may be flat and slack at the start, and the linear theories as its first step.
 
 A flat film without pretension has no transverse stiffness and plain Newton fails in many ways. What holds up: a start
 of Schwerin's shape, an energy line search, and some tension added to the tangent only, in proportion to the residual,
@@ -11,16 +11,23 @@ import numpy as np
 
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.assembly import Assembly
-from isocharge.simulate.membrane import Groups, Membrane
+from isocharge.simulate.elastic import ElasticFilm
+from isocharge.simulate.scaling import Groups
 
 GUARD_TENSION = 0.4
-"""Tension added to the tangent at a relative residual of one, in units of E_young A^2 (5 MPa at 25 um and 1 N)."""
+"""Tension added to the tangent at a relative residual of one, over a slack film's own (5 MPa at 25 um and 1 N)."""
 
 GUARD_BELOW = 1e-2
 """Relative residual below which the tangent is left as it is."""
 
 MAX_ITERATIONS = 60
-"""Limit of Newton steps; ordinary scenes take six to ten."""
+"""Limit of Newton steps; ordinary scenes take five to ten."""
+
+PATIENCE = 12
+"""Steps in which their size must halve, after the first as many."""
+
+ROUND_OFF = 1e-9
+"""Size of a Newton step in the energy norm, relative to the load's work, from which on only round-off is left."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +36,9 @@ class NewtonResult:
 
     Attributes:
         field: Nodal (U1, U2, W), shape (n_node, 3).
-        converged: Whether the residual is below the tolerance.
+        converged: Whether the residual is below the tolerance or as low as round-off lets it.
         iterations: Linear solves done.
-        residual: Norm of the out-of-balance force over the norm of the load.
+        residual: Out-of-balance force: the larger of transverse over load and in-plane over in-plane force.
         message: One sentence for people.
     """
 
@@ -42,88 +49,118 @@ class NewtonResult:
     message: str
 
 
-def schwerin_start(z: np.ndarray, rho: float, radius: float, groups: Groups) -> Array:
+def schwerin_start(z: np.ndarray, rho: float, groups: Groups) -> Array:
     """A first field: Schwerin's point-load shape in the template's coordinate, no in-plane displacement.
 
-    W = (3 / pi)^(1/3) (1 - r^(2/3)) solves a point load exactly at Poisson 1/3 (Schwerin 1929). With pretension its
-    height comes from the cubic that joins W ~ load^(1/3) to W ~ load / tension.
+    W = (3 / pi)^(1/3) (1 - r^(2/3)) solves a point load on a slack membrane exactly at Poisson 1/3 (Schwerin 1929).
+    Tension and bending lower it.
 
     Args:
         z: Template coordinates of the nodes, shape (n_node,).
         rho: Footprint radius in the template.
-        radius: Footprint radius over film radius.
         groups: The scene.
 
     Returns:
         Field of shape (n_node, 3).
     """
     shape = np.cbrt(1.0 + rho**2) - np.cbrt(np.abs(z) ** 2 + rho**2)
-    slack = np.cbrt(3.0 / np.pi * groups.load)
-    taut = -np.log(radius) / (2.0 * np.pi * max(shape.max(), 1e-3)) * groups.load
-    roots = np.roots([slack**-3, 0.0, groups.tension / taut, -1.0])
-    height = float(roots[np.argmin(np.abs(roots.imag))].real)
     field = np.zeros((z.size, 3))
-    field[:, 2] = height * shape
+    field[:, 2] = groups.height * shape
     field[np.abs(z) > 1.0 - 1e-9] = 0.0
     return field
 
 
-def solve_newton(membrane: Membrane, assembly: Assembly, start: Array, tolerance: float) -> NewtonResult:
+def solve_linear(film: ElasticFilm, assembly: Assembly) -> NewtonResult:
+    """The linear theories: W from load, tension and bending alone, then the in-plane displacement that W asks for.
+
+    The stress that the deflection induces does not act back on it. The flat film's tangent does not couple W and U, so
+    one matrix serves both steps.
+    """
+    flat = np.zeros((assembly.free.shape[0], 3))
+    tangent = film.tangent(flat)
+    field = assembly.solve(tangent, -film.residual(flat))
+    in_plane = -film.residual(field)
+    in_plane[:, 2] = 0.0
+    field = field + assembly.solve(tangent, in_plane)
+    return NewtonResult(field, bool(np.isfinite(field).all()), 2, 0.0, "linear theory, solved directly")
+
+
+def solve_newton(film: ElasticFilm, assembly: Assembly, start: Array, tolerance: float) -> NewtonResult:
     """Find the equilibrium from a start.
 
     Args:
-        membrane: The discrete problem.
+        film: The discrete problem.
         assembly: Solver for its template.
-        start: First field, shape (n_node, 3), zero on the rim.
+        start: First field, shape (n_node, 3), zero where fixed.
         tolerance: Relative residual to reach.
 
     Returns:
         The result, converged or not; the caller decides what a failure means.
     """
-    free = slice(0, assembly.n_free)
-    load_norm = membrane.groups.load * float(np.linalg.norm(membrane.geometry.load))
-    field, residual = start, membrane.residual(start)
-    for iteration in range(MAX_ITERATIONS):
-        relative = float(np.linalg.norm(residual[free])) / load_norm
+    field, residual = start, film.residual(start)
+    free = assembly.free[:, :3]
+    sizes: list[float] = []
+    for iteration in range(MAX_ITERATIONS + 1):
+        relative = _relative(film, field, residual * free)
         if not np.isfinite(relative):
             return NewtonResult(field, False, iteration, relative, "the residual is not a finite number")
         if relative <= tolerance:
             return NewtonResult(field, True, iteration, relative, f"converged in {iteration} steps")
-        step = _descent_step(membrane, assembly, field, residual, relative)
-        taken = _line_search(membrane, field, step, residual, free)
+        if iteration == MAX_ITERATIONS or _stalled(sizes):
+            return NewtonResult(field, False, iteration, relative, f"no progress any more after {iteration} steps")
+        step = _descent_step(film, assembly, field, residual, relative)
+        sizes.append(_energy_norm(film, field, step, residual))
+        if sizes[-1] <= ROUND_OFF:
+            return NewtonResult(field, True, iteration, relative, f"converged to round-off in {iteration} steps")
+        taken = _line_search(film, field, step, residual, free)
         if taken is None:
             return NewtonResult(field, False, iteration, relative, "no step lowers the energy any more")
         field, residual = taken
-    relative = float(np.linalg.norm(residual[free])) / load_norm
-    done = relative <= tolerance
-    return NewtonResult(field, done, MAX_ITERATIONS, relative, f"stopped after {MAX_ITERATIONS} steps")
+    raise AssertionError("the loop returns")
 
 
-def _descent_step(membrane: Membrane, assembly: Assembly, field: Array, residual: Array, relative: float) -> Array:
+def _stalled(sizes: list[float]) -> bool:
+    """Whether the steps have stopped shrinking: the film runs away along a direction without stiffness."""
+    return len(sizes) > 2 * PATIENCE and min(sizes[-PATIENCE:]) > 0.5 * min(sizes[:-PATIENCE])
+
+
+def _relative(film: ElasticFilm, field: Array, residual: Array) -> float:
+    across = np.linalg.norm(residual[:, 2]) / (film.groups.load * np.linalg.norm(film.geometry.load))
+    along = np.linalg.norm(residual[:, :2]) / max(film.in_plane_scale(field), 1e-300)
+    return float(max(across, along))
+
+
+def _energy_norm(film: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
+    """Square root of the energy a step would gain over the load's work."""
+    work = film.groups.load * abs(float(film.geometry.load @ field[:, 2]))
+    return float(np.sqrt(abs(float(np.sum(step * residual))) / max(work, 1e-300)))
+
+
+def _descent_step(film: ElasticFilm, assembly: Assembly, field: Array, residual: Array, relative: float) -> Array:
     """Newton step, with more and more tension in the tangent until it goes downhill."""
-    tension = GUARD_TENSION * min(1.0, relative) if relative > GUARD_BELOW else 0.0
+    slack = GUARD_TENSION * float(np.cbrt(film.groups.load)) ** 2
+    tension = slack * min(1.0, relative) if relative > GUARD_BELOW else 0.0
     for _ in range(12):
-        guarded = Membrane(membrane.geometry, membrane.groups.stiffened(tension))
-        step = assembly.solve(guarded.tangent(field), -residual)
+        step = assembly.solve(film.tangent(field, tension), -residual)
         if np.isfinite(step).all() and float(np.sum(step * residual)) < 0.0:
             break
-        tension = max(2.0 * tension, 0.05 * GUARD_TENSION)
+        tension = max(2.0 * tension, 0.05 * slack)
     return step
 
 
 def _line_search(
-    membrane: Membrane, field: Array, step: Array, residual: Array, free: slice
+    film: ElasticFilm, field: Array, step: Array, residual: Array, free: np.ndarray
 ) -> tuple[Array, Array] | None:
     """Halve the step until the energy falls enough (Armijo), or, where the energy's digits end, the residual does."""
-    energy, slope = membrane.energy(field), float(np.sum(step * residual))
+    energy, slope = film.energy(field), float(np.sum(step * residual))
     norm = np.linalg.norm(residual[free])
     share = 1.0
     for _ in range(30):
         trial = field + share * step
-        change = membrane.energy(trial) - energy
+        change = film.energy(trial) - energy
         lower = change <= 1e-4 * share * slope
         if lower or abs(change) <= 1e-12 * abs(energy):
-            trial_residual = membrane.residual(trial)
+            trial_residual = film.residual(trial)
             if lower or np.linalg.norm(trial_residual[free]) < norm:
                 return trial, trial_residual
         share *= 0.5

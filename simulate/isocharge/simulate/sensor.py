@@ -10,6 +10,7 @@ import numpy as np
 
 from isocharge.errors import SensorError
 from isocharge.simulate.arrays import Array
+from isocharge.simulate.polygon import area_of, is_convex, overlap
 
 Readout = Literal["area", "edge"]
 Surface = Literal["middle", "top", "bottom"]
@@ -90,8 +91,7 @@ class Electrode:
     @property
     def area(self) -> float:
         """m^2."""
-        x, y = np.array(self.corners).T
-        return float(0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+        return area_of(np.array(self.corners))
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -150,7 +150,7 @@ class Sensor:
                 raise SensorError(f"readout 'edge' needs square electrodes, but {electrode.name!r} is a polygon")
         for i, first in enumerate(self.electrodes):
             for second in self.electrodes[i + 1 :]:
-                if _overlap(np.array(first.corners), np.array(second.corners)):
+                if overlap(np.array(first.corners), np.array(second.corners)):
                     raise SensorError(f"electrodes {first.name!r} and {second.name!r} overlap; move one of them")
         unknown = set(self.calibration.gain) - set(self.electrode_names)
         if unknown:
@@ -173,7 +173,7 @@ def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration)
         raise SensorError(
             f"electrode {electrode.name!r}: expected at least three corners (x, y), got {corners.tolist()}"
         )
-    if not _is_convex(corners):
+    if not is_convex(corners):
         raise SensorError(
             f"electrode {electrode.name!r}: expected a convex polygon with its corners anticlockwise, "
             f"got {(corners * 1e3).tolist()} mm"
@@ -199,22 +199,3 @@ def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration)
 def _mm(value: float) -> str:
     """For messages, the value already in mm."""
     return str(float(f"{value:.6g}"))
-
-
-def _is_convex(corners: Array) -> bool:
-    """Whether a polygon turns left at every corner and no corner lies to the right of any edge (a star's do)."""
-    edge = np.roll(corners, -1, axis=0) - corners
-    turn = edge[:, 0] * np.roll(edge[:, 1], -1) - edge[:, 1] * np.roll(edge[:, 0], -1)
-    way = corners[None, :] - corners[:, None]
-    left = edge[:, None, 0] * way[..., 1] - edge[:, None, 1] * way[..., 0]
-    return bool(np.all(turn > 0.0) and left.min() >= -1e-9 * left.max())
-
-
-def _overlap(first: Array, second: Array) -> bool:
-    """Whether two convex polygons share area: no edge normal separates them (separating axis theorem)."""
-    for polygon in (first, second):
-        edge = np.roll(polygon, -1, axis=0) - polygon
-        for normal in np.stack([edge[:, 1], -edge[:, 0]], axis=1):
-            if (first @ normal).max() <= (second @ normal).min() or (second @ normal).max() <= (first @ normal).min():
-                return False
-    return True

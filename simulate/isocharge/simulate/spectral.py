@@ -33,6 +33,22 @@ def lobatto_weights(order: int) -> Array:
     return weights
 
 
+@lru_cache(maxsize=32)
+def lobatto_quadrature(order: int) -> Array:
+    """Weights of the Gauss-Lobatto rule on `lobatto_nodes`, shape (order + 1,): exact up to degree 2 order - 1."""
+    weights: Array = np.asarray(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2))
+    weights.flags.writeable = False
+    return weights
+
+
+@lru_cache(maxsize=32)
+def modal_matrix(order: int) -> Array:
+    """Matrix from values on `lobatto_nodes` to Legendre coefficients, shape (order + 1, order + 1)."""
+    matrix: Array = np.linalg.inv(np.polynomial.legendre.legvander(lobatto_nodes(order), order)).astype(np.float64)
+    matrix.flags.writeable = False
+    return matrix
+
+
 def chebyshev_nodes(count: int, low: float, high: float) -> Array:
     """Chebyshev nodes of the first kind on [low, high], ascending, shape (count,)."""
     angle = (2.0 * np.arange(count, 0, -1) - 1.0) * np.pi / (2.0 * count)
@@ -86,3 +102,20 @@ def basis(order: int, at: Array) -> tuple[Array, Array]:
     """Values and derivatives, each of shape (m, order + 1), of the Lobatto basis at points `at` of shape (m,)."""
     values = lagrange_values(lobatto_nodes(order), lobatto_weights(order), at)
     return values, values @ derivative_matrix(order)
+
+
+def tensor_values(order: int, xi: Array, eta: Array) -> Array:
+    """Basis on the square [-1, 1]^2, nodes in tensor order (xi fast), at points of shape (n,): (n, (order + 1)^2)."""
+    nodes, weights = lobatto_nodes(order), lobatto_weights(order)
+    return _product(lagrange_values(nodes, weights, xi), lagrange_values(nodes, weights, eta))
+
+
+def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
+    """Values as `tensor_values` and derivatives by xi and eta, shape (2, n, (order + 1)^2)."""
+    in_xi, d_xi = basis(order, xi)
+    in_eta, d_eta = basis(order, eta)
+    return _product(in_xi, in_eta), np.stack([_product(d_xi, in_eta), _product(in_xi, d_eta)])
+
+
+def _product(a: Array, b: Array) -> Array:
+    return (b[:, :, None] * a[:, None, :]).reshape(len(a), b.shape[1] * a.shape[1])

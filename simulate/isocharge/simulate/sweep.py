@@ -1,160 +1,316 @@
-"""A sweep: many presses spread over the working area and the forces, and their charges."""
+"""A sweep: many presses spread over the working area and the forces, and their charges.
 
-from collections.abc import Iterator
+A forward map is solved for every probe and evaluated for every press. Both are cut into tasks that do not depend on the
+workers, so neither do the bytes. What is finished is kept in a draft beside the dataset: a run that was killed goes on.
+"""
+
+import io
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import tee
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from isocharge.errors import SceneError
-from isocharge.files import refuse_existing
-from isocharge.simulate.arrays import Array
-from isocharge.simulate.dataset import Samples, write_dataset
+from isocharge.simulate.arrays import Array, Integers
+from isocharge.simulate.blas import single_threaded_blas
+from isocharge.simulate.dataset import Samples, pack_shard, shard_entry, shard_name, write_dataset, write_manifest
+from isocharge.simulate.draft import Draft, Warn, open_draft, refusals, refuse_finished
 from isocharge.simulate.forward import ForwardMap, Progress
-from isocharge.simulate.probe import Circle
+from isocharge.simulate.probe import Probe
+from isocharge.simulate.sampling import MOST_SAMPLES as MOST_SAMPLES
+from isocharge.simulate.sampling import Presses
+from isocharge.simulate.sampling import Sweep as Sweep
 from isocharge.simulate.sensor import Sensor
-
-MOST_SAMPLES = 10_000_000
-"""Largest sweep: about 600 MB on disk."""
+from isocharge.simulate.sensor_file import sensor_to_dict
+from isocharge.simulate.template import Resolution
+from isocharge.simulate.theory import ACCURACY, Theory
+from isocharge.simulate.workers import AHEAD, Checked, Workers, made_by
 
 SHARD = 16384
 """Samples per shard."""
 
+TASK = 8192
+"""Presses per task: long enough (a second) that sending the map along (12 MB) does not show."""
+
+SAMPLING = {
+    "sobol": "scrambled Sobol, uniform over the disk, log-uniform in force",
+    "random": "independent, uniform over the disk, log-uniform in force",
+    "grid": "grid: square lattice over the disk, forces in equal steps of the logarithm, evenly spread orientations",
+}
+
 
 @dataclass(frozen=True)
-class Sweep:
-    """What to sample.
+class Solver:
+    """How the film is solved in a sweep; what is absent is chosen by the scene, see `ForwardMap.build`.
 
     Attributes:
-        radius: Presses are spread uniformly over the disk of this radius, m.
-        force_range: Forces are spread uniformly in the logarithm between these, N.
-        samples: How many, shared equally among the probes.
-        seed: Of the sequence.
-        orientation: "fixed" (0) or "random" angle of the probe.
+        accuracy: Relative error of a charge that is wanted.
+        theory: Which terms to model.
+        resolution: Mesh.
     """
 
-    radius: float = 8e-3
-    force_range: tuple[float, float] = (0.05, 2.0)
-    samples: int = 20_000
-    seed: int = 0
-    orientation: Literal["fixed", "random"] = "fixed"
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.samples <= MOST_SAMPLES:
-            bound = "at least 1" if self.samples < 1 else f"at most {MOST_SAMPLES}"
-            raise SceneError(f"samples: expected {bound}, got {self.samples}")
-        if self.orientation not in ("fixed", "random"):
-            raise SceneError(f"orientation: expected 'fixed' or 'random', got {self.orientation!r}")
-
-    def presses(self) -> tuple[Array, Array, Array, Array]:
-        """x, y (m), force (N) and orientation (rad) of every sample, each of shape (samples,).
-
-        Scrambled Sobol points: fewer gaps and clumps than independent draws (Owen 1998).
-        """
-        bits = int(np.ceil(np.log2(max(self.samples, 2))))
-        unit = qmc.Sobol(4, rng=np.random.default_rng(self.seed)).random_base2(bits)[: self.samples]
-        distance, angle = self.radius * np.sqrt(unit[:, 0]), 2.0 * np.pi * unit[:, 1]
-        low, high = np.log(self.force_range)
-        turned = 2.0 * np.pi * unit[:, 3] if self.orientation == "random" else np.zeros(self.samples)
-        force = np.clip(np.exp(low + (high - low) * unit[:, 2]), *self.force_range)
-        return distance * np.cos(angle), distance * np.sin(angle), force, turned
+    accuracy: float = ACCURACY
+    theory: Theory | None = None
+    resolution: Resolution | None = None
 
 
 def run_sweep(
     folder: Path,
     sensor: Sensor,
-    probes: tuple[Circle, ...],
+    probes: Sequence[Probe],
     sweep: Sweep,
     *,
+    solver: Solver = Solver(),
     executor: Executor | None = None,
+    ahead: int = AHEAD,
+    shard: int = SHARD,
+    fresh: bool = False,
     progress: Progress | None = None,
+    sampled: Progress | None = None,
+    warn: Warn = warnings.warn,
 ) -> Path:
-    """Simulate a sweep and write it as a dataset.
+    """Simulate a sweep and write it as a dataset. Killed and called again with the same arguments, it goes on.
 
     Args:
         folder: Where; must not exist yet.
         sensor: The sensor.
-        probes: The objects that press; sample i belongs to probe i modulo their number.
+        probes: The objects that press; they take turns.
         sweep: What to sample.
-        executor: Where the solves run; the bytes written do not depend on it.
-        progress: Told how many distances are solved.
+        solver: How the film is solved.
+        executor: Where the work is done; here and now if absent. The bytes written do not depend on it.
+        ahead: Tasks to hand out before the first is back; twice the number of workers keeps all of them busy.
+        shard: Samples per shard.
+        fresh: Throw away what an earlier run left.
+        progress: Told how many distances and orientations of a probe are solved.
+        sampled: Told how many samples are made.
+        warn: Told if a part of an earlier run is damaged; it is made again.
 
     Returns:
         The folder.
 
     Raises:
         SceneError: If a press cannot exist.
-        OutputExists: If the folder is already there; said before the work begins.
+        OutputExists: If the folder is already there, or an unfinished run of other settings; said before the work
+            begins.
+        OutputError: If the file system refuses; the finished work is kept.
     """
-    refuse_existing(folder)
-    return write_sweep(folder, solve_maps(sensor, probes, sweep, executor=executor, progress=progress), sweep)
+    folder, probes = Path(folder), tuple(probes)
+    refuse_finished(folder)
+    presses = sweep.over(probes)  # before anything is written: scipy's Sobol tables swallow an interrupt
+    workers = Workers(executor, ahead)
+    identity = _identity(sensor, probes, sweep, solver, shard)
+    with single_threaded_blas(), open_draft(folder, identity, fresh=fresh, warn=warn) as draft:
+        maps = tuple(
+            _build(sensor, probe, sweep, solver, Remembering(draft, f"solve-{number:02d}", executor), progress)
+            for number, probe in enumerate(probes)
+        )
+        entries = _draft_shards(draft, maps, presses, workers, shard, sampled)
+        with refusals(folder):
+            write_manifest(draft.data, folder.name, sensor, entries, _about(maps, sweep))
+    return folder
 
 
 def solve_maps(
     sensor: Sensor,
-    probes: tuple[Circle, ...],
+    probes: Sequence[Probe],
     sweep: Sweep,
     *,
+    solver: Solver = Solver(),
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> tuple[ForwardMap, ...]:
     """A forward map for each probe, over the sweep's ranges."""
     if not probes:
         raise SceneError("probes: expected at least one, got none")
-    return tuple(
-        ForwardMap.build(sensor, probe, sweep.radius, sweep.force_range, executor=executor, progress=progress)
-        for probe in probes
+    return tuple(_build(sensor, probe, sweep, solver, executor, progress) for probe in probes)
+
+
+def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
+    """Write a sweep's presses and charges, given the solved maps, here and now; see `run_sweep`."""
+    presses = sweep.over([made.probe for made in maps])
+    return write_dataset(folder, maps[0].sensor, _samples(maps, _cut(presses, SHARD), Workers()), _about(maps, sweep))
+
+
+def _build(
+    sensor: Sensor, probe: Probe, sweep: Sweep, solver: Solver, executor: Executor | None, progress: Progress | None
+) -> ForwardMap:
+    return ForwardMap.build(
+        sensor,
+        probe,
+        sweep.radius,
+        sweep.force_range,
+        theory=solver.theory,
+        accuracy=solver.accuracy,
+        resolution=solver.resolution,
+        executor=executor,
+        progress=progress,
     )
 
 
-def write_sweep(folder: Path, maps: tuple[ForwardMap, ...], sweep: Sweep) -> Path:
-    """Write a sweep's presses and charges, given the solved maps; see `run_sweep`."""
-    about = {
-        "probes": [made.probe.notation for made in maps],
+def _identity(sensor: Sensor, probes: Sequence[Probe], sweep: Sweep, solver: Solver, shard: int) -> dict[str, Any]:
+    """All that decides about the bytes."""
+    return {
+        "made_by": made_by(),
+        "sensor": sensor_to_dict(sensor),
+        "probes": [f"{probe.notation}@{np.rad2deg(probe.angle):.12g}" for probe in probes],
+        "sweep": asdict(sweep),
+        "solver": asdict(solver),
+        "shard": shard,
+    }
+
+
+def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
+    """What the manifest says of the sweep."""
+    return {
+        "probes": list(dict.fromkeys(made.probe.notation for made in maps)),
         "ranges": {
             "radius_mm": float(f"{sweep.radius * 1e3:.12g}"),
             "force_N": list(sweep.force_range),
             "orientation": sweep.orientation,
         },
-        "sampling": "scrambled Sobol, uniform over the disk, log-uniform in force",
+        "sampling": SAMPLING[sweep.sampling],
         "seed": sweep.seed,
         "noise": "clean",
-        "solver": _solver(maps),
-    }
-    presses = sweep.presses()  # before anything is written: scipy's Sobol tables swallow an interrupt
-    return write_dataset(folder, maps[0].sensor, _shards(maps, presses), about)
-
-
-def _solver(maps: tuple[ForwardMap, ...]) -> dict[str, Any]:
-    resolution = maps[0].resolution
-    return {
-        "theory": "nonlinear membrane",
-        "order": resolution.order,
-        "around": resolution.around,
-        "rings": resolution.rings,
-        "solves": sum(len(made.table) for made in maps),
-        "interpolation_error": max(made.error for made in maps),
+        "solver": {
+            "theory": maps[0].theory.name,
+            "mesh": {made.probe.notation: _mesh_words(made.resolution) for made in maps},
+            "solves": sum(made.solves for made in maps),
+            "interpolation_error": max(made.error for made in maps),
+        },
     }
 
 
-def _shards(maps: tuple[ForwardMap, ...], presses: tuple[Array, Array, Array, Array]) -> Iterator[Samples]:
-    x, y, force, turned = presses
-    which = np.arange(x.size) % len(maps)
+def _mesh_words(resolution: Resolution) -> str:
+    return ", ".join(f"{name} {value}" for name, value in asdict(resolution).items())
+
+
+class Remembering(Executor):
+    """An executor whose `map` keeps its results, if they are arrays, in a draft, and does not work for them again.
+
+    The results of a call are named by their place in it and by the call's place among the others: both depend on the
+    run alone.
+    """
+
+    def __init__(self, draft: Draft, name: str, inner: Executor | None) -> None:
+        self._draft, self._name, self._inner, self._calls = draft, name, inner, 0
+
+    def map(self, fn: Callable[..., Any], *iterables: Iterable[Any], **_options: Any) -> Iterator[Any]:
+        """As of any executor; finished results are saved as they are taken."""
+        jobs = list(zip(*iterables, strict=False))
+        names = [f"{self._name}-{self._calls:02d}-{number:04d}.npy" for number in range(len(jobs))]
+        self._calls += 1
+        kept = [self._load(name) for name in names]
+        left = [job for job, result in zip(jobs, kept, strict=True) if result is None]
+        made = self._inner.map(Checked(Spread(fn)), left) if self._inner and left else map(Spread(fn), left)
+        return self._merged(names, kept, iter(made))
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
+        """Not remembered."""
+        if self._inner is None:
+            raise NotImplementedError("here and now there is only map")
+        return self._inner.submit(fn, *args, **kwargs)
+
+    def _merged(self, names: list[str], kept: list[Array | None], made: Iterator[Any]) -> Iterator[Any]:
+        for name, result in zip(names, kept, strict=True):
+            if result is not None:
+                yield result
+                continue
+            fresh = next(made)
+            if isinstance(fresh, np.ndarray):
+                self._draft.save(name, _npy(fresh))
+            yield fresh
+
+    def _load(self, name: str) -> Array | None:
+        data = self._draft.load(name)
+        return None if data is None else np.load(io.BytesIO(data), allow_pickle=False)
+
+
+class Spread:
+    """A function of several arguments as one of their tuple."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def __call__(self, arguments: tuple[Any, ...]) -> Any:
+        return self._function(*arguments)
+
+
+def _npy(array: Array) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _draft_shards(
+    draft: Draft,
+    maps: Sequence[ForwardMap],
+    presses: Presses,
+    workers: Workers,
+    shard: int,
+    sampled: Progress | None,
+) -> list[dict[str, Any]]:
+    """Make the shards that the draft has not got; what the manifest says of each, in order."""
+    parts = dict(enumerate(_cut(presses, shard)))
+    entries: dict[int, dict[str, Any]] = {}
+    for number, part in parts.items():
+        if (data := draft.load(shard_name(number), final=True)) is not None:
+            entries[number] = shard_entry(shard_name(number), len(part), data)
+    done = sum(entry["samples"] for entry in entries.values())
+    missing = [number for number in parts if number not in entries]
+    if sampled:
+        sampled(done, len(presses))
+    made = _samples(maps, (parts[number] for number in missing), workers)
+    for number, samples in zip(missing, made, strict=True):
+        name, data = pack_shard(number, samples, maps[0].sensor)
+        draft.save(name, data, final=True)
+        entries[number] = shard_entry(name, len(samples), data)
+        done += len(samples)
+        if sampled:
+            sampled(done, len(presses))
+    return [entries[number] for number in parts]
+
+
+def _cut(presses: Presses, size: int) -> Iterator[Presses]:
+    for start in range(0, len(presses), size):
+        yield presses[start : start + size]
+
+
+def _samples(maps: Sequence[ForwardMap], shards: Iterable[Presses], workers: Workers) -> Iterator[Samples]:
+    """Samples of each shard, in order; the workers run ahead of the one that is taken."""
+    shards, coming = tee(shards)
+    tasks = ((maps[number], part[rows]) for part in coming for number, rows in _tasks(part, len(maps)))
+    charges = workers.in_order(_charges, tasks)
     notation = np.array([made.probe.notation for made in maps])
-    for start in range(0, x.size, SHARD):
-        part = slice(start, start + SHARD)
-        charge = np.empty((len(x[part]), len(maps[0].sensor.electrodes)))
-        for number, made in enumerate(maps):
-            mine = which[part] == number
-            charge[mine] = made.forward(x[part][mine], y[part][mine], force[part][mine])
+    angle = np.array([made.probe.angle for made in maps])
+    for part in shards:
+        charge = np.empty((len(part), len(maps[0].sensor.electrodes)))
+        for _, rows in _tasks(part, len(maps)):
+            charge[rows] = next(charges)
+        turned = np.rad2deg(angle[part.probe] + part.turn)
         yield Samples(
-            x_mm=x[part] * 1e3,
-            y_mm=y[part] * 1e3,
-            force_N=force[part],
-            probe=notation[which[part]],
-            orientation_deg=np.rad2deg(turned[part]),
+            x_mm=part.x * 1e3,
+            y_mm=part.y * 1e3,
+            force_N=part.force,
+            probe=notation[part.probe],
+            orientation_deg=np.mod(np.round(turned, 9), 360.0),
             charge_pC=charge * 1e12,
         )
+
+
+def _tasks(part: Presses, probes: int) -> Iterator[tuple[int, Integers]]:
+    """How a shard is cut into tasks: number of the probe and rows of the shard."""
+    for number in range(probes):
+        rows = np.flatnonzero(part.probe == number)
+        for start in range(0, rows.size, TASK):
+            yield number, rows[start : start + TASK]
+
+
+def _charges(task: tuple[ForwardMap, Presses]) -> Array:
+    """Touch charges of a task's presses, shape (n, n_electrode), C."""
+    made, presses = task
+    return made.forward(presses.x, presses.y, presses.force, presses.turn)

@@ -1,231 +1,154 @@
-"""The mesh that follows the probe: one template, carried onto the film by a conformal map of the disk.
+"""The mesh's topology: one template for all positions, thicknesses and forces.
 
-The template is the unit disk in z, graded about its centre: a square core and four blocks fill the footprint, the disk
-|z| <= rho; rings that are uniform in ln|z| and arg z fill the rest. The disk automorphism
+Seen from the probe, the mesh is a footprint's worth of blocks inside a circle and rings from that circle to the rim:
 
-    Z = (z + c) / (1 + c z),   0 <= c < 1,
+    a polygon of n corners  is split into n quadrilaterals about its hub,
+    2 n blocks              lie between the polygon's half edges and the circle,
+    rings of 2 n sectors    carry on to the rim, the last ones thin where bending needs it.
 
-carries it onto the film (Z in units of the film's radius), circles to circles, so that with
-
-    al = (atanh(p + R) + atanh(p - R)) / 2,   be = (atanh(p + R) - atanh(p - R)) / 2,   c = tanh al,   rho = tanh be
-
-the circle |z| = rho becomes the edge of a footprint of radius R at distance p from the centre, exactly. The
-connectivity does not depend on the place, so everything symbolic is done once for a resolution, nodal fields are smooth
-functions of p, and points of the film are found in the mesh by inverting two closed formulas.
+A circular footprint is the same with a virtual square as its polygon and the circle as its edge; since it is
+symmetric about the line through the film's centre, only the upper half is meshed. Each block may be subdivided.
+`Placement` says where a template lies.
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array, Complexes, Integers
-from isocharge.simulate.spectral import basis, lobatto_nodes
+from isocharge.simulate.arrays import Array, Integers
+from isocharge.simulate.spectral import lobatto_nodes
 
-CORE = 0.45
-"""Half side of the square core over the footprint's radius in the template: corners at 0.64 of it."""
-
-SIDES = 4
-"""Blocks round the core."""
+SQUARE = 4
+"""Corners of the virtual polygon inside a circular footprint."""
 
 
 @dataclass(frozen=True)
 class Resolution:
-    """How fine the template is.
+    """How fine the mesh is.
 
     Attributes:
         order: Polynomial order of the elements.
-        around: Elements round the circle, a multiple of four.
-        rings: Rings between the footprint and the rim.
+        around: Elements round the circle; a polygon of n corners takes the next multiple of 2 n.
+        rings: Rings between the circle and the rim, in equal steps of the logarithm.
+        rim: Thin rings at the rim, for bending's boundary layer.
     """
 
-    order: int = 5
+    order: int = 4
     around: int = 8
     rings: int = 5
+    rim: int = 0
 
     def __post_init__(self) -> None:
-        if self.order < 2 or self.around < 8 or self.around % SIDES or self.rings < 1:
+        if self.order < 2 or self.around < 4 or self.rings < 1 or self.rim < 0:
             raise ValueError(
-                f"expected order >= 2, around a multiple of 4 from 8 on and rings >= 1, got {self.order}, "
-                f"{self.around}, {self.rings}"
+                f"expected order >= 2, around >= 4, rings >= 1 and rim >= 0, got {self.order}, {self.around}, "
+                f"{self.rings}, {self.rim}"
             )
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Where the template sits: the map's parameter c and the footprint's radius rho in the template, 0 <= c, rho < 1.
-
-    Both may be arrays, one placement per press.
-    """
-
-    c: float | Array
-    rho: float | Array
-
-    @classmethod
-    def of_circle(cls, distance: float | Array, radius: float) -> "Placement":
-        """Placement for a circular footprint, distance and radius in units of the film's radius, their sum below 1."""
-        outer, inner = np.arctanh(distance + radius), np.arctanh(distance - radius)
-        return cls(c=np.tanh(0.5 * (outer + inner)), rho=np.tanh(0.5 * (outer - inner)))
-
-    def to_film(self, z: Complexes) -> Complexes:
-        """Template points to film points (unit radius)."""
-        return (z + self.c) / (1.0 + self.c * z)
-
-    def to_template(self, film: Complexes) -> Complexes:
-        """Film points (unit radius) to template points."""
-        return (film - self.c) / (1.0 - self.c * film)
-
-
 class Template:
-    """Elements, nodes and their numbering for one resolution; nothing in it depends on the scene.
+    """Elements, nodes and their numbering; nothing in it depends on where the probe is.
 
-    Element e has (order + 1)^2 nodes in tensor order (xi fast); local coordinates (xi, eta) lie in [-1, 1]^2. Elements
-    come as core (m x m, m = around / 4), then four side blocks of m, then rings from the footprint outwards.
+    Element e has (order + 1)^2 nodes in tensor order (xi fast, outwards; eta anticlockwise); local coordinates lie in
+    [-1, 1]^2. Elements come as quadrilaterals of the polygon, blocks up to the circle, rings from the inside out.
 
     Attributes:
+        resolution: How fine.
+        corners: Corners of the probe's polygon, or 0 for a circle.
+        half: Whether only the upper half is meshed.
         nodes: Node number of each element's nodes, shape (n_element, (order + 1)^2).
-        n_node: Number of nodes; those on the rim come last.
-        n_free: Number of nodes that are not on the rim.
+        n_node: Number of nodes.
+        on_rim: Whether a node lies on the rim, shape (n_node,).
+        on_axis: Whether a node lies on the line of symmetry of a half template, shape (n_node,).
     """
 
-    def __init__(self, resolution: Resolution) -> None:
+    def __init__(self, resolution: Resolution, corners: int) -> None:
         self.resolution = resolution
-        self.per_side = resolution.around // SIDES
-        self.n_inner = self.per_side * (self.per_side + SIDES)
-        self.n_element = self.n_inner + resolution.around * resolution.rings
-        self.nodes, self.n_node, self.n_free = self._number()
-
-    def _local_grid(self) -> tuple[Array, Array]:
-        line = lobatto_nodes(self.resolution.order)
+        self.corners = corners
+        self.half = corners == 0
+        self.n_corner = corners or SQUARE
+        self.split = max(1, round(resolution.around / (2 * self.n_corner)))
+        self.n_meshed = self.n_corner // 2 if self.half else self.n_corner
+        self.n_sector = 2 * self.n_meshed * self.split
+        self.n_quad = self.n_meshed * self.split**2
+        self.n_inner = self.n_quad + self.n_sector
+        self.n_ring = resolution.rings + resolution.rim
+        self.n_element = self.n_inner + self.n_sector * self.n_ring
+        line = lobatto_nodes(resolution.order)
         xi, eta = np.meshgrid(line, line, indexing="xy")
-        return xi.ravel(), eta.ravel()
-
-    def element_points(self, rho: float | Array) -> Complexes:
-        """Template coordinates z of every element's nodes, shape (n_element, (order + 1)^2)."""
-        xi, eta = self._local_grid()
-        m, around, rings = self.per_side, self.resolution.around, self.resolution.rings
-        edge = np.linspace(-1.0, 1.0, m + 1)
-
-        def stretch(local: Array, index: Integers, edges: Array) -> Array:
-            low, high = edges[index][:, None], edges[index + 1][:, None]
-            stretched: Array = low + 0.5 * (local + 1.0) * (high - low)
-            return stretched
-
-        row, column = np.divmod(np.arange(m * m), m)
-        core = CORE * (stretch(xi, column, edge) + 1j * stretch(eta, row, edge))
-        t = stretch(eta, np.arange(m), edge)
-        right = _side_block(0.5 * (xi + 1.0), t)
-        sides = np.concatenate([right * 1j**side for side in range(SIDES)])
-        ring, sector = np.divmod(np.arange(rings * around), around)
-        angle = stretch(eta, sector, -0.25 * np.pi + np.linspace(0.0, 2.0 * np.pi, around + 1))
-        depth = stretch(xi, ring, np.linspace(1.0, 0.0, rings + 1))
-        outside = np.exp(depth * np.log(rho) + 1j * angle)
-        return np.concatenate([rho * core, rho * sides, outside])
-
-    def _number(self) -> tuple[Integers, int, int]:
-        """Give coincident nodes one number; nodes on the rim get the last ones."""
-        z = self.element_points(0.1).ravel()
-        _, first, number = np.unique(np.round(z, 9), return_index=True, return_inverse=True)
-        rim = np.abs(z[first]) > 1.0 - 1e-9
-        rank = np.empty(first.size, dtype=np.intp)
-        rank[np.argsort(rim, kind="stable")] = np.arange(first.size)
-        nodes = rank[number.ravel()].reshape(self.n_element, -1)
-        return nodes, first.size, int(first.size - rim.sum())
-
-    @cached_property
-    def first_seen(self) -> Integers:
-        """For each node one place, element * nodes per element + local node, where it stands; shape (n_node,)."""
-        return np.unique(self.nodes, return_index=True)[1]
-
-    def node_points(self, rho: float | Array) -> Complexes:
-        """Template coordinates z of every node, shape (n_node,)."""
-        return self.element_points(rho).ravel()[self.first_seen]
+        self.xi, self.eta = xi.ravel(), eta.ravel()
 
     @property
     def footprint(self) -> slice:
         """The elements that fill the footprint."""
-        return slice(0, self.n_inner)
+        return slice(0, self.n_inner if self.half else self.n_quad)
 
-    def locate(self, z: Complexes, rho: float | Array) -> tuple[Integers, Array, Array]:
-        """Find template points in the mesh.
+    @property
+    def copies(self) -> int:
+        """How many copies of the template make up the film."""
+        return 2 if self.half else 1
 
-        Args:
-            z: Template coordinates, shape (n,), |z| <= 1.
-            rho: Footprint radius in the template, one or one per point.
+    @cached_property
+    def boundary(self) -> Array:
+        """Points along the polygon's boundary as weights of its corners, shape (n_sector + 1, n_corner).
 
-        Returns:
-            Element, xi and eta, each of shape (n,).
+        From the middle of the edge before the first corner, anticlockwise.
         """
-        rho = np.broadcast_to(rho, z.shape)
-        outside = np.abs(z) > rho
-        element = np.empty(z.shape, dtype=np.intp)
-        xi, eta = np.empty(z.shape), np.empty(z.shape)
-        element[outside], xi[outside], eta[outside] = self._locate_rings(z[outside], rho[outside])
-        element[~outside], xi[~outside], eta[~outside] = self._locate_inner(z[~outside] / rho[~outside])
-        return element, xi, eta
+        unit = np.eye(self.n_corner)
+        middle = 0.5 * (unit + np.roll(unit, -1, axis=0))
+        stops = [middle[-1]]
+        for i in range(self.n_meshed):
+            stops += [unit[i], middle[i]]
+        share = np.arange(self.split)[:, None] / self.split
+        parts = [a + share * (b - a) for a, b in pairwise(stops)]
+        return np.concatenate([*parts, stops[-1][None]])
 
-    def _locate_rings(self, z: Complexes, rho: Array) -> tuple[Integers, Array, Array]:
-        around, rings = self.resolution.around, self.resolution.rings
-        depth = (1.0 - np.log(np.abs(z)) / np.log(rho)) * rings
-        turn = np.mod(np.angle(z) / (2.0 * np.pi) + 0.125, 1.0) * around
-        ring, xi = _split(depth, rings)
-        sector, eta = _split(turn, around)
-        return self.n_inner + ring * around + sector, xi, eta
+    @cached_property
+    def straight(self) -> Array:
+        """Corners (a, b, c, d) of the elements inside the circle as weights of the polygon's corners.
 
-    def _locate_inner(self, z: Complexes) -> tuple[Integers, Array, Array]:
-        """Points of the unit disk in the core and the four side blocks."""
-        m = self.per_side
-        quarter = np.mod(np.rint(np.angle(z) / (0.5 * np.pi)), SIDES).astype(np.intp)
-        turned = z * (1j ** (-quarter))
-        in_core = turned.real <= CORE
-        column, xi = _split((z.real / CORE + 1.0) * 0.5 * m, m)
-        row, eta = _split((z.imag / CORE + 1.0) * 0.5 * m, m)
-        element = row * m + column
-        v, t = _invert_side_block(turned[~in_core])
-        along, eta[~in_core] = _split((t + 1.0) * 0.5 * m, m)
-        element[~in_core] = m * m + quarter[~in_core] * m + along
-        xi[~in_core] = 2.0 * v - 1.0
-        return element, xi, eta
+        The element is (1 - v) (a + t (b - a)) + v (c + t (d - c)); blocks up to the circle have their outer side on it
+        and their c and d here are void. Shape (n_inner, 4, n_corner).
+        """
+        k, hub = self.split, np.full(self.n_corner, 1.0 / self.n_corner)
+        parts = []
+        for i in range(self.n_meshed):
+            before, corner, after = (
+                self.boundary[2 * k * i],
+                self.boundary[2 * k * i + k],
+                self.boundary[2 * k * (i + 1)],
+            )
+            grid = np.array(
+                [[_bilinear(hub, after, before, corner, v / k, t / k) for t in range(k + 1)] for v in range(k + 1)]
+            )
+            parts += [
+                [grid[v, t], grid[v, t + 1], grid[v + 1, t], grid[v + 1, t + 1]] for v in range(k) for t in range(k)
+            ]
+        void = np.zeros(self.n_corner)
+        parts += [[a, b, void, void] for a, b in pairwise(self.boundary)]
+        return np.array(parts)
 
-    def basis_at(self, xi: Array, eta: Array) -> tuple[Array, Array]:
-        """Basis values (n, nodes) and derivatives by xi and eta (2, n, nodes) at local points of shape (n,)."""
-        in_xi, d_xi = basis(self.resolution.order, xi)
-        in_eta, d_eta = basis(self.resolution.order, eta)
+    def turned(self, fold: int, folds: int) -> Integers:
+        """For each element the one that takes its place when the probe is turned by fold / folds of a full turn."""
+        shift = fold * self.n_corner // folds
+        quads = np.arange(self.n_quad).reshape(self.n_meshed, -1)
+        sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)
+        return np.concatenate(
+            [np.roll(quads, -shift, axis=0).ravel(), np.roll(sectors, -2 * self.split * shift, axis=1).ravel()]
+        )
 
-        def product(a: Array, b: Array) -> Array:
-            return (b[:, :, None] * a[:, None, :]).reshape(len(a), b.shape[1] * a.shape[1])
-
-        values = product(in_xi, in_eta)
-        return values, np.stack([product(d_xi, in_eta), product(in_xi, d_eta)])
-
-
-def _side_block(v: Array, t: Array) -> Complexes:
-    """The right-hand block in units of rho: from the core's side (v = 0) to the circle (v = 1), t from -1 to 1."""
-    block: Complexes = (1.0 - v) * CORE * (1.0 + 1j * t) + v * np.exp(0.25j * np.pi * t)
-    return block
-
-
-def _invert_side_block(z: Complexes) -> tuple[Array, Array]:
-    """(v, t) of points of the right-hand block: Newton on two equations, to round-off in a few steps."""
-    t = np.angle(z) * 4.0 / np.pi
-    v = np.clip((np.abs(z) - CORE) / (1.0 - CORE), 0.0, 1.0)
-    for _ in range(8):
-        arc = np.exp(0.25j * np.pi * t)
-        miss = _side_block(v, t) - z
-        by_v, by_t = arc - CORE * (1.0 + 1j * t), 1j * ((1.0 - v) * CORE + v * 0.25 * np.pi * arc)
-        determinant = (np.conj(by_v) * by_t).imag
-        v = v - (np.conj(miss) * by_t).imag / determinant
-        t = t - (np.conj(by_v) * miss).imag / determinant
-    return v, t
+    def number(self, points: np.ndarray) -> None:
+        """Give coincident nodes one number, from the film points (n_element, n_local) of any one placement."""
+        z = points.ravel()
+        _, first, number = np.unique(np.round(z, 9), return_index=True, return_inverse=True)
+        self.nodes: Integers = number.reshape(points.shape)
+        self.n_node = first.size
+        self.first_seen = first
+        self.on_rim = np.abs(z[first]) > 1.0 - 1e-9
+        self.on_axis = (np.abs(z[first].imag) < 1e-9) & self.half
 
 
-def _split(coordinate: Array, count: int) -> tuple[Integers, Array]:
-    """Interval number and local coordinate in [-1, 1] of a coordinate that runs from 0 to count."""
-    index = np.clip(np.floor(coordinate), 0, count - 1).astype(np.intp)
-    return index, 2.0 * (coordinate - index) - 1.0
-
-
-@lru_cache(maxsize=16)
-def template(resolution: Resolution) -> Template:
-    """The template of a resolution, made once."""
-    return Template(resolution)
+def _bilinear(a: Array, b: Array, c: Array, d: Array, v: float, t: float) -> Array:
+    return (1.0 - v) * (a + t * (b - a)) + v * (c + t * (d - c))

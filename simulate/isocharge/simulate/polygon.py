@@ -1,0 +1,87 @@
+"""Convex polygons and disks in the plane: area, centroid, convexity, and how much of one lies in another."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from isocharge.simulate.arrays import Array, Complexes
+
+
+def area_of(corners: Array) -> float:
+    """Signed area of a polygon with corners of shape (n, 2), positive for anticlockwise ones."""
+    x, y = corners.T
+    return float(0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+
+
+def centroid_of(corners: Array) -> Array:
+    """Centroid (x, y) of a polygon's area; corners of shape (n, 2)."""
+    origin = corners.mean(axis=0)
+    at, following = corners - origin, np.roll(corners - origin, -1, axis=0)
+    cross = at[:, 0] * following[:, 1] - at[:, 1] * following[:, 0]
+    centroid: Array = origin + np.sum((at + following) * cross[:, None], axis=0) / (3.0 * cross.sum())
+    return centroid
+
+
+def is_convex(corners: Array) -> bool:
+    """Whether a polygon turns left at every corner and no corner lies to the right of any edge (a star's do)."""
+    edge = np.roll(corners, -1, axis=0) - corners
+    turn = edge[:, 0] * np.roll(edge[:, 1], -1) - edge[:, 1] * np.roll(edge[:, 0], -1)
+    way = corners[None, :] - corners[:, None]
+    left = edge[:, None, 0] * way[..., 1] - edge[:, None, 1] * way[..., 0]
+    return bool(np.all(turn > 0.0) and left.min() >= -1e-9 * left.max())
+
+
+def overlap(first: Array, second: Array) -> bool:
+    """Whether two convex polygons share area: no edge normal separates them (separating axis theorem)."""
+    for polygon in (first, second):
+        edge = np.roll(polygon, -1, axis=0) - polygon
+        for normal in np.stack([edge[:, 1], -edge[:, 0]], axis=1):
+            if (first @ normal).max() <= (second @ normal).min() or (second @ normal).max() <= (first @ normal).min():
+                return False
+    return True
+
+
+def shared_area(first: Complexes, second: Complexes) -> float:
+    """Area common to two convex polygons with anticlockwise corners x + iy (Sutherland and Hodgman 1974)."""
+    clipped = first
+    for start, end in zip(second, np.roll(second, -1), strict=True):
+        side = ((clipped - start) * np.conj(end - start)).imag
+        clipped = _left_of(clipped, side)
+        if clipped.size < 3:
+            return 0.0
+    return area_of(np.stack([clipped.real, clipped.imag], axis=1))
+
+
+def _left_of(corners: Complexes, side: Array) -> Complexes:
+    """The part of a polygon where `side`, given at its corners and linear along its edges, is positive."""
+    kept = []
+    for at, following, here, there in zip(corners, np.roll(corners, -1), side, np.roll(side, -1), strict=True):
+        if here >= 0.0:
+            kept.append(at)
+        if here * there < 0.0:
+            kept.append(at + (following - at) * here / (here - there))
+    return np.array(kept, dtype=complex)
+
+
+def area_in_disk(corners: Complexes, centre: complex, radius: float) -> float:
+    """Area of a polygon (anticlockwise corners x + iy) that lies in a disk: edge by edge, the triangle with the centre.
+
+    Along an edge the part inside the circle spans a triangle, the parts outside span sectors.
+    """
+    total = 0.0
+    z = corners - centre
+    for start, end in zip(z, np.roll(z, -1), strict=True):
+        total += _sector_of_edge(complex(start), complex(end), radius)
+    return total
+
+
+def _sector_of_edge(start: complex, end: complex, radius: float) -> float:
+    along = (end - start) / abs(end - start)
+    low, high = (start * along.conjugate()).real, (end * along.conjugate()).real
+    height = (start * along.conjugate()).imag
+    half = np.sqrt(max(radius**2 - height**2, 0.0))
+    inside = np.clip([low, high], -half, half)
+    points = [start, *((inside + 1j * height) * along), end]
+    turns = [np.angle(b * np.conj(a)) if a != 0.0 and b != 0.0 else 0.0 for a, b in pairwise(points)]
+    triangle = -0.5 * height * (inside[1] - inside[0])
+    return float(triangle + 0.5 * radius**2 * (turns[0] + turns[2]))

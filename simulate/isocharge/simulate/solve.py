@@ -1,0 +1,174 @@
+"""Solving the film under a press."""
+
+from time import process_time
+
+import numpy as np
+
+from isocharge.errors import SceneError, SolveError
+from isocharge.simulate.assembly import assembly
+from isocharge.simulate.blas import single_threaded_blas
+from isocharge.simulate.elastic import ElasticFilm
+from isocharge.simulate.equilibrium import Equilibrium
+from isocharge.simulate.geometry import Geometry
+from isocharge.simulate.meshing import (
+    farthest,
+    layer_for,
+    place,
+    resolution_for,
+    shape_error,
+    template_for,
+    too_near_the_rim,
+)
+from isocharge.simulate.newton import NewtonResult, schwerin_start, solve_linear, solve_newton
+from isocharge.simulate.probe import Probe
+from isocharge.simulate.scaling import Groups, amplitude_squared
+from isocharge.simulate.sensor import Film
+from isocharge.simulate.template import Resolution
+from isocharge.simulate.theory import ACCURACY, Theory, choose
+
+LAYER_REUSE = (0.75, 2.0)
+"""Width of a neighbour's thin rings over one's own, between which it is taken over, so that its field still fits."""
+
+LARGEST_AMPLITUDE2 = 0.1
+"""A^2, the size of the strains, above which St. Venant-Kirchhoff elasticity is out of its range: 100 N at 25 um."""
+
+SMALLEST_PROBE = 1e-5
+"""Probe reach over film radius below which the template's grading runs out of digits."""
+
+
+def check_scene(film: Film, probe: Probe, at: tuple[float, float], force: float) -> None:
+    """Refuse presses that cannot exist, and those outside of what St. Venant-Kirchhoff elasticity says anything about.
+
+    Raises:
+        SceneError: If the footprint is not wholly on the film or hardly there, the force is not positive and finite, or
+            the film is stretched beyond small strains.
+    """
+    if not (np.isfinite(force) and force > 0.0):
+        raise SceneError(f"force: expected a positive number of newtons (F > 0 pushes), got {force}")
+    if not np.isfinite(at).all():
+        raise SceneError(f"position: expected two finite numbers, got {at}")
+    if probe.reach < SMALLEST_PROBE * film.radius:
+        raise SceneError(
+            f"probe: expected a reach of at least {SMALLEST_PROBE:g} of the film's radius "
+            f"({film.radius * 1e3:.4g} mm), got {probe.reach * 1e3:.4g} mm"
+        )
+    if farthest(probe, at) >= film.radius * (1.0 - 1e-6):
+        raise SceneError(
+            f"probe off the film: centre ({at[0] * 1e3:.4g}, {at[1] * 1e3:.4g}) mm, farthest point of {probe.notation} "
+            f"{farthest(probe, at) * 1e3:.4g} mm from the film's centre, film radius {film.radius * 1e3:.4g} mm"
+        )
+    amplitude2 = amplitude_squared(film, force)
+    if amplitude2 > LARGEST_AMPLITUDE2:
+        raise SceneError(
+            f"force {force:.4g} N stretches a film of {film.thickness * 1e6:.4g} um beyond small strains: expected "
+            f"(F / (E h a))^(2/3) up to {LARGEST_AMPLITUDE2:g}, got {amplitude2:.3g}"
+        )
+
+
+def press(
+    film: Film,
+    probe: Probe,
+    at: tuple[float, float],
+    force: float,
+    *,
+    theory: Theory | None = None,
+    accuracy: float = ACCURACY,
+    resolution: Resolution | None = None,
+    layer: float | None = None,
+    start: Equilibrium | None = None,
+    tolerance: float = 1e-7,
+    throw: bool = True,
+) -> Equilibrium:
+    """Solve the film under a press.
+
+    Args:
+        film: The clamped film.
+        probe: The footprint, pressing uniformly, dead load.
+        at: Centroid of the footprint (x, y), m.
+        force: N, positive pushes.
+        theory: Which terms to model; the fewest that the accuracy allows if absent.
+        accuracy: Relative error of a charge that is wanted.
+        resolution: Mesh of the template.
+        layer: Width of the thin rings at the rim over the film's radius; six bending lengths if absent, or what the
+            start has if that is near.
+        start: A neighbouring equilibrium of the same mesh to start from: another force, another position.
+        tolerance: Out-of-balance force over load.
+        throw: Whether a failure raises; if not, look at `status`.
+
+    Returns:
+        The equilibrium.
+
+    Raises:
+        SceneError: If the press cannot exist, or not on this mesh.
+        SolveError: If no equilibrium was found and `throw` is set.
+    """
+    check_scene(film, probe, at, force)
+    began = process_time()
+    theory = theory or choose(film, force, accuracy)
+    layer = layer or _layer(film, force, probe, resolution, start)
+    with single_threaded_blas():
+        resolution = resolution or resolution_for(film, probe, at, theory, accuracy, layer)
+        found, groups = _solve(film, probe, at, force, theory, resolution, layer, start, tolerance)
+    solved = Equilibrium(
+        film, probe, at, force, theory, resolution, layer, found.field, groups,
+        status="converged" if found.converged else "failed",
+        message=found.message,
+        iterations=found.iterations,
+        residual=found.residual,
+        seconds=process_time() - began,
+    )  # fmt: skip
+    if throw and not found.converged:
+        raise SolveError(_why(solved, tolerance))
+    return solved
+
+
+def _layer(film: Film, force: float, probe: Probe, resolution: Resolution | None, start: Equilibrium | None) -> float:
+    """Width of the thin rings: the scene's own, or the start's where that will do."""
+    own = layer_for(film, force)
+    if start is None or not LAYER_REUSE[0] < start.layer / own < LAYER_REUSE[1]:
+        return own
+    same = resolution in (None, start.resolution) and template_for(probe, start.resolution) is start.mesh
+    return start.layer if same else own
+
+
+def _solve(
+    film: Film,
+    probe: Probe,
+    at: tuple[float, float],
+    force: float,
+    theory: Theory,
+    resolution: Resolution,
+    layer: float,
+    start: Equilibrium | None,
+    tolerance: float,
+) -> tuple[NewtonResult, Groups]:
+    mesh, placement = template_for(probe, resolution), place(film, probe, at, resolution, layer)
+    points = placement.element_points(mesh)
+    geometry = Geometry.build(mesh, points)
+    if np.isinf(shape_error(mesh, geometry)):
+        raise too_near_the_rim(film, probe, at, resolution)
+    groups = Groups.of(film, force, bending=theory.bending)
+    elastic = ElasticFilm(geometry, groups)
+    solver = assembly(resolution, mesh.corners, elastic.components)
+    if not theory.stretching:
+        return solve_linear(elastic, solver), groups
+    if start is not None and start.mesh is mesh:
+        first = start.field
+    else:
+        z = placement.to_template(points.ravel()[mesh.first_seen])
+        first = schwerin_start(z, float(placement.rho), groups)
+    return solve_newton(elastic, solver, first, tolerance), groups
+
+
+def _why(solved: Equilibrium, tolerance: float) -> str:
+    """Why there is no answer."""
+    (x, y), smallest = solved.at, solved.principal_stress[0]
+    wrinkles = (
+        f"; the film is compressed to {smallest * 1e-6:.3g} MPa on the way: it wrinkles, which has many solutions; "
+        "press farther from the rim, with less force, or give the film a pretension"
+    )
+    return (
+        f"no equilibrium at {solved.force:.4g} N, position ({x * 1e3:.4g}, {y * 1e3:.4g}) mm: {solved.message}; "
+        f"residual {solved.residual:.2g} > {tolerance:.2g} after {solved.iterations} steps"
+        + (wrinkles if smallest < 0.0 else "")
+    )

@@ -1,0 +1,71 @@
+"""Bending against Laplacians on paper, a clamped plate's energy and its lowest frequency."""
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+from scipy.optimize import brentq
+from scipy.special import iv, jv
+
+from isocharge.simulate import Circle, Polygon, Resolution
+from isocharge.simulate.bending import Bending
+
+PROBES = [Circle(0.2), Polygon.triangle(0.4, 0.3), Polygon.rectangle(0.3, 0.2, 0.5)]
+FINE = Resolution(8, 8, 4)
+
+
+@pytest.fixture(scope="module", params=PROBES, ids=lambda probe: probe.notation.partition(":")[0])
+def fine(request, mesh_of):
+    return mesh_of(request.param, (0.3, 0.0), FINE)
+
+
+def test_energy_of_a_clamped_shape(fine):
+    """W = (1 - r^2)^2: lap W = 16 r^2 - 8, and the integral of its square over the disk is 64 pi / 3."""
+    shape = (1.0 - np.sum(fine.points**2, axis=1)) ** 2
+    energy = fine.template.copies * Bending(fine.geometry, 3.0).energy(shape)
+    assert energy == pytest.approx(0.5 * 3.0 * 64.0 * np.pi / 3.0, rel=1e-4)
+
+
+def test_laplacian_of_a_clamped_shape_converges(mesh_of):
+    def error(order: int) -> float:
+        mesh = mesh_of(Polygon.rectangle(0.3, 0.2, 0.5), (0.3, 0.0), Resolution(order, 8, 4))
+        r2 = np.sum(mesh.points**2, axis=1)
+        found = Bending(mesh.geometry, 1.0).laplacian((1.0 - r2) ** 2)
+        return float(np.abs(mesh.geometry.gather(mesh.geometry.mass) @ (found - 16.0 * r2 + 8.0) ** 2) ** 0.5)
+
+    errors = [error(order) for order in (3, 5, 7)]
+    assert errors[1] < errors[0] / 8.0
+    assert errors[2] < errors[1] / 8.0
+
+
+def test_translation_and_turn_in_the_plane_cost_nothing(fine):
+    """Bending knows only W, and not its mean."""
+    bending = Bending(fine.geometry, 1.0)
+    flat = np.full(fine.template.n_node, 0.7)
+    assert bending.energy(flat) < 1e-18
+    assert np.abs(bending.forces(flat)).max() < 1e-6
+
+
+def test_tilt_is_felt_at_the_clamped_rim_only(fine):
+    """A plane has no curvature inside; against the clamp it is a kink."""
+    bent = Bending(fine.geometry, 1.0).laplacian(fine.points @ [0.5, 0.0])
+    assert np.abs(bent[fine.inside]).max() < 1e-7
+    assert np.abs(bent[fine.template.on_rim]).max() > 1.0
+
+
+@pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.notation.partition(":")[0])
+def test_lowest_frequency_of_a_clamped_plate(mesh_of, probe):
+    """lap lap W = k^4 W with J0(k) I1(k) + I0(k) J1(k) = 0, k = 3.1962 (Rayleigh 1894, art. 221)."""
+    k = brentq(lambda k: jv(0, k) * iv(1, k) + iv(0, k) * jv(1, k), 3.0, 3.4)
+    mesh = mesh_of(probe, (0.3, 0.0), Resolution(4, 8, 4))
+    geometry, inside = mesh.geometry, np.flatnonzero(mesh.inside)
+    local = np.einsum("ep,epam,epan->emn", geometry.weights, geometry.gradient, geometry.gradient)
+    laplace = np.zeros((mesh.template.n_node,) * 2)
+    for numbers, block in zip(mesh.template.nodes, local, strict=True):
+        laplace[np.ix_(numbers, numbers)] += block
+    mass = geometry.gather(geometry.mass)
+    unit = np.eye(mesh.template.n_node)[:, inside]
+    plate = np.stack([geometry.gather(Bending(geometry, 1.0).forces(column)) for column in unit.T], axis=1)[inside]
+    lowest = eigh(plate, np.diag(mass[inside]), eigvals_only=True, subset_by_index=[0, 0])[0]
+    assert lowest == pytest.approx(k**4, rel=2e-4)
+    drum = eigh(laplace[np.ix_(inside, inside)], np.diag(mass[inside]), eigvals_only=True, subset_by_index=[0, 0])[0]
+    assert drum == pytest.approx(5.7832, rel=1e-4)  # the module's bound on the shift: half of what is allowed

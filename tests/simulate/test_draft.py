@@ -1,0 +1,294 @@
+"""A run that was stopped goes on, and writes what it would have written; nothing else is touched or trusted."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import Executor, Future
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from isocharge.errors import OutputExists, SceneError, SolveError
+from isocharge.simulate import Circle, Resolution, Sweep, Theory, load_sensor, run_sweep
+from isocharge.simulate.draft import draft_of, open_draft
+from isocharge.simulate.sweep import Solver
+
+SENSOR = load_sensor("three-25um-biaxial")
+QUICK = Solver(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
+SWEEP = Sweep(radius=3e-3, force_range=(1.0, 1.0), samples=60, seed=7)
+
+
+class Stopped(BaseException):
+    """As a signal would."""
+
+
+class Counting(Executor):
+    """Works here and counts."""
+
+    def __init__(self) -> None:
+        self.jobs = 0
+
+    def submit(self, function, /, *arguments):
+        self.jobs += 1
+        future: Future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+    def map(self, function, *iterables):
+        for arguments in zip(*iterables, strict=True):
+            yield self.submit(function, *arguments).result()
+
+
+def sweep_to(target: Path, **options) -> Path:
+    arguments = {"probes": (Circle(1e-3),), "sweep": SWEEP, "solver": QUICK, "shard": 10} | options
+    return run_sweep(target, SENSOR, **arguments)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> tuple[dict[str, bytes], int]:
+    """The files of an uninterrupted run, and how many jobs it took."""
+    executor = Counting()
+    return files(sweep_to(tmp_path_factory.mktemp("whole") / "presses", executor=executor)), executor.jobs
+
+
+def stop_after(count: int):
+    """A progress that stops the run when so much is done."""
+
+    def progress(done: int, _total: int) -> None:
+        if done >= count:
+            raise Stopped
+
+    return progress
+
+
+@pytest.fixture
+def stopped(tmp_path) -> Path:
+    """The target of a run that was stopped with all solves and two shards of ten done."""
+    with pytest.raises(Stopped):
+        sweep_to(tmp_path / "presses", sampled=stop_after(20))
+    return tmp_path / "presses"
+
+
+@pytest.mark.parametrize("when", [{"progress": stop_after(1)}, {"progress": stop_after(3)}, {"sampled": stop_after(0)},
+                                  {"sampled": stop_after(10)}, {"sampled": stop_after(60)}])  # fmt: skip
+def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, whole, when):
+    target, first, second = tmp_path / "presses", Counting(), Counting()
+    with pytest.raises(Stopped):
+        sweep_to(target, executor=first, ahead=1, **when)
+    assert [path.name for path in tmp_path.iterdir()] == ["presses.part"]
+    sweep_to(target, executor=second)
+    expected, jobs = whole
+    assert files(target) == expected
+    assert first.jobs + second.jobs == jobs  # nothing twice
+    assert [path.name for path in tmp_path.iterdir()] == ["presses"]
+
+
+def test_a_resumed_run_tells_what_is_there(stopped):
+    told = []
+    sweep_to(stopped, sampled=lambda done, total: told.append((done, total)))
+    assert told == [(20, 60), (30, 60), (40, 60), (50, 60), (60, 60)]
+
+
+def test_what_does_not_change_the_bytes_may_change(stopped, whole):
+    sweep_to(stopped, executor=Counting(), ahead=2)
+    assert files(stopped) == whole[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sweep": replace(SWEEP, samples=70)}, "sweep.samples is 60 there, 70 here"),
+        ({"probes": (Circle(2e-3),)}, r"probes is \['circle:1.0@0'\] there, \['circle:2.0@0'\] here"),
+        ({"solver": Solver()}, "solver.resolution is .*; solver.theory is"),
+        ({"shard": 20}, "shard is 10 there, 20 here"),
+    ],
+)  # fmt: skip
+def test_a_draft_of_other_settings_is_left_alone(stopped, whole, changes, message):
+    before = sorted(draft_of(stopped).rglob("*"))
+    with pytest.raises(OutputExists, match=rf"presses\.part holds the unfinished run of other settings: {message}"):
+        sweep_to(stopped, **changes)
+    assert sorted(draft_of(stopped).rglob("*")) == before
+    assert files(sweep_to(stopped)) == whole[0]
+
+
+def test_a_draft_of_another_sensor_or_version_is_left_alone(stopped):
+    with pytest.raises(
+        OutputExists, match=r"sensor\.electrodes\.D is None there, \[-?0\.0, -10\.0\] here; sensor.name is"
+    ):
+        run_sweep(stopped, load_sensor("four-25um-biaxial"), (Circle(1e-3),), SWEEP, solver=QUICK, shard=10)
+    run = draft_of(stopped) / "run.json"
+    run.write_text(run.read_text().replace('"made_by": "isocharge 0', '"made_by": "isocharge 9'))
+    with pytest.raises(OutputExists, match=r"made_by is isocharge 9\..* there, isocharge 0\..* here; .*--fresh"):
+        sweep_to(stopped)
+
+
+def test_fresh_throws_the_draft_away(stopped, whole):
+    executor = Counting()
+    sweep_to(stopped, shard=20, fresh=True, executor=executor)
+    assert executor.jobs == whole[1] - 3  # all of them, in half as many shards
+    assert not draft_of(stopped).exists()
+
+
+@pytest.mark.parametrize("content", [None, "{", "\\xff"])
+@pytest.mark.parametrize("fresh", [False, True])
+def test_a_folder_in_the_way_is_left_alone(tmp_path, content, fresh):
+    """Somebody's own folder, or a draft that is no more to be told from one."""
+    folder = tmp_path / "presses.part"
+    folder.mkdir()
+    (folder / "mine.txt").write_text("mine")
+    if content is not None:
+        (folder / "run.json").write_text(content)
+        (folder / "lock").touch()
+        if fresh:
+            return  # it has a draft's files, and may go
+    with pytest.raises(OutputExists, match=r"presses\.part is in the way: it holds no run\.json that can be read"):
+        sweep_to(tmp_path / "presses", fresh=fresh)
+    assert (folder / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("damage", ["flipped", "cut", "gone"])
+@pytest.mark.parametrize("name", ["parts/solve-00-00-0001.npy", "data/shard-00001.npz"])
+def test_a_damaged_part_is_told_of_and_made_again(stopped, whole, damage, name):
+    path = draft_of(stopped) / name
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    if damage == "gone":
+        path.unlink()
+    else:
+        path.write_bytes(bytes(data) if damage == "flipped" else bytes(data)[:-9])
+    with pytest.warns(UserWarning, match=rf"{path.name} is damaged: expected sha256 .*\.\.\.; made again"):
+        sweep_to(stopped)
+    assert files(stopped) == whole[0]
+
+
+def test_a_part_without_its_checksum_is_not_trusted(stopped, whole):
+    """As after a kill between the two."""
+    for name in ("solve-00-00-0001.npy", "shard-00001.npz"):
+        (draft_of(stopped) / "parts" / f"{name}.sha256").unlink()
+    (draft_of(stopped) / "data/shard-00001.npz").write_bytes(b"half a sh")
+    sweep_to(stopped)
+    assert files(stopped) == whole[0]
+
+
+def test_half_written_files_do_not_get_into_the_dataset(stopped, whole):
+    (draft_of(stopped) / "data" / ".0123abcd.draft").write_bytes(b"half")
+    assert files(sweep_to(stopped)) == whole[0]
+
+
+def test_two_runs_do_not_work_on_one_draft(tmp_path):
+    def other_run(_done, _total):
+        with pytest.raises(OutputExists, match=r"another process is at work in .*presses\.part; wait for it"):
+            sweep_to(tmp_path / "presses", fresh=True)
+        raise Stopped
+
+    with pytest.raises(Stopped):
+        sweep_to(tmp_path / "presses", progress=other_run)
+
+
+def test_killed_between_name_and_tidying(stopped):
+    """The dataset is whole, its draft not yet removed: nothing is redone, and the rest goes."""
+    draft_of(stopped).joinpath("data").rename(stopped)
+    with pytest.raises(OutputExists, match="presses is already there"):
+        sweep_to(stopped)
+    assert not draft_of(stopped).exists()
+    assert stopped.exists()
+
+
+def test_an_existing_target_keeps_its_draft(stopped):
+    stopped.mkdir()
+    with pytest.raises(OutputExists, match="presses is already there"):
+        sweep_to(stopped)
+    assert draft_of(stopped).exists()
+
+
+def save_and_raise(target: Path, error: BaseException) -> None:
+    with open_draft(target, {"a": (1, 2)}) as draft:
+        draft.save("part", b"1")
+        raise error
+
+
+@pytest.mark.parametrize("error", [SceneError("no such press"), SolveError("no equilibrium")])
+def test_what_would_fail_again_leaves_nothing(tmp_path, error):
+    with pytest.raises(type(error)):
+        save_and_raise(tmp_path / "new" / "out", error)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_part_is_what_was_saved(tmp_path):
+    with pytest.raises(Stopped):
+        save_and_raise(tmp_path / "out", Stopped())
+    with open_draft(tmp_path / "out", {"a": [1, 2]}) as draft:
+        assert draft.load("part") == b"1"
+        assert draft.load("other") is None
+        (draft.data / "file").write_bytes(b"2")
+    assert files(tmp_path / "out") == {"file": b"2"}
+
+
+# Really killed
+
+DRIVER = """
+import os, sys
+from pathlib import Path
+sys.path[:0] = {path!r}
+from isocharge.simulate import *
+from isocharge.simulate.sweep import Solver
+from isocharge.simulate.workers import local_workers
+
+def killed(done, total):
+    if done >= {count}:
+        os.kill(os.getpid(), 9)
+
+if __name__ == "__main__":
+    quick = Solver(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
+    sweep = Sweep(radius=3e-3, force_range=(1.0, 1.0), samples=60, seed=7)
+    with local_workers({workers}) as workers:
+        if workers.executor:
+            print(workers.executor.submit(os.getpid).result(), flush=True)
+        run_sweep(Path(sys.argv[1]), load_sensor("three-25um-biaxial"), (Circle(1e-3),), sweep, solver=quick, shard=10,
+                  executor=workers.executor, ahead=workers.ahead, {phase}=killed)
+"""
+
+
+@pytest.mark.parametrize(
+    ("phase", "count", "workers"), [("progress", 2, 2), ("sampled", 20, 2), ("sampled", 60, 1)]
+)  # fmt: skip
+def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path, whole, phase, count, workers):
+    """SIGKILL in the middle of the solves, between two shards, and before the manifest; no worker outlives it."""
+    script = tmp_path / "driver.py"
+    script.write_text(DRIVER.format(path=sys.path, count=count, workers=workers, phase=phase))
+    run = subprocess.run([sys.executable, script, tmp_path / "presses"], capture_output=True, text=True, timeout=100)
+    assert run.returncode == -signal.SIGKILL, run.stderr
+    assert not (tmp_path / "presses").exists()
+    assert draft_of(tmp_path / "presses").exists()
+    for pid in map(int, run.stdout.split()):
+        deadline = time.monotonic() + 10.0
+        while is_running(pid) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert not is_running(pid)
+    executor = Counting()
+    sweep_to(tmp_path / "presses", executor=executor)
+    assert files(tmp_path / "presses") == whole[0]
+    assert executor.jobs < whole[1]
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_a_draft_says_what_it_is(stopped):
+    run = json.loads((draft_of(stopped) / "run.json").read_text())
+    assert run["sweep"]["samples"] == 60
+    assert run["probes"] == ["circle:1.0@0"]
+    assert run["sensor"]["name"] == "three-25um-biaxial"
+    assert os.access(draft_of(stopped) / "lock", os.R_OK)

@@ -1,0 +1,112 @@
+"""The first rung of the ladder: energy, force and tangent agree, with stretching, bending and both, on every template.
+
+The energy is a polynomial of degree four in the nodal values, so five-point differences are exact but for round-off.
+"""
+
+import numpy as np
+import pytest
+
+from isocharge.simulate.assembly import Assembly
+from isocharge.simulate.elastic import ElasticFilm
+from isocharge.simulate.scaling import Groups
+
+GROUPS = {
+    "membrane": Groups(amplitude2=0.02, load=1.0, tension=0.0, bending=0.0, poisson=0.34),
+    "taut membrane": Groups(amplitude2=0.7, load=2.0, tension=0.6, bending=0.0, poisson=0.0),
+    "von Karman": Groups(amplitude2=0.0, load=1.0, tension=0.0, bending=0.02, poisson=0.34),
+    "plate": Groups(amplitude2=1e-4, load=1.0, tension=0.0, bending=5.0, poisson=0.49),
+    "taut plate": Groups(amplitude2=0.3, load=1.0, tension=0.4, bending=0.1, poisson=0.3),
+}
+STENCIL = ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12))
+SHIFTS = (0.0, 1.0, 5.0, 11.0)
+
+
+@pytest.fixture(params=GROUPS.values(), ids=GROUPS.keys())
+def elastic(request, mesh) -> ElasticFilm:
+    return ElasticFilm(mesh.geometry, request.param)
+
+
+def dense(mesh, matrix: np.ndarray) -> np.ndarray:
+    """The whole matrix (n_node, components, n_node, components) from element matrices, entry by entry."""
+    components, n_node = matrix.shape[2], mesh.template.n_node
+    unknown = (components * mesh.template.nodes[..., None] + np.arange(components)).reshape(len(matrix), -1)
+    whole = np.zeros((components * n_node, components * n_node))
+    for numbers, block in zip(unknown, matrix.reshape(len(matrix), unknown.shape[1], -1), strict=True):
+        whole[np.ix_(numbers, numbers)] += block
+    return whole.reshape(n_node, components, n_node, components)
+
+
+def condensed(mesh, matrix: np.ndarray) -> np.ndarray:
+    """The same over (U1, U2, W) alone: the Schur complement of the carried Laplacian; (3 n_node, 3 n_node)."""
+    whole = dense(mesh, matrix)
+    size = 3 * mesh.template.n_node
+    first = whole[:, :3, :, :3].reshape(size, size)
+    if matrix.shape[2] == 3:
+        return first
+    coupling = whole[:, 3, :, :3].reshape(-1, size)
+    return first - coupling.T @ np.linalg.solve(whole[:, 3, :, 3], coupling)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_residual_is_the_slope_of_the_energy(elastic, mesh, seed):
+    field, direction = mesh.random_field(seed), mesh.random_field(seed + 100)
+    slope = sum(share * elastic.energy(field + step * direction) for step, share in STENCIL)
+    scale = sum(abs(share * elastic.energy(field + step * direction)) for step, share in STENCIL)
+    assert np.sum(elastic.residual(field) * direction) == pytest.approx(slope, abs=1e-12 * scale)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_tangent_is_the_slope_of_the_residual(elastic, mesh, seed):
+    """Of the condensed matrix where bending carries a fourth unknown."""
+    field, direction = mesh.random_field(seed), mesh.random_field(seed + 100)
+    slope = sum(share * elastic.residual(field + step * direction) for step, share in STENCIL)
+    product = condensed(mesh, elastic.tangent(field)) @ direction.ravel()
+    np.testing.assert_allclose(product.reshape(-1, 3), slope, atol=1e-9 * np.abs(slope).max())
+
+
+def test_tangent_is_symmetric(elastic, mesh):
+    tangent = elastic.tangent(mesh.random_field(5))
+    np.testing.assert_allclose(tangent, tangent.transpose(0, 3, 4, 1, 2), atol=1e-12 * np.abs(tangent).max())
+
+
+def test_guard_is_tension_in_the_tangent_only(elastic, mesh):
+    """It adds the Laplacian of every component, weighted as tension is, and nothing to force or energy."""
+    field = mesh.random_field(3)
+    change = elastic.tangent(field, 0.7) - elastic.tangent(field)
+    more = ElasticFilm(mesh.geometry, elastic.groups.stiffened(0.7)).tangent(field) - elastic.tangent(field)
+    np.testing.assert_array_equal(change, more)
+    laplace = np.einsum("ep,epam,epan->emn", mesh.geometry.weights, mesh.geometry.gradient, mesh.geometry.gradient)
+    np.testing.assert_allclose(change[:, :, 2, :, 2], 0.7 * laplace, atol=1e-10 * np.abs(laplace).max())
+
+
+def test_load_is_the_only_outer_force(elastic, mesh):
+    """A translation does no work but against the load: the sum of all nodal forces is the load, upwards."""
+    total = elastic.residual(mesh.random_field(2)).sum(axis=0)
+    expected = -elastic.groups.load / mesh.template.copies
+    scale = np.abs(elastic.residual(mesh.random_field(2))).max()
+    assert total[2] == pytest.approx(expected, abs=1e-10 * max(scale, 1.0))
+    np.testing.assert_allclose(total[:2], 0.0, atol=1e-10 * max(scale, 1.0))
+
+
+@pytest.mark.parametrize("shift", SHIFTS)
+@pytest.mark.parametrize("kind", ["taut plate", "plate"])
+def test_step_does_not_depend_on_the_shift(mesh, monkeypatch, kind, shift):
+    """The linear solve with the carried Laplacian is (K + beta L^T M^-1 L) step = right, written out densely."""
+    monkeypatch.setattr("isocharge.simulate.bending.SHIFT", shift)
+    groups = GROUPS[kind]
+    elastic, size = ElasticFilm(mesh.geometry, groups), 3 * mesh.template.n_node
+    field, right = 0.3 * mesh.random_field(1), np.random.default_rng(2).standard_normal((mesh.template.n_node, 3))
+    stiffness = dense(mesh, elastic.membrane.tangent(field))
+    geometry = mesh.geometry
+    local = np.einsum("ep,epam,epan->emn", geometry.weights, geometry.gradient, geometry.gradient)
+    laplace = dense(mesh, local[:, :, None, :, None])[:, 0, :, 0]
+    mass = geometry.gather(geometry.mass)
+    stiffness[:, 2, :, 2] += groups.bending * laplace.T @ (laplace / mass[:, None])
+    free = np.ones((mesh.template.n_node, 3), dtype=bool)
+    free[mesh.template.on_rim] = False
+    free[mesh.template.on_axis, 1] = False
+    keep = np.flatnonzero(free)
+    expected = np.zeros(size)
+    expected[keep] = np.linalg.solve(stiffness.reshape(size, size)[np.ix_(keep, keep)], right.ravel()[keep])
+    step = Assembly(mesh.template, elastic.components).solve(elastic.tangent(field), right)
+    np.testing.assert_allclose(step.ravel(), expected, atol=1e-8 * np.abs(expected).max())

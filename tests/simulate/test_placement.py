@@ -1,0 +1,212 @@
+"""Where the mesh lies: areas, straight and round edges, load, and finding points again."""
+
+import copy
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from isocharge.errors import SceneError
+from isocharge.simulate import Circle, Film, Polygon, Probe, Resolution, Theory
+from isocharge.simulate.geometry import Geometry
+from isocharge.simulate.meshing import farthest, place, resolution_for, template_for
+from isocharge.simulate.placement import Placement
+from isocharge.simulate.template import Template
+
+FILM = Film(1.0, 1e-3, 1.0, 0.3)
+FULL = Theory(stretching=True, bending=True, pretensioned=False)
+COMMON = settings(derandomize=True, deadline=None, max_examples=25)
+
+
+@st.composite
+def probes(draw) -> Probe:
+    """Circles, rectangles, triangles and other convex polygons, on a film of unit radius, turned by any angle."""
+    kind = draw(st.sampled_from(["circle", "rectangle", "triangle", "polygon"]))
+    size, turn = 10.0 ** draw(st.floats(-3.0, -0.7)), draw(st.floats(0.0, 2.0 * np.pi))
+    if kind == "circle":
+        return Circle(size)
+    if kind == "rectangle":
+        return Polygon.rectangle(2.0 * size, 2.0 * size * draw(st.floats(0.1, 1.0)), turn)
+    if kind == "triangle":
+        return Polygon.triangle(1.7 * size, turn)
+    gaps = np.array(draw(st.lists(st.floats(0.4, 1.0), min_size=4, max_size=8)))
+    angle = 2.0 * np.pi * np.cumsum(gaps) / gaps.sum()
+    return Polygon.of(size * np.stack([np.cos(angle), np.sin(angle)], axis=1), turn)
+
+
+@st.composite
+def presses(draw) -> tuple[Probe, tuple[float, float], Resolution, float]:
+    """Presses that are accepted, up to the rim: probe, place, mesh and layer."""
+    probe, layer = draw(probes()), 10.0 ** draw(st.floats(-3.0, -1.0))
+    share, angle = draw(st.one_of(st.floats(0.0, 0.97), st.floats(0.9, 0.999))), draw(st.floats(-np.pi, np.pi))
+    distance = share * (1.0 - probe.reach)
+    at = (distance * np.cos(angle), distance * np.sin(angle))
+    try:
+        resolution = resolution_for(FILM, probe, at, FULL, 1e-3, layer)
+    except SceneError:
+        assume(False)
+    return probe, at, resolution, layer
+
+
+def exact_points(placement: Placement, mesh: Template, xi: np.ndarray, eta: np.ndarray) -> np.ndarray:
+    """Film points of the same local coordinates in every element, shape (n_element, n)."""
+    other = copy.copy(mesh)
+    other.xi, other.eta = xi, eta
+    return placement.element_points(other)
+
+
+def found_again(placement: Placement, mesh: Template, film: np.ndarray) -> np.ndarray:
+    """Film points of the elements and local coordinates that `locate` gives; these lie in [-1, 1]."""
+    element, xi, eta = (found[0] for found in placement.batch().locate(mesh, film[None]))
+    assert np.abs(np.concatenate([xi, eta])).max() <= 1.0 + 1e-7
+    return exact_points(placement, mesh, xi, eta)[element, np.arange(film.size)]
+
+
+def accuracy(film: np.ndarray, placement: Placement) -> np.ndarray:
+    """1e-9 of the size of the elements nearby: those of a small probe are small, those at a near rim too."""
+    (distance,), room = np.abs(film[None] - placement.corners.mean()), 1.0 - np.abs(placement.corners).max()
+    return 1e-9 * np.minimum(1.0, np.maximum(distance, 1e-3 * room) + np.ptp(np.abs(placement.corners)) + 1e-3)
+
+
+@given(scene=presses(), seed=st.integers(0, 2**32 - 1))
+@COMMON
+def test_locate_inverts_element_points(scene, seed):
+    """Points inside of every element are found in that element, at their local coordinates."""
+    probe, at, resolution, layer = scene
+    placement, mesh = place(FILM, probe, at, resolution, layer), template_for(probe, resolution)
+    xi, eta = np.random.default_rng(seed).uniform(-0.98, 0.98, (2, 4))
+    film = exact_points(placement, mesh, xi, eta).ravel()
+    element, found_xi, found_eta = (found[0] for found in placement.batch().locate(mesh, film[None]))
+    np.testing.assert_array_equal(element, np.repeat(np.arange(mesh.n_element), 4))
+    np.testing.assert_allclose(found_xi.reshape(-1, 4) - xi, 0.0, atol=1e-6)
+    np.testing.assert_allclose(found_eta.reshape(-1, 4) - eta, 0.0, atol=1e-6)
+
+
+@given(scene=presses(), seed=st.integers(0, 2**32 - 1))
+@COMMON
+def test_any_point_is_found_where_it_was(scene, seed):
+    """All over the film, on the rim, and on every seam: the nodes, the hub, the footprint's edge."""
+    probe, at, resolution, layer = scene
+    placement, mesh = place(FILM, probe, at, resolution, layer), template_for(probe, resolution)
+    rng = np.random.default_rng(seed)
+    disk = np.sqrt(rng.random(120)) * np.exp(2j * np.pi * rng.random(120))
+    near = placement.corners.mean() + 3.0 * probe.reach * disk[:100]
+    rim = np.exp(2j * np.pi * rng.random(20))
+    film = np.concatenate([disk, near[np.abs(near) < 1.0], rim, placement.element_points(mesh).ravel()])
+    if mesh.half:
+        film = film.real + 1j * np.abs(film.imag)
+    np.testing.assert_array_less(np.abs(found_again(placement, mesh, film) - film), accuracy(film, placement))
+
+
+@given(scene=presses())
+@COMMON
+def test_accepted_presses_have_no_folded_elements(scene):
+    """Jacobians positive at every integration point and node; the film's area is there."""
+    probe, at, resolution, layer = scene
+    mesh = template_for(probe, resolution)
+    geometry = Geometry.build(mesh, place(FILM, probe, at, resolution, layer).element_points(mesh))
+    assert geometry.weights.min() > 0.0
+    assert geometry.mass.min() > 0.0
+    assert mesh.copies * geometry.weights.sum() == pytest.approx(np.pi, rel=3e-3)
+
+
+@given(scene=presses())
+@COMMON
+def test_footprint_is_the_probes(scene):
+    """Its area, centroid and share of the load: exact for polygons, to the mesh's accuracy for circles."""
+    probe, at, resolution, layer = scene
+    mesh, distance = template_for(probe, resolution), float(np.hypot(*at))
+    points = place(FILM, probe, at, resolution, layer).element_points(mesh)
+    geometry = Geometry.build(mesh, points)
+    exact = 1e-9 if isinstance(probe, Polygon) else 1e-4
+    inner = geometry.weights[mesh.footprint]
+    assert mesh.copies * inner.sum() == pytest.approx(probe.area, rel=exact)
+    assert mesh.copies * geometry.load.sum() == pytest.approx(1.0, rel=1e-12)
+    z = points.ravel()[mesh.first_seen]
+    mean = mesh.copies * geometry.load @ z
+    assert mean.real == pytest.approx(distance, abs=exact * probe.reach)
+    if not mesh.half:
+        assert mean.imag == pytest.approx(0.0, abs=exact * probe.reach)
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.4, 0.85])
+@pytest.mark.parametrize(
+    "probe",
+    [Polygon.rectangle(0.2, 0.1, 0.7), Polygon.triangle(0.1, 0.3)],
+    ids=["rectangle", "triangle"],
+)
+def test_load_is_uniform_over_a_polygon(probe, distance):
+    """Second moments about the centroid, from the corners' closed formula, to round-off: no staircase of elements."""
+    resolution = Resolution(4, 8, 3)
+    mesh = template_for(probe, resolution)
+    points = place(FILM, probe, (distance, 0.0), resolution, 0.05).element_points(mesh)
+    load, about = Geometry.build(mesh, points).load, points.ravel()[mesh.first_seen] - distance
+    (x, y), (u, v) = (np.stack([z.real, z.imag]) for z in (probe.outline, np.roll(probe.outline, -1)))
+    cross = (x * v - u * y) / (12.0 * probe.area)
+    assert load @ about.real**2 == pytest.approx(np.sum(cross * (x * x + x * u + u * u)), rel=1e-11)
+    assert load @ about.imag**2 == pytest.approx(np.sum(cross * (y * y + y * v + v * v)), rel=1e-11)
+    mixed = 0.5 * np.sum(cross * (x * v + 2 * x * y + 2 * u * v + u * y))
+    assert load @ (about.real * about.imag) == pytest.approx(mixed, abs=1e-12 * probe.reach**2)
+    assert not load[~np.isin(np.arange(mesh.n_node), mesh.nodes[mesh.footprint])].any()
+
+
+@pytest.mark.parametrize(("distance", "radius"), [(0.0, 0.02), (0.4, 0.11), (0.1, 0.6)])
+def test_load_is_uniform_over_a_disk(distance, radius):
+    """1, the centre, R^2/4 along each axis."""
+    resolution = Resolution(8, 8, 4)
+    mesh = template_for(Circle(radius), resolution)
+    points = place(FILM, Circle(radius), (distance, 0.0), resolution, 0.05).element_points(mesh)
+    load, about = 2.0 * Geometry.build(mesh, points).load, points.ravel()[mesh.first_seen] - distance
+    assert load.sum() == pytest.approx(1.0, rel=1e-13)
+    assert abs(load @ about.real) < 1e-8 * radius
+    assert load @ about.real**2 == pytest.approx(0.25 * radius**2, rel=1e-7)
+    assert load @ about.imag**2 == pytest.approx(0.25 * radius**2, rel=1e-7)
+
+
+@pytest.mark.parametrize(("distance", "radius"), [(0.0, 0.02), (0.5, 0.002), (0.3, 0.5), (0.9, 0.05), (0.96, 0.03)])
+def test_footprint_edge_is_the_right_circle(distance, radius):
+    """The template's ring |z| = rho lands on the circle with the footprint's radius and centre, the rim on the rim."""
+    placement = place(FILM, Circle(radius), (distance, 0.0), Resolution(), 0.05)
+    turn = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 50))
+    np.testing.assert_allclose(np.abs(placement.to_film(placement.rho * turn) - distance), radius, atol=1e-13)
+    np.testing.assert_allclose(np.abs(placement.to_film(turn)), 1.0, atol=1e-13)
+    film = np.sqrt(np.linspace(0.0, 1.0, 99)) * np.exp(1j * np.arange(99.0))
+    np.testing.assert_allclose(placement.to_film(placement.to_template(film)), film, atol=1e-10)
+
+
+@given(scene=presses())
+@settings(derandomize=True, deadline=None, max_examples=30)
+def test_circle_round_a_polygon_is_on_the_film_and_holds_it(scene):
+    probe, at, resolution, layer = scene
+    placement = place(FILM, probe, at, resolution, layer)
+    ring = placement.to_film(placement.rho * np.exp(2j * np.pi * np.arange(400) / 400))
+    assert np.abs(ring).max() < 1.0
+    assert np.abs(placement.corners).max() == pytest.approx(farthest(probe, at), abs=0.8 * probe.reach)
+    assert np.all(np.abs(placement.to_template(placement.corners)) < placement.rho)
+
+
+def test_area_converges_exponentially_with_the_order():
+    error = []
+    for order in (2, 4, 6):
+        mesh = template_for(Circle(0.11), Resolution(order, 8, 4))
+        points = place(FILM, Circle(0.11), (0.4, 0.0), Resolution(order, 8, 4), 0.05).element_points(mesh)
+        error.append(abs(2.0 * Geometry.build(mesh, points).weights.sum() - np.pi))
+    assert error[1] < error[0] / 50.0
+    assert error[2] < error[1] / 50.0
+
+
+def test_placement_of_many_is_each_of_them():
+    probe, resolution = Polygon.triangle(0.1), Resolution(3, 8, 3, 1)
+    mesh, distance, turn = template_for(probe, resolution), np.array([0.0, 0.2, 0.7]), np.array([0.0, 1.0, -2.0])
+    many = Placement.of(mesh, probe, distance, 1.0, 0.05, turn)
+    for i in range(3):
+        alone = Placement.of(mesh, probe.turned(turn[i]), distance[i], 1.0, 0.05)
+        for name in ("c", "rho", "corners", "start", "end", "depth"):
+            np.testing.assert_allclose(getattr(many, name)[i], getattr(alone, name), atol=1e-12)
+    film = np.array([[0.1 + 0.2j, 0.75 - 0.03j, -0.9j, 0.0]] * 3)
+    together = many.locate(mesh, film)
+    for i in range(3):
+        alone = many[np.array([i])].locate(mesh, film[i : i + 1])
+        for one, every in zip(alone, together, strict=True):
+            np.testing.assert_array_equal(one[0], every[i])

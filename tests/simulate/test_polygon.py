@@ -1,0 +1,130 @@
+"""Areas shared by polygons and disks against closed forms, Monte Carlo and what areas must obey."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+
+from isocharge.simulate.polygon import area_in_disk, area_of, centroid_of, is_convex, overlap, shared_area
+
+SQUARE = np.array([0.0, 1.0, 1.0 + 1.0j, 1.0j])
+COMMON = settings(derandomize=True, deadline=None, max_examples=150)
+
+
+def corners_of(z: np.ndarray) -> np.ndarray:
+    return np.stack([z.real, z.imag], axis=1)
+
+
+@st.composite
+def convex(draw) -> np.ndarray:
+    """A convex polygon with anticlockwise corners x + iy: the hull of random points."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    points = draw(st.floats(0.05, 2.0)) * rng.standard_normal((draw(st.integers(4, 12)), 2)) + rng.uniform(-1, 1, 2)
+    hull = points[ConvexHull(points).vertices]
+    return hull @ np.array([1.0, 1.0j])
+
+
+def halves(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A polygon cut along the line from its first corner to a middle one (triangles are cut to an edge's middle)."""
+    if z.size == 3:
+        middle = 0.5 * (z[1] + z[2])
+        return np.array([z[0], z[1], middle]), np.array([z[0], middle, z[2]])
+    cut = z.size // 2
+    return z[: cut + 1], np.concatenate([z[cut:], z[:1]])
+
+
+@given(z=convex())
+@COMMON
+def test_area_and_centroid_add_up(z):
+    one, two = (corners_of(part) for part in halves(z))
+    whole = corners_of(z)
+    assert area_of(one) + area_of(two) == pytest.approx(area_of(whole), rel=1e-12)
+    moment = area_of(one) * centroid_of(one) + area_of(two) * centroid_of(two)
+    np.testing.assert_allclose(moment / area_of(whole), centroid_of(whole), atol=1e-9)
+    assert is_convex(whole)
+    assert not is_convex(whole[::-1])
+
+
+def test_a_dent_and_a_star_are_not_convex():
+    assert not is_convex(np.array([(0.0, 0.0), (2.0, 0.0), (0.5, 0.5), (0.0, 2.0)]))
+    star = np.exp(2j * np.pi * np.arange(5) * 2 / 5)
+    assert not is_convex(corners_of(star))
+    assert not is_convex(corners_of(np.array([0.0, 1.0, 1.0, 1.0j])))
+
+
+@given(a=convex(), b=convex())
+@COMMON
+def test_shared_area_is_symmetric_bounded_and_additive(a, b):
+    common, tiny = shared_area(a, b), 1e-9 * (area_of(corners_of(a)) + area_of(corners_of(b)))
+    assert common == pytest.approx(shared_area(b, a), abs=tiny)
+    assert -tiny <= common <= min(area_of(corners_of(a)), area_of(corners_of(b))) + tiny
+    assert sum(shared_area(part, b) for part in halves(a)) == pytest.approx(common, abs=tiny)
+    assert shared_area(a, a) == pytest.approx(area_of(corners_of(a)), rel=1e-9)
+    if common > 10.0 * tiny:
+        assert overlap(corners_of(a), corners_of(b))
+    if not overlap(corners_of(a), corners_of(b)):
+        assert common <= tiny
+
+
+@given(a=convex(), x=st.floats(-2, 2), y=st.floats(-2, 2), radius=st.floats(1e-3, 3.0))
+@COMMON
+def test_area_in_a_disk_is_bounded_and_additive_and_a_polygons_limit(a, x, y, radius):
+    centre, most = complex(x, y), min(area_of(corners_of(a)), np.pi * radius**2)
+    common = area_in_disk(a, centre, radius)
+    assert -1e-9 * most <= common <= most * (1.0 + 1e-9)
+    split = sum(area_in_disk(part, centre, radius) for part in halves(a))
+    assert split == pytest.approx(common, abs=1e-9 + 1e-9 * most)
+    count = 400
+    nearly = radius / np.sqrt(np.sin(2 * np.pi / count) * count / (2 * np.pi))
+    ring = centre + nearly * np.exp(2j * np.pi * np.arange(count) / count)
+    assert shared_area(a, ring) == pytest.approx(common, abs=2e-4 * np.pi * radius**2)
+
+
+@pytest.mark.parametrize(
+    ("shift", "expected"),
+    [(0.0, 1.0), (0.5, 0.5), (0.5 + 0.25j, 0.375), (1.0, 0.0), (2.0, 0.0), (-0.25 - 0.25j, 0.5625)],
+)
+def test_two_squares(shift, expected):
+    assert shared_area(SQUARE, SQUARE + shift) == pytest.approx(expected, abs=1e-15)
+
+
+def test_square_and_diamond():
+    """The unit square cut by |x| + |y| <= c about its centre: an octagon."""
+    diamond = 0.5 + 0.5j + 0.75 * np.array([1.0, 1.0j, -1.0, -1.0j])
+    assert shared_area(SQUARE, diamond) == pytest.approx(1.0 - 4 * 0.5 * 0.25**2, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("centre", "radius", "expected"),
+    [
+        (0.5 + 0.5j, 0.3, np.pi * 0.09),  # disk inside
+        (0.5 + 0.5j, 5.0, 1.0),  # square inside
+        (0.0, 0.5, np.pi / 16),  # about a corner
+        (0.5, 0.4, np.pi * 0.08),  # about the middle of an edge
+        (3.0, 1.0, 0.0),  # apart
+        (2.0 + 0.5j, 1.0, 0.0),  # touching
+        (0.5 + 0.5j, 0.6, 0.36 * (np.pi - 4 * (np.arccos(5 / 6) - 5 / 6 * np.sqrt(11) / 6))),  # four segments cut off
+    ],
+)
+def test_square_and_disk(centre, radius, expected):
+    assert area_in_disk(SQUARE, centre, radius) == pytest.approx(expected, abs=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_against_darts(seed):
+    """Monte Carlo: 200,000 darts, five standard deviations."""
+    rng = np.random.default_rng(seed)
+    a = np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, 6))) + 0.2
+    b = 0.8 * np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, 5))) - 0.1j
+    darts = rng.uniform(-1.3, 1.3, 200_000) + 1j * rng.uniform(-1.3, 1.3, 200_000)
+
+    def inside(z: np.ndarray) -> np.ndarray:
+        way = np.roll(z, -1) - z
+        return np.all(((darts[:, None] - z) * np.conj(way)).imag >= 0.0, axis=1)
+
+    for hit, found in (
+        (inside(a) & inside(b), shared_area(a, b)),
+        (inside(a) & (np.abs(darts - 0.3) < 0.5), area_in_disk(a, 0.3, 0.5)),
+    ):
+        assert found == pytest.approx(2.6**2 * hit.mean(), abs=5 * 2.6**2 * 0.5 / np.sqrt(200_000))

@@ -1,0 +1,164 @@
+"""The same bytes whoever does the work, a worker that dies included; and workers that do not outlive their sweep."""
+
+import os
+import re
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from isocharge.errors import InputError, MissingExtra, WorkersLost
+from isocharge.simulate import Circle, Resolution, Sweep, Theory, load_sensor, run_sweep
+from isocharge.simulate import workers as module
+from isocharge.simulate.sweep import Solver
+from isocharge.simulate.workers import Workers, dask_workers, local_workers
+
+SENSOR = load_sensor("three-25um-biaxial")
+QUICK = Solver(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
+SWEEP = Sweep(radius=3e-3, force_range=(1.0, 1.0), samples=60, seed=7, orientation="random")
+
+
+def sweep_with(workers: Workers, target: Path, **options) -> dict[str, bytes]:
+    """The files of a small sweep of two probes in shards of ten."""
+    probes = (Circle(1e-3), Circle(2e-3))
+    run_sweep(target, SENSOR, probes, SWEEP, solver=QUICK, shard=10, executor=workers.executor, ahead=3, **options)
+    return {path.name: path.read_bytes() for path in target.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory) -> dict[str, bytes]:
+    """What one process writes."""
+    with local_workers(1) as workers:
+        assert workers.executor is None
+        return sweep_with(workers, tmp_path_factory.mktemp("one") / "presses")
+
+
+def test_two_processes(tmp_path, expected):
+    with local_workers(2) as workers:
+        assert sweep_with(workers, tmp_path / "presses") == expected
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_threads(tmp_path, expected, count):
+    with ThreadPoolExecutor(count) as pool:
+        assert sweep_with(Workers(pool), tmp_path / "presses") == expected
+
+
+def test_a_worker_process_that_dies_is_told_of_and_the_run_can_go_on(tmp_path, expected):
+    def kill(_done, _total, killed=[]):  # noqa: B006
+        if not killed:
+            killed.append(workers.executor.submit(os.getpid).result())
+            os.kill(killed[0], signal.SIGKILL)
+
+    with pytest.raises(WorkersLost, match="a worker process ended by itself"), local_workers(2) as workers:
+        sweep_with(workers, tmp_path / "presses", sampled=kill)
+    assert not (tmp_path / "presses").exists()
+    assert sweep_with(Workers(), tmp_path / "presses") == expected
+
+
+def test_workers_end_with_an_interrupt_even_in_the_middle_of_a_task():
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupt_workers()
+    assert time.monotonic() - began < 60.0
+
+
+def interrupt_workers() -> None:
+    with local_workers(2) as workers:
+        assert workers.executor is not None
+        assert workers.executor.submit(os.getpid).result() != os.getpid()
+        workers.executor.submit(time.sleep, 600.0)
+        raise KeyboardInterrupt
+
+
+def test_results_come_in_order_and_tasks_are_drawn_as_they_are_needed():
+    drawn = []
+
+    def jobs() -> Iterator[float]:
+        for number in range(20):
+            drawn.append(number)
+            yield 0.002 * (number % 3)
+
+    with ThreadPoolExecutor(4) as pool:
+        results = Workers(pool, ahead=5).in_order(waited, jobs())
+        assert next(results) == 0.0
+        assert len(drawn) == 5
+        assert [0.0, *results] == [0.002 * (number % 3) for number in range(20)]
+
+
+def waited(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+
+
+def test_a_worker_with_another_isocharge_is_refused(monkeypatch):
+    """Its bytes might differ."""
+    function = module.Checked(waited)
+    monkeypatch.setattr(module, "made_by", lambda: "isocharge 9.9")
+    with pytest.raises(WorkersLost, match=r"a worker runs isocharge 9\.9, expected isocharge 0\.1\.0 \([0-9a-f]{12}\)"):
+        function(0.0)
+
+
+# Dask
+
+pytest_dask = pytest.mark.filterwarnings(
+    # a nanny's worker that is killed leaves its sockets and its process object to the collector
+    "ignore:unclosed:ResourceWarning",
+    "ignore::pytest.PytestUnraisableExceptionWarning",
+)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two worker processes on loopback."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        yield cluster
+
+
+def pids(cluster) -> list[int]:
+    return [nanny.pid for nanny in cluster.workers.values() if nanny.pid]
+
+
+@pytest_dask
+def test_dask(cluster, tmp_path, expected):
+    with dask_workers(cluster.scheduler_address) as workers:
+        assert sweep_with(workers, tmp_path / "presses") == expected
+
+
+@pytest_dask
+@pytest.mark.parametrize("phase", ["progress", "sampled"])
+def test_a_dask_worker_killed_half_way_is_no_matter(cluster, tmp_path, expected, phase):
+    """In the middle of the solves, and between two shards."""
+    killed = []
+
+    def kill(done: int, _total: int) -> None:
+        if done >= 2 and not killed:
+            killed.append(pids(cluster)[0])
+            os.kill(killed[0], signal.SIGKILL)
+
+    with dask_workers(cluster.scheduler_address) as workers:
+        assert sweep_with(workers, tmp_path / "presses", **{phase: kill}) == expected
+    assert killed
+    assert killed[0] not in pids(cluster)
+
+
+@pytest_dask
+def test_a_cluster_that_does_not_answer(monkeypatch):
+    monkeypatch.setattr(module, "CONNECT_S", 0.3)
+    with pytest.raises(WorkersLost, match="no Dask scheduler answers at tcp://127"):
+        dask_workers("tcp://127.0.0.1:9").__enter__()
+    with pytest.raises(InputError, match="cluster 'carrier-pigeon://1': expected an address like"):
+        dask_workers("carrier-pigeon://1").__enter__()
+
+
+def test_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtra, match=re.escape("pip install 'isocharge[cluster]'")):
+        dask_workers("tcp://127.0.0.1:9").__enter__()
