@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all bench release clean
+.PHONY: demo test test-all bench soak release proto clean
 
 demo: $(VENV)/installed
 	$(BIN)/isocharge demo
@@ -23,10 +23,20 @@ bench: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_predictor.py
 	$(BIN)/python tests/benchmarks/bench_stream.py
 	$(BIN)/python tests/benchmarks/bench_touch.py
+	$(BIN)/python tests/benchmarks/bench_http.py
+
+# A million requests; some minutes.
+soak: $(VENV)/installed
+	$(BIN)/python tests/benchmarks/bench_soak.py
 
 # The released model, made anew; fails if it is there already.
 release: $(VENV)/installed
 	$(BIN)/isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
+
+# The gRPC messages, compiled; a test compares them with their source.
+PROTO := serve/isocharge/serve/grpc
+proto: $(VENV)/installed
+	$(BIN)/python -m grpc_tools.protoc -I $(PROTO) --descriptor_set_out=$(PROTO)/inference.binpb inference.proto
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)

@@ -55,6 +55,7 @@ SUBCOMMANDS = [
     ("serve",),
     ("serve", "predict"),
     ("serve", "stream"),
+    ("serve", "http"),
     ("serve", "virtual"),
     ("serve", "replay"),
     ("serve", "doctor"),

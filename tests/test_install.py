@@ -57,6 +57,13 @@ def test_a_missing_extra_says_so_in_python_too(fresh, tmp_path, stage):
     assert f"pip install 'isocharge[{stage}]'" in done.stderr
 
 
+def test_serving_over_http_says_which_extra_is_missing(fresh, tmp_path):
+    done = run(fresh, "isocharge", "serve", "http", "--port", "0", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "pip install 'isocharge[http]'" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_a_missing_extra_says_how_to_get_it(fresh, tmp_path):
     done = run(fresh, "isocharge", "simulate", "point", "three-25um-biaxial", cwd=tmp_path)
     assert done.returncode == 1

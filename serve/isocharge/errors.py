@@ -45,6 +45,42 @@ class ModelError(InputError):
     """A model is missing, damaged, or of another format."""
 
 
+class ModelNotFound(ModelError):
+    """No model of that name and version is served."""
+
+
+class RequestError(InputError):
+    """A request to the server is not one that it understands."""
+
+
+class UnknownPath(RequestError):
+    """Nothing is served under this path."""
+
+
+class WrongMethod(RequestError):
+    """This path is asked for in another way; `allowed` says how."""
+
+    def __init__(self, message: str, allowed: str) -> None:
+        super().__init__(message)
+        self.allowed = allowed
+
+
+class TooLarge(RequestError):
+    """A request is larger than the server's limits."""
+
+
+class UnknownEncoding(RequestError):
+    """A body is compressed in a way that the server does not read."""
+
+
+class TokenError(IsochargeError, PermissionError):
+    """A request does not carry the server's token."""
+
+
+class ListenError(IsochargeError, OSError):
+    """The server cannot listen where it was asked to."""
+
+
 class OutputExists(IsochargeError, FileExistsError):
     """The output is already there; nothing is overwritten unasked."""
 

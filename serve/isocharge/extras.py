@@ -6,9 +6,12 @@ from contextlib import contextmanager
 from isocharge.errors import MissingExtra
 
 SIMULATE = frozenset({"scipy", "threadpoolctl", "matplotlib"})
+HTTP = frozenset({"uvicorn", "uvloop", "httptools", "orjson", "markdown_it"})
 PACKAGES = {
     "simulate": SIMULATE,
     "train": SIMULATE | {"torch", "onnx"},
+    "http": HTTP,
+    "grpc": HTTP | {"grpc", "google"},
     "cluster": frozenset({"dask", "distributed"}),
 }
 """Import names that come with an extra of pyproject.toml."""

@@ -35,7 +35,6 @@ from isocharge.simulate import (
 
 SENSORS = tuple(load_sensor(name) for name in ("three-25um-biaxial", "four-25um-uniaxial"))
 RADIUS = 45e-3
-FULL = {"stretching": True, "bending": True}
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -148,15 +147,15 @@ def tables(result: dict[str, Any]) -> str:
     entries = result["draws"]
     solved = [entry for entry in entries if entry["status"] == "converged"]
     lines = [f"{len(entries)} draws, seed {result['seed']}: {len(solved)} converged"]
-    for status in sorted({entry["status"] for entry in entries} - {"converged"}):
-        lines.append(f"  {status}: {sum(entry['status'] == status for entry in entries)}")
+    others = sorted({entry["status"] for entry in entries} - {"converged"})
+    lines += [f"  {status}: {sum(entry['status'] == status for entry in entries)}" for status in others]
     for name in ("iterations", "residual", "seconds", "estimated_error"):
         values = np.array([entry[name] for entry in solved])
         lines.append(
             f"{name}: median {np.median(values):.3g}, 95 % {np.quantile(values, 0.95):.3g}, worst {values.max():.3g}"
         )
-    for theory in sorted({entry["theory"] for entry in solved}):
-        lines.append(f"  {theory}: {sum(entry['theory'] == theory for entry in solved)}")
+    theories = sorted({entry["theory"] for entry in solved})
+    lines += [f"  {theory}: {sum(entry['theory'] == theory for entry in solved)}" for theory in theories]
     sample = [e for e in solved if e["number"] in set(result["random"]) and "error" in e]
     if sample:
         errors = np.array([entry["error"] for entry in sample])

@@ -1,4 +1,4 @@
-"""One press: `Predictor.predict` against a bare `session.run` on the same model, in interleaved rounds.
+"""One press: `Predictor.predict_into` and `predict` against a bare `session.run`, same model, in interleaved rounds.
 
     python tests/benchmarks/bench_predictor.py [--model NAME|PATH] [--rounds 30] [--calls 2000] [--json]
 
@@ -55,8 +55,10 @@ def contenders(model: str, seed: int) -> dict[str, Callable[[], object]]:
     session = open_session((folder / "model.onnx").read_bytes(), str(folder))
     charge_pC = np.random.default_rng(seed).uniform(500.0, 1500.0, len(predictor.metadata.electrodes))
     feed, values = {"charge_pC": np.float32(charge_pC[np.newaxis])}, charge_pC.tolist()
+    singles, out = np.float32(charge_pC), np.zeros(7, np.float32)
     return {
         "session.run": lambda: session.run(None, feed),
+        "predict_into": lambda: predictor.predict_into(singles, out),
         "predict(list)": lambda: predictor.predict(values),
         "predict(array)": lambda: predictor.predict(charge_pC),
     }

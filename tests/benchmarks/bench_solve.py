@@ -43,13 +43,15 @@ REFINED = {MEMBRANE: Resolution(10, 8, 8), BENT: Resolution(9, 8, 8, 2)}
 RESOLUTIONS = {
     MEMBRANE: [
         Resolution(*numbers)
-        for numbers in ((3, 8, 4), (3, 8, 6), (4, 8, 4), (4, 8, 5), (4, 8, 6), (5, 8, 5), (5, 8, 6), (6, 8, 6), (7, 8, 6))
+        for numbers in (
+            (3, 8, 4), (3, 8, 6), (4, 8, 4), (4, 8, 5), (4, 8, 6), (5, 8, 5), (5, 8, 6), (6, 8, 6), (7, 8, 6),
+        )
     ],
     BENT: [
         Resolution(*numbers)
         for numbers in (
-            (3, 8, 4, 1), (3, 8, 6, 1), (4, 8, 4, 1), (4, 8, 5, 1), (4, 8, 6, 1), (5, 8, 5, 1), (5, 8, 6, 1), (6, 8, 6, 1),
-            (7, 8, 6, 2),
+            (3, 8, 4, 1), (3, 8, 6, 1), (4, 8, 4, 1), (4, 8, 5, 1), (4, 8, 6, 1), (5, 8, 5, 1), (5, 8, 6, 1),
+            (6, 8, 6, 1), (7, 8, 6, 2),
         )
     ],
 }  # fmt: skip
@@ -201,7 +203,7 @@ def tables(result: dict[str, Any]) -> str:
         f"{result['positions']} + {result['positions']} presses (away from, on or beside an electrode), seed "
         f"{result['seed']}",
         "",
-        "order, around, rings, rim | unknowns | cold ms (95 %) | warm ms (95 %) | error median, worst | on an electrode",
+        "order, around, rings, rim | unknowns | cold ms (95 %) | warm ms (95 %) | error median, worst | on electrode",
     ]
     for entry in result["meshes"]:
         mesh = f"{entry['order']}, {entry['around']}, {entry['rings']}, {entry['rim']}"

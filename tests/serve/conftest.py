@@ -8,12 +8,17 @@ perfect model: what the serving path answers can be compared with what was press
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from isocharge.serve import ModelMetadata, Predictor, write_model
+from isocharge.serve.http import App, HttpServer
+from isocharge.serve.listen import Address
+from isocharge.serve.shelf import open_shelf
+from isocharge.serve.v2 import Handler
 
 NAMES = ("A", "B", "C", "D")
 PC_PER_N, LEVER_MM, RADIUS_MM = 800.0, 20.0, 8.0
@@ -132,3 +137,46 @@ def models(film: LinearFilm, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def predictor(models: Path) -> Predictor:
     """The model of the linear film with three electrodes."""
     return Predictor("linear", models=models)
+
+
+@pytest.fixture
+def shelf(film, tmp_path):
+    """The linear model in two versions, in a folder of the test's own."""
+    film.write(tmp_path / "models")
+    film.write(tmp_path / "models", version=2)
+    return open_shelf(tmp_path / "models")
+
+
+@pytest.fixture
+def handler(shelf):
+    """A handler for these models."""
+    return Handler(shelf)
+
+
+@pytest.fixture(scope="session")
+def stopping():
+    """Servers that were told to stop; all of them must have done so in the end. Nobody waits for each."""
+    told = []
+    yield told
+    for server, thread in told:
+        thread.join(timeout=30)
+        server.close()
+        assert not thread.is_alive()
+
+
+@pytest.fixture
+def start_http(stopping):
+    """Start servers on loopback, in threads, with ports of their own; they are told to stop when the test ends."""
+    started = []
+
+    def start(handler, *, token=None, tls=None, uds=None):
+        server = HttpServer(App(handler, token), Address(uds=uds), limits=handler.limits, tls=tls)
+        thread = Thread(target=server.run)
+        thread.start()
+        started.append((server, thread))
+        return server
+
+    yield start
+    for server, _ in started:
+        server.stop()
+    stopping.extend(started)

@@ -7,7 +7,18 @@ from isocharge.extras import require
 
 
 @pytest.mark.parametrize(
-    ("extra", "module"), [("simulate", "scipy"), ("simulate", "scipy.sparse"), ("train", "torch"), ("train", "scipy")]
+    ("extra", "module"),
+    [
+        ("simulate", "scipy"),
+        ("simulate", "scipy.sparse"),
+        ("train", "torch"),
+        ("train", "scipy"),
+        ("http", "uvicorn"),
+        ("http", "orjson"),
+        ("grpc", "grpc"),
+        ("grpc", "google.protobuf"),
+        ("grpc", "uvicorn"),
+    ],
 )
 def test_missing_package_of_an_extra(extra, module):
     with (

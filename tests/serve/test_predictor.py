@@ -1,6 +1,8 @@
 """The predictor answers what the session answers, quickly, and refuses what are no charges."""
 
 import math
+import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 from decimal import Decimal
 
 import numpy as np
@@ -11,7 +13,7 @@ from hypothesis import strategies as st
 
 from isocharge.errors import ChargeError, ModelError
 from isocharge.serve import Predictor
-from isocharge.serve.predictor import _BoundPress
+from isocharge.serve.predictor import BoundPress
 
 PRESSES = st.lists(st.floats(0.0, 5000.0, width=32), min_size=3, max_size=3).filter(lambda q: sum(q) > 1.0)
 
@@ -115,6 +117,62 @@ def test_no_batch(predictor, charge_pC, said):
         predictor.predict_batch(charge_pC)
 
 
+@pytest.mark.parametrize("gap", [1, 2], ids=["together", "with gaps"])
+def test_from_an_array_into_an_array(film, predictor, bare, gap):
+    charges, out = np.zeros(3 * gap, np.float32)[::gap], np.full(7 * gap, -1.0, np.float32)[::gap]
+    for row in film.golden_pC():
+        charges[:] = row
+        predictor.predict_into(charges, out)
+        assert out == pytest.approx(bare_answer(bare, row)[0], rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("charge_pC", "out", "said"),
+    [
+        (np.ones(3), np.zeros(7, np.float32), r"got float64 of shape \(3,\) and float32 of shape \(7,\)"),
+        (np.ones(4, np.float32), np.zeros(7, np.float32), r"\('A', 'B', 'C'\) .* got float32 of shape \(4,\)"),
+        (np.ones((1, 3), np.float32), np.zeros(7, np.float32), r"got float32 of shape \(1, 3\)"),
+        ([1.0, 1.0, 1.0], np.zeros(7, np.float32), "got list and float32"),
+        (np.ones(3, np.float32), np.zeros(7), r"and float64 of shape \(7,\)"),
+        (np.ones(3, np.float32), np.zeros(6, np.float32), r"and float32 of shape \(6,\)"),
+        (np.ones(3, np.float32), np.zeros((1, 7), np.float32), r"and float32 of shape \(1, 7\)"),
+        (np.ones(3, np.float32), [0.0] * 7, "and list"),
+        (np.ones(3, np.float32), np.broadcast_to(np.float32(0.0), 7), "read-only"),
+    ],
+)
+def test_arrays_that_do_not_fit(predictor, charge_pC, out, said):
+    with pytest.raises(ChargeError, match=said):
+        predictor.predict_into(charge_pC, out)
+    assert not np.any(out)
+
+
+def test_into_an_array_allocates_no_array(predictor):
+    charges, out = np.full(3, 100.0, np.float32), np.zeros(7, np.float32)
+    predictor.predict_into(charges, out)
+    tracemalloc.start()
+    for _ in range(1000):
+        predictor.predict_into(charges, out)
+    (grown, _), _ = tracemalloc.get_traced_memory(), tracemalloc.stop()
+    assert grown < 1000
+
+
+def test_what_threads_may_share(film, models, predictor):
+    """One predictor for each thread, and one for all of them for batches, as the README says."""
+    charges = np.tile(film.golden_pC(), (50, 1))
+    wanted = np.column_stack(predictor.predict_batch(charges))
+
+    def alone(_):
+        mine, rows = Predictor("linear", models=models), np.empty((len(charges), 7), np.float32)
+        for press, row in zip(charges, rows, strict=True):
+            mine.predict_into(press, row)
+        return rows
+
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(lambda _: np.column_stack(predictor.predict_batch(charges)), range(20)))
+        for got in [*together, *threads.map(alone, range(4))]:
+            np.testing.assert_allclose(got, wanted, rtol=1e-6, atol=1e-6)
+
+
 def test_goes_on_after_an_error(predictor):
     before = predictor.predict([100.0, 200.0, 300.0])
     with pytest.raises(ChargeError):
@@ -123,7 +181,7 @@ def test_goes_on_after_an_error(predictor):
 
 
 def test_memory_that_is_not_shared_is_noticed(models, monkeypatch):
-    monkeypatch.setattr(_BoundPress, "__init__", _unshared)
+    monkeypatch.setattr(BoundPress, "__init__", _unshared)
     with pytest.raises(ModelError, match=r"through bound memory and .* without"):
         Predictor("linear", models=models)
 

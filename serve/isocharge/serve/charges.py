@@ -1,10 +1,15 @@
 """What counts as charges for a model: the right number of finite numbers, in the order of its electrodes."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isocharge.errors import ChargeError
 from isocharge.serve.arrays import Singles
+
+SQUARES = 1e38
+"""If the squares of some charges add up to no more than this, each of them is finite and fits into float32."""
 
 
 def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
@@ -16,7 +21,7 @@ def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
     charges = _as_numbers(charge_pC, electrodes)
     if charges.shape != (len(electrodes),):
         raise ChargeError(f"expected {_charges(electrodes)}, got an array of shape {charges.shape}")
-    press: Singles = _as_singles(charges[np.newaxis], electrodes, one_press=True)[0]
+    press: Singles = as_singles(charges[np.newaxis], electrodes, one_press=True)[0]
     return press
 
 
@@ -32,7 +37,7 @@ def as_batch(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
             f"expected rows of {_charges(electrodes)}, shape (n, {len(electrodes)}), "
             f"got an array of shape {charges.shape}"
         )
-    return _as_singles(charges, electrodes, one_press=False)
+    return as_singles(charges, electrodes)
 
 
 def _charges(electrodes: tuple[str, ...]) -> str:
@@ -49,7 +54,20 @@ def _as_numbers(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> NDArray[np
     return charges
 
 
-def _as_singles(charges: NDArray[np.number], electrodes: tuple[str, ...], *, one_press: bool) -> Singles:
+def as_singles(charges: NDArray[Any], electrodes: tuple[str, ...], *, one_press: bool = False) -> Singles:
+    """Charges of shape (n, electrodes), pC, of any number type as a contiguous float32 array.
+
+    Raises:
+        ChargeError: If a charge is not finite; its electrode is named, and its row unless there is only `one_press`.
+    """
+    flat = charges.ravel()
+    if charges.dtype.kind == "f" and np.vdot(flat, flat) <= SQUARES:  # one call instead of three and an errstate
+        return np.ascontiguousarray(charges, dtype=np.float32)
+    return _examined(charges, electrodes, one_press)
+
+
+def _examined(charges: NDArray[np.number], electrodes: tuple[str, ...], one_press: bool) -> Singles:
+    """Charges one by one; the first row with a bad one is named."""
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused below
         singles = np.ascontiguousarray(charges, dtype=np.float32)
     rows, columns = np.nonzero(~np.isfinite(singles))

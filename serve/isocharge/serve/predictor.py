@@ -1,7 +1,9 @@
 """From charges to contacts in process.
 
 One press goes through buffers that are bound to the session once: writing three numbers, running, reading seven back
-allocates nothing and is faster than a plain `session.run`. Batches go through `session.run`.
+allocates no array and is faster than a plain `session.run`. Batches go through `session.run`.
+
+A host program's loop uses `predict_into`, with two arrays of its own; people use `predict`, which checks and explains.
 """
 
 import math
@@ -9,13 +11,13 @@ import struct
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import ArrayLike
 
-from isocharge.errors import ModelError
+from isocharge.errors import ChargeError, ModelError
 from isocharge.serve.arrays import Array, Singles
 from isocharge.serve.charges import as_batch, as_press
 from isocharge.serve.metadata import ModelMetadata
@@ -58,7 +60,7 @@ class Contacts(NamedTuple):
 class Predictor:
     """A loaded model. Its buffers serve one press at a time: use one Predictor per thread.
 
-    `predict_batch` touches no buffer of the predictor and may be called from any thread.
+    `predict` and `predict_into` use them; `predict_batch` touches none and may be called from any thread.
 
     Example:
         >>> from isocharge.serve import Predictor
@@ -80,7 +82,7 @@ class Predictor:
         loaded = load_model(find_model(model, models))
         self._metadata = loaded.metadata
         self._session = loaded.session
-        self._press = _BoundPress(loaded.session, len(loaded.metadata.electrodes))
+        self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
         _check_shared(self._press, loaded)
 
     @property
@@ -108,6 +110,29 @@ class Predictor:
         self._press.run()
         return Contact(*self._press.read())
 
+    def predict_into(self, charge_pC: Singles, out: Singles) -> None:
+        """The contact of one press, for the hot loop: from an array into an array, and nothing else.
+
+        Args:
+            charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. Whether
+                they are finite is not looked at: NaN in, NaN out.
+            out: Filled with the numbers of a Contact in their order, shape (7,), float32.
+
+        Raises:
+            ChargeError: If an array is not float32 or of another shape; nothing is written then.
+
+        Example:
+            >>> charges, contact = np.zeros(3, np.float32), np.zeros(7, np.float32)
+            >>> touch.predict_into(charges, contact)  # doctest: +SKIP
+        """
+        try:
+            self._press.run_into(charge_pC, out)
+        except (AttributeError, NotImplementedError, TypeError, ValueError) as error:
+            raise ChargeError(
+                f"expected charges {self._metadata.electrodes} and a writable `out` of the {len(Contact._fields)} "
+                f"numbers of a Contact, both float32 arrays, got {_kind(charge_pC)} and {_kind(out)} ({error})"
+            ) from error
+
     def predict_batch(self, charge_pC: ArrayLike) -> Contacts:
         """The contacts of n presses.
 
@@ -121,7 +146,7 @@ class Predictor:
         return Contacts(*np.concatenate([outputs[name] for name in OUTPUTS], axis=1).T)
 
 
-class _BoundPress:
+class BoundPress:
     """Input and output memory of one press, bound to a session.
 
     `write(q1, q2, ...)` puts the charges in, `run()` computes, `read()` gives the seven numbers of a Contact.
@@ -134,6 +159,25 @@ class _BoundPress:
         self.run: Callable[[], None] = partial(session.run_with_iobinding, _bind(session, charges, answers))
         self.write = partial(struct.Struct(f"={electrodes}f").pack_into, charges.data.cast("B"), 0)
         self.read = partial(struct.Struct(f"={answers.size}f").unpack, answers.data.cast("B"))
+        self._charges: Any = charges[0].data  # Any: typing knows a memoryview as bytes only
+        self._answers: Any = answers.data
+
+    def run_into(self, charge_pC: Singles, out: Singles) -> None:
+        """Compute from an array into an array; a memoryview compares number type and shape as it copies, for nothing.
+
+        Raises:
+            AttributeError, NotImplementedError, TypeError, ValueError: If one of them is not what is bound; nothing is
+                written into `out` then.
+        """
+        self._charges[:] = charge_pC
+        self.run()
+        target: Any = out.data
+        target[:] = self._answers
+
+
+def _kind(value: object) -> str:
+    """A few words on what somebody took for a float32 array."""
+    return f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
 
 
 def _bind(session: ort.InferenceSession, charges: Singles, answers: Singles) -> ort.IOBinding:
@@ -147,7 +191,7 @@ def _bind(session: ort.InferenceSession, charges: Singles, answers: Singles) -> 
     return binding
 
 
-def _check_shared(press: _BoundPress, model: Model) -> None:
+def _check_shared(press: BoundPress, model: Model) -> None:
     """Make sure that this onnxruntime computes in the bound memory and not in copies of it.
 
     Raises:

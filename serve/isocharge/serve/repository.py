@@ -71,8 +71,12 @@ def _version_folder(path: Path) -> Path | None:
     return path / str(max(versions)) if versions else None
 
 
+def version_folders(folder: Path) -> dict[int, Path]:
+    """Version folders of a model folder, ascending: the sub-folders whose name is a whole number."""
+    return {version: folder / str(version) for version in sorted(_versions(folder))}
+
+
 def _versions(folder: Path) -> list[int]:
-    """Versions of a model folder: the sub-folders whose name is a whole number."""
     if not folder.is_dir():
         return []
     return [int(entry.name) for entry in folder.iterdir() if entry.is_dir() and VERSION.fullmatch(entry.name)]

@@ -2,8 +2,8 @@
 
 At batch one a node costs more than its arithmetic, so the graph is built for few nodes: whitening, units and scales are
 folded into the first and last layers; the two perceptrons run as one with block-diagonal weights; the two starts of the
-misfit lie side by side, (n, 2, 3), through the same nodes. A test compares it with `InverseNetwork.forward` on clean,
-noisy and absurd charges.
+misfit lie side by side, (n, 2, 1, 3), through the same nodes. A test compares it with `InverseNetwork.forward` on
+clean, noisy and absurd charges.
 """
 
 from collections.abc import Mapping
@@ -52,10 +52,6 @@ class GraphBuilder:
         """Another shape for the same numbers."""
         return self.add("Reshape", data, self.constant(shape, np.int64))
 
-    def sum_over(self, data: str, axis: int) -> str:
-        """Sum over one axis, which goes."""
-        return self.add("ReduceSum", data, self.constant([axis], np.int64), keepdims=0)
-
     def split(self, data: str, names: tuple[str, ...], sizes: tuple[int, ...], axis: int) -> tuple[str, ...]:
         """Cut a tensor into pieces."""
         return self.add_many("Split", data, self.constant(sizes, np.int64), to=names, axis=axis)
@@ -73,14 +69,17 @@ def export_onnx(network: InverseNetwork, properties: Mapping[str, str]) -> bytes
         `misfit` [n, 1], all float32.
     """
     build, n_electrode = GraphBuilder(), network.features.typical.size
-    clipped = build.add("Clip", "charge_pC", build.constant(LOWEST_PC), build.constant(HIGHEST_PC))
-    logs = build.add("Log", build.add("Mul", clipped, build.constant(1.0 / network.features.typical)))
+    press = build.reshape("charge_pC", -1, 1, 1, n_electrode)
+    within = build.add("Clip", press, build.constant(-HIGHEST_PC), build.constant(HIGHEST_PC))
+    typical = build.constant(1.0 / network.features.typical)
+    logs = build.add("Log", build.add("Mul", build.add("Clip", within, build.constant(LOWEST_PC)), typical))
+    answers = _perceptrons(build, network, build.reshape(logs, -1, n_electrode))
     starts, plane, log_force, log_std = build.split(
-        _perceptrons(build, network, logs), ("starts", "plane", "log_force", "log_std"), (6, 2, 1, 3), axis=1
+        answers, ("starts", "plane", "log_force", "log_std"), (6, 2, 1, 3), axis=1
     )
     build.add("Concat", plane, build.add("Exp", log_force), to="contact", axis=1)
     build.add("Exp", log_std, to="contact_std")
-    _misfit(build, network, logs, starts)
+    _misfit(build, network, build.add("Mul", within, typical), logs, starts)
     graph = helper.make_graph(
         build.nodes,
         "isocharge",
@@ -143,51 +142,59 @@ def _outputs(
     return np.vstack([above, below]), columns(bias, nearest_bias, centre, np.log(scale))
 
 
-def _misfit(build: GraphBuilder, network: InverseNetwork, logs: str, starts: str) -> None:
-    """The smallest distance of two starts and their Gauss-Newton improvements."""
+def _misfit(build: GraphBuilder, network: InverseNetwork, charge: str, logs: str, starts: str) -> None:
+    """The smallest distance of two starts and their Gauss-Newton improvements.
+
+    Charges here are relative to the typical ones, `charge` and its logarithm, shape (n, 1, 1, n_electrode).
+    """
     n_electrode, series = network.features.typical.size, network.field.series.double().numpy()
-    first = _project(build, build.reshape(starts, -1, 2, 3))
-    rows = build.reshape(_series(build, series, first), -1, 2, 4, n_electrode)
-    log_charge, inverse = build.split(rows, ("log_charge", "inverse"), (1, 3), axis=2)
-    typical = build.constant(np.log(network.features.typical))
-    measured = build.reshape(build.add("Add", logs, typical), -1, 1, 1, n_electrode)
-    miss = build.add("Sub", measured, log_charge)
-    step = build.sum_over(build.add("Mul", inverse, miss), 3)
+    of_logs, of_step = series[0].copy(), np.moveaxis(series[1:], 0, -1)  # the step as (n_electrode, 3), to multiply
+    of_logs[0, 0, 0] -= np.log(network.features.typical)
+    both = np.concatenate([of_logs, of_step.reshape(*of_logs.shape[:3], -1)], axis=-1)
+    first = _project(build, build.reshape(starts, -1, 2, 1, 3))
+    sizes = (n_electrode, 3 * n_electrode)
+    log_charge, inverse = build.split(_series(build, both, first), ("log_charge", "inverse"), sizes, axis=3)
+    miss = build.add("Sub", logs, log_charge)
+    step = build.add("MatMul", miss, build.reshape(inverse, -1, 2, n_electrode, 3))
     better = _project(build, build.add("Add", first, step))
-    improved = build.reshape(_series(build, series[:1], better), -1, 2, 1, n_electrode)
+    improved = _series(build, of_logs, better)
     known = build.add("Exp", build.add("Concat", log_charge, improved, axis=1))
-    distances = _distances(build, network, known)
-    build.add("ReduceMin", distances, to="misfit", axes=[1], keepdims=0)
+    distances = _distances(build, network, charge, known)
+    build.add("ReduceMin", distances, to="misfit", axes=[1], keepdims=1)
 
 
-def _distances(build: GraphBuilder, network: InverseNetwork, known: str) -> str:
-    """|(Q - known) / sigma| for known charges of shape (n, 4, 1, n_electrode), shape (n, 4, 1)."""
-    white, gain = 1e12 * network.noise.white, network.noise.gain
-    limits = build.constant(-HIGHEST_PC), build.constant(HIGHEST_PC)
-    within = build.reshape(build.add("Clip", "charge_pC", *limits), -1, 1, 1, network.features.typical.size)
-    square = build.add("Mul", within, within)
+def _distances(build: GraphBuilder, network: InverseNetwork, charge: str, known: str) -> str:
+    """|(Q - known) / sigma| for known charges of shape (n, 4, 1, n_electrode), shape (n, 4)."""
+    white, gain = 1e12 * network.noise.white / network.features.typical, network.noise.gain
+    square = build.add("Mul", charge, charge)
     variance = build.add("Add", build.add("Mul", square, build.constant(gain**2)), build.constant(white**2))
-    deviation = build.add("Div", build.add("Sub", within, known), build.add("Sqrt", variance))
-    return build.add("ReduceL2", deviation, axes=[3], keepdims=0)
+    deviation = build.add("Div", build.add("Sub", charge, known), build.add("Sqrt", variance))
+    return build.add("ReduceL2", deviation, axes=[2, 3], keepdims=0)
 
 
 def _project(build: GraphBuilder, unit: str) -> str:
-    """Unit coordinates (n, 2, 3) into the domain: each over max(1, its distance from the axis or the middle)."""
+    """Unit coordinates (n, 2, 1, 3) into the domain: each over max(1, its distance from the axis or the middle)."""
     squares = build.add("Mul", unit, unit)
     shared = build.add("MatMul", squares, build.constant(INSIDE * np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1]])))
-    beyond = build.add("Sqrt", build.add("Max", shared, build.constant(1.0)))
+    beyond = build.add("Sqrt", build.add("Clip", shared, build.constant(1.0)))
     return build.add("Div", unit, beyond)
 
 
 def _series(build: GraphBuilder, series: Array, unit: str) -> str:
-    """Chebyshev series (rows, k, k, m, n_electrode) at unit coordinates (n, 2, 3): (2 n, 1, rows n_electrode)."""
-    rows, count, _, in_force, n_electrode = series.shape
-    angle = build.reshape(build.add("Acos", unit), -1, 3, 1)
-    polynomials = build.add("Cos", build.add("Mul", angle, build.constant(np.arange(count))))
-    number = len(build.nodes)
-    x, y, force = build.split(polynomials, (f"x{number}", f"y{number}", f"force{number}"), (1, 1, 1), axis=1)
-    plane = build.add("Mul", build.reshape(x, -1, count, 1), y)
-    part = series.transpose(1, 2, 3, 0, 4).reshape(count * count, -1)
-    by_force = build.add("MatMul", build.reshape(plane, -1, count * count), build.constant(part))
-    chosen = build.split(force, (f"low{number}", f"rest{number}"), (in_force, count - in_force), axis=2)[0]
-    return build.add("MatMul", chosen, build.reshape(by_force, -1, in_force, rows * n_electrode))
+    """Chebyshev series with coefficients (k, k, m, columns) at unit coordinates (n, 2, 1, 3): (n, 2, 1, columns).
+
+    With y = cos b and F = cos c, the products of the series are cosines too, T_k(y) T_m(F) = (cos(k b + m c) +
+    cos(k b - m c)) / 2. So one product with a constant makes every angle, and two more make the sum.
+    """
+    count, _, in_force, columns = series.shape
+    pairs = [(k, m) for m in range(1 - in_force, in_force) for k in range(count)]
+    orders = np.zeros((3, count + len(pairs)))
+    orders[0, :count], orders[1:, count:] = np.arange(count), np.transpose(pairs)
+    angles = build.add("MatMul", build.add("Acos", unit), build.constant(orders))
+    number, sizes = len(build.nodes), (count, len(pairs))
+    in_x, others = build.split(build.add("Cos", angles), (f"x{number}", f"others{number}"), sizes, axis=3)
+    parts = np.stack([series[:, k, abs(m)] * (0.5 if m else 1.0) for k, m in pairs])  # (pairs, k, columns)
+    by_x = build.reshape(
+        build.add("MatMul", others, build.constant(parts.reshape(len(pairs), -1))), -1, 2, count, columns
+    )
+    return build.add("MatMul", in_x, by_x)

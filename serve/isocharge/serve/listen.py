@@ -1,0 +1,139 @@
+"""Where a server listens: a TCP address or a Unix socket, safe unless told otherwise."""
+
+import contextlib
+import errno
+import ipaddress
+import os
+import socket
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+from isocharge.errors import InputError, ListenError
+
+WHY = {
+    errno.EADDRINUSE: "another program listens there; stop it or choose another port",
+    errno.EADDRNOTAVAIL: "this machine has no such address; choose one of its own",
+    errno.EACCES: "this user may not listen there; choose another place, or a port above 1023",
+}
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where to listen.
+
+    Attributes:
+        host: Name or IP address.
+        port: TCP port; 0 takes a free one.
+        uds: Path of a Unix socket, which counts instead of host and port; only its owner may connect.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 0
+    uds: Path | None = None
+
+    @property
+    def is_private(self) -> bool:
+        """Whether only this machine can connect."""
+        return self.uds is not None or is_loopback(self.host)
+
+    def listen(self, backlog: int) -> socket.socket:
+        """A listening socket.
+
+        Raises:
+            ListenError: If the place is taken or impossible; the message says what to do.
+        """
+        try:
+            return _listen_unix(self.uds, backlog) if self.uds else _listen_tcp(self.host, self.port, backlog)
+        except OSError as error:
+            if isinstance(error, ListenError):
+                raise
+            why = WHY.get(error.errno or 0, error.strerror or str(error))
+            raise ListenError(f"cannot listen on {self.uds or f'{self.host}:{self.port}'}: {why}") from error
+
+    def release(self) -> None:
+        """Remove what a Unix socket leaves behind."""
+        if self.uds:
+            self.uds.unlink(missing_ok=True)
+
+    def url(self, listening: socket.socket, *, secure: bool) -> str:
+        """What to tell clients; a Unix socket's is its path, as curl's `--unix-socket` takes it."""
+        if self.uds:
+            return f"unix:{self.uds}"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{'https' if secure else 'http'}://{host}:{listening.getsockname()[1]}"
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host is this machine and nothing else can reach it."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def check_exposure(address: Address, *, token: bool, insecure: bool) -> None:
+    """Refuse to serve others than this machine by accident.
+
+    Raises:
+        InputError: If the address is open to others and there is neither a token nor leave to go without.
+    """
+    if not (address.is_private or token or insecure):
+        raise InputError(
+            f"--host {address.host} lets other machines in: give --token TOKEN, which they then must send, "
+            "or --insecure to let everybody load, unload and ask models; the default is 127.0.0.1"
+        )
+
+
+def _listen_tcp(host: str, port: int, backlog: int) -> socket.socket:
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    except (socket.gaierror, UnicodeError) as error:
+        raise ListenError(f"cannot listen on {host}:{port}: no such host ({error})") from error
+    family, kind, protocol, _, place = min(found, key=lambda info: info[0] != socket.AF_INET)  # localhost is 127.0.0.1
+    return _bound(socket.socket(family, kind, protocol), place, backlog)
+
+
+def _bound(listening: socket.socket, place: object, backlog: int) -> socket.socket:
+    try:
+        # A port whose last user was killed is free at once; one that somebody listens on stays refused.
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(place)  # type: ignore[arg-type]
+        listening.listen(backlog)
+    except BaseException:
+        listening.close()
+        raise
+    return listening
+
+
+def _listen_unix(path: Path, backlog: int) -> socket.socket:
+    _remove_stale(path)
+    before = os.umask(0o177)
+    try:
+        return _bound(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM), str(path), backlog)
+    finally:
+        os.umask(before)
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove the socket of a server that was killed.
+
+    Raises:
+        ListenError: If the path is something else, or a server listens there.
+    """
+    if not path.exists():
+        return
+    if not stat.S_ISSOCK(path.stat().st_mode):
+        raise ListenError(f"{path}: expected nothing or a left-over socket, found a file; choose another path")
+    if _answers(path):
+        raise ListenError(f"{path}: another server listens there; stop it or choose another path")
+    path.unlink(missing_ok=True)
+
+
+def _answers(path: Path) -> bool:
+    with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)) as probe:
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            return False
+        return True

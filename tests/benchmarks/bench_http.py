@@ -1,0 +1,351 @@
+"""HTTP: ours against a bare route, an idiomatic FastAPI service and MLServer, tuned; all serve the same model file.
+
+    python tests/benchmarks/bench_http.py [--environments DIR] [--rounds 12] [--requests 400] [--seconds 4] [--json]
+
+FastAPI and MLServer get environments of their own in `--environments`, made once. Client and servers share the cores;
+the client is a plain socket, the same for all. Latency: one request at a time over one open connection, contenders take
+turns within each round. Throughput: 32 connections, each with one request under way. Ratios come from the same rounds.
+A batch of 1024 is measured twice: bytes on a socket, and arrays in and out of Triton's stock client.
+"""
+
+import argparse
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import venv
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import tritonclient.http
+from bench_predictor import machine
+
+from isocharge.serve import find_model, load_model
+from isocharge.serve.session import OUTPUTS
+
+HERE = Path(__file__).parent
+PACKAGES = {"fastapi": ["fastapi", "uvicorn[standard]", "onnxruntime"], "mlserver": ["mlserver", "onnxruntime"]}
+CONNECTIONS = 32
+
+
+class Connection:
+    """One open connection that can have one request under way."""
+
+    def __init__(self, address: tuple[str, int] | str) -> None:
+        self.socket = socket.socket(socket.AF_UNIX if isinstance(address, str) else socket.AF_INET)
+        self.socket.connect(address)
+        if not isinstance(address, str):
+            self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def send(self, request: bytes) -> None:
+        self.socket.sendall(request)
+
+    def receive(self) -> bytes:
+        """The body of an answer that must be good."""
+        data = self.socket.recv(1 << 20)
+        while (end := data.find(b"\r\n\r\n")) < 0:
+            data += self._more()
+        head = data[:end].lower()
+        if not head.startswith(b"http/1.1 200"):
+            raise RuntimeError(f"expected an answer 200, got {data[:300]!r}")
+        start = head.index(b"content-length:") + len(b"content-length:")
+        size = end + 4 + int(head[start : (head + b"\r\n").index(b"\r\n", start)])
+        while len(data) < size:
+            data += self._more()
+        return data[end + 4 :]
+
+    def _more(self) -> bytes:
+        data = self.socket.recv(1 << 20)
+        if not data:
+            raise RuntimeError("the server hung up")
+        return data
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+def http_request(path: str, body: bytes, headers: str = "") -> bytes:
+    head = f"POST {path} HTTP/1.1\r\nHost: bench\r\nContent-Type: application/json\r\n{headers}"
+    return f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body
+
+
+def json_request(path: str, charge_pC: np.ndarray) -> bytes:
+    tensor = {
+        "name": "charge_pC",
+        "datatype": "FP32",
+        "shape": list(charge_pC.shape),
+        "data": charge_pC.ravel().tolist(),
+    }
+    return http_request(path, json.dumps({"inputs": [tensor]}).encode())
+
+
+def binary_request(path: str, charge_pC: np.ndarray) -> bytes:
+    tensor = {"name": "charge_pC", "datatype": "FP32", "shape": list(charge_pC.shape)}
+    tensor["parameters"] = {"binary_data_size": charge_pC.nbytes}
+    text = json.dumps({"inputs": [tensor], "parameters": {"binary_data_output": True}}).encode()
+    return http_request(path, text + charge_pC.tobytes(), f"Inference-Header-Content-Length: {len(text)}\r\n")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def python_of(name: str, environments: Path) -> Path:
+    """The interpreter of a rival's environment, made if it is not there."""
+    folder = environments / name
+    if not (folder / "done").exists():
+        venv.create(folder, with_pip=True, clear=True)
+        subprocess.run([folder / "bin/python", "-m", "pip", "install", "--quiet", *PACKAGES[name]], check=True)
+        (folder / "done").touch()
+    return folder / "bin/python"
+
+
+def mlserver_folder(folder: Path, port: int, model: Path) -> Path:
+    """Settings of MLServer, tuned: no worker processes, no metrics, no access log, no other protocols."""
+    settings = {
+        "host": "127.0.0.1",
+        "http_port": port,
+        "grpc_port": free_port(),
+        "metrics_endpoint": None,
+        "parallel_workers": 0,
+        "debug": False,
+        "use_structured_logging": False,
+        "logging_settings": None,
+    }
+    runtime = {
+        "name": "model",
+        "implementation": "mlserver_runtime.Runtime",
+        "parameters": {"uri": str(model), "version": "1"},
+    }
+    (folder / "settings.json").write_text(json.dumps(settings))
+    (folder / "model-settings.json").write_text(json.dumps(runtime))
+    (folder / "mlserver_runtime.py").write_text((HERE / "rivals/mlserver_runtime.py").read_text())
+    return folder
+
+
+@contextmanager
+def running(
+    words: list[str | Path], address: tuple[str, int] | str, **options: Any
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A server process, from its first accepted connection to the end of the block."""
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(words, stdout=said, stderr=said, **options)
+        try:
+            _wait_for(process, address, said)
+            yield process
+        finally:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(timeout=15)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _wait_for(process: subprocess.Popen[bytes], address: tuple[str, int] | str, said: IO[bytes]) -> None:
+    """Wait until something listens, and a moment more: MLServer listens before it has loaded its model."""
+    for _ in range(600):
+        try:
+            Connection(address).close()
+            time.sleep(2.0)
+            break
+        except OSError:
+            time.sleep(0.1)
+    if process.poll() is not None:
+        said.seek(0)
+        raise RuntimeError(f"{process.args} ended: {said.read().decode()[-3000:]}")
+
+
+def start(stack: ExitStack, model: str, environments: Path | None) -> dict[str, tuple[tuple[str, int] | str, str]]:
+    """Start every contender: name to address and path."""
+    folder = find_model(model).resolve()
+    file, name = folder / "model.onnx", load_model(folder).metadata.name
+    work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+    ours, path = (
+        [Path(sys.executable).with_name("isocharge"), "serve", "http", "--models", folder.parents[1]],
+        "/v2/models/",
+    )
+    tcp = {key: ("127.0.0.1", free_port()) for key in ("isocharge", "bare route", "FastAPI", "MLServer tuned")}
+    uds = str(work / "isocharge.sock")
+    stack.enter_context(running([*ours, "--port", str(tcp["isocharge"][1])], tcp["isocharge"]))
+    stack.enter_context(running([*ours, "--uds", uds], uds))
+    bare = [sys.executable, HERE / "rivals/bare_app.py", str(tcp["bare route"][1]), file]
+    stack.enter_context(running(bare, tcp["bare route"]))
+    made: dict[str, tuple[tuple[str, int] | str, str]] = {
+        "isocharge": (tcp["isocharge"], f"{path}{name}/infer"),
+        "isocharge, Unix socket": (uds, f"{path}{name}/infer"),
+        "bare route": (tcp["bare route"], f"{path}{name}/infer"),
+    }
+    if environments is not None:
+        fastapi = [python_of("fastapi", environments), HERE / "rivals/fastapi_app.py", str(tcp["FastAPI"][1]), file]
+        stack.enter_context(running(fastapi, tcp["FastAPI"]))
+        settings = mlserver_folder(work, tcp["MLServer tuned"][1], file)
+        mlserver = [python_of("mlserver", environments).with_name("mlserver"), "start", settings]
+        variables = os.environ | {"PYTHONPATH": str(settings)}
+        stack.enter_context(running(mlserver, tcp["MLServer tuned"], cwd=settings, env=variables))
+        made |= {
+            "FastAPI": (tcp["FastAPI"], f"{path}{name}/infer"),
+            "MLServer tuned": (tcp["MLServer tuned"], f"{path}model/infer"),
+        }
+    return made
+
+
+def latencies(address: tuple[str, int] | str, request: bytes, count: int) -> np.ndarray:
+    """Durations of requests one after another on a new connection, us; the first one is thrown away."""
+    connection, clock, durations = Connection(address), time.perf_counter_ns, np.empty(count)
+    connection.send(request)
+    connection.receive()
+    for i in range(count):
+        begin = clock()
+        connection.send(request)
+        connection.receive()
+        durations[i] = clock() - begin
+    connection.close()
+    return durations / 1e3
+
+
+def throughput(address: tuple[str, int] | str, request: bytes, seconds: float) -> float:
+    """Answers per second over 32 connections, each with one request under way.
+
+    The client shares the cores, so it does as little as it can: the same request has an answer of the same length.
+    """
+    opened = [Connection(address).socket for _ in range(CONNECTIONS)]
+    connections = {connection.fileno(): connection for connection in opened}
+    size = _answer_size(address, request)
+    with select.epoll() as waiting:
+        for number, connection in connections.items():
+            waiting.register(number, select.EPOLLIN)
+            connection.sendall(request)
+        begin, answers, missing = time.perf_counter(), 0, dict.fromkeys(connections, size)
+        while (now := time.perf_counter()) < begin + seconds:
+            for number, _ in waiting.poll(1.0):
+                connection = connections[number]
+                missing[number] -= len(connection.recv(size))
+                if not missing[number]:
+                    missing[number] = size
+                    connection.send(request)
+                    answers += 1
+    for connection in connections.values():
+        connection.close()
+    return answers / (now - begin)
+
+
+def _answer_size(address: tuple[str, int] | str, request: bytes) -> int:
+    """Bytes of a good answer, its headers included."""
+    connection = Connection(address)
+    connection.send(request)
+    time.sleep(0.2)
+    data = connection.socket.recv(1 << 20)
+    connection.close()
+    if not data.startswith(b"HTTP/1.1 200"):
+        raise RuntimeError(f"expected an answer 200, got {data[:300]!r}")
+    return len(data)
+
+
+def take_turns(
+    contenders: dict[str, tuple[tuple[str, int] | str, bytes]], rounds: int, number: int
+) -> dict[str, np.ndarray]:
+    """Durations of each contender, shape (rounds, number), us; the first round only warms up."""
+    kept: dict[str, list[np.ndarray]] = {name: [] for name in contenders}
+    for _ in range(rounds + 1):
+        for name, (address, request) in contenders.items():
+            kept[name].append(latencies(address, request, number))
+    return {name: np.array(durations[1:]) for name, durations in kept.items()}
+
+
+def rows(durations: dict[str, np.ndarray], against: str) -> Iterator[dict[str, Any]]:
+    """A line for each contender: percentiles, and its p50 over the p50 of `against`, median over rounds."""
+    base = np.median(durations[against], axis=1)
+    for name, of in durations.items():
+        p50, p99 = np.percentile(of, (50, 99))
+        ratio = np.median(of, axis=1) / base
+        yield {
+            "contender": name,
+            "p50_us": round(float(p50), 1),
+            "p99_us": round(float(p99), 1),
+            "ratio_p50": round(float(np.median(ratio)), 3),
+            "ratio_range": [round(float(ratio.min()), 3), round(float(ratio.max()), 3)],
+        }
+
+
+def stock_client(address: tuple[str, int], name: str, charges: np.ndarray, count: int) -> dict[str, np.ndarray]:
+    """Arrays in, arrays out through Triton's HTTP client, shape (1, count), us: its own coding included."""
+    client = tritonclient.http.InferenceServerClient(f"{address[0]}:{address[1]}")
+    durations = {"JSON": np.empty((1, count)), "binary": np.empty((1, count))}
+    for i in range(-2, count):  # two to warm up
+        for kind, of in durations.items():
+            begin = time.perf_counter_ns()
+            tensor = tritonclient.http.InferInput("charge_pC", list(charges.shape), "FP32")
+            tensor.set_data_from_numpy(charges, binary_data=kind == "binary")
+            outputs = [tritonclient.http.InferRequestedOutput(o, binary_data=kind == "binary") for o in OUTPUTS]
+            answer = client.infer(name, [tensor], outputs=outputs)
+            for output in OUTPUTS:
+                answer.as_numpy(output)
+            of[0, max(i, 0)] = (time.perf_counter_ns() - begin) / 1e3
+    client.close()
+    return durations
+
+
+def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
+    """Every table."""
+    charges = np.random.default_rng(asked.seed).uniform(300.0, 1500.0, (1024, 3)).astype(np.float32)
+    with ExitStack() as stack:
+        servers = start(stack, asked.model, None if asked.without_rivals else asked.environments)
+        one = {name: (address, json_request(path, charges[:1])) for name, (address, path) in servers.items()}
+        address, path = servers["isocharge"]
+        batch = {"JSON": (address, json_request(path, charges)), "binary": (address, binary_request(path, charges))}
+        tables = {
+            "one press, one request at a time": list(rows(take_turns(one, asked.rounds, asked.requests), "isocharge")),
+            "1024 presses, plain socket": list(rows(take_turns(batch, asked.rounds, asked.requests // 10), "JSON")),
+            "1024 presses, arrays in and out of the stock client": list(
+                rows(stock_client(address, path.split("/")[3], charges, asked.requests // 4), "JSON")
+            ),
+        }
+        # MLServer's queues drain between turns: each contender is measured alone, twice.
+        counts = {name: [throughput(*target, asked.seconds) for _ in range(2)] for name, target in one.items()}
+    ours = np.mean(counts["isocharge"])
+    tables["32 connections"] = [
+        {
+            "contender": name,
+            "per_second": round(float(np.mean(of))),
+            "ours_over_it": round(float(ours / np.mean(of)), 2),
+        }
+        for name, of in counts.items()
+    ]
+    return tables
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", default="three-25um-biaxial", help="model name or path, three electrodes")
+    parser.add_argument("--environments", type=Path, default=Path("build/bench-environments"), metavar="DIR")
+    parser.add_argument("--without-rivals", action="store_true", help="only ours and the bare route")
+    parser.add_argument("--rounds", type=int, default=12)
+    parser.add_argument("--requests", type=int, default=400, help="of each contender in a round")
+    parser.add_argument("--seconds", type=float, default=4.0, help="of each throughput measurement")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true", help="one JSON object")
+    asked = parser.parse_args()
+    tables = measure(asked)
+    if asked.json:
+        print(json.dumps({"benchmark": "http", **vars(asked), "machine": machine(), "results": tables}, default=str))
+        return
+    print(", ".join(f"{name} {value}" for name, value in machine().items()))
+    for title, table in tables.items():
+        print(f"\n{title}")
+        for row in table:
+            print("  ".join(f"{name} {value}" for name, value in row.items()))
+
+
+if __name__ == "__main__":
+    main()

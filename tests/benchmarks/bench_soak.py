@@ -1,0 +1,142 @@
+"""A long run over HTTP: 32 connections, every answer compared with the in-process one, the server's memory watched.
+
+    python tests/benchmarks/bench_soak.py [--requests 1000000] [--model NAME|PATH] [--seed 0] [--json]
+
+Requests are JSON and binary, of one press and of three, drawn from 1000 that were made before; an answer must equal,
+bit for bit, what `Predictor` says of the same charges. Every 100,000 requests the model is loaded anew while the
+others go on. Memory is the server's resident set, from the end of a warm-up (a twentieth of the requests) to the end.
+"""
+
+import argparse
+import itertools
+import json
+import os
+import selectors
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+from bench_http import CONNECTIONS, Connection, binary_request, free_port, http_request, json_request, running
+from bench_predictor import machine
+
+from isocharge.serve import Predictor, find_model
+
+KINDS = 1000
+RELOAD_EVERY = 100_000
+
+
+def exchanges(predictor: Predictor, path: str, seed: int) -> list[tuple[bytes, bytes]]:
+    """Requests, and the numbers that their answers must have, as bytes."""
+    rng, width = np.random.default_rng(seed), len(predictor.metadata.electrodes)
+    made = []
+    for number in range(KINDS):
+        charges = rng.uniform(100.0, 1500.0, (1 if number % 4 else 3, width)).astype(np.float32)
+        request = (json_request if number % 2 else binary_request)(path, charges)
+        made.append((request, _expected(predictor, charges)))
+    return made
+
+
+def _expected(predictor: Predictor, charges: np.ndarray) -> bytes:
+    if len(charges) == 1:
+        row = np.empty(7, np.float32)
+        predictor.predict_into(charges[0], row)
+        return row.tobytes()
+    columns = np.column_stack(predictor.predict_batch(charges))
+    return b"".join(columns[:, part].tobytes() for part in (slice(0, 3), slice(3, 6), slice(6, 7)))
+
+
+def numbers_in(body: bytes) -> bytes:
+    """The numbers of an answer, output by output, JSON or binary, as float32 bytes."""
+    end = body.rindex(b"}") + 1
+    try:
+        outputs = orjson.loads(body[:end])["outputs"]
+    except orjson.JSONDecodeError:  # a byte of the binary data is a brace
+        end = body.index(b"}}]}") + 4
+        outputs = orjson.loads(body[:end])["outputs"]
+    if "data" not in outputs[0]:
+        return body[end:]
+    return b"".join(np.array(output["data"], dtype=np.float32).tobytes() for output in outputs)
+
+
+def resident_bytes(process: int) -> int:
+    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def soak(address: tuple[str, int], made: list[tuple[bytes, bytes]], count: int) -> Iterator[int]:
+    """Send and compare; yields after each thousand of answers how many there were."""
+    asked, answers = itertools.cycle(made), 0
+    with selectors.DefaultSelector() as waiting:
+        for _ in range(CONNECTIONS):
+            connection = Connection(address)
+            request, expected = next(asked)
+            waiting.register(connection.socket, selectors.EVENT_READ, [connection, expected])
+            connection.send(request)
+        while answers < count:
+            for key, _ in waiting.select(10.0):
+                connection, expected = key.data
+                got = numbers_in(connection.receive())
+                if got != expected:
+                    raise RuntimeError(f"answer {answers}: expected {expected!r}, got {got!r}")
+                request, key.data[1] = next(asked)
+                connection.send(request)
+                answers += 1
+                if answers % 1000 == 0:
+                    yield answers
+
+
+def load_again(address: tuple[str, int], name: str) -> None:
+    connection = Connection(address)
+    connection.send(http_request(f"/v2/repository/models/{name}/load", b""))
+    connection.receive()
+    connection.close()
+
+
+def measure(asked: argparse.Namespace) -> dict[str, Any]:
+    """Run it all."""
+    folder, address = find_model(asked.model).resolve(), ("127.0.0.1", free_port())
+    predictor = Predictor(folder)
+    name = predictor.metadata.name
+    made = exchanges(predictor, f"/v2/models/{name}/infer", asked.seed)
+    ours: list[str | Path] = [Path(sys.executable).with_name("isocharge"), "serve", "http"]
+    loads, warm = 0, 0
+    with running([*ours, "--models", folder.parents[1], "--port", str(address[1])], address) as process:
+        begin = time.perf_counter()
+        for answers in soak(address, made, asked.requests):
+            if answers % RELOAD_EVERY == 0:
+                load_again(address, name)
+                loads += 1
+            if not warm and answers >= asked.requests / 20:
+                load_again(address, name)
+                warm = resident_bytes(process.pid)
+        seconds, end = time.perf_counter() - begin, resident_bytes(process.pid)
+    return {
+        "requests": asked.requests,
+        "answers_equal": "all, bit for bit",
+        "loads_meanwhile": loads,
+        "seconds": round(seconds, 1),
+        "memory_MB": round(end / 1e6, 2),
+        "memory_growth_MB": round((end - warm) / 1e6, 2),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", default="three-25um-biaxial", help="model name or path")
+    parser.add_argument("--requests", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true", help="one JSON object")
+    asked = parser.parse_args()
+    result = measure(asked)
+    if asked.json:
+        print(json.dumps({"benchmark": "soak", **vars(asked), "machine": machine(), "results": result}))
+        return
+    print(", ".join(f"{name} {value}" for name, value in machine().items()))
+    print("\n".join(f"{name:18s} {value}" for name, value in result.items()))
+
+
+if __name__ == "__main__":
+    main()

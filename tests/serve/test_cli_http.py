@@ -1,0 +1,169 @@
+"""`isocharge serve http` as a user meets it: addresses on stdout, words on stderr, clear refusals, a clean end."""
+
+import http.client
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+import tritonclient.grpc
+
+from isocharge.cli.http import BATCH, BODY_BYTES, CONNECTIONS, HEADER_S, IDLE_S
+from isocharge.serve.limits import Limits
+
+PROGRAM = [sys.executable, "-c", "from isocharge.cli import main; main()", "serve", "http"]
+BODY = json.dumps(
+    {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}]}
+)
+
+
+@pytest.fixture
+def start(models):
+    """Start the command; its process ends with the test."""
+    started = []
+
+    def start(*words, folder=models):
+        process = subprocess.Popen(
+            [*PROGRAM, "--models", str(folder), *map(str, words)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def ask(url, method="POST", path="/v2/models/linear/infer", body=BODY):
+    client = http.client.HTTPConnection(url.removeprefix("http://"), timeout=20)
+    client.request(method, path, body)
+    answer = client.getresponse()
+    content = json.loads(answer.read())
+    client.close()
+    return answer.status, content
+
+
+def ended(process):
+    """Exit code and the one line of why."""
+    out, err = process.communicate(timeout=30)
+    assert out == ""
+    assert "Traceback" not in err
+    return process.returncode, err.strip()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_serves_until_told_to_stop(start, number):
+    process = start("--port", 0, "--grpc-port", 0)
+    url, grpc_url = process.stdout.readline().strip(), process.stdout.readline().strip()
+    assert ask(url)[0] == 200
+    client = tritonclient.grpc.InferenceServerClient(grpc_url.removeprefix("grpc://"))
+    assert client.is_model_ready("linear")
+    client.close()
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out) == (0, "")
+    assert err == "serving linear/1; Ctrl-C stops\n"
+
+
+def test_killed_and_started_again(start):
+    """On the same port, with a connection that was open when it was killed."""
+    process = start("--port", 0)
+    url = process.stdout.readline().strip()
+    with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2]))) as held:
+        held.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
+        assert held.recv(12) == b"HTTP/1.1 200"
+        process.kill()
+        process.wait()
+        again = start("--port", url.rpartition(":")[2])
+        assert again.stdout.readline().strip() == url
+    assert ask(url)[0] == 200
+
+
+def test_a_killed_server_s_unix_socket_is_taken_over(start, tmp_path):
+    path = tmp_path / "touch.sock"
+    for _ in range(2):
+        process = start("--uds", path)
+        assert process.stdout.readline() == f"unix:{path}\n"
+        process.kill()
+        process.wait()
+    process = start("--uds", path)
+    process.stdout.readline()
+    process.terminate()
+    process.wait(timeout=20)
+    assert not path.exists()
+
+
+def test_a_damaged_swap_while_serving(film, start, tmp_path):
+    film.write(tmp_path)
+    process = start("--port", 0, folder=tmp_path)
+    url = process.stdout.readline().strip()
+    before = ask(url)
+    good = (tmp_path / "linear/1/model.onnx").read_bytes()
+    (tmp_path / "linear/1/model.onnx").write_bytes(good[:-9])
+    status, content = ask(url, path="/v2/repository/models/linear/load", body="")
+    assert (status, "the file is damaged or changed" in content["error"]) == (400, True)
+    assert ask(url) == before
+    (tmp_path / "linear/1/model.onnx").write_bytes(good)
+    assert ask(url, path="/v2/repository/models/linear/load", body="") == (200, {})
+    assert ask(url) == before
+
+
+def test_what_is_refused_at_the_start_is_said(film, start, tmp_path):
+    film.write(tmp_path)
+    film.write(tmp_path, version=2)
+    (tmp_path / "linear/2/golden.json").unlink()
+    process = start("--port", 0, folder=tmp_path)
+    assert ask(process.stdout.readline().strip())[0] == 200
+    process.terminate()
+    refused, serving = process.communicate(timeout=20)[1].splitlines()
+    assert re.match(r"refused: .*linear/2/golden.json: not there; a model travels with its golden.json", refused)
+    assert serving == "serving linear/1; Ctrl-C stops"
+
+
+def test_bad_starts(start, models, tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "damaged").mkdir()
+    shutil.copytree(models / "linear", tmp_path / "damaged/linear")
+    (tmp_path / "damaged/linear/1/golden.json").write_text("{")
+    (tmp_path / "cert.pem").write_text("no certificate")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        cases = [
+            (start("--port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port}: another program listens"),
+            (start("--port", 0, "--grpc-port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port} for gRPC"),
+            (start("--host", "0.0.0.0"), 2, "InputError: --host 0.0.0.0 lets other machines in: give --token TOKEN"),
+            (start("--uds", "x", "--host", "0.0.0.0", "--grpc-port", 0), 2, "InputError: --host 0.0.0.0 lets other"),
+            (start("--token", ""), 2, "InputError: token: expected printable ASCII"),
+            (start("--tls-key", "x"), 2, "InputError: --tls-key: expected --tls-cert with it"),
+            (start("--tls-cert", tmp_path / "cert.pem"), 2, f"InputError: {tmp_path}/cert.pem: not a certificate"),
+            (start("--tls-cert", tmp_path / "none.pem"), 2, f"InputError: {tmp_path}/none.pem: not a certificate"),
+            (start(folder=tmp_path / "empty"), 2, f"ModelError: {tmp_path}/empty: expected models"),
+            (start(folder=tmp_path / "none"), 2, f"ModelError: {tmp_path}/none: expected a folder of models"),
+            (start(folder=tmp_path / "damaged"), 2, "ModelError: no model can be served: "),
+        ]
+        for process, code, said in cases:
+            got, error = ended(process)
+            assert (got, error[: len(said)]) == (code, said)
+
+
+def test_the_options_defaults_are_the_limits():
+    limits = Limits()
+    assert (limits.batch, limits.body_bytes, limits.connections) == (BATCH, BODY_BYTES, CONNECTIONS)
+    assert (limits.idle_seconds, limits.header_seconds) == (IDLE_S, HEADER_S)
+
+
+def test_the_token_may_come_from_the_environment(start, monkeypatch):
+    monkeypatch.setitem(os.environ, "ISOCHARGE_TOKEN", "open sesame")
+    process = start("--port", 0)
+    assert ask(process.stdout.readline().strip())[0] == 401

@@ -1,0 +1,179 @@
+"""What the stock gRPC client does not reach: numbers that are not raw, token, TLS, limits, ports, compiled messages."""
+
+import socket
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import grpc
+import numpy as np
+import pytest
+import trustme
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from tritonclient.grpc import service_pb2
+
+from isocharge.errors import InputError, ListenError
+from isocharge.serve.grpc import grpc_server
+from isocharge.serve.grpc.messages import METHODS, SERVICE
+from isocharge.serve.limits import Limits
+from isocharge.serve.tls import Tls
+from isocharge.serve.token import Token
+from isocharge.serve.v2 import Handler
+
+PROTO = Path(__file__).parents[2] / "serve/isocharge/serve/grpc/inference.proto"
+
+
+@pytest.fixture
+def start(handler):
+    """Start servers; a function that calls a method by name."""
+    with ExitStack() as stack:
+
+        def start(**named):
+            url = stack.enter_context(grpc_server(named.pop("handler", handler), "127.0.0.1", 0, **named))
+            channel = stack.enter_context(grpc.insecure_channel(url.removeprefix("grpc://")))
+            return lambda name, **fields: call(channel, name, **fields)
+
+        yield start
+
+
+def call(channel, name, metadata=None, **fields):
+    request, response = METHODS[name]
+    method = channel.unary_unary(
+        f"/{SERVICE}/{name}",
+        request_serializer=request.SerializeToString,
+        response_deserializer=response.FromString,
+    )
+    return method(request(**fields), metadata=metadata, timeout=20)
+
+
+def tensor(charges, datatype="FP32", **fields):
+    contents = {"FP32": "fp32_contents", "FP64": "fp64_contents"}[datatype]
+    values = {"contents": {contents: np.ravel(charges).tolist()}}
+    return {"name": "charge_pC", "datatype": datatype, "shape": list(np.shape(charges)), **values, **fields}
+
+
+@pytest.mark.parametrize("datatype", ["FP32", "FP64"])
+def test_numbers_that_are_not_raw(start, film, predictor, datatype):
+    answer = start()("ModelInfer", model_name="linear", id="7", inputs=[tensor(film.golden_pC(), datatype)])
+    contact, std, misfit = answer.outputs
+    assert (answer.id, list(answer.raw_output_contents)) == ("7", [])
+    assert [output.name for output in answer.outputs] == ["contact", "contact_std", "misfit"]
+    expected = np.column_stack(predictor.predict_batch(film.golden_pC()))
+    for output, columns in ((contact, slice(0, 3)), (std, slice(3, 6)), (misfit, slice(6, 7))):
+        got = np.float32(output.contents.fp32_contents).reshape(output.shape)
+        np.testing.assert_array_equal(got, expected[:, columns])
+
+
+@pytest.mark.parametrize(
+    ("fields", "status", "said"),
+    [
+        ({"inputs": []}, "INVALID_ARGUMENT", "expected one input tensor, got 0"),
+        ({"inputs": [tensor([[1.0, 2.0]])]}, "INVALID_ARGUMENT", r"expected the shape \[n, 3\]"),
+        ({"inputs": [tensor([[1.0, 2.0, np.nan]])]}, "INVALID_ARGUMENT", "for electrode 'C'"),
+        ({"inputs": [tensor([[1.0] * 3], shape=[2, 3])]}, "INVALID_ARGUMENT", "flat or in rows"),
+        (
+            {"inputs": [tensor([[1.0] * 3], contents={"bool_contents": [True]})]},
+            "INVALID_ARGUMENT",
+            "expected fp32",
+        ),
+        (
+            {"inputs": [tensor([[1.0] * 3])], "raw_input_contents": [bytes(12)]},
+            "INVALID_ARGUMENT",
+            "raw_input_contents",
+        ),
+        ({"inputs": [tensor([[1.0] * 3])], "outputs": [{"name": "z"}]}, "INVALID_ARGUMENT", "expected outputs out of"),
+        ({"inputs": [tensor([[1.0] * 3], shape=[5000, 3])]}, "RESOURCE_EXHAUSTED", "at most 4096 presses"),
+        ({"model_name": "cubic"}, "NOT_FOUND", "'cubic' is not found; serving: linear/1, linear/2"),
+        ({"model_version": "9"}, "NOT_FOUND", "'linear/9' is not found"),
+    ],
+)
+def test_bad_requests_are_refused_with_the_reason(start, fields, status, said):
+    with pytest.raises(grpc.RpcError, match=said) as caught:
+        start()("ModelInfer", **{"model_name": "linear", **fields})
+    assert caught.value.code() is grpc.StatusCode[status]
+
+
+def test_a_message_beyond_the_limit(start, shelf):
+    ask = start(handler=Handler(shelf, Limits(body_bytes=1000)))
+    with pytest.raises(grpc.RpcError) as caught:
+        ask("ModelInfer", model_name="linear", raw_input_contents=[bytes(2000)])
+    assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+def test_a_token(start):
+    ask = start(token=Token("open sesame"))
+    assert ask("ServerLive").live
+    assert ask("ServerReady").ready
+    assert ask("ServerMetadata", metadata=[("authorization", "Bearer open sesame")]).name == "isocharge"
+    for metadata in ([], [("authorization", "Bearer sesame")]):
+        with pytest.raises(grpc.RpcError, match="this server's token") as caught:
+            ask("ServerMetadata", metadata=metadata)
+        assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
+
+
+def test_tls(handler, tmp_path):
+    authority = trustme.CA()
+    issued = authority.issue_cert("127.0.0.1")
+    issued.private_key_and_cert_chain_pem.write_to_path(tmp_path / "both.pem")
+    trusted = grpc.ssl_channel_credentials(authority.cert_pem.bytes())
+    with (
+        grpc_server(handler, "127.0.0.1", 0, tls=Tls(tmp_path / "both.pem")) as url,
+        grpc.secure_channel(url.removeprefix("grpcs://"), trusted) as channel,
+    ):
+        assert call(channel, "ServerLive").live
+    with (
+        pytest.raises(InputError, match="not a certificate"),
+        grpc_server(handler, "127.0.0.1", 0, tls=Tls(tmp_path / "none.pem")),
+    ):
+        pass
+
+
+def test_a_port_that_is_taken(handler):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with (
+            pytest.raises(ListenError, match=f"cannot listen on 127.0.0.1:{port} for gRPC"),
+            grpc_server(handler, "127.0.0.1", port),
+        ):
+            pass
+
+
+def test_errors_that_are_ours_are_not_told(start, shelf, monkeypatch, caplog):
+    def fail(*_):
+        raise ZeroDivisionError("a secret")
+
+    monkeypatch.setattr(shelf, "all", fail)
+    with pytest.raises(grpc.RpcError, match="internal error") as caught:
+        start()("ServerReady")
+    assert caught.value.code() is grpc.StatusCode.INTERNAL
+    assert "a secret" in caplog.text
+
+
+def test_compiled_messages_are_those_of_the_source(tmp_path):
+    """`make proto` was not forgotten. Only what a reader sees is compared: compilers differ in details."""
+    made = tmp_path / "made.binpb"
+    words = [sys.executable, "-m", "grpc_tools.protoc", f"-I{PROTO.parent}", f"--descriptor_set_out={made}", PROTO.name]
+    subprocess.run(words, check=True)
+    kept, new = (FileDescriptorSet.FromString(path.read_bytes()) for path in (PROTO.with_suffix(".binpb"), made))
+    assert kept == new
+
+
+def test_messages_have_the_field_numbers_of_the_stock_client():
+    def fields(message):
+        return {field.name: (field.number, field.type) for field in message.fields}
+
+    def compare(ours, stock):
+        theirs = fields(stock)
+        for name, field in fields(ours).items():
+            assert name == "properties" or theirs[name] == field, (ours.full_name, name)
+        for field in ours.fields:
+            if field.message_type and field.name != "properties":
+                compare(field.message_type, stock.fields_by_name[field.name].message_type)
+
+    stock = service_pb2.DESCRIPTOR.services_by_name["GRPCInferenceService"].methods_by_name
+    for name, (request, response) in METHODS.items():
+        compare(request.DESCRIPTOR, stock[name].input_type)
+        compare(response.DESCRIPTOR, stock[name].output_type)

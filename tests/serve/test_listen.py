@@ -1,0 +1,95 @@
+"""Where a server listens and whom it lets in: addresses, Unix sockets, tokens, certificate files."""
+
+import socket
+import stat
+
+import pytest
+import trustme
+
+from isocharge.errors import InputError, ListenError, TokenError
+from isocharge.serve.http import App, HttpServer
+from isocharge.serve.listen import Address, check_exposure
+from isocharge.serve.tls import Tls
+from isocharge.serve.token import Token
+
+
+@pytest.fixture(scope="module")
+def pem_files(tmp_path_factory):
+    """A folder with a certificate and its key."""
+    folder, issued = tmp_path_factory.mktemp("tls"), trustme.CA().issue_cert("127.0.0.1")
+    issued.cert_chain_pems[0].write_to_path(folder / "cert.pem")
+    issued.private_key_pem.write_to_path(folder / "key.pem")
+    return folder
+
+
+@pytest.mark.parametrize("token", ["", " a", "a\n", "a\r\nb: c", "schlüssel"])
+def test_tokens_that_no_header_carries(token):
+    with pytest.raises(InputError, match="printable ASCII"):
+        Token(token)
+
+
+def test_tokens_are_compared_in_constant_time(monkeypatch):
+    compared = []
+    monkeypatch.setattr("hmac.compare_digest", lambda a, b: compared.append((a, b)) or a == b)
+    with pytest.raises(TokenError, match="got a wrong one"):
+        Token("right").check(b"Bearer wrong")
+    assert compared == [(b"Bearer wrong", b"Bearer right")]
+
+
+@pytest.mark.parametrize(
+    ("certificate", "key"), [("none.pem", None), ("cert.pem", None), ("key.pem", "cert.pem"), (".", None)]
+)
+def test_tls_files_that_cannot_be_used(handler, pem_files, certificate, key):
+    folder = pem_files
+    tls = Tls(folder / certificate, key and folder / key)
+    with pytest.raises(InputError, match=r"pem.*|tls.*: not a certificate and its unencrypted private key"):
+        HttpServer(App(handler), Address(), limits=handler.limits, tls=tls)
+
+
+def test_a_unix_socket(handler, start_http, tmp_path):
+    path = tmp_path / "touch.sock"
+    server = start_http(handler, uds=path)
+    assert server.url == f"unix:{path}"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.connect(str(path))
+        connection.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
+        assert connection.recv(1000).startswith(b"HTTP/1.1 200")
+
+
+def test_a_socket_left_by_a_killed_server_is_taken_over(handler, start_http, tmp_path):
+    path = tmp_path / "touch.sock"
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(path))
+    start_http(handler, uds=path)
+
+
+def test_places_that_are_taken(handler, start_http, tmp_path):
+    start_http(handler, uds=tmp_path / "touch.sock")
+    (tmp_path / "file").write_text("mine")
+    host, port = start_http(handler).url.removeprefix("http://").split(":")
+    for address, said in [
+        (Address(host, int(port)), f"cannot listen on 127.0.0.1:{port}: another program listens there"),
+        (Address(uds=tmp_path / "touch.sock"), "another server listens there"),
+        (Address(uds=tmp_path / "file"), "found a file; choose another path"),
+        (Address(uds=tmp_path / "no/such.sock"), "cannot listen on"),
+        (Address(uds=tmp_path / ("a" * 200)), "cannot listen on"),
+        (Address("192.0.2.1"), "this machine has no such address"),
+        (Address("no.such.host.invalid"), "no such host"),
+    ]:
+        with pytest.raises(ListenError, match=said):
+            address.listen(1)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
+def test_other_machines_need_a_token(host):
+    with pytest.raises(InputError, match=f"--host {host} lets other machines in: give --token TOKEN"):
+        check_exposure(Address(host), token=False, insecure=False)
+    check_exposure(Address(host), token=True, insecure=False)
+    check_exposure(Address(host), token=False, insecure=True)
+
+
+@pytest.mark.parametrize("address", [Address(), Address("127.0.0.2"), Address("::1"), Address("localhost")])
+def test_this_machine_needs_none(address):
+    check_exposure(address, token=False, insecure=False)

@@ -1,0 +1,245 @@
+"""The stock Triton clients - HTTP, HTTP with asyncio, gRPC - with their defaults, against our servers."""
+
+import asyncio
+import json
+from inspect import isawaitable
+
+import numpy as np
+import pytest
+import tritonclient.grpc
+import tritonclient.http
+import tritonclient.http.aio
+from tritonclient.utils import InferenceServerException
+
+from isocharge.serve import Predictor
+from isocharge.serve.grpc import grpc_server
+
+CLIENTS = ("http", "aio", "grpc")
+
+
+class AsyncClient:
+    """The asyncio client with the manners of the other one."""
+
+    def __init__(self, loop, address):
+        self._loop, self._client = loop, None
+        self._client = self(tritonclient.http.aio.InferenceServerClient, address)
+
+    def __call__(self, method, *arguments, **named):
+        async def call():
+            value = method(*arguments, **named)
+            return await value if isawaitable(value) else value
+
+        return self._loop.run_until_complete(call())
+
+    def __getattr__(self, name):
+        return lambda *arguments, **named: self(getattr(self._client, name), *arguments, **named)
+
+
+@pytest.fixture(params=CLIENTS)
+def client(request, handler, start_http):
+    if request.param == "grpc":
+        with grpc_server(handler, "127.0.0.1", 0) as url:
+            stock = tritonclient.grpc.InferenceServerClient(url.removeprefix("grpc://"))
+            yield stock
+            stock.close()
+        return
+    address = start_http(handler).url.removeprefix("http://")
+    if request.param == "http":
+        stock = tritonclient.http.InferenceServerClient(address)
+        yield stock
+        stock.close()
+        return
+    with asyncio.Runner() as runner:
+        stock = AsyncClient(runner.get_loop(), address)
+        yield stock
+        stock.close()
+
+
+@pytest.fixture
+def module(client):
+    return tritonclient.grpc if isinstance(client, tritonclient.grpc.InferenceServerClient) else tritonclient.http
+
+
+def plain(answer):
+    """JSON from either kind of client."""
+    return json.loads(tritonclient.grpc._client.MessageToJson(answer)) if hasattr(answer, "DESCRIPTOR") else answer
+
+
+def charges(film, n=5):
+    return np.resize(film.golden_pC(), (n, 3)).astype(np.float32)
+
+
+def tensor(module, values, datatype="FP32"):
+    made = module.InferInput("charge_pC", list(values.shape), datatype)
+    made.set_data_from_numpy(values)
+    return made
+
+
+def expected(tmp_path, values):
+    """What the same model answers in process."""
+    touch = Predictor(tmp_path / "models/linear")
+    columns = np.column_stack(touch.predict_batch(values))
+    return {"contact": columns[:, :3], "contact_std": columns[:, 3:6], "misfit": columns[:, 6:]}
+
+
+def test_health(client):
+    assert client.is_server_live()
+    assert client.is_server_ready()
+    assert client.is_model_ready("linear")
+    assert client.is_model_ready("linear", "1")
+    assert not client.is_model_ready("linear", "3")
+    assert not client.is_model_ready("cubic")
+
+
+def test_metadata(client):
+    server, model = plain(client.get_server_metadata()), plain(client.get_model_metadata("linear"))
+    assert server["name"] == "isocharge"
+    assert {"binary_tensor_data", "model_repository", "statistics"} <= set(server["extensions"])
+    assert (model["name"], model["versions"], model["platform"]) == ("linear", ["1", "2"], "onnxruntime_onnx")
+    assert [(t["name"], t["datatype"], [int(n) for n in t["shape"]]) for t in model["inputs"] + model["outputs"]] == [
+        ("charge_pC", "FP32", [-1, 3]),
+        ("contact", "FP32", [-1, 3]),
+        ("contact_std", "FP32", [-1, 3]),
+        ("misfit", "FP32", [-1, 1]),
+    ]
+
+
+def test_infer_with_defaults(client, module, film, tmp_path):
+    values = charges(film)
+    answer = client.infer("linear", [tensor(module, values)], request_id="press 7")
+    for name, rows in expected(tmp_path, values).items():
+        np.testing.assert_array_equal(answer.as_numpy(name), rows)
+    said = plain(answer.get_response())
+    assert said["id"] == "press 7"
+    assert said.get("model_version", said.get("modelVersion")) == "2"
+
+
+@pytest.mark.parametrize("version", ["1", "2"])
+def test_infer_with_a_version(client, module, film, version):
+    answer = client.infer("linear", [tensor(module, charges(film))], model_version=version)
+    said = plain(answer.get_response())
+    assert said.get("model_version", said.get("modelVersion")) == version
+
+
+def test_infer_from_doubles(client, module, film, tmp_path):
+    values = charges(film).astype(np.float64)
+    answer = client.infer("linear", [tensor(module, values, "FP64")])
+    np.testing.assert_array_equal(answer.as_numpy("contact"), expected(tmp_path, values)["contact"])
+
+
+def test_infer_some_outputs(client, module, film):
+    outputs = [module.InferRequestedOutput(name) for name in ("misfit", "contact")]
+    answer = client.infer("linear", [tensor(module, charges(film))], outputs=outputs)
+    said = plain(answer.get_response())
+    assert [output["name"] for output in said["outputs"]] == ["misfit", "contact"]
+    assert answer.as_numpy("contact_std") is None
+
+
+@pytest.mark.parametrize("binary_in", [False, True])
+@pytest.mark.parametrize("binary_out", [(False, False), (True, True), (True, False), (False, True)])
+def test_json_and_binary_mixed(handler, start_http, film, tmp_path, binary_in, binary_out):
+    client = tritonclient.http.InferenceServerClient(start_http(handler).url.removeprefix("http://"))
+    values = charges(film)
+    made = tritonclient.http.InferInput("charge_pC", list(values.shape), "FP32")
+    made.set_data_from_numpy(values, binary_data=binary_in)
+    outputs = [
+        tritonclient.http.InferRequestedOutput(name, binary_data=binary)
+        for name, binary in zip(("contact", "misfit"), binary_out, strict=True)
+    ]
+    answer = client.infer("linear", [made], outputs=outputs)
+    for name in ("contact", "misfit"):
+        np.testing.assert_array_equal(answer.as_numpy(name), expected(tmp_path, values)[name])
+    client.close()
+
+
+@pytest.mark.parametrize("way", ["gzip", "deflate"])
+@pytest.mark.parametrize("n", [1, 200])
+def test_compressed_both_ways(client, module, film, tmp_path, way, n):
+    values = charges(film, n)
+    if module is tritonclient.grpc:
+        answer = client.infer("linear", [tensor(module, values)], compression_algorithm=way)
+    else:
+        answer = client.infer(
+            "linear",
+            [tensor(module, values)],
+            request_compression_algorithm=way,
+            response_compression_algorithm=way,
+        )
+    for name, rows in expected(tmp_path, values).items():
+        np.testing.assert_array_equal(answer.as_numpy(name), rows)
+
+
+def test_index_unload_load(client, module, film):
+    def index():
+        rows = plain(client.get_model_repository_index())
+        return [(r["name"], r["version"], r["state"]) for r in (rows["models"] if isinstance(rows, dict) else rows)]
+
+    both = [("linear", "1"), ("linear", "2")]
+    assert index() == [(*version, "READY") for version in both]
+    client.unload_model("linear")
+    assert index() == [(*version, "UNAVAILABLE") for version in both]
+    assert not client.is_model_ready("linear")
+    assert not client.is_server_ready()
+    with pytest.raises(InferenceServerException, match="model 'linear' is not found"):
+        client.infer("linear", [tensor(module, charges(film))])
+    client.load_model("linear")
+    assert index() == [(*version, "READY") for version in both]
+    client.infer("linear", [tensor(module, charges(film))])
+
+
+def test_load_takes_no_configuration(client):
+    with pytest.raises(InferenceServerException, match="put the files into the model's folder"):
+        client.load_model("linear", config="{}")
+
+
+def test_configuration(client):
+    said = plain(client.get_model_config("linear"))
+    config = said.get("config", said)
+    assert config.get("max_batch_size", config.get("maxBatchSize")) == 4096
+    assert config["input"][0]["name"] == "charge_pC"
+    assert [output["name"] for output in config["output"]] == ["contact", "contact_std", "misfit"]
+
+
+def test_statistics(client, module, film):
+    for n in (1, 4):
+        client.infer("linear", [tensor(module, charges(film, n))])
+    with pytest.raises(InferenceServerException):
+        client.infer("linear", [tensor(module, charges(film)[:, :2])])
+    first, second = plain(client.get_inference_statistics("linear")).popitem()[1]
+    counts = {name.lower().replace("_", ""): value for name, value in second.items()}
+    spent = {name.lower().replace("_", ""): value for name, value in counts["inferencestats"].items()}
+    assert (int(counts["inferencecount"]), int(counts["executioncount"])) == (5, 2)
+    assert {name: int(spent[name]["count"]) for name in ("success", "fail", "computeinfer")} == {
+        "success": 2,
+        "fail": 1,
+        "computeinfer": 2,
+    }
+    assert int(spent["success"]["ns"]) >= int(spent["computeinfer"]["ns"]) > 0
+    assert int(first.get("inference_count", first.get("inferenceCount", 0))) == 0
+    assert len(plain(client.get_inference_statistics()).popitem()[1]) == 2
+
+
+def test_errors_are_said(client, module, film):
+    for values, said in [
+        (charges(film)[:, :2], r"expected the shape \[n, 3\]"),
+        (np.full((1, 3), np.nan, np.float32), "finite charges .* electrode 'A'"),
+        (np.ones((5000, 3), np.float32), "at most 4096 presses"),
+    ]:
+        with pytest.raises(InferenceServerException, match=said):
+            client.infer("linear", [tensor(module, values)])
+    with pytest.raises(InferenceServerException, match=r"model 'cubic' is not found; serving: linear/1, linear/2"):
+        client.get_model_metadata("cubic")
+
+
+def test_a_stream_of_requests(handler, film, tmp_path):
+    values, answers = charges(film), []
+    with grpc_server(handler, "127.0.0.1", 0) as url:
+        client = tritonclient.grpc.InferenceServerClient(url.removeprefix("grpc://"))
+        client.start_stream(lambda result, error: answers.append((result, error)))
+        for name in ("linear", "cubic", "linear"):
+            client.async_stream_infer(name, [tensor(tritonclient.grpc, values)])
+        client.stop_stream()
+        client.close()
+    assert [error is None for _, error in answers] == [True, False, True]
+    assert "is not found" in str(answers[1][1])
+    np.testing.assert_array_equal(answers[2][0].as_numpy("contact"), expected(tmp_path, values)["contact"])

@@ -1,0 +1,380 @@
+"""The protocol without a transport: routes, tensors both ways, compression, errors - against onnxruntime itself."""
+
+import gzip
+import tracemalloc
+import zlib
+
+import numpy as np
+import onnxruntime
+import orjson
+import pytest
+
+from isocharge.errors import InputError, ModelNotFound, TokenError
+from isocharge.serve.limits import Limits
+from isocharge.serve.v2 import Handler
+from isocharge.serve.v2.encoding import compress, decompress
+from isocharge.serve.v2.status import grpc_status, http_status
+
+INFER = "/v2/models/linear/infer"
+
+
+@pytest.fixture
+def ask(handler):
+    """Ask the handler: (status, headers, body)."""
+
+    def ask(method, path, body=b"", **headers):
+        named = [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()]
+        status, answered, body = handler.answer(method, path, named, body)
+        assert dict(answered)[b"content-length"] == b"%d" % len(body)
+        return status, {name.decode(): value.decode() for name, value in answered}, body
+
+    return ask
+
+
+@pytest.fixture
+def bare(tmp_path, shelf):  # noqa: ARG001
+    """The same file in a session with nothing of ours around it: charges to outputs by name."""
+    session = onnxruntime.InferenceSession(tmp_path / "models/linear/2/model.onnx", providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+    return lambda charges: dict(zip(names, session.run(None, {"charge_pC": np.float32(charges)}), strict=True))
+
+
+def request(charges, datatype="FP32", **more):
+    charges = np.asarray(charges)
+    tensor = {"name": "charge_pC", "datatype": datatype, "shape": list(charges.shape), "data": charges.ravel().tolist()}
+    return {"inputs": [tensor]} | more
+
+
+def refusal(answer):
+    status, headers, body = answer
+    assert headers["content-type"] == "application/json"
+    content = orjson.loads(body)
+    assert list(content) == ["error"]
+    return status, content["error"]
+
+
+ROUTES = [
+    ("GET", "/"),
+    ("GET", "/openapi.json"),
+    ("GET", "/v2"),
+    ("GET", "/v2/health/live"),
+    ("GET", "/v2/health/ready"),
+    ("GET", "/v2/models/stats"),
+    ("POST", "/v2/repository/index"),
+    ("POST", "/v2/repository/models/linear/load"),
+    *(("GET", f"/v2/models/linear{v}{t}") for v in ("", "/versions/1") for t in ("", "/ready", "/config", "/stats")),
+]
+
+
+@pytest.mark.parametrize(("method", "path"), ROUTES)
+def test_every_route_answers_its_method_only(ask, method, path):
+    assert ask(method, path)[0] == 200
+    status, error = refusal(ask("DELETE", path))
+    assert (status, ask("DELETE", path)[1]["allow"]) == (405, method)
+    assert error == f"{path}: expected the method {method}, got DELETE"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "",
+        "/v1",
+        "/v2/",
+        "/v2/health",
+        "/v2/models",
+        "/v2/models/linear/",
+        "/v2/models/linear/versions",
+        "/v2/models/linear/versions/",
+        "/v2/models/linear/versions/1/",
+        "/v2/models/linear/infer/1",
+        "/v2/models/linear/versions/1/versions/1",
+        "/v2/repository/models/linear",
+        "/v2/repository/models/linear/versions/1/load",
+        "/v2/systemsharedmemory/status",
+    ],
+)
+def test_other_paths_are_not_there(ask, path):
+    assert refusal(ask("GET", path))[0] == 404
+
+
+@pytest.mark.parametrize("path", ["/v2/models/cubic/ready", "/v2/models/linear/versions/3/ready", "/v2/models//ready"])
+def test_other_models_are_not_there(ask, path):
+    status, error = refusal(ask("GET", path))
+    assert status == 404
+    assert error.endswith("is not found; serving: linear/1, linear/2")
+
+
+@pytest.mark.parametrize("n", [1, 2, 100, 4096])
+@pytest.mark.parametrize("datatype", ["FP32", "FP64"])
+def test_answers_equal_a_bare_session(ask, bare, film, n, datatype):
+    charges = np.resize(film.golden_pC(), (n, 3))
+    status, _, body = ask("POST", INFER, orjson.dumps(request(charges, datatype, id="a")))
+    content = orjson.loads(body)
+    assert (status, content["id"], content["model_name"], content["model_version"]) == (200, "a", "linear", "2")
+    for output in content["outputs"]:
+        rows = bare(charges)[output["name"]]
+        assert (output["datatype"], output["shape"]) == ("FP32", list(rows.shape))
+        np.testing.assert_array_equal(np.float32(output["data"]), rows.ravel())
+
+
+@pytest.mark.parametrize("kind", [list, lambda rows: [int(q) for q in rows.ravel()], lambda rows: rows.tolist()])
+def test_numbers_flat_whole_or_in_rows(ask, bare, kind):
+    charges = np.array([[100.0, 200.0, 300.0], [0.0, 1.0, 0.0]])
+    content = request(charges)
+    content["inputs"][0]["data"] = kind(charges) if kind is not list else charges.ravel().tolist()
+    status, _, body = ask("POST", INFER, orjson.dumps(content))
+    assert status == 200
+    np.testing.assert_array_equal(
+        np.float32(orjson.loads(body)["outputs"][0]["data"]), bare(charges)["contact"].ravel()
+    )
+
+
+def binary_request(charges, datatype="FP32", **changes):
+    raw = charges.astype({"FP32": "<f4", "FP64": "<f8"}[datatype]).tobytes()
+    tensor = {"name": "charge_pC", "datatype": datatype, "shape": list(charges.shape)}
+    tensor |= {"parameters": {"binary_data_size": len(raw)}} | changes.pop("tensor", {})
+    text = orjson.dumps({"inputs": [tensor]} | changes)
+    return text + raw, len(text)
+
+
+@pytest.mark.parametrize("datatype", ["FP32", "FP64"])
+@pytest.mark.parametrize("blanks", range(4))
+def test_binary_in_at_any_address(ask, bare, film, datatype, blanks):
+    body, length = binary_request(film.golden_pC(), datatype, id="x" * blanks)
+    status, headers, body = ask("POST", INFER, body, inference_header_content_length=str(length))
+    assert (status, headers["content-type"]) == (200, "application/json")
+    got = np.float32(orjson.loads(body)["outputs"][0]["data"])
+    np.testing.assert_array_equal(got, bare(film.golden_pC())["contact"].ravel())
+
+
+def outputs_of(headers, body):
+    """Outputs of an answer with binary tensors, by name."""
+    length = int(headers["inference-header-content-length"])
+    raw, found = body[length:], {}
+    for output in orjson.loads(body[:length])["outputs"]:
+        size = output.get("parameters", {}).get("binary_data_size")
+        numbers = np.float32(output["data"]) if size is None else np.frombuffer(raw[:size], "<f4")
+        found[output["name"]] = numbers.reshape(output["shape"])
+        raw = raw[size or 0 :]
+    assert raw == b""
+    return found
+
+
+@pytest.mark.parametrize(
+    ("asked", "names"),
+    [
+        ({"parameters": {"binary_data_output": True}}, ("contact", "contact_std", "misfit")),
+        ({"outputs": [{"name": "misfit", "parameters": {"binary_data": True}}, {"name": "contact"}]}, None),
+        ({"parameters": {"binary_data_output": True}, "outputs": [{"name": "contact_std"}]}, ("contact_std",)),
+        (
+            {
+                "parameters": {"binary_data_output": True},
+                "outputs": [{"name": "misfit", "parameters": {"binary_data": False}}, {"name": "contact"}],
+            },
+            ("misfit", "contact"),
+        ),
+    ],
+)
+def test_binary_out(ask, bare, film, asked, names):
+    status, headers, body = ask("POST", INFER, orjson.dumps(request(film.golden_pC(), **asked)))
+    assert (status, headers["content-type"]) == (200, "application/octet-stream")
+    found = outputs_of(headers, body)
+    assert tuple(found) == (names or ("misfit", "contact"))
+    for name, rows in found.items():
+        np.testing.assert_array_equal(rows, bare(film.golden_pC())[name])
+
+
+@pytest.mark.parametrize(("way", "pack"), [("gzip", gzip.compress), ("deflate", zlib.compress), ("identity", bytes)])
+def test_compressed_in(ask, film, way, pack):
+    plain = orjson.dumps(request(film.golden_pC()))
+    assert ask("POST", INFER, pack(plain), content_encoding=way)[2] == ask("POST", INFER, plain)[2]
+
+
+@pytest.mark.parametrize(("way", "unpack"), [("gzip", gzip.decompress), ("deflate", zlib.decompress)])
+def test_compressed_out(ask, film, way, unpack):
+    body = orjson.dumps(request(np.resize(film.golden_pC(), (200, 3))))
+    _, headers, packed = ask("POST", INFER, body, accept_encoding=f"br, {way};q=0.5")
+    assert headers["content-encoding"] == way
+    assert unpack(packed) == ask("POST", INFER, body)[2]
+
+
+@pytest.mark.parametrize("accepted", ["", "br", "identity", "gzip;q=0", "gzip; q=0.000, deflate;q=0"])
+def test_nothing_is_compressed_unasked(ask, film, accepted):
+    body = orjson.dumps(request(np.resize(film.golden_pC(), (200, 3))))
+    assert "content-encoding" not in ask("POST", INFER, body, accept_encoding=accepted)[1]
+
+
+def test_short_answers_stay_as_they_are():
+    assert compress(b"a" * 500, b"gzip") == (b"a" * 500, b"")
+
+
+def test_unpacking_stops_at_the_limit():
+    bomb = gzip.compress(bytes(50_000_000))
+    assert len(bomb) < 100_000
+    tracemalloc.start()
+    with pytest.raises(InputError, match="unpacks to more than 1000 bytes"):
+        decompress(bomb, b"gzip", 1000)
+    (_, peak), _ = tracemalloc.get_traced_memory(), tracemalloc.stop()
+    assert peak < 1_000_000
+
+
+PRESS = [[100.0, 200.0, 300.0]]
+
+
+def changed(**changes):
+    content = request(PRESS)
+    content["inputs"][0] |= changes
+    return orjson.dumps(content)
+
+
+BAD = {
+    "nothing": (b"", 400, r"expected `inputs`"),
+    "no JSON": (b"{", 400, "bytes that are not JSON"),
+    "no object": (b"[]", 400, "expected a JSON object, got"),
+    "NaN": (changed(data=[1, 2, 3]).replace(b"[1,2,3]", b"[1,NaN,3]"), 400, "not JSON"),
+    "beyond float64": (changed(data=[1, 2, 3]).replace(b"[1,2,3]", b"[1,1e999,3]"), 400, "."),
+    "beyond float32": (changed(data=[1, 2, 1e39]), 400, r"finite charges .* electrode 'C' \(1e\+39\)"),
+    "beyond int64": (changed(data=[1, 2, 3]).replace(b"[1,2,3]", b"[1,%d,3]" % 10**40), 400, "electrode 'B'"),
+    "nested": (b"[" * 100_000, 400, "not JSON"),
+    "nested data": (changed(data=[1, 2, 3]).replace(b"[1,2,3]", b"[" * 500 + b"]" * 500), 400, "."),
+    "no inputs": (b'{"inputs": []}', 400, "a list with one tensor"),
+    "two inputs": (orjson.dumps({"inputs": request(PRESS)["inputs"] * 2}), 400, "a list with one tensor"),
+    "inputs no list": (b'{"inputs": {}}', 400, "inputs: expected a list"),
+    "other name": (changed(name="charges"), 400, "expected one input named 'charge_pC', got 'charges'"),
+    "other type": (changed(datatype="INT64"), 400, "FP32 or FP64, got 'INT64'"),
+    "type no text": (changed(datatype=["FP32"]), 400, "FP32 or FP64"),
+    "wrong width": (changed(shape=[1, 4]), 400, r"shape \[n, 3\] with n > 0, a column for each of \('A', 'B', 'C'\)"),
+    "no rows": (changed(shape=[0, 3], data=[]), 400, "with n > 0"),
+    "negative": (changed(shape=[-1, 3]), 400, "with n > 0"),
+    "a fraction": (changed(shape=[1.0, 3]), 400, "with n > 0"),
+    "yes rows": (changed(shape=[True, 3]), 400, "with n > 0"),
+    "three dimensions": (changed(shape=[1, 3, 1]), 400, "with n > 0"),
+    "too many": (changed(shape=[10**12, 3]), 413, "at most 4096 presses in one request, got 1000000000000"),
+    "too few numbers": (changed(data=[1, 2]), 400, r"shape \[1, 3\], flat or in rows, got int64 of shape \[2\]"),
+    "ragged": (changed(shape=[2, 3], data=[[1, 2, 3], [1, 2]]), 400, "or rows of them"),
+    "texts": (changed(data=["1", "2", "3"]), 400, "expected numbers"),
+    "yes and no": (changed(data=[True, False, True]), 400, "expected numbers for the shape"),
+    "null": (changed(data=[1, None, 3]), 400, "expected numbers"),
+    "a text": (changed(data="123"), 400, "a list of numbers, got '123'"),
+    "no data": (changed(data=None), 400, "a list of numbers, got None"),
+    "id no text": (orjson.dumps(request(PRESS, id=7)), 400, "id: expected a text, got 7"),
+    "other output": (orjson.dumps(request(PRESS, outputs=[{"name": "z"}])), 400, "expected outputs out of"),
+    "output no object": (orjson.dumps(request(PRESS, outputs=["contact"])), 400, "objects with a name"),
+    "output twice": (orjson.dumps(request(PRESS, outputs=[{"name": "misfit"}] * 2)), 400, "each output once"),
+    "parameters": (orjson.dumps(request(PRESS, parameters=[])), 400, "parameters: expected an object"),
+    "no flag": (orjson.dumps(request(PRESS, parameters={"binary_data_output": 1})), 400, "true or false, got 1"),
+    "memory": (changed(parameters={"shared_memory_region": "r"}), 400, "'shared_memory_region' is not supported"),
+    "size without bytes": (changed(parameters={"binary_data_size": 12}), 400, "binary_data_size 12 and 0 bytes"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_bodies_are_refused_with_the_reason(ask, case):
+    body, status, said = BAD[case]
+    got, error = refusal(ask("POST", INFER, body))
+    assert got == status
+    with pytest.raises(InputError, match=said):
+        raise InputError(error)
+
+
+@pytest.mark.parametrize("length", ["", "-1", "+5", "1_0", "1e3", "9999", "9" * 5000, "0x10", " 5", "٣"])
+def test_bad_header_lengths(handler, length):
+    body, _ = binary_request(np.float32(PRESS))
+    headers = [(b"inference-header-content-length", length.encode())]
+    response = handler.answer("POST", INFER, headers, body)
+    assert response.status == 400
+    assert b"Inference-Header-Content-Length: expected a whole number up to" in response.body
+
+
+@pytest.mark.parametrize(
+    ("changes", "cut", "said"),
+    [
+        ({"tensor": {"parameters": {"binary_data_size": 8}}}, None, "binary_data_size 8 and 12 bytes"),
+        ({"tensor": {"parameters": {"binary_data_size": "12"}}}, None, "binary_data_size '12'"),
+        ({"tensor": {"parameters": {"binary_data_size": 10**15}}}, None, "and 12 bytes"),
+        ({"tensor": {"data": [1, 2, 3]}}, None, "expected either `data` or 12 bytes"),
+        ({"tensor": {"parameters": {}}}, None, "binary_data_size None and 12 bytes"),
+        ({"tensor": {"shape": [2, 3]}}, None, "expected 24 bytes of binary data"),
+        ({}, -4, "and 8 bytes"),
+    ],
+)
+def test_binary_data_that_do_not_fit(ask, changes, cut, said):
+    body, length = binary_request(np.float32(PRESS), **changes)
+    status, error = refusal(ask("POST", INFER, body[:cut], inference_header_content_length=str(length)))
+    assert status == 400
+    assert said in error
+
+
+def test_binary_nan_is_refused_by_name(ask):
+    body, length = binary_request(np.float32([[1.0, np.nan, 3.0]]))
+    status, error = refusal(ask("POST", INFER, body, inference_header_content_length=str(length)))
+    assert (status, "finite charges" in error, "'B' (nan)" in error) == (400, True, True)
+
+
+@pytest.mark.parametrize(
+    ("way", "body", "status", "said"),
+    [
+        ("br", b"x", 415, "expected gzip, deflate or identity"),
+        ("gzip", b"no gzip", 400, "the body is not 'gzip'"),
+        ("gzip", gzip.compress(b"{}")[:-3], 400, "ends before"),
+        ("gzip", gzip.compress(b"{}") * 2, 400, "goes on after"),
+        ("deflate", zlib.compress(b"{}") + b"more", 400, "goes on after"),
+        ("gzip", gzip.compress(bytes(1 << 24)), 413, "unpacks to more than 1048576 bytes"),
+    ],
+)
+def test_bad_compression(ask, way, body, status, said):
+    got, error = refusal(ask("POST", INFER, body, content_encoding=way))
+    assert (got, said in error) == (status, True)
+
+
+def test_a_body_beyond_the_limit(shelf):
+    handler = Handler(shelf, Limits(body_bytes=100))
+    assert handler.answer("POST", INFER, [], bytes(101)).status == 413
+
+
+def test_errors_that_are_ours_are_logged_and_not_told(ask, shelf, monkeypatch, caplog):
+    def fail(*_):
+        raise ZeroDivisionError("a secret")
+
+    monkeypatch.setattr(shelf, "all", fail)
+    status, error = refusal(ask("GET", "/v2/health/ready"))
+    assert (status, error) == (500, "internal error; the server's log says more")
+    assert "a secret" in caplog.text
+
+
+def test_index_of_what_is_ready(ask, shelf):
+    shelf.unload("linear")
+    assert len(orjson.loads(ask("POST", "/v2/repository/index", b"{}")[2])) == 2
+    assert orjson.loads(ask("POST", "/v2/repository/index", b'{"ready": true}')[2]) == []
+    assert refusal(ask("POST", "/v2/repository/index", b'{"ready": 1}'))[0] == 400
+
+
+def test_metadata_say_what_the_file_says(ask, shelf):
+    properties = orjson.loads(ask("GET", "/v2/models/linear")[2])["properties"]
+    assert properties == shelf.get("linear").metadata.to_props()
+
+
+def test_the_page_lists_models_with_their_cards(ask, shelf, tmp_path):
+    (tmp_path / "models/linear/2/card.md").write_text("# Card\n\n| a | b |\n|---|---|\n| 1 | <script>x</script> |\n")
+    page = ask("GET", "/")[2].decode()
+    assert page.count("<article>") == 2
+    assert "<h1>The linear film</h1>" in page
+    assert "<td>&lt;script&gt;x&lt;/script&gt;</td>" in page
+    shelf.unload("linear")
+    assert "No model is loaded" in ask("GET", "/")[2].decode()
+
+
+def test_the_page_s_example_runs(ask):
+    page = ask("GET", "/")[2].decode()
+    body = page.split("-d &#x27;")[1].split("&#x27;")[0].replace("&quot;", '"')
+    assert ask("POST", INFER, body.encode())[0] == 200
+
+
+def test_status_of_errors():
+    for error, status, name in [
+        (ModelNotFound(""), 404, "NOT_FOUND"),
+        (InputError(""), 400, "INVALID_ARGUMENT"),
+        (TokenError(""), 401, "UNAUTHENTICATED"),
+        (OSError(""), 500, "INTERNAL"),
+    ]:
+        assert (http_status(error), grpc_status(error)) == (status, name)
