@@ -2,7 +2,7 @@
 
     python tests/benchmarks/bench_hard_cases.py [--draws 2000] [--refine 60] [--seed 7] [--json]     (about an hour)
 
-Drawn, each uniform in the logarithm but where said: thickness 5 um to 2 mm, pretension 0 (40 %) or 0.01 to 20 MPa, force
+Drawn, uniform in the logarithm but where said: thickness 5 um to 2 mm, pretension 0 (40 %) or 0.01 to 20 MPa, force
 1e-5 to 10 N, probe reach 0.1 to 8 mm (circle, rectangle, triangle, polygon of 4 to 8 corners, any angle), position
 uniform over the area that the footprint can take (85 %) or close to the rim, Poisson's ratio uniform in 0 to 0.49. The
 film has a radius of 45 mm and 3 GPa. Nothing is tuned: `press(film, probe, at, force)`, theory and mesh by itself.
@@ -16,6 +16,7 @@ import json
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -124,13 +125,18 @@ def refined_error(seed: int, entry: dict[str, Any]) -> float:
     )
 
 
-def record(draws: int, refine: int, seed: int) -> dict[str, Any]:
-    """Everything that is measured."""
-    entries, began = [], time.time()
-    for number in range(draws):
+def record(draws: int, refine: int, seed: int, log: Path | None) -> dict[str, Any]:
+    """Everything that is measured; what a log already holds is not solved again."""
+    entries = [json.loads(line) for line in log.read_text().splitlines()] if log and log.exists() else []
+    began = time.time()
+    for number in range(len(entries), draws):
         entries.append(solve(seed, number))
+        if log:
+            with log.open("a") as file:
+                file.write(json.dumps(entries[-1]) + "\n")
         if number % 20 == 19:
             print(f"{number + 1} of {draws}, {time.time() - began:.0f} s", file=sys.stderr, flush=True)
+    entries = entries[:draws]
     solved = [entry for entry in entries if entry["status"] == "converged"]
     worst = sorted(solved, key=lambda entry: -entry["estimated_error"])[:refine]
     chosen = np.random.default_rng(seed).permutation(len(solved))[:refine]
@@ -193,8 +199,9 @@ def main() -> None:
     parser.add_argument("--refine", type=int, default=60, help="so many of the worst, and as many at random")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--json", action="store_true", help="one JSON object instead of tables")
+    parser.add_argument("--log", type=Path, help="write each draw to this file, and go on from there")
     arguments = parser.parse_args()
-    result = record(arguments.draws, arguments.refine, arguments.seed)
+    result = record(arguments.draws, arguments.refine, arguments.seed, arguments.log)
     print(json.dumps(result) if arguments.json else tables(result))
 
 

@@ -23,7 +23,7 @@ GUARD_BELOW = 1e-2
 MAX_ITERATIONS = 60
 """Limit of Newton steps; ordinary scenes take five to ten."""
 
-PATIENCE = 12
+PATIENCE = 8
 """Steps in which their size must halve, after the first as many."""
 
 ROUND_OFF = 1e-9
