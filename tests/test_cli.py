@@ -110,8 +110,8 @@ SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1", "--s
     [
         ("SIGTERM", 2, "shard-00000"),
         ("SIGINT", 2, "solve-00-00-0001"),
-        ("SIGTERM", 1, "solve"),
-        ("SIGKILL", 2, "shard"),
+        pytest.param("SIGTERM", 1, "solve", marks=pytest.mark.slow),
+        pytest.param("SIGKILL", 2, "shard", marks=pytest.mark.slow),
     ],
 )
 def test_a_stopped_sweep_goes_on_and_leaves_no_process(command, tmp_path, signal_name, workers, awaited):

@@ -1,5 +1,6 @@
 """The dataset format: whole or not at all, and every kind of damage is told."""
 
+import errno
 import hashlib
 import json
 import shutil
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.errors import DatasetError, OutputExists
+from isocharge.errors import DatasetError, OutputError, OutputExists
 from isocharge.simulate import Samples, load_sensor, read_dataset, write_dataset
 from isocharge.simulate.dataset import COLUMNS
 
@@ -184,6 +185,16 @@ def test_manifest_with_electrodes_in_another_order(dataset):
         read_dataset(dataset)
 
 
+def test_another_sensor_where_one_is_expected(dataset):
+    assert read_dataset(dataset, SENSOR).sensor == SENSOR
+    message = r"manifest\.json: expected the sensor 'four-25um-biaxial', got 'three-25um-biaxial'; use its own"
+    with pytest.raises(DatasetError, match=message):
+        read_dataset(dataset, load_sensor("four-25um-biaxial"))
+    thicker = replace(SENSOR, film=replace(SENSOR.film, thickness=30e-6), readout="edge")
+    with pytest.raises(DatasetError, match="got one of that name with another film, readout; use its own dataset"):
+        read_dataset(dataset, thicker)
+
+
 def test_missing_shard(dataset):
     (dataset / "shard-00001.npz").unlink()
     with pytest.raises(DatasetError, match=r"shard-00001\.npz: the manifest lists this shard, but it is not there"):
@@ -278,6 +289,22 @@ def test_wrong_samples_are_not_written(tmp_path, changes, message):
     with pytest.raises(DatasetError, match=rf"shard-00001\.npz: {message}"):
         write_dataset(tmp_path / "presses", SENSOR, [samples(), replace(samples(), **changes)], ABOUT)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
+    """At every file of it."""
+    for failing in range(1, 5):
+        calls = []
+
+        def full(_handle, calls=calls, failing=failing):
+            calls.append(1)
+            if len(calls) == failing:
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr("os.fsync", full)
+        with pytest.raises(OutputError, match="presses cannot be written: No space left on device"):
+            write_dataset(tmp_path / "new" / "presses", SENSOR, [samples(), samples()], ABOUT)
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_existing_folder_is_kept(tmp_path):

@@ -107,12 +107,6 @@ def test_a_worker_with_another_isocharge_is_refused(monkeypatch):
 
 # Dask
 
-pytest_dask = pytest.mark.filterwarnings(
-    # a nanny's worker that is killed leaves its sockets and its process object to the collector
-    "ignore:unclosed:ResourceWarning",
-    "ignore::pytest.PytestUnraisableExceptionWarning",
-)
-
 
 @pytest.fixture(scope="module")
 def cluster():
@@ -128,13 +122,11 @@ def pids(cluster) -> list[int]:
     return [nanny.pid for nanny in cluster.workers.values() if nanny.pid]
 
 
-@pytest_dask
 def test_dask(cluster, tmp_path, expected):
     with dask_workers(cluster.scheduler_address) as workers:
         assert sweep_with(workers, tmp_path / "presses") == expected
 
 
-@pytest_dask
 @pytest.mark.parametrize("phase", ["progress", "sampled"])
 def test_a_dask_worker_killed_half_way_is_no_matter(cluster, tmp_path, expected, phase):
     """In the middle of the solves, and between two shards."""
@@ -151,7 +143,6 @@ def test_a_dask_worker_killed_half_way_is_no_matter(cluster, tmp_path, expected,
     assert killed[0] not in pids(cluster)
 
 
-@pytest_dask
 def test_a_cluster_that_does_not_answer(monkeypatch):
     monkeypatch.setattr(module, "CONNECT_S", 0.3)
     with pytest.raises(WorkersLost, match="no Dask scheduler answers at tcp://127"):

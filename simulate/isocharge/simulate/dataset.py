@@ -165,17 +165,27 @@ def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
             raise DatasetError(f"{where}: column {name} holds {column[row]} in row {row}; every number must be finite")
 
 
-def read_dataset(folder: Path) -> Dataset:
+def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
     """Read a dataset and check every shard against the manifest.
 
+    Args:
+        folder: Where it is.
+        sensor: The sensor that is expected; any if absent.
+
     Raises:
-        DatasetError: If the folder is not a dataset, of another format version, damaged or incomplete; the message
-            names the file and what to do.
+        DatasetError: If the folder is not a dataset, of another format version or sensor, damaged or incomplete; the
+            message names the file and what to do.
     """
     folder = Path(folder)
+    expected = sensor
     manifest, checksum = _read_manifest(folder)
     try:
         sensor = sensor_from_dict(manifest["sensor"], f"{folder}/manifest.json")
+        if expected is not None and expected != sensor:
+            raise DatasetError(
+                f"{folder}/manifest.json: expected the sensor {expected.name!r}, got {_differs(sensor, expected)}; use "
+                "its own dataset, or make one"
+            )
         if manifest["electrodes"] != list(sensor.electrode_names):
             raise DatasetError(
                 f"{folder}/manifest.json: expected the sensor's electrodes in its order, "
@@ -190,6 +200,15 @@ def read_dataset(folder: Path) -> Dataset:
         raise DatasetError(f"{folder}/manifest.json: lists no shards")
     joined = {name: np.concatenate([getattr(shard, name) for shard in shards]) for name in COLUMNS}
     return Dataset(sensor, Samples(**joined), manifest, checksum)
+
+
+def _differs(sensor: Sensor, expected: Sensor) -> str:
+    """Its name, or what is not as expected under the same name."""
+    if sensor.name != expected.name:
+        return repr(sensor.name)
+    here, there = sensor_to_dict(sensor), sensor_to_dict(expected)
+    keys = sorted(key for key in here.keys() | there.keys() if here.get(key) != there.get(key))
+    return f"one of that name with another {', '.join(keys)}"
 
 
 def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
