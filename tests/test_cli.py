@@ -87,14 +87,16 @@ def test_a_point_as_json(command):
         "residual",
         "seconds",
         "estimated_error",
+        "groups",
+        "warnings",
     }
-    assert report["deflection_mm"] == pytest.approx(2.812061, rel=3e-3)  # collocation, tests/data/film_cases.json
-    assert report["charge_pC"]["A"] == pytest.approx(848, rel=5e-3)
+    assert report["deflection_mm"] == pytest.approx(2.812061, rel=1e-4)  # collocation, tests/data/film_cases.json
+    assert report["charge_pC"]["A"] == pytest.approx(848, rel=1e-3)
     assert report["status"] == "converged"
 
 
 def test_a_point_as_a_table(command):
-    code, out, err = command("simulate", "point", SENSOR, "--at", "3,-2")
+    code, out, err = command("simulate", "point", SENSOR, "--at", "3,-2", "--force", "0.5")
     assert code == 0
     assert "charge A" in out
     assert "pC" in out
@@ -220,20 +222,42 @@ def test_rates():
     assert found == ["", "", "0.5 solves/s", "12,346 presses/s"]
 
 
-def test_a_film_that_is_mostly_bent_is_refused(command, tmp_path):
+def test_a_point_says_theory_groups_and_estimated_error(command, tmp_path):
+    """1 mm: 3.72 pC on A, 0.139 mm deep (tests/data/film_cases.json)."""
     path = sensor_file(tmp_path)
     path.write_text(path.read_text().replace("thickness_um = 25.0", "thickness_um = 1000.0"))
-    code, out, err = command("simulate", "point", path)
-    assert (code, out) == (2, "")
-    assert "mostly bent" in err
-
-
-def test_a_thick_film_is_said_to_be_beyond_the_membrane(command, tmp_path):
-    path = sensor_file(tmp_path)
-    path.write_text(path.read_text().replace("thickness_um = 25.0", "thickness_um = 500.0"))
-    code, _, err = command("simulate", "point", path)
+    code, out, _ = command("simulate", "point", path, "--at", "3,-2", "--json")
+    report = json.loads(out)
     assert code == 0
-    assert "caution: bending is left out" in err
+    assert report["charge_pC"]["A"] == pytest.approx(3.7150435, rel=1e-3)
+    assert report["deflection_mm"] == pytest.approx(0.1391483, rel=1e-3)
+    assert report["theory"] == "nonlinear membrane + bending"
+    assert 0.0 < report["estimated_error"] < 1e-3
+    assert report["groups"]["bending_length"] > 0.1
+    assert report["warnings"] == []
+
+
+def test_a_theory_that_does_not_fit_is_said_to(command, tmp_path):
+    path = sensor_file(tmp_path)
+    path.write_text(path.read_text().replace("thickness_um = 25.0", "thickness_um = 1000.0"))
+    code, out, err = command("simulate", "point", path, "--theory", "nonlinear membrane", "--json")
+    assert code == 0
+    assert json.loads(out)["estimated_error"] is None
+    assert "caution: a nonlinear membrane says nothing about this film" in err
+    code, out, err = command("simulate", "point", path, "--theory", "linear plate")
+    assert code == 0
+    assert "theory            linear plate" in out
+    assert "caution: the charges may be off by" in err
+
+
+def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
+    path = sensor_file(tmp_path)
+    path.write_text(re.sub(r"pyro_uC_per_m2_K = [0-9.]+", "pyro_uC_per_m2_K = 30.0", path.read_text()))
+    code, out, err = command("simulate", "point", path, "--force", 2.0, "--json")
+    warm = json.loads(command("simulate", "point", path, "--force", 2.0, "--temperature", 0.1, "--json")[1])
+    assert code == 0
+    assert "caution: the film is stressed to" in err
+    assert warm["charge_pC"]["B"] - json.loads(out)["charge_pC"]["B"] == pytest.approx(27.0)
 
 
 def test_sweep_fit_predict_one_by_one(command, tmp_path):
@@ -262,7 +286,13 @@ BAD = [
     (("simulate", "point", SENSOR, "--at", "3"), 2, "InputError: --at: expected two numbers in mm"),
     (("simulate", "point", SENSOR, "--probe", "cube:1"), 2, "SceneError: probe 'cube:1'"),
     (("simulate", "point", SENSOR, "--probe", "circle:0"), 2, "SceneError: probe radius: expected a positive number"),
-    (("simulate", "point", SENSOR, "--probe", "rectangle:4x2"), 2, "circles only"),
+    (
+        ("simulate", "point", SENSOR, "--probe", "rectangle:4x0"),
+        2,
+        "SceneError: probe height: expected a positive number",
+    ),
+    (("simulate", "point", SENSOR, "--theory", "magic"), 2, "SceneError: theory: expected one of"),
+    (("simulate", "point", SENSOR, "--accuracy", "0"), 2, "InputError: --accuracy: expected"),
     (("simulate", "sweep", SENSOR, "--samples", "0", "-o", "OUT"), 2, "SceneError: samples: expected at least 1"),
     (
         ("simulate", "sweep", SENSOR, "--force", "2", "1", "-o", "OUT"),
@@ -284,7 +314,7 @@ BAD = [
         2,
         "ConfigError: none.toml: cannot be",
     ),
-    (("simulate", "point", SENSOR, "--probe", "circle:1e-30"), 2, "SceneError: probe radius: expected at least"),
+    (("simulate", "point", SENSOR, "--probe", "circle:1e-30"), 2, "SceneError: probe: expected a reach of at least"),
     (("simulate", "point", SENSOR, "--force", "1e6"), 2, "beyond small strains"),
     (
         ("simulate", "sweep", SENSOR, "--samples", "1000000000000", "-o", "OUT"),

@@ -115,6 +115,12 @@ def reference_cases() -> Callable[[float], list[ReferenceCase]]:
     return lambda thickness_um: [case for case in CASES if round(case.film.thickness * 1e6) == thickness_um]
 
 
+@pytest.fixture(scope="session")
+def further_cases() -> Callable[[float], list[ReferenceCase]]:
+    """Those of film_cases_skfem.json."""
+    return lambda thickness_um: [case for case in MORE_CASES if round(case.film.thickness * 1e6) == thickness_um]
+
+
 # Films and discrete problems
 
 

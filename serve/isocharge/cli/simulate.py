@@ -4,6 +4,7 @@ import json as json_module
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from enum import StrEnum
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -68,6 +69,8 @@ def point_command(
     from isocharge.simulate import load_sensor, parse_probe, press, theory_for, thermal_charge, touch_charge
     from isocharge.simulate.theory import named
 
+    if not 1e-8 <= accuracy <= 1.0:
+        raise InputError(f"--accuracy: expected a relative error from 1e-8 to 1, got {accuracy}")
     film_sensor, pressing = load_sensor(sensor), parse_probe(probe)
     terms = named(theory, film_sensor.film) if theory != "auto" else None
     terms = terms or theory_for(film_sensor, pressing, (force, force), accuracy)
@@ -75,8 +78,16 @@ def point_command(
     charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
     report = _report(film_sensor, equilibrium, charge)
     typer.echo(json_module.dumps(report) if json else _table(report))
-    for warning in report["warnings"]:
+    for warning in [*_doubts(equilibrium, accuracy), *report["warnings"]]:
         say(f"caution: {warning}")
+
+
+def _doubts(equilibrium: "Equilibrium", accuracy: float) -> list[str]:
+    """What is to be said where the wanted accuracy is not reached."""
+    error = equilibrium.estimated_error
+    if not isfinite(error):
+        return [f"a {equilibrium.theory.name} says nothing about this film; leave --theory away"]
+    return [f"the charges may be off by {error:.2g}, {accuracy:.2g} was wanted"] if error > accuracy else []
 
 
 def _position(text: str) -> tuple[float, float]:
@@ -99,7 +110,7 @@ def _report(sensor: "Sensor", equilibrium: "Equilibrium", charge: "Array") -> di
         "iterations": equilibrium.iterations,
         "residual": equilibrium.residual,
         "seconds": equilibrium.seconds,
-        "estimated_error": equilibrium.estimated_error,
+        "estimated_error": equilibrium.estimated_error if isfinite(equilibrium.estimated_error) else None,
         "groups": {**asdict(equilibrium.groups), "bending_length": equilibrium.bending_length},
         "warnings": list(equilibrium.warnings),
     }
@@ -111,11 +122,15 @@ def _table(report: dict[str, Any]) -> str:
         [
             *charges,
             f"deflection        {report['deflection_mm']:10.4f} mm",
-            f"theory            {report['theory']}, estimated error {report['estimated_error']:.2%}",
+            f"theory            {report['theory']}, estimated error {_percent(report['estimated_error'])}",
             f"solver            {report['status']} in {report['iterations']} steps, residual "
             f"{report['residual']:.1e}, {report['seconds'] * 1e3:.0f} ms CPU",
         ]
     )
+
+
+def _percent(error: float | None) -> str:
+    return "unknown" if error is None else f"{error:.2%}"
 
 
 @simulate_app.command("sweep")
