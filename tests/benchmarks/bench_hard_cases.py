@@ -125,17 +125,17 @@ def refined_error(seed: int, entry: dict[str, Any]) -> float:
     )
 
 
-def record(draws: int, refine: int, seed: int, log: Path | None) -> dict[str, Any]:
+def record(draws: int, refine: int, seed: int, log: Path | None, first: int = 0) -> dict[str, Any]:
     """Everything that is measured; what a log already holds is not solved again."""
     entries = [json.loads(line) for line in log.read_text().splitlines()] if log and log.exists() else []
     began = time.time()
-    for number in range(len(entries), draws):
+    for number in range(first + len(entries), first + draws):
         entries.append(solve(seed, number))
         if log:
             with log.open("a") as file:
                 file.write(json.dumps(entries[-1]) + "\n")
         if number % 20 == 19:
-            print(f"{number + 1} of {draws}, {time.time() - began:.0f} s", file=sys.stderr, flush=True)
+            print(f"{number + 1 - first} of {draws}, {time.time() - began:.0f} s", file=sys.stderr, flush=True)
     entries = entries[:draws]
     solved = [entry for entry in entries if entry["status"] == "converged"]
     worst = sorted(solved, key=lambda entry: -entry["estimated_error"])[:refine]
@@ -200,8 +200,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--json", action="store_true", help="one JSON object instead of tables")
     parser.add_argument("--log", type=Path, help="write each draw to this file, and go on from there")
+    parser.add_argument("--first", type=int, default=0, help="number of the first draw, to share the work")
     arguments = parser.parse_args()
-    result = record(arguments.draws, arguments.refine, arguments.seed, arguments.log)
+    result = record(arguments.draws, arguments.refine, arguments.seed, arguments.log, arguments.first)
     print(json.dumps(result) if arguments.json else tables(result))
 
 

@@ -85,7 +85,9 @@ def solve_linear(film: ElasticFilm, assembly: Assembly) -> NewtonResult:
     return NewtonResult(field, bool(np.isfinite(field).all()), 2, 0.0, "linear theory, solved directly")
 
 
-def solve_newton(film: ElasticFilm, assembly: Assembly, start: Array, tolerance: float) -> NewtonResult:
+def solve_newton(
+    film: ElasticFilm, assembly: Assembly, start: Array, tolerance: float, near: float = GUARD_BELOW
+) -> NewtonResult:
     """Find the equilibrium from a start.
 
     Args:
@@ -93,6 +95,7 @@ def solve_newton(film: ElasticFilm, assembly: Assembly, start: Array, tolerance:
         assembly: Solver for its template.
         start: First field, shape (n_node, 3), zero where fixed.
         tolerance: Relative residual to reach.
+        near: Relative residual below which Newton's own step is taken if it halves the residual, uphill or down.
 
     Returns:
         The result, converged or not; the caller decides what a failure means.
@@ -108,11 +111,14 @@ def solve_newton(film: ElasticFilm, assembly: Assembly, start: Array, tolerance:
             return NewtonResult(field, True, iteration, relative, f"converged in {iteration} steps")
         if iteration == MAX_ITERATIONS or _stalled(sizes):
             return NewtonResult(field, False, iteration, relative, f"no progress any more after {iteration} steps")
-        step = _descent_step(film, assembly, field, residual, relative)
+        step = assembly.solve(film.tangent(field, _guard(film, relative)), -residual)
         sizes.append(_energy_norm(film, field, step, residual))
         if sizes[-1] <= ROUND_OFF:
             return NewtonResult(field, True, iteration, relative, f"converged to round-off in {iteration} steps")
-        taken = _line_search(film, field, step, residual, free)
+        taken = _local_step(film, field, step, relative, free) if relative <= near else None
+        if taken is None:
+            step = _downhill(film, assembly, field, residual, step)
+            taken = _line_search(film, field, step, residual, free)
         if taken is None:
             return NewtonResult(field, False, iteration, relative, "no step lowers the energy any more")
         field, residual = taken
@@ -136,15 +142,34 @@ def _energy_norm(film: ElasticFilm, field: Array, step: Array, residual: Array) 
     return float(np.sqrt(abs(float(np.sum(step * residual))) / max(work, 1e-300)))
 
 
-def _descent_step(film: ElasticFilm, assembly: Assembly, field: Array, residual: Array, relative: float) -> Array:
-    """Newton step, with more and more tension in the tangent until it goes downhill."""
+def _guard(film: ElasticFilm, relative: float) -> float:
+    """Tension to add to the tangent: none near the end."""
     slack = GUARD_TENSION * float(np.cbrt(film.groups.load)) ** 2
-    tension = slack * min(1.0, relative) if relative > GUARD_BELOW else 0.0
+    return slack * min(1.0, relative) if relative > GUARD_BELOW else 0.0
+
+
+def _local_step(
+    film: ElasticFilm, field: Array, step: Array, relative: float, free: np.ndarray
+) -> tuple[Array, Array] | None:
+    """Newton's own step near the end, if it halves the residual at least, uphill or down.
+
+    A compressed film can have a flat equilibrium that a wrinkle would lower by a hair: it is found, not fled from.
+    """
+    if not np.isfinite(step).all():
+        return None
+    trial = field + step
+    residual = film.residual(trial)
+    return (trial, residual) if _relative(film, trial, residual * free) < 0.5 * relative else None
+
+
+def _downhill(film: ElasticFilm, assembly: Assembly, field: Array, residual: Array, step: Array) -> Array:
+    """A step that goes downhill: the given one, or with more and more tension in the tangent."""
+    tension = 0.05 * GUARD_TENSION * float(np.cbrt(film.groups.load)) ** 2
     for _ in range(12):
-        step = assembly.solve(film.tangent(field, tension), -residual)
         if np.isfinite(step).all() and float(np.sum(step * residual)) < 0.0:
             break
-        tension = max(2.0 * tension, 0.05 * slack)
+        step = assembly.solve(film.tangent(field, tension), -residual)
+        tension *= 2.0
     return step
 
 

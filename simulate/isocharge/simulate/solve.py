@@ -1,11 +1,13 @@
 """Solving the film under a press."""
 
+from dataclasses import replace
 from time import process_time
 
 import numpy as np
 
 from isocharge.errors import SceneError, SolveError
-from isocharge.simulate.assembly import assembly
+from isocharge.simulate.arrays import Array
+from isocharge.simulate.assembly import Assembly, assembly
 from isocharge.simulate.blas import single_threaded_blas
 from isocharge.simulate.elastic import ElasticFilm
 from isocharge.simulate.equilibrium import Equilibrium
@@ -19,7 +21,7 @@ from isocharge.simulate.meshing import (
     template_for,
     too_near_the_rim,
 )
-from isocharge.simulate.newton import NewtonResult, schwerin_start, solve_linear, solve_newton
+from isocharge.simulate.newton import GUARD_BELOW, NewtonResult, schwerin_start, solve_linear, solve_newton
 from isocharge.simulate.probe import Probe
 from isocharge.simulate.scaling import Groups, amplitude_squared
 from isocharge.simulate.sensor import Film
@@ -28,6 +30,9 @@ from isocharge.simulate.theory import ACCURACY, Theory, choose
 
 LAYER_REUSE = (0.75, 2.0)
 """Width of a neighbour's thin rings over one's own, between which it is taken over, so that its field still fits."""
+
+FIRST_LOAD, LOAD_STEPS = 1.0 / 16.0, 12
+"""Where it did not go at once: share of the load to begin with, and how many parts to try."""
 
 LARGEST_AMPLITUDE2 = 0.1
 """A^2, the size of the strains, above which St. Venant-Kirchhoff elasticity is out of its range: 100 N at 25 um."""
@@ -147,17 +152,47 @@ def _solve(
     geometry = Geometry.build(mesh, points)
     if np.isinf(shape_error(mesh, geometry)):
         raise too_near_the_rim(film, probe, at, resolution)
-    groups = Groups.of(film, force, bending=theory.bending)
-    elastic = ElasticFilm(geometry, groups)
-    solver = assembly(resolution, mesh.corners, elastic.components)
+    solver = assembly(resolution, mesh.corners, 4 if theory.bending else 3)
+    elastic = ElasticFilm(geometry, Groups.of(film, force, bending=theory.bending))
     if not theory.stretching:
-        return solve_linear(elastic, solver), groups
-    if start is not None and start.mesh is mesh:
-        first = start.field
-    else:
-        z = placement.to_template(points.ravel()[mesh.first_seen])
-        first = schwerin_start(z, float(placement.rho), groups)
-    return solve_newton(elastic, solver, first, tolerance), groups
+        return solve_linear(elastic, solver), elastic.groups
+    z = placement.to_template(points.ravel()[mesh.first_seen])
+    cold = schwerin_start(z, float(placement.rho), elastic.groups)
+    first = start.field if start is not None and start.mesh is mesh else cold
+    found = solve_newton(elastic, solver, first, tolerance)
+    if not found.converged:
+        found = _by_load_steps(found, film, force, theory, geometry, solver, cold, tolerance)
+    return found, elastic.groups
+
+
+def _by_load_steps(
+    failed: NewtonResult,
+    film: Film,
+    force: float,
+    theory: Theory,
+    geometry: Geometry,
+    solver: Assembly,
+    cold: Array,
+    tolerance: float,
+) -> NewtonResult:
+    """Follow the equilibrium up from a small force where the film at once runs away into wrinkles."""
+    reached, ratio, steps, field = 0.0, 2.0, failed.iterations, cold
+    wanted = FIRST_LOAD * force
+    for _ in range(LOAD_STEPS):
+        elastic = ElasticFilm(geometry, Groups.of(film, wanted, bending=theory.bending))
+        near = np.inf if reached else GUARD_BELOW
+        found = solve_newton(elastic, solver, field, tolerance, near)
+        steps += found.iterations
+        if found.converged and wanted == force:
+            return replace(found, iterations=steps, message=f"converged in {steps} steps, the load in parts")
+        if found.converged:
+            reached, field = wanted, found.field
+        elif reached == 0.0:
+            break
+        else:
+            ratio = np.sqrt(ratio)
+        wanted = min(force, reached * ratio)
+    return replace(failed, iterations=steps)
 
 
 def _why(solved: Equilibrium, tolerance: float) -> str:

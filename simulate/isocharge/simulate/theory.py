@@ -24,7 +24,7 @@ from isocharge.simulate.sensor import Film, Sensor
 ACCURACY = 1e-3
 """Relative error of a charge that is good enough where nothing else is asked for."""
 
-LINEAR_WEIGHT = 2.0
+LINEAR_WEIGHT = 4.0
 """Relative error of a charge of the linear theories over the share of the load that induced stress carries."""
 
 LOCAL_WEIGHT = 0.4
