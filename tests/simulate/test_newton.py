@@ -118,17 +118,18 @@ def test_round_off_is_not_a_failure(film):
 def test_steps_are_limited(film, monkeypatch):
     monkeypatch.setattr("isocharge.simulate.newton.MAX_ITERATIONS", 2)
     failed = press(film, Circle(1e-3), (0.0, 0.0), 1.0, throw=False)
-    assert (failed.status, failed.message, failed.iterations) == ("failed", "no progress any more after 2 steps", 2)
+    assert (failed.status, failed.message) == ("failed", "no progress any more after 2 steps")
+    assert failed.iterations == 4  # two at once, two with the load in parts
 
 
-def test_a_start_that_is_not_finite_is_told(film):
+def test_a_start_that_is_not_finite_is_not_trusted(film):
+    """The press is solved from a small force up instead, and is none the worse."""
+    good = press(film, Circle(1e-3), (0.0, 0.0), 1.0)
     bad = press(film, Circle(1e-3), (0.0, 0.0), 1.0)
     bad.field[0, 2] = np.nan
-    failed = press(film, Circle(1e-3), (0.0, 0.0), 1.0, start=bad, throw=False)
-    assert (failed.status, failed.message) == ("failed", "the residual is not a finite number")
-
-
-WRINKLES = r"no equilibrium at .* N, position \(.*\) mm: .* it wrinkles, which has many solutions; press farther"
+    found = press(film, Circle(1e-3), (0.0, 0.0), 1.0, start=bad)
+    assert found.message.endswith("the load in parts")
+    np.testing.assert_allclose(found.field, good.field, atol=1e-6)
 
 
 def test_a_film_that_wrinkles_is_told(film, monkeypatch):
@@ -137,7 +138,7 @@ def test_a_film_that_wrinkles_is_told(film, monkeypatch):
     mesh = {"theory": FULL, "resolution": Resolution(5, 8, 6, 1)}
     with pytest.raises(SolveError, match=WRINKLES):
         press(film, Circle(1e-3), (0.0, 42e-3), 5.0, **mesh)
-    with pytest.raises(SolveError, match=r"after 3 steps$"):
+    with pytest.raises(SolveError, match=r"after 6 steps$"):
         press(film, Circle(1e-3), (0.0, 0.0), 5.0, **mesh)
 
 
