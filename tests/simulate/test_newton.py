@@ -132,6 +132,9 @@ def test_a_start_that_is_not_finite_is_not_trusted(film):
     np.testing.assert_allclose(found.field, good.field, atol=1e-6)
 
 
+WRINKLES = r"no equilibrium at .* N, position \(.*\) mm: .* it wrinkles, which has many solutions; press farther"
+
+
 def test_a_film_that_wrinkles_is_told(film, monkeypatch):
     """Stopped early, beside the rim, where it is compressed: the message says so. In the middle it does not."""
     monkeypatch.setattr("isocharge.simulate.newton.MAX_ITERATIONS", 3)
