@@ -250,7 +250,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
         title="Speed against error (numbers: order of the elements)",
     )
     axes.grid(True, which="major", color="0.9")
-    axes.legend(fontsize=7, loc="lower left")
+    axes.legend(fontsize=7, loc="lower right")
     figure.savefig(path, dpi=130)
 
 

@@ -192,7 +192,7 @@ working area. 1 % of good presses exceed {errors["misfit_p99"]:g}, 0.1 % exceed 
 
 ## Limits
 
-- The truth behind these figures is the simulator's membrane without bending. On a real film, pretension and gains that
+- The truth behind these figures is the simulator, not a film. On a real film, pretension and gains that
   nobody has measured matter more.
 - One press at a time. Outside the working area and forces the answer is finite and wrong; the misfit is then large in
   many cases, not in all.
