@@ -13,7 +13,8 @@ test: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest tests/simulate tests/train -n 2 --dist loadfile # all arithmetic: both cores
+	$(BIN)/python -m pytest --ignore tests/simulate --ignore tests/train # processes, ports and clocks: one at a time
 
 test-all: $(VENV)/installed
 	$(BIN)/python -m pytest -m "slow or not slow"
