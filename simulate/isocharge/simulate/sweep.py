@@ -212,7 +212,7 @@ class Remembering(Executor):
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
         """Not remembered."""
         if self._inner is None:
-            raise NotImplementedError("here and now there is only map")
+            raise RuntimeError("expected an executor to submit to, got none: without one there is only map")
         return self._inner.submit(fn, *args, **kwargs)
 
     def _merged(self, names: list[str], kept: list[Array | None], made: Iterator[Any]) -> Iterator[Any]:
