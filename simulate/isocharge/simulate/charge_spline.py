@@ -97,8 +97,8 @@ class ChargeSpline:
         """Weights of the table's forces at logarithms of forces, shape (...) to (..., n_force): Q = weights @ terms."""
         nodes = np.log(self.force)
         weights = lagrange_values(nodes, barycentric_weights(nodes), logs.ravel())
-        scaled: Array = (weights * amplitude_squared(self.film, np.exp(logs.ravel()))[:, None]).reshape(*logs.shape, -1)
-        return scaled
+        scaled: Array = weights * amplitude_squared(self.film, np.exp(logs.ravel()))[:, None]
+        return scaled.reshape(*logs.shape, nodes.size)
 
     def terms(self, position: Array) -> Array:
         """Scaled charges at the table's forces: positions (x, y), shape (n, 2), m, to (n, n_force, n_electrode)."""
