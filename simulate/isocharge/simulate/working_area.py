@@ -7,10 +7,11 @@ import numpy as np
 
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge_spline import ChargeSpline
-from isocharge.simulate.folds import Rings, Twins, find_twins, fold_points
+from isocharge.simulate.folds import Rings, fold_points
 from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.limits import ChargeModel, limits_at
 from isocharge.simulate.noise import NoiseModel
+from isocharge.simulate.twins import Twins, find_twins
 
 ERROR = 1e-3
 """Largest Cramer-Rao position error that a working area has by default, m: a probe's radius, under the least force."""
@@ -123,11 +124,16 @@ def working_area(
 
 
 def _within(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel, error: float) -> float:
-    """Distance of the last ring before the position error exceeds the allowed one, m."""
+    """Distance at which the position error, between rings taken as a power, first exceeds the allowed one, m."""
     worst = rings.per_ring(limits_at(model, rings.contacts(force), noise).position).max(axis=1)
     over = np.flatnonzero(~(worst <= error))
-    kept = int(over[0]) if over.size else len(worst)
-    return float(rings.distance[kept - 1]) if kept else 0.0
+    if not over.size:
+        return model.radius
+    first = int(over[0])
+    if first == 0:
+        return 0.0
+    logs = np.log(worst[first - 1 : first + 1])
+    return float(np.interp(np.log(error), logs, rings.distance[first - 1 : first + 1]))
 
 
 def _twin_words(twins: Twins) -> str:
