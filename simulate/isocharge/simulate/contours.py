@@ -13,7 +13,7 @@ from contourpy import LineType, contour_generator
 
 from isocharge.errors import SceneError
 from isocharge.simulate.arrays import Array
-from isocharge.simulate.charge_spline import ChargeSpline, onto_disk
+from isocharge.simulate.charge_table import ChargeTable, onto_disk
 from isocharge.simulate.curves import electrode_index
 from isocharge.simulate.forward import ForwardMap
 
@@ -55,7 +55,7 @@ class ContourField:
     """
 
     forward_map: ForwardMap
-    table: ChargeSpline
+    table: ChargeTable
     force: float
 
     @classmethod
@@ -68,7 +68,7 @@ class ContourField:
         low, high = forward_map.force_range
         if not low * (1.0 - 1e-9) <= force <= high * (1.0 + 1e-9):
             raise SceneError(f"force: expected {low:g} to {high:g} N, which the forward map covers, got {force:g} N")
-        return cls(forward_map, ChargeSpline.of(forward_map, radius), force)
+        return cls(forward_map, ChargeTable.of(forward_map, radius), force)
 
     def contours(self, electrode: str, charge: float) -> tuple[Contour, ...]:
         """The pieces of an electrode's contour of a charge (C); none where no press gives it.
@@ -126,7 +126,7 @@ class ContourField:
         return parts
 
     def _onto_contour(self, points: Array, index: int, charge: float) -> Array:
-        """The points moved along the slope until the forward map gives the charge; those that do not get there left out."""
+        """The points moved along the slope to where the forward map gives the charge; others are dropped."""
         at = points.copy()
         away = np.full(len(at), np.inf)
         for _ in range(STEPS):
@@ -140,7 +140,9 @@ class ContourField:
             away[active] = np.linalg.norm(step, axis=1)
             step *= np.minimum(1.0, GRID / np.maximum(away[active], 1e-300))[:, None]
             at[active] = np.where(
-                (np.abs(away[active]) > ON_CONTOUR)[:, None], onto_disk(at[active] + step, self.table.radius), at[active]
+                (np.abs(away[active]) > ON_CONTOUR)[:, None],
+                onto_disk(at[active] + step, self.table.radius),
+                at[active],
             )
         if np.array_equal(points[0], points[-1]):
             at[-1] = at[0]

@@ -80,7 +80,7 @@ class Mapping:
         first, last = angles if angles is not None else (inwards - HALF_ANGLE, inwards + HALF_ANGLE)
         _check_lines(first, last, angle_step, step, length)
         angle = np.arange(first, last - 1e-9, angle_step)
-        distance = step * np.arange(1, int(length / step * (1.0 + 1e-9)) + 1)
+        distance: Array = step * np.arange(1.0, int(length / step * (1.0 + 1e-9)) + 1.0)
         return cls(electrode, (float(x), float(y)), np.append(angle, last), distance)
 
     @property
@@ -107,7 +107,9 @@ def _check_lines(first: float, last: float, angle_step: float, step: float, leng
     if not (np.isfinite(angle_step) and angle_step > 0.0):
         raise SceneError(f"step of the angle: expected a positive number, got {np.rad2deg(angle_step):g} degrees")
     if not (np.isfinite([step, length]).all() and 0.0 < step <= length):
-        raise SceneError(f"expected 0 < step <= length, got a step of {step * 1e3:g} mm and lines of {length * 1e3:g} mm")
+        raise SceneError(
+            f"expected 0 < step <= length, got a step of {step * 1e3:g} mm and lines of {length * 1e3:g} mm"
+        )
     presses = ((last - first) / angle_step + 2.0) * length / step
     if presses > MOST_PRESSES:
         raise SceneError(f"expected at most {MOST_PRESSES} presses on the lines, got {presses:.3g}; take larger steps")

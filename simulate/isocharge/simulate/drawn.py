@@ -20,8 +20,8 @@ from isocharge.simulate.arrays import Array
 from isocharge.simulate.curves import Curves
 from isocharge.simulate.triangulation import AMBIGUOUS, APART, TOLERANCE, Fix, Meeting
 
-DEGREE = 3
-"""Of the polynomial along a line; the paper does not say its own."""
+DEGREE = 4
+"""Of the polynomial along a line; the paper does not say its own. Lower ones miss the charge near the electrode."""
 
 PER_SPAN = 8
 """Chords that a span of the spline is cut into before its crossings are refined."""
@@ -171,9 +171,7 @@ class DrawnTriangulation:
         spread = max(spread for _, spread, status in met if status is Meeting.met)
         return float(x), float(y), spread, int(Meeting.met), len(means)
 
-    def _meeting(
-        self, pairs: Map[tuple[int, int], Array], triple: tuple[int, ...]
-    ) -> tuple[Array, float, Meeting]:
+    def _meeting(self, pairs: Map[tuple[int, int], Array], triple: tuple[int, ...]) -> tuple[Array, float, Meeting]:
         """Mean and spread of the crossings of three contours that lie together most closely."""
         corners = [np.array(c) for c in product(*(pairs[pair] for pair in combinations(triple, 2)))]
         means = [c.mean(axis=0) for c in corners]
