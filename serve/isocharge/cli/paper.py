@@ -23,7 +23,7 @@ def paper_command(
     ] = False,
     json: Annotated[bool, typer.Option("--json", help="The numbers on stdout, as in paper.json.")] = False,
 ) -> None:
-    """Reproduce the paper this field starts from: every figure and number, ours beside it, and what explains the difference.
+    """Reproduce Mirbagheri et al. (2007): every figure and number, ours beside it, and what explains the difference.
 
     Writes paper.md, paper.json and each figure (mm, pC, N) as PNG and SVG into a new folder.
 

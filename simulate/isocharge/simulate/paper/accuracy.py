@@ -87,7 +87,7 @@ class Accuracy:
     @classmethod
     def of(cls, study: Study, workers: Workers, progress: Progress | None = None) -> "Accuracy":
         """Triangulate; `progress` is told how many of the methods are done."""
-        degrees = sorted({*DEGREES, study.choices.degree})
+        degrees = [degree for degree in DEGREES if degree <= study.choices.degree]
         jobs = [(study, layout, degree, False) for layout in LAYOUTS for degree in degrees]
         jobs += [(study, layout, study.choices.degree, True) for layout in LAYOUTS]
         found = []

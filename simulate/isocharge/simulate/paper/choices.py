@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.simulate.probe import Circle, Polygon
+from isocharge.simulate.probe import Circle, Polygon, Probe
 from isocharge.simulate.sensor import Electrode, Readout, Sensor
 from isocharge.simulate.sensor_file import load_sensor
 
@@ -56,6 +56,7 @@ class Choices:
         circle: Fig. 11; the paper gives its radius.
         readout: The paper's eq. 3.
         degree: Of the polynomial along a line.
+        length: Of the lines of a mapping scheme, m.
         radius: Of the working area, m.
         presses: How many presses of the working area a distribution is made from.
         thickness: Of the films that are compared, m.
@@ -67,25 +68,28 @@ class Choices:
         poisson: See `young`.
     """
 
-    triangle: Polygon = TRIANGLE
-    rectangle: Polygon = RECTANGLE
-    circle: Circle = CIRCLE
+    triangle: Probe = TRIANGLE
+    rectangle: Probe = RECTANGLE
+    circle: Probe = CIRCLE
     readout: Readout = "edge"
     degree: int = 4
+    length: float = 20e-3
     radius: float = 8e-3
     presses: int = 300
     thickness: tuple[float, ...] = (25e-6, 50e-6, 110e-6, 200e-6, 350e-6, 600e-6, 1000e-6)
     pretension: tuple[float, ...] = (0.0, 0.5e6, 1.0e6, 1.5e6, 2.5e6, 5.0e6)
     force: tuple[float, ...] = (0.05, 0.1, 0.175, 0.25, 0.35, 0.5, 0.8, 1.3, 2.0)
     shown: tuple[float, float] = (2e-3, 3e-3)
-    probes: tuple[Circle | Polygon, ...] = OTHERS
+    probes: tuple[Probe, ...] = OTHERS
     young: tuple[float, ...] = (2e9, 4e9)
     poisson: tuple[float, ...] = (0.25, 0.45)
 
     @classmethod
     def quick(cls) -> "Choices":
-        """Fewer presses and films: every figure and number, each a little coarser."""
+        """Fewer presses and films, shorter lines: every figure and number, most of them coarser."""
         return cls(
+            degree=2,
+            length=12e-3,
             presses=30,
             thickness=(25e-6, 1000e-6),
             pretension=(0.0, 1.5e6),

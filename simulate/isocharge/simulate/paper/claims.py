@@ -7,10 +7,10 @@ import numpy as np
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge import contact_charge, thermal_charge
 from isocharge.simulate.curves import Mapping
-from isocharge.simulate.paper.accuracy import Accuracy, unnoticed
+from isocharge.simulate.paper.accuracy import Accuracy, Errors, unnoticed
 from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.study import FORCE, Study
+from isocharge.simulate.paper.study import FORCE, Study, sample
 
 D33, PYRO, KELVIN = -30e-12, 30e-6, 0.1
 """Of PVDF, C/N and C/(m^2 K), and a temperature step (K) that a finger makes easily."""
@@ -41,9 +41,9 @@ def _edges(study: Study) -> tuple[Row, dict[str, object]]:
     row = Row(
         "edge averages (eq. 3) give the charge",
         "\"precise\"",
-        f"off the whole electrode's charge by {middle:.2f} % at the median, {most:.1f} % at 95 %, {worst:.1f} % at most, "
-        f"presses within {1e3 * study.choices.radius:g} mm",
-        "an electrode collects from all of its area; its edges are a quadrature that misses the stress beside the probe",
+        f"off the whole electrode's charge by {middle:.2f} % at the median, {most:.1f} % at 95 %, {worst:.1f} % most, "
+        f"within {1e3 * study.choices.radius:g} mm",
+        "an electrode collects from all of its area; edges are a quadrature that misses the stress beside the probe",
     )  # fmt: skip
     return row, {"edge_against_area_percent": {"median": middle, "p95": most, "worst": worst}}
 
@@ -52,7 +52,7 @@ def _d33(study: Study) -> tuple[Row, dict[str, object]]:
     """The contact pressure where the probe covers part of B."""
     sensor = study.choices.sensor("three")
     taking = replace(sensor, piezo=replace(sensor.piezo, d33=D33))
-    points = Mapping.lines(sensor, "A").points.reshape(-1, 2)
+    points = Mapping.lines(sensor, "A", length=study.choices.length).points.reshape(-1, 2)
     extra = np.array([contact_charge(taking, study.choices.triangle, (x, y), FORCE) for x, y in points])
     charge = study.charges("triangle", sensor, points)
     over = extra > 0.0
@@ -61,10 +61,11 @@ def _d33(study: Study) -> tuple[Row, dict[str, object]]:
     row = Row(
         "d33 where the probe overlaps an electrode",
         "no charge",
-        f"up to {1e12 * extra.max():.1f} pC, {100 * share.max():.1f} % of the charge there ({over.any(axis=1).sum()} of "
-        f"{len(points)} presses of the scheme); {1e12 * whole:.0f} pC if the electrode carried all of the force",
-        f"a thin film does carry the probe's pressure; d33 = {1e12 * D33:g} pC/N. Small beside the stretching: leaving it out is "
-        "right, the reason given is not",
+        f"up to {1e12 * extra.max():.1f} pC, {100 * share.max():.1f} % of the charge there "
+        f"({over.any(axis=1).sum()} of {len(points)} presses of the scheme); "
+        f"{1e12 * whole:.0f} pC if the electrode carried all of the force",
+        f"a thin film does carry the probe's pressure; d33 = {1e12 * D33:g} pC/N. Small beside the stretching: leaving "
+        "it out is right, the reason given is not",
     )
     return row, {"d33_pC": {"largest": 1e12 * extra.max(), "largest_share": share.max()}}
 
@@ -92,25 +93,27 @@ def _stress(study: Study) -> tuple[Row, dict[str, object]]:
     return row, {"largest_stress_MPa": 1e-6 * largest}
 
 
-def _fourth(accuracy: Accuracy, degree: int) -> Row:
-    def both(name: str, three: object, four: object) -> str:
-        first, second = three, four
-        return (
-            f"{name}: {first.percentile(50):.2g} to {second.percentile(50):.2g} mm at the median, "  # type: ignore[attr-defined]
-            f"{first.percentile(95):.2g} to {second.percentile(95):.2g} mm at 95 %, "  # type: ignore[attr-defined]
-            f"{100 * first.share_found:.0f} to {100 * second.share_found:.0f} % found"  # type: ignore[attr-defined]
-        )
+def _both(name: str, three: Errors, four: Errors) -> str:
+    """What a fourth electrode changes."""
+    medians, most = ([e.percentile(share) for e in (three, four)] for share in (50, 95))
+    return (
+        f"{name}: {medians[0]:.2g} to {medians[1]:.2g} mm at the median, {most[0]:.2g} to {most[1]:.2g} mm at 95 %, "
+        f"{100 * three.share_found:.0f} to {100 * four.share_found:.0f} % found"
+    )
 
+
+def _fourth(accuracy: Accuracy, degree: int) -> Row:
     ours = "; ".join(
         [
-            both("as the paper, no noise", accuracy.drawn["three", degree], accuracy.drawn["four", degree]),
-            both("from the field, no noise", accuracy.field["three"], accuracy.field["four"]),
-            both("from the field, noise", accuracy.noisy["three"], accuracy.noisy["four"]),
+            _both("as the paper, no noise", accuracy.drawn["three", degree], accuracy.drawn["four", degree]),
+            _both("from the field, no noise", accuracy.field["three"], accuracy.field["four"]),
+            _both("as the paper, noise", accuracy.drawn_noisy["three"], accuracy.drawn_noisy["four"]),
+            _both("from the field, noise", accuracy.noisy["three"], accuracy.noisy["four"]),
         ]
     )
     why = (
-        "noise is 1 pC and 0.2 % of each charge. Averaging triples helps less than it could: contours of opposite electrodes "
-        "touch near the centre, and their crossing is poor there; a fourth charge finds more presses"
+        "noise is 1 pC and 0.2 % of each charge. Averaging triples helps less than it could: contours of opposite "
+        "electrodes touch near the centre, and their crossing is poor there; a fourth charge finds more presses"
     )
     return Row("a fourth electrode, three to four", "a more accurate position", ours, why)
 
@@ -167,8 +170,6 @@ def what_choices_change(study: Study, accuracy: Accuracy) -> Entry:
 
 def _signed(study: Study, name: str) -> str:
     """Median relative change of a charge, with its sign."""
-    from isocharge.simulate.paper.study import sample
-
     at: Array = np.array(sample(study.choices))
     charge = study.charges("triangle", study.choices.sensor("three"), at)
     return f"{100 * float(np.median(study.variants[name][0] / charge - 1.0)):+.1f} % at the median"

@@ -24,8 +24,8 @@ from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
 from isocharge.simulate.paper.study import FORCE, Study
 
-LEVELS = 8
-"""Contours of each electrode in Fig. 11."""
+LEVELS, AREA = 8, 11.5e-3
+"""Contours of each electrode in Fig. 11, and how far from the centre they are followed, m: to the electrodes' end."""
 
 
 def fig_9(study: Study, accuracy: Accuracy) -> Entry:
@@ -81,8 +81,8 @@ def fig_10(study: Study, accuracy: Accuracy) -> Entry:
                 label=f"{contour.electrode}, {1e12 * contour.charge:.0f} pC",
             )
             axes.plot(*1e3 * contour.knots.T, ".", color=colour, ms=5)
-        draw_probe(axes, study.choices.triangle, at)
-        draw_electrodes(axes, sensor)
+    draw_probe(whole, study.choices.triangle, at)
+    draw_electrodes(whole, sensor)
     frame_film(whole, sensor, BEYOND * study.choices.radius, "Fig. 10: contours as the paper draws them")
     whole.legend(fontsize=8)
     error = 1e3 * float(np.hypot(fix.x[0] - at[0], fix.y[0] - at[1]))
@@ -98,8 +98,8 @@ def fig_10(study: Study, accuracy: Accuracy) -> Entry:
     )
     return Entry(
         "Fig. 10",
-        "Contours from a polynomial on each line and a spline through its roots; the crossings and their mean; the errors "
-        "over the working area.",
+        "Contours from a polynomial on each line and a spline through its roots; the crossings and their mean; the "
+        "errors over the working area.",
         figure,
         [
             Row(
@@ -117,7 +117,8 @@ def fig_10(study: Study, accuracy: Accuracy) -> Entry:
             Row(
                 "percentile of 0.122 mm over the working area",
                 "0.122 mm",
-                f"{here.share_below(PAPER.error_mm):.0f} %; median {here.percentile(50):.3f}, 95 % {here.percentile(95):.3f} mm; "
+                f"{here.share_below(PAPER.error_mm):.0f} %; median {here.percentile(50):.3f}, "
+                f"95 % {here.percentile(95):.3f} mm; "
                 f"{100 * here.share_found:.0f} % of {len(here.at)} presses met",
                 f"polynomials of degree {study.choices.degree}, our choice; {others}",
             ),
@@ -175,7 +176,7 @@ def fig_11(study: Study) -> Entry:
     """Contours of all four electrodes under a circle."""
     sensor = study.choices.sensor("four")
     film = study.film("circle", sensor)
-    field = ContourField.of(film, FORCE, 10e-3)
+    field = ContourField.of(film, FORCE, AREA)
     figure = new_figure(12.6, 6.6)
     left, right = figure.subplots(1, 2)
     reached = {}
@@ -190,7 +191,7 @@ def fig_11(study: Study) -> Entry:
         draw_electrodes(axes, sensor)
         draw_working_area(axes, study.choices.radius, "working area")
         draw_probe(axes, study.choices.circle, (0.0, 0.0), "probe")
-        frame_film(axes, sensor, 10e-3, title)
+        frame_film(axes, sensor, AREA, title)
     handles, labels = left.get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=8, loc="outside lower center", ncols=6)
     apart = _apart_from_triangle(study)
@@ -202,13 +203,14 @@ def fig_11(study: Study) -> Entry:
             Row(
                 "charges met in the central area",
                 "in the figure",
-                f"{reached['A'][0]:.0f} to {reached['A'][1]:.0f} pC on A, within 10 mm",
+                f"{reached['A'][0]:.0f} to {reached['A'][1]:.0f} pC on A, within {1e3 * AREA:g} mm",
                 "E, d31, d32 are our choice; largest with the probe on the electrode",
             ),
             Row(
                 "contours change with the probe's shape",
                 "they may",
-                f"triangle of 4 mm against circle of 1 mm: a charge changes by {100 * apart[0]:.1f} % at the median, {100 * apart[1]:.0f} % at most",
+                f"triangle of 4 mm against circle of 1 mm: a charge changes by {100 * apart[0]:.1f} % at the median, "
+                f"{100 * apart[1]:.0f} % at most",
                 "shape matters beside an electrode only",
             ),
         ],
@@ -221,8 +223,10 @@ def _one_electrode(axes: Any, field: ContourField, name: str, colour: str) -> No
         pieces = field.contours(name, q)
         draw_contours(axes, pieces, colour)
         for piece in pieces[:1]:
-            x, y = 1e3 * piece.points[len(piece.points) // 2]
-            axes.annotate(f"{1e12 * q:.0f}", (x, y), fontsize=7, ha="center", va="center", backgroundcolor="white")
+            end = piece.points[-1 if piece.points[-1, 1] > piece.points[0, 1] else 0]
+            out = 9.0 * end / np.linalg.norm(end)
+            label = {"xytext": tuple(out), "textcoords": "offset points", "fontsize": 7, "ha": "center", "va": "center"}
+            axes.annotate(f"{1e12 * q:.0f}", 1e3 * end, **label)
 
 
 def _apart_from_triangle(study: Study) -> tuple[float, float]:

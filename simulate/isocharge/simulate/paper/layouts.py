@@ -1,11 +1,13 @@
 """Fig. 1 to 5 and 7: the principle, the mapping schemes, the layout, the mesh."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
 
 from isocharge.simulate.arrays import Array
+from isocharge.simulate.charge import contact_charge
 from isocharge.simulate.curves import Mapping
 from isocharge.simulate.drawing import (
     COLOURS,
@@ -22,6 +24,7 @@ from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
 from isocharge.simulate.paper.study import FINEST, FORCE, MESHES, Study
 from isocharge.simulate.sensor import Sensor
+from isocharge.simulate.spectral import tensor_values
 
 FIG_4_DEG, FIG_7_DEG = (35.0, 145.0), PAPER.fig_8_deg
 """Lines from A, the half that Fig. 6 shows and its mirror image; lines from B."""
@@ -77,7 +80,7 @@ def _mirrored(first: Array, second: Array, at: Array) -> Array:
 def fig_2(study: Study) -> Entry:
     """The mapping scheme about one electrode."""
     sensor = study.choices.sensor("three")
-    mapping = Mapping.lines(sensor, "A", (0.0, 2.0 * np.pi - np.deg2rad(10.0)))
+    mapping = Mapping.lines(sensor, "A", (0.0, 2.0 * np.pi - np.deg2rad(10.0)), length=study.choices.length)
     figure = new_figure(6.4, 6.2)
     axes = figure.subplots()
     draw_mapping(axes, mapping)
@@ -108,10 +111,10 @@ def fig_3(study: Study) -> Entry:
         corners = 1e3 * np.array([e.centre for e in shown.electrodes] + [shown.electrodes[0].centre])
         axes.plot(*corners.T, color=FELT, lw=0.8, label="between the centres")
         axes.set(xlim=(-47, 47), ylim=(-47, 47), aspect="equal", xlabel="x (drawn), mm", ylabel="y, mm", title=title)
-        axes.legend(fontsize=8)
+    left.legend(fontsize=8, loc="lower left")
     (sides, angles), (printed_sides, _) = _triangle(sensor), _triangle(printed)
     directions = ", ".join(f"{angle:.0f}°" for angle in angles)
-    why = "60° and 120° are the directions from A to B and to C; as angles from the centre they give no equilateral triangle"
+    why = "60° and 120° are the directions from A to B and C; from the centre they give no equilateral triangle"
     return Entry(
         "Fig. 3",
         "Three electrodes of 3 mm, 10 mm from the centre of a film clamped at 45 mm.",
@@ -142,7 +145,8 @@ def _lengths(sides: list[float]) -> str:
 
 def _scheme(study: Study, heading: str, electrode: str, angles: tuple[float, float]) -> Entry:
     sensor = study.choices.sensor("three")
-    mapping = Mapping.lines(sensor, electrode, (np.deg2rad(angles[0]), np.deg2rad(angles[1])))
+    ends = (np.deg2rad(angles[0]), np.deg2rad(angles[1]))
+    mapping = Mapping.lines(sensor, electrode, ends, length=study.choices.length)
     figure = new_figure(6.8, 6.8)
     axes = figure.subplots()
     draw_mapping(axes, mapping)
@@ -166,10 +170,6 @@ def _scheme(study: Study, heading: str, electrode: str, angles: tuple[float, flo
 
 def _touching(study: Study, sensor: Sensor, mapping: Mapping) -> dict[str, int]:
     """How many presses of a scheme overlap each electrode: those where the contact pressure would give a charge."""
-    from dataclasses import replace
-
-    from isocharge.simulate.charge import contact_charge
-
     pressed = replace(sensor, piezo=replace(sensor.piezo, d33=-1e-12))
     charges = [contact_charge(pressed, study.choices.triangle, (x, y), FORCE) for x, y in mapping.points.reshape(-1, 2)]
     return {name: int(n) for name, n in zip(sensor.electrode_names, (np.array(charges) > 0).sum(axis=0), strict=True)}
@@ -199,11 +199,14 @@ def fig_5(study: Study) -> Entry:
     unknowns, error, seconds = mesh_errors(study)
     errors.loglog(unknowns, 100.0 * error, "o-", color=FELT, label="ours, the shown press")
     errors.axhline(0.1, color=INK, lw=0.8, ls=":", label="0.1 %")
+    errors.set_xticks(unknowns, [f"{n:,}" for n in unknowns])
+    errors.minorticks_off()
     errors.set(xlabel="unknowns", ylabel="worst charge against the finest mesh, %", title="error against mesh")
     errors.grid(alpha=0.3, which="both")
     errors.legend(fontsize=8)
     enough = int(np.argmax(error < 1e-3))
-    ours = f"{shown.mesh.nodes.shape[0]} quadrilaterals of order {shown.resolution.order}, {3 * shown.mesh.n_node} unknowns"
+    order, count = shown.resolution.order, shown.mesh.nodes.shape[0]
+    ours = f"{count} quadrilaterals of order {order}, {3 * shown.mesh.n_node} unknowns"
     why = "high order on a mesh that follows the probe; the solution is smooth outside of it"
     fixed = (
         "README, Speed against error: 13,000 quadratic triangles of dolfinx 0.08 % in 13 s, 13,000 linear ones of "
@@ -211,7 +214,7 @@ def fig_5(study: Study) -> Entry:
     )
     return Entry(
         "Fig. 5",
-        "Elements under a triangular probe: the whole film, at the probe, and the error against the number of unknowns.",
+        "Elements under a triangular probe: the whole film, at the probe, and the error against the unknowns.",
         figure,
         [
             Row("elements", f"{PAPER.elements[0]:,} to {PAPER.elements[1]:,} triangles", ours, why),
@@ -241,10 +244,9 @@ def mesh_errors(study: Study) -> tuple[Array, Array, Array]:
 
 def _draw_mesh(axes: Any, study: Study) -> None:
     shown = study.shown
-    side = shown.resolution.order + 1
-    grid = np.arange(side * side).reshape(side, side)
-    ring = np.concatenate([grid[0], grid[1:, -1], grid[-1, -2::-1], grid[-2::-1, 0]])
+    along, one = np.linspace(-1.0, 1.0, 13), np.ones(13)
+    xi, eta = np.concatenate([along, one, -along, -one]), np.concatenate([-one, along, one, -along])
     turn = 1e3 * shown.film.radius * np.exp(1j * np.angle(complex(*shown.at)))
-    z = shown.placement.element_points(shown.mesh).reshape(-1, side * side)[:, ring] * turn
+    z = shown.placement.element_points(shown.mesh) @ tensor_values(shown.resolution.order, xi, eta).T * turn
     axes.add_collection(LineCollection(list(np.stack([z.real, z.imag], axis=-1)), colors=INK, linewidths=0.5))
     draw_probe(axes, shown.probe, shown.at)

@@ -13,20 +13,21 @@ INTRODUCTION = """# Mirbagheri et al. (2007), reproduced
 A. Mirbagheri, S. Najarian, J. Dargahi, F. Tabatabai Ghomshe: Mathematical Modeling of a Tactile Sensor with
 Applications in Minimally Invasive Surgery. American Journal of Applied Sciences 4 (10), 779-785.
 
-Every figure and number of the paper, ours beside it, and what explains the difference. The paper's figures are drawn anew
-from our own film; where it gives no size the choice is ours ([what that changes](#what-the-paper-does-not-give)).
-The same numbers are in `paper.json`.
+Every figure and number of the paper, ours beside it, and what explains the difference. The figures are drawn from our
+own film; where the paper gives no size the choice is ours ([what that changes](#what-the-paper-does-not-give)). The
+same numbers are in `paper.json`.
 """
 
 
 def page(entries: Sequence[Entry], choices: Choices, seconds: float) -> str:
     """The whole page as Markdown."""
     film = choices.sensor("three").film
+    probes = ", ".join(probe.notation for probe in (choices.triangle, choices.rectangle, choices.circle))
     made = (
-        f"Film: {1e3 * film.radius:g} mm, {1e6 * film.thickness:g} um, E {1e-9 * film.young:g} GPa, nu {film.poisson:g}, "
-        f"no pretension. Probes, mm: {choices.triangle.notation}, {choices.rectangle.notation}, {choices.circle.notation}. "
-        f"Readout: {choices.readout} (eq. 3). Force 1 N. Working area: {1e3 * choices.radius:g} mm, {choices.presses} presses "
-        f"spread over it. Computed in {seconds:.0f} s."
+        f"Film: radius {1e3 * film.radius:g} mm, {1e6 * film.thickness:g} um, E {1e-9 * film.young:g} GPa, nu "
+        f"{film.poisson:g}, no pretension. Probes, mm: {probes}. Readout: {choices.readout} (eq. 3). Force 1 N. "
+        f"Working area: {1e3 * choices.radius:g} mm, up to {choices.presses} presses spread over it. Computed in "
+        f"{seconds:.0f} s."
     )
     parts = [INTRODUCTION, made, "\n## Table\n", _table(entries)]
     for entry in entries:

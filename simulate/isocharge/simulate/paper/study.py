@@ -139,7 +139,8 @@ class Study:
     def scheme(self, probe: str, sensor: Sensor) -> tuple[Curves, ...]:
         """Charge curves from every electrode, as far to both sides of the centre as contours need."""
         film = self.film(probe, sensor)
-        return tuple(Curves.of(film, Mapping.lines(sensor, name), FORCE) for name in sensor.electrode_names)
+        names, length = sensor.electrode_names, self.choices.length
+        return tuple(Curves.of(film, Mapping.lines(sensor, name, length=length), FORCE) for name in names)
 
     def charges(self, probe: str, sensor: Sensor, at: Array) -> Array:
         """Touch charges of presses of 1 N at (x, y), shape (n, 2), m; (n, n_electrode), C."""
@@ -191,11 +192,13 @@ class _Counter:
 
 def _map_jobs(choices: Choices) -> dict[str, MapJob]:
     sensor = choices.sensor("three")
-    reach = SLACK * max(Mapping.lines(s, n).reach for s in (sensor, choices.sensor("four")) for n in s.electrode_names)
+    layouts = (sensor, choices.sensor("four"))
+    lines = [Mapping.lines(s, name, length=choices.length) for s in layouts for name in s.electrode_names]
+    reach = SLACK * max(mapping.reach for mapping in lines)
     return {
         "rectangle": MapJob(sensor, choices.rectangle, reach),
         "triangle": MapJob(sensor, choices.triangle, reach),
-        "circle": MapJob(sensor, choices.circle, 12e-3),
+        "circle": MapJob(sensor, choices.circle, reach),
     }
 
 

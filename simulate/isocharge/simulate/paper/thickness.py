@@ -90,7 +90,6 @@ def films_of(study: Study) -> list[list[ChargeForce]]:
 def eq_4(study: Study) -> Entry:
     """The cubic, which film has it, and where charge is linear."""
     films = films_of(study)
-    flat = [film for row in films for film in row]
     figure = new_figure(15.5, 9.6)
     (curve, exponent), (misfit, bent) = figure.subplots(2, 2)
     _draw_curves(curve, films)
@@ -103,69 +102,7 @@ def eq_4(study: Study) -> Entry:
         lambda film: 100 * film.bent(PAPER.linear_N),
         "{:.1f}",
     )
-    thin, thick = films[0][0], films[-1]
-    best, best_thick = min(flat, key=lambda film: film.misfit), min(thick, key=lambda film: film.misfit)
-    same = [film for film in flat if film.misfit <= BAND]
-    (x, y), factor = study.eq_4
-    angle = np.rad2deg(np.arctan2(y + 10e-3, x))
-    pC = [sum(cubic) for cubic in PAPER.cubics]
-    thick_pC = 1e12 * thick[0].at_1_N
-    rows = [
-        Row(
-            "where eq. 4's press was",
-            "not given",
-            f"({1e3 * x:.2f}, {1e3 * y:.2f}) mm: {1e3 * np.hypot(x, y + 10e-3):.2f} mm from A at {angle:.0f}°",
-            "from the ratios of its three charges at 1 N, on our film of 25 um; the scheme's presses are 4 mm from A",
-        ),
-        Row(
-            "charges there at 1 N, A, B, C",
-            ", ".join(f"{q:.0f}" for q in pC) + " pC (eq. 4, \"1 mm\")",
-            ", ".join(f"{factor * q:.0f}" for q in pC) + " pC at 25 um",
-            f"one factor of {factor:.2f} for all three, which d31, E and the probe's size set: the charges of a film of 25 um",
-        ),
-        Row(
-            f"can a film of {1e3 * thick[0].thickness:g} mm give eq. 4's charges?",
-            f"{pC[0]:.0f} pC on A at 1 N",
-            f"{thick_pC:.1f} pC without pretension, at most {max(1e12 * film.at_1_N for film in thick):.1f} pC with one",
-            f"{pC[0] / thick_pC:.0f} times too little: a thick film bends and hardly stretches",
-        ),
-        Row(
-            f"can a film of {1e3 * thick[0].thickness:g} mm give eq. 4's shape?",
-            _poly(np.array(PAPER.cubics[0]) / pC[0]),
-            f"{_poly(thick[0].cubic)} without pretension",
-            f"nearest {best_thick.misfit:.2f} away at {1e-6 * best_thick.pretension:g} MPa: no" if best_thick.misfit > BAND else f"within {best_thick.misfit:.3f} at {1e-6 * best_thick.pretension:g} MPa",
-        ),
-        Row(
-            "normalised cubic, 25 um, no pretension",
-            _poly(np.array(PAPER.cubics[0]) / pC[0]),
-            f"{_poly(thin.cubic)}; curve within {thin.misfit:.4f} from 0.25 to 2 N",
-            "charge goes with F^(2/3) on a slack membrane; a cubic with a constant at zero force is its fit",
-        ),
-        Row(
-            "films that fit eq. 4's cubic to 0.02",
-            "1 mm",
-            _list(same) if same else f"none; nearest {_name(best)}, {best.misfit:.3f} away",
-            f"nearest: {_name(best)}, {best.misfit:.4f}; any film so thin that it stretches, and slack",
-        ),
-        Row(
-            "linear up to 0.5 N",
-            "yes (25 um)",
-            f"25 um, slack: {100 * thin.bent(PAPER.linear_N):.0f} % off a line; " + _linear_words(films),
-            "charge goes with F^(2/3) when slack, linearly where pretension carries the load, with F^2 where bending does",
-        ),
-        Row(
-            "thicker is more linear",
-            "linearity is enhanced, nonlinearity remains",
-            "; ".join(f"{_um(row[0])} {100 * row[0].bent(PAPER.linear_N):.0f} %" for row in films) + " off a line up to 0.5 N, slack",
-            "on the way from F^(2/3) to F^2 the exponent passes through 1 at some hundred um",
-        ),
-        Row(
-            f"local exponent at {', '.join(f'{f:g}' for f in SHOWN_N)} N, slack",
-            "not given",
-            "; ".join(f"{_um(row[0])} " + ", ".join(f"{row[0].exponent(f):.2f}" for f in SHOWN_N) for row in films),
-            "2/3: membrane; 2: plate",
-        ),
-    ]  # fmt: skip
+    rows = [*_rows_of_press(study, films), *_rows_of_cubic(films), *_rows_of_line(films)]
     return Entry(
         "Eq. 4",
         "Charge of A against force at the place of eq. 4's press, films of several thicknesses and pretensions.",
@@ -173,6 +110,92 @@ def eq_4(study: Study) -> Entry:
         rows,
         _numbers(study, films),
     )
+
+
+def _rows_of_press(study: Study, films: list[list[ChargeForce]]) -> list[Row]:
+    """Where eq. 4's press was, and how large its charges are."""
+    (x, y), factor = study.eq_4
+    pC, thick = [sum(cubic) for cubic in PAPER.cubics], films[-1]
+    thick_pC, most = 1e12 * thick[0].at_1_N, 1e12 * max(film.at_1_N for film in thick)
+    angle, away = np.rad2deg(np.arctan2(y + 10e-3, x)), 1e3 * np.hypot(x, y + 10e-3)
+    ours = ", ".join(f"{factor * q:.0f}" for q in pC)
+    return [
+        Row(
+            "where eq. 4's press was",
+            "not given",
+            f"({1e3 * x:.2f}, {1e3 * y:.2f}) mm: {away:.2f} mm from A at {angle:.0f}°",
+            "from the ratios of its three charges at 1 N, on our film of 25 um; the scheme's presses are 4 mm from A",
+        ),
+        Row(
+            "charges there at 1 N, A, B, C",
+            ", ".join(f"{q:.0f}" for q in pC) + " pC (eq. 4, said to be 1 mm)",
+            f"{ours} pC at 25 um",
+            f"one factor of {factor:.2f} for all three (d31, E, probe): these are the charges of a film of 25 um",
+        ),
+        Row(
+            f"can a film of {1e3 * thick[0].thickness:g} mm give eq. 4's charges?",
+            f"{pC[0]:.0f} pC on A at 1 N",
+            f"no: {thick_pC:.1f} pC without pretension, at most {most:.1f} pC with it",
+            f"{pC[0] / thick_pC:.0f} times too little: a thick film bends and hardly stretches",
+        ),
+    ]
+
+
+def _rows_of_cubic(films: list[list[ChargeForce]]) -> list[Row]:
+    """Which film has the shape of eq. 4."""
+    flat = [film for row in films for film in row]
+    thin, thick, cubic = films[0][0], films[-1], _poly(np.array(PAPER.cubics[0]) / sum(PAPER.cubics[0]))
+    best, best_thick = min(flat, key=lambda film: film.misfit), min(thick, key=lambda film: film.misfit)
+    same = [film for film in flat if film.misfit <= BAND]
+    verdict = "yes" if best_thick.misfit <= BAND else "no"
+    return [
+        Row(
+            f"can a film of {1e3 * thick[0].thickness:g} mm give eq. 4's shape?",
+            cubic,
+            f"{verdict}: {_poly(thick[0].cubic)} without pretension; nearest {best_thick.misfit:.2f} away, "
+            f"at {1e-6 * best_thick.pretension:g} MPa",
+            "charge of A over its value at 1 N, a cubic of the force in N, 0.25 to 2 N",
+        ),
+        Row(
+            f"the same at {_um(thin)}, no pretension",
+            cubic,
+            f"{_poly(thin.cubic)}; the curve is within {thin.misfit:.4f} of the paper's from 0.25 to 2 N",
+            "charge goes with F^(2/3) on a slack membrane; a cubic with a constant at zero force is its fit",
+        ),
+        Row(
+            f"films that fit eq. 4's cubic to {BAND:g}",
+            "1 mm",
+            _list(same) if same else "none",
+            f"nearest: {_name(best)}, {best.misfit:.4f}; any film so thin that it stretches, and slack",
+        ),
+    ]
+
+
+def _rows_of_line(films: list[list[ChargeForce]]) -> list[Row]:
+    """Where charge goes with force."""
+    thin = films[0][0]
+    off = "; ".join(f"{_um(row[0])} {100 * row[0].bent(PAPER.linear_N):.0f} %" for row in films)
+    exponents = "; ".join(f"{_um(row[0])} " + ", ".join(f"{row[0].exponent(f):.2f}" for f in SHOWN_N) for row in films)
+    return [
+        Row(
+            f"linear up to {PAPER.linear_N:g} N",
+            "yes (25 um)",
+            f"{_um(thin)}, slack: {100 * thin.bent(PAPER.linear_N):.0f} % off a line; " + _linear_words(films),
+            "F^(2/3) where stretching carries the load, F^2 where pretension or bending does; linear on the way",
+        ),
+        Row(
+            "thicker is more linear",
+            "linearity is enhanced, nonlinearity remains",
+            f"{off} off a line up to {PAPER.linear_N:g} N, slack",
+            "on the way from F^(2/3) to F^2 the exponent passes through 1 at some hundred um",
+        ),
+        Row(
+            f"local exponent at {', '.join(f'{f:g}' for f in SHOWN_N)} N, slack",
+            "not given",
+            exponents,
+            "2/3: membrane; 2: plate",
+        ),
+    ]
 
 
 def _um(film: ChargeForce) -> str:
@@ -245,7 +268,7 @@ def _draw_curves(axes: Any, films: list[list[ChargeForce]]) -> None:
             film.charge(force) / film.at_1_N,
             color=colour,
             lw=1.6,
-            label=f"{_name(film)}, {1e12 * film.at_1_N:.3g} pC at 1 N",
+            label=f"{_name(film)}, {1e12 * film.at_1_N:.{0 if film.at_1_N > 1e-10 else 1}f} pC at 1 N",
         )
     axes.set(xlabel="force, N", ylabel="charge of A over its value at 1 N", title="Eq. 4: charge against force")
     axes.set_ylim(0, 3)
@@ -262,7 +285,7 @@ def _draw_exponents(axes: Any, films: list[list[ChargeForce]]) -> None:
         axes.axhline(level, color=INK, lw=0.6, ls=":")
     axes.set(xlabel="force, N", ylabel="d(ln charge) / d(ln force)", title="local exponent, no pretension (one with)")
     axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=8, ncols=2)
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _colours(count: int) -> Array:
