@@ -99,7 +99,7 @@ class Accuracy:
         field, noisy, mistaken = {}, {}, {}
         for layout in LAYOUTS:
             film = study.film("triangle", study.choices.sensor(layout))
-            contours = Triangulation.from_map(film, radius=BEYOND * study.choices.radius)
+            contours = Triangulation.from_map(film, radius=BEYOND * study.choices.radius, spacing=study.choices.spacing)
             charge = study.charges("triangle", film.sensor, study.places)
             field[layout] = Errors(contours.locate(charge, FORCE), study.places)
             noisy[layout] = Errors(contours.locate(_noisy(charge), FORCE), study.places)

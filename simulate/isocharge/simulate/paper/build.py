@@ -56,8 +56,9 @@ def write_paper(
         entries = []
         for entry in make_entries(study, accuracy):
             if entry.figure is not None:
-                for kind in ("png", "svg"):
-                    save_picture(entry.figure, draft / f"{entry.slug}.{kind}")
+                save_picture(entry.figure, draft / f"{entry.slug}.png")
+                entry.figure.set_layout_engine("none")  # as it was laid out, which takes as long as drawing it
+                save_picture(entry.figure, draft / f"{entry.slug}.svg")
             entries.append(entry)
             if drawn:
                 drawn(len(entries), FIGURES)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from isocharge.simulate.charge_table import SPACING
 from isocharge.simulate.probe import Circle, Polygon, Probe
 from isocharge.simulate.sensor import Electrode, Readout, Sensor
 from isocharge.simulate.sensor_file import load_sensor
@@ -57,6 +58,8 @@ class Choices:
         readout: The paper's eq. 3.
         degree: Of the polynomial along a line.
         length: Of the lines of a mapping scheme, m.
+        printed_length: Of lines where B sits at 60 degrees, m: some of them lead away from the centre.
+        spacing: Of the knots that charges are tabled with, m.
         radius: Of the working area, m.
         presses: How many presses of the working area a distribution is made from.
         thickness: Of the films that are compared, m.
@@ -74,6 +77,8 @@ class Choices:
     readout: Readout = "edge"
     degree: int = 4
     length: float = 20e-3
+    printed_length: float = 12e-3
+    spacing: float = SPACING
     radius: float = 8e-3
     presses: int = 300
     thickness: tuple[float, ...] = (25e-6, 50e-6, 110e-6, 200e-6, 350e-6, 600e-6, 1000e-6)
@@ -90,6 +95,8 @@ class Choices:
         return cls(
             degree=2,
             length=12e-3,
+            printed_length=8e-3,
+            spacing=0.6e-3,
             presses=30,
             thickness=(25e-6, 1000e-6),
             pretension=(0.0, 1.5e6),

@@ -10,6 +10,7 @@ from isocharge.simulate.curves import Mapping
 from isocharge.simulate.paper.accuracy import Accuracy, Errors, unnoticed
 from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
+from isocharge.simulate.paper.layouts import TOUCHED
 from isocharge.simulate.paper.study import FORCE, Study, sample
 
 D33, PYRO, KELVIN = -30e-12, 30e-6, 0.1
@@ -55,8 +56,8 @@ def _d33(study: Study) -> tuple[Row, dict[str, object]]:
     points = Mapping.lines(sensor, "A", length=study.choices.length).points.reshape(-1, 2)
     extra = np.array([contact_charge(taking, study.choices.triangle, (x, y), FORCE) for x, y in points])
     charge = study.charges("triangle", sensor, points)
-    over = extra > 0.0
-    share = extra[over] / charge[over] if over.any() else np.zeros(1)
+    share = extra / charge
+    over = extra > TOUCHED * -D33 * FORCE
     whole = -D33 * FORCE
     row = Row(
         "d33 where the probe overlaps an electrode",

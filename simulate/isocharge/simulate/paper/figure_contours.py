@@ -23,6 +23,7 @@ from isocharge.simulate.paper.accuracy import BEYOND, Accuracy
 from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
 from isocharge.simulate.paper.study import FORCE, Study
+from isocharge.simulate.triangulation import Meeting
 
 LEVELS, AREA = 8, 11.5e-3
 """Contours of each electrode in Fig. 11, and how far from the centre they are followed, m: to the electrodes' end."""
@@ -33,7 +34,7 @@ def fig_9(study: Study, accuracy: Accuracy) -> Entry:
     sensor = study.choices.sensor("three")
     film, at = study.film("triangle", sensor), study.choices.shown
     charge = film.forward(np.array([at[0]]), np.array([at[1]]), np.array([FORCE]))[0]
-    field = ContourField.of(film, FORCE, BEYOND * study.choices.radius)
+    field = ContourField.of(film, FORCE, BEYOND * study.choices.radius, study.choices.spacing)
     figure = new_figure(6.6, 7.0)
     axes = figure.subplots()
     for name, q, colour in zip(sensor.electrode_names, charge, COLOURS, strict=False):
@@ -111,7 +112,7 @@ def fig_10(study: Study, accuracy: Accuracy) -> Entry:
             Row(
                 "the shown press, distance from the mean of the crossings",
                 "0.122 mm (place not given)",
-                f"{error:.3f} mm",
+                f"{error:.3f} mm" if fix.found[0] else Meeting(int(fix.status[0])).words,
                 "the place of the paper's press is not given",
             ),
             Row(
@@ -135,7 +136,7 @@ def _zoom(axes: Any, drawn: list[DrawnContour], at: tuple[float, float], mean: t
     for one, other in combinations(drawn, 2):
         points = one.crossings(other)
         if len(points):
-            crossings.append(points[np.argmin(np.linalg.norm(points - np.array(mean), axis=1))])
+            crossings.append(points[np.argmin(np.linalg.norm(points - np.array(at), axis=1))])
     if crossings:
         axes.plot(*1e3 * np.array(crossings).T, "o", mfc="none", color=INK, ms=8, label="crossings")
     axes.plot(1e3 * mean[0], 1e3 * mean[1], "x", color=INK, ms=9, mew=2, label="their mean")
@@ -176,7 +177,7 @@ def fig_11(study: Study) -> Entry:
     """Contours of all four electrodes under a circle."""
     sensor = study.choices.sensor("four")
     film = study.film("circle", sensor)
-    field = ContourField.of(film, FORCE, AREA)
+    field = ContourField.of(film, FORCE, AREA, study.choices.spacing)
     figure = new_figure(12.6, 6.6)
     left, right = figure.subplots(1, 2)
     reached = {}

@@ -17,19 +17,16 @@ FIG_6_DEG, FOUR_DEG = (35.0, 90.0), (110.0, 250.0)
 FINE = 97
 """Presses on a line that is drawn smooth."""
 
-PRINTED_LENGTH = 12e-3
-"""Of the lines where B sits at 60 degrees, m: some of them lead away from the centre."""
-
 RATIOS = np.linspace(0.0, 2.0, 41)
 """d32 over d31 that are tried for the order of Fig. 8."""
 
 
 def curves_of(
-    study: Study, probe: str, sensor: Sensor, name: str, degrees: tuple[float, float], length: float = np.inf
+    study: Study, probe: str, sensor: Sensor, name: str, degrees: tuple[float, float], length: float | None = None
 ) -> tuple[Curves, Curves]:
     """Curves at the scheme's presses, and finely along the same lines."""
     ends = (np.deg2rad(degrees[0]), np.deg2rad(degrees[1]))
-    mapping = Mapping.lines(sensor, name, ends, length=min(length, study.choices.length))
+    mapping = Mapping.lines(sensor, name, ends, length=length or study.choices.length)
     film = study.film(probe, sensor)
     return Curves.of(film, mapping, FORCE), Curves.of(film, mapping.finer(FINE), FORCE)
 
@@ -123,7 +120,9 @@ def fig_8(study: Study) -> Entry:
     right.set_title("the same, against the mean of the lines")
     right.grid(alpha=0.3)
     right.legend()
-    printed, _ = curves_of(study, "rectangle", study.choices.as_printed(), "B", PAPER.fig_8_deg, PRINTED_LENGTH)
+    printed, _ = curves_of(
+        study, "rectangle", study.choices.as_printed(), "B", PAPER.fig_8_deg, study.choices.printed_length
+    )
     ratio, share = _best_ratio(study)
     under_circle, _ = curves_of(study, "circle", sensor, "B", PAPER.fig_8_deg)
     why = (

@@ -155,10 +155,9 @@ def _scheme(study: Study, heading: str, electrode: str, angles: tuple[float, flo
     draw_probe(axes, study.choices.triangle, (float(mapping.points[3, 1, 0]), float(mapping.points[3, 1, 1])), "probe")
     frame_film(axes, sensor, mapping.reach, f"{heading}: lines from {electrode}")
     figure.legend(fontsize=8, loc="outside lower center", ncols=4)
-    overlap = _touching(study, sensor, mapping)
-    words = f"{sum(overlap.values())} of {mapping.angle.size * mapping.distance.size} presses, " + ", ".join(
-        f"{count} on {name}" for name, count in overlap.items()
-    )
+    over = touching(study, sensor, mapping)
+    overlap = dict(zip(sensor.electrode_names, over.sum(axis=0).tolist(), strict=True))
+    words = f"{over.any(axis=1).sum()} of {len(over)} presses: " + ", ".join(f"{n} on {e}" for e, n in overlap.items())
     return Entry(
         heading,
         f"Lines from electrode {electrode} at {angles[0]:g}° to {angles[1]:g}° from the drawn direction.",
@@ -168,11 +167,18 @@ def _scheme(study: Study, heading: str, electrode: str, angles: tuple[float, flo
     )
 
 
-def _touching(study: Study, sensor: Sensor, mapping: Mapping) -> dict[str, int]:
-    """How many presses of a scheme overlap each electrode: those where the contact pressure would give a charge."""
-    pressed = replace(sensor, piezo=replace(sensor.piezo, d33=-1e-12))
-    charges = [contact_charge(pressed, study.choices.triangle, (x, y), FORCE) for x, y in mapping.points.reshape(-1, 2)]
-    return {name: int(n) for name, n in zip(sensor.electrode_names, (np.array(charges) > 0).sum(axis=0), strict=True)}
+TOUCHED = 1e-3
+"""Share of the probe that must lie on an electrode to count: less is the round-off of areas."""
+
+
+def touching(study: Study, sensor: Sensor, mapping: Mapping) -> np.ndarray:
+    """Which presses of a scheme overlap which electrode under the triangle, shape (n, n_electrode)."""
+    pressed = replace(
+        sensor, piezo=replace(sensor.piezo, d33=-1.0)
+    )  # so that the contact's charge is the share covered
+    points = mapping.points.reshape(-1, 2)
+    covered = [contact_charge(pressed, study.choices.triangle, (x, y), FORCE) for x, y in points]
+    return np.asarray(np.array(covered) > TOUCHED)
 
 
 def fig_4(study: Study) -> Entry:

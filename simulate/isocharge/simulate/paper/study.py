@@ -167,7 +167,7 @@ def conduct(choices: Choices, workers: Workers, progress: Progress | None = None
     )
     maps = dict(zip(first, early, strict=False))
     read = dict(zip(variants, early[len(first) :], strict=False))
-    eq_4 = find_eq_4(replace(maps["triangle"], sensor=sensor), choices.radius)
+    eq_4 = find_eq_4(replace(maps["triangle"], sensor=sensor), choices)
     late = bar.over(workers, [(solve_presses, job) for job in _chain_jobs(choices, eq_4[0])])
     charges = np.array(late)[:, 0].reshape(len(choices.thickness), len(choices.pretension), len(choices.force), -1)
     shown = press(sensor.film, choices.triangle, choices.shown, FORCE)
@@ -195,8 +195,10 @@ def _map_jobs(choices: Choices) -> dict[str, MapJob]:
     layouts = (sensor, choices.sensor("four"))
     lines = [Mapping.lines(s, name, length=choices.length) for s in layouts for name in s.electrode_names]
     reach = SLACK * max(mapping.reach for mapping in lines)
+    ends = (np.deg2rad(PAPER.fig_8_deg[0]), np.deg2rad(PAPER.fig_8_deg[1]))
+    printed = SLACK * Mapping.lines(choices.as_printed(), "B", ends, length=choices.printed_length).reach
     return {
-        "rectangle": MapJob(sensor, choices.rectangle, reach),
+        "rectangle": MapJob(sensor, choices.rectangle, max(reach, printed)),
         "triangle": MapJob(sensor, choices.triangle, reach),
         "circle": MapJob(sensor, choices.circle, reach),
     }
@@ -244,9 +246,9 @@ def _variants(choices: Choices) -> dict[str, Presses]:
     return found
 
 
-def find_eq_4(film: ForwardMap, radius: float) -> tuple[tuple[float, float], float]:
+def find_eq_4(film: ForwardMap, choices: Choices) -> tuple[tuple[float, float], float]:
     """Where the ratios of eq. 4's charges at 1 N put the press: (x, y) in m, and our charges there over the paper's."""
-    table = ChargeTable.of(film, 1.2 * radius)
+    table = ChargeTable.of(film, 1.2 * choices.radius, choices.spacing)
     wanted = np.array([sum(cubic) for cubic in PAPER.cubics]) * 1e-12
 
     def miss(at_mm: Array) -> Array:
