@@ -56,7 +56,7 @@ def fig_9(study: Study, accuracy: Accuracy) -> Entry:
             Row(
                 "distance from the press to the mean of the intersections, from the field",
                 "not done",
-                f"{ours}; contours met for {100 * errors.share_found:.0f} % of {len(errors.at)} presses",
+                f"{ours}; contours met for {errors.fix.found.sum()} of {len(errors.at)} presses",
                 "without the error of the drawing the contours meet; where two of them only touch, on the line between "
                 "their electrodes, they may miss",
             )
@@ -120,7 +120,7 @@ def fig_10(study: Study, accuracy: Accuracy) -> Entry:
                 "0.122 mm",
                 f"{here.share_below(PAPER.error_mm):.0f} %; median {here.percentile(50):.3f}, "
                 f"95 % {here.percentile(95):.3f} mm; "
-                f"{100 * here.share_found:.0f} % of {len(here.at)} presses met",
+                f"contours met for {here.fix.found.sum()} of {len(here.at)} presses",
                 f"polynomials of degree {study.choices.degree}, our choice; {others}",
             ),
         ],

@@ -1,7 +1,7 @@
 """Everything that is solved for the page, once: forward maps and single presses, on all workers."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from time import process_time
 from typing import Any
 
@@ -130,7 +130,6 @@ class Study:
     meshes: tuple[tuple[Array, int, float], ...]
     variants: dict[str, Array]
     shown: Equilibrium
-    _curves: dict[Any, Curves] = field(default_factory=dict, repr=False)
 
     def film(self, probe: str, sensor: Sensor) -> ForwardMap:
         """The map of a probe, read by a sensor with the same film."""
