@@ -13,7 +13,10 @@ with require("simulate"):
     from isocharge.simulate.amplifier import Amplifier, Measurement, load_amplifier
     from isocharge.simulate.charge import contact_charge, pretension_charge, thermal_charge, touch_charge
     from isocharge.simulate.charge_spline import ChargeSpline
+    from isocharge.simulate.contours import Contour, ContourField
+    from isocharge.simulate.curves import Curves, Mapping
     from isocharge.simulate.dataset import Dataset, Samples, read_dataset, write_dataset
+    from isocharge.simulate.drawn import DrawnContour, DrawnTriangulation, draw_contour
     from isocharge.simulate.equilibrium import Equilibrium
     from isocharge.simulate.forward import ForwardMap
     from isocharge.simulate.limits import ChargeFunction, CramerRao, limits_at
@@ -25,6 +28,7 @@ with require("simulate"):
     from isocharge.simulate.sweep import Sweep, run_sweep, solve_maps, write_sweep
     from isocharge.simulate.template import Resolution
     from isocharge.simulate.theory import Theory, theory_for
+    from isocharge.simulate.triangulation import Fix, Meeting, Triangulation
     from isocharge.simulate.working_area import WorkingArea, working_area
 
 __all__ = [
@@ -33,13 +37,21 @@ __all__ = [
     "ChargeFunction",
     "ChargeSpline",
     "Circle",
+    "Contour",
+    "ContourField",
     "CramerRao",
+    "Curves",
     "Dataset",
+    "DrawnContour",
+    "DrawnTriangulation",
     "Electrode",
     "Equilibrium",
     "Film",
+    "Fix",
     "ForwardMap",
+    "Mapping",
     "Measurement",
+    "Meeting",
     "NoiseModel",
     "Piezo",
     "Polygon",
@@ -49,9 +61,11 @@ __all__ = [
     "Sensor",
     "Sweep",
     "Theory",
+    "Triangulation",
     "WorkingArea",
     "built_in_sensors",
     "contact_charge",
+    "draw_contour",
     "limits_at",
     "load_amplifier",
     "load_sensor",
