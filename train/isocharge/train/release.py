@@ -31,9 +31,9 @@ CORNERS = 64
 """Corners of the polygon that stands for a round working area."""
 
 AGREEMENT = {
-    "contact": (np.array([1.0, 1.0, 0.1]), 1e-4),
-    "contact_std": (np.array([1.0, 1.0, 0.1]), 1e-4),
-    "misfit": (np.array([1.0]), 0.05),
+    "contact": (np.array([1.0, 1.0, 0.1]), 1e-5),
+    "contact_std": (np.array([1.0, 1.0, 0.1]), 1e-5),
+    "misfit": (np.array([1.0]), 1e-4),
 }
 """By output: unit below which differences count absolutely, and how far file and network may be apart (float32)."""
 
