@@ -12,6 +12,7 @@ from isocharge.extras import require
 with require("simulate"):
     from isocharge.simulate.amplifier import Amplifier, Measurement, load_amplifier
     from isocharge.simulate.charge import contact_charge, pretension_charge, thermal_charge, touch_charge
+    from isocharge.simulate.charge_spline import ChargeSpline
     from isocharge.simulate.dataset import Dataset, Samples, read_dataset, write_dataset
     from isocharge.simulate.equilibrium import Equilibrium
     from isocharge.simulate.forward import ForwardMap
@@ -27,6 +28,7 @@ with require("simulate"):
 __all__ = [
     "Amplifier",
     "Calibration",
+    "ChargeSpline",
     "Circle",
     "Dataset",
     "Electrode",
