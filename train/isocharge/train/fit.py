@@ -233,10 +233,10 @@ class _Training:
 
     def _constant_deviations(self) -> None:
         """Root-mean-square errors of the watched presses as the deviations, whatever the charges."""
-        last = self.network.contact[-1]
+        last, straight = self.network.contact.layers()[-1], self.network.contact.straight
         with torch.no_grad():
             off = self.network.contact(self.network.inputs(self.watched_charge).double())[:, :3] - self.watched_unit
-            last.weight[3:] = 0.0
+            last.weight[3:] = straight.weight[3:] = 0.0
             last.bias[3:] = 0.5 * (off**2).mean(dim=0).log()
 
     def _strange_charges(self) -> Strange:

@@ -16,13 +16,21 @@ RINGS, ANGLES, FORCES = 81, 120, 5
 FLAT = 1e-2
 """Share of the middle's volume below which a map of more than three charges counts as folded."""
 
+SURE = 3e-4
+"""Error of the fitted charges above which nothing is said: the slopes of a poor fit fold by themselves."""
+
+RIM = 0.98
+"""Share of the radius that is looked at: at the very rim no press holds the slopes from outside."""
+
 SMALLEST_SHARE = 0.2
 """Share of the asked radius that has to be left for a training to make sense."""
 
 
 def fold_free_share(field: ChargeField) -> float:
-    """Share of the domain's radius within which the map does not fold, 1 if nowhere."""
-    reach = np.linspace(0.0, 1.0, RINGS)
+    """Share of the domain's radius within which the map does not fold, 1 if nowhere or if nobody can say."""
+    if field.error > SURE:
+        return 1.0
+    reach = np.linspace(0.0, RIM, RINGS)
     angle = 2.0 * np.pi * np.arange(ANGLES) / ANGLES
     ring, turn, force = (axis.ravel() for axis in np.meshgrid(reach, angle, np.linspace(-1, 1, FORCES), indexing="ij"))
     unit = np.stack([ring * np.cos(turn), ring * np.sin(turn), force], axis=1)
