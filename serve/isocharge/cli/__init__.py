@@ -10,6 +10,7 @@ import sys
 import typer
 
 from isocharge.cli.demo import demo_command
+from isocharge.cli.identify import identify_command
 from isocharge.cli.serve import serve_app
 from isocharge.cli.simulate import simulate_app
 from isocharge.cli.train import train_app
@@ -22,6 +23,7 @@ app = typer.Typer(
     help="Where a piezoelectric tactile film is touched and how hard, from three or four charges.",
 )
 app.command("demo")(demo_command)
+simulate_app.command("identify")(identify_command)
 app.add_typer(simulate_app, name="simulate")
 app.add_typer(train_app, name="train")
 app.add_typer(serve_app, name="serve")

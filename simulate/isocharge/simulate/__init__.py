@@ -16,6 +16,7 @@ with require("simulate"):
     from isocharge.simulate.dataset import Dataset, Samples, read_dataset, write_dataset
     from isocharge.simulate.equilibrium import Equilibrium
     from isocharge.simulate.forward import ForwardMap
+    from isocharge.simulate.limits import ChargeFunction, CramerRao, limits_at
     from isocharge.simulate.noise import NoiseModel, noise_model
     from isocharge.simulate.probe import Circle, Polygon, Probe, parse_probe
     from isocharge.simulate.sensor import Calibration, Electrode, Film, Piezo, Sensor
@@ -24,12 +25,15 @@ with require("simulate"):
     from isocharge.simulate.sweep import Sweep, run_sweep, solve_maps, write_sweep
     from isocharge.simulate.template import Resolution
     from isocharge.simulate.theory import Theory, theory_for
+    from isocharge.simulate.working_area import WorkingArea, working_area
 
 __all__ = [
     "Amplifier",
     "Calibration",
+    "ChargeFunction",
     "ChargeSpline",
     "Circle",
+    "CramerRao",
     "Dataset",
     "Electrode",
     "Equilibrium",
@@ -45,8 +49,10 @@ __all__ = [
     "Sensor",
     "Sweep",
     "Theory",
+    "WorkingArea",
     "built_in_sensors",
     "contact_charge",
+    "limits_at",
     "load_amplifier",
     "load_sensor",
     "noise_model",
@@ -61,6 +67,7 @@ __all__ = [
     "theory_for",
     "thermal_charge",
     "touch_charge",
+    "working_area",
     "write_dataset",
     "write_sweep",
 ]

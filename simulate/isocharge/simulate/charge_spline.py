@@ -13,6 +13,7 @@ from scipy.interpolate import NdBSpline, make_interp_spline
 from isocharge.errors import SceneError
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.forward import ForwardMap
+from isocharge.simulate.sampling import sunflower
 from isocharge.simulate.scaling import amplitude_squared
 from isocharge.simulate.sensor import Film
 from isocharge.simulate.spectral import barycentric_weights, chebyshev_nodes, lagrange_values
@@ -150,7 +151,7 @@ def _polar_spline(distance: Array, angle: Array, values: Array) -> NdBSpline:
 def _difference(made: ChargeSpline, forward_map: ForwardMap) -> float:
     """Largest error at presses that are spread evenly but off the grid."""
     number = np.arange(CHECKS)
-    at = made.radius * np.sqrt((number + 0.5) / CHECKS) * np.exp(2.39996j * number)
+    at = made.radius * sunflower(CHECKS)
     low, high = made.force_range
     force = np.clip(low * (high / low) ** (number * 0.618 % 1.0), low, high)
     truth = forward_map.forward(at.real, at.imag, force)
