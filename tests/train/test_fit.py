@@ -3,7 +3,6 @@
 import re
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -11,7 +10,8 @@ from isocharge.errors import InputError, TrainingError
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network
 
 TINY = FitConfig(
-    NetworkConfig(hidden=(16, 16), misfit_hidden=(8, 8)), TrainingConfig(steps=40, misfit_steps=10, misfit_charges=1_000, batch=128)
+    NetworkConfig(hidden=(16, 16), misfit_hidden=(8, 8)),
+    TrainingConfig(steps=40, misfit_steps=10, misfit_charges=1_000, batch=128),
 )
 
 

@@ -10,9 +10,9 @@ from isocharge.train.nearest import into_domain, nearest_contact, search
 NOISE = noise_model("reference")
 FAULTS = {
     "noisy": lambda charge, rng: 1e12 * NOISE.add(1e-12 * charge, rng),
-    "wrong gain": lambda charge, rng: charge * [1.0, 1.3, 1.0],
-    "far too hard": lambda charge, rng: 4.0 * charge,
-    "dead electrode": lambda charge, rng: np.maximum(charge * [1.0, 0.0, 1.0], 1.0),
+    "wrong gain": lambda charge, _: charge * [1.0, 1.3, 1.0],
+    "far too hard": lambda charge, _: 4.0 * charge,
+    "dead electrode": lambda charge, _: np.maximum(charge * [1.0, 0.0, 1.0], 1.0),
     "anything": lambda charge, rng: 10.0 ** rng.uniform(0.0, 4.0, charge.shape),
 }
 

@@ -111,7 +111,9 @@ class ChargeField:
             if error < GOOD_ENOUGH:
                 break
         if best is None:
-            raise TrainingError(f"expected at least {FEWEST_PER_TERM * 56} presses to fit the charges by, got {len(unit)}")
+            raise TrainingError(
+                f"expected at least {FEWEST_PER_TERM * 56} presses to fit the charges by, got {len(unit)}"
+            )
         return best
 
     def charge_pC(self, contact: Array) -> Array:
@@ -133,7 +135,7 @@ class ChargeField:
 
     @cached_property
     def _rows(self) -> Array:
-        """The series and its three derivatives by term of the plane, shape (n_term, (force_degree + 1) 4 n_electrode)."""
+        """The series and its derivatives by term of the plane, shape (n_term, (force_degree + 1) 4 n_electrode)."""
         all_four = np.stack([self.series, *(_derivative(self.series, axis) for axis in range(3))])
         of_terms = all_four[:, *_plane_terms(self.series.shape[0] - 1)]  # (4, n_term, force_degree + 1, n_electrode)
         rows: Array = of_terms.transpose(1, 2, 0, 3).reshape(of_terms.shape[1], -1)

@@ -21,6 +21,7 @@ from isocharge.train.network import HIGHEST_PC, LOWEST_PC, MISFIT_UNIT, InverseN
 OPSET, IR_VERSION = 17, 8
 """Old enough for runtimes of 2022 on, new enough for every operator used."""
 
+
 @dataclass
 class GraphBuilder:
     """Nodes and constants in the order they are added; a method returns the name of its result."""

@@ -74,7 +74,7 @@ class Perceptron(nn.Module):
         """The bent way's layers, first to last."""
         return [layer for layer in self.bent if isinstance(layer, nn.Linear)]
 
-    def hidden_matrices(self) -> list[nn.Parameter]:
+    def hidden_matrices(self) -> list[Tensor]:
         """Weights from one hidden layer to the next."""
         return [layer.weight for layer in self.layers()[1:-1]]
 
@@ -131,6 +131,6 @@ class InverseNetwork(nn.Module):
 
 
 def squeezed(miss: Tensor) -> Tensor:
-    """What the misfit network learns: the vector `miss`, (n, n_electrode), its length brought to asinh(length / unit)."""
-    length = torch.linalg.vector_norm(miss, dim=1, keepdim=True)
+    """What the misfit network learns: `miss`, shape (n, n_electrode), its length brought to asinh(length / unit)."""
+    length: Tensor = torch.linalg.vector_norm(miss, dim=1, keepdim=True)
     return miss * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=1e-9))

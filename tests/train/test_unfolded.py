@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from isocharge.errors import DatasetError
-from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, run_sweep
+from isocharge.simulate import ChargeFunction, Circle, Sweep, load_sensor, noise_model, read_dataset, run_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network
 from isocharge.train.charge_field import ChargeField, Domain
-from isocharge.train.folds import fold_free_share, signed_volume
+from isocharge.train.unfolded import FieldModel, unfolded
 
 TINY = FitConfig(NetworkConfig((8, 8), (8, 8)), TrainingConfig(steps=5, misfit_steps=5, misfit_charges=1_000))
 
@@ -30,13 +30,16 @@ def test_a_fold_at_a_known_place(fold):
     def charges(x, y, force):
         return force[:, None] ** 0.7 * np.exp(np.stack([0 * x, 0.1 * (x - x**2 / (2 * fold)), 0.1 * y], axis=1))
 
-    assert 8.0 * fold_free_share(field_of(charges)) == pytest.approx(min(fold, 8.0), abs=0.11)
+    domain = unfolded(field_of(charges), noise_model("reference"))
+    assert domain.radius_mm == pytest.approx(min(fold, 8.0), abs=0.11)
 
 
-def test_the_volume_is_that_of_three_of_four_when_the_fourth_says_nothing():
-    slope = np.random.default_rng(0).normal(size=(20, 3, 3))
-    padded = np.concatenate([slope, np.zeros((20, 3, 1))], axis=2)
-    assert np.allclose(signed_volume(padded), np.abs(signed_volume(slope)))
+def test_the_derivatives_are_those_of_the_charges(fit):
+    model = FieldModel(fit.field)
+    differences = ChargeFunction(model.charge, model.radius, model.force_range, steps=(1e-6, 1e-6, 1e-4))
+    contact = fit.held.contact[np.hypot(*fit.held.contact[:, :2].T) < 7.0][:100] * [1e-3, 1e-3, 1.0]
+    contact[:, 2] = np.clip(contact[:, 2], 0.06, 1.9)  # the series ends at the domain's
+    assert np.allclose(model.jacobian(contact), differences.jacobian(contact), rtol=1e-5, atol=1e-14)
 
 
 def swept(tmp_path, name, samples, radius):
@@ -56,9 +59,9 @@ def test_three_uniaxial_electrodes_fold_inside_five_mm_and_the_user_is_told(tmp_
     assert "6000 presses" in words
 
 
-def test_where_nothing_is_left_it_is_refused(tmp_path, dataset, monkeypatch):
-    monkeypatch.setattr("isocharge.train.fit.fold_free_share", lambda field: 0.1)
-    with pytest.raises(DatasetError, match="folds within"):
+def test_where_nothing_is_left_it_is_refused(dataset, monkeypatch):
+    monkeypatch.setattr("isocharge.train.fit.unfolded", lambda field, _: replace(field.domain, radius_mm=0.8))
+    with pytest.raises(DatasetError, match=r"folds 0\.8 mm from the centre, of 8 mm asked for"):
         fit_network(dataset, TINY)
 
 
