@@ -26,7 +26,8 @@ def by_scipy(field, charge, start):
 
     inside = {"type": "ineq", "fun": lambda unit: 1.0 - unit[0] ** 2 - unit[1] ** 2}
     bounds = [(-1, 1), (-1, 1), (-1, 1)]
-    return np.sqrt(minimize(square, start, bounds=bounds, constraints=inside, options={"ftol": 1e-12}).fun)
+    found = minimize(square, start, bounds=bounds, constraints=inside, options={"ftol": 1e-12})
+    return np.sqrt(square(into_domain(found.x[None])[0]))  # it may end a little outside
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -38,7 +39,7 @@ def test_nobody_finds_a_nearer_one(fit, fault):
     for row in range(len(charge)):
         starts = [unit[row], *into_domain(rng.uniform(-0.7, 0.7, (3, 3)))]
         best = min(by_scipy(fit.field, charge[row], start) for start in starts)
-        assert found[row] <= best + 0.01 + 0.05 * max(best - 5.0, 0.0)  # far away, a valley more or less
+        assert found[row] <= best + 0.01 + 1e-3 * best
 
 
 def test_the_miss_is_that_of_the_contact(fit):
