@@ -85,13 +85,13 @@ def _solve(sensor: "Sensor", probe: "Probe", force: tuple[float, float], radius:
 
 def _mistakes(found: "list[Identification]") -> list[dict[str, Any]]:
     """Each of the other probes taken for the first."""
-    from isocharge.simulate.shapes import mistake, spread_contacts
+    from isocharge.simulate.shapes import inner_forces, mistake, spread_contacts
 
     first, rows = found[0], []
     for other in found[1:]:
-        reach = min(first.area.unfolded, other.area.unfolded)
-        for made in first.maps if reach else ():
-            taken = mistake(other.charges, first.charges, first.noise, spread_contacts(reach, made.force))
+        reach = min(first.area.radius, other.area.radius)
+        for force in inner_forces(first.area.force_range) if reach else ():
+            taken = mistake(other.charges, first.charges, first.noise, spread_contacts(reach, force))
             rows.append({"probe": other.probe.notation, "within_mm": 1e3 * reach, **taken.to_dict()})
     return rows
 
@@ -100,7 +100,7 @@ def _size(made: "ForwardMap", found: "Identification") -> list[dict[str, Any]]:
     """How well the charges tell a circle's radius."""
     from isocharge.simulate.shapes import size_told
 
-    forces, reach = [each.force for each in found.maps], found.area.unfolded
+    forces, reach = [each.force for each in found.maps], found.area.radius
     with progress("solving the film under other radii") as advance:
         return [told.to_dict() for told in size_told(made, found.charges, found.noise, forces, reach, advance)]
 
@@ -127,13 +127,16 @@ def _words(numbers: dict[str, Any]) -> list[str]:
         f"{row['position_error_median_mm']:.3f} mm off at the median, {row['position_error_p95_mm']:.3f} mm at 95 %."
         for row in numbers["other_probes"]
     ]
-    sizes = [
+    return shapes + [_size_words(row) for row in numbers["size"]]
+
+
+def _size_words(row: dict[str, Any]) -> str:
+    x, y = row["best_at_mm"]
+    return (
         f"The radius at {row['force_N']:g} N: known to {row['radius_std_median_percent']:.0f} % at the median place, "
-        f"to {row['radius_std_best_percent']:.0f} % at best, at ({row['best_at_mm'][0]:.1f}, {row['best_at_mm'][1]:.1f}) "
-        f"mm; to a third at {row['told_share']:.0%} of the places."
-        for row in numbers["size"]
-    ]
-    return shapes + sizes
+        f"to {row['radius_std_best_percent']:.0f} % at best, at ({x:.1f}, {y:.1f}) mm; to a third or better at "
+        f"{row['told_share']:.0%} of the places."
+    )
 
 
 def _write(output: Path, found: "Identification", numbers: dict[str, Any]) -> None:

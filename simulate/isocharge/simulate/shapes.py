@@ -25,6 +25,9 @@ from isocharge.simulate.twins import nearest_contact
 TOLD = 3.0
 """Standard deviations by which charges must differ to tell two probes apart from one press."""
 
+INSIDE = 1.3
+"""Factor by which forces keep off the ends of the range: the explaining contact's may differ."""
+
 RADIUS_STEP = 0.1
 """Relative step in the probe's radius of its derivative."""
 
@@ -89,6 +92,12 @@ def size_limit(
         raise _too_few(charge.shape[1])
     by_radius = (larger.charge(contact) - smaller.charge(contact)) / (2.0 * RADIUS_STEP)
     return cramer_rao(charge, np.concatenate([jacobian, by_radius[..., None]], axis=2), noise).parameter(3)
+
+
+def inner_forces(force_range: tuple[float, float]) -> list[float]:
+    """Forces to compare probes under: near both ends of the range, and 1 N or what is nearest to it, N."""
+    low, high = INSIDE * force_range[0], force_range[1] / INSIDE
+    return sorted({low, float(np.clip(1.0, low, high)), high}) if low < high else [float(np.sqrt(low * high))]
 
 
 def spread_contacts(radius: float, force: float, count: int = 1000) -> Array:
