@@ -69,6 +69,12 @@ class Domain:
         unit: Array = (logs - self.centre) / self.scale
         return unit
 
+    def to_contact(self, unit: Array) -> Array:
+        """The inverse of `to_unit`: shape (n, 3) to (x_mm, y_mm, force_N), shape (n, 3)."""
+        contact: Array = unit * self.scale + self.centre
+        contact[..., 2] = np.exp(contact[..., 2])
+        return contact
+
 
 @dataclass(frozen=True)
 class ChargeField:
@@ -125,6 +131,15 @@ class ChargeField:
         """Charges of contacts (x_mm, y_mm, force_N): shape (n, 3) to (n, n_electrode)."""
         charge: Array = np.exp(_evaluate(self.coefficients[0], self.domain.to_unit(contact)))
         return charge
+
+    def with_slopes(self) -> Array:
+        """Series of ln Q and of its derivatives by the unit coordinates, side by side.
+
+        Returns:
+            Shape (degree + 1, degree + 1, force_degree + 1, 4, n_electrode).
+        """
+        series = self.coefficients[0]
+        return np.stack([series, *(_derivative(series, axis) for axis in range(3))], axis=3)
 
 
 def _polynomials(unit: Array, degree: int, force_degree: int) -> tuple[Array, Array, Array]:

@@ -1,0 +1,296 @@
+"""Gauss-Newton on an interpolated forward map: the contact whose charges fit best, maximum a posteriori.
+
+The forward map is the Chebyshev series of `ChargeField`, fitted to clean training presses. The residuals are
+(Q - Q(c)) / sigma(Q) and, for the prior, uniform over the disk and the range of log force, the distance beyond its edge
+over a small width. Levenberg damping makes every step an improvement; the start is the nearest of a few presses, and
+the next nearest where that led to charges that do not fit.
+
+The SciPy form hands the same residuals to `scipy.optimize.least_squares`, press by press.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from isocharge.simulate.arrays import Array
+from isocharge.simulate.noise import NoiseModel
+from isocharge.train.charge_field import ChargeField, Domain
+from isocharge.train.rivals.estimator import Fitted, Task
+from isocharge.train.rivals.features import LogFeatures
+
+NAME = "Gauss-Newton"
+
+WALL = 0.003
+"""Width of the prior's edge in unit coordinates."""
+
+BEYOND = 1.0 + 3.0 * WALL
+"""Trial steps are brought back to here: further out the series means nothing."""
+
+STARTS = 600
+"""Presses that a start is chosen from."""
+
+TOLERANCE = 1e-5
+"""Step in unit coordinates at which a press is done: 0.1 um or 1e-5 of the force."""
+
+MOST_STEPS = 30
+"""Steps after which a press is done anyway."""
+
+DOUBTFUL = 12.0
+"""Sum of squared residuals from which another start is tried: noise alone, with a charge or none to spare, hardly
+reaches it."""
+
+ATTEMPTS = 3
+"""Starts at most."""
+
+BATCH = 512
+"""Presses at once: their polynomials stay in the cache."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Charges as a function of the contact, and the prior.
+
+    Attributes:
+        series: ln Q and its derivatives, shape (degree + 1, degree + 1, force_degree + 1, 4 n_electrode).
+        orders: 0 to degree, shape (degree + 1,).
+        white_pC: Noise that every charge has.
+        gain: Noise in proportion to the charge.
+    """
+
+    series: Array
+    orders: Array
+    white_pC: float
+    gain: float
+
+    @classmethod
+    def of(cls, field: ChargeField, noise: NoiseModel) -> "Problem":
+        """From a fitted forward map."""
+        series = field.with_slopes()
+        series = series.reshape(*series.shape[:3], -1)
+        return cls(series, np.arange(float(len(series))), 1e12 * noise.white, noise.gain)
+
+    def sigma(self, charge_pC: Array) -> Array:
+        """Standard deviation of measured charges, pC."""
+        sigma: Array = np.sqrt(self.white_pC**2 + (self.gain * charge_pC) ** 2)
+        return sigma
+
+    def known(self, unit: Array) -> tuple[Array, Array]:
+        """Charges and their derivatives by the unit coordinates.
+
+        Args:
+            unit: Shape (3,) or (n, 3).
+
+        Returns:
+            Shape (..., n_electrode), pC, and (..., 3, n_electrode).
+        """
+        in_x, in_y, in_force = self._polynomials(unit)
+        count, _, forces, width = self.series.shape
+        lead = unit.shape[:-1]
+        sums = (in_x @ self.series.reshape(count, -1)).reshape(*lead, count, -1)
+        sums = (in_y[..., None, :] @ sums).reshape(*lead, forces, width)
+        values = (in_force[..., None, :forces] @ sums).reshape(*lead, 4, -1)
+        charge = np.exp(values[..., 0, :])
+        return charge, charge[..., None, :] * values[..., 1:, :]
+
+    def _polynomials(self, unit: Array) -> Array:
+        """T_k of every coordinate, shape (3, ..., degree + 1)."""
+        angle = np.arccos(np.minimum(np.maximum(unit.T, -1.0), 1.0))
+        values: Array = np.cos(angle[..., None] * self.orders)
+        return values
+
+    def residuals(self, unit: Array, charge_pC: Array, sigma_pC: Array) -> tuple[Array, Array]:
+        """Residuals, shape (..., n_electrode + 2), and their derivatives, shape (..., 3, n_electrode + 2)."""
+        known, slopes = self.known(unit)
+        beyond, outward = _wall(unit)
+        residual = np.concatenate([(known - charge_pC) / sigma_pC, beyond], axis=-1)
+        return residual, np.concatenate([slopes / sigma_pC[..., None, :], outward], axis=-1)
+
+
+def _wall(unit: Array) -> tuple[Array, Array]:
+    """How far a contact lies beyond the prior's edge, over its width, (..., 2), and the derivatives, (..., 3, 2)."""
+    radius = np.sqrt(unit[..., 0] ** 2 + unit[..., 1] ** 2)
+    size = np.stack([radius, np.abs(unit[..., 2])], axis=-1)
+    out = size > 1.0
+    outward = np.zeros((*unit.shape, 2))
+    outward[..., :2, 0] = unit[..., :2] * (out[..., 0] / np.maximum(radius, 1.0))[..., None] / WALL
+    outward[..., 2, 1] = np.sign(unit[..., 2]) * out[..., 1] / WALL
+    return np.maximum(size - 1.0, 0.0) / WALL, outward
+
+
+def _held(unit: Array) -> Array:
+    """Contacts brought back to where the series still means something."""
+    held = unit.copy()
+    radius = np.sqrt(unit[..., 0] ** 2 + unit[..., 1] ** 2)
+    held[..., :2] *= (BEYOND / np.maximum(radius, BEYOND))[..., None]
+    held[..., 2] = np.minimum(np.maximum(unit[..., 2], -BEYOND), BEYOND)
+    return held
+
+
+def damped_step(residual: Array, slopes: Array, damping: Array | float) -> Array:
+    """Levenberg-Marquardt step (Marquardt 1963), shape (..., 3)."""
+    normal = slopes @ slopes.swapaxes(-1, -2)
+    normal += normal * (np.asarray(damping)[..., None, None] * np.eye(3))
+    step: Array = -np.linalg.solve(normal, slopes @ residual[..., None])[..., 0]
+    return step
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """The method."""
+
+    name: str = NAME
+
+    def fit(self, task: Task) -> tuple[Fitted, ...]:
+        """Fit the forward map on clean presses, its degree by the validation presses; both forms."""
+        held = (task.validation.contact, task.validation.charge_pC)
+        field = ChargeField.fit(task.domain, task.train.contact, task.train.charge_pC, held, task.noise)
+        rows = np.random.default_rng(task.seed).permutation(len(task.train))[:STARTS]
+        features = LogFeatures.fit(task.train.charge_pC)
+        starts = features(task.train.charge_pC[rows]), task.domain.to_unit(task.train.contact[rows])
+        problem, degree = Problem.of(field, task.noise), len(field.coefficients[0]) - 1
+        choice = f"series of degree {degree}, {100 * field.error:.2g} % rms off; start from {len(rows)} presses"
+        return tuple(
+            form(problem, features, *starts, task.domain, choice) for form in (ScipyGaussNewton, NumpyGaussNewton)
+        )
+
+
+@dataclass(frozen=True)
+class _GaussNewton(Fitted):
+    """What both forms need.
+
+    Attributes:
+        problem: Forward map and prior.
+        features: Of the charges, to find a start.
+        points: Features of the starts, shape (m, n_electrode).
+        unit: Their contacts in unit coordinates, shape (m, 3).
+        domain: What the unit coordinates refer to.
+    """
+
+    problem: Problem
+    features: LogFeatures
+    points: Array
+    unit: Array
+    domain: Domain
+    choice: str = ""
+    name: str = NAME
+    form: str = ""
+
+    def start(self, charge_pC: Array, attempt: int) -> Array:
+        """The nearest of the starts, or the next nearest ones, unit coordinates, (..., n_electrode) to (..., 3)."""
+        distance = self._squares - self.features(charge_pC) @ self.points.T
+        rank = distance.argmin(axis=-1) if attempt == 0 else distance.argsort(axis=-1)[..., attempt]
+        start: Array = self.unit[rank]
+        return start
+
+    @cached_property
+    def _squares(self) -> Array:
+        squares: Array = 0.5 * (self.points**2).sum(axis=1)
+        return squares
+
+
+@dataclass(frozen=True)
+class ScipyGaussNewton(_GaussNewton):
+    """scipy.optimize.least_squares, MINPACK's Levenberg-Marquardt."""
+
+    form: str = "SciPy least_squares"
+
+    def predict(self, charge_pC: Array) -> Array:
+        """See `Fitted.predict`."""
+        return self.domain.to_contact(np.stack([self._solve(charge) for charge in charge_pC]))
+
+    def _solve(self, charge: Array) -> Array:
+        best: Any = None
+        for attempt in range(ATTEMPTS):
+            solution = self._descend(charge, self.start(charge, attempt))
+            best = solution if best is None or solution.cost < best.cost else best
+            if 2.0 * best.cost <= DOUBTFUL:
+                break
+        return _held(np.asarray(best.x))
+
+    def _descend(self, charge: Array, start: Array) -> Any:
+        sigma = self.problem.sigma(charge)
+        return least_squares(
+            lambda unit: self.problem.residuals(_held(unit), charge, sigma)[0],
+            start,
+            lambda unit: self.problem.residuals(_held(unit), charge, sigma)[1].T,
+            method="lm",
+            xtol=TOLERANCE,
+        )
+
+
+@dataclass(frozen=True)
+class NumpyGaussNewton(_GaussNewton):
+    """All presses of a batch step together; those that are done wait no longer."""
+
+    form: str = "NumPy"
+
+    def predict(self, charge_pC: Array) -> Array:
+        """See `Fitted.predict`."""
+        parts = [self._solve(charge_pC[start : start + BATCH]) for start in range(0, len(charge_pC), BATCH)]
+        return self.domain.to_contact(np.concatenate(parts))
+
+    def _solve(self, charge: Array) -> Array:
+        unit, cost = self._descend(charge, self.start(charge, 0))
+        for attempt in range(1, ATTEMPTS):
+            again = np.flatnonzero(cost > DOUBTFUL)
+            if not again.size:
+                break
+            other, other_cost = self._descend(charge[again], self.start(charge[again], attempt))
+            better = other_cost < cost[again]
+            unit[again[better]], cost[again[better]] = other[better], other_cost[better]
+        return unit
+
+    def _descend(self, charge: Array, unit: Array) -> tuple[Array, Array]:
+        """Contacts (n, 3) and sums of squared residuals (n,) from a start."""
+        sigma = self.problem.sigma(charge)
+        residual, slopes = self.problem.residuals(unit, charge, sigma)
+        damping, todo = np.full(len(unit), 1e-3), np.arange(len(unit))
+        for _ in range(MOST_STEPS):
+            step = damped_step(residual[todo], slopes[todo], damping[todo])
+            trial = _held(unit[todo] + step)
+            new_residual, new_slopes = self.problem.residuals(trial, charge[todo], sigma[todo])
+            better = (new_residual**2).sum(axis=1) <= (residual[todo] ** 2).sum(axis=1)
+            taken = todo[better]
+            unit[taken], residual[taken], slopes[taken] = trial[better], new_residual[better], new_slopes[better]
+            damping[todo] *= np.where(better, 0.1, 10.0)
+            todo = todo[np.abs(step).max(axis=1) > TOLERANCE]
+            if not todo.size:
+                break
+        return unit, (residual**2).sum(axis=1)
+
+    def one(self, charge_pC: Array) -> Callable[[], object]:
+        """See `Fitted.one`."""
+        charge = np.array(charge_pC, dtype=float)
+        return lambda: self.single(charge)
+
+    def single(self, charge_pC: Array) -> Array:
+        """The contact of one press, shape (n_electrode,) to (3,)."""
+        unit, cost = self._descend_one(charge_pC, self.start(charge_pC, 0))
+        for attempt in range(1, ATTEMPTS):
+            if cost <= DOUBTFUL:
+                break
+            other, other_cost = self._descend_one(charge_pC, self.start(charge_pC, attempt))
+            unit, cost = (other, other_cost) if other_cost < cost else (unit, cost)
+        return self.domain.to_contact(unit)
+
+    def _descend_one(self, charge: Array, unit: Array) -> tuple[Array, float]:
+        """As `_descend`, without a batch's bookkeeping."""
+        sigma, damping = self.problem.sigma(charge), 1e-3
+        residual, slopes = self.problem.residuals(unit, charge, sigma)
+        cost = float(residual @ residual)
+        for _ in range(MOST_STEPS):
+            step = damped_step(residual, slopes, damping)
+            trial = _held(unit + step)
+            new_residual, new_slopes = self.problem.residuals(trial, charge, sigma)
+            new_cost = float(new_residual @ new_residual)
+            better = new_cost <= cost
+            if better:
+                unit, residual, slopes, cost = trial, new_residual, new_slopes, new_cost
+            damping *= 0.1 if better else 10.0
+            if np.abs(step).max() <= TOLERANCE:
+                break
+        return unit, cost

@@ -1,0 +1,262 @@
+"""Networks of several sizes, trained by the usual pipeline, and what carries them: torch, ONNX Runtime, NumPy.
+
+The rivals give a contact and nothing else, so here the contact network runs alone, without deviations and misfit; the
+released model, `ReleasedModel`, gives all seven numbers.
+"""
+
+import io
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+import torch
+from onnx import TensorProto, helper
+from torch import nn
+
+from isocharge.serve import Predictor
+from isocharge.serve.session import open_session
+from isocharge.simulate.arrays import Array
+from isocharge.simulate.dataset import Dataset
+from isocharge.train.config import FitConfig, NetworkConfig, TrainingConfig
+from isocharge.train.export import IR_VERSION, OPSET, GraphBuilder
+from isocharge.train.fit import fit_network
+from isocharge.train.network import HIGHEST_PC, LOWEST_PC, InverseNetwork
+from isocharge.train.rivals.estimator import Fitted, Task
+
+Layers = list[tuple[Array, Array]]
+"""Weights (inputs, outputs) and biases, units and scales folded in: ln Q in; x_mm, y_mm, ln F out; tanh between."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network of one size.
+
+    Attributes:
+        dataset: What it learns from; its own split by position, with the task's seed and share.
+        hidden: Widths.
+        steps: Optimiser steps.
+        hold_out: Share of the positions that the task holds back.
+    """
+
+    dataset: Dataset
+    hidden: tuple[int, ...] = (64, 64, 64)
+    steps: int = 4_000
+    hold_out: float = 0.1
+
+    @property
+    def name(self) -> str:
+        """With its widths."""
+        return f"network {'-'.join(map(str, self.hidden))}"
+
+    def fit(self, task: Task) -> tuple[Fitted, ...]:
+        """Train, and give the contact network in torch, ONNX Runtime (session.run, iobinding) and NumPy."""
+        training = TrainingConfig(
+            steps=self.steps, nearest_steps=1, hold_out=self.hold_out, seed=task.seed, noise=task.noise.name
+        )
+        sizes = NetworkConfig(hidden=self.hidden, nearest_hidden=(8,) * len(self.hidden))
+        network = fit_network(self.dataset, FitConfig(sizes, training)).network
+        choice, layers = f"{self.steps} steps", folded_layers(network)
+        graph = contact_graph(layers)
+        return (
+            TorchNetwork(network, choice, self.name),
+            SessionNetwork(graph, choice, self.name),
+            BoundNetwork(graph, choice, self.name),
+            NumpyNetwork(layers, choice, self.name),
+        )
+
+
+def folded_layers(network: InverseNetwork) -> Layers:
+    """The contact network with whitening and units folded into its first and last layer."""
+    layers = [
+        (layer.weight.detach().double().numpy().T, layer.bias.detach().double().numpy())
+        for layer in network.contact
+        if isinstance(layer, nn.Linear)
+    ]
+    whitening, typical = network.features.matrix, network.features.typical
+    weight, bias = layers[0]
+    layers[0] = whitening @ weight, bias - np.log(typical) @ whitening @ weight
+    scale, centre = network.scale.double().numpy(), network.centre.double().numpy()
+    weight, bias = layers[-1]
+    layers[-1] = weight[:, :3] * scale, bias[:3] * scale + centre
+    return layers
+
+
+def contact_graph(layers: Layers) -> bytes:
+    """An ONNX graph with the input `charge_pC` [n, n_electrode] and the output `contact` [n, 3], float32."""
+    build = GraphBuilder()
+    value = build.add("Clip", "charge_pC", build.constant(LOWEST_PC), build.constant(HIGHEST_PC))
+    value = build.add("Log", value)
+    for number, (weight, bias) in enumerate(layers):
+        value = build.add("Tanh", value) if number else value
+        value = build.add("Gemm", value, build.constant(weight), build.constant(bias))
+    plane, log_force = build.split(value, ("plane", "log_force"), (2, 1), axis=1)
+    build.add("Concat", plane, build.add("Exp", log_force), to="contact", axis=1)
+    charge, contact = (
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
+        for name, width in (("charge_pC", len(layers[0][0])), ("contact", 3))
+    )
+    graph = helper.make_graph(build.nodes, "contact", [charge], [contact], build.constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+    return bytes(model.SerializeToString())
+
+
+@dataclass(frozen=True)
+class TorchNetwork(Fitted):
+    """In torch, as it was trained."""
+
+    network: InverseNetwork
+    choice: str
+    name: str
+    form: str = "torch"
+
+    def predict(self, charge_pC: Array) -> Array:
+        """See `Fitted.predict`."""
+        return self._contacts(torch.tensor(charge_pC).float()).double().numpy()
+
+    def _contacts(self, charge_pC: torch.Tensor) -> torch.Tensor:
+        with torch.inference_mode():
+            value = self.network.posterior(charge_pC)[0] * self.network.scale + self.network.centre
+            return torch.cat([value[:, :2], torch.exp(value[:, 2:])], dim=1)
+
+    def one(self, charge_pC: Array) -> Callable[[], object]:
+        """See `Fitted.one`."""
+        row = torch.tensor(charge_pC).float()[None]
+        return lambda: self._contacts(row)
+
+    @property
+    def memory(self) -> int:
+        """See `Fitted.memory`: the contact network and its normalisation."""
+        buffer = io.BytesIO()
+        parts = {name: getattr(self.network, name) for name in ("typical", "whitening", "scale", "centre")}
+        torch.save({**self.network.contact.state_dict(), **parts}, buffer)
+        return buffer.tell()
+
+
+@dataclass(frozen=True)
+class SessionNetwork(Fitted):
+    """In ONNX Runtime, one `session.run` per call."""
+
+    graph: bytes
+    choice: str
+    name: str
+    form: str = "ONNX Runtime"
+
+    @cached_property
+    def session(self) -> ort.InferenceSession:
+        """One thread, no spinning."""
+        return open_session(self.graph, self.name)
+
+    def predict(self, charge_pC: Array) -> Array:
+        """See `Fitted.predict`."""
+        contact: Array = self.session.run(None, {"charge_pC": charge_pC.astype(np.float32)})[0].astype(float)
+        return contact
+
+    def one(self, charge_pC: Array) -> Callable[[], object]:
+        """See `Fitted.one`."""
+        feed = {"charge_pC": charge_pC.astype(np.float32)[None]}
+        return partial(self.session.run, None, feed)
+
+    @property
+    def memory(self) -> int:
+        """See `Fitted.memory`: the file."""
+        return len(self.graph)
+
+
+@dataclass(frozen=True)
+class BoundNetwork(SessionNetwork):
+    """In ONNX Runtime, buffers bound once."""
+
+    form: str = "ONNX Runtime, bound"
+
+    @cached_property
+    def _bound(self) -> "_Bound":
+        return _Bound(self.session, self.session.get_inputs()[0].shape[1])
+
+    def one(self, charge_pC: Array) -> Callable[[], object]:
+        """See `Fitted.one`: charges into the bound input, run, answers out of the bound output."""
+        bound, charge, out = self._bound, charge_pC.astype(np.float32), np.zeros(3, np.float32)
+
+        def compute() -> object:
+            bound.charges[:] = charge
+            bound.run()
+            out[:] = bound.answers
+            return out
+
+        return compute
+
+
+class _Bound:
+    """Input and output memory of one press."""
+
+    def __init__(self, session: ort.InferenceSession, electrodes: int) -> None:
+        charges, answers = np.zeros((1, electrodes), np.float32), np.zeros((1, 3), np.float32)
+        binding = session.io_binding()
+        binding.bind_input("charge_pC", "cpu", 0, np.float32, charges.shape, charges.ctypes.data)
+        binding.bind_output("contact", "cpu", 0, np.float32, answers.shape, answers.ctypes.data)
+        self.charges, self.answers = charges[0], answers[0]
+        self.run: Callable[[], None] = partial(session.run_with_iobinding, binding)
+
+
+@dataclass(frozen=True)
+class NumpyNetwork(Fitted):
+    """In NumPy, float64."""
+
+    layers: Layers
+    choice: str
+    name: str
+    form: str = "NumPy"
+
+    def predict(self, charge_pC: Array) -> Array:
+        """See `Fitted.predict`."""
+        value: Array = np.log(np.minimum(np.maximum(charge_pC, LOWEST_PC), HIGHEST_PC))
+        for weight, bias in self.layers[:-1]:
+            value = np.tanh(value @ weight + bias)
+        value = value @ self.layers[-1][0] + self.layers[-1][1]
+        value[..., 2] = np.exp(value[..., 2])
+        return value
+
+    def one(self, charge_pC: Array) -> Callable[[], object]:
+        """See `Fitted.one`."""
+        return partial(self.predict, np.array(charge_pC, dtype=float))
+
+    @property
+    def memory(self) -> int:
+        """See `Fitted.memory`."""
+        return len(pickle.dumps(self.layers))
+
+
+@dataclass(frozen=True)
+class ReleasedModel(Fitted):
+    """A model folder through `Predictor`: contact, standard deviations and misfit."""
+
+    folder: Path
+    name: str = "released network"
+    choice: str = "as released"
+    form: str = "Predictor"
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        """The loaded model."""
+        return Predictor(self.folder)
+
+    def predict(self, charge_pC: Array) -> Array:
+        """See `Fitted.predict`."""
+        return self.answer(charge_pC)[0]
+
+    def answer(self, charge_pC: Array) -> tuple[Array, Array, Array]:
+        """Contact (n, 3), standard deviations (n, 3) and misfit (n, 1)."""
+        columns = np.stack(self.predictor.predict_batch(charge_pC), axis=1).astype(float)
+        return columns[:, :3], columns[:, 3:6], columns[:, 6:]
+
+    def one(self, charge_pC: Array) -> Callable[[], object]:
+        """See `Fitted.one`: `Predictor.predict_into`."""
+        return partial(self.predictor.predict_into, charge_pC.astype(np.float32), np.zeros(7, np.float32))
+
+    @property
+    def memory(self) -> int:
+        """See `Fitted.memory`: the file."""
+        return (self.folder / "model.onnx").stat().st_size
