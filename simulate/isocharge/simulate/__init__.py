@@ -23,6 +23,7 @@ with require("simulate"):
     from isocharge.simulate.sweep import Sweep, run_sweep, solve_maps, write_sweep
     from isocharge.simulate.template import Resolution
     from isocharge.simulate.theory import Theory, theory_for
+    from isocharge.simulate.triangulation import Fix, Meeting, Triangulation
 
 __all__ = [
     "Amplifier",
@@ -32,8 +33,10 @@ __all__ = [
     "Electrode",
     "Equilibrium",
     "Film",
+    "Fix",
     "ForwardMap",
     "Measurement",
+    "Meeting",
     "NoiseModel",
     "Piezo",
     "Polygon",
@@ -43,6 +46,7 @@ __all__ = [
     "Sensor",
     "Sweep",
     "Theory",
+    "Triangulation",
     "built_in_sensors",
     "contact_charge",
     "load_amplifier",
