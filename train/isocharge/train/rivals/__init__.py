@@ -15,6 +15,7 @@ from isocharge.train.rivals.neighbours import NearestNeighbours
 from isocharge.train.rivals.networks import Network, ReleasedModel
 from isocharge.train.rivals.polynomial import PolynomialRidge
 from isocharge.train.rivals.table import InterpolatedTable, NearestEntry
+from isocharge.train.rivals.triangulation import Triangulate
 
 __all__ = [
     "Estimator",
@@ -30,4 +31,5 @@ __all__ = [
     "PolynomialRidge",
     "ReleasedModel",
     "Task",
+    "Triangulate",
 ]

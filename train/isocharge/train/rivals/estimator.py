@@ -71,7 +71,7 @@ class Fitted(ABC):
         name: The method.
         form: What computes it: a library's name or "NumPy".
         choice: The hyperparameters and how they were chosen, in words.
-        given_force: Whether it was told the true force, as no sensor is.
+        given_force: Whether it has to be told the true force, as no sensor can.
     """
 
     name: str
@@ -89,6 +89,11 @@ class Fitted(ABC):
         Returns:
             (x_mm, y_mm, force_N), shape (n, 3); NaN where the method has no answer.
         """
+
+    def told(self, force_N: Array) -> "Fitted":
+        """The same, told the true forces of the presses that come next, shape (n,), N: itself, if it does not ask."""
+        del force_N
+        return self
 
     def one(self, charge_pC: Array) -> Callable[[], object]:
         """One press, charges of shape (n_electrode,), ready to be computed and timed: the fastest way there is."""

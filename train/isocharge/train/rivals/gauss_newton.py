@@ -132,8 +132,8 @@ def _held(unit: Array) -> Array:
 
 def damped_step(residual: Array, slopes: Array, damping: Array | float) -> Array:
     """Levenberg-Marquardt step (Marquardt 1963), shape (..., 3)."""
-    normal = slopes @ slopes.swapaxes(-1, -2)
-    normal += normal * (np.asarray(damping)[..., None, None] * np.eye(3))
+    square = slopes @ slopes.swapaxes(-1, -2)
+    normal = square + square * (np.asarray(damping)[..., None, None] * np.eye(3))
     step: Array = -np.linalg.solve(normal, slopes @ residual[..., None])[..., 0]
     return step
 

@@ -1,0 +1,331 @@
+"""The report's pictures, from its record and the draws behind it; each as PNG and SVG."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+
+from isocharge.simulate import Sensor
+from isocharge.simulate.arrays import Array
+from isocharge.train.charge_field import Domain
+from isocharge.train.report.maps import COORDINATES, Draws
+from isocharge.train.report.measures import rms
+
+INK, GREY, RELEASED = "#1b2a41", "#8a95a5", "#d1495b"
+"""Colours of outlines, of what is beside the point, and of the released model."""
+
+KINDS = {"paper": "#7a5195", "learnt": "#2f7f6f", "fitted map": "#c47f17", "network": "#2b6cb0"}
+"""Colours of the kinds of methods."""
+
+KIND_WORDS = {
+    "paper": "Mirbagheri et al. 2007",
+    "learnt": "learnt from presses",
+    "fitted map": "search on a forward map",
+    "network": "network",
+}
+
+MARKERS = {
+    "NumPy": "o",
+    "scikit-learn": "s",
+    "SciPy KD-tree": "^",
+    "SciPy least_squares": "v",
+    "torch": "P",
+    "ONNX Runtime": "D",
+    "ONNX Runtime, bound": "X",
+    "Predictor": "*",
+}
+"""Markers of what computes a method."""
+
+LINES = ("#2b6cb0", "#2f7f6f", "#c47f17", "#7a5195", "#8c564b", "#4c9be8")
+"""Colours of methods where kinds do not tell them apart."""
+
+
+def save(figure: Any, path: Path) -> list[str]:
+    """Write a figure as PNG and SVG; the files' names."""
+    FigureCanvasAgg(figure)
+    names = [f"{path.name}.png", f"{path.name}.svg"]
+    for name in names:
+        figure.savefig(path.with_name(name), dpi=130, metadata={"Date": None} if name.endswith("svg") else None)
+    return names
+
+
+AXES = {
+    "latency": ("p50_us", "time of one prediction, median, us", "us"),
+    "throughput": ("per_second", "predictions per second in batches of {batch}", "/s"),
+    "memory": ("memory_bytes", "memory of the method, bytes", "B"),
+}
+
+
+def speed(records: Sequence[dict[str, Any]], plot: str, limit_mm: float | None, cramer_rao_mm: float | None, batch: int) -> Any:
+    """Position error against latency, throughput or memory, one point for each method and form."""
+    key, words, _ = AXES[plot]
+    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
+    axes = figure.subplots()
+    shown = [record for record in records if record["errors"]["position_rms_mm"]]
+    _points(axes, shown, key)
+    _front(axes, shown, key, plot)
+    for value, name, style in ((limit_mm, "Bayes limit", "-"), (cramer_rao_mm, "Cramér-Rao", ":")):
+        if value:
+            axes.axhline(value, color=INK, lw=1.3, ls=style, zorder=1)
+            axes.annotate(
+                f"{name}, {value:.3f} mm", (0.005, value), xycoords=("axes fraction", "data"), fontsize=8,
+                va="top", xytext=(2, -3), textcoords="offset points", color=INK,
+            )
+    axes.set(xscale="log", yscale="log", xlabel=words.format(batch=batch), ylabel="position error, rms, mm")
+    _error_ticks(axes, shown, limit_mm)
+    axes.grid(alpha=0.25, which="both", lw=0.5)
+    if plot == "throughput":
+        axes.invert_xaxis()
+    _name_methods(axes, shown, key)
+    _legend(axes, shown)
+    return figure
+
+
+def _points(axes: Any, records: Sequence[dict[str, Any]], key: str) -> None:
+    """Points, the forms of one method joined by a thin line."""
+    for name in dict.fromkeys(record["name"] for record in records):
+        forms = [record for record in records if record["name"] == name]
+        spots = sorted((record[key], record["errors"]["position_rms_mm"]) for record in forms)
+        axes.plot(*np.array(spots).T, color=KINDS[forms[0]["kind"]], lw=0.8, alpha=0.6, zorder=2)
+    for record in records:
+        released = record["form"] == "Predictor"
+        colour = RELEASED if released else KINDS[record["kind"]]
+        hollow = record["force_given"] or record["errors"]["answered"] < 1.0
+        axes.plot(
+            record[key], record["errors"]["position_rms_mm"], MARKERS.get(record["form"], "o"), color=colour,
+            mfc="white" if hollow else colour, ms=17 if released else 7, mec="white" if released else colour,
+            zorder=5 if released else 3,
+        )
+
+
+def _front(axes: Any, records: Sequence[dict[str, Any]], key: str, plot: str) -> None:
+    front = sorted((r[key], r["errors"]["position_rms_mm"]) for r in records if plot in r["best_on"])
+    if len(front) > 1:
+        style = "steps-post" if plot != "throughput" else "steps-pre"
+        axes.plot(*np.array(front).T, color=INK, lw=1.0, ls="--", drawstyle=style, alpha=0.7, zorder=1, label="front")
+
+
+def _error_ticks(axes: Any, records: Sequence[dict[str, Any]], limit: float | None) -> None:
+    errors = [record["errors"]["position_rms_mm"] for record in records] + ([limit] if limit else [])
+    low, high = 0.93 * min(errors), 1.12 * max(errors)
+    axes.set_ylim(low, high)
+    steps = [0.05, 0.06, 0.07, 0.08, 0.1, 0.12, 0.15, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.8, 1, 1.5, 2, 3, 4, 6, 8, 10]
+    axes.yaxis.set_major_locator(FixedLocator([step for step in steps if low <= step <= high]))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _name_methods(axes: Any, records: Sequence[dict[str, Any]], key: str) -> None:
+    """Names in a column beside the plot, kept apart, each joined to its method's last point."""
+    names = list(dict.fromkeys(record["name"] for record in records))
+    last = axes.get_xlim()[0] > axes.get_xlim()[1]
+    ends = {}
+    for name in names:
+        forms = [record for record in records if record["name"] == name]
+        ends[name] = (min if last else max)(forms, key=lambda record: record[key])
+    low, high = np.log(axes.get_ylim())
+    ranked = sorted(names, key=lambda name: ends[name]["errors"]["position_rms_mm"])
+    wanted = [(np.log(ends[name]["errors"]["position_rms_mm"]) - low) / (high - low) for name in ranked]
+    for name, height in zip(ranked, spread(wanted, 0.036), strict=True):
+        record = ends[name]
+        colour = RELEASED if record["form"] == "Predictor" else KINDS[record["kind"]]
+        axes.annotate(
+            _short(record), (record[key], record["errors"]["position_rms_mm"]), xytext=(1.025, height),
+            textcoords="axes fraction", fontsize=9, va="center", color=colour, annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": colour, "lw": 0.5, "alpha": 0.45, "shrinkA": 1, "shrinkB": 4},
+        )
+
+
+def spread(wanted: Sequence[float], apart: float) -> list[float]:
+    """Heights at least so far apart, in the same ascending order, as near to the wanted ones as a sweep brings them."""
+    heights: list[float] = []
+    for height in wanted:
+        heights.append(max(height, heights[-1] + apart) if heights else height)
+    beyond = heights[-1] - max(1.0, wanted[-1])
+    if beyond > 0.0:
+        heights[-1] -= beyond
+        for k in range(len(heights) - 2, -1, -1):
+            heights[k] = min(heights[k], heights[k + 1] - apart)
+    return heights
+
+
+def _short(record: dict[str, Any]) -> str:
+    answered = record["errors"]["answered"]
+    return record["name"] + (f" ({100 * answered:.0f} % answered)" if answered < 1.0 else "")
+
+
+def _legend(axes: Any, records: Sequence[dict[str, Any]]) -> None:
+    for kind in dict.fromkeys(record["kind"] for record in records):
+        axes.plot([], [], "-", lw=4, color=KINDS[kind], label=KIND_WORDS[kind])
+    for form in MARKERS:
+        if any(record["form"] == form for record in records):
+            released = form == "Predictor"
+            axes.plot([], [], MARKERS[form], color=RELEASED if released else GREY, label=_form_words(form), ms=7)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), fontsize=8, ncol=5, frameon=False)
+
+
+def _form_words(form: str) -> str:
+    return "released model (Predictor)" if form == "Predictor" else form
+
+
+def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Any:
+    """Root-mean-square errors of the released model over the film."""
+    figure = Figure(figsize=(11.5, 5.0), layout="constrained")
+    for axes, values, words in zip(
+        figure.subplots(1, 2),
+        (draws.position_mm, draws.force_percent),
+        ("position error, rms, mm", "relative force error, rms, %"),
+        strict=True,
+    ):
+        cells = axes.hexbin(
+            draws.truth[:, 0], draws.truth[:, 1], values, gridsize=22, reduce_C_function=rms, cmap="viridis", lw=0.1
+        )
+        axes.figure.colorbar(cells, ax=axes, shrink=0.85, label=words)
+        outline(axes, sensor, domain)
+        axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", title=words)
+    return figure
+
+
+def outline(axes: Any, sensor: Sensor, domain: Domain) -> None:
+    """Electrodes to scale, and the working area."""
+    reach = domain.radius_mm
+    for electrode in sensor.electrodes:
+        corners = 1e3 * sensor.calibration.place(np.array(electrode.corners))
+        axes.add_patch(Polygon(corners, fill=False, ec=INK, lw=1.4))
+        axes.annotate(electrode.name, corners.mean(axis=0), ha="center", va="center", color=INK, fontsize=9)
+        reach = max(reach, float(np.hypot(*corners.T).max()))
+    axes.add_patch(Circle((0, 0), domain.radius_mm, fill=False, ls=":", color=INK))
+    axes.set(xlim=(-reach - 0.7, reach + 0.7), ylim=(-reach - 0.7, reach + 0.7))
+
+
+def against_force(lines: dict[str, Any], released: str) -> Any:
+    """Position error of several methods, and the limits, against the force."""
+    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+    axes = figure.subplots()
+    colours = iter(LINES)
+    for name, values in lines["position_rms_mm"].items():
+        style: dict[str, Any] = {"lw": 1.4, "marker": ".", "color": None}
+        if name == "Bayes limit":
+            style = {"lw": 2.0, "color": INK}
+        elif name == "Cramér-Rao":
+            style = {"lw": 1.4, "ls": ":", "color": INK}
+        elif name == released:
+            style = {"lw": 2.0, "marker": "*", "ms": 9, "color": RELEASED}
+        else:
+            style["color"] = next(colours, GREY)
+        axes.plot(lines["force_N"], np.array(values, dtype=float), label=name, **style)
+    axes.set(xscale="log", yscale="log", xlabel="force, N", ylabel="position error, rms, mm")
+    _plain_ticks(axes)
+    axes.grid(alpha=0.25, which="both", lw=0.5)
+    axes.legend(fontsize=8)
+    return figure
+
+
+def _plain_ticks(axes: Any) -> None:
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        steps = [step * 10.0**power for power in range(-3, 4) for step in (1, 2, 5)]
+        axis.set_major_locator(FixedLocator([step for step in steps if low <= step <= high]))
+        axis.set_major_formatter(plain)
+        axis.set_minor_formatter(NullFormatter())
+
+
+def calibration(record: dict[str, Any]) -> Any:
+    """Coverage of the released model's intervals against their nominal level, and the difference of both."""
+    figure = Figure(figsize=(9.5, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    level = 100.0 * np.array(record["levels"])
+    for axes in (left, right):
+        axes.axhline(0.0, color=GREY, lw=1.0) if axes is right else axes.plot([0, 100], [0, 100], color=GREY, lw=1.0)
+    for name, colour in zip(COORDINATES, (LINES[0], LINES[1], RELEASED), strict=True):
+        covered = 100.0 * np.array(record["coverage"][name])
+        left.plot(level, covered, ".-", color=colour, label=name)
+        right.plot(level, covered - level, ".-", color=colour, label=name)
+    left.set(xlabel="nominal level, %", ylabel="truths inside, %", aspect="equal", xlim=(0, 100), ylim=(0, 100))
+    right.set(xlabel="nominal level, %", ylabel="inside minus nominal, percentage points", xlim=(0, 100))
+    reach = max(3.5, 1.15 * float(np.abs(right.get_ylim()).max()))
+    right.set_ylim(-reach, reach)
+    right.axhspan(-2.0, 2.0, color=GREY, alpha=0.15, lw=0)
+    left.legend()
+    for axes in (left, right):
+        axes.grid(alpha=0.25, lw=0.5)
+    return figure
+
+
+def noise_effect(cases: Sequence[dict[str, Any]], released: str) -> Any:
+    """Position error against the level of the noise."""
+    some = [case for case in cases if case["group"] == "noise"]
+    levels = [float(case["case"].removeprefix("x ")) for case in some]
+    lines = {name: [case["errors"][name]["position_rms_mm"] for case in some] for name in some[0]["errors"]}
+    figure = Figure(figsize=(8.0, 4.6), layout="constrained")
+    axes = figure.subplots()
+    _method_lines(axes, levels, lines, released)
+    axes.set(xscale="log", yscale="log", xlabel="noise over reference", ylabel="position error, rms, mm")
+    _plain_ticks(axes)
+    axes.grid(alpha=0.25, which="both", lw=0.5)
+    axes.legend(fontsize=8)
+    return figure
+
+
+def _method_lines(axes: Any, x: Sequence[float], lines: dict[str, list[float]], released: str) -> None:
+    colours = iter(LINES)
+    for name, values in lines.items():
+        mine = name == released
+        axes.plot(
+            x, values, marker="*" if mine else ".", ms=9 if mine else 5, lw=2.0 if mine else 1.3,
+            color=RELEASED if mine else next(colours, GREY), label=name,
+        )
+
+
+def wrong_world(cases: Sequence[dict[str, Any]], released: str, nominal: float | None) -> Any:
+    """Errors and alarms where the film, probe or chain is not as the models were told."""
+    some = [case for case in cases if case["group"] != "noise"]
+    figure = Figure(figsize=(11.5, 1.6 + 0.36 * len(some)), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1.0))
+    height = np.arange(len(some))[::-1]
+    _error_dots(left, some, height, released)
+    if nominal:
+        left.axvline(nominal, color=RELEASED, lw=0.9, ls="--")
+        left.annotate("as told", (nominal, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=8)
+    right.barh(height, [case["alarms_percent"] for case in some], color=RELEASED, alpha=0.8, height=0.6)
+    for y, case in zip(height, some, strict=True):
+        right.annotate(f"{case['alarms_percent']:g}", (case["alarms_percent"], y), xytext=(3, 0),
+                       textcoords="offset points", va="center", fontsize=8)
+    right.axvline(1.0, color=INK, lw=0.9, ls="--")
+    left.set(xlabel="position error, rms, mm", xscale="log", yticks=height,
+             yticklabels=[_case_words(case) for case in some], ylim=(-0.7, len(some) - 0.3))
+    right.set(xlabel="presses with an alarm from the misfit, %", xlim=(0, 112))
+    left.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    left.grid(alpha=0.25, lw=0.5)
+    left.legend(fontsize=8, loc="lower right")
+    return figure
+
+
+def _error_dots(axes: Any, cases: Sequence[dict[str, Any]], height: Array, released: str) -> None:
+    known = [(y, case["errors"]) for y, case in zip(height, cases, strict=True) if case["errors"]]
+    colours = iter(LINES)
+    for name in known[0][1]:
+        mine = name == released
+        axes.plot(
+            [errors[name]["position_rms_mm"] for _, errors in known], [y for y, _ in known],
+            "*" if mine else "o", ms=12 if mine else 5, color=RELEASED if mine else next(colours, GREY),
+            label=name, zorder=3 if mine else 2,
+        )
+
+
+def _case_words(case: dict[str, Any]) -> str:
+    return f"{case['group']}: {case['case']}" if case["group"] in ("probe", "pretension", "gain") else str(case["case"])
+
+
+def draw_all(folder: Path, stem: str, drawings: dict[str, Callable[[], Any]], progress: Callable[[str], None]) -> dict[str, list[str]]:
+    """Draw and write every picture; name to files."""
+    files = {}
+    for name, draw in drawings.items():
+        progress(f"drawing: {name}")
+        files[name] = save(draw(), folder / f"{stem}-{name}")
+    return files
