@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from isocharge.cli.report import report_command
 from isocharge.cli.terminal import progress, say, this_command
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing
@@ -14,11 +15,7 @@ if TYPE_CHECKING:
     from isocharge.train import Release
 
 train_app = typer.Typer(no_args_is_help=True, help="From a dataset to a model.")
-
-
-@train_app.callback()
-def train_group() -> None:
-    """Keeps `fit` a sub-command while it is the only one."""
+train_app.command("report")(report_command)
 
 
 @train_app.command("fit")

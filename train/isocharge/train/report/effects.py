@@ -11,8 +11,8 @@ from isocharge.simulate import parse_probe
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.noise import NoiseModel
 from isocharge.train.evaluate import noisy_charges
+from isocharge.train.report.bench import Bench, press_on
 from isocharge.train.report.measures import errors, rounded
-from isocharge.train.report.scene import Scene, press_on
 from isocharge.train.report.settings import Settings
 from isocharge.train.rivals import Fitted, GaussNewton, PolynomialRidge, ReleasedModel, Task
 from isocharge.train.split import Presses
@@ -39,7 +39,7 @@ ONE_NEWTON = (0.8, 1.25)
 """Forces that count as about 1 N."""
 
 NOISE_SEED = 515
-"""Of the noise on every case's charges, relative to the scene's."""
+"""Of the noise on every case's charges, relative to the bench's."""
 
 Progress = Callable[[str], None]
 
@@ -63,59 +63,61 @@ class Case:
     known: bool = True
 
 
-def cases(scene: Scene, clean: Presses, settings: Settings, progress: Progress) -> Iterator[Case]:
-    """Every case, from clean test presses of the scene."""
-    sweep = scene.sweep()
+def cases(bench: Bench, clean: Presses, settings: Settings, progress: Progress) -> Iterator[Case]:
+    """Every case, from clean test presses of the bench."""
+    sweep = bench.sweep()
 
     def noisy(presses: Presses) -> Array:
-        return noisy_charges(presses, scene.noise, scene.seed + NOISE_SEED)
+        return noisy_charges(presses, bench.noise, bench.seed + NOISE_SEED)
 
     for level in LEVELS:
-        yield Case("noise", f"x {level:g}", clean, _noisy(clean, scene, level))
+        yield Case("noise", f"x {level:g}", clean, _noisy(clean, bench, level))
     for notation in settings.shapes:
         progress(f"solving the film under {notation}")
-        presses = press_on(scene.films(probes=(parse_probe(notation),), accuracy=ROUGH), sweep)
+        presses = press_on(bench.films(probes=(parse_probe(notation),), accuracy=ROUGH), sweep)
         yield Case("probe", notation, presses, noisy(presses))
     progress("solving a film with more pretension")
-    film = scene.sensor.film
-    tauter = replace(scene.sensor, film=replace(film, pretension=film.pretension + PRETENSION_OFF))
-    presses = press_on(scene.films(sensor=tauter, accuracy=ROUGH), sweep)
+    film = bench.sensor.film
+    tauter = replace(bench.sensor, film=replace(film, pretension=film.pretension + PRETENSION_OFF))
+    presses = press_on(bench.films(sensor=tauter, accuracy=ROUGH), sweep)
     yield Case("pretension", f"+{1e-6 * PRETENSION_OFF:g} MPa", presses, noisy(presses))
-    yield from _wrong_gains(scene, clean, noisy(clean))
-    yield from _outside(scene, progress, noisy)
+    yield from _wrong_gains(bench, clean, noisy(clean))
+    yield from _outside(bench, progress, noisy)
 
 
-def _noisy(clean: Presses, scene: Scene, level: float) -> Array:
-    louder = NoiseModel(f"x {level:g}", level * scene.noise.white, level * scene.noise.gain)
-    return noisy_charges(clean, louder, scene.seed + NOISE_SEED)
+def _noisy(clean: Presses, bench: Bench, level: float) -> Array:
+    louder = NoiseModel(f"x {level:g}", level * bench.noise.white, level * bench.noise.gain)
+    return noisy_charges(clean, louder, bench.seed + NOISE_SEED)
 
 
-def _wrong_gains(scene: Scene, clean: Presses, noisy: Array) -> Iterator[Case]:
+def _wrong_gains(bench: Bench, clean: Presses, noisy: Array) -> Iterator[Case]:
     """Gains off by some 1 %, each sensor differently; one off by 20 %; one dead."""
-    rng = np.random.default_rng(scene.seed + NOISE_SEED)
+    rng = np.random.default_rng(bench.seed + NOISE_SEED)
     gains = 1.0 + GAIN_OFF * rng.standard_normal(noisy.shape)
     yield Case("gain", f"each off by {100 * GAIN_OFF:g} % rms", clean, gains * noisy)
-    for number, name in enumerate(scene.sensor.electrode_names):
+    for number, name in enumerate(bench.sensor.electrode_names):
         here = np.arange(noisy.shape[1]) == number
-        yield Case("gain", f"{name} off by {100 * GAIN_WRONG:g} %", clean, np.where(here, (1.0 + GAIN_WRONG) * noisy, noisy))
-    silence = 1e12 * scene.noise.white * rng.standard_normal(noisy.shape)
-    for number, name in enumerate(scene.sensor.electrode_names):
+        yield Case(
+            "gain", f"{name} off by {100 * GAIN_WRONG:g} %", clean, np.where(here, (1.0 + GAIN_WRONG) * noisy, noisy)
+        )
+    silence = 1e12 * bench.noise.white * rng.standard_normal(noisy.shape)
+    for number, name in enumerate(bench.sensor.electrode_names):
         here = np.arange(noisy.shape[1]) == number
         yield Case("dead electrode", f"{name} dead", clean, np.where(here, silence, noisy))
 
 
-def _outside(scene: Scene, progress: Progress, noisy: Callable[[Presses], Array]) -> Iterator[Case]:
+def _outside(bench: Bench, progress: Progress, noisy: Callable[[Presses], Array]) -> Iterator[Case]:
     """Presses beyond the working area, where the film is large enough."""
     progress("solving the film outside of the working area")
     try:
-        films = scene.films(further=OUTSIDE, accuracy=ROUGH)
+        films = bench.films(further=OUTSIDE, accuracy=ROUGH)
     except IsochargeError:
         return
-    low, high = scene.domain.force_range_N
-    presses = press_on(films, replace(scene.sweep(OUTSIDE), force_range=(low, high)))
-    beyond = np.hypot(*presses.contact[:, :2].T) > scene.domain.radius_mm
+    low, high = bench.domain.force_range_N
+    presses = press_on(films, replace(bench.sweep(OUTSIDE), force_range=(low, high)))
+    beyond = np.hypot(*presses.contact[:, :2].T) > bench.domain.radius_mm
     presses = presses[np.flatnonzero(beyond)]
-    reach = f"up to {(OUTSIDE - 1.0) * scene.domain.radius_mm:.2g} mm outside the working area"
+    reach = f"up to {(OUTSIDE - 1.0) * bench.domain.radius_mm:.2g} mm outside the working area"
     yield Case("elsewhere", reach, presses, noisy(presses), known=False)
 
 
@@ -143,19 +145,19 @@ def _measured(case: Case, released: ReleasedModel, rivals: list[Fitted], thresho
     }
 
 
-def threshold_of(released: ReleasedModel, clean: Presses, scene: Scene, draws: int) -> float:
+def threshold_of(released: ReleasedModel, clean: Presses, bench: Bench, draws: int) -> float:
     """The misfit that 1 % of good test presses exceed."""
-    seeds = range(scene.seed + NOISE_SEED + 1, scene.seed + NOISE_SEED + 1 + draws)
-    misfits = [released.answer(noisy_charges(clean, scene.noise, seed))[2] for seed in seeds]
+    seeds = range(bench.seed + NOISE_SEED + 1, bench.seed + NOISE_SEED + 1 + draws)
+    misfits = [released.answer(noisy_charges(clean, bench.noise, seed))[2] for seed in seeds]
     return float(np.percentile(np.concatenate(misfits), 100.0 - FALSE_ALARMS))
 
 
-def remaining(task: Task, scene: Scene, clean: Presses, progress: Progress) -> list[dict[str, Any]]:
+def remaining(task: Task, bench: Bench, clean: Presses, progress: Progress) -> list[dict[str, Any]]:
     """A known dead electrode: methods fitted anew to the charges that remain. Nothing for fewer than three of those."""
-    names = scene.sensor.electrode_names
+    names = bench.sensor.electrode_names
     if len(names) < 4:
         return []
-    noisy, records = noisy_charges(clean, scene.noise, scene.seed + NOISE_SEED), []
+    noisy, records = noisy_charges(clean, bench.noise, bench.seed + NOISE_SEED), []
     for number, name in enumerate(names):
         progress(f"fitting without electrode {name}")
         kept = np.arange(len(names)) != number

@@ -1,6 +1,7 @@
 """Where the errors are: over the film, over the force, in which corners worst, and whether the deviations are true."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -8,13 +9,13 @@ import numpy as np
 from isocharge.simulate.arrays import Array, Integers
 from isocharge.train.charge_field import Domain
 from isocharge.train.evaluate import noisy_charges, position_error
+from isocharge.train.report.bench import Bench
 from isocharge.train.report.measures import coverage, rms, rounded
-from isocharge.train.report.scene import Scene
 from isocharge.train.rivals import ReleasedModel
 from isocharge.train.split import Presses
 
 DRAW_SEED = 90_000
-"""Of the draws of the noise, relative to the scene's."""
+"""Of the draws of the noise, relative to the bench's."""
 
 RINGS, SECTORS, FORCES = 4, 12, 3
 """Cells that the worst regions are looked for in: rings of equal area, sectors, equal steps of log force."""
@@ -41,9 +42,9 @@ class Draws:
         std: Their standard deviations.
     """
 
-    def __init__(self, released: ReleasedModel, clean: Presses, scene: Scene, draws: int) -> None:
+    def __init__(self, released: ReleasedModel, clean: Presses, bench: Bench, draws: int) -> None:
         answers = [
-            released.answer(noisy_charges(clean, scene.noise, scene.seed + DRAW_SEED + draw))[:2]
+            released.answer(noisy_charges(clean, bench.noise, bench.seed + DRAW_SEED + draw))[:2]
             for draw in range(draws)
         ]
         self.truth = np.tile(clean.contact, (draws, 1))
@@ -79,7 +80,9 @@ def by_force(domain: Domain, truth: Array, found: dict[str, Array]) -> dict[str,
     return {"force_N": [rounded(value) for value in middle], "position_rms_mm": lines}
 
 
-def worst_regions(domain: Domain, draws: Draws, bayes: Array | None, contact: Array, truth: Array) -> list[dict[str, Any]]:
+def worst_regions(
+    domain: Domain, draws: Draws, bayes: Array | None, contact: Array, truth: Array
+) -> list[dict[str, Any]]:
     """The cells in which the released model errs most.
 
     Args:
@@ -98,7 +101,9 @@ def worst_regions(domain: Domain, draws: Draws, bayes: Array | None, contact: Ar
             **_cell_words(domain, int(k)),
             "position_rms_mm": rounded(rms(error[cell == k])),
             "force_rms_percent": rounded(rms(force[cell == k])),
-            "over_bayes": _over_bayes(bayes, contact, truth, few == k) if bayes is not None and few is not None else None,
+            "over_bayes": _over_bayes(bayes, contact, truth, few == k)
+            if bayes is not None and few is not None
+            else None,
         }
         for k in ranked
     ]
@@ -149,9 +154,9 @@ def _parts(domain: Domain, draws: Draws) -> Iterator[dict[str, Any]]:
     radii = domain.radius_mm * np.sqrt(np.arange(4) / 3)
     newtons = np.geomspace(*domain.force_range_N, 4)
     yield _part("everywhere", draws, np.full(force.size, True))
-    for low, high in zip(newtons[:-1], newtons[1:], strict=True):
+    for low, high in pairwise(newtons):
         yield _part(f"{low:.2g} to {high:.2g} N", draws, (force >= low) & (force <= high))
-    for low, high in zip(radii[:-1], radii[1:], strict=True):
+    for low, high in pairwise(radii):
         yield _part(f"{low:.1f} to {high:.1f} mm from the centre", draws, (distance >= low) & (distance <= high))
 
 

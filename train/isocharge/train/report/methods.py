@@ -10,8 +10,8 @@ import numpy as np
 from isocharge.simulate import Dataset, ForwardMap
 from isocharge.simulate.arrays import Array
 from isocharge.train.evaluate import noisy_charges
+from isocharge.train.report.bench import Bench
 from isocharge.train.report.measures import errors, pareto, rounded
-from isocharge.train.report.scene import Scene
 from isocharge.train.report.settings import Settings
 from isocharge.train.report.timing import latencies, throughputs
 from isocharge.train.rivals import (
@@ -40,7 +40,7 @@ TIMED = 64
 """Presses that single predictions go through in turn."""
 
 TEST_NOISE = 4242
-"""Seed of the noise on the test presses, relative to the scene's."""
+"""Seed of the noise on the test presses, relative to the bench's."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +88,15 @@ class Test:
     charge_pC: Array
 
     @classmethod
-    def of(cls, scene: Scene, presses: Presses) -> "Test":
-        """With one draw of the scene's noise."""
-        return cls(presses, noisy_charges(presses, scene.noise, scene.seed + TEST_NOISE))
+    def of(cls, bench: Bench, presses: Presses) -> "Test":
+        """With one draw of the bench's noise."""
+        return cls(presses, noisy_charges(presses, bench.noise, bench.seed + TEST_NOISE))
 
 
-def task_of(dataset: Dataset, scene: Scene, settings: Settings) -> Task:
+def task_of(dataset: Dataset, bench: Bench, settings: Settings) -> Task:
     """What the methods are fitted for."""
     train, validation = split_by_position(dataset, settings.hold_out, settings.seed)
-    return Task(train, validation, scene.domain, scene.noise, settings.seed, quick=settings.quick)
+    return Task(train, validation, bench.domain, bench.noise, settings.seed, quick=settings.quick)
 
 
 def roster(dataset: Dataset, film: ForwardMap, settings: Settings) -> list[tuple[str, Estimator]]:

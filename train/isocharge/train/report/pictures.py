@@ -11,7 +11,7 @@ from matplotlib.patches import Circle, Polygon
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
 from isocharge.simulate import Sensor
-from isocharge.simulate.arrays import Array
+from isocharge.simulate.arrays import Integers
 from isocharge.train.charge_field import Domain
 from isocharge.train.report.maps import COORDINATES, Draws
 from isocharge.train.report.measures import rms
@@ -61,7 +61,9 @@ AXES = {
 }
 
 
-def speed(records: Sequence[dict[str, Any]], plot: str, limit_mm: float | None, cramer_rao_mm: float | None, batch: int) -> Any:
+def speed(
+    records: Sequence[dict[str, Any]], plot: str, limit_mm: float | None, cramer_rao_mm: float | None, batch: int
+) -> Any:
     """Position error against latency, throughput or memory, one point for each method and form."""
     key, words, _ = AXES[plot]
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
@@ -73,8 +75,14 @@ def speed(records: Sequence[dict[str, Any]], plot: str, limit_mm: float | None, 
         if value:
             axes.axhline(value, color=INK, lw=1.3, ls=style, zorder=1)
             axes.annotate(
-                f"{name}, {value:.3f} mm", (0.005, value), xycoords=("axes fraction", "data"), fontsize=8,
-                va="top", xytext=(2, -3), textcoords="offset points", color=INK,
+                f"{name}, {value:.3f} mm",
+                (0.005, value),
+                xycoords=("axes fraction", "data"),
+                fontsize=8,
+                va="top",
+                xytext=(2, -3),
+                textcoords="offset points",
+                color=INK,
             )
     axes.set(xscale="log", yscale="log", xlabel=words.format(batch=batch), ylabel="position error, rms, mm")
     _error_ticks(axes, shown, limit_mm)
@@ -97,8 +105,13 @@ def _points(axes: Any, records: Sequence[dict[str, Any]], key: str) -> None:
         colour = RELEASED if released else KINDS[record["kind"]]
         hollow = record["force_given"] or record["errors"]["answered"] < 1.0
         axes.plot(
-            record[key], record["errors"]["position_rms_mm"], MARKERS.get(record["form"], "o"), color=colour,
-            mfc="white" if hollow else colour, ms=17 if released else 7, mec="white" if released else colour,
+            record[key],
+            record["errors"]["position_rms_mm"],
+            MARKERS.get(record["form"], "o"),
+            color=colour,
+            mfc="white" if hollow else colour,
+            ms=17 if released else 7,
+            mec="white" if released else colour,
             zorder=5 if released else 3,
         )
 
@@ -107,14 +120,47 @@ def _front(axes: Any, records: Sequence[dict[str, Any]], key: str, plot: str) ->
     front = sorted((r[key], r["errors"]["position_rms_mm"]) for r in records if plot in r["best_on"])
     if len(front) > 1:
         style = "steps-post" if plot != "throughput" else "steps-pre"
-        axes.plot(*np.array(front).T, color=INK, lw=1.0, ls="--", drawstyle=style, alpha=0.7, zorder=1, label="front")
+        axes.plot(
+            *np.array(front).T,
+            color=INK,
+            lw=1.0,
+            ls="--",
+            drawstyle=style,
+            alpha=0.7,
+            zorder=1,
+            label="nothing beats these",
+        )
 
 
 def _error_ticks(axes: Any, records: Sequence[dict[str, Any]], limit: float | None) -> None:
     errors = [record["errors"]["position_rms_mm"] for record in records] + ([limit] if limit else [])
     low, high = 0.93 * min(errors), 1.12 * max(errors)
     axes.set_ylim(low, high)
-    steps = [0.05, 0.06, 0.07, 0.08, 0.1, 0.12, 0.15, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.8, 1, 1.5, 2, 3, 4, 6, 8, 10]
+    steps = [
+        0.05,
+        0.06,
+        0.07,
+        0.08,
+        0.1,
+        0.12,
+        0.15,
+        0.17,
+        0.2,
+        0.25,
+        0.3,
+        0.4,
+        0.5,
+        0.6,
+        0.8,
+        1,
+        1.5,
+        2,
+        3,
+        4,
+        6,
+        8,
+        10,
+    ]
     axes.yaxis.set_major_locator(FixedLocator([step for step in steps if low <= step <= high]))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
@@ -135,8 +181,14 @@ def _name_methods(axes: Any, records: Sequence[dict[str, Any]], key: str) -> Non
         record = ends[name]
         colour = RELEASED if record["form"] == "Predictor" else KINDS[record["kind"]]
         axes.annotate(
-            _short(record), (record[key], record["errors"]["position_rms_mm"]), xytext=(1.025, height),
-            textcoords="axes fraction", fontsize=9, va="center", color=colour, annotation_clip=False,
+            _short(record),
+            (record[key], record["errors"]["position_rms_mm"]),
+            xytext=(1.025, height),
+            textcoords="axes fraction",
+            fontsize=9,
+            va="center",
+            color=colour,
+            annotation_clip=False,
             arrowprops={"arrowstyle": "-", "color": colour, "lw": 0.5, "alpha": 0.45, "shrinkA": 1, "shrinkB": 4},
         )
 
@@ -156,7 +208,7 @@ def spread(wanted: Sequence[float], apart: float) -> list[float]:
 
 def _short(record: dict[str, Any]) -> str:
     answered = record["errors"]["answered"]
-    return record["name"] + (f" ({100 * answered:.0f} % answered)" if answered < 1.0 else "")
+    return str(record["name"]) + (f" ({100 * answered:.0f} % answered)" if answered < 1.0 else "")
 
 
 def _legend(axes: Any, records: Sequence[dict[str, Any]]) -> None:
@@ -164,9 +216,9 @@ def _legend(axes: Any, records: Sequence[dict[str, Any]]) -> None:
         axes.plot([], [], "-", lw=4, color=KINDS[kind], label=KIND_WORDS[kind])
     for form in MARKERS:
         if any(record["form"] == form for record in records):
-            released = form == "Predictor"
-            axes.plot([], [], MARKERS[form], color=RELEASED if released else GREY, label=_form_words(form), ms=7)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), fontsize=8, ncol=5, frameon=False)
+            colour = RELEASED if form == "Predictor" else GREY
+            axes.plot([], [], MARKERS[form], color=colour, label=_form_words(form), ms=7)
+    axes.figure.legend(loc="outside lower center", fontsize=8, ncol=5, frameon=False)
 
 
 def _form_words(form: str) -> str:
@@ -277,9 +329,18 @@ def _method_lines(axes: Any, x: Sequence[float], lines: dict[str, list[float]], 
     for name, values in lines.items():
         mine = name == released
         axes.plot(
-            x, values, marker="*" if mine else ".", ms=9 if mine else 5, lw=2.0 if mine else 1.3,
-            color=RELEASED if mine else next(colours, GREY), label=name,
+            x,
+            values,
+            marker="*" if mine else ".",
+            ms=9 if mine else 5,
+            lw=2.0 if mine else 1.3,
+            color=RELEASED if mine else next(colours, GREY),
+            label=name,
         )
+
+
+FARTHEST_MM = 50.0
+"""Errors beyond this, from methods that explode outside of what they know, are drawn here."""
 
 
 def wrong_world(cases: Sequence[dict[str, Any]], released: str, nominal: float | None) -> Any:
@@ -291,14 +352,27 @@ def wrong_world(cases: Sequence[dict[str, Any]], released: str, nominal: float |
     _error_dots(left, some, height, released)
     if nominal:
         left.axvline(nominal, color=RELEASED, lw=0.9, ls="--")
-        left.annotate("as told", (nominal, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=8)
+        left.annotate(
+            "as told", (nominal, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=8
+        )
     right.barh(height, [case["alarms_percent"] for case in some], color=RELEASED, alpha=0.8, height=0.6)
     for y, case in zip(height, some, strict=True):
-        right.annotate(f"{case['alarms_percent']:g}", (case["alarms_percent"], y), xytext=(3, 0),
-                       textcoords="offset points", va="center", fontsize=8)
+        right.annotate(
+            f"{case['alarms_percent']:g}",
+            (case["alarms_percent"], y),
+            xytext=(3, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+        )
     right.axvline(1.0, color=INK, lw=0.9, ls="--")
-    left.set(xlabel="position error, rms, mm", xscale="log", yticks=height,
-             yticklabels=[_case_words(case) for case in some], ylim=(-0.7, len(some) - 0.3))
+    left.set(
+        xlabel="position error, rms, mm",
+        xscale="log",
+        yticks=height,
+        yticklabels=[_case_words(case) for case in some],
+        ylim=(-0.7, len(some) - 0.3),
+    )
     right.set(xlabel="presses with an alarm from the misfit, %", xlim=(0, 112))
     left.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     left.grid(alpha=0.25, lw=0.5)
@@ -306,15 +380,19 @@ def wrong_world(cases: Sequence[dict[str, Any]], released: str, nominal: float |
     return figure
 
 
-def _error_dots(axes: Any, cases: Sequence[dict[str, Any]], height: Array, released: str) -> None:
+def _error_dots(axes: Any, cases: Sequence[dict[str, Any]], height: Integers, released: str) -> None:
     known = [(y, case["errors"]) for y, case in zip(height, cases, strict=True) if case["errors"]]
     colours = iter(LINES)
     for name in known[0][1]:
         mine = name == released
         axes.plot(
-            [errors[name]["position_rms_mm"] for _, errors in known], [y for y, _ in known],
-            "*" if mine else "o", ms=12 if mine else 5, color=RELEASED if mine else next(colours, GREY),
-            label=name, zorder=3 if mine else 2,
+            [min(errors[name]["position_rms_mm"], FARTHEST_MM) for _, errors in known],
+            [y for y, _ in known],
+            "*" if mine else "o",
+            ms=12 if mine else 5,
+            color=RELEASED if mine else next(colours, GREY),
+            label=name,
+            zorder=3 if mine else 2,
         )
 
 
@@ -322,7 +400,9 @@ def _case_words(case: dict[str, Any]) -> str:
     return f"{case['group']}: {case['case']}" if case["group"] in ("probe", "pretension", "gain") else str(case["case"])
 
 
-def draw_all(folder: Path, stem: str, drawings: dict[str, Callable[[], Any]], progress: Callable[[str], None]) -> dict[str, list[str]]:
+def draw_all(
+    folder: Path, stem: str, drawings: dict[str, Callable[[], Any]], progress: Callable[[str], None]
+) -> dict[str, list[str]]:
     """Draw and write every picture; name to files."""
     files = {}
     for name, draw in drawings.items():

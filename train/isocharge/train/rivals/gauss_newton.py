@@ -1,11 +1,13 @@
 """Gauss-Newton on an interpolated forward map: the contact whose charges fit best, maximum a posteriori.
 
-The forward map is the Chebyshev series of `ChargeField`, fitted to clean training presses. The residuals are
-(Q - Q(c)) / sigma(Q) and, for the prior, uniform over the disk and the range of log force, the distance beyond its edge
-over a small width. Levenberg damping makes every step an improvement; the start is the nearest of a few presses, and
-the next nearest where that led to charges that do not fit.
+The forward map is the Chebyshev series of `ChargeField`, fitted to clean training presses; the residuals are
+(Q - Q(c)) / sigma(Q). The prior, uniform over the disk and the range of log force, is a constraint: where a step leaves
+it, the linear problem is solved once more with the step's end held to the edge's tangent, and the end is projected.
+Levenberg damping makes every step an improvement. The start is the nearest of a few presses, and the next nearest where
+that led to charges that do not fit.
 
-The SciPy form hands the same residuals to `scipy.optimize.least_squares`, press by press.
+The SciPy form hands the same residuals to `scipy.optimize.least_squares` in polar coordinates, where the disk is a box,
+press by press.
 """
 
 from collections.abc import Callable
@@ -24,17 +26,17 @@ from isocharge.train.rivals.features import LogFeatures
 
 NAME = "Gauss-Newton"
 
-WALL = 0.003
-"""Width of the prior's edge in unit coordinates."""
-
-BEYOND = 1.0 + 3.0 * WALL
-"""Trial steps are brought back to here: further out the series means nothing."""
+STIFF = 1e6
+"""Weight of the edge's tangent over that of the charges."""
 
 STARTS = 600
 """Presses that a start is chosen from."""
 
 TOLERANCE = 1e-5
 """Step in unit coordinates at which a press is done: 0.1 um or 1e-5 of the force."""
+
+ROUNDING = 1e-9
+"""A sum of squares that grows by less has not grown."""
 
 MOST_STEPS = 30
 """Steps after which a press is done anyway."""
@@ -82,7 +84,7 @@ class Problem:
         """Charges and their derivatives by the unit coordinates.
 
         Args:
-            unit: Shape (3,) or (n, 3).
+            unit: Shape (3,) or (n, 3), within the domain.
 
         Returns:
             Shape (..., n_electrode), pC, and (..., 3, n_electrode).
@@ -103,39 +105,52 @@ class Problem:
         return values
 
     def residuals(self, unit: Array, charge_pC: Array, sigma_pC: Array) -> tuple[Array, Array]:
-        """Residuals, shape (..., n_electrode + 2), and their derivatives, shape (..., 3, n_electrode + 2)."""
+        """Residuals, shape (..., n_electrode), and their derivatives, shape (..., 3, n_electrode)."""
         known, slopes = self.known(unit)
-        beyond, outward = _wall(unit)
-        residual = np.concatenate([(known - charge_pC) / sigma_pC, beyond], axis=-1)
-        return residual, np.concatenate([slopes / sigma_pC[..., None, :], outward], axis=-1)
+        return (known - charge_pC) / sigma_pC, slopes / sigma_pC[..., None, :]
 
 
-def _wall(unit: Array) -> tuple[Array, Array]:
-    """How far a contact lies beyond the prior's edge, over its width, (..., 2), and the derivatives, (..., 3, 2)."""
-    radius = np.sqrt(unit[..., 0] ** 2 + unit[..., 1] ** 2)
-    size = np.stack([radius, np.abs(unit[..., 2])], axis=-1)
-    out = size > 1.0
-    outward = np.zeros((*unit.shape, 2))
-    outward[..., :2, 0] = unit[..., :2] * (out[..., 0] / np.maximum(radius, 1.0))[..., None] / WALL
-    outward[..., 2, 1] = np.sign(unit[..., 2]) * out[..., 1] / WALL
-    return np.maximum(size - 1.0, 0.0) / WALL, outward
-
-
-def _held(unit: Array) -> Array:
-    """Contacts brought back to where the series still means something."""
+def within(unit: Array) -> Array:
+    """The nearest contacts in the domain."""
     held = unit.copy()
     radius = np.sqrt(unit[..., 0] ** 2 + unit[..., 1] ** 2)
-    held[..., :2] *= (BEYOND / np.maximum(radius, BEYOND))[..., None]
-    held[..., 2] = np.minimum(np.maximum(unit[..., 2], -BEYOND), BEYOND)
+    held[..., :2] /= np.maximum(radius, 1.0)[..., None]
+    held[..., 2] = np.minimum(np.maximum(unit[..., 2], -1.0), 1.0)
     return held
 
 
-def damped_step(residual: Array, slopes: Array, damping: Array | float) -> Array:
-    """Levenberg-Marquardt step (Marquardt 1963), shape (..., 3)."""
-    square = slopes @ slopes.swapaxes(-1, -2)
-    normal = square + square * (np.asarray(damping)[..., None, None] * np.eye(3))
-    step: Array = -np.linalg.solve(normal, slopes @ residual[..., None])[..., 0]
-    return step
+def damped_step(unit: Array, residual: Array, slopes: Array, damping: Array) -> Array:
+    """Where a Levenberg-Marquardt step (Marquardt 1963) ends, kept in the domain.
+
+    Args:
+        unit: Where it begins, shape (..., 3).
+        residual: There, shape (..., n_electrode).
+        slopes: Derivatives, shape (..., 3, n_electrode).
+        damping: Relative to the diagonal, shape (...).
+    """
+    normal: Array = slopes @ slopes.swapaxes(-1, -2)
+    normal = normal * (1.0 + damping[..., None, None] * np.eye(3))
+    gradient = slopes @ residual[..., None]
+    end: Array = unit + np.linalg.solve(normal, -gradient)[..., 0]
+    outside = (end[..., 0] ** 2 + end[..., 1] ** 2 > 1.0) | (np.abs(end[..., 2]) > 1.0)
+    if not outside.any():
+        return end
+    tangents, gap = _tangents(end, unit)
+    stiff = STIFF / 3.0 * np.trace(normal, axis1=-2, axis2=-1)[..., None, None]
+    normal = normal + stiff * (tangents.swapaxes(-1, -2) @ tangents)
+    gradient = gradient + stiff * (tangents.swapaxes(-1, -2) @ gap[..., None])
+    held: Array = unit + np.linalg.solve(normal, -gradient)[..., 0]
+    return within(np.where(outside[..., None], held, end))
+
+
+def _tangents(end: Array, unit: Array) -> tuple[Array, Array]:
+    """Outward normals of the edges that a step's end lies beyond, (..., 2, 3), and how far beyond them `unit` is."""
+    radius = np.sqrt(end[..., 0] ** 2 + end[..., 1] ** 2)
+    tangents = np.zeros((*end.shape[:-1], 2, 3))
+    tangents[..., 0, :2] = end[..., :2] * ((radius > 1.0) / np.maximum(radius, 1.0))[..., None]
+    tangents[..., 1, 2] = np.sign(end[..., 2]) * (np.abs(end[..., 2]) > 1.0)
+    there = (tangents != 0.0).any(axis=-1)
+    return tangents, (tangents @ unit[..., None])[..., 0] - there
 
 
 @dataclass(frozen=True)
@@ -194,7 +209,7 @@ class _GaussNewton(Fitted):
 
 @dataclass(frozen=True)
 class ScipyGaussNewton(_GaussNewton):
-    """scipy.optimize.least_squares, MINPACK's Levenberg-Marquardt."""
+    """scipy.optimize.least_squares, its trust-region method for bounded variables."""
 
     form: str = "SciPy least_squares"
 
@@ -209,15 +224,26 @@ class ScipyGaussNewton(_GaussNewton):
             best = solution if best is None or solution.cost < best.cost else best
             if 2.0 * best.cost <= DOUBTFUL:
                 break
-        return _held(np.asarray(best.x))
+        radius, angle, log_force = best.x
+        return np.array([radius * np.cos(angle), radius * np.sin(angle), log_force])
 
     def _descend(self, charge: Array, start: Array) -> Any:
         sigma = self.problem.sigma(charge)
+
+        def cartesian(polar: Array) -> Array:
+            return np.array([polar[0] * np.cos(polar[1]), polar[0] * np.sin(polar[1]), polar[2]])
+
+        def slopes(polar: Array) -> Array:
+            sine, cosine = np.sin(polar[1]), np.cos(polar[1])
+            turn = np.array([[cosine, sine, 0.0], [-polar[0] * sine, polar[0] * cosine, 0.0], [0.0, 0.0, 1.0]])
+            return (turn @ self.problem.residuals(cartesian(polar), charge, sigma)[1]).T
+
         return least_squares(
-            lambda unit: self.problem.residuals(_held(unit), charge, sigma)[0],
-            start,
-            lambda unit: self.problem.residuals(_held(unit), charge, sigma)[1].T,
-            method="lm",
+            lambda polar: self.problem.residuals(cartesian(polar), charge, sigma)[0],
+            [np.hypot(start[0], start[1]), np.arctan2(start[1], start[0]), start[2]],
+            slopes,
+            bounds=([0.0, -np.inf, -1.0], [1.0, np.inf, 1.0]),
+            x_scale="jac",
             xtol=TOLERANCE,
         )
 
@@ -248,19 +274,21 @@ class NumpyGaussNewton(_GaussNewton):
         """Contacts (n, 3) and sums of squared residuals (n,) from a start."""
         sigma = self.problem.sigma(charge)
         residual, slopes = self.problem.residuals(unit, charge, sigma)
-        damping, todo = np.full(len(unit), 1e-3), np.arange(len(unit))
+        cost, damping, todo = (residual**2).sum(axis=1), np.full(len(unit), 1e-3), np.arange(len(unit))
         for _ in range(MOST_STEPS):
-            step = damped_step(residual[todo], slopes[todo], damping[todo])
-            trial = _held(unit[todo] + step)
+            trial = damped_step(unit[todo], residual[todo], slopes[todo], damping[todo])
             new_residual, new_slopes = self.problem.residuals(trial, charge[todo], sigma[todo])
-            better = (new_residual**2).sum(axis=1) <= (residual[todo] ** 2).sum(axis=1)
+            new_cost, far = (new_residual**2).sum(axis=1), np.abs(trial - unit[todo]).max(axis=1) > TOLERANCE
+            better = new_cost <= cost[todo]
+            going = far | (new_cost - cost[todo] > ROUNDING)
             taken = todo[better]
             unit[taken], residual[taken], slopes[taken] = trial[better], new_residual[better], new_slopes[better]
+            cost[taken] = new_cost[better]
             damping[todo] *= np.where(better, 0.1, 10.0)
-            todo = todo[np.abs(step).max(axis=1) > TOLERANCE]
+            todo = todo[going]
             if not todo.size:
                 break
-        return unit, (residual**2).sum(axis=1)
+        return unit, cost
 
     def one(self, charge_pC: Array) -> Callable[[], object]:
         """See `Fitted.one`."""
@@ -279,18 +307,17 @@ class NumpyGaussNewton(_GaussNewton):
 
     def _descend_one(self, charge: Array, unit: Array) -> tuple[Array, float]:
         """As `_descend`, without a batch's bookkeeping."""
-        sigma, damping = self.problem.sigma(charge), 1e-3
+        sigma, damping = self.problem.sigma(charge), np.array(1e-3)
         residual, slopes = self.problem.residuals(unit, charge, sigma)
         cost = float(residual @ residual)
         for _ in range(MOST_STEPS):
-            step = damped_step(residual, slopes, damping)
-            trial = _held(unit + step)
+            trial = damped_step(unit, residual, slopes, damping)
             new_residual, new_slopes = self.problem.residuals(trial, charge, sigma)
-            new_cost = float(new_residual @ new_residual)
-            better = new_cost <= cost
+            new_cost, far = float(new_residual @ new_residual), np.abs(trial - unit).max() > TOLERANCE
+            better, going = new_cost <= cost, far or new_cost - cost > ROUNDING
             if better:
                 unit, residual, slopes, cost = trial, new_residual, new_slopes, new_cost
-            damping *= 0.1 if better else 10.0
-            if np.abs(step).max() <= TOLERANCE:
+            damping = damping * (0.1 if better else 10.0)
+            if not going:
                 break
         return unit, cost

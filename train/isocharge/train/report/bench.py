@@ -1,4 +1,4 @@
-"""The presses that every method is measured on, and the same presses where the film is not as it was thought to be.
+"""The presses that every method is measured on.
 
 Test charges come from solves that training never saw: the forward map of the test reaches a little further than the
 dataset's, so that its distances and forces, hence all its solves, are others.
@@ -19,8 +19,9 @@ from isocharge.train.split import Presses, domain_of
 FURTHER = 1.03
 """How much further than the dataset the test's solves reach, in distance and force."""
 
+
 @dataclass(frozen=True)
-class Scene:
+class Bench:
     """What a dataset is about.
 
     Attributes:
@@ -42,7 +43,7 @@ class Scene:
     presses: int
 
     @classmethod
-    def of(cls, dataset: Dataset, presses: int, seed: int, noise: str = "reference") -> "Scene":
+    def of(cls, dataset: Dataset, presses: int, seed: int, noise: str = "reference") -> "Bench":
         """From a dataset's columns and manifest.
 
         Raises:
