@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 from isocharge.errors import MissingExtra
 
-SIMULATE = frozenset({"scipy", "threadpoolctl", "matplotlib"})
+SIMULATE = frozenset({"scipy", "threadpoolctl", "matplotlib", "contourpy"})
 HTTP = frozenset({"uvicorn", "uvloop", "httptools", "orjson", "markdown_it"})
 PACKAGES = {
     "simulate": SIMULATE,

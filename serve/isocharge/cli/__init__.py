@@ -9,6 +9,7 @@ import sys
 
 import typer
 
+from isocharge.cli.curves import contours_command, curves_command
 from isocharge.cli.demo import demo_command
 from isocharge.cli.serve import serve_app
 from isocharge.cli.simulate import simulate_app
@@ -22,6 +23,8 @@ app = typer.Typer(
     help="Where a piezoelectric tactile film is touched and how hard, from three or four charges.",
 )
 app.command("demo")(demo_command)
+simulate_app.command("curves")(curves_command)
+simulate_app.command("contours")(contours_command)
 app.add_typer(simulate_app, name="simulate")
 app.add_typer(train_app, name="train")
 app.add_typer(serve_app, name="serve")

@@ -6,18 +6,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disk
-from matplotlib.patches import Polygon
 
 from isocharge.simulate.arrays import Array
+from isocharge.simulate.drawing import (
+    FELT,
+    INK,
+    PRESSED,
+    draw_charge_map,
+    draw_electrodes,
+    draw_working_area,
+    frame_film,
+    new_figure,
+)
 
 if TYPE_CHECKING:
-    from isocharge.simulate import Equilibrium, ForwardMap, Sensor
-
-INK, PRESSED, FELT = "#1b2a41", "#9aa5b1", "#d1495b"
-"""Colours of outlines, of what was pressed and of what was felt."""
+    from isocharge.simulate import Equilibrium, ForwardMap
 
 
 @dataclass(frozen=True)
@@ -46,8 +50,7 @@ class Page:
 def draw_page(page: Page, path: Path) -> None:
     """Draw the page and write it as PNG."""
     electrodes = page.film.sensor.electrodes
-    figure = Figure(figsize=(15.0, 9.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(15.0, 9.2)
     top, bottom = cast(np.ndarray, figure.subfigures(2, 1))
     _deflected_film(top, page)
     maps = bottom.subplots(1, len(electrodes) + 1, width_ratios=(*(1.0,) * len(electrodes), 1.25))
@@ -72,7 +75,7 @@ def _film_from_above(axes: Any, page: Page) -> None:
     w = page.equilibrium.deflection(1e-3 * np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape) * 1e3
     shades = axes.contourf(x, y, w, levels=24, cmap="viridis_r")
     axes.figure.colorbar(shades, ax=axes, shrink=0.8, label="deflection, mm")
-    _outlines(axes, page.film.sensor, names=False)
+    draw_electrodes(axes, page.film.sensor, names=False)
     axes.add_patch(Disk((0, 0), 1e3 * film.radius, fill=False, color=INK))
     axes.set(title=f"the film under {page.equilibrium.force:g} N", xlabel="x, mm", ylabel="y, mm", aspect="equal")
 
@@ -105,27 +108,18 @@ def _path(axes: Any, page: Page) -> None:
     axes.plot([], [], color=PRESSED, lw=3.0, label="pressed")
     axes.plot([], [], color=FELT, lw=0.7, label="felt")
     axes.legend(loc="upper right")
-    _outlines(axes, page.film.sensor)
-    _working_area(axes, page.film)
-    axes.set(title="live path, through the port", xlabel="x, mm", ylabel="y, mm", aspect="equal")
+    draw_electrodes(axes, page.film.sensor)
+    draw_working_area(axes, page.film.radius)
+    frame_film(axes, page.film.sensor, page.film.radius, "live path, through the port")
 
 
-def _isocharge_maps(all_axes: Sequence[Any], film: "ForwardMap", force: float = 1.0, count: int = 81) -> None:
+def _isocharge_maps(all_axes: Sequence[Any], film: "ForwardMap", force: float = 1.0) -> None:
     """Contours of each electrode's charge over the position of a press."""
-    radius = film.radius * np.sqrt(np.linspace(0.0, 1.0, count // 2))
-    angle = np.linspace(0.0, 2.0 * np.pi, count)
-    x, y = np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))
-    charge = 1e12 * film.forward(x.ravel(), y.ravel(), np.full(x.size, force))
     for number, (axes, name) in enumerate(zip(all_axes, film.sensor.electrode_names, strict=True)):
-        values = charge[:, number].reshape(x.shape)
-        axes.contourf(1e3 * x, 1e3 * y, values, levels=30, cmap="YlGnBu")
-        lines = axes.contour(1e3 * x, 1e3 * y, values, levels=12, colors=INK, linewidths=0.8)
-        axes.clabel(lines, fmt="%.0f", fontsize=7)
-        _outlines(axes, film.sensor, highlight=name)
-        _working_area(axes, film)
-        axes.set(
-            title=f"isocharge contours of {name} at {force:g} N, pC", xlabel="x, mm", ylabel="y, mm", aspect="equal"
-        )
+        draw_charge_map(axes, film, number, force)
+        draw_electrodes(axes, film.sensor, highlight=name)
+        draw_working_area(axes, film.radius)
+        frame_film(axes, film.sensor, film.radius, f"isocharge contours of {name} at {force:g} N, pC")
 
 
 def _error_against_force(axes: Any, page: Page) -> None:
@@ -141,18 +135,3 @@ def _error_against_force(axes: Any, page: Page) -> None:
     axes.set(title="position error of presses never seen", xlabel="force, N", ylabel="error, mm")
     axes.set_ylim(bottom=2e-3)
     axes.grid(alpha=0.3, which="both")
-
-
-def _outlines(axes: Any, sensor: "Sensor", highlight: str = "", names: bool = True) -> None:
-    for electrode in sensor.electrodes:
-        corners = 1e3 * sensor.calibration.place(np.array(electrode.corners))
-        colour = FELT if electrode.name == highlight else INK
-        axes.add_patch(Polygon(corners, fill=False, ec=colour, lw=1.6))
-        if names:
-            axes.annotate(electrode.name, corners.mean(axis=0), ha="center", va="center", color=colour, fontsize=9)
-
-
-def _working_area(axes: Any, film: "ForwardMap") -> None:
-    axes.add_patch(Disk((0, 0), 1e3 * film.radius, fill=False, ls=":", color=INK))
-    reach = 1e3 * max(film.radius, *(np.hypot(*corner) for e in film.sensor.electrodes for corner in e.corners)) + 0.7
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach))

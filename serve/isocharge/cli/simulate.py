@@ -74,7 +74,7 @@ def point_command(
     film_sensor, pressing = load_sensor(sensor), parse_probe(probe)
     terms = named(theory, film_sensor.film) if theory != "auto" else None
     terms = terms or theory_for(film_sensor, pressing, (force, force), accuracy)
-    equilibrium = press(film_sensor.film, pressing, _position(at), force, theory=terms, accuracy=accuracy)
+    equilibrium = press(film_sensor.film, pressing, position(at), force, theory=terms, accuracy=accuracy)
     charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
     report = _report(film_sensor, equilibrium, charge)
     typer.echo(json_module.dumps(report) if json else _table(report))
@@ -90,7 +90,7 @@ def _doubts(equilibrium: "Equilibrium", accuracy: float) -> list[str]:
     return [f"the charges may be off by {error:.2g}, {accuracy:.2g} was wanted"] if error > accuracy else []
 
 
-def _position(text: str) -> tuple[float, float]:
+def position(text: str) -> tuple[float, float]:
     try:
         x, y = (float(part) * 1e-3 for part in text.split(","))
     except ValueError as error:

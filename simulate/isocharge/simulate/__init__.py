@@ -12,7 +12,10 @@ from isocharge.extras import require
 with require("simulate"):
     from isocharge.simulate.amplifier import Amplifier, Measurement, load_amplifier
     from isocharge.simulate.charge import contact_charge, pretension_charge, thermal_charge, touch_charge
+    from isocharge.simulate.contours import Contour, ContourField
+    from isocharge.simulate.curves import Curves, Mapping
     from isocharge.simulate.dataset import Dataset, Samples, read_dataset, write_dataset
+    from isocharge.simulate.drawn import DrawnContour, DrawnTriangulation, draw_contour
     from isocharge.simulate.equilibrium import Equilibrium
     from isocharge.simulate.forward import ForwardMap
     from isocharge.simulate.noise import NoiseModel, noise_model
@@ -29,12 +32,18 @@ __all__ = [
     "Amplifier",
     "Calibration",
     "Circle",
+    "Contour",
+    "ContourField",
+    "Curves",
     "Dataset",
+    "DrawnContour",
+    "DrawnTriangulation",
     "Electrode",
     "Equilibrium",
     "Film",
     "Fix",
     "ForwardMap",
+    "Mapping",
     "Measurement",
     "Meeting",
     "NoiseModel",
@@ -49,6 +58,7 @@ __all__ = [
     "Triangulation",
     "built_in_sensors",
     "contact_charge",
+    "draw_contour",
     "load_amplifier",
     "load_sensor",
     "noise_model",

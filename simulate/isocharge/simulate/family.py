@@ -35,13 +35,20 @@ class Family:
     folds: int
 
     @classmethod
-    def spread(cls, radius: float, force_range: tuple[float, float], count: tuple[int, int], period: float) -> "Family":
+    def spread(
+        cls,
+        radius: float,
+        force_range: tuple[float, float],
+        count: tuple[int, int],
+        period: float,
+        turns: int = TURNS,
+    ) -> "Family":
         """So many distances and forces; orientations for a probe that looks the same after `period` (rad, 0 round)."""
         low, high = np.log(force_range)
         force = np.exp(chebyshev_nodes(count[1], low, high)) if high > low else np.array([force_range[0]])
         folds = round(2.0 * np.pi / period) if period > 0.0 else 1
-        turns = folds * (-(-TURNS // folds)) if period > 0.0 else 1
-        turn = 2.0 * np.pi * np.arange(turns) / turns
+        n_turn = folds * (-(-turns // folds)) if period > 0.0 else 1
+        turn = 2.0 * np.pi * np.arange(n_turn) / n_turn
         return cls(radius, force_range, chebyshev_nodes(count[0], 0.0, radius), force, turn, folds)
 
     @property

@@ -20,7 +20,7 @@ from isocharge.simulate.arrays import Array, Complexes, Integers
 from isocharge.simulate.blas import single_threaded_blas
 from isocharge.simulate.charge import COARSE, FINE, NEAR, ReadoutPoints, contact_charge, touch_charge
 from isocharge.simulate.equilibrium import Equilibrium
-from isocharge.simulate.family import Family
+from isocharge.simulate.family import TURNS, Family
 from isocharge.simulate.membrane import turn_stress
 from isocharge.simulate.meshing import layer_for, resolution_for, template_for
 from isocharge.simulate.placement import Placement
@@ -110,8 +110,8 @@ class ForwardMap:
         layer = layer_for(film, float(np.sqrt(force_range[0] * force_range[1])))
         resolution = resolution or resolution_for(film, probe, (radius, 0.0), theory, accuracy, layer)
         error = np.inf
-        for count in ((5, 3), (8, 5), (13, 8)):
-            family = Family.spread(radius, force_range, count, probe.period)
+        for count, turns in (((5, 3), TURNS), ((8, 5), 2 * TURNS), ((13, 8), 3 * TURNS)):
+            family = Family.spread(radius, force_range, count, probe.period, turns)
             table = _solve_family(film, probe, sensor.surface, family, theory, resolution, layer, executor, progress)
             made = cls(sensor, probe, family, theory, resolution, layer, table, error)
             error = _check_against_solves(made)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from isocharge.simulate.arrays import Array, Integers
-from isocharge.simulate.charge_spline import ChargeSpline, onto_disk
+from isocharge.simulate.charge_table import ChargeTable, onto_disk
 
 NODE_SPACING = 0.6e-3
 """Distance of the nodes that are tried, m: contours bend little on this scale."""
@@ -94,13 +94,13 @@ class Nodes:
         side: Nodes along the grid's side.
     """
 
-    table: ChargeSpline
+    table: ChargeTable
     at: Array
     place: Integers
     side: int
 
     @classmethod
-    def of(cls, table: ChargeSpline) -> "Nodes":
+    def of(cls, table: ChargeTable) -> "Nodes":
         """Over a table's disk, edge included."""
         side = 2 * max(4, int(np.ceil(table.radius / NODE_SPACING))) + 1
         line = np.linspace(-1.0, 1.0, side) * table.radius

@@ -19,7 +19,7 @@ import numpy as np
 
 from isocharge.errors import ChargeError, SceneError, SensorError
 from isocharge.simulate.arrays import Array, Integers
-from isocharge.simulate.charge_spline import SPACING, ChargeSpline, onto_disk
+from isocharge.simulate.charge_table import SPACING, ChargeTable, onto_disk
 from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.meetings import FLAT, Candidates, Nodes, step_to_meet
 
@@ -101,7 +101,7 @@ class Triangulation:
         tolerance: Distance (m) of crossings from their mean up to which contours meet.
     """
 
-    table: ChargeSpline
+    table: ChargeTable
     tolerance: float = TOLERANCE
 
     def __post_init__(self) -> None:
@@ -138,7 +138,7 @@ class Triangulation:
             raise SensorError(
                 f"triangulation needs at least three electrodes, got {forward_map.sensor.electrode_names}"
             )
-        return cls(ChargeSpline.of(forward_map, radius, spacing), tolerance)
+        return cls(ChargeTable.of(forward_map, radius, spacing), tolerance)
 
     def locate(self, charge: Array, force: Array | float) -> Fix:
         """Positions of presses of known force.

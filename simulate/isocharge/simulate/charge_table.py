@@ -20,7 +20,7 @@ from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.sampling import lattice
 from isocharge.simulate.scaling import amplitude_squared
 from isocharge.simulate.sensor import Film
-from isocharge.simulate.spectral import barycentric_weights, lagrange_values
+from isocharge.simulate.spectral import barycentric_weights, chebyshev_nodes, lagrange_values
 
 SPACING = 0.3e-3
 """Distance of knots, m."""
@@ -31,6 +31,9 @@ OVERSAMPLING = 1.6
 STIFFNESS = 1e-5
 """Weight of the coefficients' third differences in the fit: holds those outside the disk, which no press reaches."""
 
+FORCES = 9
+"""Force nodes where d33 counts."""
+
 CHECKS = 200
 """Presses that a table is compared with."""
 
@@ -39,7 +42,7 @@ Forward = Callable[[Array, Array, Array], Array]
 
 
 @dataclass(frozen=True)
-class ChargeSpline:
+class ChargeTable:
     """Charges of every electrode over a disk of positions and a range of forces, for one probe as it is turned.
 
     Attributes:
@@ -63,7 +66,7 @@ class ChargeSpline:
     error: float
 
     @classmethod
-    def of(cls, forward_map: ForwardMap, radius: float | None = None, spacing: float = SPACING) -> "ChargeSpline":
+    def of(cls, forward_map: ForwardMap, radius: float | None = None, spacing: float = SPACING) -> "ChargeTable":
         """Table a forward map over its disk, or a smaller one of `radius` (m), with knots `spacing` (m) apart.
 
         Raises:
@@ -74,9 +77,9 @@ class ChargeSpline:
             raise SceneError(
                 f"radius: expected up to the forward map's {forward_map.radius * 1e3:g} mm, got {radius * 1e3:g} mm"
             )
-        sensor, family = forward_map.sensor, forward_map.family
+        sensor, force = forward_map.sensor, _force_nodes(forward_map)
         return cls.fit(
-            forward_map.forward, sensor.electrode_names, sensor.film, radius, family.force, family.force_range, spacing
+            forward_map.forward, sensor.electrode_names, sensor.film, radius, force, forward_map.force_range, spacing
         )
 
     @classmethod
@@ -89,7 +92,7 @@ class ChargeSpline:
         force: Array,
         force_range: tuple[float, float],
         spacing: float = SPACING,
-    ) -> "ChargeSpline":
+    ) -> "ChargeTable":
         """Table any function of (x, y, force): least squares on a lattice and along the disk's edge."""
         at = _samples(radius, spacing)
         cells = max(4, int(np.ceil(2.0 * radius / spacing)))
@@ -146,6 +149,15 @@ class ChargeSpline:
         return weights * _scale(self.film, force)[:, None]
 
 
+def _force_nodes(forward_map: ForwardMap) -> Array:
+    """The map's own, between which it is a polynomial; more where the contact pressure (d33) goes another way."""
+    low, high = np.log(forward_map.force_range)
+    if forward_map.sensor.piezo.d33 == 0.0 or low == high:
+        return forward_map.family.force
+    nodes: Array = np.exp(chebyshev_nodes(FORCES, low, high))
+    return nodes
+
+
 def onto_disk(at: Array, radius: float) -> Array:
     """Positions (x, y), shape (n, 2), those outside the disk moved onto its edge; m."""
     onto: Array = at / np.maximum(1.0, np.hypot(at[:, 0], at[:, 1]) / radius)[:, None]
@@ -177,7 +189,7 @@ def _least_squares(at: Array, target: Array, knots: Array) -> Array:
     return solved
 
 
-def _error_against(forward: Forward, made: ChargeSpline) -> float:
+def _error_against(forward: Forward, made: ChargeTable) -> float:
     at = made.radius * lattice(CHECKS) * np.exp(0.3j)
     logs = np.log(made.force_range)
     force = np.clip(np.exp(logs[0] + (logs[1] - logs[0]) * ((0.618 * np.arange(at.size)) % 1.0)), *made.force_range)

@@ -5,7 +5,7 @@ import pytest
 
 from isocharge.errors import SceneError
 from isocharge.simulate import Circle, ForwardMap, Resolution, Theory, load_sensor
-from isocharge.simulate.charge_spline import ChargeSpline
+from isocharge.simulate.charge_table import ChargeTable
 
 QUICK = {"theory": Theory(stretching=True, bending=False, pretensioned=False), "resolution": Resolution(5, 8, 5)}
 
@@ -16,8 +16,8 @@ def made() -> ForwardMap:
 
 
 @pytest.fixture(scope="module")
-def table(made) -> ChargeSpline:
-    return ChargeSpline.of(made)
+def table(made) -> ChargeTable:
+    return ChargeTable.of(made)
 
 
 def presses(count: int, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -36,7 +36,7 @@ def test_table_is_the_map(made, table):
 
 
 def test_closer_knots_are_better(made, table):
-    assert table.error < 0.5 * ChargeSpline.of(made, spacing=1e-3).error
+    assert table.error < 0.5 * ChargeTable.of(made, spacing=1e-3).error
 
 
 def test_slopes_are_differences(table):
@@ -60,4 +60,4 @@ def test_beyond_the_edge_is_the_edge(table):
 @pytest.mark.parametrize("radius", [0.0, -1e-3, 11e-3, np.nan])
 def test_impossible_radius_is_refused(made, radius):
     with pytest.raises(SceneError, match=r"radius: expected up to the forward map's 10 mm"):
-        ChargeSpline.of(made, radius)
+        ChargeTable.of(made, radius)
