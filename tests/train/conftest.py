@@ -10,6 +10,12 @@ QUICK = FitConfig(
 )
 
 
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch, tmp_path):
+    """Nothing is kept from one test to another, or in the user's own cache."""
+    monkeypatch.setenv("ISOCHARGE_CACHE", str(tmp_path / "cache"))
+
+
 @pytest.fixture(scope="session")
 def sensor():
     return load_sensor("three-25um-biaxial")

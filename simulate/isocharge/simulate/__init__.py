@@ -12,6 +12,7 @@ from isocharge.extras import require
 with require("simulate"):
     from isocharge.simulate.amplifier import Amplifier, Measurement, load_amplifier
     from isocharge.simulate.charge import contact_charge, pretension_charge, thermal_charge, touch_charge
+    from isocharge.simulate.charge_spline import ChargeSpline
     from isocharge.simulate.contours import Contour, ContourField
     from isocharge.simulate.curves import Curves, Mapping
     from isocharge.simulate.dataset import Dataset, Samples, read_dataset, write_dataset
@@ -31,6 +32,7 @@ with require("simulate"):
 __all__ = [
     "Amplifier",
     "Calibration",
+    "ChargeSpline",
     "Circle",
     "Contour",
     "ContourField",

@@ -9,5 +9,8 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.intp]
 """Array of indices."""
 
+Booleans = NDArray[np.bool_]
+"""Array of truths, often of rows to take."""
+
 Complexes = NDArray[np.complex128]
 """Points of the plane as x + iy."""

@@ -33,6 +33,11 @@ class NoiseModel:
         """Standard deviation for charges of any shape, C; the same shape."""
         return np.hypot(self.white, self.gain * np.asarray(charge))
 
+    def variance(self, charge: Array) -> Array:
+        """Square of `sigma`, C^2; faster where there are many."""
+        variance: Array = self.white**2 + (self.gain * np.asarray(charge)) ** 2
+        return variance
+
     def add(self, charge: Array, rng: np.random.Generator) -> Array:
         """Noisy readings of charges of any shape, C."""
         noisy: Array = charge + self.sigma(charge) * rng.standard_normal(np.shape(charge))

@@ -10,17 +10,22 @@ print(release.metadata.errors)
 from isocharge.extras import require
 
 with require("train"):
+    from isocharge.train.bayes import BayesLimit, Scene, bayes_estimate, bayes_limit
     from isocharge.train.config import FitConfig, NetworkConfig, TrainingConfig, load_config
     from isocharge.train.evaluate import measure_errors
     from isocharge.train.fit import Fit, fit_network
     from isocharge.train.release import Release, train_model
 
 __all__ = [
+    "BayesLimit",
     "Fit",
     "FitConfig",
     "NetworkConfig",
     "Release",
+    "Scene",
     "TrainingConfig",
+    "bayes_estimate",
+    "bayes_limit",
     "fit_network",
     "load_config",
     "measure_errors",

@@ -5,19 +5,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Polygon
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
 from isocharge.simulate import Sensor
 from isocharge.simulate.arrays import Integers
+from isocharge.simulate.drawing import (
+    FELT,
+    INK,
+    draw_electrodes,
+    draw_working_area,
+    frame_film,
+    new_figure,
+    save_picture,
+)
 from isocharge.train.charge_field import Domain
 from isocharge.train.report.maps import COORDINATES, Draws
 from isocharge.train.report.measures import rms
 
-INK, GREY, RELEASED = "#1b2a41", "#8a95a5", "#d1495b"
-"""Colours of outlines, of what is beside the point, and of the released model."""
+GREY, RELEASED = "#8a95a5", FELT
+"""Colours of what is beside the point, and of the released model."""
 
 KINDS = {"paper": "#7a5195", "learnt": "#2f7f6f", "fitted map": "#c47f17", "network": "#2b6cb0"}
 """Colours of the kinds of methods."""
@@ -45,15 +52,6 @@ LINES = ("#2b6cb0", "#2f7f6f", "#c47f17", "#7a5195", "#8c564b", "#4c9be8")
 """Colours of methods where kinds do not tell them apart."""
 
 
-def save(figure: Any, path: Path) -> list[str]:
-    """Write a figure as PNG and SVG; the files' names."""
-    FigureCanvasAgg(figure)
-    names = [f"{path.name}.png", f"{path.name}.svg"]
-    for name in names:
-        figure.savefig(path.with_name(name), dpi=130, metadata={"Date": None} if name.endswith("svg") else None)
-    return names
-
-
 AXES = {
     "latency": ("p50_us", "time of one prediction, median, us", "us"),
     "throughput": ("per_second", "predictions per second in batches of {batch}", "/s"),
@@ -63,10 +61,10 @@ AXES = {
 
 def speed(
     records: Sequence[dict[str, Any]], plot: str, limit_mm: float | None, cramer_rao_mm: float | None, batch: int
-) -> Any:
+) -> Figure:
     """Position error against latency, throughput or memory, one point for each method and form."""
     key, words, _ = AXES[plot]
-    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
+    figure = new_figure(10.0, 6.4)
     axes = figure.subplots()
     shown = [record for record in records if record["errors"]["position_rms_mm"]]
     _points(axes, shown, key)
@@ -225,9 +223,9 @@ def _form_words(form: str) -> str:
     return "released model (Predictor)" if form == "Predictor" else form
 
 
-def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Any:
+def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Figure:
     """Root-mean-square errors of the released model over the film."""
-    figure = Figure(figsize=(11.5, 5.0), layout="constrained")
+    figure = new_figure(11.5, 5.0)
     for axes, values, words in zip(
         figure.subplots(1, 2),
         (draws.position_mm, draws.force_percent),
@@ -238,26 +236,15 @@ def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Any:
             draws.truth[:, 0], draws.truth[:, 1], values, gridsize=22, reduce_C_function=rms, cmap="viridis", lw=0.1
         )
         axes.figure.colorbar(cells, ax=axes, shrink=0.85, label=words)
-        outline(axes, sensor, domain)
-        axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", title=words)
+        draw_electrodes(axes, sensor)
+        draw_working_area(axes, 1e-3 * domain.radius_mm)
+        frame_film(axes, sensor, 1e-3 * domain.radius_mm, words)
     return figure
 
 
-def outline(axes: Any, sensor: Sensor, domain: Domain) -> None:
-    """Electrodes to scale, and the working area."""
-    reach = domain.radius_mm
-    for electrode in sensor.electrodes:
-        corners = 1e3 * sensor.calibration.place(np.array(electrode.corners))
-        axes.add_patch(Polygon(corners, fill=False, ec=INK, lw=1.4))
-        axes.annotate(electrode.name, corners.mean(axis=0), ha="center", va="center", color=INK, fontsize=9)
-        reach = max(reach, float(np.hypot(*corners.T).max()))
-    axes.add_patch(Circle((0, 0), domain.radius_mm, fill=False, ls=":", color=INK))
-    axes.set(xlim=(-reach - 0.7, reach + 0.7), ylim=(-reach - 0.7, reach + 0.7))
-
-
-def against_force(lines: dict[str, Any], released: str) -> Any:
+def against_force(lines: dict[str, Any], released: str) -> Figure:
     """Position error of several methods, and the limits, against the force."""
-    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+    figure = new_figure(8.0, 5.0)
     axes = figure.subplots()
     colours = iter(LINES)
     for name, values in lines["position_rms_mm"].items():
@@ -287,9 +274,9 @@ def _plain_ticks(axes: Any) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def calibration(record: dict[str, Any]) -> Any:
+def calibration(record: dict[str, Any]) -> Figure:
     """Coverage of the released model's intervals against their nominal level, and the difference of both."""
-    figure = Figure(figsize=(9.5, 4.4), layout="constrained")
+    figure = new_figure(9.5, 4.4)
     left, right = figure.subplots(1, 2)
     level = 100.0 * np.array(record["levels"])
     for axes in (left, right):
@@ -309,12 +296,12 @@ def calibration(record: dict[str, Any]) -> Any:
     return figure
 
 
-def noise_effect(cases: Sequence[dict[str, Any]], released: str) -> Any:
+def noise_effect(cases: Sequence[dict[str, Any]], released: str) -> Figure:
     """Position error against the level of the noise."""
     some = [case for case in cases if case["group"] == "noise"]
     levels = [float(case["case"].removeprefix("x ")) for case in some]
     lines = {name: [case["errors"][name]["position_rms_mm"] for case in some] for name in some[0]["errors"]}
-    figure = Figure(figsize=(8.0, 4.6), layout="constrained")
+    figure = new_figure(8.0, 4.6)
     axes = figure.subplots()
     _method_lines(axes, levels, lines, released)
     axes.set(xscale="log", yscale="log", xlabel="noise over reference", ylabel="position error, rms, mm")
@@ -343,10 +330,10 @@ FARTHEST_MM = 50.0
 """Errors beyond this, from methods that explode outside of what they know, are drawn here."""
 
 
-def wrong_world(cases: Sequence[dict[str, Any]], released: str, nominal: float | None) -> Any:
+def wrong_world(cases: Sequence[dict[str, Any]], released: str, nominal: float | None) -> Figure:
     """Errors and alarms where the film, probe or chain is not as the models were told."""
     some = [case for case in cases if case["group"] != "noise"]
-    figure = Figure(figsize=(11.5, 1.6 + 0.36 * len(some)), layout="constrained")
+    figure = new_figure(11.5, 1.6 + 0.36 * len(some))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1.0))
     height = np.arange(len(some))[::-1]
     _error_dots(left, some, height, released)
@@ -401,11 +388,14 @@ def _case_words(case: dict[str, Any]) -> str:
 
 
 def draw_all(
-    folder: Path, stem: str, drawings: dict[str, Callable[[], Any]], progress: Callable[[str], None]
+    folder: Path, stem: str, drawings: dict[str, Callable[[], Figure]], progress: Callable[[str], None]
 ) -> dict[str, list[str]]:
     """Draw and write every picture; name to files."""
     files = {}
     for name, draw in drawings.items():
         progress(f"drawing: {name}")
-        files[name] = save(draw(), folder / f"{stem}-{name}")
+        figure = draw()
+        files[name] = [f"{stem}-{name}.{kind}" for kind in ("png", "svg")]
+        for file in files[name]:
+            save_picture(figure, folder / file)
     return files

@@ -1,0 +1,165 @@
+"""The posterior against closed forms, brute force, and itself."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from isocharge.errors import ChargeError, InputError
+from isocharge.simulate import ChargeSpline, NoiseModel, noise_model
+from isocharge.train.posterior import Posterior
+
+REFERENCE = noise_model("reference")
+
+
+@dataclass(frozen=True)
+class Straight:
+    """Charges that are a quadratic function of place, at a force that is known all but exactly."""
+
+    offset: np.ndarray
+    linear: np.ndarray
+    quadratic: np.ndarray
+    radius: float = 1.0
+    force_range: tuple[float, float] = (1.0, 1.0 + 1e-9)
+
+    @property
+    def electrodes(self):
+        return self.offset.size
+
+    def by_force(self, logs):
+        return np.exp(logs)[..., None]
+
+    def terms(self, position):
+        return (self.offset + position @ self.linear + position**2 @ self.quadratic)[:, None]
+
+    def slopes(self, position):
+        moved = self.linear.T + 2.0 * position[:, None, :] * self.quadratic.T
+        return moved[:, None]
+
+
+def straight(seed: int, electrodes: int = 4) -> Straight:
+    rng = np.random.default_rng(seed)
+    return Straight(100.0 + rng.random(electrodes), rng.normal(size=(2, electrodes)), np.zeros((2, electrodes)))
+
+
+def spread(made, count, seed):
+    """Presses from the prior (m, N) and their noisy charges (C)."""
+    rng = np.random.default_rng(seed)
+    at = made.radius * np.sqrt(rng.random(count)) * np.exp(2j * np.pi * rng.random(count))
+    force = np.exp(rng.uniform(*np.log(made.force_range), count))
+    contact = np.stack([at.real, at.imag, force], axis=1)
+    return contact, REFERENCE.add(made.charge(contact), rng)
+
+
+@pytest.fixture(scope="module")
+def charges(film):
+    return ChargeSpline.of(film)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_linear_charges_in_white_noise_give_the_textbook_gaussian(seed):
+    made, white = straight(seed), 0.01
+    noisy = made.terms(np.array([[0.2, -0.3]]))[:, 0] + white * np.random.default_rng(seed).normal(size=(1, 4))
+    mean, std = Posterior(made, NoiseModel("white", white, 0.0), 1.0).mean_and_std(noisy)
+    covariance = white**2 * np.linalg.inv(made.linear @ made.linear.T)
+    best = np.linalg.lstsq(made.linear.T, (noisy - made.offset)[0], rcond=None)[0]
+    assert (np.abs(mean[0, :2] - best) < 0.01 * std[0, :2]).all()
+    assert std[0, :2] == pytest.approx(np.sqrt(np.diag(covariance)), rel=5e-3)
+
+
+def test_at_the_edge_of_the_disk_the_gaussian_is_cut_off():
+    made = Straight(np.array([100.0, 100.0]), np.eye(2), np.zeros((2, 2)), radius=1000.0)
+    noisy = np.array([[1100.0, 100.0]])  # x is 1000, y is 0: on an edge that is all but straight
+    mean, std = Posterior(made, NoiseModel("white", 1.0, 0.0), 1000.0).mean_and_std(noisy)
+    half = stats.halfnorm()
+    assert mean[0, :2] == pytest.approx([1000.0 - half.mean(), 0.0], abs=0.003)
+    assert std[0, :2] == pytest.approx([half.std(), 1.0], rel=0.01)
+
+
+def test_two_places_with_the_same_charges_are_both_found():
+    """Charges even in x: the mean is in the middle, where the contact certainly is not, and the deviation says so."""
+    made = Straight(np.array([100.0, 100.0]), np.array([[0.0, 0.0], [0.0, 1.0]]), np.array([[1.0, 0.0], [0.0, 0.0]]))
+    noisy = made.terms(np.array([[0.6, 0.1]]))[:, 0]
+    mean, std = Posterior(made, NoiseModel("white", 0.001, 0.0), 1.0).mean_and_std(noisy)
+    assert mean[0, :2] == pytest.approx([0.0, 0.1], abs=1e-4)
+    assert std[0, 0] == pytest.approx(0.6, rel=1e-3)
+
+
+def brute_force(charges, noise, charge, centre, reach, count):
+    """Mean and deviation of (x, y, F) by a plain sum over a box, cut off at the prior's edges."""
+    low, high = centre - reach, centre + reach
+    low[2], high[2] = (
+        np.maximum(low[2], np.log(charges.force_range[0])),
+        np.minimum(high[2], np.log(charges.force_range[1])),
+    )
+    axes = [a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, count, strict=True)]
+    x, y, logs = (axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
+    inside = np.hypot(x, y) <= charges.radius
+    contact = np.stack([x, y, np.exp(logs)], axis=1)[inside]
+    known = charges.charge(contact)
+    likelihood = stats.norm.logpdf(charge, known, noise.sigma(known)).sum(axis=1)
+    mass = np.exp(likelihood - likelihood.max())
+    mass /= mass.sum()
+    mean = mass @ contact
+    std = np.sqrt(mass @ (contact - mean) ** 2)
+    mean[2] = (mass @ (1.0 / contact[:, 2])) / (mass @ (1.0 / contact[:, 2] ** 2))
+    return mean, std
+
+
+@pytest.mark.parametrize(
+    "contact",
+    [(2e-3, -3e-3, 1.0), (-7.9e-3, 0.4e-3, 0.3), (1e-3, 6e-3, 0.0503), (7.2e-3, 3.4e-3, 0.06), (1e-4, 0.0, 1.995)],
+    ids=["within", "at the rim", "least force", "rim, small force", "centre, most force"],
+)
+def test_as_brute_force(charges, contact):
+    charge = REFERENCE.add(charges.charge(np.array([contact])), np.random.default_rng(1))
+    mean, std = Posterior(charges, REFERENCE, charges.radius).mean_and_std(charge)
+    centre, reach = mean[0].copy(), 7.0 * std[0]
+    centre[2], reach[2] = np.log(mean[0, 2]), 7.0 * std[0, 2] / mean[0, 2]
+    expected_mean, expected_std = brute_force(charges, REFERENCE, charge[0], centre, reach, (240, 240, 24))
+    assert std[0] == pytest.approx(expected_std, rel=0.01)
+    assert (np.abs(mean[0] - expected_mean) < 0.01 * expected_std).all()
+
+
+def test_deviations_are_as_large_as_errors(charges):
+    """Simulated presses and their noise: the squares of error over deviation are one on average."""
+    contact, charge = spread(charges, 300, seed=3)
+    mean, std = Posterior(charges, REFERENCE, charges.radius).mean_and_std(charge)
+    squares = np.mean(((mean - contact) / std) ** 2, axis=0)
+    assert squares == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 300))
+
+
+def test_finer_cells_change_nothing(charges):
+    contact, charge = spread(charges, 40, seed=4)
+    coarse, _ = Posterior(charges, REFERENCE, charges.radius).mean_and_std(charge)
+    fine, _ = Posterior(charges, REFERENCE, charges.radius, step=0.75).mean_and_std(charge)
+    rms = [np.sqrt(np.mean(np.sum((mean - contact)[:, :2] ** 2, axis=1))) for mean in (coarse, fine)]
+    assert rms[0] == pytest.approx(rms[1], rel=1e-3)
+
+
+def test_a_smaller_prior_knows_more(charges):
+    charge = charges.charge(np.array([[3.9e-3, 0.0, 0.1]]))
+    wide = Posterior(charges, REFERENCE, charges.radius).mean_and_std(charge)[1]
+    narrow = Posterior(charges, REFERENCE, 4e-3).mean_and_std(charge)[1]
+    assert narrow[0, 0] < 0.8 * wide[0, 0]
+
+
+def test_charges_of_nothing_still_give_an_answer(charges):
+    """What no press gives: the nearest that the prior knows, finite."""
+    mean, std = Posterior(charges, REFERENCE, charges.radius).mean_and_std(1e-12 * np.array([[0.0, -5.0, 1e6]]))
+    assert np.isfinite(mean).all()
+    assert np.isfinite(std).all()
+    assert np.hypot(*mean[0, :2]) <= charges.radius
+
+
+def test_bad_input_is_refused(charges):
+    posterior = Posterior(charges, REFERENCE, charges.radius)
+    with pytest.raises(ChargeError, match=r"shape \(n, 3\), got shape \(2, 4\)"):
+        posterior.mean_and_std(np.ones((2, 4)))
+    with pytest.raises(ChargeError, match="finite"):
+        posterior.mean_and_std(np.array([[np.nan, 1.0, 1.0]]))
+    with pytest.raises(InputError, match="white noise"):
+        replace(posterior, noise=noise_model("clean"))
+    with pytest.raises(InputError, match="up to 8 mm"):
+        replace(posterior, radius=9e-3)

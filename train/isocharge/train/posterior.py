@@ -1,0 +1,285 @@
+"""The posterior of a contact given noisy charges, by dense integration: what no estimator can beat on average.
+
+The prior is uniform over the disk and in the logarithm of the force. Charges are Gaussian about Q(c) with the sigma of
+the true charge, so the likelihood carries its normalisation,
+
+    p(Q | x, y, ln F) = prod_e exp(-(Q_e - q_e)^2 / (2 sigma_e^2)) / sigma_e,   q = Q(x, y, F),   sigma_e = sigma(q_e).
+
+Positions are integrated over square cells, cut in four where the posterior may have mass until they are small against
+its width; wherever that mass lies, in one place or several, in an ellipse or a sickle, it is found, because a cell is
+left only when no contact in it can explain the charges. In each cell the force is integrated about its best value by
+Gauss and Legendre's rule, cut off at the ends of the range. The midpoint rule on a Gaussian is exact to 1e-5 with cells
+of 1.25 standard deviations (Trefethen and Weideman 2014); only the edge of the disk wants more.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from isocharge.errors import ChargeError, InputError
+from isocharge.simulate.arrays import Array, Booleans, Integers
+from isocharge.simulate.charge_spline import ChargeSpline
+from isocharge.simulate.noise import NoiseModel
+
+CHUNK = 64
+"""Presses integrated at once: keeps the working arrays within some 100 MB."""
+
+ACROSS = 32
+"""Cells across the disk to begin with."""
+
+MOST_CUTS = 10
+"""How often a cell may be cut in four: down to a thirty-thousandth of the disk."""
+
+STEP = 1.25
+"""Largest side of a cell in standard deviations of the position, in the direction that the charges tell best."""
+
+MARGIN = 36.0
+"""Excess of a cell's chi-squared over the press's smallest above which it holds nothing: exp(-18)."""
+
+NEAR = 9.0
+"""The same below which a cell on the edge of the disk matters: the press is then integrated with more care."""
+
+NEWTON_STEPS = 4
+"""Gauss-Newton steps for the best force at a place; from a start that is nearly right, with a curve nearly straight."""
+
+WIDTH, NODES = 5.0, 12
+"""Half width of the force's integral in standard deviations, and its points: to 1e-4 together."""
+
+EDGE = 8
+"""Points across a cell on the edge of the disk that are counted in or out."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Squares in the plane of positions, each for one press.
+
+    Attributes:
+        press: Number of the press, ascending, shape (n,).
+        root: Number of the first cell that it was cut from, shape (n,).
+        centre: Shape (n, 2), m.
+        side: Of every cell, m.
+    """
+
+    press: Integers
+    root: Integers
+    centre: Array
+    side: float
+
+    def __len__(self) -> int:
+        return self.press.size
+
+    def __getitem__(self, rows: np.ndarray) -> "Cells":
+        return Cells(self.press[rows], self.root[rows], self.centre[rows], self.side)
+
+    def cut(self, radius: float) -> "Cells":
+        """Each in four; those without a share in the disk are dropped."""
+        parts = self._four(0.25)
+        return parts[np.hypot(*np.maximum(np.abs(parts.centre) - 0.5 * parts.side, 0.0).T) < radius]
+
+    def finer(self, radius: float) -> Iterator["Cells"]:
+        """Whole ones as Gauss and Legendre's four points, others in sixteen."""
+        edge = self.on_edge(radius)
+        yield self[~edge]._four(1.0 / np.sqrt(12.0))
+        yield self[edge].cut(radius).cut(radius)
+
+    def _four(self, offset: float) -> "Cells":
+        """Half as wide, their centres by so many sides off the middle in both directions."""
+        corner = offset * self.side * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
+        centre = (self.centre[:, None] + corner).reshape(-1, 2)
+        return Cells(np.repeat(self.press, 4), np.repeat(self.root, 4), centre, 0.5 * self.side)
+
+    def on_edge(self, radius: float) -> Booleans:
+        """Which may stick out of the disk, shape (n,)."""
+        return np.asarray(np.hypot(*self.centre.T) + np.sqrt(0.5) * self.side > radius)
+
+    def inside(self, radius: float) -> tuple[Array, Array]:
+        """Share of each cell that lies in the disk, shape (n,), and that share's centre, shape (n, 2).
+
+        A corner that holds none of the points that are counted has half of one's share.
+        """
+        share, centre = np.ones(len(self)), self.centre.copy()
+        edge = np.flatnonzero(self.on_edge(radius))
+        line = self.side * ((np.arange(EDGE) + 0.5) / EDGE - 0.5)
+        points = self.centre[edge, None] + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        counts = np.asarray(np.hypot(points[..., 0], points[..., 1]) <= radius)
+        share[edge] = np.maximum(counts.sum(axis=1), 0.5) / EDGE**2
+        middle = (points * counts[..., None]).sum(axis=1) / np.maximum(counts.sum(axis=1), 1)[:, None]
+        centre[edge] = np.where(counts.any(axis=1)[:, None], middle, onto_disk(centre[edge], radius))
+        return share, centre
+
+
+def onto_disk(position: Array, radius: float) -> Array:
+    """Positions, shape (n, 2), or the points of the disk that are nearest to them."""
+    shrink = np.minimum(1.0, radius / np.maximum(np.hypot(*position.T), 1e-300))
+    inside: Array = position * shrink[:, None]
+    return inside
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Integrates over the contacts that may have given some charges.
+
+    Attributes:
+        charges: Charges of a contact.
+        noise: Of the readings.
+        radius: Of the disk of the prior, m.
+        step: Largest side of a cell in standard deviations; half of it is the check.
+    """
+
+    charges: ChargeSpline
+    noise: NoiseModel
+    radius: float
+    step: float = STEP
+
+    def __post_init__(self) -> None:
+        if self.noise.white <= 0.0:
+            raise InputError(f"noise: expected white noise above 0 pC, got {self.noise.name!r}: nothing to integrate")
+        if not 0.0 < self.radius <= self.charges.radius * (1.0 + 1e-9):
+            raise InputError(
+                f"radius: expected up to {self.charges.radius * 1e3:g} mm, where the charges are known, got "
+                f"{self.radius * 1e3:g} mm"
+            )
+
+    def mean_and_std(self, charge: Array) -> tuple[Array, Array]:
+        """Of noisy charges, shape (n, n_electrode), C: each (n, 3) for x, y, F in m and N.
+
+        The mean of the force is E[1/F] / E[1/F^2], of all estimates the one with the least mean square relative error.
+        """
+        charge = np.asarray(charge, dtype=float)
+        if charge.ndim != 2 or charge.shape[1] != self.charges.electrodes or not np.isfinite(charge).all():
+            raise ChargeError(
+                f"expected finite charges of shape (n, {self.charges.electrodes}), got shape {charge.shape}"
+            )
+        parts = [self._integrate(charge[start : start + CHUNK]) for start in range(0, len(charge), CHUNK)]
+        mean, std = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        return mean, std
+
+    @property
+    def _ends(self) -> tuple[float, float]:
+        low, high = np.log(self.charges.force_range)
+        return float(low), float(high)
+
+    @cached_property
+    def _roots(self) -> tuple[Cells, Array, Array]:
+        """The first cells, their terms, and the steepest slope of each scaled charge in them, (n, n_electrode)."""
+        side = 2.0 * self.radius / ACROSS
+        line = side * (np.arange(ACROSS) + 0.5) - self.radius
+        centre = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        centre = centre[np.hypot(*np.maximum(np.abs(centre) - 0.5 * side, 0.0).T) < self.radius]
+        cells = Cells(np.zeros(len(centre), dtype=np.intp), np.arange(len(centre)), centre, side)
+        corner = 0.5 * side * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
+        slopes = self.charges.slopes(onto_disk((centre[:, None] + corner).reshape(-1, 2), self.radius))
+        steepest = np.linalg.norm(slopes, axis=-1).max(axis=1).reshape(len(centre), len(corner), -1).max(axis=1)
+        return cells, self.charges.terms(onto_disk(centre, self.radius)), steepest
+
+    @cached_property
+    def _scale(self) -> tuple[Array, Array, Array]:
+        """Logarithms of forces, of the charges' common factor there, both ascending, and its exponent."""
+        logs = np.linspace(*self._ends, 65)
+        scale = np.log(self.charges.by_force(logs).sum(axis=1))
+        return logs, scale, np.gradient(scale, logs)
+
+    def _integrate(self, charge: Array) -> tuple[Array, Array]:
+        found = list(self._cells(charge))
+        side = np.concatenate([np.full(len(cells), cells.side) for cells in found])
+        press = np.concatenate([cells.press for cells in found])
+        shares, centres = zip(*(cells.inside(self.radius) for cells in found), strict=True)
+        order = np.argsort(press, kind="stable")
+        share, press, centre = np.concatenate(shares)[order], press[order], np.concatenate(centres)[order]
+        logs, weight = self._over_force(centre, charge[press])
+        weight += np.log(share * side[order] ** 2)[:, None]
+        return _moments(press, centre, logs, weight)
+
+    def _cells(self, charge: Array) -> Iterator[Cells]:
+        """Cells that hold all of the mass, small against its width; every press in cells of one size."""
+        roots, terms, steepest = self._roots
+        press, root = (axis.ravel() for axis in np.indices((len(charge), len(roots))))
+        cells, terms = Cells(press, root, roots.centre[root], roots.side), terms[root]
+        for cut in range(MOST_CUTS + 1):
+            logs = self._best_force(terms, charge[cells.press])
+            chi2, reach = self._fit(terms, logs, charge[cells.press], steepest[cells.root])
+            best = np.full(len(charge), np.inf)
+            np.minimum.at(best, cells.press, chi2)
+            excess = np.maximum(np.sqrt(chi2) - np.sqrt(0.5) * cells.side * reach, 0.0) ** 2 - best[cells.press]
+            kept = np.flatnonzero(excess <= MARGIN)
+            stiffest = np.zeros(len(charge))
+            np.maximum.at(stiffest, cells.press[kept], self._stiffness(cells.centre[kept], terms[kept], logs[kept]))
+            cut_off = np.zeros(len(charge), dtype=bool)
+            cut_off[cells.press[cells.on_edge(self.radius) & (chi2 <= best[cells.press] + NEAR)]] = True
+            done = (stiffest * cells.side <= self.step)[cells.press] | (cut == MOST_CUTS)
+            ready = cells[done & (chi2 <= best[cells.press] + MARGIN)]
+            yield ready[~cut_off[ready.press]]
+            yield from ready[cut_off[ready.press]].finer(self.radius)
+            cells = cells[kept][~done[kept]].cut(self.radius)
+            if not len(cells):
+                return
+            terms = self.charges.terms(onto_disk(cells.centre, self.radius))
+
+    def _fit(self, terms: Array, logs: Array, charge: Array, steepest: Array) -> tuple[Array, Array]:
+        """Chi-squared at each cell, and how fast its root can change with the place at most, 1/m."""
+        by_force = self.charges.by_force(logs)
+        known = np.einsum("nk,nke->ne", by_force, terms)
+        deviation = (charge - known) / self.noise.sigma(known)
+        steep = steepest * by_force.sum(axis=1)[:, None] / self.noise.sigma(known)
+        return np.einsum("ne,ne->n", deviation, deviation), np.sqrt(np.einsum("ne,ne->n", steep, steep))
+
+    def _stiffness(self, position: Array, terms: Array, logs: Array) -> Array:
+        """One over the smallest standard deviation of the position if it lay here, the force unknown; shape (n,)."""
+        by_force, slopes = self.charges.by_force(logs), self.charges.slopes(onto_disk(position, self.radius))
+        known = np.einsum("nk,nke->ne", by_force, terms)
+        sigma = self.noise.sigma(known)
+        toward = known / sigma / np.linalg.norm(known / sigma, axis=1, keepdims=True)
+        moved = np.einsum("nk,nkei->nei", by_force, slopes) / sigma[..., None]
+        across = moved - toward[..., None] * np.einsum("ne,nei->ni", toward, moved)[:, None]
+        return np.asarray(np.linalg.norm(across, ord=2, axis=(1, 2)))
+
+    def _best_force(self, terms: Array, charge: Array) -> Array:
+        """Logarithm of the force within the range that fits best at each place, shape (n,).
+
+        Starts where least squares wants the charges' common factor; its exponent stands for every charge's.
+        """
+        table, scale, exponent = self._scale
+        known, weight = terms[:, terms.shape[1] // 2], 1.0 / self.noise.sigma(charge) ** 2
+        ratio = (weight * charge * known).sum(axis=1) / (weight * known**2).sum(axis=1)
+        logs = np.interp(np.log(np.maximum(ratio, 1e-300)), scale, table)
+        for _ in range(NEWTON_STEPS):
+            known = np.einsum("nk,nke->ne", self.charges.by_force(logs), terms)
+            slope = np.interp(logs, table, exponent)[:, None] * known
+            weight = 1.0 / self.noise.sigma(known) ** 2
+            change = (weight * slope * (charge - known)).sum(axis=1) / (weight * slope**2).sum(axis=1)
+            logs = np.clip(logs + change, *self._ends)
+        return np.asarray(logs)
+
+    def _over_force(self, position: Array, charge: Array) -> tuple[Array, Array]:
+        """Points of the integral over the force's logarithm at each place, and the logarithms of their weights times
+        the likelihood; both (n, NODES)."""
+        terms = self.charges.terms(position)
+        best = self._best_force(terms, charge)
+        known = np.einsum("nk,nke->ne", self.charges.by_force(best), terms)
+        table, _, exponent = self._scale
+        slope = np.interp(best, table, exponent)[:, None] * known
+        reach = WIDTH / np.linalg.norm(slope / self.noise.sigma(known), axis=1)
+        low, high = np.maximum(best - reach, self._ends[0]), np.minimum(best + reach, self._ends[1])
+        nodes, weights = np.polynomial.legendre.leggauss(NODES)
+        logs = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * nodes
+        known = np.einsum("nmk,nke->enm", self.charges.by_force(logs), terms)
+        variance = self.noise.variance(known)
+        exponents = ((charge.T[:, :, None] - known) ** 2 / variance).sum(axis=0) + np.log(variance.prod(axis=0))
+        return logs, np.log(weights * (high - low)[:, None]) - 0.5 * exponents
+
+
+def _moments(press: Integers, place: Array, logs: Array, weight: Array) -> tuple[Array, Array]:
+    """Mean and standard deviation of (x, y, F) of every press, from the points at its places, `press` ascending."""
+    first = np.flatnonzero(np.diff(press, prepend=-1))
+    largest = np.maximum.reduceat(weight.max(axis=1), first)
+    mass = np.exp(weight - np.repeat(largest, np.diff(first, append=press.size))[:, None])
+    force, total = np.exp(logs), mass.sum(axis=1)
+    columns = [total, *(total * place.T), *(total * place.T**2)]
+    columns += [(mass * force**power).sum(axis=1) for power in (1, 2, -1, -2)]
+    sums = np.add.reduceat(np.stack(columns, axis=1), first)
+    x, y, x2, y2, f, f2, inverse, inverse2 = (sums[:, 1:] / sums[:, :1]).T
+    mean = np.stack([x, y, inverse / inverse2], axis=1)
+    variance = np.stack([x2 - x**2, y2 - y**2, f2 - f**2], axis=1)
+    return mean, np.sqrt(np.maximum(variance, 0.0))
