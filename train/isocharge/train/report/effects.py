@@ -74,15 +74,15 @@ def cases(bench: Bench, clean: Presses, settings: Settings, progress: Progress) 
         yield Case("noise", f"x {level:g}", clean, _noisy(clean, bench, level))
     for notation in settings.shapes:
         progress(f"solving the film under {notation}")
-        presses = press_on(bench.films(probes=(parse_probe(notation),), accuracy=ROUGH), sweep)
+        presses = press_on(bench.films(probes=(parse_probe(notation),), accuracy=max(ROUGH, settings.accuracy)), sweep)
         yield Case("probe", notation, presses, noisy(presses))
     progress("solving a film with more pretension")
     film = bench.sensor.film
     tauter = replace(bench.sensor, film=replace(film, pretension=film.pretension + PRETENSION_OFF))
-    presses = press_on(bench.films(sensor=tauter, accuracy=ROUGH), sweep)
+    presses = press_on(bench.films(sensor=tauter, accuracy=max(ROUGH, settings.accuracy)), sweep)
     yield Case("pretension", f"+{1e-6 * PRETENSION_OFF:g} MPa", presses, noisy(presses))
     yield from _wrong_gains(bench, clean, noisy(clean))
-    yield from _outside(bench, progress, noisy)
+    yield from _outside(bench, settings, progress, noisy)
 
 
 def _noisy(clean: Presses, bench: Bench, level: float) -> Array:
@@ -106,11 +106,11 @@ def _wrong_gains(bench: Bench, clean: Presses, noisy: Array) -> Iterator[Case]:
         yield Case("dead electrode", f"{name} dead", clean, np.where(here, silence, noisy))
 
 
-def _outside(bench: Bench, progress: Progress, noisy: Callable[[Presses], Array]) -> Iterator[Case]:
+def _outside(bench: Bench, settings: Settings, progress: Progress, noisy: Callable[[Presses], Array]) -> Iterator[Case]:
     """Presses beyond the working area, where the film is large enough."""
     progress("solving the film outside of the working area")
     try:
-        films = bench.films(further=OUTSIDE, accuracy=ROUGH)
+        films = bench.films(further=OUTSIDE, accuracy=max(ROUGH, settings.accuracy))
     except IsochargeError:
         return
     low, high = bench.domain.force_range_N

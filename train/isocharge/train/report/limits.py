@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.simulate import ForwardMap
+from isocharge.simulate import ChargeSpline, ForwardMap
 from isocharge.simulate.arrays import Array
 from isocharge.train.bayes import Scene, bayes_estimate
 from isocharge.train.report.bench import Bench
 from isocharge.train.report.measures import errors, rms, rounded
 from isocharge.train.split import Presses
+
+BAYES, CRAMER_RAO = "Bayes limit", "Cramér-Rao"
+"""Their names in pictures."""
 
 
 @dataclass(frozen=True)
@@ -77,32 +80,11 @@ def limits_of(
     return Limits(bayes, _cramer_rao(bench, films, presses))
 
 
-STEP = 1e-5
-"""Step of the difference quotients, in radii and relative force."""
-
-
 def _cramer_rao(bench: Bench, films: tuple[ForwardMap, ...], presses: Presses) -> Array:
-    """TEMPORARY until isocharge.simulate.limits is there."""
-    film, radius = films[0], 1e-3 * bench.domain.radius_mm
-    x, y, force = presses.contact.T * np.array([[1e-3], [1e-3], [1.0]])
-    inward = np.minimum(1.0, (radius - 2 * STEP * radius) / np.maximum(np.hypot(x, y), 1e-9))
-    x, y, force = (
-        x * inward,
-        y * inward,
-        np.clip(force, bench.domain.force_range_N[0] * 1.001, bench.domain.force_range_N[1] * 0.999),
-    )
-    h = STEP * radius
-    slopes = (
-        np.stack(
-            [
-                (film.forward(x + h, y, force) - film.forward(x - h, y, force)) / (2 * h),
-                (film.forward(x, y + h, force) - film.forward(x, y - h, force)) / (2 * h),
-                (film.forward(x, y, force * (1 + STEP)) - film.forward(x, y, force * (1 - STEP)))
-                / (2 * STEP * force)[:, None],
-            ],
-            axis=1,
-        )
-        / bench.noise.sigma(1e-12 * presses.charge_pC)[:, None]
-    )
-    covariance = np.linalg.inv(slopes @ slopes.transpose(0, 2, 1))
-    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) * np.array([1e3, 1e3, 1.0])
+    """Standard deviations from the Fisher information of every press; with several probes as if the first pressed."""
+    contact = presses.contact * np.array([1e-3, 1e-3, 1.0])
+    spline = ChargeSpline.of(films[0])
+    slopes = spline.jacobian(contact) / bench.noise.sigma(spline.charge(contact))[..., None]
+    variance = np.diagonal(np.linalg.inv(slopes.transpose(0, 2, 1) @ slopes), axis1=1, axis2=2)
+    deviations: Array = np.sqrt(variance) * np.column_stack([np.full((len(contact), 2), 1e3), contact[:, 2]])
+    return deviations

@@ -10,6 +10,7 @@ from isocharge.simulate.arrays import Array, Integers
 from isocharge.train.charge_field import Domain
 from isocharge.train.evaluate import noisy_charges, position_error
 from isocharge.train.report.bench import Bench
+from isocharge.train.report.limits import CRAMER_RAO
 from isocharge.train.report.measures import coverage, rms, rounded
 from isocharge.train.rivals import ReleasedModel
 from isocharge.train.split import Presses
@@ -69,14 +70,15 @@ def force_bins(domain: Domain, force_N: Array, bins: int = FORCE_BINS) -> tuple[
     return np.sqrt(edges[:-1] * edges[1:]), number
 
 
-def by_force(domain: Domain, truth: Array, found: dict[str, Array]) -> dict[str, Any]:
-    """Root-mean-square position error, mm, of several methods in bins of the force."""
+def by_force(domain: Domain, truth: Array, found: dict[str, Array], cramer_rao_mm: Array) -> dict[str, Any]:
+    """Root-mean-square position error, mm, of several methods and Cramér-Rao's in bins of the force."""
     middle, number = force_bins(domain, truth[:, 2])
     lines = {}
     for name, contact in found.items():
         error = position_error(contact, truth[: len(contact)])
         here = [error[(number[: len(contact)] == k) & np.isfinite(error)] for k in range(len(middle))]
         lines[name] = [rounded(rms(part)) if part.size else None for part in here]
+    lines[CRAMER_RAO] = [rounded(rms(cramer_rao_mm[number == k])) for k in range(len(middle)) if (number == k).any()]
     return {"force_N": [rounded(value) for value in middle], "position_rms_mm": lines}
 
 

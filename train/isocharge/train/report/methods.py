@@ -120,7 +120,8 @@ def fit_all(
     estimators: list[tuple[str, Estimator]], released: ReleasedModel, task: Task, test: Test, progress: Progress
 ) -> list[Method]:
     """Fit every method and let all of its forms answer the test presses; the released model comes first."""
-    methods = [Method(released, "network", released.predict(test.charge_pC), 0.0)]
+    given: list[Fitted] = [released, released.contact_only()]
+    methods = [Method(form, "network", form.predict(test.charge_pC), 0.0) for form in given]
     for kind, estimator in estimators:
         progress(f"fitting: {estimator.name}")
         begin = time.perf_counter()

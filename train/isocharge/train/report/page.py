@@ -23,19 +23,19 @@ def page(record: dict[str, Any]) -> str:
 def _summary(section: dict[str, Any]) -> Iterator[str]:
     released, limits = section["methods"][0], section["limits"]
     errors = released["errors"]
-    yield f"**{section['sensor']}**: the released model `{section['model']['label']}` errs by"
+    yield f"**{section['sensor']}**, released model `{section['model']['label']}`:"
+    yield ""
     yield (
-        f"{errors['position_rms_mm']:.3g} mm rms ({errors['position_median_mm']:.3g} mm median) and "
-        f"{errors['force_rms_percent']:.3g} % of the force, in {released['p50_us']:.3g} us."
+        f"- It errs by {errors['position_rms_mm']:.3g} mm rms ({errors['position_median_mm']:.3g} mm median) and by "
+        f"{errors['force_rms_percent']:.3g} % of the force, and takes {released['p50_us']:.3g} us for one press."
     )
     if released["over_bayes"]:
         bayes = limits["bayes"]
         yield (
-            f"That is {released['over_bayes']:.3f} times the Bayes limit of {bayes['position_rms_mm']:.3g} mm, below "
-            f"which no method can be (force: {bayes['force_rms_percent']:.3g} %)."
+            f"- That is {released['over_bayes']:.3f} times the Bayes limit, {bayes['position_rms_mm']:.3g} mm and "
+            f"{bayes['force_rms_percent']:.3g} % of the force on the same charges: no method can do better on average."
         )
-    yield from section["verdict"]["sentences"]
-    yield ""
+    yield from (f"- {sentence}" for sentence in section["verdict"]["sentences"])
 
 
 def _section(section: dict[str, Any], settings: dict[str, Any]) -> Iterator[str]:
@@ -132,7 +132,8 @@ def _band(records: Sequence[dict[str, Any]]) -> str:
 
 CAPTIONS = {
     "latency": "Position error (rms, mm) against the time of one prediction (median, us). Points of one method are "
-    "joined; markers say what computes it. Dashed: the front that nothing beats.",
+    "joined; markers say what computes it. Dashed: the front that nothing beats. The error axis is stretched near the "
+    "limit. Hollow: told the force, or not all presses answered.",
     "throughput": "The same against predictions per second in batches of {batch} (more to the left).",
     "memory": "The same against the bytes a method needs to predict.",
     "maps": "Errors of the released model over the film: rms over forces and {draws} draws of the noise. Squares: "

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
 from isocharge.simulate import Sensor
-from isocharge.simulate.arrays import Integers
+from isocharge.simulate.arrays import Array, Integers
 from isocharge.simulate.drawing import (
     FELT,
     INK,
@@ -20,6 +21,7 @@ from isocharge.simulate.drawing import (
     save_picture,
 )
 from isocharge.train.charge_field import Domain
+from isocharge.train.report.limits import BAYES, CRAMER_RAO
 from isocharge.train.report.maps import COORDINATES, Draws
 from isocharge.train.report.measures import rms
 
@@ -37,6 +39,7 @@ KIND_WORDS = {
 }
 
 MARKERS = {
+    "Predictor": "*",
     "NumPy": "o",
     "scikit-learn": "s",
     "SciPy KD-tree": "^",
@@ -44,7 +47,6 @@ MARKERS = {
     "torch": "P",
     "ONNX Runtime": "D",
     "ONNX Runtime, bound": "X",
-    "Predictor": "*",
 }
 """Markers of what computes a method."""
 
@@ -53,58 +55,89 @@ LINES = ("#2b6cb0", "#2f7f6f", "#c47f17", "#7a5195", "#8c564b", "#4c9be8")
 
 
 AXES = {
-    "latency": ("p50_us", "time of one prediction, median, us", "us"),
-    "throughput": ("per_second", "predictions per second in batches of {batch}", "/s"),
-    "memory": ("memory_bytes", "memory of the method, bytes", "B"),
+    "latency": ("p50_us", "time of one prediction, median, us"),
+    "throughput": ("per_second", "predictions per second in batches of {batch}"),
+    "memory": ("memory_bytes", "memory of the method, bytes"),
 }
+"""Plot to the figure along its horizontal axis, and its words."""
 
 
-def speed(
-    records: Sequence[dict[str, Any]], plot: str, limit_mm: float | None, cramer_rao_mm: float | None, batch: int
-) -> Figure:
-    """Position error against latency, throughput or memory, one point for each method and form."""
-    key, words, _ = AXES[plot]
-    figure = new_figure(10.0, 6.4)
+def speed(records: Sequence[dict[str, Any]], plot: str, limits: dict[str, float], batch: int) -> Figure:
+    """Position error against latency, throughput or memory, one point for each method and form.
+
+    Args:
+        records: Of the methods.
+        plot: Which of AXES.
+        limits: Name to position error, mm, of what is drawn as a line.
+        batch: Presses in a batch, for the words.
+    """
+    key, words = AXES[plot]
+    figure = new_figure(10.5, 6.6)
     axes = figure.subplots()
     shown = [record for record in records if record["errors"]["position_rms_mm"]]
+    fair = [record["errors"]["position_rms_mm"] for record in shown if not record["force_given"]]
+    _error_axis(axes, fair + list(limits.values()))
     _points(axes, shown, key)
     _front(axes, shown, key, plot)
-    for value, name, style in ((limit_mm, "Bayes limit", "-"), (cramer_rao_mm, "Cramér-Rao", ":")):
-        if value:
-            axes.axhline(value, color=INK, lw=1.3, ls=style, zorder=1)
-            axes.annotate(
-                f"{name}, {value:.3f} mm",
-                (0.005, value),
-                xycoords=("axes fraction", "data"),
-                fontsize=8,
-                va="top",
-                xytext=(2, -3),
-                textcoords="offset points",
-                color=INK,
-            )
-    axes.set(xscale="log", yscale="log", xlabel=words.format(batch=batch), ylabel="position error, rms, mm")
-    _error_ticks(axes, shown, limit_mm)
+    for name, value in limits.items():
+        axes.axhline(value, color=INK, lw=1.4, ls=LIMIT_STYLES[name], zorder=1)
+    axes.set(xscale="log", xlabel=words.format(batch=batch), ylabel="position error, rms, mm")
     axes.grid(alpha=0.25, which="both", lw=0.5)
     if plot == "throughput":
         axes.invert_xaxis()
-    _name_methods(axes, shown, key)
+    _name_all(axes, shown, key, limits)
     _legend(axes, shown)
     return figure
+
+
+LIMIT_STYLES = {BAYES: "-", CRAMER_RAO: ":"}
+
+STRETCH = 0.97
+"""The error axis is logarithmic in the distance from this share of the smallest error: stretched near the limit. What
+is told the force may lie below; it is drawn at the axis' lower end."""
+
+
+def _error_axis(axes: Any, errors: Sequence[float]) -> None:
+    base = STRETCH * min(errors)
+
+    def forward(value: Array) -> Array:
+        logs: Array = np.log(np.maximum(np.asarray(value, dtype=float) - base, 1e-4))
+        return logs
+
+    axes.set_yscale("function", functions=(forward, lambda height: np.exp(height) + base))
+    low, high = base + 0.35 * (min(errors) - base), base + 1.3 * (max(errors) - base)
+    axes.set_ylim(low, high)
+    axes.yaxis.set_major_locator(FixedLocator(_ticks(low, high, lambda tick: _axes_height(axes, tick))))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+NICE = ((1, 2, 5), (1.5, 3, 4, 7), (1.2, 1.7, 2.5, 6, 8), tuple(np.arange(1.05, 3.0, 0.05)))
+"""Leading digits of ticks, the nicest first."""
+
+
+def _ticks(low: float, high: float, height: Callable[[float], float]) -> list[float]:
+    """Round numbers from low to high, the nicest first, at heights (0 to 1) that keep their words apart."""
+    ticks: list[float] = []
+    for digits in NICE:
+        for tick in (float(f"{digit * 10.0**power:.6g}") for power in range(-3, 2) for digit in digits):
+            if low <= tick <= high and all(abs(height(tick) - height(other)) > 0.045 for other in ticks):
+                ticks.append(tick)
+    return sorted(ticks)
 
 
 def _points(axes: Any, records: Sequence[dict[str, Any]], key: str) -> None:
     """Points, the forms of one method joined by a thin line."""
     for name in dict.fromkeys(record["name"] for record in records):
         forms = [record for record in records if record["name"] == name]
-        spots = sorted((record[key], record["errors"]["position_rms_mm"]) for record in forms)
-        axes.plot(*np.array(spots).T, color=KINDS[forms[0]["kind"]], lw=0.8, alpha=0.6, zorder=2)
+        spots = sorted((record[key], _height(axes, record)) for record in forms)
+        axes.plot(*np.array(spots).T, color=_colour(forms[0]), lw=0.9, alpha=0.6, zorder=2)
     for record in records:
         released = record["form"] == "Predictor"
-        colour = RELEASED if released else KINDS[record["kind"]]
+        colour = _colour(record)
         hollow = record["force_given"] or record["errors"]["answered"] < 1.0
         axes.plot(
             record[key],
-            record["errors"]["position_rms_mm"],
+            _height(axes, record),
             MARKERS.get(record["form"], "o"),
             color=colour,
             mfc="white" if hollow else colour,
@@ -130,65 +163,52 @@ def _front(axes: Any, records: Sequence[dict[str, Any]], key: str, plot: str) ->
         )
 
 
-def _error_ticks(axes: Any, records: Sequence[dict[str, Any]], limit: float | None) -> None:
-    errors = [record["errors"]["position_rms_mm"] for record in records] + ([limit] if limit else [])
-    low, high = 0.93 * min(errors), 1.12 * max(errors)
-    axes.set_ylim(low, high)
-    steps = [
-        0.05,
-        0.06,
-        0.07,
-        0.08,
-        0.1,
-        0.12,
-        0.15,
-        0.17,
-        0.2,
-        0.25,
-        0.3,
-        0.4,
-        0.5,
-        0.6,
-        0.8,
-        1,
-        1.5,
-        2,
-        3,
-        4,
-        6,
-        8,
-        10,
-    ]
-    axes.yaxis.set_major_locator(FixedLocator([step for step in steps if low <= step <= high]))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _name_methods(axes: Any, records: Sequence[dict[str, Any]], key: str) -> None:
-    """Names in a column beside the plot, kept apart, each joined to its method's last point."""
-    names = list(dict.fromkeys(record["name"] for record in records))
-    last = axes.get_xlim()[0] > axes.get_xlim()[1]
-    ends = {}
-    for name in names:
+def _name_all(axes: Any, records: Sequence[dict[str, Any]], key: str, limits: dict[str, float]) -> None:
+    """Names of methods and limits in a column beside the plot, kept apart, each led to its height."""
+    entries = [(value, f"{name}, {value:.3g} mm", INK) for name, value in limits.items()]
+    edge = axes.get_xlim()[1]
+    for name in dict.fromkeys(record["name"] for record in records):
         forms = [record for record in records if record["name"] == name]
-        ends[name] = (min if last else max)(forms, key=lambda record: record[key])
-    low, high = np.log(axes.get_ylim())
-    ranked = sorted(names, key=lambda name: ends[name]["errors"]["position_rms_mm"])
-    wanted = [(np.log(ends[name]["errors"]["position_rms_mm"]) - low) / (high - low) for name in ranked]
-    for name, height in zip(ranked, spread(wanted, 0.036), strict=True):
-        record = ends[name]
-        colour = RELEASED if record["form"] == "Predictor" else KINDS[record["kind"]]
+        error, colour = _height(axes, forms[0]), _colour(forms[0])
+        nearest = (min if edge < axes.get_xlim()[0] else max)(record[key] for record in forms)
+        axes.plot([nearest, edge], [error, error], color=colour, lw=0.5, alpha=0.35, zorder=1)
+        entries.append((error, _short(forms[0]), colour))
+    entries.sort(key=lambda entry: entry[0])
+    axes.set_xlim(axes.get_xlim()[0], edge)
+    heights = [_axes_height(axes, entry[0]) for entry in entries]
+    for (error, words, colour), height in zip(entries, spread(heights, 0.037), strict=True):
         axes.annotate(
-            _short(record),
-            (record[key], record["errors"]["position_rms_mm"]),
-            xytext=(1.025, height),
+            words,
+            (1.0, error),
+            xycoords=("axes fraction", "data"),
+            xytext=(1.05, height),
             textcoords="axes fraction",
             fontsize=9,
             va="center",
             color=colour,
             annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": colour, "lw": 0.5, "alpha": 0.45, "shrinkA": 1, "shrinkB": 4},
+            arrowprops={
+                "arrowstyle": "-",
+                "color": colour,
+                "lw": 0.7,
+                "alpha": 0.6,
+                "relpos": (0.0, 0.5),
+                "shrinkB": 0,
+            },
         )
+
+
+def _axes_height(axes: Any, value: float) -> float:
+    """Where a value of the vertical axis lies, 0 to 1."""
+    return float(axes.transAxes.inverted().transform(axes.transData.transform((1.0, value)))[1])
+
+
+def _height(axes: Any, record: dict[str, Any]) -> float:
+    return max(float(record["errors"]["position_rms_mm"]), float(axes.get_ylim()[0]))
+
+
+def _colour(record: dict[str, Any]) -> str:
+    return RELEASED if record["name"].startswith("released") else KINDS[record["kind"]]
 
 
 def spread(wanted: Sequence[float], apart: float) -> list[float]:
@@ -205,8 +225,12 @@ def spread(wanted: Sequence[float], apart: float) -> list[float]:
 
 
 def _short(record: dict[str, Any]) -> str:
-    answered = record["errors"]["answered"]
-    return str(record["name"]) + (f" ({100 * answered:.0f} % answered)" if answered < 1.0 else "")
+    errors, notes = record["errors"], []
+    if record["force_given"]:
+        notes.append(f"{errors['position_rms_mm']:.3g} mm")
+    if errors["answered"] < 1.0:
+        notes.append(f"{100 * errors['answered']:.3g} % answered")
+    return str(record["name"]) + (f" ({', '.join(notes)})" if notes else "")
 
 
 def _legend(axes: Any, records: Sequence[dict[str, Any]]) -> None:
@@ -232,9 +256,9 @@ def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Figure:
         ("position error, rms, mm", "relative force error, rms, %"),
         strict=True,
     ):
-        cells = axes.hexbin(
-            draws.truth[:, 0], draws.truth[:, 1], values, gridsize=22, reduce_C_function=rms, cmap="viridis", lw=0.1
-        )
+        cells = axes.hexbin(*draws.truth[:, :2].T, values, gridsize=22, reduce_C_function=rms, cmap="viridis", lw=0.1)
+        cells.set_clip_path(Circle((0, 0), domain.radius_mm, transform=axes.transData))
+        cells.set_clim(*np.percentile(np.ma.compressed(cells.get_array()), (0.5, 99.5)))
         axes.figure.colorbar(cells, ax=axes, shrink=0.85, label=words)
         draw_electrodes(axes, sensor)
         draw_working_area(axes, 1e-3 * domain.radius_mm)
@@ -249,10 +273,8 @@ def against_force(lines: dict[str, Any], released: str) -> Figure:
     colours = iter(LINES)
     for name, values in lines["position_rms_mm"].items():
         style: dict[str, Any] = {"lw": 1.4, "marker": ".", "color": None}
-        if name == "Bayes limit":
-            style = {"lw": 2.0, "color": INK}
-        elif name == "Cramér-Rao":
-            style = {"lw": 1.4, "ls": ":", "color": INK}
+        if name in LIMIT_STYLES:
+            style = {"lw": 2.0, "ls": LIMIT_STYLES[name], "color": INK}
         elif name == released:
             style = {"lw": 2.0, "marker": "*", "ms": 9, "color": RELEASED}
         else:
@@ -268,7 +290,7 @@ def against_force(lines: dict[str, Any], released: str) -> Figure:
 def _plain_ticks(axes: Any) -> None:
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        steps = [step * 10.0**power for power in range(-3, 4) for step in (1, 2, 5)]
+        steps = [step * 10.0**power for power in range(-3, 4) for step in (1, 1.5, 2, 3, 5, 7)]
         axis.set_major_locator(FixedLocator([step for step in steps if low <= step <= high]))
         axis.set_major_formatter(plain)
         axis.set_minor_formatter(NullFormatter())

@@ -15,7 +15,7 @@ from isocharge.simulate import Dataset, sensor_to_dict
 from isocharge.simulate.arrays import Array
 from isocharge.train.report import effects, maps, pictures
 from isocharge.train.report.bench import Bench, press_on
-from isocharge.train.report.limits import Limits, limits_of
+from isocharge.train.report.limits import BAYES, CRAMER_RAO, Limits, limits_of
 from isocharge.train.report.measures import rounded
 from isocharge.train.report.methods import Method, Test, fit_all, roster, table, task_of, timed
 from isocharge.train.report.page import page
@@ -139,9 +139,9 @@ class _Subject:
         """Everything about this dataset: its section of the record, its pictures written."""
         settings, bench = self.settings, self.bench
         steps("solving the film for the test presses")
-        test = Test.of(bench, press_on(bench.films(), bench.sweep()))
+        test = Test.of(bench, press_on(bench.films(accuracy=settings.accuracy), bench.sweep()))
         steps("solving the film for limits and contours")
-        films = bench.films(further=1.0)
+        films = bench.films(further=1.0, accuracy=settings.accuracy)
         steps("integrating the Bayes limit")
         limits = limits_of(bench, films, test.presses, test.charge_pC, settings.limited, steps.say)
         methods = fit_all(roster(self.dataset, films[0], settings), self.released, self.task, test, steps)
@@ -169,7 +169,7 @@ class _Subject:
             "limits": limits.record(truth),
             "methods": records,
             "verdict": verdict(records),
-            "by_force": maps.by_force(bench.domain, truth, _lines(methods, limits)),
+            "by_force": maps.by_force(bench.domain, truth, _lines(methods, limits), limits.position_mm),
             "worst_regions": maps.worst_regions(bench.domain, draws, limits.bayes, methods[0].contact, truth),
             "calibration": maps.calibration(bench.domain, draws),
             "alarm_threshold": rounded(threshold),
@@ -229,7 +229,7 @@ def _compared(methods: list[Method]) -> list[Fitted]:
 def _lines(methods: list[Method], limits: Limits) -> dict[str, Array]:
     """Contacts for the picture of error against force."""
     last = {method.fitted.name: method.contact for method in methods}
-    lines = {"Bayes limit": limits.bayes} if limits.bayes is not None else {}
+    lines = {BAYES: limits.bayes} if limits.bayes is not None else {}
     released = methods[0].fitted.name
     return {**lines, released: methods[0].contact, **{name: last[name] for name in COMPARED if name in last}}
 
@@ -244,12 +244,12 @@ def _draw(
     steps: Steps,
 ) -> dict[str, list[str]]:
     released = section["methods"][0]["name"]
-    bayes, bound = section["limits"]["bayes"], section["limits"]["cramer_rao"]["position_rms_mm"]
-    limit = bayes["position_rms_mm"] if bayes else None
+    known = {BAYES: section["limits"]["bayes"], CRAMER_RAO: section["limits"]["cramer_rao"]}
+    limits = {name: limit["position_rms_mm"] for name, limit in known.items() if limit}
     own = section["methods"][0]["errors"]["position_rms_mm"]
 
     def speed(plot: str) -> Callable[[], Any]:
-        return lambda: pictures.speed(section["methods"], plot, limit, bound, settings.batch)
+        return lambda: pictures.speed(section["methods"], plot, limits, settings.batch)
 
     drawings: dict[str, Callable[[], Any]] = {
         **{plot: speed(plot) for plot in pictures.AXES},

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from isocharge.simulate.theory import ACCURACY
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -18,6 +20,7 @@ class Settings:
         batch: Presses in a batch.
         draws: Draws of the noise for maps and coverage of the released model.
         limited: Test presses that the Bayes limit is integrated for.
+        accuracy: Relative error of a charge in the films that are solved.
         shapes: Probes that the models do not expect, as notations.
         seed: Of everything random.
         quick: Whether methods are fitted small.
@@ -26,13 +29,14 @@ class Settings:
     presses: int = 4096
     hold_out: float = 0.1
     learn_from: int = 200_000
-    sizes: tuple[tuple[int, ...], ...] = ((16, 16), (32, 32), (48, 48, 48), (64, 64, 64), (128, 128, 128))
+    sizes: tuple[tuple[int, ...], ...] = ((16, 16), (32, 32), (64, 64, 64), (128, 128, 128))
     steps: int = 4_000
     rounds: int = 12
     round_ms: float = 8.0
     batch: int = 4096
     draws: int = 20
     limited: int = 4096
+    accuracy: float = ACCURACY
     shapes: tuple[str, ...] = ("circle:0.5", "circle:1.5", "circle:2.0", "rectangle:4.0x2.0", "triangle:4.0")
     seed: int = 0
     quick: bool = False
@@ -48,6 +52,7 @@ QUICK = Settings(
     batch=512,
     draws=4,
     limited=128,
+    accuracy=1e-2,
     shapes=("circle:2.0",),
     quick=True,
 )

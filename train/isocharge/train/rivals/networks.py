@@ -12,6 +12,8 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
+import onnx
+import onnx.utils
 import onnxruntime as ort
 import torch
 from onnx import TensorProto, helper
@@ -229,6 +231,12 @@ class NumpyNetwork(Fitted):
         return len(pickle.dumps(self.layers))
 
 
+def contact_of(model: bytes) -> bytes:
+    """The part of a released model's graph that gives the contact, without standard deviations and misfit."""
+    graph = onnx.load_model_from_string(model)
+    return bytes(onnx.utils.Extractor(graph).extract_model(["charge_pC"], ["contact"]).SerializeToString())
+
+
 @dataclass(frozen=True)
 class ReleasedModel(Fitted):
     """A model folder through `Predictor`: contact, standard deviations and misfit."""
@@ -246,6 +254,11 @@ class ReleasedModel(Fitted):
     def predict(self, charge_pC: Array) -> Array:
         """See `Fitted.predict`."""
         return self.answer(charge_pC)[0]
+
+    def contact_only(self) -> BoundNetwork:
+        """Its contact alone, which is all that the other methods give."""
+        graph = contact_of((self.folder / "model.onnx").read_bytes())
+        return BoundNetwork(graph, "as released, its contact alone", f"{self.name}, contact only")
 
     def answer(self, charge_pC: Array) -> tuple[Array, Array, Array]:
         """Contact (n, 3), standard deviations (n, 3) and misfit (n, 1)."""
