@@ -38,6 +38,16 @@ class NoiseModel:
         variance: Array = self.white**2 + (self.gain * np.asarray(charge)) ** 2
         return variance
 
+    def information(self, charge: Array) -> Array:
+        """What a reading tells about its true charge, 1/C^2: one over the variance of the best unbiased estimate.
+
+        Of a Gaussian whose mean and standard deviation both depend on the charge (Kay 1993, eq. 3.31),
+        (1 + 2 (d sigma / dQ)^2) / sigma^2.
+        """
+        variance = self.variance(charge)
+        information: Array = (1.0 + 2.0 * (self.gain**2 * np.asarray(charge)) ** 2 / variance) / variance
+        return information
+
     def add(self, charge: Array, rng: np.random.Generator) -> Array:
         """Noisy readings of charges of any shape, C."""
         noisy: Array = charge + self.sigma(charge) * rng.standard_normal(np.shape(charge))

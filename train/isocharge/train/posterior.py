@@ -21,6 +21,7 @@ import numpy as np
 from isocharge.errors import ChargeError, InputError
 from isocharge.simulate.arrays import Array, Booleans, Integers
 from isocharge.simulate.charge_spline import ChargeSpline
+from isocharge.simulate.force_curve import ForceCurve
 from isocharge.simulate.noise import NoiseModel
 
 CHUNK = 64
@@ -40,9 +41,6 @@ MARGIN = 36.0
 
 NEAR = 9.0
 """The same below which a cell on the edge of the disk matters: the press is then integrated with more care."""
-
-NEWTON_STEPS = 4
-"""Gauss-Newton steps for the best force at a place; from a start that is nearly right, with a curve nearly straight."""
 
 WIDTH, NODES = 5.0, 12
 """Half width of the force's integral in standard deviations, and its points: to 1e-4 together."""
@@ -103,10 +101,11 @@ class Cells:
         edge = np.flatnonzero(self.on_edge(radius))
         line = self.side * ((np.arange(EDGE) + 0.5) / EDGE - 0.5)
         points = self.centre[edge, None] + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        counts = np.asarray(np.hypot(points[..., 0], points[..., 1]) <= radius)
-        share[edge] = np.maximum(counts.sum(axis=1), 0.5) / EDGE**2
-        middle = (points * counts[..., None]).sum(axis=1) / np.maximum(counts.sum(axis=1), 1)[:, None]
-        centre[edge] = np.where(counts.any(axis=1)[:, None], middle, onto_disk(centre[edge], radius))
+        counts = np.hypot(points[..., 0], points[..., 1]) <= radius
+        total = counts.sum(axis=1, keepdims=True)
+        share[edge] = np.maximum(total[:, 0], 0.5) / EDGE**2
+        middle = np.einsum("np,npi->ni", counts, points) / np.maximum(total, 1)
+        centre[edge] = np.where(total > 0, middle, onto_disk(centre[edge], radius))
         return share, centre
 
 
@@ -156,10 +155,9 @@ class Posterior:
         mean, std = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         return mean, std
 
-    @property
-    def _ends(self) -> tuple[float, float]:
-        low, high = np.log(self.charges.force_range)
-        return float(low), float(high)
+    @cached_property
+    def _curve(self) -> ForceCurve:
+        return ForceCurve.of(self.charges.by_force, self.charges.force_range)
 
     @cached_property
     def _roots(self) -> tuple[Cells, Array, Array]:
@@ -173,13 +171,6 @@ class Posterior:
         slopes = self.charges.slopes(onto_disk((centre[:, None] + corner).reshape(-1, 2), self.radius))
         steepest = np.linalg.norm(slopes, axis=-1).max(axis=1).reshape(len(centre), len(corner), -1).max(axis=1)
         return cells, self.charges.terms(onto_disk(centre, self.radius)), steepest
-
-    @cached_property
-    def _scale(self) -> tuple[Array, Array, Array]:
-        """Logarithms of forces, of the charges' common factor there, both ascending, and its exponent."""
-        logs = np.linspace(*self._ends, 65)
-        scale = np.log(self.charges.by_force(logs).sum(axis=1))
-        return logs, scale, np.gradient(scale, logs)
 
     def _integrate(self, charge: Array) -> tuple[Array, Array]:
         found = list(self._cells(charge))
@@ -198,7 +189,7 @@ class Posterior:
         press, root = (axis.ravel() for axis in np.indices((len(charge), len(roots))))
         cells, terms = Cells(press, root, roots.centre[root], roots.side), terms[root]
         for cut in range(MOST_CUTS + 1):
-            logs = self._best_force(terms, charge[cells.press])
+            logs = self._curve.best(terms, charge[cells.press], self.noise)
             chi2, reach = self._fit(terms, logs, charge[cells.press], steepest[cells.root])
             best = np.full(len(charge), np.inf)
             np.minimum.at(best, cells.press, chi2)
@@ -235,33 +226,14 @@ class Posterior:
         across = moved - toward[..., None] * np.einsum("ne,nei->ni", toward, moved)[:, None]
         return np.asarray(np.linalg.norm(across, ord=2, axis=(1, 2)))
 
-    def _best_force(self, terms: Array, charge: Array) -> Array:
-        """Logarithm of the force within the range that fits best at each place, shape (n,).
-
-        Starts where least squares wants the charges' common factor; its exponent stands for every charge's.
-        """
-        table, scale, exponent = self._scale
-        known, weight = terms[:, terms.shape[1] // 2], 1.0 / self.noise.sigma(charge) ** 2
-        ratio = (weight * charge * known).sum(axis=1) / (weight * known**2).sum(axis=1)
-        logs = np.interp(np.log(np.maximum(ratio, 1e-300)), scale, table)
-        for _ in range(NEWTON_STEPS):
-            known = np.einsum("nk,nke->ne", self.charges.by_force(logs), terms)
-            slope = np.interp(logs, table, exponent)[:, None] * known
-            weight = 1.0 / self.noise.sigma(known) ** 2
-            change = (weight * slope * (charge - known)).sum(axis=1) / (weight * slope**2).sum(axis=1)
-            logs = np.clip(logs + change, *self._ends)
-        return np.asarray(logs)
-
     def _over_force(self, position: Array, charge: Array) -> tuple[Array, Array]:
         """Points of the integral over the force's logarithm at each place, and the logarithms of their weights times
         the likelihood; both (n, NODES)."""
         terms = self.charges.terms(position)
-        best = self._best_force(terms, charge)
-        known = np.einsum("nk,nke->ne", self.charges.by_force(best), terms)
-        table, _, exponent = self._scale
-        slope = np.interp(best, table, exponent)[:, None] * known
-        reach = WIDTH / np.linalg.norm(slope / self.noise.sigma(known), axis=1)
-        low, high = np.maximum(best - reach, self._ends[0]), np.minimum(best + reach, self._ends[1])
+        best = self._curve.best(terms, charge, self.noise)
+        known = self._curve.charge(best, terms)
+        reach = WIDTH / np.linalg.norm(self._curve.slope(best, known) / self.noise.sigma(known), axis=1)
+        low, high = np.maximum(best - reach, self._curve.ends[0]), np.minimum(best + reach, self._curve.ends[1])
         nodes, weights = np.polynomial.legendre.leggauss(NODES)
         logs = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * nodes
         known = np.einsum("nmk,nke->enm", self.charges.by_force(logs), terms)
