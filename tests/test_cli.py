@@ -265,7 +265,7 @@ def test_sweep_fit_predict_one_by_one(command, tmp_path):
     assert command("simulate", "sweep", SENSOR, "--samples", 2000, "--radius", 5, "--workers", 2, "-o", presses)[0] == 0
     config = tmp_path / "quick.toml"
     config.write_text(
-        "[network]\nhidden = [32, 32]\nnearest_hidden = [16, 16]\n[training]\nsteps = 300\nnearest_steps = 50\n"
+        "[network]\nhidden = [32, 32]\nmisfit_hidden = [16, 16]\n[training]\nsteps = 300\nmisfit_steps = 50\n"
     )
     code, _, err = command("train", "fit", presses, "--config", config, "-o", model)
     assert code == 0
@@ -383,5 +383,5 @@ def test_the_demo_end_to_end(command, tmp_path):
 
 def quick(folder):
     path = folder / "quick.toml"
-    path.write_text("[training]\nsteps = 400\nnearest_steps = 100\n")
+    path.write_text("[training]\nsteps = 400\nmisfit_steps = 100\n")
     return path

@@ -11,7 +11,7 @@ from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_networ
 from isocharge.train.network import project
 
 TINY = FitConfig(
-    NetworkConfig(hidden=(16, 16), nearest_hidden=(8, 8)), TrainingConfig(steps=40, nearest_steps=10, batch=128)
+    NetworkConfig(hidden=(16, 16), misfit_hidden=(8, 8)), TrainingConfig(steps=40, misfit_steps=10, batch=128)
 )
 
 

@@ -15,7 +15,7 @@ from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, train_mode
 from isocharge.train.evaluate import measure_errors
 from isocharge.train.split import Presses
 
-QUICK = FitConfig(NetworkConfig((24, 24), (12, 12)), TrainingConfig(steps=200, nearest_steps=50, batch=256))
+QUICK = FitConfig(NetworkConfig((24, 24), (12, 12)), TrainingConfig(steps=200, misfit_steps=50, batch=256))
 RELEASED = Path(__file__).parents[2] / "models" / "three-25um-biaxial"
 LOW, HIGH, RADIUS = 0.05, 2.0, 8.0
 
@@ -166,7 +166,7 @@ def test_four_electrodes_have_one_check_to_spare(tmp_path):
 
     sweep = Sweep(samples=8_000)
     maps = solve_maps(load_sensor("four-25um-biaxial"), (Circle(1e-3),), sweep)
-    config = FitConfig(training=TrainingConfig(steps=1_500, nearest_steps=300))
+    config = FitConfig(training=TrainingConfig(steps=1_500, misfit_steps=300))
     release = train_model(read_dataset(write_sweep(tmp_path / "presses", maps, sweep)), tmp_path / "four", config)
     truth = presses(maps[0], 3000, seed=4)
     truth = truth[np.hypot(*truth.contact[:, :2].T) < 6.0]

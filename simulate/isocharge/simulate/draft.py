@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from isocharge.errors import InputError, OutputError, OutputExists, SolveError
+from isocharge.errors import InputError, OutputError, OutputExists, SolveError, TrainingError
 from isocharge.files import new_folder, refuse_existing, sha256_of, write_whole
 
 Warn = Callable[[str], object]
@@ -125,6 +125,16 @@ def open_draft(
         OutputExists: If the target is already there, or the draft is another run's or in use.
         OutputError: If the file system refuses.
     """
+    with keep_draft(target, identity, fresh=fresh, warn=warn) as draft:
+        yield draft
+        draft.publish()
+
+
+@contextmanager
+def keep_draft(
+    target: Path, identity: Mapping[str, Any], *, fresh: bool = False, warn: Warn = warnings.warn
+) -> Iterator[Draft]:
+    """As `open_draft`, but the block makes the target itself; the draft is gone when it ends well."""
     refuse_finished(target)
     draft = Draft(target, warn)
     parents = [parent for parent in target.parents if not parent.exists()]
@@ -133,9 +143,9 @@ def open_draft(
             try:
                 draft.tidy()
                 yield draft
-                draft.publish()
+                draft.remove()
             except BaseException as error:
-                if draft.is_empty() or isinstance(error, InputError | SolveError):
+                if draft.is_empty() or isinstance(error, InputError | SolveError | TrainingError):
                     draft.remove()
                 raise
     finally:

@@ -14,7 +14,7 @@ from isocharge.train.rivals.networks import (
     contact_graph,
     folded_layers,
 )
-from isocharge.train.split import domain_of, split_by_position
+from isocharge.train.split import domain_of, presses_of, split_by_position
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_memory_is_that_of_the_weights(fit, forms):
 
 
 def test_fitting_goes_through_the_pipeline(dataset):
-    train, held = split_by_position(dataset, 0.1, 0)
+    train, held = split_by_position(presses_of(dataset), 0.1, 0)
     task = Task(train, held, domain_of(dataset), noise_model("reference"))
     network = Network(dataset, hidden=(8, 8), steps=20)
     assert network.name == "network 8-8"

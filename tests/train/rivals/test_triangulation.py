@@ -6,12 +6,12 @@ import pytest
 from isocharge.simulate import noise_model
 from isocharge.train.evaluate import position_error
 from isocharge.train.rivals import Task, Triangulate
-from isocharge.train.split import Presses, domain_of, split_by_position
+from isocharge.train.split import Presses, domain_of, presses_of, split_by_position
 
 
 @pytest.fixture(scope="module")
 def forms(dataset, film):
-    train, held = split_by_position(dataset, 0.1, 0)
+    train, held = split_by_position(presses_of(dataset), 0.1, 0)
     return Triangulate(film).fit(Task(train, held, domain_of(dataset), noise_model("reference")))
 
 

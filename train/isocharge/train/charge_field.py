@@ -1,41 +1,38 @@
-"""The forward map as a short series: what charges a contact gives, cheap enough to live inside the model.
+"""The forward map as a short series fitted to a dataset: what charges a contact gives, with derivatives, cheaply.
 
 Without pretension Q = F^(2/3) g(x, y) nearly, with g smooth, so ln Q is expanded in Chebyshev polynomials
 
     ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
 
 with r the radius of the working area and l the logarithm of the force scaled to [-1, 1]. The coefficients follow from
-linear least squares. A second series of the same polynomials gives the Gauss-Newton inverse of the map,
-
-    P = (J' W J + damping)^-1 J' W,   J = d(ln Q)/d(unit contact),   W = (Q / sigma)^2,
-
-so that P (ln Q_measured - ln Q(c)) is the step from c to the contact that fits measured charges best.
+linear least squares. Training needs it to find the contact nearest to any charges, and to see folds; the model itself
+does without. A dataset of several probes gives their mean.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 
 from isocharge.errors import TrainingError
-from isocharge.simulate.arrays import Array
-from isocharge.simulate.noise import NoiseModel
+from isocharge.simulate.arrays import Array, Integers
 
-CANDIDATES = ((6, 1), (10, 1), (14, 1), (18, 1), (22, 1), (22, 2), (22, 3))
+CANDIDATES = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
 """Degrees tried in turn, in position and in force."""
-
-DAMPING = 1e-4
-"""Levenberg damping of the inverse, relative to the mean diagonal: bounds it where the map nearly folds."""
 
 ROWS_PER_TERM = 40
 """Presses used for each coefficient at most. Near the edge of the disk, where the series is worst, more help most."""
 
-RIDGE = 1e-4
-"""Weight of the coefficients' own size in the fit, relative: the square's corners lie outside the disk, where nothing
-holds the polynomials, and large coefficients that cancel would cost the digits of float32."""
+CHUNK = 4096
+"""Presses whose terms are held at once."""
 
-GOOD_ENOUGH = 2e-4
+RIDGE = 1e-9
+"""Weight of the coefficients' own size in the fit, relative: the square's corners lie outside the disk, where nothing
+holds the polynomials."""
+
+GOOD_ENOUGH = 1.5e-4
 """Root-mean-square relative error of the charges at which no higher degree is tried: a tenth of the reference noise."""
 
 
@@ -82,19 +79,16 @@ class ChargeField:
 
     Attributes:
         domain: Where it holds.
-        coefficients: Of ln Q (Q in pC) and of the three rows of P, shape
-            (4, degree + 1, degree + 1, force_degree + 1, n_electrode).
+        series: Coefficients of ln Q (Q in pC), shape (degree + 1, degree + 1, force_degree + 1, n_electrode).
         error: Root-mean-square relative error on samples that the fit did not see.
     """
 
     domain: Domain
-    coefficients: Array
+    series: Array
     error: float
 
     @classmethod
-    def fit(
-        cls, domain: Domain, contact: Array, charge_pC: Array, held: tuple[Array, Array], noise: NoiseModel
-    ) -> "ChargeField":
+    def fit(cls, domain: Domain, contact: Array, charge_pC: Array, held: tuple[Array, Array]) -> "ChargeField":
         """Least squares on (contact, charge), the degree chosen on `held`.
 
         Args:
@@ -102,35 +96,37 @@ class ChargeField:
             contact: (x_mm, y_mm, force_N), shape (n, 3).
             charge_pC: Clean charges, shape (n, n_electrode), all positive.
             held: Contacts and charges to measure the error on.
-            noise: Weights of the inverse.
 
         Raises:
             TrainingError: If there are too few samples for the smallest degree.
         """
-        best: tuple[float, Array] | None = None
-        target, unit, held_unit = np.log(charge_pC), domain.to_unit(contact), domain.to_unit(held[0])
+        best: ChargeField | None = None
+        unit, target = domain.to_unit(contact), np.log(charge_pC)
         for degree, force_degree in CANDIDATES:
             count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
             if 4 * count > len(unit):
                 break
             rows = slice(0, ROWS_PER_TERM * count)
-            solve = _LeastSquares(unit[rows], degree, force_degree)
-            series = solve(target[rows])
-            relative = np.exp(_evaluate(series, held_unit)) / held[1] - 1.0
-            error = float(np.sqrt(np.mean(relative**2)))
-            if best is None or error < best[0]:
-                inverse = np.split(solve(_inverse(series, unit[rows], noise)), 3, axis=-1)
-                best = error, np.stack([series, *inverse])
+            field = cls(domain, _least_squares(unit[rows], target[rows], degree, force_degree), np.inf)
+            error = float(np.sqrt(np.mean((field.charge_pC(held[0]) / held[1] - 1.0) ** 2)))
+            if best is None or error < best.error:
+                best = cls(domain, field.series, error)
             if error < GOOD_ENOUGH:
                 break
         if best is None:
             raise TrainingError(f"expected at least 224 presses to fit the charges by, got {len(unit)}")
-        return cls(domain, best[1], best[0])
+        return best
 
     def charge_pC(self, contact: Array) -> Array:
         """Charges of contacts (x_mm, y_mm, force_N): shape (n, 3) to (n, n_electrode)."""
-        charge: Array = np.exp(_evaluate(self.coefficients[0], self.domain.to_unit(contact)))
+        charge: Array = np.exp(self.log_charge(self.domain.to_unit(contact))[:, 0])
         return charge
+
+    def log_charge(self, unit: Array) -> Array:
+        """ln Q and its derivatives by the unit coordinates: contacts (n, 3) in them to (n, 4, n_electrode)."""
+        degree, _, orders, n_electrode = (size - 1 for size in self.series.shape)
+        parts = [self._some_logs(some, degree, orders) for some in np.array_split(unit, len(unit) // CHUNK + 1)]
+        return np.concatenate(parts).reshape(len(unit), 4, n_electrode + 1)
 
     def with_slopes(self) -> Array:
         """Series of ln Q and of its derivatives by the unit coordinates, side by side.
@@ -138,52 +134,50 @@ class ChargeField:
         Returns:
             Shape (degree + 1, degree + 1, force_degree + 1, 4, n_electrode).
         """
-        series = self.coefficients[0]
-        return np.stack([series, *(_derivative(series, axis) for axis in range(3))], axis=3)
+        return np.stack([self.series, *(_derivative(self.series, axis) for axis in range(3))], axis=3)
+
+    def _some_logs(self, unit: Array, degree: int, force_degree: int) -> Array:
+        plane, in_force = _terms(unit, degree, force_degree)
+        by_force = (plane @ self._rows).reshape(len(unit), in_force.shape[1], -1)
+        logs: Array = (in_force[:, None, :] @ by_force)[:, 0]
+        return logs
+
+    @cached_property
+    def _rows(self) -> Array:
+        """The series and its three derivatives by term of the plane, shape (n_term, (force_degree + 1) 4 n_electrode)."""
+        all_four = np.stack([self.series, *(_derivative(self.series, axis) for axis in range(3))])
+        of_terms = all_four[:, *_plane_terms(self.series.shape[0] - 1)]  # (4, n_term, force_degree + 1, n_electrode)
+        rows: Array = of_terms.transpose(1, 2, 0, 3).reshape(of_terms.shape[1], -1)
+        return rows
 
 
-def _polynomials(unit: Array, degree: int, force_degree: int) -> tuple[Array, Array, Array]:
-    degrees = (degree, degree, force_degree)
-    x, y, force = (chebyshev.chebvander(np.clip(unit[:, i], -1.0, 1.0), degrees[i]).astype(float) for i in range(3))
-    return x, y, force
+def _plane_terms(degree: int) -> tuple[Integers, Integers]:
+    """Degrees in x and y of the terms."""
+    of_x, of_y = np.nonzero(np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) <= degree)
+    return of_x, of_y
 
 
-class _LeastSquares:
-    """Least squares for one set of terms at one set of contacts: factorised once, solved for several targets."""
-
-    def __init__(self, unit: Array, degree: int, force_degree: int) -> None:
-        in_x, in_y, in_force = _polynomials(unit, degree, force_degree)
-        self.shape = (degree + 1, degree + 1, force_degree + 1)
-        self.terms = np.nonzero(np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) <= degree)
-        plane = in_x[:, self.terms[0]] * in_y[:, self.terms[1]]
-        columns = (plane[:, :, None] * in_force[:, None, :]).reshape(len(unit), -1)
-        ridge = RIDGE * np.sqrt(len(unit)) * np.eye(columns.shape[1])
-        self.factor = np.linalg.qr(np.vstack([columns, ridge]))
-
-    def __call__(self, target: Array) -> Array:
-        """Series of shape (degree + 1, degree + 1, force_degree + 1, k) for targets of shape (n, k)."""
-        orthogonal, triangle = self.factor
-        solution = solve_triangular(triangle, orthogonal[: len(target)].T @ target)
-        series = np.zeros((*self.shape, target.shape[1]))
-        series[self.terms] = solution.reshape(self.terms[0].size, self.shape[2], -1)
-        return series
+def _terms(unit: Array, degree: int, force_degree: int) -> tuple[Array, Array]:
+    """Products of the polynomials in x and y, (n, n_term), and the polynomials in the force, (n, force_degree + 1)."""
+    inside = np.clip(unit, -1.0, 1.0)
+    in_x, in_y = (chebyshev.chebvander(inside[:, axis], degree).astype(float) for axis in range(2))
+    of_x, of_y = _plane_terms(degree)
+    return in_x[:, of_x] * in_y[:, of_y], chebyshev.chebvander(inside[:, 2], force_degree).astype(float)
 
 
-def _evaluate(series: Array, unit: Array) -> Array:
-    parts = _polynomials(unit, series.shape[0] - 1, series.shape[2] - 1)
-    values: Array = np.einsum("ni,nj,nm,ijme->ne", *parts, series, optimize=True)
-    return values
-
-
-def _inverse(series: Array, unit: Array, noise: NoiseModel) -> Array:
-    """P at contacts in unit coordinates, its three rows side by side: (n, 3) to (n, 3 n_electrode)."""
-    jacobian = np.stack([_evaluate(_derivative(series, axis), unit) for axis in range(3)], axis=1)
-    charge = np.exp(_evaluate(series, unit)) * 1e-12
-    weighted = jacobian * ((charge / noise.sigma(charge)) ** 2)[:, None, :]
-    normal = weighted @ jacobian.transpose(0, 2, 1)
-    damping = DAMPING / 3.0 * np.trace(normal, axis1=1, axis2=2)
-    inverse: Array = np.linalg.solve(normal + damping[:, None, None] * np.eye(3), weighted)
-    return inverse.reshape(len(unit), -1)
+def _least_squares(unit: Array, target: Array, degree: int, force_degree: int) -> Array:
+    """Series for targets of shape (n, k), by the normal equations: double precision is plenty for these polynomials."""
+    count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
+    normal, moment = RIDGE * len(unit) * np.eye(count), np.zeros((count, target.shape[1]))
+    for some in np.array_split(np.arange(len(unit)), len(unit) // CHUNK + 1):
+        plane, in_force = _terms(unit[some], degree, force_degree)
+        columns = (plane[:, :, None] * in_force[:, None, :]).reshape(len(some), -1)
+        normal += columns.T @ columns
+        moment += columns.T @ target[some]
+    series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
+    solution = cho_solve(cho_factor(normal), moment)
+    series[_plane_terms(degree)] = solution.reshape(-1, force_degree + 1, target.shape[1])
+    return series
 
 
 def _derivative(series: Array, axis: int) -> Array:

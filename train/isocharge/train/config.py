@@ -9,8 +9,11 @@ from isocharge.errors import ConfigError
 
 LIMITS = {
     "steps": (1, 10_000_000),
-    "nearest_steps": (1, 10_000_000),
+    "finish_steps": (0, 100_000),
+    "misfit_steps": (1, 10_000_000),
+    "misfit_charges": (1_000, 10_000_000),
     "batch": (1, 1_000_000),
+    "patience": (1, 10_000_000),
     "seed": (0, 2**31 - 1),
     "threads": (1, 64),
 }
@@ -23,22 +26,26 @@ class NetworkConfig:
 
     Attributes:
         hidden: Widths of the hidden layers of the contact network.
-        nearest_hidden: Widths of the one that proposes the nearest known contact, for the misfit; as many layers.
+        misfit_hidden: Widths of the one that gives the misfit; as many layers.
+        electrodes: How many electrodes the dataset has to have; 0 takes what it has.
     """
 
     hidden: tuple[int, ...] = (64, 64, 64)
-    nearest_hidden: tuple[int, ...] = (48, 48, 48)
+    misfit_hidden: tuple[int, ...] = (64, 64, 64)
+    electrodes: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("hidden", "nearest_hidden"):
+        for name in ("hidden", "misfit_hidden"):
             widths = getattr(self, name)
             if not widths or not all(type(width) is int and 1 <= width <= 4096 for width in widths):
                 raise ConfigError(f"network.{name}: expected widths from 1 to 4096, got {widths}")
-        if len(self.hidden) != len(self.nearest_hidden):
+        if len(self.hidden) != len(self.misfit_hidden):
             raise ConfigError(
-                f"network.nearest_hidden: expected as many layers as network.hidden ({len(self.hidden)}; they run side "
-                f"by side), got {self.nearest_hidden}"
+                f"network.misfit_hidden: expected as many layers as network.hidden ({len(self.hidden)}; they run side "
+                f"by side), got {self.misfit_hidden}"
             )
+        if type(self.electrodes) is not int or not (self.electrodes == 0 or 3 <= self.electrodes <= 64):
+            raise ConfigError(f"network.electrodes: expected 0 (as the dataset) or 3 to 64, got {self.electrodes!r}")
 
 
 @dataclass(frozen=True)
@@ -47,19 +54,25 @@ class TrainingConfig:
 
     Attributes:
         steps: Optimiser steps of the contact network.
-        nearest_steps: Those of the nearest-contact network.
+        finish_steps: Levenberg-Marquardt steps after them; only without noise, and for some 1,500 weights at most.
+        misfit_steps: Optimiser steps of the misfit network.
+        misfit_charges: Charges that it learns from.
         batch: Samples per step.
-        learning_rate: Largest rate of the one-cycle schedule (Adam's; Muon's is a multiple).
-        hold_out: Share of the positions kept for measuring errors.
+        learning_rate: Largest rate of the schedule (Adam's; Muon's is a multiple).
+        patience: Steps without a better network after which a stage ends early; the best one is kept.
+        hold_out: Share of the positions kept for measuring errors; half as many are watched while it trains.
         noise: Level of the noise model that is added afresh in every step.
         seed: Of weights, batches, noise and split.
         threads: CPU threads; one is nearly as fast as two at this size and does not suffer when the cores are busy.
     """
 
     steps: int = 6_000
-    nearest_steps: int = 2_500
+    finish_steps: int = 0
+    misfit_steps: int = 6_000
+    misfit_charges: int = 80_000
     batch: int = 1024
     learning_rate: float = 5e-3
+    patience: int = 3_000
     hold_out: float = 0.1
     noise: str = "reference"
     seed: int = 0
@@ -72,8 +85,13 @@ class TrainingConfig:
                 raise ConfigError(f"training.{name}: expected a whole number from {low} to {high}, got {value!r}")
         if not 0.0 < self.learning_rate < 1.0:
             raise ConfigError(f"training.learning_rate: expected a number between 0 and 1, got {self.learning_rate!r}")
-        if not 0.0 < self.hold_out < 0.9:
-            raise ConfigError(f"training.hold_out: expected a share between 0 and 0.9, got {self.hold_out!r}")
+        if not 0.0 < self.hold_out < 0.6:
+            raise ConfigError(f"training.hold_out: expected a share between 0 and 0.6, got {self.hold_out!r}")
+        if self.finish_steps and self.noise != "clean":
+            raise ConfigError(
+                f"training.finish_steps: expected 0 with the noise {self.noise!r} (it would learn the noise by heart), "
+                f'got {self.finish_steps}; training.noise = "clean" allows it'
+            )
 
 
 @dataclass(frozen=True)
@@ -86,7 +104,7 @@ class FitConfig:
     def to_dict(self) -> dict[str, Any]:
         """As the tables of the file, ready for JSON."""
         table = asdict(self)
-        table["network"] = {name: list(widths) for name, widths in table["network"].items()}
+        table["network"] |= {name: list(table["network"][name]) for name in ("hidden", "misfit_hidden")}
         return table
 
 

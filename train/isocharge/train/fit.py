@@ -1,38 +1,43 @@
 """Training: a dataset in, a trained `InverseNetwork` out.
 
 The contact network learns mean and standard deviation by maximum likelihood on charges with fresh noise in every step;
-the first steps learn the mean by least squares, because a likelihood with free deviations is slow to find it. The
-nearest-contact network learns to minimise the misfit itself, on presses, and on charges that no press gives: wrong
-gains, a dead electrode, forces far outside.
+the first steps learn the mean by least squares, because a likelihood with free deviations is slow to find it. Without
+noise Levenberg-Marquardt finishes the mean. The misfit network learns from charges of all kinds, whose distance from the
+nearest known contact is searched for beforehand.
 """
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
-from torch import Tensor, nn
+from torch import Tensor
 
-from isocharge.errors import ConfigError, TrainingError
+from isocharge.errors import ConfigError, DatasetError, TrainingError
 from isocharge.simulate.dataset import Dataset
-from isocharge.simulate.noise import noise_model
-from isocharge.train.charge_field import ChargeField
+from isocharge.simulate.noise import NoiseModel, noise_model
+from isocharge.train.charge_field import ChargeField, Domain
+from isocharge.train.checkpoint import Checkpoint
 from isocharge.train.config import FitConfig, TrainingConfig
-from isocharge.train.network import Features, InverseNetwork, project
-from isocharge.train.split import Presses, domain_of, split_by_position
-
-Progress = Callable[[int, int, str], None]
-"""Called with (steps done, steps in all, a line about the state)."""
+from isocharge.train.descent import REPORT_EVERY, Descent, Progress, Task
+from isocharge.train.evaluate import misfit_noise, noisy_charges
+from isocharge.train.folds import SMALLEST_SHARE, fold_free_share, shrunk
+from isocharge.train.network import Features, InverseNetwork, squeezed
+from isocharge.train.second_order import FIRST, levenberg_marquardt
+from isocharge.train.split import Presses, domain_of, presses_of, split_by_position
+from isocharge.train.strange import Strange, strange_charges
 
 WARM_UP = 0.15
 """Share of the steps that learn the mean by least squares."""
 
-MUON_RATE = 6.0
-"""Muon's rate over Adam's: a step of Muon has a given size whatever the gradient."""
+WATCHED = 0.5
+"""Positions that are watched while it trains, over those that are held out."""
 
-REPORT_EVERY = 200
-"""Steps between two calls of the progress function."""
+Warn = Callable[[str], object]
+"""Told what a person should know."""
 
 
 @dataclass(frozen=True)
@@ -41,47 +46,89 @@ class Fit:
 
     Attributes:
         network: The model.
-        field: The forward map inside it.
+        field: The forward map that the misfit was learned with.
         held: Presses kept for measuring errors.
         config: What it was trained with.
+        asked: The domain of the dataset; larger than the network's where the map folds.
     """
 
     network: InverseNetwork
     field: ChargeField
     held: Presses
     config: FitConfig
+    asked: Domain
 
 
-def fit_network(dataset: Dataset, config: FitConfig, progress: Progress | None = None) -> Fit:
+def fit_network(
+    dataset: Dataset,
+    config: FitConfig,
+    progress: Progress | None = None,
+    *,
+    checkpoint: Checkpoint | None = None,
+    warn: Warn = warnings.warn,
+) -> Fit:
     """Train on a dataset.
 
     Args:
         dataset: Clean charges; noise is added here.
         config: Sizes, steps, seed.
-        progress: Told about steps and loss.
+        progress: Told about steps, loss and errors on presses that are kept aside.
+        checkpoint: Keeps the state, so that a stopped run goes on.
+        warn: Told where the map folds.
 
     Raises:
-        ConfigError: If the noise level is unknown or has no noise.
+        ConfigError: If the noise level is unknown.
         DatasetError: If the dataset cannot train an inverse.
         TrainingError: If the loss is not finite.
     """
     training = config.training
-    noise = noise_model(training.noise)
-    if noise.white <= 0.0:
-        raise ConfigError(
-            f"training.noise: expected a level with noise (the misfit is in its units), got {noise.name!r}"
-        )
-    train, held = split_by_position(dataset, training.hold_out, training.seed)
+    noise_model(training.noise)  # an unknown level is said before the work
+    asked, presses = domain_of(dataset), presses_of(dataset)
+    _check_electrodes(dataset, config)
     with _threads_and_seed(training):
-        field = ChargeField.fit(
-            domain_of(dataset), train.contact, train.charge_pC, (held.contact, held.charge_pC), noise
-        )
+        domain, presses = _without_folds(asked, presses, training.seed, warn)
+        rest, held = split_by_position(presses, training.hold_out, training.seed)
+        train, watched = split_by_position(rest, WATCHED * training.hold_out, training.seed + 1)
+        field = _field(domain, train, watched)
         network = InverseNetwork(
-            field, Features.fit(train.charge_pC), noise, config.network.hidden, config.network.nearest_hidden
+            domain, Features.fit(train.charge_pC), config.network.hidden, config.network.misfit_hidden
         )
-        _Training(network, field, train, training, progress).run()
+        _Training(network, field, train, watched, training, checkpoint or Checkpoint(), progress).run()
     network.eval()
-    return Fit(network, field, held, config)
+    return Fit(network, field, held, config, asked)
+
+
+def _field(domain: Domain, train: Presses, watched: Presses) -> ChargeField:
+    return ChargeField.fit(domain, train.contact, train.charge_pC, (watched.contact, watched.charge_pC))
+
+
+def _check_electrodes(dataset: Dataset, config: FitConfig) -> None:
+    names, wanted = dataset.sensor.electrode_names, config.network.electrodes
+    if wanted and wanted != len(names):
+        raise ConfigError(
+            f"network.electrodes: the configuration is for {wanted} electrodes, the dataset of {dataset.sensor.name!r} "
+            f"has {len(names)} ({', '.join(names)}); use another dataset or leave the key out"
+        )
+
+
+def _without_folds(asked: Domain, presses: Presses, seed: int, warn: Warn) -> tuple[Domain, Presses]:
+    """The largest disk in which the map does not fold, and the presses in it."""
+    share = fold_free_share(_field(asked, *split_by_position(presses, 0.1, seed)))
+    if share == 1.0:
+        return asked, presses
+    domain = shrunk(asked, share)
+    if share < SMALLEST_SHARE:
+        raise DatasetError(
+            f"the map from contacts to charges folds within {domain.radius_mm:g} mm of {asked.radius_mm:g} mm: two "
+            "contacts give the same charges; add an electrode, or take a biaxial film"
+        )
+    inside = presses[np.hypot(presses.contact[:, 0], presses.contact[:, 1]) <= domain.radius_mm]
+    warn(
+        f"the map from contacts to charges folds beyond {domain.radius_mm:g} mm: two contacts give the same charges "
+        f"there; the model is trained for {domain.radius_mm:g} mm, not {asked.radius_mm:g} mm, on {len(inside)} of "
+        f"{len(presses)} presses"
+    )
+    return domain, inside
 
 
 @contextmanager
@@ -101,112 +148,139 @@ def _threads_and_seed(training: TrainingConfig) -> Iterator[None]:
 
 
 class _Training:
-    """One run: data as tensors, a generator, and the two loops."""
+    """One run: data as tensors, and the stages one after the other."""
 
     def __init__(
         self,
         network: InverseNetwork,
         field: ChargeField,
         train: Presses,
+        watched: Presses,
         config: TrainingConfig,
+        checkpoint: Checkpoint,
         progress: Progress | None,
     ) -> None:
-        self.network, self.config, self.progress = network, config, progress
+        self.network, self.field, self.train, self.watched = network, field, train, watched
+        self.config, self.checkpoint, self.progress = config, checkpoint, progress
+        self.noise = noise_model(config.noise)
         self.charge = torch.tensor(train.charge_pC).float()
         self.unit = torch.tensor(field.domain.to_unit(train.contact)).float()
-        self.random = torch.Generator().manual_seed(config.seed)
+        self.watched_charge = torch.tensor(noisy_charges(watched, self.noise, config.seed)).float()
+        self.watched_unit = torch.tensor(field.domain.to_unit(watched.contact)).float()
+        self.total = config.steps + config.finish_steps + config.misfit_steps
 
     def run(self) -> None:
-        warm_up = round(WARM_UP * self.config.steps)
-
-        def contact_loss(step: int, charge: Tensor, unit: Tensor) -> Tensor:
-            mean, log_std = self.network.posterior(self._noisy(charge))
-            return _start_loss(mean, log_std, unit) if step < warm_up else _likelihood_loss(mean, log_std, unit)
-
-        def nearest_loss(step: int, charge: Tensor, unit: Tensor) -> Tensor:
-            if step < round(WARM_UP * self.config.nearest_steps):
-                return ((self.network.propose(self._noisy(charge)) - unit) ** 2).sum(dim=1).mean()
-            return self._misfit_loss(self._noisy(self._corrupt(charge)))
-
-        total = self.config.steps + self.config.nearest_steps
-        self._descend(self.network.contact, contact_loss, self.config.steps, (0, total), "contact")
-        self._descend(
-            self.network.nearest, nearest_loss, self.config.nearest_steps, (self.config.steps, total), "misfit"
+        config = self.config
+        contact = Task(
+            "contact",
+            self.network.contact,
+            self._contact_loss,
+            self._contact_score,
+            config.steps,
+            round(WARM_UP * config.steps),
         )
+        self._descend(contact, 0)
+        if config.finish_steps:
+            self._finish()
+        strange = _Learned.of(self.network, self._strange_charges(), config)
+        misfit = Task("misfit", self.network.missing, strange.loss, strange.score, config.misfit_steps)
+        self._descend(misfit, config.steps + config.finish_steps)
 
-    def _descend(
-        self,
-        part: nn.Module,
-        loss_of: Callable[[int, Tensor, Tensor], Tensor],
-        steps: int,
-        position: tuple[int, int],
-        label: str,
-    ) -> None:
-        """Minimise a loss over one part of the network."""
-        optimisers = _optimisers(part, self.config.learning_rate)
-        schedules = [
-            torch.optim.lr_scheduler.OneCycleLR(each, each.defaults["lr"], total_steps=steps + 1, pct_start=0.1)
-            for each in optimisers
-        ]
-        for step, rows in zip(range(steps), self._batches(), strict=False):
-            loss = loss_of(step, self.charge[rows], self.unit[rows])
-            part.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            for optimiser, schedule in zip(optimisers, schedules, strict=True):
-                optimiser.step()
-                schedule.step()
-            if step % REPORT_EVERY == 0 or step == steps - 1:
-                self._report(loss, position[0] + step + 1, position[1], label)
+    def _descend(self, task: Task, before: int) -> None:
+        descent = Descent(task, self.config.learning_rate, self.config.patience, self.config.seed)
+        descent.run(self.checkpoint, lambda step, words: self._tell(before + step, words))
 
-    def _report(self, loss: Tensor, done: int, total: int, label: str) -> None:
-        value = loss.item()
-        if not torch.isfinite(loss):
-            raise TrainingError(f"the {label} loss is {value} at step {done} of {total}; lower training.learning_rate")
+    def _tell(self, done: int, words: str) -> None:
         if self.progress:
-            self.progress(done, total, f"{label} loss {value:.3f}")
+            self.progress(done, self.total, words)
 
-    def _batches(self) -> Iterator[Tensor]:
-        """Row numbers, every sample once an epoch, for ever."""
-        batch = min(self.config.batch, len(self.charge))
-        while True:
-            order = torch.randperm(len(self.charge), generator=self.random)
-            yield from torch.split(order, batch)[: len(order) // batch]
+    def _contact_loss(self, step: int, random: torch.Generator) -> Tensor:
+        rows = torch.randint(len(self.charge), (min(self.config.batch, len(self.charge)),), generator=random)
+        mean, log_std = self.network.posterior(_noisy(self.charge[rows], self.noise, random))
+        warm_up = step < round(WARM_UP * self.config.steps)
+        return (_start_loss if warm_up else _likelihood_loss)(mean, log_std, self.unit[rows])
 
-    def _normal(self, shape: torch.Size) -> Tensor:
-        return torch.randn(shape, generator=self.random)
+    def _contact_score(self) -> tuple[float, str]:
+        with torch.no_grad():
+            mean, log_std = self.network.posterior(self.watched_charge)
+            loss = _likelihood_loss(mean, log_std, self.watched_unit).item()
+            off = ((mean - self.watched_unit) * self.network.scale) ** 2
+        position, force = off[:, :2].sum(dim=1).mean().sqrt().item(), off[:, 2].mean().sqrt().item()
+        return loss, f"{loss:.3f} on watched presses: {position:.4f} mm and {100.0 * force:.3f} % of force rms"
 
-    def _noisy(self, charge: Tensor) -> Tensor:
-        return charge + self.network.sigma(charge) * self._normal(charge.shape)
+    def _finish(self) -> None:
+        """Levenberg-Marquardt for the mean in double precision; the deviations are then those of watched presses."""
+        part = self.network.contact.double()
+        inputs, wanted = self.network.inputs(self.charge).double(), self.unit.double()
+        state = self.checkpoint.load("finish") or {"step": 0, "damping": FIRST, "part": part.state_dict()}
+        part.load_state_dict(state["part"])
+        step = state["step"]
+        left = self.config.finish_steps - step
+        for square, damping in levenberg_marquardt(part, inputs, wanted, left, state["damping"]):
+            step += 1
+            state = {"step": step, "damping": damping, "part": part.state_dict()}
+            self.checkpoint.save("finish", lambda kept=state: kept)
+            self._tell(self.config.steps + step, f"finish: {square:.3g}, {self._mean_off()}")
+        self.checkpoint.save("finish", lambda: {**state, "step": self.config.finish_steps}, now=True)
+        self._constant_deviations()
+        part.float()
 
-    def _corrupt(self, charge: Tensor) -> Tensor:
-        """A quarter of the rows as they are, 30 % with wrong gains, 15 % with a dead electrode, 30 % scaled."""
-        count, n_electrode = charge.shape
-        kind = torch.rand(count, 1, generator=self.random)
-        gain = torch.exp(0.15 * self._normal(charge.shape))
-        dead = torch.randint(n_electrode, (count, 1), generator=self.random) == torch.arange(n_electrode)
-        scale = 10.0 ** (2.0 * torch.rand(count, 1, generator=self.random) - 1.0)
-        wrong = torch.where(kind < 0.55, charge * gain, torch.where(kind < 0.7, charge * ~dead, charge * scale))
-        return torch.where(kind < 0.25, charge, wrong)
+    def _mean_off(self) -> str:
+        with torch.no_grad():
+            mean = self.network.contact(self.network.inputs(self.watched_charge).double())[:, :3]
+            off = ((mean - self.watched_unit) * self.network.scale).double() ** 2
+        return f"{off[:, :2].sum(dim=1).mean().sqrt():.5f} mm and {100.0 * off[:, 2].mean().sqrt():.4f} % of force rms"
 
-    def _misfit_loss(self, charge: Tensor) -> Tensor:
-        """log(1 + misfit^2) of the proposal, plus a pull towards the domain, outside of which there is no slope."""
-        proposal = self.network.propose(charge)
-        distance = self.network.distance(charge, project(proposal))
-        beyond = torch.stack([proposal[:, :2].norm(dim=1), proposal[:, 2].abs()]) - 1.0
-        outside = (beyond.clamp(min=0.0) ** 2).sum(dim=0)
-        return (torch.log1p(distance**2) + 3.0 * outside).mean()
+    def _constant_deviations(self) -> None:
+        """Root-mean-square errors of the watched presses as the deviations, whatever the charges."""
+        last = self.network.contact[-1]
+        with torch.no_grad():
+            off = self.network.contact(self.network.inputs(self.watched_charge).double())[:, :3] - self.watched_unit
+            last.weight[3:] = 0.0
+            last.bias[3:] = 0.5 * (off**2).mean(dim=0).log()
+
+    def _strange_charges(self) -> Strange:
+        """Charges for the misfit; searching for their nearest contacts takes long enough to be kept."""
+        if (kept := self.checkpoint.load("charges")) is not None:
+            return Strange(*(kept[name].numpy() for name in ("charge_pC", "miss")))
+        made = strange_charges(
+            self.train, self.field, misfit_noise(self.noise), self.config.misfit_charges, self.config.seed
+        )
+        self.checkpoint.save(
+            "charges", lambda: {name: torch.tensor(getattr(made, name)) for name in ("charge_pC", "miss")}, now=True
+        )
+        return made
 
 
-def _optimisers(part: nn.Module, rate: float) -> list[torch.optim.Optimizer]:
-    """Muon (Jordan et al. 2024) for the hidden layers' matrices, Adam with a short memory for the rest.
+@dataclass(frozen=True)
+class _Learned:
+    """The misfit network's data: inputs and squeezed vectors, the last `watched` of them kept aside."""
 
-    At equal steps the pair halves the error that plain Adam reaches on clean charges.
-    """
-    matrices = [parameter for parameter in part.parameters() if parameter.ndim == 2][1:-1]
-    hidden = {id(parameter) for parameter in matrices}
-    rest = [parameter for parameter in part.parameters() if id(parameter) not in hidden]
-    adam = torch.optim.Adam(rest, lr=rate, betas=(0.9, 0.98))
-    return [torch.optim.Muon(matrices, lr=MUON_RATE * rate, weight_decay=0.0), adam] if matrices else [adam]
+    network: InverseNetwork
+    inputs: Tensor
+    wanted: Tensor
+    watched: int
+    batch: int
+
+    @classmethod
+    def of(cls, network: InverseNetwork, strange: Strange, config: TrainingConfig) -> "_Learned":
+        inputs = network.inputs(torch.tensor(strange.charge_pC).float())
+        watched = round(WATCHED * config.hold_out * len(inputs))
+        return cls(network, inputs, squeezed(torch.tensor(strange.miss)).float(), watched, config.batch)
+
+    def loss(self, _: int, random: torch.Generator) -> Tensor:
+        rows = torch.randint(len(self.inputs) - self.watched, (self.batch,), generator=random)
+        return ((self.network.missing(self.inputs[rows]) - self.wanted[rows]) ** 2).sum(dim=1).mean()
+
+    def score(self) -> tuple[float, str]:
+        with torch.no_grad():
+            off = ((self.network.missing(self.inputs[-self.watched :]) - self.wanted[-self.watched :]) ** 2).sum(dim=1)
+        return off.mean().item(), f"{off.mean().item():.4f} on watched charges"
+
+
+def _noisy(charge_pC: Tensor, noise: NoiseModel, random: torch.Generator) -> Tensor:
+    sigma = torch.hypot(torch.tensor(1e12 * noise.white), noise.gain * charge_pC)
+    return charge_pC + sigma * torch.randn(charge_pC.shape, generator=random)
 
 
 def _start_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:

@@ -1,14 +1,13 @@
 """The inverse: charges in; contact, standard deviations and misfit out. The torch twin of the exported graph.
 
 Features are whitened logarithms of the charges: a force multiplies all charges nearly alike, so ratios carry the
-position and the common factor the force. One perceptron gives mean and log standard deviation of (x, y, ln F). The
-misfit
+position and the common factor the force. One perceptron gives mean and log standard deviation of (x, y, ln F). A second
+one gives the misfit
 
     min over known contacts c of |(Q - Q(c)) / sigma|
 
-starts from two proposals, the mean itself and a second perceptron trained to find the nearest contact of charges that
-no contact gives; each is brought into the domain, improved by one Gauss-Newton step, and the best of the four wins. It
-is an upper bound of the minimum that is tight where the charges come from a contact.
+as the length of a vector, (Q - Q(c)) / sigma at the nearest contact: that vector is smooth where its length is not, on
+the image of the forward map. Lengths from a tenth to thousands are brought into reach of a network by asinh.
 """
 
 from dataclasses import dataclass
@@ -19,11 +18,13 @@ import torch
 from torch import Tensor, nn
 
 from isocharge.simulate.arrays import Array
-from isocharge.simulate.noise import NoiseModel
-from isocharge.train.charge_field import ChargeField
+from isocharge.train.charge_field import Domain
 
 LOWEST_PC, HIGHEST_PC = 1.0, 1e6
 """Charges are brought between these before the logarithm: what is negative or absurd still gives a finite answer."""
+
+MISFIT_UNIT = 5.0
+"""Standard deviations up to which the misfit is learned about linearly; beyond, its logarithm is."""
 
 
 @dataclass(frozen=True)
@@ -56,45 +57,14 @@ def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequent
     return nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
 
 
-class TorchField(nn.Module):
-    """`ChargeField` in torch, on unit coordinates."""
-
-    series: Tensor
-
-    def __init__(self, field: ChargeField) -> None:
-        super().__init__()
-        self.register_buffer("series", torch.tensor(field.coefficients).float())
-
-    def forward(self, unit: Tensor, rows: int = 1) -> Tensor:
-        """ln Q and, with rows = 4, the rows of P: unit coordinates (n, 3) to (n, rows, n_electrode)."""
-        in_x = _chebyshev(unit[:, 0], self.series.shape[1])
-        in_y = _chebyshev(unit[:, 1], self.series.shape[2])
-        in_force = _chebyshev(unit[:, 2], self.series.shape[3])
-        plane = (in_x[:, :, None] * in_y[:, None, :]).flatten(1)
-        part = self.series[:rows].permute(1, 2, 0, 4, 3).flatten(0, 1)
-        by_force = (plane @ part.flatten(1)).reshape(-1, *part.shape[1:])
-        values: Tensor = (by_force @ in_force[:, None, :, None])[..., 0]
-        return values
-
-
-def _chebyshev(x: Tensor, count: int) -> Tensor:
-    """T_0 ... T_(count-1) at points (n,), by their recurrence: unlike cos(k acos x) it differentiates at +-1."""
-    x = x.clamp(-1.0, 1.0)
-    values = [torch.ones_like(x), x]
-    for _ in range(count - 2):
-        values.append(2.0 * x * values[-1] - values[-2])
-    return torch.stack(values[:count], dim=-1)
-
-
 class InverseNetwork(nn.Module):
     """The whole model.
 
     Args:
-        field: The forward map; its domain is the model's.
+        domain: The contacts it knows.
         features: Normalisation.
-        noise: For the sigma of the misfit.
         hidden: Widths of the contact network.
-        nearest_hidden: Widths of the nearest-contact network.
+        misfit_hidden: Widths of the misfit network.
     """
 
     centre: Tensor
@@ -103,63 +73,29 @@ class InverseNetwork(nn.Module):
     whitening: Tensor
 
     def __init__(
-        self,
-        field: ChargeField,
-        features: Features,
-        noise: NoiseModel,
-        hidden: tuple[int, ...],
-        nearest_hidden: tuple[int, ...],
+        self, domain: Domain, features: Features, hidden: tuple[int, ...], misfit_hidden: tuple[int, ...]
     ) -> None:
         super().__init__()
         n_electrode = features.typical.size
-        self.features, self.noise = features, noise
-        self.field = TorchField(field)
+        self.domain, self.features = domain, features
         self.contact = perceptron(n_electrode, hidden, 6)
-        self.nearest = perceptron(n_electrode, nearest_hidden, 3)
+        self.missing = perceptron(n_electrode, misfit_hidden, n_electrode)
         for name, values in (
-            ("centre", field.domain.centre),
-            ("scale", field.domain.scale),
+            ("centre", domain.centre),
+            ("scale", domain.scale),
             ("typical", features.typical),
             ("whitening", features.matrix),
         ):
             self.register_buffer(name, torch.tensor(values).float())
 
-    def logs(self, charge_pC: Tensor) -> Tensor:
-        """ln(Q / typical), finite for any input."""
-        return torch.log(charge_pC.clamp(LOWEST_PC, HIGHEST_PC) / self.typical)
-
-    def sigma(self, charge_pC: Tensor) -> Tensor:
-        """Standard deviation of charges in pC."""
-        return torch.sqrt((1e12 * self.noise.white) ** 2 + (self.noise.gain * charge_pC) ** 2)
+    def inputs(self, charge_pC: Tensor) -> Tensor:
+        """What both perceptrons see, finite for any charges (n, n_electrode), pC."""
+        return torch.log(charge_pC.clamp(LOWEST_PC, HIGHEST_PC) / self.typical) @ self.whitening
 
     def posterior(self, charge_pC: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation of the unit coordinates, each (n, 3)."""
-        out = self.contact(self.logs(charge_pC) @ self.whitening)
+        out = self.contact(self.inputs(charge_pC))
         return out[:, :3], out[:, 3:]
-
-    def propose(self, charge_pC: Tensor) -> Tensor:
-        """The nearest-contact network's unit coordinates (n, 3), not yet inside the domain."""
-        proposal: Tensor = self.nearest(self.logs(charge_pC) @ self.whitening)
-        return proposal
-
-    def distance(self, charge_pC: Tensor, unit: Tensor) -> Tensor:
-        """|(Q - Q(c)) / sigma| for contacts c in unit coordinates, shape (n,)."""
-        within = charge_pC.clamp(-HIGHEST_PC, HIGHEST_PC)
-        known = torch.exp(self.field(unit)[:, 0])
-        distance: Tensor = torch.linalg.vector_norm((within - known) / self.sigma(within), dim=1)
-        return distance
-
-    def improve(self, charge_pC: Tensor, unit: Tensor) -> Tensor:
-        """One Gauss-Newton step towards the nearest contact, projected onto the domain."""
-        rows = self.field(unit, rows=4)
-        miss = self.logs(charge_pC) + torch.log(self.typical) - rows[:, 0]
-        return project(unit + (rows[:, 1:] * miss[:, None]).sum(dim=2))
-
-    def misfit(self, charge_pC: Tensor, mean: Tensor) -> Tensor:
-        """Distance to the nearest known contact in units of sigma, shape (n,)."""
-        starts = (project(mean), project(self.propose(charge_pC)))
-        tried = [unit for start in starts for unit in (start, self.improve(charge_pC, start))]
-        return torch.stack([self.distance(charge_pC, unit) for unit in tried]).amin(dim=0)
 
     def forward(self, charge_pC: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
@@ -168,10 +104,11 @@ class InverseNetwork(nn.Module):
         force = torch.exp(value[:, 2:])
         contact = torch.cat([value[:, :2], force], dim=1)
         contact_std = torch.cat([std[:, :2], std[:, 2:] * force], dim=1)
-        return contact, contact_std, self.misfit(charge_pC, mean)[:, None]
+        squeezed = torch.linalg.vector_norm(self.missing(self.inputs(charge_pC)), dim=1, keepdim=True)
+        return contact, contact_std, MISFIT_UNIT * torch.sinh(squeezed)
 
 
-def project(unit: Tensor) -> Tensor:
-    """The nearest point of the domain, unit disk times [-1, 1]; shape (n, 3)."""
-    radius = unit[:, :2].norm(dim=1, keepdim=True).clamp(min=1.0)
-    return torch.cat([unit[:, :2] / radius, unit[:, 2:].clamp(-1.0, 1.0)], dim=1)
+def squeezed(miss: Tensor) -> Tensor:
+    """What the misfit network learns: the vector `miss`, (n, n_electrode), its length brought to asinh(length / unit)."""
+    length = torch.linalg.vector_norm(miss, dim=1, keepdim=True)
+    return miss * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=1e-9))

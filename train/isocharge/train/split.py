@@ -58,23 +58,34 @@ def domain_of(dataset: Dataset) -> Domain:
     return Domain(radius, (low, high))
 
 
-def split_by_position(dataset: Dataset, hold_out: float, seed: int) -> tuple[Presses, Presses]:
-    """Training and held-out presses.
-
-    Raises:
-        DatasetError: If the dataset has too few presses or positions, fewer than three electrodes, or charges that are
-            not positive.
-    """
-    presses = Presses.of(dataset.samples)
-    _check(presses)
+def split_by_position(presses: Presses, share: float, seed: int) -> tuple[Presses, Presses]:
+    """The presses at all but a share of the positions, and those at the share."""
     _, position = np.unique(np.round(presses.contact[:, :2], 6), axis=0, return_inverse=True)
     order = np.random.default_rng(seed).permutation(position.max() + 1)
-    held_positions = order[: max(1, round(hold_out * order.size))]
-    held = np.isin(position.ravel(), held_positions)
+    held = np.isin(position.ravel(), order[: max(1, round(share * order.size))])
     return presses[~held], presses[held]
 
 
+def presses_of(dataset: Dataset) -> Presses:
+    """A dataset's presses, checked.
+
+    Raises:
+        DatasetError: If the dataset has too few presses or positions, fewer than three electrodes, or numbers that are
+            not finite or charges that are not positive.
+    """
+    presses = Presses.of(dataset.samples)
+    _check(presses)
+    return presses
+
+
 def _check(presses: Presses) -> None:
+    finite = np.isfinite(presses.charge_pC).all(axis=1) & np.isfinite(presses.contact).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise DatasetError(
+            f"sample {row}: expected finite numbers, got the contact {presses.contact[row].tolist()} (mm, mm, N) and "
+            f"{presses.charge_pC[row].tolist()} pC"
+        )
     positions = len(np.unique(np.round(presses.contact[:, :2], 3), axis=0))
     if len(presses) < FEWEST or positions < 50:
         raise DatasetError(

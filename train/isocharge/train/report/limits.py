@@ -8,6 +8,7 @@ import numpy as np
 
 from isocharge.simulate import ChargeSpline, ForwardMap
 from isocharge.simulate.arrays import Array
+from isocharge.simulate.limits import CramerRao, limits_at
 from isocharge.train.bayes import Scene, bayes_estimate
 from isocharge.train.report.bench import Bench
 from isocharge.train.report.measures import errors, rms, rounded
@@ -24,16 +25,16 @@ class Limits:
     Attributes:
         bayes: Posterior means for the first of the noisy test presses, (x_mm, y_mm, force_N), shape (m, 3); None where
             the probe is not known to the sensor, and the posterior would be one over probes, too.
-        cramer_rao: Smallest standard deviations of an unbiased estimate, (x_mm, y_mm, force_N), shape (n, 3).
+        cramer_rao: Of every press, for unbiased estimates.
     """
 
     bayes: Array | None
-    cramer_rao: Array
+    cramer_rao: CramerRao
 
     @property
     def position_mm(self) -> Array:
-        """Cramér-Rao's position error, root of the sum of both variances, shape (n,)."""
-        return np.hypot(self.cramer_rao[:, 0], self.cramer_rao[:, 1])
+        """Cramér-Rao's position error, shape (n,)."""
+        return 1e3 * self.cramer_rao.position
 
     def record(self, truth: Array) -> dict[str, Any]:
         """Root-mean-square errors for the record; Cramér-Rao's holds for unbiased estimates only."""
@@ -45,7 +46,7 @@ class Limits:
             "cramer_rao": {
                 "position_rms_mm": rounded(rms(self.position_mm)),
                 "position_median_mm": rounded(float(np.median(self.position_mm))),
-                "force_rms_percent": rounded(100.0 * rms(self.cramer_rao[:, 2] / truth[:, 2])),
+                "force_rms_percent": rounded(100.0 * rms(self.cramer_rao.force)),
             },
         }
 
@@ -80,11 +81,6 @@ def limits_of(
     return Limits(bayes, _cramer_rao(bench, films, presses))
 
 
-def _cramer_rao(bench: Bench, films: tuple[ForwardMap, ...], presses: Presses) -> Array:
-    """Standard deviations from the Fisher information of every press; with several probes as if the first pressed."""
-    contact = presses.contact * np.array([1e-3, 1e-3, 1.0])
-    spline = ChargeSpline.of(films[0])
-    slopes = spline.jacobian(contact) / bench.noise.sigma(spline.charge(contact))[..., None]
-    variance = np.diagonal(np.linalg.inv(slopes.transpose(0, 2, 1) @ slopes), axis1=1, axis2=2)
-    deviations: Array = np.sqrt(variance) * np.column_stack([np.full((len(contact), 2), 1e3), contact[:, 2]])
-    return deviations
+def _cramer_rao(bench: Bench, films: tuple[ForwardMap, ...], presses: Presses) -> CramerRao:
+    """With several probes as if the first one pressed."""
+    return limits_at(ChargeSpline.of(films[0]), presses.contact * np.array([1e-3, 1e-3, 1.0]), bench.noise)

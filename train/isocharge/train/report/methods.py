@@ -31,7 +31,7 @@ from isocharge.train.rivals import (
     Triangulate,
 )
 from isocharge.train.rivals.linear_band import BAND_N
-from isocharge.train.split import Presses, split_by_position
+from isocharge.train.split import Presses, presses_of, split_by_position
 
 Progress = Callable[[str], None]
 """Told what comes next."""
@@ -95,7 +95,7 @@ class Test:
 
 def task_of(dataset: Dataset, bench: Bench, settings: Settings) -> Task:
     """What the methods are fitted for."""
-    train, validation = split_by_position(dataset, settings.hold_out, settings.seed)
+    train, validation = split_by_position(presses_of(dataset), settings.hold_out, settings.seed)
     return Task(train, validation, bench.domain, bench.noise, settings.seed, quick=settings.quick)
 
 

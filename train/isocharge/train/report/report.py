@@ -11,7 +11,7 @@ import numpy as np
 from isocharge.errors import ModelError
 from isocharge.files import new_folder, write_whole
 from isocharge.serve import ModelMetadata
-from isocharge.simulate import Dataset, sensor_to_dict
+from isocharge.simulate import Dataset, Samples, sensor_to_dict
 from isocharge.simulate.arrays import Array
 from isocharge.train.report import effects, maps, pictures
 from isocharge.train.report.bench import Bench, press_on
@@ -23,6 +23,7 @@ from isocharge.train.report.settings import Settings
 from isocharge.train.report.timing import machine, one_thread
 from isocharge.train.report.verdict import verdict
 from isocharge.train.rivals import Fitted, ReleasedModel, Task
+from isocharge.train.split import domain_of
 
 FORMAT_VERSION = 1
 
@@ -122,11 +123,12 @@ class _Subject:
 
     @classmethod
     def of(cls, dataset: Dataset, model: Path, settings: Settings) -> "_Subject":
+        released = ReleasedModel(model)
+        dataset = _known_to(released.predictor.metadata, dataset)
         if len(dataset.samples) > settings.learn_from:
-            dataset = replace(dataset, samples=_first(dataset, settings.learn_from))
+            dataset = replace(dataset, samples=_rows(dataset.samples, np.arange(settings.learn_from)))
         bench = Bench.of(dataset, settings.presses, settings.seed)
-        task, released = task_of(dataset, bench, settings), ReleasedModel(model)
-        _check_model(released.predictor.metadata, dataset, bench)
+        task = task_of(dataset, bench, settings)
         return cls(dataset, released, task, bench, settings)
 
     @property
@@ -181,16 +183,15 @@ class _Subject:
         return maps.Draws(self.released, test.presses, self.bench, self.settings.draws)
 
 
-def _first(dataset: Dataset, count: int) -> Any:
-    columns = {name: column[:count] for name, column in dataset.samples.columns().items()}
-    return type(dataset.samples)(**columns)
+def _rows(samples: Samples, rows: np.ndarray) -> Samples:
+    return Samples(**{name: column[rows] for name, column in samples.columns().items()})
 
 
-def _check_model(model: ModelMetadata, dataset: Dataset, bench: Bench) -> None:
-    """The model must be for the dataset's sensor and know all of its contacts.
+def _known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
+    """The presses of the dataset that lie in the model's working area, which may be the smaller one.
 
     Raises:
-        ModelError: If it is or does not.
+        ModelError: If the model is for another sensor, or knows fewer forces.
     """
     here, there = sensor_to_dict(dataset.sensor), dict(model.sensor)
     keys = sorted(key for key in (here.keys() | there.keys()) - {"name"} if here.get(key) != there.get(key))
@@ -199,14 +200,32 @@ def _check_model(model: ModelMetadata, dataset: Dataset, bench: Bench) -> None:
             f"model {model.label}: expected the dataset's sensor {here['name']!r}, got {there.get('name')!r} with "
             f"another {', '.join(keys)}; choose its own model with --model, or train one"
         )
-    radius = max(float(np.hypot(x, y)) for x, y in model.working_area_mm)
-    (low, high), forces = model.force_range_N, bench.domain.force_range_N
-    slack = 1.0 + 1e-6
-    if bench.domain.radius_mm > radius * slack or forces[0] * slack < low or forces[1] > high * slack:
+    domain, (low, high) = domain_of(dataset), model.force_range_N
+    least, most = domain.force_range_N
+    if least * SLACK < low or most > high * SLACK:
         raise ModelError(
-            f"model {model.label}: knows presses within {radius:.3g} mm and {low:g} to {high:g} N, the dataset reaches "
-            f"{bench.domain.radius_mm:g} mm and {forces[0]:g} to {forces[1]:g} N; sweep within that, or train one"
+            f"model {model.label}: knows forces from {low:g} to {high:g} N, the dataset reaches from {least:g} to "
+            f"{most:g} N; sweep within that, or train one"
         )
+    radius = inner_radius(model.working_area_mm)
+    if domain.radius_mm <= radius * SLACK:
+        return dataset
+    inside = np.hypot(dataset.samples.x_mm, dataset.samples.y_mm) <= radius
+    ranges = {**dataset.manifest.get("ranges", {}), "radius_mm": radius}
+    samples = _rows(dataset.samples, np.flatnonzero(inside))
+    return replace(dataset, samples=samples, manifest={**dataset.manifest, "ranges": ranges})
+
+
+SLACK = 1.0 + 1e-6
+"""By how much a range may be passed: rounding."""
+
+
+def inner_radius(polygon_mm: Sequence[tuple[float, float]]) -> float:
+    """Radius of the largest disk about the origin in a convex polygon, mm, to 0.001 mm."""
+    corners = np.array(polygon_mm)
+    along = np.roll(corners, -1, axis=0) - corners
+    distances = np.abs(along[:, 0] * corners[:, 1] - along[:, 1] * corners[:, 0]) / np.hypot(*along.T)
+    return round(float(distances.min()), 3)
 
 
 def _model_record(released: ReleasedModel) -> dict[str, Any]:

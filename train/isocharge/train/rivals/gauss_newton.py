@@ -162,11 +162,11 @@ class GaussNewton:
     def fit(self, task: Task) -> tuple[Fitted, ...]:
         """Fit the forward map on clean presses, its degree by the validation presses; both forms."""
         held = (task.validation.contact, task.validation.charge_pC)
-        field = ChargeField.fit(task.domain, task.train.contact, task.train.charge_pC, held, task.noise)
+        field = ChargeField.fit(task.domain, task.train.contact, task.train.charge_pC, held)
         rows = np.random.default_rng(task.seed).permutation(len(task.train))[:STARTS]
         features = LogFeatures.fit(task.train.charge_pC)
         starts = features(task.train.charge_pC[rows]), task.domain.to_unit(task.train.contact[rows])
-        problem, degree = Problem.of(field, task.noise), len(field.coefficients[0]) - 1
+        problem, degree = Problem.of(field, task.noise), len(field.series) - 1
         choice = f"series of degree {degree}, {100 * field.error:.2g} % rms off; start from {len(rows)} presses"
         return tuple(
             form(problem, features, *starts, task.domain, choice) for form in (ScipyGaussNewton, NumpyGaussNewton)

@@ -57,10 +57,15 @@ class Network:
     def fit(self, task: Task) -> tuple[Fitted, ...]:
         """Train, and give the contact network in torch, ONNX Runtime (session.run, iobinding) and NumPy."""
         training = TrainingConfig(
-            steps=self.steps, nearest_steps=1, hold_out=self.hold_out, seed=task.seed, noise=task.noise.name
+            steps=self.steps,
+            misfit_steps=1,
+            misfit_charges=1000,
+            hold_out=self.hold_out,
+            seed=task.seed,
+            noise=task.noise.name,
         )
-        sizes = NetworkConfig(hidden=self.hidden, nearest_hidden=(8,) * len(self.hidden))
-        network = fit_network(self.dataset, FitConfig(sizes, training)).network
+        sizes = NetworkConfig(hidden=self.hidden, misfit_hidden=(8,) * len(self.hidden))
+        network = fit_network(self.dataset, FitConfig(sizes, training), warn=lambda _: None).network
         choice, layers = f"{self.steps} steps", folded_layers(network)
         graph = contact_graph(layers)
         return (
@@ -81,7 +86,7 @@ def folded_layers(network: InverseNetwork) -> Layers:
     whitening, typical = network.features.matrix, network.features.typical
     weight, bias = layers[0]
     layers[0] = whitening @ weight, bias - np.log(typical) @ whitening @ weight
-    scale, centre = network.scale.double().numpy(), network.centre.double().numpy()
+    scale, centre = network.domain.scale, network.domain.centre
     weight, bias = layers[-1]
     layers[-1] = weight[:, :3] * scale, bias[:3] * scale + centre
     return layers

@@ -1,0 +1,47 @@
+"""The state of a training run, kept every few seconds, so that a killed run goes on and ends with the same weights.
+
+Each stage has a part of its own in the run's draft (`isocharge.simulate.draft`): written whole, with a checksum.
+"""
+
+import io
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from isocharge.simulate.draft import Draft
+
+EVERY_S = 3.0
+"""Seconds between two writes of a stage that is under way."""
+
+
+class Checkpoint:
+    """Keeps states of stages in a draft, or nowhere.
+
+    Args:
+        draft: Where; nowhere if absent.
+        clock: Seconds.
+    """
+
+    def __init__(self, draft: Draft | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+        self._draft, self._clock = draft, clock
+        self._written = clock()
+
+    def load(self, stage: str) -> Any:
+        """The state that was kept last, or None."""
+        data = self._draft.load(stage) if self._draft else None
+        return None if data is None else torch.load(io.BytesIO(data), weights_only=True)
+
+    def save(self, stage: str, state: Callable[[], Any], *, now: bool = False) -> None:
+        """Keep a state made of tensors, numbers and texts; unless `now`, only if some seconds have passed.
+
+        Raises:
+            OutputError: If the file system refuses; what was kept before stays.
+        """
+        if self._draft is None or not (now or self._clock() - self._written >= EVERY_S):
+            return
+        buffer = io.BytesIO()
+        torch.save(state(), buffer)
+        self._draft.save(stage, buffer.getvalue())
+        self._written = self._clock()
