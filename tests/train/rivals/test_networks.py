@@ -5,6 +5,9 @@ import pytest
 import torch
 
 from isocharge.simulate import noise_model
+from isocharge.train.charge_field import Domain
+from isocharge.train.export import export_onnx
+from isocharge.train.network import Features, InverseNetwork
 from isocharge.train.rivals import Network, Task
 from isocharge.train.rivals.networks import (
     BoundNetwork,
@@ -12,33 +15,41 @@ from isocharge.train.rivals.networks import (
     SessionNetwork,
     TorchNetwork,
     contact_graph,
+    contact_of,
     folded_layers,
 )
 from isocharge.train.split import domain_of, presses_of, split_by_position
 
+CHARGE = np.random.default_rng(0).uniform(100.0, 1500.0, (400, 3))
+
 
 @pytest.fixture(scope="module")
-def forms(fit):
-    layers = folded_layers(fit.network)
+def network():
+    """Untrained: the forms have to agree on any weights."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(3)
+        return InverseNetwork(Domain(8.0, (0.05, 2.0)), Features.fit(CHARGE), (24, 24), (8, 8)).eval()
+
+
+@pytest.fixture(scope="module")
+def forms(network):
+    layers = folded_layers(network)
     graph = contact_graph(layers)
     return [
-        TorchNetwork(fit.network, "", "n"),
+        TorchNetwork(network, "", "n"),
         SessionNetwork(graph, "", "n"),
         BoundNetwork(graph, "", "n"),
         NumpyNetwork(layers, "", "n"),
     ]
 
 
-def test_forms_give_the_networks_contact(fit, forms):
-    charge = fit.held.charge_pC[:200]
+def test_forms_give_the_networks_contact(network, forms):
     with torch.no_grad():
-        expected = fit.network(torch.tensor(charge).float())[0].numpy()
+        expected = network(torch.tensor(CHARGE).float())[0].numpy()
     for form in forms:
-        np.testing.assert_allclose(form.predict(charge), expected, rtol=1e-4, atol=1e-3, err_msg=form.form)
-        single = np.array(
-            [np.ravel(form.one(row)()) if form.form != "ONNX Runtime" else form.one(row)()[0][0] for row in charge[:9]]
-        )
-        np.testing.assert_allclose(single, expected[:9], rtol=1e-4, atol=1e-3, err_msg=form.form)
+        np.testing.assert_allclose(form.predict(CHARGE), expected, rtol=1e-4, atol=1e-4, err_msg=form.form)
+        single = np.array([np.ravel(form.one(row)()).copy() for row in CHARGE[:9]])
+        np.testing.assert_allclose(single, expected[:9], rtol=1e-4, atol=1e-4, err_msg=form.form)
 
 
 def test_absurd_charges_stay_finite(forms):
@@ -47,11 +58,19 @@ def test_absurd_charges_stay_finite(forms):
         assert np.isfinite(form.predict(charge)).all()
 
 
-def test_memory_is_that_of_the_weights(fit, forms):
-    count = sum(parameter.numel() for parameter in fit.network.contact.parameters())
+def test_memory_is_that_of_the_weights(network, forms):
+    count = sum(parameter.numel() for parameter in network.contact.parameters())
     for form in forms[:3]:
         assert 4 * count < form.memory < 4 * count + 8000
     assert 8 * 0.8 * count < forms[3].memory < 8 * count + 8000
+
+
+def test_the_contact_cut_out_of_a_released_graph(network, forms):
+    cut = contact_of(export_onnx(network, {}))
+    alone = BoundNetwork(cut, "", "n")
+    assert [output.name for output in alone.session.get_outputs()] == ["contact"]
+    np.testing.assert_allclose(alone.predict(CHARGE), forms[1].predict(CHARGE), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(alone.one(CHARGE[0])(), alone.predict(CHARGE[:1])[0], rtol=1e-5, atol=1e-5)
 
 
 def test_fitting_goes_through_the_pipeline(dataset):

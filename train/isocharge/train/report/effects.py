@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.errors import IsochargeError
-from isocharge.simulate import parse_probe
+from isocharge.simulate import Sensor, parse_probe
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.noise import NoiseModel
 from isocharge.train.evaluate import noisy_charges
@@ -76,13 +76,18 @@ def cases(bench: Bench, clean: Presses, settings: Settings, progress: Progress) 
         progress(f"solving the film under {notation}")
         presses = press_on(bench.films(probes=(parse_probe(notation),), accuracy=max(ROUGH, settings.accuracy)), sweep)
         yield Case("probe", notation, presses, noisy(presses))
-    progress("solving a film with more pretension")
-    film = bench.sensor.film
-    tauter = replace(bench.sensor, film=replace(film, pretension=film.pretension + PRETENSION_OFF))
-    presses = press_on(bench.films(sensor=tauter, accuracy=max(ROUGH, settings.accuracy)), sweep)
-    yield Case("pretension", f"+{1e-6 * PRETENSION_OFF:g} MPa", presses, noisy(presses))
+    if settings.worlds:
+        progress("solving a film with more pretension")
+        presses = press_on(bench.films(sensor=_tauter(bench.sensor), accuracy=ROUGH), sweep)
+        yield Case("pretension", f"+{1e-6 * PRETENSION_OFF:g} MPa", presses, noisy(presses))
     yield from _wrong_gains(bench, clean, noisy(clean))
-    yield from _outside(bench, settings, progress, noisy)
+    if settings.worlds:
+        progress("solving the film outside of the working area")
+        yield from _outside(bench, noisy)
+
+
+def _tauter(sensor: Sensor) -> Sensor:
+    return replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension + PRETENSION_OFF))
 
 
 def _noisy(clean: Presses, bench: Bench, level: float) -> Array:
@@ -106,11 +111,10 @@ def _wrong_gains(bench: Bench, clean: Presses, noisy: Array) -> Iterator[Case]:
         yield Case("dead electrode", f"{name} dead", clean, np.where(here, silence, noisy))
 
 
-def _outside(bench: Bench, settings: Settings, progress: Progress, noisy: Callable[[Presses], Array]) -> Iterator[Case]:
+def _outside(bench: Bench, noisy: Callable[[Presses], Array]) -> Iterator[Case]:
     """Presses beyond the working area, where the film is large enough."""
-    progress("solving the film outside of the working area")
     try:
-        films = bench.films(further=OUTSIDE, accuracy=max(ROUGH, settings.accuracy))
+        films = bench.films(further=OUTSIDE, accuracy=ROUGH)
     except IsochargeError:
         return
     low, high = bench.domain.force_range_N

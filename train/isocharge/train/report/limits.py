@@ -25,7 +25,7 @@ class Limits:
     Attributes:
         bayes: Posterior means for the first of the noisy test presses, (x_mm, y_mm, force_N), shape (m, 3); None where
             the probe is not known to the sensor, and the posterior would be one over probes, too.
-        cramer_rao: Of every press, for unbiased estimates.
+        cramer_rao: Of every press, for unbiased estimates; with several probes as if the first one pressed.
     """
 
     bayes: Array | None
@@ -69,18 +69,13 @@ def limits_of(
         limited: For how many of them the posterior is integrated.
         progress: Told how it goes.
     """
-    bayes = None
+    bayes, charges = None, ChargeSpline.of(films[0])
     if len(films) == 1 and not bench.turned:
         scene = Scene(bench.sensor, bench.probes[0], bench.domain.radius_mm, bench.domain.force_range_N, bench.noise)
         bayes = bayes_estimate(
             scene,
             noisy_pC[:limited],
-            forward_map=films[0],
+            forward_map=charges,
             progress=lambda done, total: progress(f"integrating the Bayes limit: {done} of {total} presses"),
         )[0]
-    return Limits(bayes, _cramer_rao(bench, films, presses))
-
-
-def _cramer_rao(bench: Bench, films: tuple[ForwardMap, ...], presses: Presses) -> CramerRao:
-    """With several probes as if the first one pressed."""
-    return limits_at(ChargeSpline.of(films[0]), presses.contact * np.array([1e-3, 1e-3, 1.0]), bench.noise)
+    return Limits(bayes, limits_at(charges, presses.contact * np.array([1e-3, 1e-3, 1.0]), bench.noise))

@@ -140,10 +140,10 @@ class _Subject:
     def measure(self, folder: Path, stem: str, steps: Steps) -> dict[str, Any]:
         """Everything about this dataset: its section of the record, its pictures written."""
         settings, bench = self.settings, self.bench
-        steps("solving the film for the test presses")
-        test = Test.of(bench, press_on(bench.films(accuracy=settings.accuracy), bench.sweep()))
         steps("solving the film for limits and contours")
         films = bench.films(further=1.0, accuracy=settings.accuracy)
+        steps("solving the film for the test presses")
+        test = Test.of(bench, press_on(films if settings.quick else bench.films(), bench.sweep()))
         steps("integrating the Bayes limit")
         limits = limits_of(bench, films, test.presses, test.charge_pC, settings.limited, steps.say)
         methods = fit_all(roster(self.dataset, films[0], settings), self.released, self.task, test, steps)

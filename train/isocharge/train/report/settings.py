@@ -22,6 +22,7 @@ class Settings:
         limited: Test presses that the Bayes limit is integrated for.
         accuracy: Relative error of a charge in the films that are solved.
         shapes: Probes that the models do not expect, as notations.
+        worlds: Whether other pretensions and presses outside the working area are tried; each takes solves of its own.
         seed: Of everything random.
         quick: Whether methods are fitted small.
     """
@@ -38,6 +39,7 @@ class Settings:
     limited: int = 4096
     accuracy: float = ACCURACY
     shapes: tuple[str, ...] = ("circle:0.5", "circle:1.5", "circle:2.0", "rectangle:4.0x2.0", "triangle:4.0")
+    worlds: bool = True
     seed: int = 0
     quick: bool = False
 
@@ -54,6 +56,7 @@ QUICK = Settings(
     limited=128,
     accuracy=1e-2,
     shapes=("circle:2.0",),
+    worlds=False,
     quick=True,
 )
 """Everything once, small: seconds, to try it out. Its figures mean nothing."""
