@@ -204,8 +204,8 @@ def _known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
     least, most = domain.force_range_N
     if least * SLACK < low or most > high * SLACK:
         raise ModelError(
-            f"model {model.label}: knows forces from {low:g} to {high:g} N, the dataset reaches from {least:g} to "
-            f"{most:g} N; sweep within that, or train one"
+            f"model {model.label}: knows forces from {low:g} to {high:g} N, the dataset reaches from {least:.4g} to "
+            f"{most:.4g} N; sweep within that, or train one"
         )
     radius = inner_radius(model.working_area_mm)
     if domain.radius_mm <= radius * SLACK:
