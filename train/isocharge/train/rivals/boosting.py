@@ -1,10 +1,11 @@
-"""Gradient boosting: scikit-learn's histogram trees, one ensemble per coordinate, learnt from noisy copies.
+"""Gradient boosting: scikit-learn's histogram trees, one ensemble per coordinate, learnt from noisy copies, on what an
+affine fit leaves.
 
 The NumPy form walks all trees of all coordinates at once, one level per step.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from sklearn.ensemble import HistGradientBoostingRegressor
@@ -12,7 +13,7 @@ from sklearn.ensemble import HistGradientBoostingRegressor
 from isocharge.simulate.arrays import Array, Integers
 from isocharge.train.charge_field import Domain
 from isocharge.train.rivals.estimator import Fitted, Task, best_of
-from isocharge.train.rivals.features import LogFeatures
+from isocharge.train.rivals.features import LogFeatures, affine_fit, with_one
 
 NAME = "gradient boosting"
 
@@ -40,9 +41,12 @@ class GradientBoosting:
         noisy = task.noisy_train(1 if task.quick else min(task.copies, 3))
         features, unit = LogFeatures.fit(noisy.charge_pC), task.domain.to_unit(noisy.contact)
         values, made = features(noisy.charge_pC), {}
+        plane = affine_fit(values, unit)
+        residual = unit - with_one(values) @ plane
 
         def predict_with(leaves: int) -> Callable[[Array], Array]:
-            made[leaves] = SklearnBoosting(features, self._models(values, unit, leaves, task), task.domain)
+            models = self._models(values, residual, leaves, task)
+            made[leaves] = SklearnBoosting(features, plane, models, task.domain)
             return made[leaves].predict
 
         leaves, words = best_of(task, self.leaves[:1] if task.quick else self.leaves, predict_with)
@@ -50,7 +54,7 @@ class GradientBoosting:
         choice = (
             f"{count} trees of {leaves} leaves per coordinate, rate {self.rate:g}, {len(unit)} noisy presses{words}"
         )
-        library = SklearnBoosting(features, made[leaves].models, task.domain, choice)
+        library = replace(made[leaves], choice=choice)
         return library, NumpyBoosting.of(library)
 
     def _models(self, values: Array, unit: Array, leaves: int, task: Task) -> tuple[HistGradientBoostingRegressor, ...]:
@@ -66,9 +70,10 @@ class GradientBoosting:
 
 @dataclass(frozen=True)
 class SklearnBoosting(Fitted):
-    """Three HistGradientBoostingRegressors, for x, y and ln F."""
+    """An affine map and three HistGradientBoostingRegressors, for x, y and ln F."""
 
     features: LogFeatures
+    plane: Array
     models: tuple[HistGradientBoostingRegressor, ...]
     domain: Domain
     choice: str = ""
@@ -78,7 +83,8 @@ class SklearnBoosting(Fitted):
     def predict(self, charge_pC: Array) -> Array:
         """See `Fitted.predict`."""
         values = self.features(charge_pC)
-        return self.domain.to_contact(np.stack([model.predict(values) for model in self.models], axis=1))
+        boosted = np.stack([model.predict(values) for model in self.models], axis=1)
+        return self.domain.to_contact(with_one(values) @ self.plane + boosted)
 
 
 @dataclass(frozen=True)
@@ -87,22 +93,22 @@ class NumpyBoosting(Fitted):
 
     Attributes:
         features: Of the charges.
+        plane: The affine map, shape (n_electrode + 1, 3); the trees' own start is in it.
         feature: Which one a node looks at, shape (n_node,).
         threshold: Left if the feature is not above it; infinite for a leaf, shape (n_node,).
         children: Left and right node, a leaf's own number for a leaf, shape (n_node, 2).
         value: Of a leaf, shape (n_node,).
         roots: First node of each tree, shape (3, n_tree).
-        start: Value before any tree, shape (3,).
         depth: Steps from a root to its deepest leaf.
     """
 
     features: LogFeatures
+    plane: Array
     feature: Integers
     threshold: Array
     children: Integers
     value: Array
     roots: Integers
-    start: Array
     depth: int
     domain: Domain
     choice: str = ""
@@ -117,15 +123,16 @@ class NumpyBoosting(Fitted):
         nodes = np.concatenate(trees)
         offset, leaf = np.repeat(first[:-1], np.diff(first)), nodes["is_leaf"].astype(bool)
         own = np.arange(len(nodes))
+        start = [float(model._baseline_prediction[0, 0]) for model in library.models]
         children = [np.where(leaf, own, nodes[side].astype(np.intp) + offset) for side in ("left", "right")]
         return cls(
             features=library.features,
+            plane=library.plane + np.outer(np.eye(len(library.plane))[-1], start),
             feature=np.where(leaf, 0, nodes["feature_idx"]).astype(np.intp),
             threshold=np.where(leaf, np.inf, nodes["num_threshold"]),
             children=np.stack(children, axis=1),
             value=nodes["value"].astype(float),
             roots=first[:-1].reshape(3, -1),
-            start=np.array([float(model._baseline_prediction[0, 0]) for model in library.models]),
             depth=int(nodes["depth"].max()),
             domain=library.domain,
             choice=library.choice,
@@ -147,5 +154,5 @@ class NumpyBoosting(Fitted):
             right = flat.take(self.feature.take(node) + row) > self.threshold.take(node)
             node = children.take(2 * node + right)
         sums = self.value.take(node).reshape(len(values), 3, -1).sum(axis=2)
-        unit: Array = sums + self.start
+        unit: Array = sums + with_one(values) @ self.plane
         return unit

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from isocharge.simulate.arrays import Array
 from isocharge.train.charge_field import Domain
 from isocharge.train.rivals.estimator import Fitted, Task, best_of
-from isocharge.train.rivals.features import LogFeatures
+from isocharge.train.rivals.features import RULERS, LogFeatures
 
 CHUNK = 100_000
 """Neighbours gathered at once."""
@@ -44,28 +44,36 @@ class InterpolatedTable:
     """The table with local linear interpolation.
 
     Attributes:
-        candidates: What the affine maps are fitted to: "clean" or "noisy" presses, and how many of them.
+        candidates: What the affine maps are fitted to: "clean" or "noisy" presses, how many of them, and the ruler
+            of the axes by which they are near.
+        copies: Noisy copies of the presses.
     """
 
-    candidates: tuple[tuple[str, int], ...] = (("clean", 16), ("noisy", 48), ("noisy", 96), ("noisy", 192))
+    candidates: tuple[tuple[str, int, tuple[float, float]], ...] = (
+        ("clean", 16, RULERS[0]),
+        ("noisy", 64, RULERS[0]),
+        *(("noisy", count, ruler) for ruler in RULERS[1:] for count in (64, 128)),
+    )
+    copies: int = 5
     name: str = "lookup table, interpolated"
 
     def fit(self, task: Task) -> tuple[Fitted, ...]:
-        """Choose the neighbourhood's size and whether its presses are noisy."""
-        features, copies = LogFeatures.fit(task.train.charge_pC), 1 if task.quick else 4
-        entries = features(task.train.charge_pC)
-        tree, noisy = cKDTree(entries), task.noisy_train(copies)
+        """Choose the neighbourhoods: their size, their metric, and whether their presses are noisy."""
+        noisy = task.noisy_train(1 if task.quick else self.copies)
+        whitened = LogFeatures.fit(noisy.charge_pC)
 
-        def table(candidate: tuple[str, int]) -> AffineTable:
-            kind, count = candidate
-            learnt = noisy if kind == "noisy" else task.train
+        def table(candidate: tuple[str, int, tuple[float, float]]) -> AffineTable:
+            kind, count, ruler = candidate
+            learnt, features = noisy if kind == "noisy" else task.train, whitened.measured_by(ruler)
+            entries = features(task.train.charge_pC)
             maps = affine_maps(entries, features(learnt.charge_pC), task.domain.to_unit(learnt.contact), count)
-            return AffineTable(features, tree, maps, task.domain, self.name)
+            return AffineTable(features, cKDTree(entries), maps, task.domain, self.name)
 
         made = {candidate: table(candidate) for candidate in (self.candidates[1:2] if task.quick else self.candidates)}
         best, words = best_of(task, made, lambda candidate: made[candidate].predict)
-        learnt = f"{best[1]} {best[0]} neighbours" + (f" ({copies} copies)" if best[0] == "noisy" else "")
-        return (replace(made[best], choice=f"{len(entries)} entries, affine maps through {learnt}{words}"),)
+        learnt = f"{best[1]} {best[0]} neighbours, force axis x {best[2][0]:g}"
+        choice = f"{len(task.train)} entries, affine maps through {learnt}{words}"
+        return (replace(made[best], choice=choice),)
 
 
 def affine_maps(entries: Array, features: Array, unit: Array, count: int) -> Array:
