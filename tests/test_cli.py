@@ -52,6 +52,7 @@ SUBCOMMANDS = [
     ("simulate", "sweep"),
     ("train",),
     ("train", "fit"),
+    ("train", "report"),
     ("serve",),
     ("serve", "predict"),
     ("serve", "stream"),

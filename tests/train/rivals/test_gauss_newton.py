@@ -6,7 +6,7 @@ from scipy.optimize import approx_fprime
 
 from isocharge.train.evaluate import noisy_charges
 from isocharge.train.rivals import GaussNewton
-from isocharge.train.rivals.gauss_newton import damped_step
+from isocharge.train.rivals.problem import damped_step
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from isocharge.train.report.measures import rounded
 from isocharge.train.report.methods import Method, Test, fit_all, roster, table, task_of, timed
 from isocharge.train.report.page import page
 from isocharge.train.report.settings import Settings
+from isocharge.train.report.speed import AXES, speed_plot
 from isocharge.train.report.timing import machine, one_thread
 from isocharge.train.report.verdict import verdict
 from isocharge.train.rivals import Fitted, ReleasedModel, Task
@@ -268,10 +269,10 @@ def _draw(
     own = section["methods"][0]["errors"]["position_rms_mm"]
 
     def speed(plot: str) -> Callable[[], Any]:
-        return lambda: pictures.speed(section["methods"], plot, limits, settings.batch)
+        return lambda: speed_plot(section["methods"], plot, limits, settings.batch)
 
     drawings: dict[str, Callable[[], Any]] = {
-        **{plot: speed(plot) for plot in pictures.AXES},
+        **{plot: speed(plot) for plot in AXES},
         "maps": lambda: pictures.error_maps(bench.sensor, bench.domain, draws),
         "force": lambda: pictures.against_force(section["by_force"], released),
         "calibration": lambda: pictures.calibration(section["calibration"]),

@@ -1,8 +1,8 @@
-"""Helpers of the pictures."""
+"""Names beside a plot."""
 
 import numpy as np
 
-from isocharge.train.report.pictures import spread
+from isocharge.train.report.speed import spread
 
 
 def test_names_are_kept_apart_in_order():
