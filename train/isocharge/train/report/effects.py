@@ -35,6 +35,9 @@ ROUGH = 2e-3
 FALSE_ALARMS = 1.0
 """Percent of good presses whose misfit is above the alarm's threshold."""
 
+FARTHEST = 50.0
+"""Answers farther from zero, mm or N, are cut to this: polynomials explode outside of what they know."""
+
 ONE_NEWTON = (0.8, 1.25)
 """Forces that count as about 1 N."""
 
@@ -137,7 +140,8 @@ def _measured(case: Case, released: ReleasedModel, rivals: list[Fitted], thresho
     contact, std, misfit = released.answer(case.charge_pC)
     alarm = misfit[:, 0] > threshold
     about = (truth[:, 2] >= ONE_NEWTON[0]) & (truth[:, 2] <= ONE_NEWTON[1])
-    found = {released.name: contact, **{rival.name: rival.predict(case.charge_pC) for rival in rivals}}
+    answers = {rival.name: np.clip(rival.predict(case.charge_pC), -FARTHEST, FARTHEST) for rival in rivals}
+    found = {released.name: contact, **answers}
     return {
         "group": case.group,
         "case": case.name,

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from isocharge.train.report.effects import GAIN_OFF, PRETENSION_OFF
+from isocharge.train.report.effects import FALSE_ALARMS, FARTHEST, GAIN_OFF, PRETENSION_OFF
 from isocharge.train.rivals.linear_band import BAND_N
 
 
@@ -110,7 +110,7 @@ def _cells(record: dict[str, Any]) -> list[str]:
         f"{record['per_second']:,.0f}",
         f"{record['memory_bytes']:,}",
     ]
-    return [f"**{cell}**" for cell in cells] if "latency" in record["best_on"] else cells
+    return [f"**{cell}**" if cell else "" for cell in cells] if "latency" in record["best_on"] else cells
 
 
 def _row(cells: Sequence[str]) -> str:
@@ -143,7 +143,7 @@ CAPTIONS = {
     "shaded: 2 percentage points.",
     "noise": "Position error (rms, mm) when the noise is not the one that the methods were fitted for.",
     "effects": "Left: position error (rms, mm) when the probe, the pretension or gains are not as the methods were "
-    "told (those beyond 50 mm are drawn there). Right: share of presses whose misfit gives an alarm, at {alarms:g} % "
+    "told; answers beyond {farthest:g} mm or N are cut there. Right: share of presses whose misfit gives an alarm, at {alarms:g} % "
     "false alarms (dashed).",
 }
 
@@ -192,7 +192,7 @@ def _effects(section: dict[str, Any]) -> Iterator[str]:
     yield "### When the world is not as told"
     yield ""
     yield _picture(section, "noise")
-    yield _picture(section, "effects", alarms=1.0)
+    yield _picture(section, "effects", alarms=FALSE_ALARMS, farthest=FARTHEST)
     names = list(next(case["errors"] for case in section["cases"] if case["errors"]))
     threshold = _number(section["alarm_threshold"])
     yield f"Position error rms, mm, and alarms of the released model (misfit above {threshold}):"

@@ -126,10 +126,6 @@ def _method_lines(axes: Any, x: Sequence[float], lines: dict[str, list[float]], 
         )
 
 
-FARTHEST_MM = 50.0
-"""Errors beyond this, from methods that explode outside of what they know, are drawn here."""
-
-
 def wrong_world(cases: Sequence[dict[str, Any]], released: str, nominal: float | None) -> Figure:
     """Errors and alarms where the film, probe or chain is not as the models were told."""
     some = [case for case in cases if case["group"] != "noise"]
@@ -173,7 +169,7 @@ def _error_dots(axes: Any, cases: Sequence[dict[str, Any]], height: Integers, re
     for name in known[0][1]:
         mine = name == released
         axes.plot(
-            [min(errors[name]["position_rms_mm"], FARTHEST_MM) for _, errors in known],
+            [errors[name]["position_rms_mm"] for _, errors in known],
             [y for y, _ in known],
             "*" if mine else "o",
             ms=12 if mine else 5,

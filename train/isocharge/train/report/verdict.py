@@ -51,13 +51,13 @@ def _sentence(plot: str, released: dict[str, Any], others: Sequence[dict[str, An
         return f"In {words}, none of {len(others)} {kind} is faster than the released model."
     nearest = min(faster, key=lambda record: float(record["errors"]["position_rms_mm"]))
     return (
-        f"In {words}, none of {len(others)} {kind} is both faster and more accurate than the released model. Of the "
-        f"{len(faster)} that are faster the most accurate is {_compared(nearest, released, key, sign)}."
+        f"In {words}, none of {len(others)} {kind} is both faster and more accurate than the released model. Of those "
+        f"that are faster the most accurate is {_compared(nearest, released, key, sign)}."
     )
 
 
 def _compared(record: dict[str, Any], released: dict[str, Any], key: str, sign: float) -> str:
     ratio = (released[key] / record[key]) ** sign
     error = 100.0 * (record["errors"]["position_rms_mm"] / released["errors"]["position_rms_mm"] - 1.0)
-    more = f"{abs(error):.2g} % {'less' if error < 0.0 else 'more'} error"
-    return f"{record['label']} ({ratio:.2g} times as fast, {more})"
+    more = f"{abs(error):.2g} % {'less' if error < 0.0 else 'more'} error" if error else "the same error"
+    return f"{record['label']} ({ratio:.3g} times as fast, {more})"
