@@ -143,8 +143,8 @@ CAPTIONS = {
     "shaded: 2 percentage points.",
     "noise": "Position error (rms, mm) when the noise is not the one that the methods were fitted for.",
     "effects": "Left: position error (rms, mm) when the probe, the pretension or gains are not as the methods were "
-    "told; answers beyond {farthest:g} mm or N are cut there. Right: share of presses whose misfit gives an alarm, at {alarms:g} % "
-    "false alarms (dashed).",
+    "told; answers beyond {farthest:g} mm or N are cut there. Right: share of presses whose misfit gives an alarm, at "
+    "{alarms:g} % false alarms (dashed).",
 }
 
 
