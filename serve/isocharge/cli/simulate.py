@@ -14,7 +14,7 @@ from isocharge.cli.terminal import progress_rows, say
 from isocharge.errors import InputError
 
 if TYPE_CHECKING:
-    from isocharge.simulate import Equilibrium, Sensor
+    from isocharge.simulate import Equilibrium, Probe, Sensor
     from isocharge.simulate.arrays import Array
     from isocharge.simulate.workers import Workers
 
@@ -140,7 +140,12 @@ def sweep_command(
     probe: Annotated[
         list[str] | None, typer.Option("--probe", help="What presses; may be given again. (default: circle:1.0)")
     ] = None,
-    radius: Annotated[float, typer.Option("--radius", help="Largest distance of a press from the centre, mm.")] = 8.0,
+    radius: Annotated[
+        str,
+        typer.Option(
+            "--radius", metavar="MM|auto", help="Largest distance from the centre, mm, or auto: the working area's."
+        ),
+    ] = "8.0",
     force: Annotated[
         tuple[float, float], typer.Option("--force", metavar="MIN MAX", help="Smallest and largest force, N.")
     ] = (0.05, 2.0),
@@ -170,11 +175,14 @@ def sweep_command(
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
     from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
+    from isocharge.simulate.draft import refuse_finished
 
     if workers and cluster:
         raise InputError("expected either --workers or --cluster, got both")
     film_sensor, probes = load_sensor(sensor), [parse_probe(text) for text in probe or ["circle:1.0"]]
-    sweep = Sweep(radius * 1e-3, force, samples, seed, orientation.value, sampling.value)
+    refuse_finished(output)
+    reach = _auto_radius(film_sensor, probes, force) if radius == "auto" else 1e-3 * _number_mm(radius)
+    sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)
     try:
         with _crew(workers, cluster) as crew, progress_rows(*SWEEP_ROWS) as (solving, sampled):
             run_sweep(
@@ -194,6 +202,33 @@ def sweep_command(
             say(f"stopped; what is done is kept in {part}, and the same command goes on")
         raise
     say(f"{json_module.loads((output / 'manifest.json').read_text())['samples']} presses in {output}")
+
+
+def _number_mm(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error
+
+
+def _auto_radius(sensor: "Sensor", probes: "list[Probe]", force: tuple[float, float]) -> float:
+    """Radius of the disk that is in the working area of every probe under `reference` noise, m."""
+    from isocharge.simulate import ForwardMap, noise_model, working_area
+    from isocharge.simulate.identify import search_radius
+
+    areas = []
+    for probe in probes:
+        with progress_rows((f"finding the working area of {probe.notation}", "solves")) as (advance,):
+            made = ForwardMap.build(sensor, probe, search_radius(sensor, probe), force, progress=advance)
+        areas.append(working_area(made, noise_model("reference")))
+        say(f"{probe.notation}: {areas[-1].words}")
+    radius = min(area.radius for area in areas)
+    if radius == 0.0:
+        raise InputError(
+            "--radius auto: nowhere do the charges tell the contact well enough; see 'isocharge simulate identify', or "
+            "give a radius"
+        )
+    return radius
 
 
 def _crew(workers: int | None, cluster: str | None) -> AbstractContextManager["Workers"]:

@@ -19,6 +19,7 @@ with require("simulate"):
     from isocharge.simulate.drawn import DrawnContour, DrawnTriangulation, draw_contour
     from isocharge.simulate.equilibrium import Equilibrium
     from isocharge.simulate.forward import ForwardMap
+    from isocharge.simulate.limits import ChargeFunction, CramerRao, limits_at
     from isocharge.simulate.noise import NoiseModel, noise_model
     from isocharge.simulate.probe import Circle, Polygon, Probe, parse_probe
     from isocharge.simulate.sensor import Calibration, Electrode, Film, Piezo, Sensor
@@ -28,14 +29,17 @@ with require("simulate"):
     from isocharge.simulate.template import Resolution
     from isocharge.simulate.theory import Theory, theory_for
     from isocharge.simulate.triangulation import Fix, Meeting, Triangulation
+    from isocharge.simulate.working_area import WorkingArea, working_area
 
 __all__ = [
     "Amplifier",
     "Calibration",
+    "ChargeFunction",
     "ChargeSpline",
     "Circle",
     "Contour",
     "ContourField",
+    "CramerRao",
     "Curves",
     "Dataset",
     "DrawnContour",
@@ -58,9 +62,11 @@ __all__ = [
     "Sweep",
     "Theory",
     "Triangulation",
+    "WorkingArea",
     "built_in_sensors",
     "contact_charge",
     "draw_contour",
+    "limits_at",
     "load_amplifier",
     "load_sensor",
     "noise_model",
@@ -75,6 +81,7 @@ __all__ = [
     "theory_for",
     "thermal_charge",
     "touch_charge",
+    "working_area",
     "write_dataset",
     "write_sweep",
 ]

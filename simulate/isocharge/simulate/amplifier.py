@@ -157,7 +157,7 @@ class Measurement:
 
 
 BENCH = Amplifier(
-    noise=NoiseModel("bench", 0.3e-12, 0.0),
+    noise=noise_model("bench"),
     tau=10.0,
     tau_mismatch=0.05,
     gain_mismatch=0.01,
@@ -172,7 +172,7 @@ LEVELS = {
     "clean": Amplifier(noise=noise_model("clean")),
     "reference": Amplifier(noise=noise_model("reference")),
     "bench": BENCH,
-    "surgery": replace(BENCH, noise=NoiseModel("surgery", 1e-12, 0.0), hum=5e-12, step=0.5),
+    "surgery": replace(BENCH, noise=noise_model("surgery"), hum=5e-12, step=0.5),
 }
 
 PICO, UNIT = 1e-12, 1.0

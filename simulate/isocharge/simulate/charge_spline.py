@@ -5,20 +5,18 @@ tabulated on a polar grid, cubic splines along both directions, and at a few for
 logarithm. A forward map interpolates its fields between forces in the same way, so there its own nodes lose nothing.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import NdBSpline, make_interp_spline
 
 from isocharge.errors import SceneError
-from isocharge.simulate.arrays import Array
+from isocharge.simulate.arrays import Array, Complexes
 from isocharge.simulate.forward import ForwardMap
+from isocharge.simulate.sampling import sunflower
 from isocharge.simulate.scaling import amplitude_squared
 from isocharge.simulate.sensor import Film
-from isocharge.simulate.spectral import barycentric_weights, chebyshev_nodes, lagrange_values
-
-FORCES = 9
-"""Forces in the table where the contact pressure (d33) adds charges that do not go with the amplitude's square."""
+from isocharge.simulate.spectral import barycentric_weights, lagrange_values
 
 STEPS = (16, 400)
 """Fewest and most radial steps of the table."""
@@ -39,7 +37,8 @@ class ChargeSpline:
         radius: Largest distance from the centre, m.
         force_range: Smallest and largest force, N.
         force: Forces of the table, shape (n_force,), N.
-        table: Scaled charge over distance and angle, values of shape (n_force, n_electrode).
+        pressed: Whether a further term goes with the force itself: the contact pressure on electrodes (d33).
+        table: Scaled charge over distance and angle, values of shape (n_term, n_electrode).
         error: Largest error against the forward map, relative to a press's largest charge.
     """
 
@@ -47,6 +46,7 @@ class ChargeSpline:
     radius: float
     force_range: tuple[float, float]
     force: Array
+    pressed: bool
     table: NdBSpline
     error: float
 
@@ -58,16 +58,15 @@ class ChargeSpline:
             forward_map: The charges; the orientation of the probe is the one it was built with.
             spacing: Of the grid, m; a sixth of the probe's reach if absent.
         """
-        radius, film = forward_map.radius, forward_map.sensor.film
-        force = _forces(forward_map)
+        radius, film, force = forward_map.radius, forward_map.sensor.film, forward_map.family.force
+        pressed = forward_map.sensor.piezo.d33 != 0.0
         steps = int(np.clip(round(radius / (spacing or forward_map.probe.reach / 6.0)), *STEPS))
         distance, angle = np.linspace(0.0, radius, steps + 1), np.linspace(0.0, 2.0 * np.pi, 6 * steps + 1)
         at = np.outer(distance, np.exp(1j * angle[:-1]))
-        rows = [forward_map.forward(at.real.ravel(), at.imag.ravel(), np.full(at.size, f)) for f in force]
-        scaled = np.stack([row / amplitude_squared(film, f) for row, f in zip(rows, force, strict=True)], axis=1)
-        table = _polar_spline(distance, angle, scaled.reshape(*at.shape, force.size, -1))
-        made = cls(film, radius, forward_map.force_range, force, table, np.nan)
-        return cls(film, radius, forward_map.force_range, force, table, _difference(made, forward_map))
+        terms = _terms(forward_map, at.ravel(), force, pressed).reshape(*at.shape, force.size + pressed, -1)
+        table = _polar_spline(distance, angle, terms)
+        made = cls(film, radius, forward_map.force_range, force, pressed, table, np.nan)
+        return replace(made, error=_difference(made, forward_map))
 
     @property
     def electrodes(self) -> int:
@@ -94,23 +93,25 @@ class ChargeSpline:
         return np.concatenate([slope, by_force[..., None]], axis=2)
 
     def by_force(self, logs: Array) -> Array:
-        """Weights of the table's forces at logarithms of forces, shape (...) to (..., n_force): Q = weights @ terms."""
+        """Weights of the table's forces at logarithms of forces, shape (...) to (..., n_term): Q = weights @ terms."""
         nodes = np.log(self.force)
         weights = lagrange_values(nodes, barycentric_weights(nodes), logs.ravel())
-        scaled: Array = weights * amplitude_squared(self.film, np.exp(logs.ravel()))[:, None]
-        return scaled.reshape(*logs.shape, nodes.size)
+        weights *= amplitude_squared(self.film, np.exp(logs.ravel()))[:, None]
+        if self.pressed:
+            weights = np.concatenate([weights, _own_scale(self.film) * np.exp(logs.ravel())[:, None]], axis=1)
+        return weights.reshape(*logs.shape, -1) if logs.size else np.empty((*logs.shape, weights.shape[1]))
 
     def terms(self, position: Array) -> Array:
-        """Scaled charges at the table's forces: positions (x, y), shape (n, 2), m, to (n, n_force, n_electrode)."""
+        """Scaled charges at the table's forces: positions (x, y), shape (n, 2), m, to (n, n_term, n_electrode)."""
         terms: Array = self.table(_polar(position))
         return terms
 
     def slopes(self, position: Array) -> Array:
-        """Their derivatives by x and y, shape (n, n_force, n_electrode, 2), 1/m."""
+        """Their derivatives by x and y, shape (n, n_term, n_electrode, 2), 1/m."""
         polar = _polar(position)
-        radial, around = self.table(polar, nu=(1, 0)), self.table(polar, nu=(0, 1))
+        polar[:, 0] = np.maximum(polar[:, 0], 1e-6 * self.radius)  # at the very centre the angle says nothing
         distance, angle = polar[:, 0, None, None], polar[:, 1, None, None]
-        around = around / np.maximum(distance, 1e-6 * self.radius)
+        radial, around = self.table(polar, nu=(1, 0)), self.table(polar, nu=(0, 1)) / distance
         cos, sin = np.cos(angle), np.sin(angle)
         return np.stack([cos * radial - sin * around, sin * radial + cos * around], axis=-1)
 
@@ -126,11 +127,22 @@ class ChargeSpline:
             )
 
 
-def _forces(forward_map: ForwardMap) -> Array:
-    low, high = np.log(forward_map.force_range)
-    if forward_map.sensor.piezo.d33 == 0.0 or low == high:
-        return forward_map.family.force
-    return np.exp(chebyshev_nodes(FORCES, low, high))
+def _terms(forward_map: ForwardMap, at: Complexes, force: Array, pressed: bool) -> Array:
+    """Scaled charges at positions x + iy, shape (n,), for every force, and the contact pressure's: (n, n_term, ...)."""
+    sensor = forward_map.sensor
+    stretched = replace(forward_map, sensor=replace(sensor, piezo=replace(sensor.piezo, d33=0.0)))
+    rows = [stretched.forward(at.real, at.imag, np.full(at.size, f)) for f in force]
+    terms = [row / amplitude_squared(sensor.film, f) for row, f in zip(rows, force, strict=True)]
+    if pressed:
+        most = force[-1]
+        contact = forward_map.forward(at.real, at.imag, np.full(at.size, most)) - rows[-1]
+        terms.append(contact / (_own_scale(sensor.film) * most))
+    return np.stack(terms, axis=1)
+
+
+def _own_scale(film: Film) -> float:
+    """What makes a term that goes with the force as large as those that go with the amplitude's square, at 1 N."""
+    return float(amplitude_squared(film, 1.0))
 
 
 def _polar(position: Array) -> Array:
@@ -150,7 +162,7 @@ def _polar_spline(distance: Array, angle: Array, values: Array) -> NdBSpline:
 def _difference(made: ChargeSpline, forward_map: ForwardMap) -> float:
     """Largest error at presses that are spread evenly but off the grid."""
     number = np.arange(CHECKS)
-    at = made.radius * np.sqrt((number + 0.5) / CHECKS) * np.exp(2.39996j * number)
+    at = made.radius * sunflower(CHECKS)
     low, high = made.force_range
     force = np.clip(low * (high / low) ** (number * 0.618 % 1.0), low, high)
     truth = forward_map.forward(at.real, at.imag, force)

@@ -18,6 +18,9 @@ SMALLEST = 1e-14
 """Smallest eigenvalue of a scaled information that counts as more than rounding; limits stop there, some 1e7 times
 above the others, instead of becoming infinite."""
 
+NOTHING = 1e-60
+"""Information (1/m^2, or without unit) below which a parameter is not told at all."""
+
 STEPS = (5e-5, 5e-5, 1e-3)
 """Steps in x and y (m) and in ln F by which charges without derivatives are differentiated."""
 
@@ -122,7 +125,7 @@ def limits_at(model: ChargeModel, contact: Array, noise: NoiseModel) -> CramerRa
 
 def _invert(information: Array) -> Array:
     """Of symmetric matrices, shape (n, p, p), of any scale in each parameter, hardly singular or wholly so."""
-    size = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), np.finfo(float).tiny))
+    size = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), NOTHING))
     both = size[:, :, None] * size[:, None, :]
     values, vectors = np.linalg.eigh(information / both)
     inverse: Array = np.einsum("nik,nk,njk->nij", vectors, 1.0 / np.maximum(values, SMALLEST), vectors) / both

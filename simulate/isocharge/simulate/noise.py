@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from isocharge.errors import InputError
 from isocharge.simulate.arrays import Array
 
 
@@ -62,15 +61,26 @@ class NoiseModel:
 LEVELS = {
     "clean": NoiseModel("clean", 0.0, 0.0),
     "reference": NoiseModel("reference", 1e-12, 2e-3),
+    "bench": NoiseModel("bench", 0.3e-12, 0.0),
+    "surgery": NoiseModel("surgery", 1e-12, 0.0),
 }
+"""By name; of `bench` and `surgery` the memoryless part, the rest is in `isocharge.simulate.amplifier`."""
 
 
 def noise_model(level: str) -> NoiseModel:
-    """A noise level by name.
+    """Noise by the name of its level, or from a TOML file, for all that takes charges one by one.
+
+        like = "reference"      # optional: what is not said is as there, otherwise as in "clean"
+        white_pC = 0.5
+        proportional = 0.001    # standard deviation over charge
+
+    The file may describe a whole measuring chain (`load_amplifier`); what has a memory plays no part here.
 
     Raises:
-        InputError: If there is no such level.
+        InputError: If there is no such level or file, or a key is unknown or no number in its range.
     """
-    if level not in LEVELS:
-        raise InputError(f"noise level: expected one of {', '.join(LEVELS)}, got {level!r}")
-    return LEVELS[level]
+    if level in LEVELS:
+        return LEVELS[level]
+    from isocharge.simulate.amplifier import load_amplifier  # which builds on this module
+
+    return load_amplifier(level).noise

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from isocharge.errors import SceneError
-from isocharge.simulate.arrays import Array, Integers
+from isocharge.simulate.arrays import Array, Complexes, Integers
 from isocharge.simulate.probe import Probe
 
 MOST_SAMPLES = 10_000_000
@@ -151,4 +151,11 @@ def lattice(most: int) -> np.ndarray:
     inside = np.flatnonzero(squared <= ring)
     inside = inside[np.lexsort((j[inside], i[inside], squared[inside]))]
     points: np.ndarray = (i[inside] + 1j * j[inside]) / max(np.sqrt(ring), 1.0) * (1.0 - 1e-15)
+    return points
+
+
+def sunflower(count: int) -> Complexes:
+    """So many points x + iy evenly over the unit disk, from the inside out (Vogel 1979)."""
+    number = np.arange(count)
+    points: Complexes = np.sqrt((number + 0.5) / count) * np.exp(1j * np.pi * (3.0 - np.sqrt(5.0)) * number)
     return points

@@ -21,6 +21,7 @@ import numpy as np
 from isocharge.errors import ChargeError, InputError
 from isocharge.simulate.arrays import Array, Booleans, Integers
 from isocharge.simulate.charge_spline import ChargeSpline
+from isocharge.simulate.folds import singular_values
 from isocharge.simulate.force_curve import ForceCurve
 from isocharge.simulate.noise import NoiseModel
 
@@ -220,11 +221,9 @@ class Posterior:
         """One over the smallest standard deviation of the position if it lay here, the force unknown; shape (n,)."""
         by_force, slopes = self.charges.by_force(logs), self.charges.slopes(onto_disk(position, self.radius))
         known = np.einsum("nk,nke->ne", by_force, terms)
-        sigma = self.noise.sigma(known)
-        toward = known / sigma / np.linalg.norm(known / sigma, axis=1, keepdims=True)
-        moved = np.einsum("nk,nkei->nei", by_force, slopes) / sigma[..., None]
-        across = moved - toward[..., None] * np.einsum("ne,nei->ni", toward, moved)[:, None]
-        return np.asarray(np.linalg.norm(across, ord=2, axis=(1, 2)))
+        moved = np.einsum("nk,nkei->nei", by_force, slopes)
+        jacobian = np.concatenate([moved, self._curve.slope(logs, known)[..., None]], axis=2)
+        return singular_values(jacobian / self.noise.sigma(known)[..., None])[:, 0]
 
     def _over_force(self, position: Array, charge: Array) -> tuple[Array, Array]:
         """Points of the integral over the force's logarithm at each place, and the logarithms of their weights times

@@ -1,0 +1,175 @@
+"""Folds, twins and the working area on maps whose folds are known, and on the real sensors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.simulate import ChargeFunction, ChargeSpline, Circle, ForwardMap, load_sensor, noise_model, working_area
+from isocharge.simulate.folds import Rings, fold_points, scaled_jacobian, singular_values, turned_over
+from isocharge.simulate.limits import limits_at
+from isocharge.simulate.twins import find_twins, nearest_contact
+
+REFERENCE = noise_model("reference")
+CREASE = 3e-3
+"""Where the synthetic maps fold, m: x and 2 CREASE - x give the same charges."""
+
+
+def creased(extra: float | None = None, radius: float = 5e-3) -> ChargeFunction:
+    """Three charges that fold at x = CREASE; a fourth, if there is one, rises with x by so much (1/m)."""
+
+    def charge(contact):
+        x, y, force = contact.T
+        columns = [3.0 + 1e3 * (x - x**2 / (2.0 * CREASE)) / 3.0, 3.0 + 300.0 * y, np.full(len(x), 3.0)]
+        if extra is not None:
+            columns.append(3.0 + extra * x)
+        return 3e-10 * force[:, None] ** (2.0 / 3.0) * np.stack(columns, axis=1)
+
+    return ChargeFunction(charge, radius, (0.05, 2.0))
+
+
+@pytest.fixture(scope="module")
+def film():
+    """One family of presses: other layouts and coefficients are only read differently."""
+    return ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1e-3), 11.5e-3)
+
+
+@pytest.fixture(scope="module")
+def area(film):
+    """Working areas by sensor, each made once."""
+    made = {}
+
+    def of(name):
+        if name not in made:
+            charges = ChargeSpline.of(replace(film, sensor=load_sensor(name)), 4e-4)
+            made[name] = working_area(charges, REFERENCE)
+        return made[name]
+
+    return of
+
+
+@pytest.mark.parametrize("extra", [None, 0.0], ids=["three charges", "a fourth that tells nothing"])
+def test_a_known_crease_is_found(extra):
+    points = fold_points(creased(extra), Rings.spread(5e-3), 1.0, REFERENCE)
+    assert len(points) > 50
+    assert points[:, 0] == pytest.approx(CREASE, abs=1e-4)
+    assert np.ptp(points[:, 1]) > 7e-3
+
+
+def test_a_charge_that_tells_the_sides_apart_unfolds_it():
+    assert len(fold_points(creased(300.0), Rings.spread(5e-3), 1.0, REFERENCE)) == 0
+
+
+def test_without_a_crease_there_is_no_fold():
+    assert len(fold_points(creased(radius=2.5e-3), Rings.spread(2.5e-3), 1.0, REFERENCE)) == 0
+
+
+def test_turning_over_is_the_sign_of_the_determinant():
+    rng = np.random.default_rng(0)
+    first, second = rng.normal(size=(2, 200, 3, 3)) * [1e6, 1e6, 1.0]
+    np.testing.assert_array_equal(turned_over(first, second), np.linalg.det(first) * np.linalg.det(second) < 0.0)
+
+
+def test_singular_values_are_the_deviations_by_direction():
+    contact = np.array([[1e-3, 1e-3, 1.0]])
+    model = creased(200.0)
+    values = singular_values(scaled_jacobian(model, contact, REFERENCE))
+    covariance = limits_at(model, contact, replace(REFERENCE, gain=1e-9)).covariance[0, :2, :2]
+    values_white = singular_values(scaled_jacobian(model, contact, replace(REFERENCE, gain=1e-9)))
+    assert 1.0 / values_white[0] ** 2 == pytest.approx(np.linalg.eigvalsh(covariance), rel=1e-6)
+    assert (values < values_white).all()
+
+
+def test_twins_are_mirror_images_in_the_crease():
+    twins = find_twins(creased(), REFERENCE, 0.5, places=400)
+    assert len(twins) > 20
+    assert twins.first[:, 0] + twins.second[:, 0] == pytest.approx(2.0 * CREASE, abs=5e-4)
+    assert twins.first[:, 1] == pytest.approx(twins.second[:, 1], abs=5e-4)
+    assert (twins.distance < 3.0).all()
+    assert np.median(twins.distance) < 0.01
+    assert (np.diff(twins.reach) >= 0.0).all()
+
+
+def test_no_twins_where_the_sides_are_told_apart():
+    assert len(find_twins(creased(300.0), REFERENCE, 0.5, places=400)) == 0
+
+
+def test_the_nearest_contact_is_the_right_one():
+    model = creased(300.0)
+    truth = np.array([[1e-3, -2e-3, 0.7], [-3e-3, 1e-3, 0.1]])
+    found, distance = nearest_contact(model, REFERENCE, model.charge(truth), np.array([[0.0, 0.0, 0.3]] * 2))
+    np.testing.assert_allclose(found, truth, rtol=1e-4)
+    assert distance == pytest.approx(0.0, abs=0.01)
+
+
+def test_the_crease_bounds_the_working_area():
+    found = working_area(creased(), REFERENCE, error=np.inf)
+    assert found.fold_radius == pytest.approx(CREASE, abs=6e-5)
+    assert found.why == "fold"
+    assert found.radius == found.unfolded == pytest.approx(2.9e-3, abs=1.1e-4)
+    assert "folds 3" in found.words
+
+
+def test_the_allowed_error_bounds_it_earlier():
+    found = working_area(creased(), REFERENCE, error=0.2e-3, twins=False)
+    assert found.why == "error"
+    ring = found.error_radius * np.exp(2j * np.pi * np.arange(360) / 360)
+    contact = np.stack([ring.real, ring.imag, np.full(360, 0.05)], axis=1)
+    assert limits_at(creased(), contact, REFERENCE).position.max() == pytest.approx(0.2e-3, rel=0.01)
+    assert "exceeds 0.2 mm at 0.05 N" in found.words
+
+
+def test_where_nothing_ends_it_the_search_does():
+    found = working_area(creased(radius=1e-3), REFERENCE, error=1.0)
+    assert (found.radius, found.why) == (1e-3, "searched")
+    assert "no farther than 1 mm" in found.words
+
+
+def test_where_nothing_is_known_there_is_none():
+    assert working_area(creased(), REFERENCE, error=1e-6, twins=False).radius == 0.0
+
+
+def test_three_biaxial_electrodes_fold_outside_of_8_mm(area):
+    """The prototype found none within 8 mm, and some from about 9.5 mm."""
+    assert 9.3e-3 < area("three-25um-biaxial").fold_radius < 10.1e-3
+    assert 7e-3 < area("three-25um-biaxial").radius < 8.5e-3
+
+
+def test_three_uniaxial_electrodes_fold_within_5_mm(area):
+    assert area("three-25um-uniaxial").fold_radius < 5e-3
+    assert area("three-25um-uniaxial").radius < 3e-3
+    assert "no method can tell them apart" in area("three-25um-uniaxial").words
+
+
+@pytest.mark.parametrize("name", ["four-25um-biaxial", "four-25um-uniaxial"])
+def test_four_electrodes_are_usable_to_8_or_10_mm(area, name):
+    assert 7.8e-3 < area(name).radius < 10e-3
+    assert area(name).fold_radius > 8e-3
+
+
+def test_twins_of_a_biaxial_film_are_mirror_images_in_the_electrodes_circle(area):
+    """Inversion: the product of their distances from the centre is the square of the circle's radius, 10 mm."""
+    twins = area("four-25um-biaxial").twins
+    product = np.hypot(*twins.first[:, :2].T) * np.hypot(*twins.second[:, :2].T)
+    assert np.median(product) == pytest.approx(1e-4, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "reach", "force", "position", "relative"),
+    [
+        ("three-25um-biaxial", 8e-3, 1.0, 0.07e-3, 0.0024),
+        ("three-25um-biaxial", 8e-3, 0.1, 0.19e-3, 0.0065),
+        ("four-25um-biaxial", 10e-3, 1.0, 0.05e-3, 0.002),
+        ("four-25um-biaxial", 10e-3, 0.1, 0.13e-3, 0.005),
+    ],
+)
+def test_limits_of_the_prototype(film, name, reach, force, position, relative):
+    """Medians over the area, as the design notes them, to one or two digits."""
+    charges = ChargeSpline.of(replace(film, sensor=load_sensor(name)), 4e-4)
+    rings = Rings.spread(reach)
+    limits = limits_at(charges, rings.contacts(force), REFERENCE)
+    area_weights = np.repeat(rings.distance, rings.position.shape[1])
+    order = np.argsort(limits.position)
+    half = np.searchsorted(np.cumsum(area_weights[order]), 0.5 * area_weights.sum())
+    assert limits.position[order][half] == pytest.approx(position, rel=0.1)
+    assert np.median(limits.force) == pytest.approx(relative, rel=0.25)
