@@ -334,6 +334,13 @@ def test_orientations_are_spread_evenly_and_solved_once_each(folds):
     assert family.solved_turns.size * folds == family.turn.size
 
 
+@pytest.mark.parametrize(("folds", "turns"), [(0, 1), (1, 14), (2, 14), (3, 15), (4, 16)])
+def test_a_second_try_has_more_orientations(folds, turns):
+    """Whole sets of those that look different; a round probe has one whatever is asked."""
+    period = 2.0 * np.pi / folds if folds else 0.0
+    assert Family.spread(8e-3, (0.05, 2.0), (8, 5), period, 14).turn.size == turns
+
+
 @pytest.mark.parametrize("period", [2 * np.pi, np.pi, 2 * np.pi / 3])
 def test_nodes_interpolate_what_charges_look_like(period):
     """A power of the force, a smooth function of the distance, the first harmonics of the orientation."""

@@ -12,6 +12,7 @@ import typer
 from isocharge.cli.curves import contours_command, curves_command
 from isocharge.cli.demo import demo_command
 from isocharge.cli.identify import identify_command
+from isocharge.cli.paper import paper_command
 from isocharge.cli.serve import serve_app
 from isocharge.cli.simulate import simulate_app
 from isocharge.cli.train import train_app
@@ -27,6 +28,7 @@ app.command("demo")(demo_command)
 simulate_app.command("curves")(curves_command)
 simulate_app.command("contours")(contours_command)
 simulate_app.command("identify")(identify_command)
+simulate_app.command("paper")(paper_command)
 app.add_typer(simulate_app, name="simulate")
 app.add_typer(train_app, name="train")
 app.add_typer(serve_app, name="serve")

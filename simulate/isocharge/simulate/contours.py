@@ -13,7 +13,7 @@ from contourpy import LineType, contour_generator
 
 from isocharge.errors import SceneError
 from isocharge.simulate.arrays import Array
-from isocharge.simulate.charge_table import ChargeTable, onto_disk
+from isocharge.simulate.charge_table import SPACING, ChargeTable, onto_disk
 from isocharge.simulate.curves import electrode_index
 from isocharge.simulate.forward import ForwardMap
 
@@ -59,8 +59,10 @@ class ContourField:
     force: float
 
     @classmethod
-    def of(cls, forward_map: ForwardMap, force: float, radius: float | None = None) -> "ContourField":
-        """Of presses within `radius` (m) of the centre, as far as the map reaches if absent.
+    def of(
+        cls, forward_map: ForwardMap, force: float, radius: float | None = None, spacing: float = SPACING
+    ) -> "ContourField":
+        """Of presses within `radius` (m) of the centre, as far as the map reaches if absent; see `ChargeTable.of`.
 
         Raises:
             SceneError: If the map does not cover the force or the radius.
@@ -68,7 +70,7 @@ class ContourField:
         low, high = forward_map.force_range
         if not low * (1.0 - 1e-9) <= force <= high * (1.0 + 1e-9):
             raise SceneError(f"force: expected {low:g} to {high:g} N, which the forward map covers, got {force:g} N")
-        return cls(forward_map, ChargeTable.of(forward_map, radius), force)
+        return cls(forward_map, ChargeTable.of(forward_map, radius, spacing), force)
 
     def contours(self, electrode: str, charge: float) -> tuple[Contour, ...]:
         """The pieces of an electrode's contour of a charge (C); none where no press gives it.

@@ -163,9 +163,3 @@ class Curves:
                 f"degree: expected 1 to {distance.size - 1} for {distance.size} presses on a line, got {degree}"
             )
         return [Polynomial.fit(distance, line, degree) for line in self.own]
-
-
-def map_for(sensor: Sensor, probe: Probe, mappings: Sequence[Mapping], force: float, **how: object) -> ForwardMap:
-    """A forward map at one force that covers the lines; `how` goes to `ForwardMap.build`."""
-    radius = max(mapping.reach for mapping in mappings)
-    return ForwardMap.build(sensor, probe, radius * (1.0 + 1e-6), (force, force), **how)  # type: ignore[arg-type]

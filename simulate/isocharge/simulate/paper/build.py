@@ -1,0 +1,81 @@
+"""From nothing to the folder: solve, triangulate, draw, write."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from isocharge.files import new_folder
+from isocharge.simulate.drawing import save_picture
+from isocharge.simulate.forward import Progress
+from isocharge.simulate.paper.accuracy import Accuracy
+from isocharge.simulate.paper.choices import Choices
+from isocharge.simulate.paper.claims import claims, what_choices_change
+from isocharge.simulate.paper.entry import Entry
+from isocharge.simulate.paper.figure_contours import fig_9, fig_10, fig_11
+from isocharge.simulate.paper.figure_curves import fig_6, fig_8, fig_12
+from isocharge.simulate.paper.layouts import fig_1, fig_2, fig_3, fig_4, fig_5, fig_7
+from isocharge.simulate.paper.page import as_json, page
+from isocharge.simulate.paper.study import Study, conduct
+from isocharge.simulate.paper.thickness import eq_4
+from isocharge.simulate.workers import Workers
+
+FIGURES = 15
+"""Entries of the page."""
+
+
+def write_paper(
+    output: Path,
+    choices: Choices | None = None,
+    workers: Workers | None = None,
+    *,
+    solved: Progress | None = None,
+    triangulated: Progress | None = None,
+    drawn: Progress | None = None,
+) -> tuple[Entry, ...]:
+    """Reproduce the paper in a new folder: paper.md, paper.json, and every figure as PNG and SVG.
+
+    Args:
+        output: The folder to make.
+        choices: What the paper leaves open.
+        workers: Who does the work; here and now if absent. The result does not depend on it.
+        solved: Told how many tasks are solved.
+        triangulated: Told how many ways of triangulating are done.
+        drawn: Told how many figures are drawn.
+
+    Returns:
+        The entries of the page.
+
+    Raises:
+        OutputExists: If the folder is there.
+    """
+    began = time.perf_counter()
+    choices, workers = choices or Choices(), workers or Workers()
+    with new_folder(output) as draft:
+        study = conduct(choices, workers, solved)
+        accuracy = Accuracy.of(study, workers, triangulated)
+        entries = []
+        for entry in make_entries(study, accuracy):
+            if entry.figure is not None:
+                save_picture(entry.figure, draft / f"{entry.slug}.png")
+                entry.figure.set_layout_engine("none")  # as it was laid out, which takes as long as drawing it
+                save_picture(entry.figure, draft / f"{entry.slug}.svg")
+            entries.append(entry)
+            if drawn:
+                drawn(len(entries), FIGURES)
+        seconds = time.perf_counter() - began
+        (draft / "paper.json").write_text(as_json(entries), "utf-8")
+        (draft / "paper.md").write_text(page(entries, choices, seconds), "utf-8")
+    return tuple(entries)
+
+
+def make_entries(study: Study, accuracy: Accuracy) -> Iterator[Entry]:
+    """Every figure in the paper's order, then eq. 4, the claims and our choices."""
+    for make in (fig_1, fig_2, fig_3, fig_4, fig_5, fig_6, fig_7, fig_8):
+        yield make(study)
+    yield fig_9(study, accuracy)
+    yield fig_10(study, accuracy)
+    yield fig_11(study)
+    yield fig_12(study)
+    yield eq_4(study)
+    yield claims(study, accuracy)
+    yield what_choices_change(study, accuracy)

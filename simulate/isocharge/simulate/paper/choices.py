@@ -1,0 +1,127 @@
+"""What the paper says in numbers, and what it leaves open and we choose."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from isocharge.simulate.charge_table import SPACING
+from isocharge.simulate.probe import Circle, Polygon, Probe
+from isocharge.simulate.sensor import Electrode, Readout, Sensor
+from isocharge.simulate.sensor_file import load_sensor
+
+
+@dataclass(frozen=True)
+class Paper:
+    """Numbers of Mirbagheri et al. (2007), in the paper's units.
+
+    Attributes:
+        cubics: Eq. 4: charge (pC) of A, B, C against force (N), falling powers.
+        error_mm: Distance between press and triangulated position ("only 0.122 mm").
+        contour_pC: The example of a contour, Fig. 6.
+        elements: Triangles of a mesh, least and most.
+        linear_N: Force up to which charge is called linear.
+        linear_MPa: Stress up to which PVDF is called linear.
+        fig_8_deg: Angles of the uppermost and the lowermost curve of Fig. 8.
+    """
+
+    cubics: tuple[tuple[float, float, float, float], ...] = (
+        (126.3, -592.4, 1743.9, 183.0),
+        (52.679, -247.820, 731.498, 90.838),
+        (47.189, -222.109, 656.633, 84.974),
+    )
+    error_mm: float = 0.122
+    contour_pC: float = 650.0
+    elements: tuple[int, int] = (13_000, 14_000)
+    linear_N: float = 0.5
+    linear_MPa: float = 40.0
+    fig_8_deg: tuple[float, float] = (140.0, 240.0)
+
+
+PAPER = Paper()
+
+
+TRIANGLE, RECTANGLE, CIRCLE = Polygon.triangle(4e-3), Polygon.rectangle(4e-3, 2e-3), Circle(1e-3)
+"""Probes: of the first two the paper gives the shape, of the third the size too."""
+
+OTHERS = (Polygon.triangle(2e-3), Polygon.triangle(6e-3), CIRCLE, RECTANGLE)
+"""Probes to show what the size and the shape change."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What the paper does not give.
+
+    Attributes:
+        triangle: Fig. 5, 6, 9, 10, 12 and eq. 4: "the triangular probe".
+        rectangle: Fig. 8.
+        circle: Fig. 11; the paper gives its radius.
+        readout: The paper's eq. 3.
+        degree: Of the polynomial along a line.
+        length: Of the lines of a mapping scheme, m.
+        printed_length: Of lines where B sits at 60 degrees, m: some of them lead away from the centre.
+        spacing: Of the knots that charges are tabled with, m.
+        radius: Of the working area, m.
+        presses: How many presses of the working area a distribution is made from.
+        thickness: Of the films that are compared, m.
+        pretension: Of them, Pa.
+        force: At which they are solved, N.
+        shown: A press to show a triangulation with, m.
+        probes: Other probes, to show what their size changes.
+        young: Moduli, Pa, to show what they change; and Poisson's ratios.
+        poisson: See `young`.
+    """
+
+    triangle: Probe = TRIANGLE
+    rectangle: Probe = RECTANGLE
+    circle: Probe = CIRCLE
+    readout: Readout = "edge"
+    degree: int = 4
+    length: float = 20e-3
+    printed_length: float = 12e-3
+    spacing: float = SPACING
+    radius: float = 8e-3
+    presses: int = 300
+    thickness: tuple[float, ...] = (25e-6, 50e-6, 110e-6, 200e-6, 350e-6, 600e-6, 1000e-6)
+    pretension: tuple[float, ...] = (0.0, 0.5e6, 1.0e6, 1.5e6, 2.5e6, 5.0e6)
+    force: tuple[float, ...] = (0.05, 0.1, 0.175, 0.25, 0.35, 0.5, 0.8, 1.3, 2.0)
+    shown: tuple[float, float] = (2e-3, 3e-3)
+    probes: tuple[Probe, ...] = OTHERS
+    young: tuple[float, ...] = (2e9, 4e9)
+    poisson: tuple[float, ...] = (0.25, 0.45)
+
+    @classmethod
+    def quick(cls) -> "Choices":
+        """Fewer presses and films, shorter lines: every figure and number, most of them coarser."""
+        return cls(
+            degree=2,
+            length=12e-3,
+            printed_length=8e-3,
+            spacing=0.6e-3,
+            presses=30,
+            thickness=(25e-6, 1000e-6),
+            pretension=(0.0, 1.5e6),
+            force=(0.05, 0.25, 0.5, 1.0, 2.0),
+            probes=OTHERS[:1],
+            young=(2e9,),
+            poisson=(0.25,),
+        )
+
+    def sensor(self, layout: str, film: str = "biaxial", readout: Readout | None = None) -> Sensor:
+        """A built-in sensor, "three" or "four", with the paper's readout or another."""
+        return replace(load_sensor(f"{layout}-25um-{film}"), readout=readout or self.readout)
+
+    def as_printed(self) -> Sensor:
+        """Three electrodes with B and C at 60 and 120 degrees from x, as the paper's sentence has it, A at -y."""
+        angles = dict(zip("ABC", np.deg2rad([-90.0, 60.0, 120.0]), strict=True))
+        electrodes = tuple(
+            Electrode.of_square(name, (10e-3 * float(np.cos(a)), 10e-3 * float(np.sin(a))), 3e-3)
+            for name, a in angles.items()
+        )
+        return replace(self.sensor("three"), name="B and C at 60 and 120 degrees", electrodes=electrodes)
+
+
+def normalised_cubic(force: np.ndarray) -> np.ndarray:
+    """Eq. 4 for electrode A over its value at 1 N."""
+    cubic = np.array(PAPER.cubics[0])
+    normalised: np.ndarray = np.polyval(cubic / cubic.sum(), force)
+    return normalised

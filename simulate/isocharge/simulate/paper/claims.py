@@ -1,0 +1,176 @@
+"""The paper's other claims, and what our choices change."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from isocharge.simulate.arrays import Array
+from isocharge.simulate.charge import contact_charge, thermal_charge
+from isocharge.simulate.curves import Mapping
+from isocharge.simulate.paper.accuracy import Accuracy, Errors, unnoticed
+from isocharge.simulate.paper.choices import PAPER
+from isocharge.simulate.paper.entry import Entry, Row
+from isocharge.simulate.paper.layouts import TOUCHED
+from isocharge.simulate.paper.study import FORCE, Study, sample
+
+D33, PYRO, KELVIN = -30e-12, 30e-6, 0.1
+"""Of PVDF, C/N and C/(m^2 K), and a temperature step (K) that a finger makes easily."""
+
+
+def claims(study: Study, accuracy: Accuracy) -> Entry:
+    """What the text says without a figure."""
+    rows, numbers = [], {}
+    for make in (_edges, _d33, _pyro, _stress):
+        row, found = make(study)
+        rows.append(row)
+        numbers.update(found)
+    rows += [_fourth(accuracy, study.choices.degree), _known(accuracy)]
+    numbers["from_the_field_with_reference_noise"] = {name: e.numbers() for name, e in accuracy.noisy.items()}
+    numbers["drawn_with_reference_noise"] = {name: e.numbers() for name, e in accuracy.drawn_noisy.items()}
+    return Entry("Claims", "What the text says, in numbers.", None, rows, numbers)
+
+
+def _edges(study: Study) -> tuple[Row, dict[str, object]]:
+    """Edge averages against the whole electrode."""
+    places = study.places
+    edge, area = (
+        study.charges("triangle", study.choices.sensor("three", readout=readout), places)
+        for readout in ("edge", "area")
+    )
+    change = 100.0 * np.abs(edge / area - 1.0)
+    middle, most, worst = np.median(change), np.percentile(change, 95), change.max()
+    row = Row(
+        "edge averages (eq. 3) give the charge",
+        "\"precise\"",
+        f"off the whole electrode's charge by {middle:.2f} % at the median, {most:.1f} % at 95 %, {worst:.1f} % most, "
+        f"within {1e3 * study.choices.radius:g} mm",
+        "an electrode collects from all of its area; edges are a quadrature that misses the stress beside the probe",
+    )  # fmt: skip
+    return row, {"edge_against_area_percent": {"median": middle, "p95": most, "worst": worst}}
+
+
+def _d33(study: Study) -> tuple[Row, dict[str, object]]:
+    """The contact pressure where the probe covers part of B."""
+    sensor = study.choices.sensor("three")
+    taking = replace(sensor, piezo=replace(sensor.piezo, d33=D33))
+    points = Mapping.lines(sensor, "A", length=study.choices.length).points.reshape(-1, 2)
+    extra = np.array([contact_charge(taking, study.choices.triangle, (x, y), FORCE) for x, y in points])
+    charge = study.charges("triangle", sensor, points)
+    share = extra / charge
+    over = extra > TOUCHED * -D33 * FORCE
+    whole = -D33 * FORCE
+    row = Row(
+        "d33 where the probe overlaps an electrode",
+        "no charge",
+        f"up to {1e12 * extra.max():.1f} pC, {100 * share.max():.1f} % of the charge there "
+        f"({over.any(axis=1).sum()} of {len(points)} presses of the scheme); "
+        f"{1e12 * whole:.0f} pC if the electrode carried all of the force",
+        f"a thin film does carry the probe's pressure; d33 = {1e12 * D33:g} pC/N. Small beside the stretching: leaving "
+        "it out is right, the reason given is not",
+    )
+    return row, {"d33_pC": {"largest": 1e12 * extra.max(), "largest_share": share.max()}}
+
+
+def _pyro(study: Study) -> tuple[Row, dict[str, object]]:
+    sensor = study.choices.sensor("three")
+    warm = thermal_charge(replace(sensor, piezo=replace(sensor.piezo, pyro=PYRO)), KELVIN)[0]
+    row = Row(
+        "pyroelectric charge",
+        "can dominate; left out",
+        f"{1e12 * warm:.0f} pC on each electrode for {KELVIN:g} K",
+        f"{1e6 * PYRO:g} uC/(m^2 K) on {1e6 * sensor.electrodes[0].area:g} mm^2; the same on all, a press is not",
+    )
+    return row, {"pyro_pC_per_0.1_K": 1e12 * warm}
+
+
+def _stress(study: Study) -> tuple[Row, dict[str, object]]:
+    largest = study.shown.principal_stress[1]
+    row = Row(
+        "the material stays linear",
+        f"up to {PAPER.linear_MPa:g} MPa",
+        f"{1e-6 * largest:.0f} MPa beside the triangle at 1 N",
+        "beyond its range beside the probe" if largest > 1e6 * PAPER.linear_MPa else "within its range",
+    )
+    return row, {"largest_stress_MPa": 1e-6 * largest}
+
+
+def _both(name: str, three: Errors, four: Errors) -> str:
+    """What a fourth electrode changes."""
+    medians, most = ([e.percentile(share) for e in (three, four)] for share in (50, 95))
+    return (
+        f"{name}: {medians[0]:.2g} to {medians[1]:.2g} mm at the median, {most[0]:.2g} to {most[1]:.2g} mm at 95 %, "
+        f"{100 * three.share_found:.0f} to {100 * four.share_found:.0f} % found"
+    )
+
+
+def _fourth(accuracy: Accuracy, degree: int) -> Row:
+    ours = "; ".join(
+        [
+            _both("as the paper, no noise", accuracy.drawn["three", degree], accuracy.drawn["four", degree]),
+            _both("from the field, no noise", accuracy.field["three"], accuracy.field["four"]),
+            _both("as the paper, noise", accuracy.drawn_noisy["three"], accuracy.drawn_noisy["four"]),
+            _both("from the field, noise", accuracy.noisy["three"], accuracy.noisy["four"]),
+        ]
+    )
+    why = (
+        "noise is 1 pC and 0.2 % of each charge. Averaging triples helps less than it could: contours of opposite "
+        "electrodes touch near the centre, and their crossing is poor there; a fourth charge finds more presses"
+    )
+    return Row("a fourth electrode, three to four", "a more accurate position", ours, why)
+
+
+def _known(accuracy: Accuracy) -> Row:
+    """The probe and the film must be known."""
+    words = [
+        f"{name}: {errors.percentile(50):.2f} mm, {100 * errors.share_found:.0f} % found"
+        for name, errors in accuracy.mistaken.items()
+        if name.startswith(("probe", "pretension"))
+    ]
+    return Row(
+        "shape and size of the object must be known",
+        "must be known",
+        "taken for a triangle of 4 mm on a slack film, median error: " + "; ".join(words),
+        "known force; a film that is a little taut costs more than the wrong probe",
+    )
+
+
+def what_choices_change(study: Study, accuracy: Accuracy) -> Entry:
+    """Sizes that the paper does not give."""
+    rows = []
+    film, piezo = study.choices.sensor("three").film, study.choices.sensor("three").piezo
+    ours = {
+        "E": f"{film.young * 1e-9:g} GPa",
+        "nu": f"{film.poisson:g}",
+        "probe": f"{study.choices.triangle.notation} (side, mm)",
+        "pretension": "0 MPa",
+    }
+    for name in study.variants:
+        kind, _, value = name.partition(" ")
+        errors = accuracy.mistaken[name]
+        position = f"{errors.percentile(50):.3f} mm" if errors.found_mm.size else "no contours met"
+        change = f"charges by {_signed(study, name)}, at most {100 * unnoticed(study, name):.1f} %"
+        rows.append(
+            Row(
+                f"{kind}: {value}",
+                "not given",
+                f"{change}; position if not known: {position}",
+                f"our choice {ours[kind]}",
+            )
+        )
+    rows.append(
+        Row(
+            "d31, d32",
+            "not given",
+            f"charges are linear in them; biaxial {1e12 * piezo.d31:g} and {1e12 * piezo.d32:g} pC/N",
+            f"eq. 4 agrees with d31 = {1e12 * piezo.d31 / study.eq_4[1]:.1f} pC/N, all else as ours",
+        )
+    )
+    found = {name: {"largest_change": unnoticed(study, name)} for name in study.variants}
+    return Entry("What the paper does not give", "Our choices, and what others would change.", None, rows, found)
+
+
+def _signed(study: Study, name: str) -> str:
+    """Median relative change of a charge, with its sign."""
+    at: Array = np.array(sample(study.choices))
+    charge = study.charges("triangle", study.choices.sensor("three"), at)
+    return f"{100 * float(np.median(study.variants[name][0] / charge - 1.0)):+.1f} % at the median"

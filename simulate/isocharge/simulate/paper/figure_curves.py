@@ -1,0 +1,239 @@
+"""Fig. 6, 8 and 12: charge against distance."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from isocharge.simulate.arrays import Array
+from isocharge.simulate.curves import Curves, Mapping
+from isocharge.simulate.drawing import COLOURS, PRESSED, draw_curves, new_figure
+from isocharge.simulate.drawn import draw_contour
+from isocharge.simulate.paper.choices import PAPER
+from isocharge.simulate.paper.entry import Entry, Row
+from isocharge.simulate.paper.study import FORCE, Study
+from isocharge.simulate.sensor import Piezo, Sensor
+
+FIG_6_DEG, FOUR_DEG = (35.0, 90.0), (110.0, 250.0)
+FINE = 97
+"""Presses on a line that is drawn smooth."""
+
+RATIOS = np.linspace(0.0, 2.0, 41)
+"""d32 over d31 that are tried for the order of Fig. 8."""
+
+
+def curves_of(
+    study: Study, probe: str, sensor: Sensor, name: str, degrees: tuple[float, float], length: float | None = None
+) -> tuple[Curves, Curves]:
+    """Curves at the scheme's presses, and finely along the same lines."""
+    ends = (np.deg2rad(degrees[0]), np.deg2rad(degrees[1]))
+    mapping = Mapping.lines(sensor, name, ends, length=length or study.choices.length)
+    film = study.film(probe, sensor)
+    return Curves.of(film, mapping, FORCE), Curves.of(film, mapping.finer(FINE), FORCE)
+
+
+def numbers(curves: Curves) -> dict[str, object]:
+    """A set of curves for programs."""
+    return {
+        "angle_deg": np.rad2deg(curves.mapping.angle).tolist(),
+        "distance_mm": (1e3 * curves.mapping.distance).tolist(),
+        "charge_pC": (1e12 * curves.own).tolist(),
+    }
+
+
+def fig_6(study: Study) -> Entry:
+    """Triangle, biaxial, from A; three electrodes as in the paper, and four."""
+    figure = new_figure(12.6, 5.2)
+    left, right = figure.subplots(1, 2)
+    at, smooth = curves_of(study, "triangle", study.choices.sensor("three"), "A", FIG_6_DEG)
+    four, four_smooth = curves_of(study, "triangle", study.choices.sensor("four"), "A", FOUR_DEG)
+    for axes, curves, line, layout in ((left, at, smooth, "three"), (right, four, four_smooth, "four")):
+        draw_curves(axes, curves, line)
+        axes.axhline(PAPER.contour_pC, color="k", lw=0.8, ls=":")
+        axes.annotate(f"{PAPER.contour_pC:g} pC", (4, PAPER.contour_pC), fontsize=8, va="bottom")
+        axes.set_title(f"Fig. 6: triangular probe, biaxial film, {layout} electrodes, 1 N")
+    area = curves_of(study, "triangle", study.choices.sensor("three", readout="area"), "A", FIG_6_DEG)[0]
+    contour_row, distance = _example(study, at, smooth)
+    apart, change = 100.0 * _spread(at), 100.0 * np.abs(at.own / area.own - 1.0).max(axis=0)
+    rows = [
+        contour_row,
+        Row(
+            "how far the lines lie apart",
+            "in the figure",
+            _at_distances(at, apart),
+            "round film, biaxial coefficients: the angle hardly matters, but for the triangle's corners near by",
+        ),
+        Row(
+            "edge against area readout on these lines",
+            "edges are precise",
+            _at_distances(at, change),
+            "the stress is not linear across an electrode near the probe",
+        ),
+    ]
+    found = {
+        **numbers(at),
+        "four_electrodes": numbers(four),
+        "distance_of_650_pC_mm": distance,
+        "spread_of_lines": 0.01 * apart,
+    }
+    caption = f"Charge of A under a triangle; the dotted line is the paper's example of {PAPER.contour_pC:g} pC."
+    return Entry("Fig. 6", caption, figure, rows, found)
+
+
+def _example(study: Study, at: Curves, smooth: Curves) -> tuple[Row, Array]:
+    """The paper's example of a contour: distances (mm) at which the lines have 650 pC."""
+    contour = draw_contour(at, 1e-12 * PAPER.contour_pC, study.choices.degree)
+    knots = np.empty((0, 2)) if contour is None else contour.knots
+    distance = 1e3 * np.linalg.norm(knots - at.mapping.origin, axis=1)
+    exact = 1e3 * np.array([np.interp(-1e-12 * PAPER.contour_pC, -q, smooth.mapping.distance) for q in smooth.own])
+    row = Row(
+        f"{PAPER.contour_pC:g} pC, distance from A on lines of 35° to 90°",
+        "x1 to x7, in the figure",
+        f"{len(knots)} lines, {distance.min():.2f} to {distance.max():.2f} mm" if len(knots) else "not reached",
+        f"by the field {exact.min():.2f} to {exact.max():.2f} mm; E, d31 and the probe's size are our choice",
+    )
+    return row, distance
+
+
+def _at_distances(curves: Curves, percent: Array) -> str:
+    return ", ".join(f"{p:.1f} % at {1e3 * d:g} mm" for p, d in zip(percent, curves.mapping.distance, strict=True))
+
+
+def _spread(curves: Curves) -> Array:
+    """Largest less smallest charge of the lines over their mean, at each distance."""
+    spread: Array = np.ptp(curves.own, axis=0) / curves.own.mean(axis=0)
+    return spread
+
+
+def fig_8(study: Study) -> Entry:
+    """Rectangle, biaxial, from B; and who is uppermost."""
+    sensor = study.choices.sensor("three")
+    at, smooth = curves_of(study, "rectangle", sensor, "B", PAPER.fig_8_deg)
+    figure = new_figure(12.0, 5.2)
+    left, right = figure.subplots(1, 2)
+    draw_curves(left, at, smooth)
+    left.set_title("Fig. 8: rectangular probe, biaxial film, 1 N")
+    mean = smooth.own.mean(axis=0)
+    for angle, own in zip(np.rad2deg(at.mapping.angle), smooth.own, strict=True):
+        colour, width, label = _marked(float(angle))
+        right.plot(1e3 * smooth.mapping.distance, 100.0 * (own / mean - 1.0), lw=width, color=colour, label=label)
+    right.set(xlabel="distance from the centre of B, mm", ylabel="charge over the mean of the lines, %")
+    right.set_title("the same, against the mean of the lines")
+    right.grid(alpha=0.3)
+    right.legend()
+    printed, _ = curves_of(
+        study, "rectangle", study.choices.as_printed(), "B", PAPER.fig_8_deg, study.choices.printed_length
+    )
+    ratio, share = _best_ratio(study)
+    under_circle, _ = curves_of(study, "circle", sensor, "B", PAPER.fig_8_deg)
+    why = (
+        "from our B 210° leads to the film's centre and 140° farthest from it; nearer the rim a press stretches the "
+        "electrode less. Beside the electrode the rectangle's long side, along x, counts more"
+    )
+    return Entry(
+        "Fig. 8",
+        "Charge of B under a rectangle of 4 x 2 mm; on the right each line against the mean of all.",
+        figure,
+        [
+            Row("uppermost line at 4, 8, ... mm", "140° throughout", _extreme(at, np.argmax), why),
+            Row(
+                "lowermost line at 4, 8, ... mm",
+                "240° throughout",
+                _extreme(at, np.argmin),
+                "the reverse of the claim, farther out",
+            ),
+            Row(
+                "under a circle",
+                "not given",
+                f"uppermost {_extreme(under_circle, np.argmax)}; lowermost {_extreme(under_circle, np.argmin)}",
+                "no corners: what is left is the place of the rim",
+            ),
+            Row(
+                "with B at 60° from the centre, as printed",
+                "140° uppermost, 240° lowermost",
+                f"uppermost {_extreme(printed, np.argmax)}; lowermost {_extreme(printed, np.argmin)}",
+                "the layout's angles do not explain it",
+            ),
+            Row(
+                "with another d32 over d31",
+                "not given",
+                f"140° uppermost and 240° lowermost at {100 * share:.0f} % of the distances"
+                + (f", with d32/d31 = {ratio:.2f}" if share else ""),
+                f"{'explains it' if share == 1.0 else 'does not explain it'}; tried {RATIOS[0]:g} to {RATIOS[-1]:g}",
+            ),
+        ],
+        {
+            **numbers(at),
+            "uppermost_deg": _angles(at, np.argmax),
+            "lowermost_deg": _angles(at, np.argmin),
+            "uppermost_as_printed_deg": _angles(printed, np.argmax),
+            "lowermost_as_printed_deg": _angles(printed, np.argmin),
+            "best_d32_over_d31": ratio,
+            "share_of_distances_in_order": share,
+        },
+    )
+
+
+def _marked(angle: float) -> tuple[str, float, str | None]:
+    """Colour, width and label of a line: the two that the paper names stand out."""
+    for named, colour in zip(PAPER.fig_8_deg, COLOURS, strict=False):
+        if np.isclose(angle, named):
+            return colour, 2.4, f"{named:.0f}°"
+    return PRESSED, 0.7, "the others" if np.isclose(angle, 190.0) else None
+
+
+def _angles(curves: Curves, extreme: object) -> list[float]:
+    index = extreme(curves.own, axis=0)  # type: ignore[operator]
+    return [round(float(angle), 6) for angle in np.rad2deg(curves.mapping.angle[index])]
+
+
+def _extreme(curves: Curves, extreme: object) -> str:
+    return ", ".join(f"{angle:.0f}°" for angle in _angles(curves, extreme))
+
+
+def _best_ratio(study: Study) -> tuple[float, float]:
+    """d32 over d31 with which the order of Fig. 8 holds at most distances, and the share of them."""
+    sensor = study.choices.sensor("three")
+    directions = (Piezo(d31=1e-12, d32=0.0), Piezo(d31=0.0, d32=1e-12))
+    sensors = [replace(sensor, piezo=piezo) for piezo in directions]
+    parts = [curves_of(study, "rectangle", taking, "B", PAPER.fig_8_deg)[0].own for taking in sensors]
+    best = (0.0, 0.0)
+    for ratio in RATIOS:
+        own = parts[0] + ratio * parts[1]
+        share = float(np.mean((own.argmax(axis=0) == 0) & (own.argmin(axis=0) == len(own) - 1)))
+        best = max(best, (share, float(ratio)))
+    return best[1], best[0]
+
+
+def fig_12(study: Study) -> Entry:
+    """Triangle, uniaxial, from A, beside biaxial."""
+    figure = new_figure(12.0, 5.2)
+    found, rows = {}, []
+    for axes, layout in zip(figure.subplots(1, 2), ("three", "four"), strict=True):
+        name = "A"
+        degrees = FIG_6_DEG if layout == "three" else FOUR_DEG
+        uniaxial, smooth = curves_of(study, "triangle", study.choices.sensor(layout, "uniaxial"), name, degrees)
+        biaxial, _ = curves_of(study, "triangle", study.choices.sensor(layout), name, degrees)
+        draw_curves(axes, uniaxial, smooth)
+        axes.set_title(f"Fig. 12: triangular probe, uniaxial, {layout} electrodes, 1 N")
+        apart = [100.0 * _spread(curves) for curves in (biaxial, uniaxial)]
+        rows.append(
+            Row(
+                f"how far the lines lie apart, {layout} electrodes",
+                "more distinct and separated",
+                f"{apart[1].min():.0f} to {apart[1].max():.0f} % of the charge, "
+                f"biaxial {apart[0].min():.0f} to {apart[0].max():.0f} %",
+                "d31 : d32 = 20 : 2 pC/N, our choice, weighs the radial against the hoop stress by the angle",
+            )
+        )
+        found[layout] = {
+            **numbers(uniaxial),
+            "spread": (0.01 * apart[1]).tolist(),
+            "spread_biaxial": (0.01 * apart[0]).tolist(),
+        }
+    return Entry(
+        "Fig. 12",
+        "Charge of A on a uniaxial film under a triangle of 4 mm, with three and with four electrodes.",
+        figure,
+        rows,
+        found,
+    )

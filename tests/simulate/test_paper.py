@@ -1,0 +1,165 @@
+"""The paper's page: made once, small, with round probes; and its arithmetic against numpy and closed forms."""
+
+import json
+import re
+import xml.etree.ElementTree
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from isocharge.errors import OutputExists
+from isocharge.simulate import Circle, drawing, load_sensor
+from isocharge.simulate.paper import Choices, write_paper
+from isocharge.simulate.paper.choices import PAPER, normalised_cubic
+from isocharge.simulate.paper.layouts import trilaterate
+from isocharge.simulate.paper.study import Presses, solve_presses
+from isocharge.simulate.paper.thickness import ChargeForce
+from isocharge.simulate.workers import Workers
+
+FIGURES = [f"Fig. {number}" for number in range(1, 13)]
+SMALL = replace(
+    Choices.quick(),
+    triangle=Circle(1.2e-3),
+    rectangle=Circle(1.5e-3),
+    probes=(Circle(2e-3),),
+    presses=12,
+    force=(0.05, 0.2, 0.5, 1.0, 2.0),
+    spacing=0.8e-3,
+)
+
+
+@pytest.fixture(scope="module")
+def told() -> dict[str, list[tuple[int, int]]]:
+    return {"solved": [], "triangulated": [], "drawn": []}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, told):
+    path = tmp_path_factory.mktemp("paper") / "made"
+    progress = {name: (lambda done, total, steps=steps: steps.append((done, total))) for name, steps in told.items()}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drawing, "DPI", 40)
+        write_paper(path, SMALL, Workers(), **progress)
+    return path
+
+
+@pytest.fixture(scope="module")
+def numbers(folder):
+    return json.loads((folder / "paper.json").read_text("utf-8"))
+
+
+def test_every_heading_is_there(folder, numbers):
+    page = (folder / "paper.md").read_text("utf-8")
+    headings = re.findall(r"^## (.+)$", page, re.MULTILINE)
+    assert headings == ["Table", *FIGURES, "Eq. 4", "Claims", "What the paper does not give"]
+    assert list(numbers) == headings[1:]
+
+
+def test_every_picture_is_there_twice_and_shown(folder):
+    page = (folder / "paper.md").read_text("utf-8")
+    slugs = [f"fig-{number:02d}" for number in range(1, 13)] + ["eq-04"]
+    names = {f"{slug}.{kind}" for slug in slugs for kind in ("png", "svg")} | {"paper.md", "paper.json"}
+    assert {path.name for path in folder.iterdir()} == names
+    assert set(re.findall(r"\]\((.+?\.(?:png|svg))\)", page)) == names - {"paper.md", "paper.json"}
+    for slug in slugs:
+        with Image.open(folder / f"{slug}.png") as picture:
+            assert min(picture.size) > 100
+            assert len(picture.convert("L").getcolors()) > 10
+        text = "".join(xml.etree.ElementTree.parse(folder / f"{slug}.svg").getroot().itertext())
+        assert "mm" in text or "force, N" in text
+
+
+def test_the_table_has_a_row_for_every_figure_with_the_papers_value(folder):
+    rows = re.findall(
+        r"^\| ((?:Fig\.|Eq\.) \d+) \| (.+) \| (.+) \| (.+) \| (.+) \|$", (folder / "paper.md").read_text(), re.M
+    )
+    assert {row[0] for row in rows} == {*FIGURES, "Eq. 4"}
+    assert all(len(cell) > 1 and "nan" not in cell for row in rows for cell in row)
+    assert any("0.122 mm" in row[2] for row in rows)
+
+
+def test_progress_is_told(folder, told):
+    assert folder.exists()
+    for steps in told.values():
+        total = steps[-1][1]
+        assert steps == [(done, total) for done in range(1, total + 1)]
+
+
+def test_charges_on_the_page_are_presses(numbers):
+    """Fig. 6 against a direct solve, the paper's readout."""
+    found = numbers["Fig. 6"]
+    angle, distance = np.deg2rad(found["angle_deg"][2]), 1e-3 * found["distance_mm"][1]
+    at = (float(distance * np.cos(angle)), float(-10e-3 + distance * np.sin(angle)))
+    sensor = replace(load_sensor("three-25um-biaxial"), readout="edge")
+    direct = 1e12 * solve_presses(Presses((sensor,), SMALL.triangle, (at,), (1.0,)))[0, 0, 0]
+    assert found["charge_pC"][2][1] == pytest.approx(direct, rel=2e-3)
+
+
+def test_eq_4_is_a_membranes(numbers):
+    """Normalised charge at 25 um within 0.02 of the paper's cubic; the thick film far from it."""
+    films = {(film["thickness_um"], film["pretension_MPa"]): film for film in numbers["Eq. 4"]["films"]}
+    assert films[25.0, 0.0]["misfit"] < 0.02
+    assert films[25.0, 0.0]["exponent"]["1_N"] == pytest.approx(2.0 / 3.0, abs=5e-3)
+    assert films[1000.0, 0.0]["misfit"] > 1.0
+    assert films[1000.0, 0.0]["exponent"]["0.1_N"] == pytest.approx(2.0, abs=0.02)
+    assert max(films[1000.0, 0.0]["charge_pC"][-1]) < 100.0
+    x, y = numbers["Eq. 4"]["press_of_eq_4_mm"]
+    assert np.hypot(x, y + 10.0) == pytest.approx(4.0, abs=0.5)
+
+
+def test_contours_from_the_field_meet_at_the_press(numbers):
+    assert numbers["Fig. 9"]["p50_mm"] < 0.005
+    assert numbers["Fig. 9"]["met"] >= 8
+    assert 0.0 <= numbers["Fig. 10"]["three_degree_2"]["percentile_of_0.122_mm"] <= 100.0
+
+
+def test_a_folder_that_is_there_is_left_alone(tmp_path):
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(OutputExists, match="mine is already there"):
+        write_paper(tmp_path / "mine", SMALL)
+    assert list((tmp_path / "mine").iterdir()) == []
+
+
+def test_nothing_is_left_when_it_fails(tmp_path, monkeypatch):
+    def fail(*_):
+        raise ArithmeticError("no")
+
+    monkeypatch.setattr("isocharge.simulate.paper.build.conduct", fail)
+    with pytest.raises(ArithmeticError):
+        write_paper(tmp_path / "new", SMALL)
+    assert list(tmp_path.iterdir()) == []
+
+
+# Its arithmetic
+
+
+def test_trilateration_is_the_inverse_of_distances():
+    rng = np.random.default_rng(2)
+    centres, at = rng.standard_normal((3, 2)), rng.standard_normal(2)
+    np.testing.assert_allclose(trilaterate(centres, np.linalg.norm(centres - at, axis=1)), at, atol=1e-12)
+
+
+def test_normalised_cubic_is_the_designs():
+    """(0.0865, -0.4055, 1.1938, 0.1253), and 1 at 1 N."""
+    force = np.array([0.25, 0.7, 1.0, 2.0])
+    np.testing.assert_allclose(normalised_cubic(force), np.polyval([0.0865, -0.4055, 1.1938, 0.1253], force), rtol=5e-4)
+    assert sum(PAPER.cubics[0]) == pytest.approx(1460.8)
+
+
+@pytest.mark.parametrize("exponent", [2.0 / 3.0, 1.0, 2.0])
+def test_power_laws(exponent):
+    """Exponent, distance from a line and the cubic of Q = F^n."""
+    from scipy.interpolate import CubicSpline
+
+    force = np.geomspace(0.05, 2.0, 9)
+    film = ChargeForce(25e-6, 0.0, CubicSpline(np.log(force), exponent * np.log(force) + np.log(1e-9)))
+    assert film.exponent(0.7) == pytest.approx(exponent)
+    fine = np.linspace(0.25, 2.0, 352)
+    np.testing.assert_allclose(film.cubic, np.polyfit(fine, fine**exponent, 3), atol=2e-3)
+    line = np.linspace(0.05, 0.5, 91)
+    slope = np.sum(line ** (1.0 + exponent)) / np.sum(line**2)
+    expected = np.abs(line**exponent - slope * line).max() / 0.5**exponent
+    assert film.bent(0.5) == pytest.approx(expected, abs=1e-9)
+    assert (film.bent(0.5) < 1e-9) == (exponent == 1.0)
