@@ -6,7 +6,8 @@ from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, run_swe
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network
 
 QUICK = FitConfig(
-    NetworkConfig(hidden=(32, 32), misfit_hidden=(16, 16)), TrainingConfig(steps=400, misfit_steps=100, batch=256)
+    NetworkConfig(hidden=(32, 32), misfit_hidden=(24, 24)),
+    TrainingConfig(steps=400, misfit_steps=600, misfit_charges=4_000, batch=256),
 )
 
 

@@ -1,17 +1,21 @@
 """Training: repeatable, seeded, leaves the caller's settings alone, fails loudly."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from isocharge.errors import InputError, TrainingError
+from isocharge.errors import ConfigError, InputError, TrainingError
+from isocharge.simulate import Dataset, Samples, noise_model
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network
-from isocharge.train.network import project
+from isocharge.train.evaluate import measure_errors, noisy_charges, position_error
+from isocharge.train.release import predict_with
 
 TINY = FitConfig(
-    NetworkConfig(hidden=(16, 16), misfit_hidden=(8, 8)), TrainingConfig(steps=40, misfit_steps=10, batch=128)
+    NetworkConfig(hidden=(16, 16), misfit_hidden=(8, 8)),
+    TrainingConfig(steps=40, misfit_steps=10, misfit_charges=1_000, batch=128),
 )
 
 
@@ -38,15 +42,11 @@ def test_progress_is_told_to_the_end(dataset):
     calls = []
     fit_network(dataset, TINY, lambda done, total, words: calls.append((done, total, words)))
     assert calls[-1][:2] == (50, 50)
-    assert "contact loss" in calls[0][2]
-    assert "misfit loss" in calls[-1][2]
+    assert re.search(r"contact: loss .* [\d.]+ mm and [\d.]+ % of force rms", calls[0][2])
+    assert calls[-1][2].startswith("misfit: loss ")
 
 
 def test_training_lowers_the_error(dataset, fit):
-    from isocharge.simulate import noise_model
-    from isocharge.train.evaluate import measure_errors
-    from isocharge.train.release import predict_with
-
     untrained = fit_network(dataset, replace(TINY, training=replace(TINY.training, steps=1)))
     noise = noise_model("reference")
     before, after = (measure_errors(predict_with(each), each.held, noise) for each in (untrained, fit))
@@ -65,11 +65,57 @@ def test_an_unknown_noise_level(dataset):
         fit_network(dataset, replace(TINY, training=replace(TINY.training, noise="loud")))
 
 
-def test_projection_ends_in_the_domain_and_leaves_it_alone():
-    unit = torch.tensor(np.random.default_rng(0).normal(size=(500, 3)), dtype=torch.float32)
-    inside = project(unit)
-    assert float(inside[:, :2].norm(dim=1).max()) <= 1.0 + 1e-6
-    assert float(inside[:, 2].abs().max()) <= 1.0
-    assert torch.allclose(project(inside), inside, atol=1e-6)
-    already = unit[(unit[:, :2].norm(dim=1) < 1) & (unit[:, 2].abs() < 1)]
-    assert torch.equal(project(already), already)
+def test_coverage_where_the_truth_is_known(sensor):
+    """Charges whose logarithms are linear in the contact, noise in proportion: the posterior is Gaussian, its width
+    known, but at the edge."""
+    rng = np.random.default_rng(0)
+    count, radius = 6_000, 8.0
+    reach, angle = radius * np.sqrt(rng.uniform(size=count)), rng.uniform(-np.pi, np.pi, count)
+    force = np.exp(rng.uniform(np.log(0.05), np.log(2.0), count))
+    contact = np.stack([reach * np.cos(angle), reach * np.sin(angle), np.log(force)], axis=1)
+    slope = np.array([[0.0, -0.1, 0.7], [0.1, 0.05, 0.7], [-0.1, 0.05, 0.7]])
+    charge = 1e4 * np.exp(contact @ slope.T)
+    samples = Samples(*contact[:, :2].T, force, np.full(count, "circle:1.0"), np.zeros(count), charge)
+    dataset = Dataset(sensor, samples, {"ranges": {"radius_mm": radius, "force_N": [0.05, 2.0]}}, "made up")
+    config = FitConfig(
+        NetworkConfig((24, 24), (8, 8)),
+        TrainingConfig(steps=1_500, misfit_steps=1, misfit_charges=1_000, batch=512, noise="reference"),
+    )
+    fit = fit_network(dataset, config)
+    good = fit.held[np.hypot(*fit.held.contact[:, :2].T) < 7.0]
+    found, std, _ = predict_with(fit)(noisy_charges(good, noise_model("reference"), seed=4))
+    exact = np.sqrt(np.diag(np.linalg.inv(slope.T @ slope))) * 0.002  # of x, y (mm) and ln F; 1 pC is nothing here
+    ratio = std / exact / np.stack([np.ones(len(good)), np.ones(len(good)), found[:, 2]], axis=1)
+    assert np.median(ratio, axis=0) == pytest.approx([1.0, 1.0, 1.0], abs=0.15)
+    deviation = np.abs(found - good.contact) / std
+    assert np.mean(deviation < 1.0, axis=0) == pytest.approx([0.68] * 3, abs=0.08)
+    assert np.mean(deviation < 1.96, axis=0) == pytest.approx([0.95] * 3, abs=0.04)
+
+
+def test_a_configuration_for_more_electrodes_is_refused(dataset):
+    four = replace(TINY, network=replace(TINY.network, electrodes=4))
+    with pytest.raises(ConfigError, match=r"for 4 electrodes, the dataset of 'three-25um-biaxial' has 3 \(A, B, C\)"):
+        fit_network(dataset, four)
+
+
+def test_without_a_better_network_it_ends_early_and_keeps_the_best(dataset):
+    """A rate that throws the weights about: stopped by patience, and the best network that was seen is kept."""
+    wild = replace(TINY.training, steps=20_000, patience=400, learning_rate=0.9)
+    seen = []
+    fit_network(dataset, replace(TINY, training=wild), lambda done, _, words: seen.append((done, words)))
+    contact = [words for _, words in seen if words.startswith("contact")]
+    assert len(contact) < 100
+
+
+def test_without_noise_the_finish_reaches_what_first_order_does_not(dataset):
+    """Clean charges, the same small network: Levenberg-Marquardt halves the error at least, and says how large it is."""
+    small = NetworkConfig((12, 12), (8, 8))
+    clean = TrainingConfig(steps=300, misfit_steps=1, misfit_charges=1_000, batch=256, noise="clean")
+    errors = []
+    for steps in (0, 25):
+        fit = fit_network(dataset, FitConfig(small, replace(clean, finish_steps=steps)))
+        found, std, _ = predict_with(fit)(fit.held.charge_pC)
+        errors.append(np.median(position_error(found, fit.held.contact)))
+    assert errors[1] < 0.5 * errors[0]
+    coverage = np.mean(np.abs(found - fit.held.contact) < std, axis=0)
+    assert np.all((coverage > 0.55) & (coverage < 0.95))  # errors of a fit are no Gaussians

@@ -7,16 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from scipy.stats import halfnorm
 
 from isocharge.errors import OutputExists
-from isocharge.serve import Predictor
-from isocharge.simulate import noise_model, sensor_from_dict
+from isocharge.serve import Predictor, find_model
+from isocharge.serve.repository import model_names
+from isocharge.simulate import Circle, Sweep, noise_model, sensor_from_dict, solve_maps
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, train_model
 from isocharge.train.evaluate import measure_errors
 from isocharge.train.split import Presses
 
-QUICK = FitConfig(NetworkConfig((24, 24), (12, 12)), TrainingConfig(steps=200, misfit_steps=50, batch=256))
-RELEASED = Path(__file__).parents[2] / "models" / "three-25um-biaxial"
+QUICK = FitConfig(
+    NetworkConfig((24, 24), (24, 24)), TrainingConfig(steps=200, misfit_steps=50, misfit_charges=2_000, batch=256)
+)
+MODELS = Path(__file__).parents[2] / "models"
 LOW, HIGH, RADIUS = 0.05, 2.0, 8.0
 
 
@@ -25,15 +29,26 @@ def release(dataset, tmp_path_factory):
     return train_model(dataset, tmp_path_factory.mktemp("models") / "mine", QUICK, command="make it")
 
 
+@pytest.fixture(scope="module", params=model_names(MODELS))
+def touch(request):
+    """Every released model."""
+    return Predictor(find_model(MODELS / request.param))
+
+
 @pytest.fixture(scope="module")
-def touch():
-    return Predictor(RELEASED)
+def known(touch, film):
+    """The simulator's map of the model's sensor: one equilibrium serves every layout and readout."""
+    area = np.array(touch.metadata.working_area_mm)
+    radius = np.cos(np.pi / len(area)) * np.hypot(*area[0])
+    sensor = sensor_from_dict(dict(touch.metadata.sensor))
+    wide = film if radius <= RADIUS else solve_maps(sensor, (Circle(1e-3),), Sweep(radius=1e-3 * radius))[0]
+    return replace(wide, sensor=sensor), radius
 
 
-def presses(film, count, seed):
+def presses(film, count, seed, within=RADIUS):
     """Contacts that no training saw, and the simulator's charges."""
     rng = np.random.default_rng(seed)
-    radius, angle = RADIUS * np.sqrt(rng.uniform(size=count)), rng.uniform(-np.pi, np.pi, count)
+    radius, angle = within * np.sqrt(rng.uniform(size=count)), rng.uniform(-np.pi, np.pi, count)
     force = np.exp(rng.uniform(np.log(LOW), np.log(HIGH), count))
     contact = np.stack([radius * np.cos(angle), radius * np.sin(angle), force], axis=1)
     return Presses(contact, 1e12 * film.forward(1e-3 * contact[:, 0], 1e-3 * contact[:, 1], force))
@@ -96,42 +111,51 @@ def test_a_failed_training_leaves_nothing(dataset, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_released_model_reaches_what_it_should(film, touch):
-    """On the simulator's own charges at presses drawn here: the figures that the first issue asked for."""
-    errors = measure_errors(predict(touch), presses(film, 6000, seed=77), noise_model("reference"), seed=5)
-    assert errors["position_median_mm"] <= 0.10
-    assert errors["position_rms_mm"] <= 0.20
-    assert errors["clean_position_p95_mm"] <= 0.18
-    assert errors["force_rms_percent"] <= 1.0
-
-
-def test_the_cards_figures_hold_on_other_presses(film, touch):
-    errors = measure_errors(predict(touch), presses(film, 6000, seed=78), noise_model("reference"), seed=6)
-    for name in ("position_median_mm", "position_rms_mm", "force_rms_percent"):
+def test_the_card_holds_on_other_presses(known, touch):
+    errors = measure_errors(predict(touch), presses(*known_presses(known, 6000, 78)), noise_model("reference"), seed=6)
+    for name in ("position_median_mm", "position_rms_mm", "force_rms_percent", "misfit_p99"):
         assert errors[name] == pytest.approx(touch.metadata.errors[name], rel=0.15)
 
 
-def test_the_deviations_are_honest(film, touch):
+def known_presses(known, count, seed):
+    film, radius = known
+    return film, count, seed, radius
+
+
+def test_the_released_models_reach_what_they_should(known, touch):
+    errors = measure_errors(predict(touch), presses(*known_presses(known, 6000, 77)), noise_model("reference"), seed=5)
+    assert errors["position_median_mm"] <= 0.10
+    assert errors["position_rms_mm"] <= 0.20
+    assert errors["clean_position_p95_mm"] <= 0.18
+    assert errors["force_rms_percent"] <= 0.8
+    if len(touch.metadata.electrodes) == 4:
+        assert errors["found_gain_20_percent"] >= 0.9
+        assert errors["found_dead_electrode"] >= 0.99
+
+
+def test_the_deviations_are_honest(known, touch):
     """68 % and 95 % intervals cover what they say, per coordinate and in every third of force and radius."""
-    truth = presses(film, 9000, seed=79)
+    truth = presses(*known_presses(known, 12_000, 79))
     charge = 1e12 * noise_model("reference").add(1e-12 * truth.charge_pC, np.random.default_rng(7))
     contact, std, _ = predict(touch)(charge)
     deviation = np.abs(contact - truth.contact) / std
+    assert np.all(np.abs(np.mean(deviation < 1.0, axis=0) - 0.68) < 0.025)
+    assert np.all(np.abs(np.mean(deviation < 1.96, axis=0) - 0.95) < 0.012)
     radius, force = np.hypot(*truth.contact[:, :2].T), truth.contact[:, 2]
     for key in (radius, force):
         for rows in np.array_split(np.argsort(key), 3):
-            assert np.all(np.abs(np.mean(deviation[rows] < 1.0, axis=0) - 0.68) < 0.05)
+            assert np.all(np.abs(np.mean(deviation[rows] < 1.0, axis=0) - 0.68) < 0.04)
             assert np.all(np.abs(np.mean(deviation[rows] < 1.96, axis=0) - 0.95) < 0.03)
 
 
-def nearest_by_search(film, charge, rng):
+def nearest_by_search(film, within, charge, rng):
     """min over c of |(Q - Q(c)) / sigma| by random search and Nelder-Mead on the simulator's forward map."""
     sigma = noise_model("reference").sigma(1e-12 * charge) * 1e12
-    tried = presses(film, 4000, seed=int(rng.integers(1 << 30)))
+    tried = presses(film, 4000, int(rng.integers(1 << 30)), within)
     distance = np.linalg.norm((tried.charge_pC - charge) / sigma, axis=1)
 
     def squared(point):
-        x, y = point[:2] * min(1.0, RADIUS / max(np.hypot(*point[:2]), 1e-9))
+        x, y = point[:2] * min(1.0, within / max(np.hypot(*point[:2]), 1e-9))
         force = np.exp(np.clip(point[2], np.log(LOW), np.log(HIGH)))
         known = 1e12 * film.forward(np.array([1e-3 * x]), np.array([1e-3 * y]), np.array([force]))[0]
         return float(np.sum(((charge - known) / sigma) ** 2))
@@ -144,37 +168,28 @@ def nearest_by_search(film, charge, rng):
     return np.sqrt(best)
 
 
-@pytest.mark.parametrize("gains", [(1.0, 1.0, 1.0), (1.0, 1.2, 1.0), (0.0, 1.0, 1.0), (3.0, 3.0, 3.0)], ids=str)
-def test_the_misfit_is_the_distance_to_the_nearest_known_contact(film, touch, gains):
-    """An upper bound: never below the searched minimum, tight where a contact fits, within a third elsewhere."""
-    rng = np.random.default_rng(11)
-    charges = presses(film, 8, seed=80).charge_pC * np.array(gains)
-    searched = np.array([nearest_by_search(film, charge, rng) for charge in charges])
+@pytest.mark.slow
+@pytest.mark.parametrize("gain", [1.0, 1.2, 0.0, 3.0], ids=["good", "one gain off", "one dead", "far too hard"])
+def test_the_misfit_is_the_distance_to_the_nearest_known_contact(known, touch, gain):
+    """Searched for without anything that training used: within half a deviation near, within a quarter far away."""
+    rng, (film, radius) = np.random.default_rng(11), known
+    gains = np.full(len(touch.metadata.electrodes), gain if gain == 3.0 else 1.0)
+    gains[1] = gain
+    charges = presses(film, 8, 80, radius).charge_pC * gains
+    searched = np.array([nearest_by_search(film, radius, charge, rng) for charge in charges])
     misfit = touch.predict_batch(charges).misfit
-    assert np.all(misfit >= 0.95 * searched - 0.3)
-    fits = searched < 0.1
-    assert np.all(misfit[fits] < 1.0)
-    assert not fits.any() or np.median(misfit[fits]) < 0.05
-    assert np.mean(misfit <= 1.33 * searched + 0.3) > 0.8
+    near = np.abs(misfit - searched) <= 0.5 + 0.25 * searched
+    assert np.mean(near) >= 0.8
+    assert np.all(np.abs(misfit - searched) <= 2.0 + 0.6 * searched)
 
 
-def test_four_electrodes_have_one_check_to_spare(tmp_path):
-    """Inside the domain the misfit of good presses is the length of one normal deviate; a wrong gain sticks out."""
-    from scipy.stats import halfnorm
-
-    from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, solve_maps, write_sweep
-
-    sweep = Sweep(samples=8_000)
-    maps = solve_maps(load_sensor("four-25um-biaxial"), (Circle(1e-3),), sweep)
-    config = FitConfig(training=TrainingConfig(steps=1_500, misfit_steps=300))
-    release = train_model(read_dataset(write_sweep(tmp_path / "presses", maps, sweep)), tmp_path / "four", config)
-    truth = presses(maps[0], 3000, seed=4)
-    truth = truth[np.hypot(*truth.contact[:, :2].T) < 6.0]
+def test_four_electrodes_have_one_check_to_spare(known, touch):
+    """Inside the domain the misfit of good presses is the length of one normal deviate."""
+    if len(touch.metadata.electrodes) != 4:
+        pytest.skip("three charges always fit some contact")
+    truth = presses(*known_presses(known, 6000, 4))
+    truth = truth[np.hypot(*truth.contact[:, :2].T) < 0.9 * known[1]]
     charge = 1e12 * noise_model("reference").add(1e-12 * truth.charge_pC, np.random.default_rng(3))
-    touch = Predictor(release.folder)
     good = touch.predict_batch(charge).misfit
-    for share in (0.5, 0.9, 0.95):
-        assert np.quantile(good, share) == pytest.approx(halfnorm.ppf(share), rel=0.12)
-    hard = truth.contact[:, 2] > 0.8
-    wrong = touch.predict_batch(charge[hard] * [1.0, 1.2, 1.0, 1.0]).misfit
-    assert np.mean(wrong > np.quantile(good, 0.99)) > 0.9
+    for share in (0.5, 0.9, 0.95, 0.99):
+        assert np.quantile(good, share) == pytest.approx(halfnorm.ppf(share), rel=0.15)

@@ -7,7 +7,7 @@ import pytest
 
 from isocharge.errors import DatasetError
 from isocharge.simulate import Samples
-from isocharge.train.split import domain_of, split_by_position
+from isocharge.train.split import domain_of, presses_of, split_by_position
 
 
 def with_samples(dataset, **columns):
@@ -24,7 +24,7 @@ def test_no_position_is_on_both_sides(dataset):
     repeated = with_samples(
         dataset, x_mm=dataset.samples.x_mm[positions], y_mm=dataset.samples.y_mm[positions]
     )  # many forces at each of 400 positions
-    train, held = split_by_position(repeated, 0.2, seed=3)
+    train, held = split_by_position(presses_of(repeated), 0.2, seed=3)
     seen = {tuple(row) for row in train.contact[:, :2]}
     kept = {tuple(row) for row in held.contact[:, :2]}
     assert not seen & kept
@@ -33,7 +33,7 @@ def test_no_position_is_on_both_sides(dataset):
 
 
 def test_the_split_depends_on_the_seed_only(dataset):
-    again = [split_by_position(dataset, 0.1, seed)[1].contact for seed in (1, 1, 2)]
+    again = [split_by_position(presses_of(dataset), 0.1, seed)[1].contact for seed in (1, 1, 2)]
     assert np.array_equal(again[0], again[1])
     assert not np.array_equal(again[0], again[2])
 
@@ -53,23 +53,30 @@ def test_measured_data_without_ranges_show_their_domain(dataset):
 def test_too_few_presses(dataset):
     few = replace(dataset, samples=cut(dataset.samples, slice(0, 100)))
     with pytest.raises(DatasetError, match="expected at least 500 presses at 50 positions, got 100 at 100"):
-        split_by_position(few, 0.1, 0)
+        presses_of(few)
 
 
 def test_a_single_position(dataset):
     one = with_samples(dataset, x_mm=np.zeros(len(dataset.samples)), y_mm=np.zeros(len(dataset.samples)))
     with pytest.raises(DatasetError, match="got 6000 at 1"):
-        split_by_position(one, 0.1, 0)
+        presses_of(one)
 
 
 def test_two_electrodes(dataset):
     two = with_samples(dataset, charge_pC=dataset.samples.charge_pC[:, :2])
     with pytest.raises(DatasetError, match="at least three electrodes"):
-        split_by_position(two, 0.1, 0)
+        presses_of(two)
 
 
 def test_a_negative_charge_is_named(dataset):
     charge = dataset.samples.charge_pC.copy()
     charge[17, 1] = -3.0
     with pytest.raises(DatasetError, match="sample 17: expected positive force and charges"):
-        split_by_position(with_samples(dataset, charge_pC=charge), 0.1, 0)
+        presses_of(with_samples(dataset, charge_pC=charge))
+
+
+def test_a_number_that_is_not_finite_is_named(dataset):
+    charge = dataset.samples.charge_pC.copy()
+    charge[17, 1] = np.nan
+    with pytest.raises(DatasetError, match=r"sample 17: expected finite numbers, .*nan.* pC"):
+        presses_of(with_samples(dataset, charge_pC=charge))

@@ -1,11 +1,13 @@
 """`isocharge train ...`: a dataset, or a sensor, to a model."""
 
+import json as json_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from isocharge.cli.report import report_command
+from isocharge.cli.simulate import PROBE_HELP, _auto_radius, _number_mm
 from isocharge.cli.terminal import progress, say, this_command
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing
@@ -13,6 +15,9 @@ from isocharge.files import refuse_existing
 if TYPE_CHECKING:
     from isocharge.simulate import Dataset
     from isocharge.train import Release
+
+SAMPLES = 24_000
+"""Presses that are simulated where no dataset is given."""
 
 train_app = typer.Typer(no_args_is_help=True, help="From a dataset to a model.")
 train_app.command("report")(report_command)
@@ -27,14 +32,31 @@ def fit_command(
         Path | None, typer.Argument(metavar="[DATASET]", help="Dataset folder, as `simulate sweep` makes it.")
     ] = None,
     sensor: Annotated[
-        str | None, typer.Option("--sensor", help="Simulate this sensor's presses instead, circle:1.0 within 8 mm.")
+        str | None, typer.Option("--sensor", help="Simulate 24,000 presses on this sensor instead, 0.05 to 2 N.")
     ] = None,
+    probe: Annotated[
+        list[str] | None,
+        typer.Option("--probe", help=f"With --sensor: {PROBE_HELP} May be given again. (default: circle:1.0)"),
+    ] = None,
+    radius: Annotated[
+        str,
+        typer.Option(
+            "--radius",
+            metavar="MM|auto",
+            help="With --sensor: largest distance from the centre, mm, or auto.",
+        ),
+    ] = "8.0",
     config: Annotated[
         Path | None, typer.Option("--config", metavar="FILE", help="Training configuration, TOML. (default: built in)")
     ] = None,
     version: Annotated[int, typer.Option("--version", min=1, help="Number of the version folder to make.")] = 1,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Throw away what a stopped run left.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object: folder and measured errors.")] = False,
 ) -> None:
     """Train a network, export it as ONNX, measure it, and write the model folder with its card.
+
+    A run that was stopped or killed leaves models/NAME/VERSION.part; the same command goes on from there and makes the
+    same model.
 
     Example: isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
     """
@@ -44,9 +66,25 @@ def fit_command(
 
     refuse_existing(output / str(version))
     settings = load_config(config) if config else None
-    presses = _read(dataset) if dataset else _simulate(str(sensor))
-    with progress("training") as advance:
-        release = train_model(presses, output, settings, command=this_command(), version=version, progress=advance)
+    presses = _read(dataset) if dataset else _simulate(str(sensor), probe or ["circle:1.0"], radius)
+    try:
+        with progress("training") as advance:
+            release = train_model(
+                presses,
+                output,
+                settings,
+                command=this_command(),
+                version=version,
+                fresh=fresh,
+                progress=advance,
+                warn=lambda words: say(f"caution: {words}"),
+            )
+    except KeyboardInterrupt:
+        if (part := output / f"{version}.part").exists():
+            say(f"stopped; what is done is kept in {part}, and the same command goes on")
+        raise
+    if json:
+        typer.echo(json_module.dumps({"folder": str(release.folder), "errors": dict(release.metadata.errors)}))
     say(_summary(release))
 
 
@@ -56,17 +94,17 @@ def _read(folder: Path) -> "Dataset":
     return read_dataset(folder)
 
 
-def _simulate(sensor: str) -> "Dataset":
-    """A sweep with its defaults, kept only as long as it is needed."""
+def _simulate(sensor: str, probes: list[str], radius: str) -> "Dataset":
+    """A sweep with its defaults, kept only as long as it is needed; a few seconds, so in this process."""
     from tempfile import TemporaryDirectory
 
-    from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, run_sweep
+    from isocharge.simulate import Sweep, load_sensor, parse_probe, read_dataset, run_sweep
 
+    film_sensor, pressing, forces = load_sensor(sensor), [parse_probe(text) for text in probes], Sweep().force_range
+    reach = _auto_radius(film_sensor, pressing, forces) if radius == "auto" else 1e-3 * _number_mm(radius)
     with TemporaryDirectory() as folder, progress("solving the film") as advance:
-        probes = (Circle(1e-3),)
-        return read_dataset(
-            run_sweep(Path(folder) / "presses", load_sensor(sensor), probes, Sweep(samples=24_000), progress=advance)
-        )
+        sweep = Sweep(reach, samples=SAMPLES)
+        return read_dataset(run_sweep(Path(folder) / "presses", film_sensor, pressing, sweep, progress=advance))
 
 
 def _summary(release: "Release") -> str:

@@ -1,8 +1,8 @@
 """The model card: what a model is for, what it reaches, what it cannot do, and how to make it again."""
 
 from isocharge.serve.metadata import ModelMetadata
-from isocharge.train.evaluate import misfit_noise
 from isocharge.simulate.noise import noise_model
+from isocharge.train.evaluate import misfit_noise
 from isocharge.train.fit import Fit
 
 
@@ -81,8 +81,8 @@ def _what_misfit_sees(metadata: ModelMetadata) -> str:
     found = ""
     if "found_dead_electrode" in errors:
         found = (
-            f"Of presses of about 1 N the former finds {100 * errors['found_gain_20_percent']:.3g} % where one gain is\n"
-            f"off by 20 %, and {100 * errors['found_dead_electrode']:.3g} % where one electrode is dead."
+            f"Of presses of about 1 N the former finds {100 * errors['found_gain_20_percent']:.3g} % where one gain\n"
+            f"is off by 20 %, and {100 * errors['found_dead_electrode']:.3g} % where one electrode is dead."
         )
     if len(metadata.electrodes) == 3:
         return (

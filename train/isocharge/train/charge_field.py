@@ -25,6 +25,9 @@ CANDIDATES = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
 ROWS_PER_TERM = 40
 """Presses used for each coefficient at most. Near the edge of the disk, where the series is worst, more help most."""
 
+FEWEST_PER_TERM = 8
+"""Fewer presses for a coefficient than this leave the slopes at the rim to chance."""
+
 CHUNK = 4096
 """Presses whose terms are held at once."""
 
@@ -104,7 +107,7 @@ class ChargeField:
         unit, target = domain.to_unit(contact), np.log(charge_pC)
         for degree, force_degree in CANDIDATES:
             count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
-            if 4 * count > len(unit):
+            if FEWEST_PER_TERM * count > len(unit):
                 break
             rows = slice(0, ROWS_PER_TERM * count)
             field = cls(domain, _least_squares(unit[rows], target[rows], degree, force_degree), np.inf)
@@ -114,7 +117,9 @@ class ChargeField:
             if error < GOOD_ENOUGH:
                 break
         if best is None:
-            raise TrainingError(f"expected at least 224 presses to fit the charges by, got {len(unit)}")
+            raise TrainingError(
+                f"expected at least {FEWEST_PER_TERM * 56} presses to fit the charges by, got {len(unit)}"
+            )
         return best
 
     def charge_pC(self, contact: Array) -> Array:
@@ -144,7 +149,7 @@ class ChargeField:
 
     @cached_property
     def _rows(self) -> Array:
-        """The series and its three derivatives by term of the plane, shape (n_term, (force_degree + 1) 4 n_electrode)."""
+        """The series and its derivatives by term of the plane, shape (n_term, (force_degree + 1) 4 n_electrode)."""
         all_four = np.stack([self.series, *(_derivative(self.series, axis) for axis in range(3))])
         of_terms = all_four[:, *_plane_terms(self.series.shape[0] - 1)]  # (4, n_term, force_degree + 1, n_electrode)
         rows: Array = of_terms.transpose(1, 2, 0, 3).reshape(of_terms.shape[1], -1)

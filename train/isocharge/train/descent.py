@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from isocharge.errors import TrainingError
 from isocharge.train.checkpoint import Checkpoint
+from isocharge.train.network import Perceptron
 
 MUON_RATE = 6.0
 """Muon's rate over Adam's: a step of Muon has a given size whatever the gradient."""
@@ -44,7 +45,7 @@ class Task:
     """
 
     name: str
-    part: nn.Module
+    part: Perceptron
     loss: Callable[[int, torch.Generator], Tensor]
     score: Callable[[], tuple[float, str]]
     steps: int
@@ -131,9 +132,9 @@ def _rate_share(done: float) -> float:
     return 0.5 * (1.0 + math.cos(math.pi * (done - RISE) / (1.0 - RISE)))
 
 
-def _optimisers(part: nn.Module, rate: float) -> list[torch.optim.Optimizer]:
-    matrices = [parameter for parameter in part.parameters() if parameter.ndim == 2][1:-1]
-    hidden = {id(parameter) for parameter in matrices}
+def _optimisers(part: Perceptron, rate: float) -> list[torch.optim.Optimizer]:
+    matrices = part.hidden_matrices()
+    hidden = {id(matrix) for matrix in matrices}
     rest = [parameter for parameter in part.parameters() if id(parameter) not in hidden]
     adam = torch.optim.Adam(rest, lr=rate, betas=(0.9, 0.98))
     muon = [torch.optim.Muon(matrices, lr=MUON_RATE * rate, weight_decay=0.0)] if matrices else []

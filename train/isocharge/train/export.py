@@ -21,6 +21,7 @@ from isocharge.train.network import HIGHEST_PC, LOWEST_PC, MISFIT_UNIT, InverseN
 OPSET, IR_VERSION = 17, 8
 """Old enough for runtimes of 2022 on, new enough for every operator used."""
 
+
 @dataclass
 class GraphBuilder:
     """Nodes and constants in the order they are added; a method returns the name of its result."""
@@ -91,35 +92,43 @@ def _perceptrons(build: GraphBuilder, network: InverseNetwork, logs: str) -> str
     Columns of the result: x_mm and y_mm (2), ln F (1), logarithms of the standard deviations in mm and N (3), the
     squeezed vector of the misfit (n_electrode).
     """
-    contact, missing = _layers(network, network.contact), _layers(network, network.missing)
-    contact.append(_in_units(network, contact.pop()))
-    value = logs
-    for number, ((first, first_bias), (second, second_bias)) in enumerate(zip(contact, missing, strict=True)):
-        value = build.add("Tanh", value) if number else value
-        both = block_diag(first, second) if number else np.hstack([first, second])
-        value = build.add("Gemm", value, build.constant(both), build.constant(np.r_[first_bias, second_bias]))
-    return value
+    whitening, value = network.features.matrix, logs
+    *hidden, last = zip(network.contact.layers(), network.missing.layers(), strict=True)
+    for number, (first, second) in enumerate(hidden):
+        both = block_diag(*map(_matrix, (first, second))) if number else whitening @ _side_by_side(first, second)
+        value = build.add("Gemm", value, build.constant(both), build.constant(np.r_[_bias(first), _bias(second)]))
+        value = build.add("Tanh", value)
+    units, shift = _in_units(network)
+    bias = build.constant(np.r_[_bias(last[0]), _bias(last[1])] @ units + shift)
+    straight = whitening @ _side_by_side(network.contact.straight, network.missing.straight) @ units
+    beside = build.add("Gemm", logs, build.constant(straight), bias)
+    return build.add("Gemm", value, build.constant(block_diag(*map(_matrix, last)) @ units), beside)
 
 
-def _layers(network: InverseNetwork, layers: nn.Sequential) -> list[tuple[Array, Array]]:
-    """Weights (inputs, outputs) and biases of a perceptron, the whitening of logarithms folded into the first."""
-    weights = [
-        (layer.weight.detach().double().numpy().T, layer.bias.detach().double().numpy())
-        for layer in layers
-        if isinstance(layer, nn.Linear)
-    ]
-    weights[0] = (network.features.matrix @ weights[0][0], weights[0][1])
+def _matrix(layer: nn.Linear) -> Array:
+    """Weights of a layer, shape (inputs, outputs)."""
+    weights: Array = layer.weight.detach().double().numpy().T
     return weights
 
 
-def _in_units(network: InverseNetwork, last: tuple[Array, Array]) -> tuple[Array, Array]:
-    """The contact network's last layer in mm and ln N. A force's deviation is relative to the force: its logarithm adds
-    ln F."""
-    centre, scale = network.domain.centre, network.domain.scale
+def _bias(layer: nn.Linear) -> Array:
+    bias: Array = layer.bias.detach().double().numpy()
+    return bias
 
-    def columns(values: Array, shift: Array, log_scale: Array) -> Array:
-        value = values[..., :3] * scale + shift
-        return np.concatenate([value, values[..., 3:] + log_scale + value * np.array([0.0, 0.0, 1.0])], axis=-1)
 
-    weight, bias = last
-    return columns(weight, np.zeros(3), np.zeros(3)), columns(bias, centre, np.log(scale))
+def _side_by_side(first: nn.Linear, second: nn.Linear) -> Array:
+    """Weights of two layers with the same inputs as one layer's."""
+    return np.hstack([_matrix(first), _matrix(second)])
+
+
+def _in_units(network: InverseNetwork) -> tuple[Array, Array]:
+    """Matrix and shift from the perceptrons' outputs to `_perceptrons`' columns.
+
+    A force's deviation is relative to the force, so its logarithm adds ln F.
+    """
+    scale, n_electrode = network.domain.scale, network.features.typical.size
+    matrix, shift = np.diag(np.r_[scale, np.ones(3 + n_electrode)]), np.zeros(6 + n_electrode)
+    matrix[2, 5] = scale[2]
+    shift[:3], shift[3:6] = network.domain.centre, np.log(scale)
+    shift[5] += network.domain.centre[2]
+    return matrix, shift

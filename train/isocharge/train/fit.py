@@ -2,33 +2,35 @@
 
 The contact network learns mean and standard deviation by maximum likelihood on charges with fresh noise in every step;
 the first steps learn the mean by least squares, because a likelihood with free deviations is slow to find it. Without
-noise Levenberg-Marquardt finishes the mean. The misfit network learns from charges of all kinds, whose distance from the
-nearest known contact is searched for beforehand.
+noise Levenberg-Marquardt finishes the mean. The misfit network learns from charges of all kinds, whose distance from
+the nearest known contact is searched for beforehand.
 """
 
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from isocharge.errors import ConfigError, DatasetError, TrainingError
+from isocharge.errors import ConfigError, DatasetError
 from isocharge.simulate.dataset import Dataset
 from isocharge.simulate.noise import NoiseModel, noise_model
 from isocharge.train.charge_field import ChargeField, Domain
 from isocharge.train.checkpoint import Checkpoint
 from isocharge.train.config import FitConfig, TrainingConfig
-from isocharge.train.descent import REPORT_EVERY, Descent, Progress, Task
+from isocharge.train.descent import Descent, Progress, Task
 from isocharge.train.evaluate import misfit_noise, noisy_charges
-from isocharge.train.folds import SMALLEST_SHARE, fold_free_share, shrunk
 from isocharge.train.network import Features, InverseNetwork, squeezed
 from isocharge.train.second_order import FIRST, levenberg_marquardt
 from isocharge.train.split import Presses, domain_of, presses_of, split_by_position
 from isocharge.train.strange import Strange, strange_charges
+from isocharge.train.unfolded import SMALLEST_SHARE, unfolded
 
 WARM_UP = 0.15
 """Share of the steps that learn the mean by least squares."""
@@ -86,7 +88,7 @@ def fit_network(
     asked, presses = domain_of(dataset), presses_of(dataset)
     _check_electrodes(dataset, config)
     with _threads_and_seed(training):
-        domain, presses = _without_folds(asked, presses, training.seed, warn)
+        domain, presses = _without_folds(asked, presses, training, warn)
         rest, held = split_by_position(presses, training.hold_out, training.seed)
         train, watched = split_by_position(rest, WATCHED * training.hold_out, training.seed + 1)
         field = _field(domain, train, watched)
@@ -111,16 +113,16 @@ def _check_electrodes(dataset: Dataset, config: FitConfig) -> None:
         )
 
 
-def _without_folds(asked: Domain, presses: Presses, seed: int, warn: Warn) -> tuple[Domain, Presses]:
+def _without_folds(asked: Domain, presses: Presses, training: TrainingConfig, warn: Warn) -> tuple[Domain, Presses]:
     """The largest disk in which the map does not fold, and the presses in it."""
-    share = fold_free_share(_field(asked, *split_by_position(presses, 0.1, seed)))
-    if share == 1.0:
+    field = _field(asked, *split_by_position(presses, training.hold_out, training.seed))
+    domain = unfolded(field, misfit_noise(noise_model(training.noise)))
+    if domain == asked:
         return asked, presses
-    domain = shrunk(asked, share)
-    if share < SMALLEST_SHARE:
+    if domain.radius_mm < SMALLEST_SHARE * asked.radius_mm:
         raise DatasetError(
-            f"the map from contacts to charges folds within {domain.radius_mm:g} mm of {asked.radius_mm:g} mm: two "
-            "contacts give the same charges; add an electrode, or take a biaxial film"
+            f"the map from contacts to charges folds {domain.radius_mm:g} mm from the centre, of {asked.radius_mm:g} "
+            "mm asked for: beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
         )
     inside = presses[np.hypot(presses.contact[:, 0], presses.contact[:, 1]) <= domain.radius_mm]
     warn(
@@ -219,7 +221,7 @@ class _Training:
         for square, damping in levenberg_marquardt(part, inputs, wanted, left, state["damping"]):
             step += 1
             state = {"step": step, "damping": damping, "part": part.state_dict()}
-            self.checkpoint.save("finish", lambda kept=state: kept)
+            self.checkpoint.save("finish", partial(_as_it_is, state))
             self._tell(self.config.steps + step, f"finish: {square:.3g}, {self._mean_off()}")
         self.checkpoint.save("finish", lambda: {**state, "step": self.config.finish_steps}, now=True)
         self._constant_deviations()
@@ -233,10 +235,10 @@ class _Training:
 
     def _constant_deviations(self) -> None:
         """Root-mean-square errors of the watched presses as the deviations, whatever the charges."""
-        last = self.network.contact[-1]
+        last, straight = self.network.contact.layers()[-1], self.network.contact.straight
         with torch.no_grad():
             off = self.network.contact(self.network.inputs(self.watched_charge).double())[:, :3] - self.watched_unit
-            last.weight[3:] = 0.0
+            last.weight[3:] = straight.weight[3:] = 0.0
             last.bias[3:] = 0.5 * (off**2).mean(dim=0).log()
 
     def _strange_charges(self) -> Strange:
@@ -270,12 +272,17 @@ class _Learned:
 
     def loss(self, _: int, random: torch.Generator) -> Tensor:
         rows = torch.randint(len(self.inputs) - self.watched, (self.batch,), generator=random)
-        return ((self.network.missing(self.inputs[rows]) - self.wanted[rows]) ** 2).sum(dim=1).mean()
+        squares: Tensor = ((self.network.missing(self.inputs[rows]) - self.wanted[rows]) ** 2).sum(dim=1)
+        return squares.mean()
 
     def score(self) -> tuple[float, str]:
         with torch.no_grad():
             off = ((self.network.missing(self.inputs[-self.watched :]) - self.wanted[-self.watched :]) ** 2).sum(dim=1)
         return off.mean().item(), f"{off.mean().item():.4f} on watched charges"
+
+
+def _as_it_is(state: dict[str, Any]) -> dict[str, Any]:
+    return state
 
 
 def _noisy(charge_pC: Tensor, noise: NoiseModel, random: torch.Generator) -> Tensor:

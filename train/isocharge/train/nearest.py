@@ -2,15 +2,15 @@
 
     min over contacts c of the domain of |(Q - Q(c)) / sigma|,   sigma of the measured charges Q.
 
-Levenberg-Marquardt for many charges at once. The domain, a disk times a range of forces, is held by an active set: where
-a contact lies on the edge and its slope leads out, it moves along the edge only, and on the circle the edge's own
+Levenberg-Marquardt for many charges at once. The domain, a disk times a range of forces, is held by an active set:
+where a contact lies on the edge and its slope leads out, it moves along the edge only, and on the circle the edge's own
 curvature joins the second derivatives; then the nearest point of a disk is found in a few steps as well.
 """
 
 import numpy as np
 from scipy.stats import qmc
 
-from isocharge.simulate.arrays import Array
+from isocharge.simulate.arrays import Array, Integers
 from isocharge.simulate.noise import NoiseModel
 from isocharge.train.charge_field import ChargeField
 
@@ -97,16 +97,16 @@ def _chunks(charge_pC: Array) -> list[Array]:
 def _candidates() -> Array:
     sobol = qmc.Sobol(3, scramble=False).random(CANDIDATES)
     radius, angle = np.sqrt(sobol[:, 0]), 2.0 * np.pi * sobol[:, 1]
-    radius[:: 4] = 1.0
+    radius[::4] = 1.0
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), 2.0 * sobol[:, 2] - 1.0], axis=1)
 
 
-def _best(charge_pC: Array, known_pC: Array, noise: NoiseModel, count: int) -> np.ndarray:
+def _best(charge_pC: Array, known_pC: Array, noise: NoiseModel, count: int) -> Integers:
     """Numbers of the nearest candidates, shape (n, count): |Q - K|^2 multiplied out, one matrix product each."""
     weight = (1e12 * noise.sigma(1e-12 * charge_pC)) ** -2
     square = weight @ (known_pC**2).T - 2.0 * (charge_pC * weight) @ known_pC.T
-    part = np.argpartition(square, count - 1, axis=1)[:, :count]
-    return part
+    best: Integers = np.argpartition(square, count - 1, axis=1)[:, :count]
+    return best
 
 
 def _miss(field: ChargeField, charge_pC: Array, sigma: Array, shift: Array, unit: Array) -> tuple[Array, Array]:

@@ -48,13 +48,35 @@ class Features:
         return cls(np.exp(mean), axes.T * (np.sqrt(len(logs)) / np.maximum(singular, 1e-12)))
 
 
-def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
-    """Linear layers with tanh between them."""
-    widths = (inputs, *hidden)
-    layers: list[nn.Module] = []
-    for before, after in pairwise(widths):
-        layers += [nn.Linear(before, after), nn.Tanh()]
-    return nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
+class Perceptron(nn.Module):
+    """Linear layers with tanh between them, and beside them one straight from the inputs to the outputs.
+
+    The logarithm of the force is nearly linear in those of the charges, and has to be right to a thousandth of its
+    range: with the straight layer the others need only learn what is bent.
+    """
+
+    def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int) -> None:
+        super().__init__()
+        widths = (inputs, *hidden)
+        layers: list[nn.Module] = []
+        for before, after in pairwise(widths):
+            layers += [nn.Linear(before, after), nn.Tanh()]
+        self.bent = nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
+        self.straight = nn.Linear(inputs, outputs, bias=False)
+        nn.init.zeros_(self.straight.weight)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Shape (n, inputs) to (n, outputs)."""
+        out: Tensor = self.bent(inputs) + self.straight(inputs)
+        return out
+
+    def layers(self) -> list[nn.Linear]:
+        """The bent way's layers, first to last."""
+        return [layer for layer in self.bent if isinstance(layer, nn.Linear)]
+
+    def hidden_matrices(self) -> list[Tensor]:
+        """Weights from one hidden layer to the next."""
+        return [layer.weight for layer in self.layers()[1:-1]]
 
 
 class InverseNetwork(nn.Module):
@@ -78,8 +100,8 @@ class InverseNetwork(nn.Module):
         super().__init__()
         n_electrode = features.typical.size
         self.domain, self.features = domain, features
-        self.contact = perceptron(n_electrode, hidden, 6)
-        self.missing = perceptron(n_electrode, misfit_hidden, n_electrode)
+        self.contact = Perceptron(n_electrode, hidden, 6)
+        self.missing = Perceptron(n_electrode, misfit_hidden, n_electrode)
         for name, values in (
             ("centre", domain.centre),
             ("scale", domain.scale),
@@ -109,6 +131,6 @@ class InverseNetwork(nn.Module):
 
 
 def squeezed(miss: Tensor) -> Tensor:
-    """What the misfit network learns: the vector `miss`, (n, n_electrode), its length brought to asinh(length / unit)."""
-    length = torch.linalg.vector_norm(miss, dim=1, keepdim=True)
+    """What the misfit network learns: `miss`, shape (n, n_electrode), its length brought to asinh(length / unit)."""
+    length: Tensor = torch.linalg.vector_norm(miss, dim=1, keepdim=True)
     return miss * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=1e-9))

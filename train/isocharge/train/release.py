@@ -181,7 +181,9 @@ def _golden_charges(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 def _many_charges(fit: Fit) -> np.ndarray:
     """Noisy charges of held-out presses, float32, shape (COMPARED, n_electrode)."""
     rows = np.arange(COMPARED) % len(fit.held)
-    return noisy_charges(fit.held[rows], misfit_noise(noise_model(fit.config.training.noise)), seed=3).astype(np.float32)
+    return noisy_charges(fit.held[rows], misfit_noise(noise_model(fit.config.training.noise)), seed=3).astype(
+        np.float32
+    )
 
 
 def _compare(graph: bytes, fit: Fit, charge_pC: np.ndarray, slack: float) -> None:

@@ -80,7 +80,7 @@ def _normal_equations(
     count = sum(value.numel() for value in values.values())
     normal, slope = torch.zeros(count, count, dtype=inputs.dtype), torch.zeros(count, dtype=inputs.dtype)
     with torch.no_grad():
-        for some, wanted in zip(inputs.split(CHUNK), targets.split(CHUNK), strict=True):
+        for some, wanted in zip(torch.split(inputs, CHUNK), torch.split(targets, CHUNK), strict=True):
             rows: Mapping[str, Tensor] = of_sample(values, some, wanted)
             jacobian = torch.cat([rows[name].flatten(2) for name in values], dim=2).flatten(0, 1)
             normal.addmm_(jacobian.T, jacobian)
@@ -100,5 +100,5 @@ def _step(normal: Tensor, slope: Tensor, damping: float) -> Tensor:
 
 def _moved(values: Parameters, step: Tensor) -> Parameters:
     sizes = [value.numel() for value in values.values()]
-    parts = zip(values.items(), step.split(sizes), strict=True)
+    parts = zip(values.items(), torch.split(step, sizes), strict=True)
     return {name: value + part.view_as(value) for (name, value), part in parts}
