@@ -11,12 +11,12 @@ from isocharge.train.network import Features, InverseNetwork
 from isocharge.train.rivals import Network, Task
 from isocharge.train.rivals.networks import (
     BoundNetwork,
+    Folded,
     NumpyNetwork,
     SessionNetwork,
     TorchNetwork,
     contact_graph,
     contact_of,
-    folded_layers,
 )
 from isocharge.train.split import domain_of, presses_of, split_by_position
 
@@ -28,18 +28,20 @@ def network():
     """Untrained: the forms have to agree on any weights."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
-        return InverseNetwork(Domain(8.0, (0.05, 2.0)), Features.fit(CHARGE), (24, 24), (8, 8)).eval()
+        made = InverseNetwork(Domain(8.0, (0.05, 2.0)), Features.fit(CHARGE), (24, 24), (8, 8))
+        torch.nn.init.normal_(made.contact.straight.weight, std=0.3)
+        return made.eval()
 
 
 @pytest.fixture(scope="module")
 def forms(network):
-    layers = folded_layers(network)
-    graph = contact_graph(layers)
+    folded = Folded.of(network)
+    graph = contact_graph(folded)
     return [
         TorchNetwork(network, "", "n"),
         SessionNetwork(graph, "", "n"),
         BoundNetwork(graph, "", "n"),
-        NumpyNetwork(layers, "", "n"),
+        NumpyNetwork(folded, "", "n"),
     ]
 
 

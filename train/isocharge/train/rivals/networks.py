@@ -29,8 +29,40 @@ from isocharge.train.fit import fit_network
 from isocharge.train.network import HIGHEST_PC, LOWEST_PC, InverseNetwork
 from isocharge.train.rivals.estimator import Fitted, Task
 
-Layers = list[tuple[Array, Array]]
-"""Weights (inputs, outputs) and biases, units and scales folded in: ln Q in; x_mm, y_mm, ln F out; tanh between."""
+
+@dataclass(frozen=True)
+class Folded:
+    """The contact network from ln Q to (x_mm, y_mm, ln F), whitening and units folded in.
+
+    Attributes:
+        hidden: Weights (inputs, outputs) and biases of the layers that tanh follows.
+        last: Of the last layer.
+        straight: Weights straight from the inputs to the outputs, shape (n_electrode, 3).
+    """
+
+    hidden: tuple[tuple[Array, Array], ...]
+    last: tuple[Array, Array]
+    straight: Array
+
+    @classmethod
+    def of(cls, network: InverseNetwork) -> "Folded":
+        """From a trained network."""
+        whitening, logs = network.features.matrix, np.log(network.features.typical)
+        layers = [_parameters(layer) for layer in network.contact.layers()]
+        weight, bias = layers[0]
+        first = whitening @ weight
+        scale = network.domain.scale
+        straight = whitening @ _parameters(network.contact.straight)[0][:, :3] * scale
+        weight_out, bias_out = layers[-1]
+        shift = bias_out[:3] * scale + network.domain.centre - logs @ straight
+        return cls(((first, bias - logs @ first), *layers[1:-1]), (weight_out[:, :3] * scale, shift), straight)
+
+
+def _parameters(layer: nn.Linear) -> tuple[Array, Array]:
+    """Weights (inputs, outputs) and bias of a layer, zero if it has none."""
+    weight: Array = layer.weight.detach().double().numpy().T
+    bias = np.zeros(weight.shape[1]) if layer.bias is None else layer.bias.detach().double().numpy()
+    return weight, bias
 
 
 @dataclass(frozen=True)
@@ -66,45 +98,32 @@ class Network:
         )
         sizes = NetworkConfig(hidden=self.hidden, misfit_hidden=(8,) * len(self.hidden))
         network = fit_network(self.dataset, FitConfig(sizes, training), warn=lambda _: None).network
-        choice, layers = f"{self.steps} steps", folded_layers(network)
-        graph = contact_graph(layers)
+        choice, folded = f"{self.steps} steps", Folded.of(network)
+        graph = contact_graph(folded)
         return (
             TorchNetwork(network, choice, self.name),
             SessionNetwork(graph, choice, self.name),
             BoundNetwork(graph, choice, self.name),
-            NumpyNetwork(layers, choice, self.name),
+            NumpyNetwork(folded, choice, self.name),
         )
 
 
-def folded_layers(network: InverseNetwork) -> Layers:
-    """The contact network with whitening and units folded into its first and last layer."""
-    layers = [
-        (layer.weight.detach().double().numpy().T, layer.bias.detach().double().numpy())
-        for layer in network.contact
-        if isinstance(layer, nn.Linear)
-    ]
-    whitening, typical = network.features.matrix, network.features.typical
-    weight, bias = layers[0]
-    layers[0] = whitening @ weight, bias - np.log(typical) @ whitening @ weight
-    scale, centre = network.domain.scale, network.domain.centre
-    weight, bias = layers[-1]
-    layers[-1] = weight[:, :3] * scale, bias[:3] * scale + centre
-    return layers
-
-
-def contact_graph(layers: Layers) -> bytes:
+def contact_graph(folded: Folded) -> bytes:
     """An ONNX graph with the input `charge_pC` [n, n_electrode] and the output `contact` [n, 3], float32."""
     build = GraphBuilder()
-    value = build.add("Clip", "charge_pC", build.constant(LOWEST_PC), build.constant(HIGHEST_PC))
-    value = build.add("Log", value)
-    for number, (weight, bias) in enumerate(layers):
-        value = build.add("Tanh", value) if number else value
-        value = build.add("Gemm", value, build.constant(weight), build.constant(bias))
+    value = logs = build.add(
+        "Log", build.add("Clip", "charge_pC", build.constant(LOWEST_PC), build.constant(HIGHEST_PC))
+    )
+    for weight, bias in folded.hidden:
+        value = build.add("Tanh", build.add("Gemm", value, build.constant(weight), build.constant(bias)))
+    weight, bias = folded.last
+    beside = build.add("Gemm", logs, build.constant(folded.straight), build.constant(bias))
+    value = build.add("Gemm", value, build.constant(weight), beside)
     plane, log_force = build.split(value, ("plane", "log_force"), (2, 1), axis=1)
     build.add("Concat", plane, build.add("Exp", log_force), to="contact", axis=1)
     charge, contact = (
         helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
-        for name, width in (("charge_pC", len(layers[0][0])), ("contact", 3))
+        for name, width in (("charge_pC", len(folded.straight)), ("contact", 3))
     )
     graph = helper.make_graph(build.nodes, "contact", [charge], [contact], build.constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
@@ -212,19 +231,19 @@ class _Bound:
 class NumpyNetwork(Fitted):
     """In NumPy, float64."""
 
-    layers: Layers
+    folded: Folded
     choice: str
     name: str
     form: str = "NumPy"
 
     def predict(self, charge_pC: Array) -> Array:
         """See `Fitted.predict`."""
-        value: Array = np.log(np.minimum(np.maximum(charge_pC, LOWEST_PC), HIGHEST_PC))
-        for weight, bias in self.layers[:-1]:
+        value = logs = np.log(np.minimum(np.maximum(charge_pC, LOWEST_PC), HIGHEST_PC))
+        for weight, bias in self.folded.hidden:
             value = np.tanh(value @ weight + bias)
-        value = value @ self.layers[-1][0] + self.layers[-1][1]
-        value[..., 2] = np.exp(value[..., 2])
-        return value
+        contact: Array = value @ self.folded.last[0] + logs @ self.folded.straight + self.folded.last[1]
+        contact[..., 2] = np.exp(contact[..., 2])
+        return contact
 
     def one(self, charge_pC: Array) -> Callable[[], object]:
         """See `Fitted.one`."""
@@ -233,7 +252,7 @@ class NumpyNetwork(Fitted):
     @property
     def memory(self) -> int:
         """See `Fitted.memory`."""
-        return len(pickle.dumps(self.layers))
+        return len(pickle.dumps(self.folded))
 
 
 def contact_of(model: bytes) -> bytes:
