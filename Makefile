@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all bench soak release proto clean
+.PHONY: demo test test-all bench soak release report proto clean
 
 demo: $(VENV)/installed
 	$(BIN)/isocharge demo
@@ -35,6 +35,12 @@ release: $(VENV)/installed
 	$(BIN)/isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
 	$(BIN)/isocharge train fit --sensor four-25um-biaxial --radius auto -o models/four-25um-biaxial
 	$(BIN)/isocharge train fit --sensor four-25um-uniaxial --radius auto -o models/four-25um-uniaxial
+
+# Speed against error of the released models, on fresh presses: report/report.md. Nothing else should run meanwhile.
+report: $(VENV)/installed
+	$(BIN)/isocharge simulate sweep three-25um-biaxial --samples 24000 -o build/three-25um-biaxial
+	$(BIN)/isocharge simulate sweep four-25um-biaxial --radius 10 --samples 24000 -o build/four-25um-biaxial
+	$(BIN)/isocharge train report build/three-25um-biaxial build/four-25um-biaxial -o report
 
 # The gRPC messages, compiled; a test compares them with their source.
 PROTO := serve/isocharge/serve/grpc

@@ -56,6 +56,7 @@ SUBCOMMANDS = [
     ("simulate", "paper"),
     ("train",),
     ("train", "fit"),
+    ("train", "report"),
     ("serve",),
     ("serve", "predict"),
     ("serve", "stream"),

@@ -9,7 +9,7 @@ SIMULATE = frozenset({"scipy", "threadpoolctl", "matplotlib", "contourpy"})
 HTTP = frozenset({"uvicorn", "uvloop", "httptools", "orjson", "markdown_it"})
 PACKAGES = {
     "simulate": SIMULATE,
-    "train": SIMULATE | {"torch", "onnx"},
+    "train": SIMULATE | {"torch", "onnx", "sklearn"},
     "http": HTTP,
     "grpc": HTTP | {"grpc", "google"},
     "cluster": frozenset({"dask", "distributed"}),

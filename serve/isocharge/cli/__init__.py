@@ -25,9 +25,9 @@ app = typer.Typer(
     help="Where a piezoelectric tactile film is touched and how hard, from three or four charges.",
 )
 app.command("demo")(demo_command)
-simulate_app.command("identify")(identify_command)
 simulate_app.command("curves")(curves_command)
 simulate_app.command("contours")(contours_command)
+simulate_app.command("identify")(identify_command)
 simulate_app.command("paper")(paper_command)
 app.add_typer(simulate_app, name="simulate")
 app.add_typer(train_app, name="train")

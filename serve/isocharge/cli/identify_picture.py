@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disk
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from isocharge.cli.pictures import FELT, INK, _outlines
 from isocharge.simulate.arrays import Array
+from isocharge.simulate.drawing import FELT, INK, draw_electrodes
 
 if TYPE_CHECKING:
     from isocharge.simulate.identify import Identification, LimitMap
@@ -48,7 +48,7 @@ def draw_limit_map(axes: Any, found: "Identification", made: "LimitMap") -> Any:
     folds = 1e3 * found.area.folds
     axes.plot(*folds.T, ".", color=FELT, ms=3)
     axes.add_patch(Disk((0, 0), 1e3 * found.area.radius, fill=False, ls="--", lw=1.8, color="white"))
-    _outlines(axes, found.sensor)
+    draw_electrodes(axes, found.sensor)
     reach = 1e3 * found.area.searched
     title = f"{made.force:g} N; dashed: working area, {1e3 * found.area.radius:g} mm"
     title += "; red: folds" if len(folds) else ""

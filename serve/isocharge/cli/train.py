@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from isocharge.cli.report import report_command
 from isocharge.cli.simulate import PROBE_HELP, auto_radius, number_mm
 from isocharge.cli.terminal import progress, say, this_command
 from isocharge.errors import InputError
@@ -19,11 +20,7 @@ SAMPLES = 24_000
 """Presses that are simulated where no dataset is given."""
 
 train_app = typer.Typer(no_args_is_help=True, help="From a dataset to a model.")
-
-
-@train_app.callback()
-def train_group() -> None:
-    """Keeps `fit` a sub-command while it is the only one."""
+train_app.command("report")(report_command)
 
 
 @train_app.command("fit")

@@ -69,6 +69,12 @@ class Domain:
         unit: Array = (logs - self.centre) / self.scale
         return unit
 
+    def to_contact(self, unit: Array) -> Array:
+        """The inverse of `to_unit`: shape (n, 3) to (x_mm, y_mm, force_N), shape (n, 3)."""
+        contact: Array = unit * self.scale + self.centre
+        contact[..., 2] = np.exp(contact[..., 2])
+        return contact
+
 
 @dataclass(frozen=True)
 class ChargeField:
@@ -126,6 +132,14 @@ class ChargeField:
         degree, _, orders, n_electrode = (size - 1 for size in self.series.shape)
         parts = [self._some_logs(some, degree, orders) for some in np.array_split(unit, len(unit) // CHUNK + 1)]
         return np.concatenate(parts).reshape(len(unit), 4, n_electrode + 1)
+
+    def with_slopes(self) -> Array:
+        """Series of ln Q and of its derivatives by the unit coordinates, side by side.
+
+        Returns:
+            Shape (degree + 1, degree + 1, force_degree + 1, 4, n_electrode).
+        """
+        return np.stack([self.series, *(_derivative(self.series, axis) for axis in range(3))], axis=3)
 
     def _some_logs(self, unit: Array, degree: int, force_degree: int) -> Array:
         plane, in_force = _terms(unit, degree, force_degree)

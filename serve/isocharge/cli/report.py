@@ -1,0 +1,57 @@
+"""`isocharge train report`: speed against error, all methods, with the limits."""
+
+import json as json_module
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from isocharge.cli.terminal import progress, say, this_command
+from isocharge.errors import InputError
+from isocharge.files import refuse_existing
+
+
+def report_command(
+    datasets: Annotated[
+        list[Path], typer.Argument(metavar="DATASET...", help="Folders as `simulate sweep` makes them.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to make, with report.md.")],
+    model: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--model",
+            help="Released model to compare, once for each DATASET; name or path. (default: the sensor's name)",
+        ),
+    ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option("--quick", help="Everything small, in half a minute, to try it out; its figures mean nothing."),
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the record, as in report.json.")] = False,
+) -> None:
+    """Every method on the same noisy presses: error (mm, % of force) against time (us), throughput and memory (bytes).
+
+    Takes some minutes for a dataset of 24,000 presses. Nothing else should run meanwhile: times are measured.
+
+    Example: isocharge train report presses -o report
+    """
+    refuse_existing(output)
+    if model and len(model) != len(datasets):
+        raise InputError(f"--model: expected one for each of {len(datasets)} datasets, got {len(model)}")
+    from isocharge.serve import find_model
+    from isocharge.simulate import read_dataset
+    from isocharge.train.report import QUICK, Settings, write_report
+
+    read = [read_dataset(folder) for folder in datasets]
+    names = model or [dataset.sensor.name for dataset in read]
+    subjects = [(dataset, find_model(name)) for dataset, name in zip(read, names, strict=True)]
+    with progress("report") as advance:
+        record = write_report(
+            output, subjects, QUICK if quick else Settings(), command=this_command(), progress=advance
+        )
+    for section in record["datasets"]:
+        for sentence in section["verdict"]["sentences"]:
+            say(f"{section['sensor']}: {sentence}")
+    say(str(output / "report.md"))
+    if json:
+        typer.echo(json_module.dumps(record))

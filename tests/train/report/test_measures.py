@@ -1,0 +1,65 @@
+"""Figures of merit against scikit-learn, SciPy and brute force."""
+
+import numpy as np
+from sklearn.metrics import root_mean_squared_error
+
+from isocharge.train.report.measures import coverage, errors, pareto, rounded
+
+
+def contacts(count, seed):
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.normal(0.0, 4.0, (count, 2)), rng.uniform(0.1, 2.0, count)])
+
+
+def test_errors_by_scikit_learn():
+    truth = contacts(500, 0)
+    found = truth + np.random.default_rng(1).normal(0.0, 0.1, truth.shape)
+    figures = errors(found, truth)
+    plane = root_mean_squared_error(truth[:, :2].ravel(), found[:, :2].ravel())
+    force = root_mean_squared_error(np.ones(500), found[:, 2] / truth[:, 2])
+    np.testing.assert_allclose(figures["position_rms_mm"], np.sqrt(2.0) * plane, rtol=1e-3)
+    np.testing.assert_allclose(figures["force_rms_percent"], 100.0 * force, rtol=1e-3)
+    distances = sorted(np.linalg.norm((found - truth)[:, :2], axis=1))
+    assert distances[248] <= figures["position_median_mm"] <= distances[251]
+    assert distances[473] <= figures["position_p95_mm"] <= distances[475] * 1.001
+    assert figures["answered"] == 1.0
+
+
+def test_presses_without_an_answer_do_not_count():
+    truth = contacts(10, 2)
+    found = truth + 0.1
+    found[3] = np.nan
+    figures = errors(found, truth)
+    assert figures["answered"] == 0.9
+    np.testing.assert_allclose(figures["position_rms_mm"], 0.1 * np.sqrt(2.0), rtol=1e-3)
+    assert errors(np.full((10, 3), np.nan), truth)["position_rms_mm"] is None
+
+
+def test_the_front_by_brute_force():
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        cost, error = rng.integers(0, 6, 12).astype(float), rng.integers(0, 6, 12).astype(float)
+        error[rng.random(12) < 0.1] = np.nan
+        front = pareto(cost, error)
+        for i in range(12):
+            beaten = any(
+                cost[j] <= cost[i] and error[j] <= error[i] and (cost[j] < cost[i] or error[j] < error[i])
+                for j in range(12)
+            )
+            assert front[i] == (not beaten and np.isfinite(error[i]))
+
+
+def test_true_deviations_cover_their_level():
+    rng = np.random.default_rng(4)
+    truth, std = contacts(40_000, 5), rng.uniform(0.1, 1.0, (40_000, 3))
+    levels = np.array([0.1, 0.5, 0.68, 0.95])
+    covered = coverage(truth + std * rng.standard_normal(truth.shape), std, truth, levels)
+    np.testing.assert_allclose(covered, np.broadcast_to(levels[:, None], (4, 3)), atol=0.01)
+    too_small = coverage(truth + 2.0 * std * rng.standard_normal(truth.shape), std, truth, levels)
+    assert (too_small < levels[:, None] - 0.03).all()
+
+
+def test_numbers_for_the_record():
+    assert rounded(0.123456) == 0.1235
+    assert rounded(np.nan) is None
+    assert rounded(None) is None

@@ -1,0 +1,102 @@
+"""The presses that every method is measured on.
+
+Test charges come from solves that training never saw: the forward map of the test reaches a little further than the
+dataset's, so that its distances and forces, hence all its solves, are others.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.errors import DatasetError
+from isocharge.simulate import Dataset, ForwardMap, Probe, Samples, Sensor, Sweep, noise_model, parse_probe, solve_maps
+from isocharge.simulate.noise import NoiseModel
+from isocharge.simulate.sweep import Solver
+from isocharge.simulate.theory import ACCURACY
+from isocharge.train.charge_field import Domain
+from isocharge.train.split import Presses, domain_of
+
+FURTHER = 1.03
+"""How much further than the dataset the test's solves reach, in distance and force."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What a dataset is about.
+
+    Attributes:
+        sensor: Its sensor.
+        probes: Its probes.
+        domain: Its contacts.
+        turned: Whether its probes are turned at random.
+        noise: What is on the charges.
+        seed: Of test presses and noise.
+        presses: How many test presses.
+    """
+
+    sensor: Sensor
+    probes: tuple[Probe, ...]
+    domain: Domain
+    turned: bool
+    noise: NoiseModel
+    seed: int
+    presses: int
+
+    @classmethod
+    def of(cls, dataset: Dataset, presses: int, seed: int, noise: str = "reference") -> "Bench":
+        """From a dataset's columns and manifest.
+
+        Raises:
+            DatasetError: If a probe of the dataset is no probe's notation.
+        """
+        probes, turned = _probes_of(dataset.samples)
+        count = presses - presses % len(probes)
+        return cls(dataset.sensor, probes, domain_of(dataset), turned, noise_model(noise), seed, count)
+
+    def sweep(self, further: float = 1.0) -> Sweep:
+        """Presses spread like the dataset's, of another seed."""
+        low, high = self.domain.force_range_N
+        return Sweep(
+            radius=1e-3 * self.domain.radius_mm * further,
+            force_range=(low / further, high * further),
+            samples=self.presses,
+            seed=self.seed + 7919,
+            orientation="random" if self.turned else "fixed",
+        )
+
+    def films(
+        self,
+        sensor: Sensor | None = None,
+        probes: tuple[Probe, ...] | None = None,
+        further: float = FURTHER,
+        accuracy: float = ACCURACY,
+    ) -> tuple[ForwardMap, ...]:
+        """Forward maps of the sensor under its probes, or of another sensor, other probes, another reach."""
+        return solve_maps(
+            sensor or self.sensor, probes or self.probes, self.sweep(further), solver=Solver(accuracy=accuracy)
+        )
+
+
+def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
+    """The probes, and whether they are turned at random; one that is turned by one angle carries it."""
+    probes, turned = [], False
+    for name in np.unique(samples.probe):
+        angles = samples.orientation_deg[samples.probe == name]
+        try:
+            probe = parse_probe(str(name))
+        except ValueError as error:
+            raise DatasetError(f"the dataset's probe {str(name)!r}: {error}") from error
+        turned = turned or (np.ptp(angles) > 0.0 and probe.period > 0.0)
+        probes.append(probe if np.ptp(angles) > 0.0 else probe.turned(float(np.deg2rad(angles[0]))))
+    return tuple(probes), bool(turned)
+
+
+def press_on(films: tuple[ForwardMap, ...], sweep: Sweep) -> Presses:
+    """Clean charges of a sweep's presses from these forward maps, one for each probe."""
+    presses = sweep.over([film.probe for film in films])
+    charge = np.empty((len(presses), len(films[0].sensor.electrodes)))
+    for number, film in enumerate(films):
+        rows = np.flatnonzero(presses.probe == number)
+        chosen = presses[rows]
+        charge[rows] = film.forward(chosen.x, chosen.y, chosen.force, chosen.turn)
+    return Presses(np.stack([1e3 * presses.x, 1e3 * presses.y, presses.force], axis=1), 1e12 * charge)

@@ -1,0 +1,182 @@
+"""What it costs when the world is not as the model was told: noise, probe, pretension, gains, a dead electrode."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from isocharge.errors import IsochargeError
+from isocharge.simulate import Sensor, parse_probe
+from isocharge.simulate.arrays import Array
+from isocharge.simulate.noise import NoiseModel
+from isocharge.train.evaluate import noisy_charges
+from isocharge.train.report.bench import Bench, press_on
+from isocharge.train.report.measures import errors, rounded
+from isocharge.train.report.settings import Settings
+from isocharge.train.rivals import Fitted, GaussNewton, PolynomialRidge, ReleasedModel, Task
+from isocharge.train.split import Presses
+
+LEVELS = (0.1, 0.3, 1.0, 3.0, 10.0)
+"""Factors on the noise."""
+
+PRETENSION_OFF = 0.2e6
+"""Pretension that nobody knew of, Pa."""
+
+GAIN_OFF, GAIN_WRONG = 0.01, 0.2
+"""Standard deviation of unknown gains, and the gain that is plainly wrong."""
+
+OUTSIDE = 1.25
+"""Presses outside the working area lie within so many of its radii."""
+
+ROUGH = 2e-3
+"""Accuracy of charges under other probes and pretensions: far below what they change."""
+
+FALSE_ALARMS = 1.0
+"""Percent of good presses whose misfit is above the alarm's threshold."""
+
+FARTHEST = 50.0
+"""Answers farther from zero, mm or N, are cut to this: polynomials explode outside of what they know."""
+
+ONE_NEWTON = (0.8, 1.25)
+"""Forces that count as about 1 N."""
+
+NOISE_SEED = 515
+"""Of the noise on every case's charges, relative to the bench's."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Presses in a world that the models were not told of.
+
+    Attributes:
+        group: "noise", "probe", "pretension", "gain", "dead electrode" or "elsewhere".
+        name: What is different.
+        presses: Clean presses.
+        charge_pC: What is measured, shape (n, n_electrode).
+        known: Whether a model could answer: false for presses that it has no answer for.
+    """
+
+    group: str
+    name: str
+    presses: Presses
+    charge_pC: Array
+    known: bool = True
+
+
+def cases(bench: Bench, clean: Presses, settings: Settings, progress: Progress) -> Iterator[Case]:
+    """Every case, from clean test presses of the bench."""
+    sweep = bench.sweep()
+
+    def noisy(presses: Presses) -> Array:
+        return noisy_charges(presses, bench.noise, bench.seed + NOISE_SEED)
+
+    for level in LEVELS:
+        yield Case("noise", f"x {level:g}", clean, _noisy(clean, bench, level))
+    for notation in settings.shapes:
+        progress(f"solving the film under {notation}")
+        presses = press_on(bench.films(probes=(parse_probe(notation),), accuracy=max(ROUGH, settings.accuracy)), sweep)
+        yield Case("probe", notation, presses, noisy(presses))
+    if settings.worlds:
+        progress("solving a film with more pretension")
+        presses = press_on(bench.films(sensor=_tauter(bench.sensor), accuracy=ROUGH), sweep)
+        yield Case("pretension", f"+{1e-6 * PRETENSION_OFF:g} MPa", presses, noisy(presses))
+    yield from _wrong_gains(bench, clean, noisy(clean))
+    if settings.worlds:
+        progress("solving the film outside of the working area")
+        yield from _outside(bench, noisy)
+
+
+def _tauter(sensor: Sensor) -> Sensor:
+    return replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension + PRETENSION_OFF))
+
+
+def _noisy(clean: Presses, bench: Bench, level: float) -> Array:
+    louder = NoiseModel(f"x {level:g}", level * bench.noise.white, level * bench.noise.gain)
+    return noisy_charges(clean, louder, bench.seed + NOISE_SEED)
+
+
+def _wrong_gains(bench: Bench, clean: Presses, noisy: Array) -> Iterator[Case]:
+    """Gains off by some 1 %, each sensor differently; one off by 20 %; one dead."""
+    rng = np.random.default_rng(bench.seed + NOISE_SEED)
+    gains = 1.0 + GAIN_OFF * rng.standard_normal(noisy.shape)
+    yield Case("gain", f"each off by {100 * GAIN_OFF:g} % rms", clean, gains * noisy)
+    for number, name in enumerate(bench.sensor.electrode_names):
+        here = np.arange(noisy.shape[1]) == number
+        yield Case(
+            "gain", f"{name} off by {100 * GAIN_WRONG:g} %", clean, np.where(here, (1.0 + GAIN_WRONG) * noisy, noisy)
+        )
+    silence = 1e12 * bench.noise.white * rng.standard_normal(noisy.shape)
+    for number, name in enumerate(bench.sensor.electrode_names):
+        here = np.arange(noisy.shape[1]) == number
+        yield Case("dead electrode", f"{name} dead", clean, np.where(here, silence, noisy))
+
+
+def _outside(bench: Bench, noisy: Callable[[Presses], Array]) -> Iterator[Case]:
+    """Presses beyond the working area, where the film is large enough."""
+    try:
+        films = bench.films(further=OUTSIDE, accuracy=ROUGH)
+    except IsochargeError:
+        return
+    low, high = bench.domain.force_range_N
+    presses = press_on(films, replace(bench.sweep(OUTSIDE), force_range=(low, high)))
+    beyond = np.hypot(*presses.contact[:, :2].T) > bench.domain.radius_mm
+    presses = presses[np.flatnonzero(beyond)]
+    reach = f"up to {(OUTSIDE - 1.0) * bench.domain.radius_mm:.2g} mm outside the working area"
+    yield Case("elsewhere", reach, presses, noisy(presses), known=False)
+
+
+def measure(
+    every: Iterator[Case], released: ReleasedModel, rivals: list[Fitted], threshold: float
+) -> list[dict[str, Any]]:
+    """Errors of several methods in every case, and how often the released model's misfit gives the alarm."""
+    return [_measured(case, released, rivals, threshold) for case in every]
+
+
+def _measured(case: Case, released: ReleasedModel, rivals: list[Fitted], threshold: float) -> dict[str, Any]:
+    truth = case.presses.contact
+    contact, std, misfit = released.answer(case.charge_pC)
+    alarm = misfit[:, 0] > threshold
+    about = (truth[:, 2] >= ONE_NEWTON[0]) & (truth[:, 2] <= ONE_NEWTON[1])
+    answers = {rival.name: np.clip(rival.predict(case.charge_pC), -FARTHEST, FARTHEST) for rival in rivals}
+    found = {released.name: contact, **answers}
+    return {
+        "group": case.group,
+        "case": case.name,
+        "presses": len(truth),
+        "alarms_percent": rounded(100.0 * float(np.mean(alarm)), 3),
+        "alarms_percent_about_1N": rounded(100.0 * float(np.mean(alarm[about])), 3) if about.any() else None,
+        "coverage_68": rounded(float(np.mean(np.abs(contact - truth) < std)), 3) if case.known else None,
+        "errors": {name: errors(answer, truth) for name, answer in found.items()} if case.known else None,
+    }
+
+
+def threshold_of(released: ReleasedModel, clean: Presses, bench: Bench, draws: int) -> float:
+    """The misfit that 1 % of good test presses exceed."""
+    seeds = range(bench.seed + NOISE_SEED + 1, bench.seed + NOISE_SEED + 1 + draws)
+    misfits = [released.answer(noisy_charges(clean, bench.noise, seed))[2] for seed in seeds]
+    return float(np.percentile(np.concatenate(misfits), 100.0 - FALSE_ALARMS))
+
+
+def remaining(task: Task, bench: Bench, clean: Presses, progress: Progress) -> list[dict[str, Any]]:
+    """A known dead electrode: methods fitted anew to the charges that remain. Nothing for fewer than three of those."""
+    names = bench.sensor.electrode_names
+    if len(names) < 4:
+        return []
+    noisy, records = noisy_charges(clean, bench.noise, bench.seed + NOISE_SEED), []
+    for number, name in enumerate(names):
+        progress(f"fitting without electrode {name}")
+        kept = np.arange(len(names)) != number
+        fewer = replace(task, train=_only(task.train, kept), validation=_only(task.validation, kept))
+        forms = [
+            estimator.fit(fewer)[-1] for estimator in (PolynomialRidge(degrees=(8, 10), alphas=(1e-11,)), GaussNewton())
+        ]
+        found = {form.name: errors(form.predict(noisy[:, kept]), clean.contact) for form in forms}
+        records.append({"without": name, "errors": found})
+    return records
+
+
+def _only(presses: Presses, kept: np.ndarray) -> Presses:
+    return Presses(presses.contact, presses.charge_pC[:, kept])

@@ -1,0 +1,231 @@
+"""Every method, fitted and measured on the same presses."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from isocharge.simulate import Dataset, ForwardMap
+from isocharge.simulate.arrays import Array
+from isocharge.train.evaluate import noisy_charges
+from isocharge.train.report.bench import Bench
+from isocharge.train.report.measures import errors, pareto, rounded
+from isocharge.train.report.settings import Settings
+from isocharge.train.report.timing import latencies, throughputs
+from isocharge.train.rivals import (
+    Estimator,
+    Fitted,
+    GaussianProcess,
+    GaussNewton,
+    GradientBoosting,
+    InterpolatedTable,
+    LinearBand,
+    NearestEntry,
+    NearestNeighbours,
+    Network,
+    PolynomialRidge,
+    ReleasedModel,
+    Task,
+    Triangulate,
+)
+from isocharge.train.rivals.linear_band import BAND_N
+from isocharge.train.split import Presses, presses_of, split_by_position
+
+Progress = Callable[[str], None]
+"""Told what comes next."""
+
+TIMED = 64
+"""Presses that single predictions go through in turn."""
+
+TEST_NOISE = 4242
+"""Seed of the noise on the test presses, relative to the bench's."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method in one form, and what it made of the test presses.
+
+    Attributes:
+        fitted: It.
+        kind: "paper", "learnt", "fitted map" or "network".
+        contact: Its answers, shape (n, 3).
+        fit_seconds: What fitting all forms took.
+        p50_us: Median duration of one prediction, us.
+        p95_us: 95th percentile.
+        rounds_us: Smallest and largest median of a round.
+        per_second: Predictions per second in a batch.
+        memory: Bytes.
+    """
+
+    fitted: Fitted
+    kind: str
+    contact: Array
+    fit_seconds: float
+    p50_us: float = np.nan
+    p95_us: float = np.nan
+    rounds_us: tuple[float, float] = (np.nan, np.nan)
+    per_second: float = np.nan
+    memory: int = 0
+
+    @property
+    def label(self) -> str:
+        """Name and form."""
+        return f"{self.fitted.name} ({self.fitted.form})"
+
+
+@dataclass(frozen=True)
+class Test:
+    """Test presses.
+
+    Attributes:
+        presses: Clean.
+        charge_pC: With noise, shape (n, n_electrode).
+    """
+
+    presses: Presses
+    charge_pC: Array
+
+    @classmethod
+    def of(cls, bench: Bench, presses: Presses) -> "Test":
+        """With one draw of the bench's noise."""
+        return cls(presses, noisy_charges(presses, bench.noise, bench.seed + TEST_NOISE))
+
+
+def task_of(dataset: Dataset, bench: Bench, settings: Settings) -> Task:
+    """What the methods are fitted for."""
+    train, validation = split_by_position(presses_of(dataset), settings.hold_out, settings.seed)
+    return Task(train, validation, bench.domain, bench.noise, settings.seed, quick=settings.quick)
+
+
+def roster(dataset: Dataset, film: ForwardMap, settings: Settings) -> list[tuple[str, Estimator]]:
+    """Every method with its kind."""
+    networks = [Network(dataset, hidden, settings.steps, settings.hold_out) for hidden in settings.sizes]
+    return [
+        ("paper", Triangulate(film)),
+        ("paper", LinearBand()),
+        ("paper", NearestEntry()),
+        ("paper", InterpolatedTable()),
+        ("learnt", NearestNeighbours()),
+        ("learnt", PolynomialRidge()),
+        ("learnt", GradientBoosting()),
+        ("learnt", GaussianProcess()),
+        ("fitted map", GaussNewton()),
+        *(("network", network) for network in networks),
+    ]
+
+
+def fit_all(
+    estimators: list[tuple[str, Estimator]], released: ReleasedModel, task: Task, test: Test, progress: Progress
+) -> list[Method]:
+    """Fit every method and let all of its forms answer the test presses; the released model comes first."""
+    given: list[Fitted] = [released, released.contact_only()]
+    methods = [Method(form, "network", form.predict(test.charge_pC), 0.0) for form in given]
+    for kind, estimator in estimators:
+        progress(f"fitting: {estimator.name}")
+        begin = time.perf_counter()
+        forms = estimator.fit(task)
+        seconds = time.perf_counter() - begin
+        methods += [Method(form, kind, answers(form, test), seconds) for form in forms]
+    return methods
+
+
+def answers(fitted: Fitted, test: Test) -> Array:
+    """Contacts of the noisy test presses."""
+    return fitted.told(test.presses.contact[:, 2]).predict(test.charge_pC)
+
+
+def timed(methods: list[Method], test: Test, settings: Settings, progress: Progress) -> list[Method]:
+    """The same methods with their times and sizes, taken when all of them are fitted."""
+    force, charge = test.presses.contact[:, 2], test.charge_pC
+    singles = {
+        method.label: [method.fitted.told(force[i : i + 1]).one(charge[i]) for i in range(TIMED)] for method in methods
+    }
+    durations = latencies(
+        singles, settings.rounds, settings.round_ms, lambda done, total: progress(f"timing: round {done} of {total}")
+    )
+    many = {method.label: _batched(method.fitted, force) for method in methods}
+    batch = np.resize(charge, (settings.batch, charge.shape[1]))
+    per_second = throughputs(
+        many, batch, 3, 1.0, lambda done, total: progress(f"timing batches: round {done} of {total}")
+    )
+    return [_with_times(method, durations[method.label], per_second[method.label]) for method in methods]
+
+
+def _batched(fitted: Fitted, force: Array) -> Callable[[Array], object]:
+    return lambda charge: fitted.told(np.resize(force, len(charge))).predict(charge)
+
+
+def _with_times(method: Method, durations: Array, per_second: float) -> Method:
+    medians = np.median(durations, axis=1)
+    return replace(
+        method,
+        p50_us=float(np.percentile(durations, 50)),
+        p95_us=float(np.percentile(durations, 95)),
+        rounds_us=(float(medians.min()), float(medians.max())),
+        per_second=per_second,
+        memory=method.fitted.memory,
+    )
+
+
+def table(methods: list[Method], test: Test, bayes: Array | None) -> list[dict[str, Any]]:
+    """One record for each method, ready for JSON; errors over the limit where `bayes` gives its contacts."""
+    truth = test.presses.contact
+    band = truth[:, 2] <= BAND_N
+    limit = errors(bayes, truth[: len(bayes)]) if bayes is not None else None
+    records = []
+    for method in methods:
+        figures, fitted = errors(method.contact, truth), method.fitted
+        if fitted.given_force:
+            figures |= {"force_rms_percent": None, "force_median_percent": None}
+        records.append(
+            {
+                "label": method.label,
+                "name": fitted.name,
+                "form": fitted.form,
+                "kind": method.kind,
+                "choice": fitted.choice,
+                "force_given": fitted.given_force,
+                "errors": figures,
+                "errors_in_band": errors(method.contact[band], truth[band]) if band.any() else None,
+                "over_bayes": _ratio(method.contact, truth, bayes, limit),
+                "p50_us": rounded(method.p50_us),
+                "p95_us": rounded(method.p95_us),
+                "p50_of_rounds_us": [rounded(value) for value in method.rounds_us],
+                "per_second": rounded(method.per_second),
+                "memory_bytes": method.memory,
+                "fit_seconds": rounded(method.fit_seconds, 3),
+            }
+        )
+    _mark_fronts(records)
+    return records
+
+
+def _ratio(contact: Array, truth: Array, bayes: Array | None, limit: dict[str, Any] | None) -> float | None:
+    if bayes is None or limit is None:
+        return None
+    mine = errors(contact[: len(bayes)], truth[: len(bayes)])["position_rms_mm"]
+    return rounded(mine / limit["position_rms_mm"]) if mine else None
+
+
+FRONTS = {"latency": ("p50_us", 1.0), "throughput": ("per_second", -1.0), "memory": ("memory_bytes", 1.0)}
+"""Plot to the cost along its axis, and whether less (1) or more (-1) of it is better."""
+
+
+def _mark_fronts(records: list[dict[str, Any]]) -> None:
+    """On which plots nothing beats a method; one that is told the force, or does not answer all, does not compete."""
+    error = np.array(
+        [record["errors"]["position_rms_mm"] if competes(record) else np.nan for record in records], dtype=float
+    )
+    fronts = {
+        plot: pareto(sign * np.array([record[key] for record in records], dtype=float), error)
+        for plot, (key, sign) in FRONTS.items()
+    }
+    for number, record in enumerate(records):
+        record["best_on"] = [plot for plot, front in fronts.items() if front[number]]
+
+
+def competes(record: dict[str, Any]) -> bool:
+    """Whether a method answers what the others answer."""
+    return not record["force_given"] and record["errors"]["answered"] == 1.0
