@@ -53,6 +53,7 @@ SUBCOMMANDS = [
     ("simulate", "curves"),
     ("simulate", "contours"),
     ("simulate", "paper"),
+    ("simulate", "identify"),
     ("train",),
     ("train", "fit"),
     ("train", "report"),
