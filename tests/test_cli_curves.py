@@ -69,7 +69,7 @@ def test_curves_as_a_table_and_a_picture(command, tmp_path):
 
 
 def test_contours_of_a_charge_as_json(command):
-    code, out, _ = command("contours", SENSOR, "--charge", "A=900", "--charge", "B=9000", "--json")
+    code, out, _ = command("contours", SENSOR, "--charge", "A=900", "--charge", "B=9000", "--radius", 6, "--json")
     report = json.loads(out)
     assert code == 0
     first, second = report["contours"]
@@ -81,14 +81,14 @@ def test_contours_of_a_charge_as_json(command):
 
 
 def test_a_charge_that_no_contour_reaches_is_said(command):
-    code, out, _ = command("contours", SENSOR, "--charge", "B=9000")
+    code, out, _ = command("contours", SENSOR, "--charge", "B=9000", "--radius", 3)
     assert code == 0
-    assert "no contour: within 10 mm it has" in out
+    assert "no contour: within 3 mm it has" in out
 
 
 def test_contours_of_a_press_meet_there(command, tmp_path):
     picture = tmp_path / "contours.png"
-    words = ("contours", SENSOR, "--at=2,-3", "--radius", "9.5", "-o", picture)
+    words = ("contours", SENSOR, "--at=2,-3", "--radius", 5, "-o", picture)
     code, out, _ = command(*words, "--json")
     meeting = json.loads(out)["meeting"]
     assert code == 0
@@ -101,7 +101,7 @@ def test_contours_of_a_press_meet_there(command, tmp_path):
 
 
 def test_levels_by_default(command):
-    code, out, _ = command("contours", SENSOR, "--levels", 2, "--radius", 5)
+    code, out, _ = command("contours", SENSOR, "--levels", 2, "--radius", 3)
     assert code == 0
     assert [line.split()[0] for line in out.splitlines()] == ["A", "A", "B", "B", "C", "C"]
 
@@ -114,7 +114,7 @@ def test_levels_by_default(command):
         (("curves", SENSOR, "-o", "curves.txt"), "expected a picture's name ending in png, svg, pdf"),
         (("contours", SENSOR, "--charge", "E=900"), "no electrode 'E'"),
         (("contours", SENSOR, "--charge", "A=much"), "expected an electrode and pC like 'A=650', got 'A=much'"),
-        (("contours", SENSOR, "--charge", "A=nan"), "expected a number, got nan pC"),
+        (("contours", SENSOR, "--charge", "A=nan"), "expected an electrode and pC like 'A=650', got 'A=nan'"),
         (("contours", SENSOR, "--charge", "A=900", "--at", "1,1"), "either --charge or --at, got both"),
         (("contours", SENSOR, "--at", "here"), "expected two numbers in mm"),
     ],

@@ -11,10 +11,10 @@ from PIL import Image
 
 from isocharge.errors import OutputExists
 from isocharge.simulate import Circle, drawing, load_sensor
-from isocharge.simulate.paper import Choices, write_paper
+from isocharge.simulate.paper import Choices, study, write_paper
 from isocharge.simulate.paper.choices import PAPER, normalised_cubic
 from isocharge.simulate.paper.layouts import trilaterate
-from isocharge.simulate.paper.study import Presses, solve_presses
+from isocharge.simulate.paper.study import Presses, build_map, solve_presses
 from isocharge.simulate.paper.thickness import ChargeForce
 from isocharge.simulate.workers import Workers
 
@@ -22,7 +22,8 @@ FIGURES = [f"Fig. {number}" for number in range(1, 13)]
 SMALL = replace(
     Choices.quick(),
     triangle=Circle(1.2e-3),
-    rectangle=Circle(1.5e-3),
+    rectangle=Circle(1.2e-3),
+    circle=Circle(1.2e-3),
     probes=(Circle(2e-3),),
     presses=12,
     force=(0.05, 0.2, 0.5, 1.0, 2.0),
@@ -35,12 +36,25 @@ def told() -> dict[str, list[tuple[int, int]]]:
     return {"solved": [], "triangulated": [], "drawn": []}
 
 
+MADE = []
+"""The one map that stands for all three, whose probes are the same here."""
+
+
+def one_map(job):
+    if not MADE:
+        MADE.append(build_map(replace(job, radius=14e-3)))
+    return MADE[0]
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, told):
     path = tmp_path_factory.mktemp("paper") / "made"
     progress = {name: (lambda done, total, steps=steps: steps.append((done, total))) for name, steps in told.items()}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drawing, "DPI", 40)
+        patch.setattr(study, "build_map", one_map)  # one for all
+        patch.setattr(study, "MESHES", study.MESHES[:3])
+        patch.setattr(study, "FINEST", (5, 8, 6, 1))
         write_paper(path, SMALL, Workers(), **progress)
     return path
 

@@ -2,6 +2,7 @@
 
 import json as json_module
 from collections.abc import Mapping as Map
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -193,6 +194,8 @@ def _wanted(sensor: "Sensor", texts: list[str]) -> dict[str, tuple[float, ...]]:
         name, _, value = text.partition("=")
         try:
             charge = 1e-12 * float(value)
+            if not isfinite(charge):
+                raise ValueError(value)
         except ValueError as error:
             raise InputError(f"--charge: expected an electrode and pC like 'A=650', got {text!r}") from error
         electrode_index(sensor, name)
