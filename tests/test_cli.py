@@ -270,7 +270,8 @@ def test_sweep_fit_predict_one_by_one(command, tmp_path):
     assert command("simulate", "sweep", SENSOR, "--samples", 2000, "--radius", 5, "--workers", 2, "-o", presses)[0] == 0
     config = tmp_path / "quick.toml"
     config.write_text(
-        "[network]\nhidden = [32, 32]\nmisfit_hidden = [16, 16]\n[training]\nsteps = 300\nmisfit_steps = 50\n"
+        "[network]\nhidden = [32, 32]\nmisfit_hidden = [16, 16]\n"
+        "[training]\nsteps = 300\nmisfit_steps = 50\nmisfit_charges = 2000\n"
     )
     code, _, err = command("train", "fit", presses, "--config", config, "-o", model)
     assert code == 0
@@ -281,6 +282,31 @@ def test_sweep_fit_predict_one_by_one(command, tmp_path):
     assert code == 0
     assert header.startswith("x_mm,y_mm,force_N")
     assert [float(value) for value in row.split(",")[:3]] == pytest.approx([0.0, 0.0, 1.0], abs=0.3)
+
+
+def test_fit_says_folds_and_prints_json(command, tmp_path):
+    """Three uniaxial electrodes: the asked 8 mm are cut, and the user is told."""
+    config = tmp_path / "quick.toml"
+    config.write_text("[training]\nsteps = 200\nmisfit_steps = 50\nmisfit_charges = 2000\n")
+    words = ("--sensor", "three-25um-uniaxial", "--config", config, "--json", "-o", tmp_path / "models" / "u")
+    code, out, err = command("train", "fit", *words)
+    assert code == 0
+    folded = re.search(r"caution: the map from contacts to charges folds beyond ([0-9.]+) mm", err)
+    assert 1.5 < float(folded[1]) < 5.0
+    answer = json.loads(out)
+    assert answer["errors"]["position_median_mm"] > 0.0
+    card = (Path(answer["folder"]) / "card.md").read_text()
+    assert f"within {folded[1]} mm of the centre (of 8 mm asked for" in card
+
+
+def test_a_fit_for_other_electrodes_is_refused(command, tmp_path):
+    presses, config = tmp_path / "presses", tmp_path / "four.toml"
+    command("simulate", "sweep", SENSOR, "--samples", 600, "--radius", 3, "-o", presses)
+    config.write_text("[network]\nelectrodes = 4\n")
+    code, _, err = command("train", "fit", presses, "--config", config, "-o", tmp_path / "models" / "mine")
+    assert code == 2
+    assert "ConfigError: network.electrodes: the configuration is for 4 electrodes" in err
+    assert not (tmp_path / "models").exists()
 
 
 BAD = [
@@ -388,5 +414,5 @@ def test_the_demo_end_to_end(command, tmp_path):
 
 def quick(folder):
     path = folder / "quick.toml"
-    path.write_text("[training]\nsteps = 400\nmisfit_steps = 100\n")
+    path.write_text("[training]\nsteps = 400\nmisfit_steps = 100\nmisfit_charges = 2000\n")
     return path

@@ -49,7 +49,7 @@ def test_train_example_runs(tmp_path, monkeypatch, capsys):
 
     monkeypatch.chdir(tmp_path)
     run_sweep(Path("presses"), load_sensor("three-25um-biaxial"), (Circle(1e-3),), Sweep(samples=2000))
-    Path("quick.toml").write_text("[training]\nsteps = 50\nmisfit_steps = 20\n")
+    Path("quick.toml").write_text("[training]\nsteps = 50\nmisfit_steps = 20\nmisfit_charges = 2000\n")
     (example,) = blocks(TRAIN, "python")
     exec(compile(example, "train/README.md", "exec"), {})
     assert "position_median_mm" in capsys.readouterr().out

@@ -1,20 +1,41 @@
 """What holds for every model in the top-level `models/` folder, released ones above all."""
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from google.protobuf import text_format
+from tritonclient.grpc.model_config_pb2 import ModelConfig
 
 from isocharge.errors import ChargeError
 from isocharge.serve import Predictor, check_golden, find_model, load_model
 from isocharge.serve.repository import model_names
+from isocharge.serve.session import OUTPUTS
 
 MODELS = Path(__file__).parents[2] / "models"
 NAMES = model_names(MODELS)
 
 
-def test_a_model_is_released():
-    assert "three-25um-biaxial" in NAMES
+RELEASED = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial")
+LARGEST = 1_000_000
+
+
+def test_the_models_are_released():
+    assert set(RELEASED) <= set(NAMES)
+
+
+@pytest.mark.parametrize("name", RELEASED)
+def test_released_models_ship_in_the_wheel(name):
+    project = tomllib.loads((MODELS.parent / "pyproject.toml").read_text())
+    shipped = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
+    assert shipped[f"models/{name}"] == f"isocharge/serve/released/{name}"
+
+
+@pytest.mark.parametrize("name", RELEASED)
+def test_the_makefile_and_the_table_name_it(name):
+    assert f"models/{name}" in (MODELS.parent / "Makefile").read_text()
+    assert f"({name}/1/card.md)" in (MODELS / "README.md").read_text()
 
 
 @pytest.fixture(params=NAMES)
@@ -31,6 +52,21 @@ def test_folder_says_what_the_metadata_say(model):
     assert (model.folder.parent.name, model.folder.name) == (model.metadata.name, str(model.metadata.version))
     assert (model.folder / "card.md").read_text().strip()
     assert f'name: "{model.metadata.name}"' in (model.folder.parent / "config.pbtxt").read_text()
+
+
+def test_triton_reads_its_configuration(model):
+    config = text_format.Parse((model.folder.parent / "config.pbtxt").read_text(), ModelConfig())
+    assert (config.name, config.platform) == (model.metadata.name, "onnxruntime_onnx")
+    assert [(tensor.name, list(tensor.dims)) for tensor in config.input] == [
+        ("charge_pC", [len(model.metadata.electrodes)])
+    ]
+    assert {tensor.name: list(tensor.dims) for tensor in config.output} == {
+        name: [width] for name, width in OUTPUTS.items()
+    }
+
+
+def test_it_is_small(model):
+    assert sum(path.stat().st_size for path in model.folder.rglob("*") if path.is_file()) < LARGEST
 
 
 def test_golden_vectors_are_reproduced(model):
@@ -53,7 +89,7 @@ def test_one_press_equals_the_batch(model, released):
         *contact, misfit = released.predict(charge_pC)
         *expected, expected_misfit = (column[row] for column in batch)
         assert contact == pytest.approx(expected, rel=1e-4, abs=1e-4)
-        assert misfit == pytest.approx(expected_misfit, rel=1e-4, abs=0.02)  # float32, sums in another order
+        assert misfit == pytest.approx(expected_misfit, rel=1e-4, abs=1e-3)  # float32, sums in another order
 
 
 def test_wrong_width_names_the_electrodes(model, released):

@@ -1,12 +1,17 @@
 """A training that is stopped anywhere and goes on ends with the weights of one that was not."""
 
 import json
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
+import onnx
 import pytest
 import torch
 
 from isocharge.errors import OutputExists
+from isocharge.simulate import Circle, Sweep, read_dataset, run_sweep
 from isocharge.simulate.draft import keep_draft
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, checkpoint, fit_network, train_model
 from isocharge.train.checkpoint import Checkpoint
@@ -15,6 +20,13 @@ NOISY = FitConfig(
     NetworkConfig((12, 12), (10, 10)), TrainingConfig(steps=230, misfit_steps=210, misfit_charges=1_000, batch=64)
 )
 CLEAN = replace(NOISY, training=replace(NOISY.training, noise="clean", finish_steps=4))
+
+
+@pytest.fixture(scope="module")
+def dataset(sensor, tmp_path_factory):
+    """Just enough to train on, as what is tested does not depend on it."""
+    folder = tmp_path_factory.mktemp("small") / "presses"
+    return read_dataset(run_sweep(folder, sensor, (Circle(1e-3),), Sweep(samples=900)))
 
 
 class Killed(BaseException):
@@ -118,3 +130,24 @@ def test_a_state_of_another_dataset_is_refused(dataset, stopped):
     with pytest.raises(OutputExists, match="dataset_sha256 is"):
         train_model(replace(dataset, sha256="another"), stopped, NOISY)
     assert json.loads((stopped / "1.part" / "run.json").read_text())["dataset_sha256"] == dataset.sha256
+
+
+@pytest.mark.slow
+def test_a_killed_command_goes_on(sensor, tmp_path):
+    """SIGKILL in the middle; the same command makes the same model as one that was left alone."""
+    run_sweep(tmp_path / "presses", sensor, (Circle(1e-3),), Sweep(samples=3_000))
+    (tmp_path / "config.toml").write_text("[training]\nsteps = 4000\nmisfit_steps = 300\nmisfit_charges = 2000\n")
+    command = [sys.executable, "-m", "isocharge.cli", "train", "fit", "presses", "--config", "config.toml", "-o"]
+    part = tmp_path / "broken" / "mine" / "1.part"
+    with subprocess.Popen([*command, "broken/mine"], cwd=tmp_path, stderr=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 120.0
+        while not (part / "parts" / "contact.sha256").exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        process.kill()
+    assert part.is_dir()
+    assert not (tmp_path / "broken" / "mine" / "1").exists()
+    for folder in ("broken", "whole"):
+        subprocess.run([*command, f"{folder}/mine"], cwd=tmp_path, check=True, capture_output=True, timeout=200)
+    broken, whole = (onnx.load(tmp_path / name / "mine" / "1" / "model.onnx").graph for name in ("broken", "whole"))
+    assert broken == whole
+    assert not part.exists()

@@ -17,7 +17,11 @@ def main(folder: Path, quick: bool = False) -> Contact:
     dataset = read_dataset(run_sweep(folder / "presses", sensor, (probe,), Sweep(samples=4_000 if quick else 24_000)))
     print(f"{len(dataset.samples)} presses, charges up to {dataset.samples.charge_pC.max():.0f} pC")
 
-    config = FitConfig(training=TrainingConfig(steps=1_500, misfit_steps=300)) if quick else FitConfig()
+    config = (
+        FitConfig(training=TrainingConfig(steps=1_500, misfit_steps=500, misfit_charges=5_000))
+        if quick
+        else FitConfig()
+    )
     release = train_model(dataset, folder / "models" / sensor.name, config)
     for name, value in release.metadata.errors.items():
         print(f"{name:28} {value:g}")

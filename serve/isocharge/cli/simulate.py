@@ -181,7 +181,7 @@ def sweep_command(
         raise InputError("expected either --workers or --cluster, got both")
     film_sensor, probes = load_sensor(sensor), [parse_probe(text) for text in probe or ["circle:1.0"]]
     refuse_finished(output)
-    reach = _auto_radius(film_sensor, probes, force) if radius == "auto" else 1e-3 * _number_mm(radius)
+    reach = auto_radius(film_sensor, probes, force) if radius == "auto" else 1e-3 * number_mm(radius)
     sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)
     try:
         with _crew(workers, cluster) as crew, progress_rows(*SWEEP_ROWS) as (solving, sampled):
@@ -204,14 +204,14 @@ def sweep_command(
     say(f"{json_module.loads((output / 'manifest.json').read_text())['samples']} presses in {output}")
 
 
-def _number_mm(text: str) -> float:
+def number_mm(text: str) -> float:
     try:
         return float(text)
     except ValueError as error:
         raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error
 
 
-def _auto_radius(sensor: "Sensor", probes: "list[Probe]", force: tuple[float, float]) -> float:
+def auto_radius(sensor: "Sensor", probes: "list[Probe]", force: tuple[float, float]) -> float:
     """Radius of the disk that is in the working area of every probe under `reference` noise, m."""
     from isocharge.simulate import noise_model, working_area
     from isocharge.simulate.identify import map_to_search

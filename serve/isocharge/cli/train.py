@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from isocharge.cli.report import report_command
-from isocharge.cli.simulate import PROBE_HELP, _auto_radius, _number_mm
+from isocharge.cli.simulate import PROBE_HELP, auto_radius, number_mm
 from isocharge.cli.terminal import progress, say, this_command
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing
@@ -101,7 +101,7 @@ def _simulate(sensor: str, probes: list[str], radius: str) -> "Dataset":
     from isocharge.simulate import Sweep, load_sensor, parse_probe, read_dataset, run_sweep
 
     film_sensor, pressing, forces = load_sensor(sensor), [parse_probe(text) for text in probes], Sweep().force_range
-    reach = _auto_radius(film_sensor, pressing, forces) if radius == "auto" else 1e-3 * _number_mm(radius)
+    reach = auto_radius(film_sensor, pressing, forces) if radius == "auto" else 1e-3 * number_mm(radius)
     with TemporaryDirectory() as folder, progress("solving the film") as advance:
         sweep = Sweep(reach, samples=SAMPLES)
         return read_dataset(run_sweep(Path(folder) / "presses", film_sensor, pressing, sweep, progress=advance))
