@@ -197,9 +197,10 @@ def made_up() -> Callable[..., Equilibrium]:
         of: Film | None = None,
         probe: Probe = TURNED,
         theory: Theory = FULL,
+        order: int = 5,
     ) -> Equilibrium:
         of = of or load_sensor("three-25um-biaxial").film
-        resolution = Resolution(5, 8, 5, 1)
+        resolution = Resolution(order, 8, 5, 1)
         template = template_for(probe, resolution)
         z = place(of, probe, at, resolution, 0.05).element_points(template).ravel()[template.first_seen]
         values = field(np.stack([z.real, z.imag], axis=1))

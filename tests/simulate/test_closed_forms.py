@@ -314,7 +314,7 @@ def test_linear_theories_are_limits_of_the_nonlinear_ones(film, theory, probe):
         for each in (theory, full)
     ]
     one, two = (touch_charge(sensor, each) for each in solved)
-    np.testing.assert_allclose(one, two, rtol=1e-5)
+    np.testing.assert_allclose(one, two, rtol=3e-5)
     assert solved[0].iterations == 2
 
 

@@ -4,7 +4,7 @@ The film is round and its elasticity isotropic, so every press is solved on the 
 read: one equilibrium serves all angles, electrode layouts and piezoelectric coefficients.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -14,7 +14,7 @@ from isocharge.errors import SceneError
 from isocharge.simulate.arrays import Array, Complexes, Integers
 from isocharge.simulate.geometry import Geometry, film_gradient
 from isocharge.simulate.membrane import strain, stress, turn_stress
-from isocharge.simulate.meshing import mesh_error, place, template_for
+from isocharge.simulate.meshing import LEAST_ERROR, mesh_error, place, template_for
 from isocharge.simulate.placement import Placement
 from isocharge.simulate.probe import Probe
 from isocharge.simulate.scaling import Groups
@@ -49,6 +49,7 @@ class Equilibrium:
         iterations: Linear solves.
         residual: Out-of-balance force over load.
         seconds: Process CPU time of mesh and solve.
+        proven_error: Difference of the charges from those on a mesh of one order less, if that was solved too.
     """
 
     film: Film
@@ -65,6 +66,7 @@ class Equilibrium:
     iterations: int
     residual: float
     seconds: float
+    proven_error: float | None = None
 
     @property
     def estimated_error(self) -> float:
@@ -82,6 +84,8 @@ class Equilibrium:
     @cached_property
     def mesh_error(self) -> float:
         """Relative error of a charge to expect from the mesh."""
+        if self.proven_error is not None:
+            return max(LEAST_ERROR, self.proven_error)
         geometry = Geometry.build(self.mesh, self._nodes)
         return mesh_error(self.mesh, geometry, self._node_slope[..., 2])
 
@@ -122,6 +126,14 @@ class Equilibrium:
     def placement(self) -> Placement:
         """Where the template lies, the press turned onto the x axis."""
         return place(self.film, self.probe, self.at, self.resolution, self.layer)
+
+    def field_of_order(self, order: int) -> Array:
+        """The field on the nodes of the same mesh with elements of another order, shape (n_node, 3)."""
+        other = template_for(self.probe, replace(self.resolution, order=order))
+        values = tensor_values(self.resolution.order, other.xi, other.eta)
+        field = np.empty((other.n_node, 3))
+        field[other.nodes] = values @ self.field[self.mesh.nodes]
+        return field
 
     def deflection(self, points: Array) -> Array:
         """Deflection w at film points.

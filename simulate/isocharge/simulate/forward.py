@@ -22,7 +22,7 @@ from isocharge.simulate.charge import COARSE, FINE, NEAR, ReadoutPoints, contact
 from isocharge.simulate.equilibrium import Equilibrium
 from isocharge.simulate.family import TURNS, Family
 from isocharge.simulate.membrane import turn_stress
-from isocharge.simulate.meshing import layer_for, resolution_for, template_for
+from isocharge.simulate.meshing import layer_for, template_for
 from isocharge.simulate.placement import Placement
 from isocharge.simulate.probe import Probe
 from isocharge.simulate.scaling import amplitude_squared
@@ -107,8 +107,11 @@ class ForwardMap:
         film = sensor.film
         _check_family(film, probe, radius, force_range)
         theory = theory or theory_for(sensor, probe, force_range, accuracy)
-        layer = layer_for(film, float(np.sqrt(force_range[0] * force_range[1])))
-        resolution = resolution or resolution_for(film, probe, (radius, 0.0), theory, accuracy, layer)
+        middle = float(np.sqrt(force_range[0] * force_range[1]))
+        layer = layer_for(film, middle)
+        if resolution is None:
+            outermost = press(film, probe, (radius, 0.0), middle, theory=theory, accuracy=accuracy, layer=layer)
+            resolution = outermost.resolution
         error = np.inf
         for count, turns in (((5, 3), TURNS), ((8, 5), 2 * TURNS), ((13, 8), 3 * TURNS)):
             family = Family.spread(radius, force_range, count, probe.period, turns)

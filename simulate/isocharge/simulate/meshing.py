@@ -22,6 +22,9 @@ LAYER = 6.0
 FINER = ((0, 1), (1, 1), (0, 2), (2, 1), (1, 2), (0, 3), (2, 2), (1, 3), (2, 3), (3, 3))
 """Meshes that are tried in turn: so much higher an order, so many times the elements round the circle."""
 
+RIM_RINGS = 0.8
+"""Thin rings at the rim over the number of thirds that their widths span."""
+
 TOO_COARSE = 0.05
 """Relative error of a charge, as the mesh's shape foretells it, above which a press is refused."""
 
@@ -69,7 +72,7 @@ def resolution_for(
         SceneError: If the press is so near the rim that even the finest mesh carries it badly.
     """
     error = np.inf
-    for resolution in _ladder(film, probe, at, theory, accuracy):
+    for resolution in _ladder(film, probe, at, theory, accuracy, layer):
         points = place(film, probe, at, resolution, layer).element_points(template_for(probe, resolution))
         error = shape_error(template_for(probe, resolution), Geometry.build(template_for(probe, resolution), points))
         if error <= 0.5 * accuracy:
@@ -88,7 +91,9 @@ def too_near_the_rim(film: Film, probe: Probe, at: tuple[float, float], resoluti
     )
 
 
-def _ladder(film: Film, probe: Probe, at: tuple[float, float], theory: Theory, accuracy: float) -> Iterator[Resolution]:
+def _ladder(
+    film: Film, probe: Probe, at: tuple[float, float], theory: Theory, accuracy: float, layer: float
+) -> Iterator[Resolution]:
     """Meshes from coarse to fine; the first is enough in the inner half of the film."""
     placement = place(film, probe, at, Resolution(2, 8, 1), 0.1)
     stretch = float((1.0 + placement.c) / (1.0 - placement.c))
@@ -99,10 +104,18 @@ def _ladder(film: Film, probe: Probe, at: tuple[float, float], theory: Theory, a
         around=16 if crowded else 8,
         rings=max(3, math.ceil(-1.3 * math.log(float(placement.rho)) + min(2.0 * math.log(stretch), 4.0)))
         + sharper // 2,
-        rim=1 + (stretch > 2.5) + (stretch > 8.0) if theory.bending else 0,
+        rim=_thin_rings(placement, layer) if theory.bending else 0,
     )
     for order, around in FINER:
         yield replace(base, order=base.order + order, around=base.around * around)
+
+
+def _thin_rings(placement: Placement, layer: float) -> int:
+    """How many rings at the rim: as many as lead, each a third of the last, from the layer's width beside the probe to
+    its width on the film's far side, where the map has drawn it together."""
+    stretch, depth = float((1.0 + placement.c) / (1.0 - placement.c)), -float(np.log(placement.rho))
+    near, far = min(layer * stretch / depth, 1.0 / 8.0), min(min(layer, 0.2) / stretch / depth, 1.0 / 8.0)
+    return 1 + math.floor(RIM_RINGS * math.log(near / far, 3.0))
 
 
 def shape_error(mesh: Template, geometry: Geometry) -> float:

@@ -34,6 +34,12 @@ DIAGONALS = np.array([0.25, 0.75, 1.25, 1.75])
 CLEARANCE = 0.4
 """Room between a polygon's farthest corner and the circle round it, in units of that corner's distance."""
 
+LARGEST_TURN = 0.2
+"""How far (rad) a sector's side is turned at most from the ray through its corner: clustered corners would fold it."""
+
+INNER_SHARE, OUTER_SHARE = 0.25, 0.35
+"""Beside the rim: that room, and the room between circle and rim, over that between polygon and rim."""
+
 GRADING = 0.65
 """How much of the map's stretching round the rim the sectors take up there: none 0, all 1."""
 
@@ -51,7 +57,8 @@ class Placement:
     Attributes:
         c: The map's parameter, shape (...).
         rho: Radius of the circle in the template, shape (...).
-        corners: Corners of the footprint's polygon on the film, in units of its radius, shape (..., n_corner).
+        corners: Corners of the footprint's polygon and, last, its centroid, the hub, on the film, in units of its
+            radius, shape (..., n_corner + 1).
         start: Angles of the sectors on the circle, shape (..., n_sector + 1).
         end: Angles of the sectors on the rim, shape (..., n_sector + 1).
         depth: Edges of the rings, 0 on the circle and 1 on the rim, shape (..., n_ring + 1).
@@ -86,6 +93,7 @@ class Placement:
             turned = np.exp(1j * np.broadcast_to(turn, at.shape))[..., None]
             corners = at[..., None] + probe.outline / film_radius * turned
             centre, radius = _enclosing(corners, at)
+        corners = np.concatenate([corners, at[..., None]], axis=-1)
         c, rho = _conformal(centre, radius)
         start = _sectors(mesh, corners, centre, radius, c * rho)
         depth = _rings(mesh.resolution, rho, layer * (1.0 + c) / (1.0 - c))
@@ -217,17 +225,17 @@ def _enclosing(corners: Complexes, at: Array) -> tuple[Array, Array]:
 
     def radius(centre: Array) -> Array:
         reach = np.abs(corners - centre[..., None]).max(axis=-1)
-        room = np.minimum(CLEARANCE * reach, 0.4 * gap)
+        room = np.minimum(CLEARANCE * reach, INNER_SHARE * gap)
         total: Array = reach + room
         return total
 
-    fits = at + radius(at) <= 1.0 - 0.5 * gap
+    fits = at + radius(at) <= 1.0 - OUTER_SHARE * gap
     if np.all(fits):
         return at, radius(at)
     low, high = np.zeros(at.shape), at.copy()
     for _ in range(40):
         middle = 0.5 * (low + high)
-        inside = middle + radius(middle) <= 1.0 - 0.5 * gap
+        inside = middle + radius(middle) <= 1.0 - OUTER_SHARE * gap
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
     centre = np.where(fits, at, low)
     return centre, radius(centre)
@@ -236,17 +244,17 @@ def _enclosing(corners: Complexes, at: Array) -> tuple[Array, Array]:
 def _sectors(mesh: Template, corners: Complexes, centre: Array, radius: Array, pull: Array) -> Array:
     """Angles on the template's circle, where rays from the polygon's hub meet it.
 
-    Their directions are half way between those of the polygon's corners and an even spread where there is room between
-    polygon and circle, else nearer to the polygon, lest elements fold. `pull` is c rho.
+    Their directions lie between those of the polygon's corners and an even spread where there is room between polygon
+    and circle, else nearer to the polygon, lest elements fold. `pull` is c rho.
     """
-    hub = corners.mean(axis=-1)[..., None]
+    hub = corners[..., -1:]
     stops = corners @ mesh.boundary[:: mesh.split].T
     angle = np.unwrap(np.angle(stops - hub), axis=-1)
     even = np.linspace(0.0, 2.0 * np.pi / mesh.copies, angle.shape[-1])
     even = even + np.mean(angle[..., :-1] - even[:-1], axis=-1)[..., None]
     reach = np.abs(corners - centre[..., None]).max(axis=-1)
     evenness = 0.5 * np.minimum((radius / reach - 1.0) / CLEARANCE, 1.0)[..., None]
-    mixed = angle + evenness * (even - angle)
+    mixed = angle + LARGEST_TURN * np.tanh(evenness * (even - angle) / LARGEST_TURN)
     share = np.arange(mesh.split) / mesh.split
     steps = (mixed[..., :-1, None] + share * np.diff(mixed, axis=-1)[..., None]).reshape(*mixed.shape[:-1], -1)
     ray = np.exp(1j * np.concatenate([steps, mixed[..., -1:]], axis=-1))

@@ -1,6 +1,6 @@
 """Solving the film under a press."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import process_time
 
 import numpy as np
@@ -22,10 +22,12 @@ from isocharge.simulate.meshing import (
     too_near_the_rim,
 )
 from isocharge.simulate.newton import GUARD_BELOW, NewtonResult, schwerin_start, solve_linear, solve_newton
+from isocharge.simulate.placement import Placement
 from isocharge.simulate.probe import Probe
+from isocharge.simulate.proof import MOST_ORDERS, apart, needs_proof
 from isocharge.simulate.scaling import Groups, amplitude_squared
 from isocharge.simulate.sensor import Film
-from isocharge.simulate.template import Resolution
+from isocharge.simulate.template import Resolution, Template
 from isocharge.simulate.theory import ACCURACY, Theory, choose
 
 LAYER_REUSE = (0.75, 2.0)
@@ -108,22 +110,113 @@ def press(
         SolveError: If no equilibrium was found and `throw` is set.
     """
     check_scene(film, probe, at, force)
-    began = process_time()
     theory = theory or choose(film, probe, force, accuracy)
-    layer = layer or _layer(film, force, probe, resolution, start)
+    began = process_time()
+    scene = _Scene(film, probe, at, force, theory, layer or _layer(film, force, probe, resolution, start), tolerance)
     with single_threaded_blas():
-        resolution = resolution or resolution_for(film, probe, at, theory, accuracy, layer)
-        found, groups = _solve(film, probe, at, force, theory, resolution, layer, start, tolerance)
-    solved = Equilibrium(
-        film, probe, at, force, theory, resolution, layer, found.field, groups,
-        status="converged" if found.converged else "failed",
-        message=found.message,
-        iterations=found.iterations,
-        residual=found.residual,
-        seconds=process_time() - began,
-    )  # fmt: skip
-    if throw and not found.converged:
+        if resolution is None and needs_proof(film, probe, at, accuracy):
+            solved = _proven(scene, accuracy, start)
+        else:
+            solved = scene.solve(resolution or scene.resolution(accuracy), start)
+    solved = replace(solved, seconds=process_time() - began)
+    if throw and solved.status != "converged":
         raise SolveError(_why(solved, tolerance))
+    return solved
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """A press with all that is decided about it but the mesh; the attributes are those of `press`."""
+
+    film: Film
+    probe: Probe
+    at: tuple[float, float]
+    force: float
+    theory: Theory
+    layer: float
+    tolerance: float
+
+    def resolution(self, accuracy: float) -> Resolution:
+        """The coarsest mesh that seems to be enough."""
+        return resolution_for(self.film, self.probe, self.at, self.theory, accuracy, self.layer)
+
+    def solve(self, resolution: Resolution, start: Equilibrium | None) -> Equilibrium:
+        """Solve on one mesh."""
+        mesh, placement = self._mesh(resolution)
+        points = placement.element_points(mesh)
+        geometry = Geometry.build(mesh, points)
+        if np.isinf(shape_error(mesh, geometry)):
+            raise too_near_the_rim(self.film, self.probe, self.at, resolution)
+        solver = assembly(resolution, mesh.corners, 4 if self.theory.bending else 3)
+        elastic = self._elastic(geometry, self.force)
+        if self.theory.stretching:
+            z = placement.to_template(points.ravel()[mesh.first_seen])
+            cold = schwerin_start(z, float(placement.rho), elastic.groups)
+            found = solve_newton(elastic, solver, self._start(start, resolution, cold), self.tolerance)
+            found = found if found.converged else self._by_load_steps(found, geometry, solver, cold)
+        else:
+            found = solve_linear(elastic, solver)
+        return Equilibrium(
+            self.film, self.probe, self.at, self.force, self.theory, resolution, self.layer, found.field,
+            elastic.groups,
+            status="converged" if found.converged else "failed",
+            message=found.message,
+            iterations=found.iterations,
+            residual=found.residual,
+            seconds=0.0,
+        )  # fmt: skip
+
+    def _mesh(self, resolution: Resolution) -> tuple[Template, Placement]:
+        mesh = template_for(self.probe, resolution)
+        return mesh, place(self.film, self.probe, self.at, resolution, self.layer)
+
+    def _elastic(self, geometry: Geometry, force: float) -> ElasticFilm:
+        return ElasticFilm(geometry, Groups.of(self.film, force, bending=self.theory.bending))
+
+    def _start(self, start: Equilibrium | None, resolution: Resolution, cold: Array) -> Array:
+        """A neighbour's field where its mesh is the same, but perhaps for the order; else the cold start."""
+        if start is None or start.mesh.corners != template_for(self.probe, resolution).corners:
+            return cold
+        if replace(start.resolution, order=resolution.order) != resolution:
+            return cold
+        return start.field if start.resolution == resolution else start.field_of_order(resolution.order)
+
+    def _by_load_steps(self, failed: NewtonResult, geometry: Geometry, solver: Assembly, cold: Array) -> NewtonResult:
+        """Follow the equilibrium up from a small force where the film at once runs away into wrinkles."""
+        reached, ratio, steps, field = 0.0, 2.0, failed.iterations, cold
+        wanted = FIRST_LOAD * self.force
+        for _ in range(LOAD_STEPS):
+            near = np.inf if reached else GUARD_BELOW
+            found = solve_newton(self._elastic(geometry, wanted), solver, field, self.tolerance, near)
+            steps += found.iterations
+            if found.converged and wanted == self.force:
+                return replace(found, iterations=steps, message=f"converged in {steps} steps, the load in parts")
+            if found.converged:
+                reached, field = wanted, found.field
+            elif reached == 0.0:
+                break
+            else:
+                ratio = np.sqrt(ratio)
+            wanted = min(self.force, reached * ratio)
+        return replace(failed, iterations=steps)
+
+
+def _proven(scene: _Scene, accuracy: float, start: Equilibrium | None) -> Equilibrium:
+    """Solve on meshes of rising order until two agree to half of the accuracy, or `MOST_ORDERS` have been tried.
+
+    Where a still finer mesh finds no rest, what two meshes agreed on stands, with their difference as its error.
+    """
+    solved = scene.solve(scene.resolution(accuracy), start)
+    for _ in range(MOST_ORDERS):
+        if solved.status != "converged":
+            return solved
+        finer = scene.solve(replace(solved.resolution, order=solved.resolution.order + 1), solved)
+        if finer.status != "converged" and solved.proven_error is not None:
+            return solved
+        error = apart(solved, finer) if finer.status == "converged" else None
+        solved = replace(finer, iterations=solved.iterations + finer.iterations, proven_error=error)
+        if error is not None and error <= 0.5 * accuracy:
+            return solved
     return solved
 
 
@@ -134,65 +227,6 @@ def _layer(film: Film, force: float, probe: Probe, resolution: Resolution | None
         return own
     same = resolution in (None, start.resolution) and template_for(probe, start.resolution) is start.mesh
     return start.layer if same else own
-
-
-def _solve(
-    film: Film,
-    probe: Probe,
-    at: tuple[float, float],
-    force: float,
-    theory: Theory,
-    resolution: Resolution,
-    layer: float,
-    start: Equilibrium | None,
-    tolerance: float,
-) -> tuple[NewtonResult, Groups]:
-    mesh, placement = template_for(probe, resolution), place(film, probe, at, resolution, layer)
-    points = placement.element_points(mesh)
-    geometry = Geometry.build(mesh, points)
-    if np.isinf(shape_error(mesh, geometry)):
-        raise too_near_the_rim(film, probe, at, resolution)
-    solver = assembly(resolution, mesh.corners, 4 if theory.bending else 3)
-    elastic = ElasticFilm(geometry, Groups.of(film, force, bending=theory.bending))
-    if not theory.stretching:
-        return solve_linear(elastic, solver), elastic.groups
-    z = placement.to_template(points.ravel()[mesh.first_seen])
-    cold = schwerin_start(z, float(placement.rho), elastic.groups)
-    first = start.field if start is not None and start.mesh is mesh else cold
-    found = solve_newton(elastic, solver, first, tolerance)
-    if not found.converged:
-        found = _by_load_steps(found, film, force, theory, geometry, solver, cold, tolerance)
-    return found, elastic.groups
-
-
-def _by_load_steps(
-    failed: NewtonResult,
-    film: Film,
-    force: float,
-    theory: Theory,
-    geometry: Geometry,
-    solver: Assembly,
-    cold: Array,
-    tolerance: float,
-) -> NewtonResult:
-    """Follow the equilibrium up from a small force where the film at once runs away into wrinkles."""
-    reached, ratio, steps, field = 0.0, 2.0, failed.iterations, cold
-    wanted = FIRST_LOAD * force
-    for _ in range(LOAD_STEPS):
-        elastic = ElasticFilm(geometry, Groups.of(film, wanted, bending=theory.bending))
-        near = np.inf if reached else GUARD_BELOW
-        found = solve_newton(elastic, solver, field, tolerance, near)
-        steps += found.iterations
-        if found.converged and wanted == force:
-            return replace(found, iterations=steps, message=f"converged in {steps} steps, the load in parts")
-        if found.converged:
-            reached, field = wanted, found.field
-        elif reached == 0.0:
-            break
-        else:
-            ratio = np.sqrt(ratio)
-        wanted = min(force, reached * ratio)
-    return replace(failed, iterations=steps)
 
 
 def _why(solved: Equilibrium, tolerance: float) -> str:

@@ -92,11 +92,11 @@ class Template:
 
     @cached_property
     def boundary(self) -> Array:
-        """Points along the polygon's boundary as weights of its corners, shape (n_sector + 1, n_corner).
+        """Points along the polygon's boundary as weights of its corners and hub, shape (n_sector + 1, n_corner + 1).
 
         From the middle of the edge before the first corner, anticlockwise.
         """
-        unit = np.eye(self.n_corner)
+        unit = np.eye(self.n_corner + 1)[:-1]
         middle = 0.5 * (unit + np.roll(unit, -1, axis=0))
         stops = [middle[-1]]
         for i in range(self.n_meshed):
@@ -107,12 +107,12 @@ class Template:
 
     @cached_property
     def straight(self) -> Array:
-        """Corners (a, b, c, d) of the elements inside the circle as weights of the polygon's corners.
+        """Corners (a, b, c, d) of the elements inside the circle as weights of the polygon's corners and its hub.
 
         The element is (1 - v) (a + t (b - a)) + v (c + t (d - c)); blocks up to the circle have their outer side on it
-        and their c and d here are void. Shape (n_inner, 4, n_corner).
+        and their c and d here are void. Shape (n_inner, 4, n_corner + 1).
         """
-        k, hub = self.split, np.full(self.n_corner, 1.0 / self.n_corner)
+        k, hub = self.split, np.eye(self.n_corner + 1)[-1]
         parts = []
         for i in range(self.n_meshed):
             before, corner, after = (
@@ -126,7 +126,7 @@ class Template:
             parts += [
                 [grid[v, t], grid[v, t + 1], grid[v + 1, t], grid[v + 1, t + 1]] for v in range(k) for t in range(k)
             ]
-        void = np.zeros(self.n_corner)
+        void = np.zeros(self.n_corner + 1)
         parts += [[a, b, void, void] for a, b in pairwise(self.boundary)]
         return np.array(parts)
 
