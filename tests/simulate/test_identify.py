@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import SceneError
+from isocharge.errors import SceneError, SolveError
 from isocharge.simulate import (
     ChargeFunction,
     ChargeSpline,
@@ -17,7 +17,7 @@ from isocharge.simulate import (
     load_sensor,
     noise_model,
 )
-from isocharge.simulate.identify import identify, search_radius
+from isocharge.simulate.identify import identify, map_to_search, search_radius
 from isocharge.simulate.shapes import (
     inner_forces,
     mistake,
@@ -72,11 +72,28 @@ def test_summaries_are_ordered_and_fall_with_the_force(found):
     assert rows[0]["position_rms_mm"] > 2.0 * rows[1]["position_rms_mm"] > rows[2]["position_rms_mm"]
 
 
-def test_the_search_goes_past_the_electrodes_but_not_to_the_rim():
+def test_the_search_goes_over_the_electrodes_but_not_to_the_rim():
     sensor = load_sensor("three-25um-biaxial")
-    assert search_radius(sensor, Circle(1e-3)) == pytest.approx(1e-3 + np.hypot(10.160254e-3, 6.5e-3))
+    assert search_radius(sensor, Circle(1e-3)) == pytest.approx(np.hypot(10.160254e-3, 6.5e-3))
     small = replace(sensor, film=replace(sensor.film, radius=14e-3))
     assert search_radius(small, Circle(1e-3)) == pytest.approx(9.5e-3)
+
+
+def test_where_charges_are_too_rough_it_looks_less_far(monkeypatch):
+    asked = []
+
+    def build(_sensor, _probe, radius, *_, **__):
+        asked.append(radius)
+        if radius > 0.01:
+            raise SolveError("interpolates to 0.001 only")
+        return "a map"
+
+    monkeypatch.setattr(ForwardMap, "build", build)
+    assert map_to_search(load_sensor("three-25um-biaxial"), Circle(1e-3), (0.05, 2.0)) == "a map"
+    assert asked == pytest.approx(12.0617e-3 * np.array([1.0, 0.9, 0.81]), rel=1e-4)
+    monkeypatch.setattr(ForwardMap, "build", lambda *_, **__: build(None, None, 1.0))
+    with pytest.raises(SolveError):
+        map_to_search(load_sensor("three-25um-biaxial"), Circle(1e-3), (0.05, 2.0))
 
 
 def test_the_size_is_told_as_well_as_its_charge():

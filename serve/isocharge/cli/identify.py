@@ -80,10 +80,11 @@ def identify_command(
 
 def _solve(sensor: "Sensor", probe: "Probe", force: tuple[float, float], radius: float | None) -> "ForwardMap":
     from isocharge.simulate import ForwardMap
-    from isocharge.simulate.identify import search_radius
+    from isocharge.simulate.identify import map_to_search
 
     with progress(f"solving the film under {probe.notation}") as advance:
-        radius = search_radius(sensor, probe) if radius is None else radius
+        if radius is None:
+            return map_to_search(sensor, probe, force, advance)
         return ForwardMap.build(sensor, probe, radius, force, progress=advance)
 
 
@@ -130,7 +131,7 @@ def _words(numbers: dict[str, Any]) -> list[str]:
     """What is to be said of size and shape."""
     first = numbers["probe"]
     shapes = [
-        f"{row['probe']} against {first} at {row['force_N']:g} N within {row['within_mm']:.1f} mm: told apart "
+        f"{row['probe']} against {first} at {row['force_N']:.3g} N within {row['within_mm']:.1f} mm: told apart "
         f"({3} standard deviations) at {row['told_apart_share']:.0%} of the places, {row['sigmas_median']:.1f} "
         f"standard deviations at the median, {row['sigmas_most']:.1f} at most; taken for {first} it is felt "
         f"{row['position_error_median_mm']:.3f} mm off at the median, {row['position_error_p95_mm']:.3f} mm at 95 %."

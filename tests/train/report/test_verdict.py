@@ -28,7 +28,7 @@ def test_nothing_beats_it():
 def test_what_beats_it_is_named():
     said = verdict([RELEASED, method("better", "paper", 0.19, 4.0, 2e5), method("worse", "paper", 0.3, 4.0)])
     assert said["both"] == {"latency": ["better"], "throughput": ["better"]}
-    assert "1 of 2 other methods are both" in said["sentences"][0]
+    assert "both faster and more accurate than the released model: 1 of 2 other methods" in said["sentences"][0]
     assert "better (2.5 times as fast, 5 % less error)" in said["sentences"][0]
 
 

@@ -30,7 +30,7 @@ class NetworkConfig:
         electrodes: How many electrodes the dataset has to have; 0 takes what it has.
     """
 
-    hidden: tuple[int, ...] = (64, 64, 64)
+    hidden: tuple[int, ...] = (96, 96, 96)
     misfit_hidden: tuple[int, ...] = (64, 64, 64)
     electrodes: int = 0
 
@@ -66,7 +66,7 @@ class TrainingConfig:
         threads: CPU threads; one is nearly as fast as two at this size and does not suffer when the cores are busy.
     """
 
-    steps: int = 6_000
+    steps: int = 8_000
     finish_steps: int = 0
     misfit_steps: int = 6_000
     misfit_charges: int = 80_000

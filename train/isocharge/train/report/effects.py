@@ -140,7 +140,8 @@ def _measured(case: Case, released: ReleasedModel, rivals: list[Fitted], thresho
     contact, std, misfit = released.answer(case.charge_pC)
     alarm = misfit[:, 0] > threshold
     about = (truth[:, 2] >= ONE_NEWTON[0]) & (truth[:, 2] <= ONE_NEWTON[1])
-    answers = {rival.name: np.clip(rival.predict(case.charge_pC), -FARTHEST, FARTHEST) for rival in rivals}
+    with np.errstate(over="ignore"):
+        answers = {rival.name: np.clip(rival.predict(case.charge_pC), -FARTHEST, FARTHEST) for rival in rivals}
     found = {released.name: contact, **answers}
     return {
         "group": case.group,

@@ -44,8 +44,8 @@ def _sentence(plot: str, released: dict[str, Any], others: Sequence[dict[str, An
     both = [record for record in others if _beats(record, released, key, sign)]
     if both:
         listed = "; ".join(_compared(record, released, key, sign) for record in both)
-        beaten = f"{len(both)} of {len(others)} {kind} are both faster and more accurate than the released model"
-        return f"In {words}, {beaten}: {listed}."
+        count = f"{len(both)} of {len(others)} {kind}"
+        return f"In {words}, both faster and more accurate than the released model: {count}. {listed}."
     faster = [record for record in others if _faster(record, released, key, sign)]
     if not faster:
         return f"In {words}, none of {len(others)} {kind} is faster than the released model."
