@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from isocharge.errors import SceneError, SensorError
 from isocharge.simulate import Circle, ContourField, Electrode, ForwardMap, Resolution, Sensor, Theory, load_sensor
-from isocharge.simulate.charge_table import ChargeTable
+from isocharge.simulate.charge_spline import ChargeSpline
 
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = {"theory": Theory(stretching=True, bending=False, pretensioned=False), "resolution": Resolution(4, 8, 4)}
@@ -34,7 +34,7 @@ class RoundMap:
 @pytest.fixture(scope="module")
 def round_field() -> ContourField:
     made = RoundMap(SENSOR)
-    table = ChargeTable.fit(
+    table = ChargeSpline.fit(
         made.forward, SENSOR.electrode_names, SENSOR.film, RADIUS, np.array([1.0]), (1.0, 1.0), 0.6e-3
     )
     return ContourField(made, table, 1.0)
@@ -58,7 +58,7 @@ def test_contours_of_a_round_field_are_circles(round_field, name, distance_mm):
 def test_a_contour_inside_is_closed():
     sensor = Sensor("one", SENSOR.film, SENSOR.piezo, (Electrode.of_square("A", (1e-3, 2e-3), 3e-3),))
     made = RoundMap(sensor)
-    table = ChargeTable.fit(made.forward, ("A",), sensor.film, RADIUS, np.array([1.0]), (1.0, 1.0), 0.6e-3)
+    table = ChargeSpline.fit(made.forward, ("A",), sensor.film, RADIUS, np.array([1.0]), (1.0, 1.0), 0.6e-3)
     (contour,) = ContourField(made, table, 1.0).contours("A", 1e-9 / (1.0 + 0.4**2))
     assert contour.closed
     assert len(np.unique(np.round(contour.points, 12), axis=0)) > 50
@@ -70,10 +70,10 @@ def test_the_charge_is_constant_on_a_contour(field):
         (contour,) = field.contours("B", charge)
         x, y = contour.points.T
         found = field.forward_map.forward(x, y, np.ones(x.size))[:, 1]
-        slope = np.linalg.norm(field.table.slopes(contour.points, 1.0)[1][:, 1], axis=1)
+        slope = np.linalg.norm(field.table.first_order(contour.points, 1.0)[1][:, 1], axis=1)
         assert np.abs((found - charge) / slope).max() < 1e-7
         for i in (5, len(x) // 2, -6):
-            uphill = field.table.slopes(contour.points[[i]], 1.0)[1][0, 1]
+            uphill = field.table.first_order(contour.points[[i]], 1.0)[1][0, 1]
             across = uphill / np.linalg.norm(uphill)
 
             def miss(step, here=contour.points[i], across=across, charge=charge):

@@ -38,7 +38,7 @@ def film():
 @pytest.fixture(scope="module")
 def charges(film):
     """By sensor, each made once."""
-    return cache(lambda name: ChargeSpline.of(replace(film, sensor=load_sensor(name)), 4e-4))
+    return cache(lambda name: ChargeSpline.of(replace(film, sensor=load_sensor(name)), spacing=4e-4))
 
 
 @pytest.fixture(scope="module")

@@ -128,7 +128,7 @@ def test_uniaxial_charges_tell_the_size_and_biaxial_ones_do_not(film):
     ]
     limits = {}
     for name in ("four-25um-uniaxial", "four-25um-biaxial"):
-        models = [ChargeSpline.of(replace(made, sensor=load_sensor(name)), 2.5e-4) for made in sizes]
+        models = [ChargeSpline.of(replace(made, sensor=load_sensor(name)), spacing=2.5e-4) for made in sizes]
         limits[name] = size_limit(*models, REFERENCE, spread_contacts(4e-3, 1.0, 200))
     assert limits["four-25um-uniaxial"].max() < 0.2
     assert limits["four-25um-biaxial"].min() > 1.0

@@ -19,7 +19,7 @@ from isocharge.simulate import (
     load_sensor,
     noise_model,
 )
-from isocharge.simulate.charge_table import ChargeTable
+from isocharge.simulate.charge_spline import ChargeSpline
 from isocharge.simulate.scaling import amplitude_squared
 
 RADIUS, FORCES = 8e-3, (0.2, 2.0)
@@ -40,11 +40,11 @@ def circles(film: Film, centres: np.ndarray):
     return forward, distance
 
 
-def round_table(sensor) -> tuple[ChargeTable, object, object, np.ndarray]:
+def round_table(sensor) -> tuple[ChargeSpline, object, object, np.ndarray]:
     centres = np.array([electrode.centre for electrode in sensor.electrodes])
     forward, distance = circles(sensor.film, centres)
     nodes = np.geomspace(*FORCES, 3)
-    table = ChargeTable.fit(forward, sensor.electrode_names, sensor.film, RADIUS, nodes, FORCES, 0.6e-3)
+    table = ChargeSpline.fit(forward, sensor.electrode_names, sensor.film, RADIUS, nodes, FORCES, 0.6e-3)
     return table, forward, distance, centres
 
 
@@ -127,7 +127,7 @@ def test_closest_to_meeting_is_scipys_least_squares():
 
     def away(contact):
         here, force = contact[None, :2] * 1e-3, np.exp(contact[2:])
-        value, slope, _ = table.slopes(here, force)
+        value, slope, _ = table.first_order(here, force)
         return 1e3 * ((value - charge) / np.linalg.norm(slope, axis=2))[0]
 
     best = least_squares(away, [2.0, -1.0, np.log(0.8)], xtol=1e-12, ftol=1e-12)
@@ -196,7 +196,7 @@ def test_contours_that_meet_twice():
     sensor = LAYOUTS["three"]
     centres = np.array([[-9e-3, 0.0], [0.0, 0.0], [9e-3, 0.0]])
     forward, _ = circles(sensor.film, centres)
-    table = ChargeTable.fit(forward, ("A", "B", "C"), sensor.film, RADIUS, np.array([1.0]), (1.0, 1.0), 0.6e-3)
+    table = ChargeSpline.fit(forward, ("A", "B", "C"), sensor.film, RADIUS, np.array([1.0]), (1.0, 1.0), 0.6e-3)
     fix = Triangulation(table).locate(forward(np.array([1e-3]), np.array([3e-3]), np.array([1.0])), 1.0)
     assert fix.status.tolist() == [Meeting.twice]
     assert np.isnan([fix.x[0], fix.y[0]]).all()

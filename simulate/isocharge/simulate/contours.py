@@ -13,7 +13,7 @@ from contourpy import LineType, contour_generator
 
 from isocharge.errors import SceneError
 from isocharge.simulate.arrays import Array
-from isocharge.simulate.charge_table import SPACING, ChargeTable, onto_disk
+from isocharge.simulate.charge_spline import ChargeSpline, onto_disk
 from isocharge.simulate.curves import electrode_index
 from isocharge.simulate.forward import ForwardMap
 
@@ -55,14 +55,14 @@ class ContourField:
     """
 
     forward_map: ForwardMap
-    table: ChargeTable
+    table: ChargeSpline
     force: float
 
     @classmethod
     def of(
-        cls, forward_map: ForwardMap, force: float, radius: float | None = None, spacing: float = SPACING
+        cls, forward_map: ForwardMap, force: float, radius: float | None = None, spacing: float | None = None
     ) -> "ContourField":
-        """Of presses within `radius` (m) of the centre, as far as the map reaches if absent; see `ChargeTable.of`.
+        """Of presses within `radius` (m) of the centre, as far as the map reaches if absent; see `ChargeSpline.of`.
 
         Raises:
             SceneError: If the map does not cover the force or the radius.
@@ -70,7 +70,7 @@ class ContourField:
         low, high = forward_map.force_range
         if not low * (1.0 - 1e-9) <= force <= high * (1.0 + 1e-9):
             raise SceneError(f"force: expected {low:g} to {high:g} N, which the forward map covers, got {force:g} N")
-        return cls(forward_map, ChargeTable.of(forward_map, radius, spacing), force)
+        return cls(forward_map, ChargeSpline.of(forward_map, radius, spacing), force)
 
     def contours(self, electrode: str, charge: float) -> tuple[Contour, ...]:
         """The pieces of an electrode's contour of a charge (C); none where no press gives it.
@@ -109,7 +109,7 @@ class ContourField:
         radius = self.table.radius
         line = np.linspace(-radius, radius, 2 * int(np.ceil(radius / GRID)) + 1)
         at = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        return line, line, self.table.charge(at, self.force).reshape(line.size, line.size, -1)
+        return line, line, self.table.first_order(at, self.force)[0].reshape(line.size, line.size, -1)
 
     def _inside(self, line: Array) -> Sequence[Array]:
         """The parts of a traced line that lie on the disk, each up to its edge."""
@@ -136,7 +136,7 @@ class ContourField:
             if active.size == 0:
                 break
             exact = self.forward_map.forward(at[active, 0], at[active, 1], np.full(active.size, self.force))
-            slope = self.table.slopes(at[active], self.force)[1][:, index]
+            slope = self.table.first_order(at[active], self.force)[1][:, index]
             squared = np.maximum(np.sum(slope**2, axis=1), 1e-300)
             step = (charge - exact[:, index])[:, None] * slope / squared[:, None]
             away[active] = np.linalg.norm(step, axis=1)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from isocharge.simulate.arrays import Array, Integers
-from isocharge.simulate.charge_table import ChargeTable, onto_disk
+from isocharge.simulate.charge_spline import ChargeSpline, onto_disk
 
 NODE_SPACING = 0.6e-3
 """Distance of the nodes that are tried, m: contours bend little on this scale."""
@@ -94,13 +94,13 @@ class Nodes:
         side: Nodes along the grid's side.
     """
 
-    table: ChargeTable
+    table: ChargeSpline
     at: Array
     place: Integers
     side: int
 
     @classmethod
-    def of(cls, table: ChargeTable) -> "Nodes":
+    def of(cls, table: ChargeSpline) -> "Nodes":
         """Over a table's disk, edge included."""
         side = 2 * max(4, int(np.ceil(table.radius / NODE_SPACING))) + 1
         line = np.linspace(-1.0, 1.0, side) * table.radius
@@ -111,21 +111,21 @@ class Nodes:
     @cached_property
     def nodal(self) -> Array:
         """Scaled charges at the nodes, shape (n_force, n_node, n_electrode)."""
-        nodal: Array = np.moveaxis(self.table.scaled(self.at), 1, 0)
+        nodal: Array = np.moveaxis(self.table.terms(self.at), 1, 0)
         return nodal
 
     @cached_property
     def gauge(self) -> Array:
         """Length of the slopes at the middle force, over `table.scale`, shape (n_node, n_electrode), 1/m."""
         middle = np.sqrt(np.prod(self.table.force_range))
-        _, slope, _ = self.table.slopes(self.at, middle)
+        _, slope, _ = self.table.first_order(self.at, middle)
         gauge: Array = np.linalg.norm(slope, axis=2) / self.table.scale(middle)
         return np.maximum(gauge, FLAT * np.median(gauge, axis=0))
 
     def charge(self, force: Array) -> Array:
         """Charges at all nodes, forces of shape (n, 1) or (n, n_node), N; (n, n_node, n_electrode), C."""
         n_force, n_node, n_electrode = self.nodal.shape
-        weights = self.table.force_weights(force.ravel()).reshape(*force.shape, n_force)
+        weights = self.table.by_force(np.log(force))
         if force.shape[1] == 1:
             return (weights[:, 0] @ self.nodal.reshape(n_force, -1)).reshape(-1, n_node, n_electrode)
         charge: Array = np.einsum("pnf,fne->pne", weights, self.nodal)

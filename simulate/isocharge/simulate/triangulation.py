@@ -19,7 +19,7 @@ import numpy as np
 
 from isocharge.errors import ChargeError, SceneError, SensorError
 from isocharge.simulate.arrays import Array, Integers
-from isocharge.simulate.charge_table import SPACING, ChargeTable, onto_disk
+from isocharge.simulate.charge_spline import ChargeSpline, onto_disk
 from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.meetings import FLAT, Candidates, Nodes, step_to_meet
 
@@ -101,14 +101,14 @@ class Triangulation:
         tolerance: Distance (m) of crossings from their mean up to which contours meet.
     """
 
-    table: ChargeTable
+    table: ChargeSpline
     tolerance: float = TOLERANCE
 
     def __post_init__(self) -> None:
-        if len(self.table.electrodes) < 3:
+        if self.table.electrodes < 3:
             raise SensorError(
-                f"triangulation needs at least three electrodes, got {len(self.table.electrodes)}: "
-                f"{self.table.electrodes}"
+                f"triangulation needs at least three electrodes, got {self.table.electrodes}: "
+                f"{self.table.electrode_names}"
             )
         if not (np.isfinite(self.tolerance) and self.tolerance > 0.0):
             raise SceneError(f"tolerance: expected a positive length, got {self.tolerance * 1e3} mm")
@@ -119,7 +119,7 @@ class Triangulation:
         forward_map: ForwardMap,
         *,
         radius: float | None = None,
-        spacing: float = SPACING,
+        spacing: float | None = None,
         tolerance: float = TOLERANCE,
     ) -> "Triangulation":
         """From a forward map, whose probe keeps the angle it has.
@@ -127,7 +127,7 @@ class Triangulation:
         Args:
             forward_map: Charges of the sensor under the probe.
             radius: Look within this distance from the centre only, m; as far as the map reaches if absent.
-            spacing: Distance of the knots that the charges are tabled with, m.
+            spacing: Distance of the knots that the charges are tabled with, m; that of `ChargeSpline.of` if absent.
             tolerance: See the class.
 
         Raises:
@@ -138,7 +138,7 @@ class Triangulation:
             raise SensorError(
                 f"triangulation needs at least three electrodes, got {forward_map.sensor.electrode_names}"
             )
-        return cls(ChargeTable.of(forward_map, radius, spacing), tolerance)
+        return cls(ChargeSpline.of(forward_map, radius, spacing), tolerance)
 
     def locate(self, charge: Array, force: Array | float) -> Fix:
         """Positions of presses of known force.
@@ -173,7 +173,7 @@ class Triangulation:
         return self._in_chunks(self._checked(charge), None)
 
     def _checked(self, charge: Array) -> Array:
-        charge, names = np.asarray(charge, dtype=float), self.table.electrodes
+        charge, names = np.asarray(charge, dtype=float), self.table.electrode_names
         if charge.ndim != 2 or charge.shape[1] != len(names):
             raise ChargeError(f"expected charges of shape (n, {len(names)}) for {names}, got shape {charge.shape}")
         if not np.isfinite(charge).all():
@@ -263,7 +263,7 @@ class Triangulation:
 
     def _beside(self, closest: Candidates, *, fixed: bool) -> Candidates:
         """Where a second meeting would be if the map folds between: to both sides where the contours part least."""
-        _, slope, by_force = self.table.slopes(closest.at, closest.force)
+        _, slope, by_force = self.table.first_order(closest.at, closest.force)
         free = self._unit_slopes(slope, by_force, closest.force, fixed=fixed)
         softest = np.linalg.svd(free)[2][:, -1]
         sides = []
@@ -276,7 +276,7 @@ class Triangulation:
         """Gauss-Newton to the point (and, unless fixed, the force) of least mean square distance to the contours."""
         at, force, best = seeds.at, seeds.force, seeds
         for _ in range(STEPS):
-            value, slope, by_force = self.table.slopes(at, force)
+            value, slope, by_force = self.table.first_order(at, force)
             away = (value - charge[seeds.press]) / self._gauge(slope, force)
             best = best.improved(at, force, np.sqrt(np.mean(away**2, axis=1)))
             step = step_to_meet(self._unit_slopes(slope, by_force, force, fixed=fixed), away)
@@ -293,7 +293,7 @@ class Triangulation:
 
     def _cross(self, charge: Array, near: Candidates) -> Candidates:
         """The mean of each triple's crossings near a candidate, averaged over the triples that meet there."""
-        count = len(self.table.electrodes)
+        count = self.table.electrodes
         pairs = list(combinations(range(count), 2))
         crossing = np.stack([self._crossing(charge, near, pair) for pair in pairs], axis=1)
         total, met = np.zeros_like(near.at), np.zeros(len(near.press), dtype=np.intp)
@@ -317,7 +317,7 @@ class Triangulation:
         active = np.arange(len(at))
         for _ in range(STEPS):
             force = near.force[active]
-            value, slope, _ = self.table.slopes(at[active], force)
+            value, slope, _ = self.table.first_order(at[active], force)
             gauge = self._gauge(slope, force)[:, pair]
             away = (value[:, pair] - wanted[active]) / gauge
             going = np.abs(away).max(axis=1) >= CONVERGED

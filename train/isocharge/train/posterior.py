@@ -20,7 +20,7 @@ import numpy as np
 
 from isocharge.errors import ChargeError, InputError
 from isocharge.simulate.arrays import Array, Booleans, Integers
-from isocharge.simulate.charge_spline import ChargeSpline
+from isocharge.simulate.charge_spline import ChargeSpline, onto_disk
 from isocharge.simulate.folds import singular_values
 from isocharge.simulate.force_curve import ForceCurve
 from isocharge.simulate.noise import NoiseModel
@@ -108,13 +108,6 @@ class Cells:
         middle = np.einsum("np,npi->ni", counts, points) / np.maximum(total, 1)
         centre[edge] = np.where(total > 0, middle, onto_disk(centre[edge], radius))
         return share, centre
-
-
-def onto_disk(position: Array, radius: float) -> Array:
-    """Positions, shape (n, 2), or the points of the disk that are nearest to them."""
-    shrink = np.minimum(1.0, radius / np.maximum(np.hypot(*position.T), 1e-300))
-    inside: Array = position * shrink[:, None]
-    return inside
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.simulate.charge_table import SPACING
+from isocharge.simulate.charge_spline import SPACING
 from isocharge.simulate.probe import Circle, Polygon, Probe
 from isocharge.simulate.sensor import Electrode, Readout, Sensor
 from isocharge.simulate.sensor_file import load_sensor

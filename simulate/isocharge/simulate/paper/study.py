@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from isocharge.errors import SolveError
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge import touch_charge
-from isocharge.simulate.charge_table import ChargeTable
+from isocharge.simulate.charge_spline import ChargeSpline
 from isocharge.simulate.curves import Curves, Mapping
 from isocharge.simulate.equilibrium import Equilibrium
 from isocharge.simulate.forward import ForwardMap, Progress
@@ -247,14 +247,14 @@ def _variants(choices: Choices) -> dict[str, Presses]:
 
 def find_eq_4(film: ForwardMap, choices: Choices) -> tuple[tuple[float, float], float]:
     """Where the ratios of eq. 4's charges at 1 N put the press: (x, y) in m, and our charges there over the paper's."""
-    table = ChargeTable.of(film, 1.2 * choices.radius, choices.spacing)
+    table = ChargeSpline.of(film, 1.2 * choices.radius, choices.spacing)
     wanted = np.array([sum(cubic) for cubic in PAPER.cubics]) * 1e-12
 
     def miss(at_mm: Array) -> Array:
-        charge = table.charge(1e-3 * at_mm[None], FORCE)[0]
+        charge = table.first_order(1e-3 * at_mm[None], FORCE)[0][0]
         away: Array = np.log(charge[1:] / charge[0]) - np.log(wanted[1:] / wanted[0])
         return away
 
     found = least_squares(miss, np.array([0.0, -4.0])).x * 1e-3
-    factor = table.charge(found[None], FORCE)[0] / wanted
+    factor = table.first_order(found[None], FORCE)[0][0] / wanted
     return (float(found[0]), float(found[1])), float(np.mean(factor))
