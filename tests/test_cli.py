@@ -50,6 +50,7 @@ SUBCOMMANDS = [
     ("simulate",),
     ("simulate", "point"),
     ("simulate", "sweep"),
+    ("simulate", "identify"),
     ("train",),
     ("train", "fit"),
     ("serve",),

@@ -1,6 +1,7 @@
 """Folds, twins and the working area on maps whose folds are known, and on the real sensors."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -35,17 +36,15 @@ def film():
 
 
 @pytest.fixture(scope="module")
-def area(film):
-    """Working areas by sensor, each made once."""
-    made = {}
+def charges(film):
+    """By sensor, each made once."""
+    return cache(lambda name: ChargeSpline.of(replace(film, sensor=load_sensor(name)), 4e-4))
 
-    def of(name):
-        if name not in made:
-            charges = ChargeSpline.of(replace(film, sensor=load_sensor(name)), 4e-4)
-            made[name] = working_area(charges, REFERENCE)
-        return made[name]
 
-    return of
+@pytest.fixture(scope="module")
+def area(charges):
+    """Working areas by sensor, each found once."""
+    return cache(lambda name: working_area(charges(name), REFERENCE))
 
 
 @pytest.mark.parametrize("extra", [None, 0.0], ids=["three charges", "a fourth that tells nothing"])
@@ -163,11 +162,10 @@ def test_twins_of_a_biaxial_film_are_mirror_images_in_the_electrodes_circle(area
         ("four-25um-biaxial", 10e-3, 0.1, 0.13e-3, 0.005),
     ],
 )
-def test_limits_of_the_prototype(film, name, reach, force, position, relative):
+def test_limits_of_the_prototype(charges, name, reach, force, position, relative):
     """Medians over the area, as the design notes them, to one or two digits."""
-    charges = ChargeSpline.of(replace(film, sensor=load_sensor(name)), 4e-4)
     rings = Rings.spread(reach)
-    limits = limits_at(charges, rings.contacts(force), REFERENCE)
+    limits = limits_at(charges(name), rings.contacts(force), REFERENCE)
     area_weights = np.repeat(rings.distance, rings.position.shape[1])
     order = np.argsort(limits.position)
     half = np.searchsorted(np.cumsum(area_weights[order]), 0.5 * area_weights.sum())

@@ -5,7 +5,8 @@ import pytest
 from scipy import stats
 
 from isocharge.errors import InputError
-from isocharge.simulate import noise_model
+from isocharge.simulate import load_amplifier, noise_model
+from isocharge.simulate.amplifier import LEVELS
 
 
 @pytest.mark.parametrize(("charge", "sigma"), [(0.0, 1e-12), (500e-12, np.sqrt(2.0) * 1e-12), (3e-9, 6.0827625e-12)])
@@ -53,5 +54,40 @@ def test_metadata_has_units():
 
 
 def test_unknown_level_names_the_known_ones():
-    with pytest.raises(InputError, match="noise level: expected one of clean, reference, got 'surgery'"):
-        noise_model("surgery")
+    with pytest.raises(
+        InputError, match="expected one of clean, reference, bench, surgery, or a TOML file, got 'loud'"
+    ):
+        noise_model("loud")
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_level_is_the_same_noise_for_all(level):
+    """Training and limits take charges one by one, the virtual sensor in time: from one level the same noise."""
+    assert noise_model(level) == load_amplifier(level).noise
+
+
+def test_noise_from_a_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('like = "reference"\nwhite_pC = 0.5\ntau_s = 3.0\n')
+    made = noise_model(str(path))
+    assert made.name == "mine"
+    assert made.white == pytest.approx(0.5e-12)
+    assert made.gain == 0.002
+    assert made.to_dict() == {"name": "mine", "white_pC": 0.5, "gain": 0.002}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("white = 1.0", "unknown key 'white'"), ("white_pC = -1.0", "white_pC"), ('like = "loud"', "like"), ("x", "TOML")],
+)
+def test_a_wrong_file_is_refused(tmp_path, text, words):
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        noise_model(str(path))
+
+
+def test_variance_is_the_square():
+    charge = np.linspace(-1e-9, 1e-9, 7)
+    model = noise_model("reference")
+    np.testing.assert_allclose(model.variance(charge), model.sigma(charge) ** 2)

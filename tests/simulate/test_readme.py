@@ -16,7 +16,7 @@ README = (SIMULATE / "README.md").read_text("utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=["one press", "many presses", "a dataset"])
+@pytest.mark.parametrize("example", EXAMPLES, ids=["one press", "many presses", "a dataset", "working area"])
 def test_example_runs(example, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     exec(compile(example, "simulate/README.md", "exec"), {})

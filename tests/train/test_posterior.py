@@ -122,6 +122,17 @@ def test_as_brute_force(charges, contact):
     assert (np.abs(mean[0] - expected_mean) < 0.01 * expected_std).all()
 
 
+def test_noise_that_grows_with_the_charge_speaks_for_small_ones(charges):
+    """The likelihood's 1 / sigma counts: it moves the mean by a tenth of a deviation here."""
+    loud = NoiseModel("loud", 1e-12, 0.05)
+    charge = charges.charge(np.array([[1e-3, 2e-3, 0.4]]))
+    mean, std = Posterior(charges, loud, charges.radius).mean_and_std(charge)
+    centre, reach = np.append(mean[0, :2], np.log(mean[0, 2])), 6.0 * np.append(std[0, :2], std[0, 2] / mean[0, 2])
+    expected_mean, expected_std = brute_force(charges, loud, charge[0], centre, reach, (70, 70, 70))
+    assert std[0] == pytest.approx(expected_std, rel=0.01)
+    assert (np.abs(mean[0] - expected_mean) < 0.01 * expected_std).all()
+
+
 def test_deviations_are_as_large_as_errors(charges):
     """Simulated presses and their noise: the squares of error over deviation are one on average."""
     contact, charge = spread(charges, 300, seed=3)

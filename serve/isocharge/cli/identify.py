@@ -1,7 +1,7 @@
 """`isocharge simulate identify`: what the charges of a sensor can tell about a press."""
 
 import json as json_module
-from math import isfinite
+from math import degrees, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -57,9 +57,13 @@ def identify_command(
 
     if output is not None:
         refuse_existing(output)
+    if size and probe and not probe[0].startswith("circle"):
+        raise InputError(f"--size: expected a circle first, whose radius is its size, got {probe[0]!r}")
     if not (isfinite(error) and error > 0.0):
         raise InputError(f"--error: expected a positive number of mm, got {error}")
     film_sensor, level = load_sensor(sensor), noise_model(noise)
+    if level.white <= 0.0:
+        raise InputError(f"--noise: expected white noise above 0 pC, got {noise!r}: without it nothing limits")
     probes = [parse_probe(text) for text in probe or ["circle:1.0"]]
     reach = None if radius is None else 1e-3 * radius
     maps = [_solve(film_sensor, each, force, reach) for each in probes]
@@ -76,10 +80,11 @@ def identify_command(
 
 def _solve(sensor: "Sensor", probe: "Probe", force: tuple[float, float], radius: float | None) -> "ForwardMap":
     from isocharge.simulate import ForwardMap
-    from isocharge.simulate.identify import search_radius
+    from isocharge.simulate.identify import map_to_search
 
     with progress(f"solving the film under {probe.notation}") as advance:
-        radius = search_radius(sensor, probe) if radius is None else radius
+        if radius is None:
+            return map_to_search(sensor, probe, force, advance)
         return ForwardMap.build(sensor, probe, radius, force, progress=advance)
 
 
@@ -92,8 +97,13 @@ def _mistakes(found: "list[Identification]") -> list[dict[str, Any]]:
         reach = min(first.area.radius, other.area.radius)
         for force in inner_forces(first.area.force_range) if reach else ():
             taken = mistake(other.charges, first.charges, first.noise, spread_contacts(reach, force))
-            rows.append({"probe": other.probe.notation, "within_mm": 1e3 * reach, **taken.to_dict()})
+            rows.append({"probe": _name(other.probe), "within_mm": 1e3 * reach, **taken.to_dict()})
     return rows
+
+
+def _name(probe: "Probe") -> str:
+    """As on the command line, with the angle."""
+    return probe.notation + (f"@{degrees(probe.angle):.4g}" if probe.angle else "")
 
 
 def _size(made: "ForwardMap", found: "Identification") -> list[dict[str, Any]]:
@@ -121,7 +131,7 @@ def _words(numbers: dict[str, Any]) -> list[str]:
     """What is to be said of size and shape."""
     first = numbers["probe"]
     shapes = [
-        f"{row['probe']} against {first} at {row['force_N']:g} N within {row['within_mm']:.1f} mm: told apart "
+        f"{row['probe']} against {first} at {row['force_N']:.3g} N within {row['within_mm']:.1f} mm: told apart "
         f"({3} standard deviations) at {row['told_apart_share']:.0%} of the places, {row['sigmas_median']:.1f} "
         f"standard deviations at the median, {row['sigmas_most']:.1f} at most; taken for {first} it is felt "
         f"{row['position_error_median_mm']:.3f} mm off at the median, {row['position_error_p95_mm']:.3f} mm at 95 %."

@@ -213,13 +213,13 @@ def number_mm(text: str) -> float:
 
 def auto_radius(sensor: "Sensor", probes: "list[Probe]", force: tuple[float, float]) -> float:
     """Radius of the disk that is in the working area of every probe under `reference` noise, m."""
-    from isocharge.simulate import ForwardMap, noise_model, working_area
-    from isocharge.simulate.identify import search_radius
+    from isocharge.simulate import noise_model, working_area
+    from isocharge.simulate.identify import map_to_search
 
     areas = []
     for probe in probes:
         with progress_rows((f"finding the working area of {probe.notation}", "solves")) as (advance,):
-            made = ForwardMap.build(sensor, probe, search_radius(sensor, probe), force, progress=advance)
+            made = map_to_search(sensor, probe, force, advance)
         areas.append(working_area(made, noise_model("reference")))
         say(f"{probe.notation}: {areas[-1].words}")
     radius = min(area.radius for area in areas)

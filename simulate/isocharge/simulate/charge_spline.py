@@ -1,4 +1,4 @@
-"""The forward map as splines: the same charges some fifty times faster, and their derivatives.
+"""The forward map as splines: the same charges some two hundred times faster, and their derivatives.
 
 Charges over the amplitude's square, which takes most of the force out of them (`isocharge.simulate.scaling`), are
 tabulated on a polar grid, cubic splines along both directions, and at a few forces, Lagrange's polynomials in the

@@ -8,7 +8,7 @@ import numpy as np
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.noise import NoiseModel
 
-STEPS = 5
+STEPS = 4
 """Steps towards the best force; each is right to second order in what the exponent leaves out."""
 
 FAR = 30.0

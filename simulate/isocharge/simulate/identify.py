@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.errors import SolveError
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge_spline import ChargeSpline
 from isocharge.simulate.folds import Rings, scaled_jacobian, singular_values
-from isocharge.simulate.forward import ForwardMap
+from isocharge.simulate.forward import ForwardMap, Progress
 from isocharge.simulate.limits import limits_at
 from isocharge.simulate.noise import NoiseModel
 from isocharge.simulate.probe import Probe
@@ -17,6 +18,9 @@ from isocharge.simulate.working_area import ERROR, WorkingArea, working_area
 
 CLEAR = 0.75
 """Share of the film's radius up to which is looked at most: nearer to the rim presses cost ever more."""
+
+RETREAT, RETREATS = 0.9, 3
+"""Factor by which to look less far where the charges cannot be interpolated, and how often at most."""
 
 
 @dataclass(frozen=True)
@@ -137,13 +141,31 @@ def identify(
 
 
 def search_radius(sensor: Sensor, probe: Probe) -> float:
-    """How far from the centre to look for the working area, m: until the probe has left the outermost electrode.
+    """How far from the centre to look for the working area, m: to the outermost corner of an electrode.
 
     Electrodes that surround the working area bound it, mostly by a fold through themselves.
     """
     corners = np.concatenate([sensor.calibration.place(np.array(e.corners)) for e in sensor.electrodes])
-    outermost = float(np.hypot(*corners.T).max()) + probe.reach
-    return min(outermost, CLEAR * sensor.film.radius - probe.reach)
+    return min(float(np.hypot(*corners.T).max()), CLEAR * sensor.film.radius - probe.reach)
+
+
+def map_to_search(
+    sensor: Sensor, probe: Probe, force_range: tuple[float, float], progress: Progress | None = None
+) -> ForwardMap:
+    """A forward map that reaches as far as the working area is looked for, or nearly: where the charges are too rough
+    to interpolate so far out, less far.
+
+    Raises:
+        SceneError: If some presses cannot exist.
+        SolveError: If an equilibrium or the wanted interpolation error was not reached.
+    """
+    radius = search_radius(sensor, probe)
+    for _ in range(RETREATS):
+        try:
+            return ForwardMap.build(sensor, probe, radius, force_range, progress=progress)
+        except SolveError:
+            radius *= RETREAT
+    return ForwardMap.build(sensor, probe, radius, force_range, progress=progress)
 
 
 def _quantile(values: Array, weights: Array, share: float) -> float:

@@ -65,8 +65,8 @@ class WorkingArea:
             parts.append(f"Farther out the position error exceeds {_mm(self.error)} at {low:g} N.")
         if np.isfinite(self.fold_radius):
             parts.append(
-                f"The map folds {_mm(self.fold_radius)} from the centre: contacts on both sides of the fold give the "
-                "same charges, and no method can tell them apart."
+                f"The map folds {1e3 * self.fold_radius:.1f} mm from the centre: contacts on both sides of the fold "
+                "give the same charges, and no method can tell them apart."
             )
         if len(self.twins):
             parts.append(_twin_words(self.twins))

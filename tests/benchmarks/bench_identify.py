@@ -1,0 +1,55 @@
+"""What the built-in sensors' charges can tell: the table and the picture of simulate/README.md.
+
+    python tests/benchmarks/bench_identify.py [-o simulate/pictures/identify.png]
+
+One family of presses serves all four: layouts and coefficients only read it differently.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from isocharge.cli.identify_picture import TICKS, draw_limit_map
+from isocharge.files import write_whole
+from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
+from isocharge.simulate.identify import identify, search_radius
+
+SENSORS = ("three-25um-biaxial", "three-25um-uniaxial", "four-25um-biaxial", "four-25um-uniaxial")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("-o", "--output", type=Path, help="PNG to write")
+    output = parser.parse_args().output
+    probe = Circle(1e-3)
+    widest = max((load_sensor(name) for name in SENSORS), key=lambda sensor: search_radius(sensor, probe))
+    film = ForwardMap.build(widest, probe, search_radius(widest, probe))
+    figure = Figure(figsize=(11.5, 10.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    all_axes = figure.subplots(2, 2)
+    print("| sensor | working area | first fold | position, 0.05 N, 1 N | force, 0.05 N, 1 N |\n|---|---|---|---|---|")
+    for name, axes in zip(SENSORS, all_axes.ravel(), strict=True):
+        found = identify(replace(film, sensor=load_sensor(name)), noise_model("reference"))
+        weak, one, _ = (made.summary(found.area.radius) for made in found.maps)
+        print(
+            f"| {name} | {1e3 * found.area.radius:.1f} mm | {1e3 * found.area.fold_radius:.1f} mm | "
+            f"{weak['position_median_mm']:.3f}, {one['position_median_mm']:.3f} mm | "
+            f"{weak['force_median_percent']:.2f}, {one['force_median_percent']:.2f} % |"
+        )
+        shades = draw_limit_map(axes, found, found.maps[1])
+        axes.set_title(f"{name}: {axes.get_title()}", fontsize=10)
+    if output:
+        figure.colorbar(
+            shades, ax=all_axes, label="least position error (rms), mm", ticks=TICKS, format="%g", shrink=0.7
+        )
+        draft = output.with_suffix(".new.png")
+        figure.savefig(draft, dpi=80)
+        write_whole(output, draft.read_bytes())
+        draft.unlink()
+
+
+if __name__ == "__main__":
+    main()
