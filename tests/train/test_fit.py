@@ -100,21 +100,12 @@ def test_a_configuration_for_more_electrodes_is_refused(dataset):
         fit_network(dataset, four)
 
 
-def test_without_a_better_network_it_ends_early_and_keeps_the_best(dataset):
-    """A rate that throws the weights about: stopped by patience, and the best network that was seen is kept."""
-    wild = replace(TINY.training, steps=20_000, patience=400, learning_rate=0.9)
-    seen = []
-    fit_network(dataset, replace(TINY, training=wild), lambda done, _, words: seen.append((done, words)))
-    contact = [words for _, words in seen if words.startswith("contact")]
-    assert len(contact) < 100
-
-
 def test_without_noise_the_finish_reaches_what_first_order_does_not(dataset):
     """Clean charges, the same small network: Levenberg-Marquardt halves the error, and says how large it is."""
     small = NetworkConfig((12, 12), (8, 8))
     clean = TrainingConfig(steps=300, misfit_steps=1, misfit_charges=1_000, batch=256, noise="clean")
     errors = []
-    for steps in (0, 25):
+    for steps in (0, 15):
         fit = fit_network(dataset, FitConfig(small, replace(clean, finish_steps=steps)))
         found, std, _ = predict_with(fit)(fit.held.charge_pC)
         errors.append(np.median(position_error(found, fit.held.contact)))

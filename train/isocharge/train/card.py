@@ -87,6 +87,6 @@ def _what_misfit_sees(metadata: ModelMetadata) -> str:
     if len(metadata.electrodes) == 3:
         return (
             "Three charges and three unknowns: nearly every triple fits some contact, so it sees only what leads out\n"
-            f"of the working area or the forces. {found}"
+            f"of the working area or the forces.\n{found}"
         )
-    return f"Charges that disagree with each other (a wrong gain, a dead electrode, two presses) raise it. {found}"
+    return f"Charges that disagree with each other (a wrong gain, a dead electrode, two presses) raise it.\n{found}"

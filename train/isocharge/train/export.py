@@ -62,7 +62,7 @@ def export_onnx(network: InverseNetwork, properties: Mapping[str, str]) -> bytes
     """
     build, n_electrode = GraphBuilder(), network.features.typical.size
     within = build.add("Clip", "charge_pC", build.constant(LOWEST_PC), build.constant(HIGHEST_PC))
-    ratios = build.add("Mul", within, build.constant(1.0 / network.features.typical))  # logarithms near zero: digits
+    ratios = build.add("Mul", within, build.constant(1.0 / network.features.typical))
     answers = _perceptrons(build, network, build.add("Log", ratios))
     plane, logs, missing = build.split(answers, ("plane", "logs", "missing"), (2, 4, n_electrode), axis=1)
     force, _ = build.split(build.add("Exp", logs), ("force", "contact_std"), (1, 3), axis=1)
@@ -92,16 +92,17 @@ def _perceptrons(build: GraphBuilder, network: InverseNetwork, logs: str) -> str
     Columns of the result: x_mm and y_mm (2), ln F (1), logarithms of the standard deviations in mm and N (3), the
     squeezed vector of the misfit (n_electrode).
     """
-    whitening, value = network.features.matrix, logs
+    whitening, mean = network.whitening.double().numpy(), network.logs_mean.double().numpy()
+    value = logs
     *hidden, last = zip(network.contact.layers(), network.missing.layers(), strict=True)
     for number, (first, second) in enumerate(hidden):
         both = block_diag(*map(_matrix, (first, second))) if number else whitening @ _side_by_side(first, second)
-        value = build.add("Gemm", value, build.constant(both), build.constant(np.r_[_bias(first), _bias(second)]))
-        value = build.add("Tanh", value)
+        bias = np.r_[_bias(first), _bias(second)] - (0.0 if number else mean @ both)
+        value = build.add("Tanh", build.add("Gemm", value, build.constant(both), build.constant(bias)))
     units, shift = _in_units(network)
-    bias = build.constant(np.r_[_bias(last[0]), _bias(last[1])] @ units + shift)
     straight = whitening @ _side_by_side(network.contact.straight, network.missing.straight) @ units
-    beside = build.add("Gemm", logs, build.constant(straight), bias)
+    bias = np.r_[_bias(last[0]), _bias(last[1])] @ units + shift - mean @ straight
+    beside = build.add("Gemm", logs, build.constant(straight), build.constant(bias))
     return build.add("Gemm", value, build.constant(block_diag(*map(_matrix, last)) @ units), beside)
 
 

@@ -29,23 +29,28 @@ MISFIT_UNIT = 5.0
 
 @dataclass(frozen=True)
 class Features:
-    """Whitened logarithms of the charges: x = ln(clip(Q) / typical) @ matrix.
+    """Whitened logarithms of the charges: x = (ln(clip(Q) / typical) - mean) @ matrix.
 
     Attributes:
-        typical: Geometric mean of each charge, shape (n_electrode,), pC.
+        typical: The power of two nearest to each charge's geometric mean, shape (n_electrode,), pC: dividing by it
+            costs a float32 no digit, and the logarithms are small enough to keep theirs.
+        mean: Of the logarithms, shape (n_electrode,).
         matrix: Shape (n_electrode, n_electrode).
     """
 
     typical: Array
+    mean: Array
     matrix: Array
 
     @classmethod
     def fit(cls, charge_pC: Array) -> "Features":
         """From clean charges, shape (n, n_electrode): zero mean, unit covariance along the principal axes."""
-        logs = np.log(np.clip(charge_pC, LOWEST_PC, HIGHEST_PC))
+        within = np.clip(charge_pC, LOWEST_PC, HIGHEST_PC)
+        typical = 2.0 ** np.round(np.log2(within).mean(axis=0))
+        logs = np.log(within / typical)
         mean = logs.mean(axis=0)
         _, singular, axes = np.linalg.svd(logs - mean, full_matrices=False)
-        return cls(np.exp(mean), axes.T * (np.sqrt(len(logs)) / np.maximum(singular, 1e-12)))
+        return cls(typical, mean, axes.T * (np.sqrt(len(logs)) / np.maximum(singular, 1e-12)))
 
 
 class Perceptron(nn.Module):
@@ -92,6 +97,7 @@ class InverseNetwork(nn.Module):
     centre: Tensor
     scale: Tensor
     typical: Tensor
+    logs_mean: Tensor
     whitening: Tensor
 
     def __init__(
@@ -106,13 +112,15 @@ class InverseNetwork(nn.Module):
             ("centre", domain.centre),
             ("scale", domain.scale),
             ("typical", features.typical),
+            ("logs_mean", features.mean),
             ("whitening", features.matrix),
         ):
             self.register_buffer(name, torch.tensor(values).float())
 
     def inputs(self, charge_pC: Tensor) -> Tensor:
         """What both perceptrons see, finite for any charges (n, n_electrode), pC."""
-        return torch.log(charge_pC.clamp(LOWEST_PC, HIGHEST_PC) / self.typical) @ self.whitening
+        logs = torch.log(charge_pC.clamp(LOWEST_PC, HIGHEST_PC) / self.typical)
+        return (logs - self.logs_mean) @ self.whitening
 
     def posterior(self, charge_pC: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation of the unit coordinates, each (n, 3)."""

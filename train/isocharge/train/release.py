@@ -4,6 +4,7 @@ A run that was stopped or killed leaves `<name>/<version>.part`; the same call g
 model.
 """
 
+import copy
 import platform
 import warnings
 from dataclasses import dataclass
@@ -196,9 +197,11 @@ def _many_charges(fit: Fit) -> np.ndarray:
 
 
 def _compare(graph: bytes, fit: Fit, charge_pC: np.ndarray, slack: float) -> None:
-    """The file must answer as the network does."""
+    """The file must answer as the network does, which is computed in double precision here."""
     answers = run(open_session(graph, "the exported graph"), charge_pC)
-    for mine, (name, theirs) in zip(predict_with(fit)(charge_pC), answers.items(), strict=True):
+    with torch.no_grad():
+        exact = [tensor.numpy() for tensor in copy.deepcopy(fit.network).double()(torch.tensor(charge_pC).double())]
+    for mine, (name, theirs) in zip(exact, answers.items(), strict=True):
         unit, limit = AGREEMENT[name]
         apart = np.max(np.abs(mine - theirs) / np.maximum(np.abs(mine), unit), axis=1)
         nearly_all, all_of_them = float(np.quantile(apart, NEARLY_ALL)), float(apart.max())
