@@ -44,6 +44,17 @@ def test_command_line_example_runs_line_by_line(tmp_path):
     assert (tmp_path / "models/mine/1/model.onnx").is_file()
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_study_examples_run(tmp_path):
+    (example,) = (block for block in blocks(README, "sh") if "simulate paper" in block)
+    sweep = "isocharge simulate sweep three-25um-biaxial --samples 3000 -o presses"
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    subprocess.run(["bash", "-ec", f"{sweep}\n{example}"], cwd=tmp_path, env=environment, timeout=3600, check=True)
+    assert (tmp_path / "paper" / "paper.md").is_file()
+    assert (tmp_path / "report" / "report.md").is_file()
+
+
 def test_train_example_runs(tmp_path, monkeypatch, capsys):
     from isocharge.simulate import Circle, Sweep, load_sensor, run_sweep
 
