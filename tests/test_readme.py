@@ -50,9 +50,18 @@ def test_train_example_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     run_sweep(Path("presses"), load_sensor("three-25um-biaxial"), (Circle(1e-3),), Sweep(samples=2000))
     Path("quick.toml").write_text("[training]\nsteps = 50\nmisfit_steps = 20\nmisfit_charges = 2000\n")
-    (example,) = blocks(TRAIN, "python")
+    (example,) = (block for block in blocks(TRAIN, "python") if "train_model" in block)
     exec(compile(example, "train/README.md", "exec"), {})
     assert "position_median_mm" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_bayes_limit_is_what_train_says(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ISOCHARGE_CACHE", str(tmp_path))
+    (example,) = (block for block in blocks(TRAIN, "python") if "bayes_limit" in block)
+    exec(compile(example, "train/README.md", "exec"), {})
+    said = re.search(r"print\(bayes_limit.*# ([\d.]+)", example)
+    assert f"{float(capsys.readouterr().out):.3f}" == said[1]
 
 
 def test_every_module_of_train_is_listed():

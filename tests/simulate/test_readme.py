@@ -8,11 +8,19 @@ import numpy as np
 import pytest
 
 import isocharge.simulate
-from isocharge.simulate import built_in_sensors, press, sensor_from_dict, touch_charge
+from isocharge.simulate import (
+    built_in_sensors,
+    load_amplifier,
+    noise_model,
+    press,
+    sensor_from_dict,
+    touch_charge,
+)
 from isocharge.simulate.dataset import COLUMNS
 
 SIMULATE = Path(__file__).parents[2] / "simulate"
 README = (SIMULATE / "README.md").read_text("utf-8")
+TABLES = re.findall(r"```toml\n(.*?)```", README, re.DOTALL)
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
@@ -65,7 +73,7 @@ def test_accuracy_table(reference_cases, further_cases):
 
 
 def test_sensor_file_can_be_read():
-    (text,) = re.findall(r"```toml\n(.*?)```", README, re.DOTALL)
+    (text,) = (block for block in TABLES if "[film]" in block)
     sensor = sensor_from_dict(tomllib.loads(text))
     assert sensor.electrode_names == ("A", "B")
     assert sensor.calibration.gain == {"A": 1.02}
@@ -78,3 +86,10 @@ def test_names_are_complete():
         assert f"`{name}`" in README
     for column in COLUMNS:
         assert f"`{column}`" in README
+
+
+def test_noise_file_can_be_read(tmp_path):
+    (text,) = (block for block in TABLES if "white_pC" in block)
+    (tmp_path / "mine.toml").write_text(text)
+    assert noise_model(str(tmp_path / "mine.toml")).gain == 0.001
+    assert load_amplifier(str(tmp_path / "mine.toml")).tau == 5.0

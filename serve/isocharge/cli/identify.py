@@ -37,7 +37,7 @@ def identify_command(
     ] = 1.0,
     radius: Annotated[
         float | None,
-        typer.Option("--radius", help="How far from the centre to look, mm. (default: past the electrodes)"),
+        typer.Option("--radius", help="How far from the centre to look, mm. (default: to the electrodes' far corners)"),
     ] = None,
     size: Annotated[bool, typer.Option("--size", help="Ask whether the charges tell a circle's radius, too.")] = False,
     output: Annotated[
