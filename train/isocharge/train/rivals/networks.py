@@ -47,7 +47,7 @@ class Folded:
     @classmethod
     def of(cls, network: InverseNetwork) -> "Folded":
         """From a trained network."""
-        whitening, logs = network.features.matrix, np.log(network.features.typical)
+        whitening, logs = network.features.matrix, np.log(network.features.typical) + network.features.mean
         layers = [_parameters(layer) for layer in network.contact.layers()]
         weight, bias = layers[0]
         first = whitening @ weight
@@ -157,7 +157,8 @@ class TorchNetwork(Fitted):
     def memory(self) -> int:
         """See `Fitted.memory`: the contact network and its normalisation."""
         buffer = io.BytesIO()
-        parts = {name: getattr(self.network, name) for name in ("typical", "whitening", "scale", "centre")}
+        names = ("typical", "logs_mean", "whitening", "scale", "centre")
+        parts = {name: getattr(self.network, name) for name in names}
         torch.save({**self.network.contact.state_dict(), **parts}, buffer)
         return buffer.tell()
 
