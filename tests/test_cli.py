@@ -12,23 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from isocharge.cli import main, terminal
+from isocharge.cli import terminal
 
 SENSOR = "three-25um-biaxial"
-
-
-@pytest.fixture
-def command(monkeypatch, capsys):
-    """Run `isocharge ...` in this process: (exit code, stdout, stderr)."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["isocharge", *map(str, words)])
-        with pytest.raises(SystemExit) as done:
-            main()
-        out, err = capsys.readouterr()
-        return int(done.value.code or 0), out, err
-
-    return run
 
 
 def sensor_file(folder, **changes):

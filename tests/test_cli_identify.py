@@ -1,28 +1,11 @@
 """`isocharge simulate identify` and `sweep --radius auto` as a user meets them."""
 
 import json
-import sys
 
 import pytest
 from matplotlib.image import imread
 
-from isocharge.cli import main
-
 UNIAXIAL = ("simulate", "identify", "three-25um-uniaxial", "--radius", "4", "--force", "0.5", "1")
-
-
-@pytest.fixture
-def command(monkeypatch, capsys):
-    """Run `isocharge ...` in this process: (exit code, stdout, stderr)."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["isocharge", *map(str, words)])
-        with pytest.raises(SystemExit) as done:
-            main()
-        out, err = capsys.readouterr()
-        return int(done.value.code or 0), out, err
-
-    return run
 
 
 def test_a_map_that_folds_is_told_drawn_and_written(command, tmp_path):
