@@ -33,6 +33,7 @@ from isocharge.serve import (
     encode_frame,
 )
 from isocharge.simulate import Amplifier, Circle, ForwardMap, Measurement, load_amplifier, sensor_from_dict
+from isocharge.train.report.report import inner_radius
 
 REST_S, PRESS_S, PAUSE_S, RAMP_S = 4.0, 1.5, 1.5, 0.1
 
@@ -125,8 +126,7 @@ def accuracy(
     predictor: Predictor, film: ForwardMap, part: Amplifier, n: int, rate_Hz: float, gain_error: float, seed: int
 ) -> dict[str, Any]:
     """Errors on the plateaus of n presses, delay of the first reading."""
-    radius_mm = min(np.hypot(*np.array(predictor.metadata.working_area_mm).T))
-    script = presses(n, rate_Hz, float(radius_mm), seed)
+    script = presses(n, rate_Hz, 1e3 * film.radius, seed)
     records = feel(predictor, charges(film, script), rate_Hz, part, gain_error, seed)
     plateau = np.flatnonzero(script.force_N >= 1.0)
     felt = [k for k in plateau if records[k].contact]
@@ -134,13 +134,16 @@ def accuracy(
     force = np.array([records[k].force_N - 1.0 for k in felt])
     starts = np.flatnonzero(np.diff(script.touching.astype(int)) == 1) + 1
     contact = np.array([record.contact for record in records])
-    delay_ms = [1e3 * np.argmax(contact[start:]) / rate_Hz for start in starts]
+    first = [np.flatnonzero(contact[start : start + round(PRESS_S * rate_Hz)]) for start in starts]
+    delay_ms = [1e3 * frames[0] / rate_Hz if frames.size else np.inf for frames in first]
+    clipped = np.array(["saturated" in records[k].flags for k in felt])
     away = ~script.touching & ~np.convolve(script.touching, np.ones(round(0.2 * rate_Hz)))[: len(script)].astype(bool)
     return {
         "position_mm": percentiles(error),
+        "position_not_saturated_mm": percentiles(error[~clipped]),
         "force_percent": percentiles(100 * np.abs(force)),
         "felt_share": round(len(felt) / len(plateau), 4),
-        "saturated_share": round(float(np.mean(["saturated" in records[k].flags for k in felt])), 4),
+        "saturated_share": round(float(clipped.mean()), 4),
         "first_reading_ms": percentiles(np.array(delay_ms)),
         "false_contact_share": round(float(contact[away].mean()), 5),
     }
@@ -246,7 +249,8 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="one JSON object")
     asked = parser.parse_args()
     predictor, part = Predictor(asked.model), load_amplifier(asked.noise)
-    film = ForwardMap.build(sensor_from_dict(dict(predictor.metadata.sensor)), Circle(1e-3), force_range=(0.05, 2.0))
+    radius_mm = inner_radius(predictor.metadata.working_area_mm)
+    film = ForwardMap.build(sensor_from_dict(dict(predictor.metadata.sensor)), Circle(1e-3), 1e-3 * radius_mm)
     common = (predictor, film, part)
     result = {
         "gains to 0.2 %": accuracy(*common, asked.presses, asked.rate_Hz, 0.002, asked.seed),

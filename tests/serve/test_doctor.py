@@ -1,11 +1,14 @@
 """The doctor against boards whose illness is known."""
 
+import json
 import threading
+from dataclasses import asdict
 from functools import partial
 
 import numpy as np
 import pytest
 
+from isocharge.cli.doctor import _in_words
 from isocharge.errors import PortError
 from isocharge.serve import Script, VirtualSensor, device_from_table, encode_text, examine
 from isocharge.serve.doctor import _health
@@ -55,6 +58,37 @@ def test_text_in_counts(film):
         found = examine(sensor.url, bauds=BAUD, seconds=0.6, device=device)
     assert "name:value: seq, t_us, A, B, C" in found.format
     assert [(channel.name, round(channel.offset_pC)) for channel in found.channels] == [("A", 10), ("B", 6), ("C", 7)]
+
+
+def test_values_that_are_no_charges_are_counted_and_left_out():
+    t = np.arange(0.0, 4.0, 0.01)
+    charge = 7.0 + np.random.default_rng(0).normal(0.0, 0.3, t.size)
+    charge[[3, 90, 200]] = np.nan, 1e300, -np.inf
+    health = _health("A", charge, t, 100.0)
+    assert health.offset_pC == pytest.approx(7.0, abs=0.05)
+    assert (health.unusable, health.noise_pC) == (3, pytest.approx(0.3, rel=0.1))
+
+
+def test_a_channel_without_a_number():
+    """A board prints `nan` where an amplifier is missing; the other channels are told as ever, in valid JSON too."""
+    port = PseudoPort()
+    stop = threading.Event()
+
+    def send():
+        while not stop.wait(0.002):
+            port.write_whole(b"A:nan,B:1.5,C:2.5\n")
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    found = examine(port.url, bauds=BAUD, seconds=0.6)
+    stop.set()
+    sender.join()
+    port.close()
+    assert [(c.name, c.offset_pC) for c in found.channels] == [("A", None), ("B", 1.5), ("C", 2.5)]
+    assert found.channels[0].unusable == found.good > 100
+    assert "charges on channel A" in missing(found)
+    assert "?" in "\n".join(_in_words(found))
+    json.dumps(asdict(found), allow_nan=False)
 
 
 def missing(found):

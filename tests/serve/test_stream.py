@@ -108,6 +108,28 @@ def test_a_charge_that_is_no_number(film, play):
     assert "NaN" not in records[1].to_json()
 
 
+@pytest.mark.parametrize("damaged", [1.01e9, -1e38, 1e300, -1.7e308, math.inf])
+def test_a_number_that_no_film_sends_costs_its_frame_only(film, predictor, damaged):
+    """Text has no checksum: a digit more in the exponent must stop neither the stream nor the sums of the chain."""
+    device = device_from_table(
+        {"gain": {"pC_per_unit": 2.0}, "leak": {"tau_s": 1.0}, "hum": {"frequency_Hz": 50.0}}, ""
+    )
+    good = (pressed(film) / 2.0).tolist()
+
+    def play(*odd):
+        rows = [(0.0, 0.0, 0.0)] * 400 + [good] * 50 + [(good[0], value, good[2]) for value in odd] + [good] * 50
+        lines = (",".join(f"{value:.9g}" for value in row) + "\n" for row in rows)
+        path = TouchStream(predictor, device)
+        return [r for k, line in enumerate(lines) for r in path.feed(Chunk(line.encode(), 1e9 + 0.005 * k, 0))]
+
+    *_, expected = play()
+    records = play(damaged)
+    bad = next(r for r in records if "invalid" in r.flags)
+    assert (bad.contact, bad.force_N, bad.charge_pC) == (False, None, None)
+    assert records[-1].charge_pC == pytest.approx(expected.charge_pC, rel=1e-2)
+    assert records[-1].contact
+
+
 def test_another_number_of_charges(play):
     with pytest.raises(ChargeError, match=r"model linear/1 expects 3 charges \('A', 'B', 'C'\), frame 10 has 4"):
         play(Frame(10, 0, (1.0, 2.0, 3.0, 4.0)))

@@ -1,5 +1,6 @@
 """Lines of text: documented examples of each notation, recognition, and damage."""
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -64,6 +65,11 @@ def test_lines_that_are_damaged(text):
 def feed(*lines, parser=None):
     """Frames of whole lines: they begin with the end of another one."""
     return (parser or TextParser()).feed("".join(f"\n{line}" for line in lines).encode() + b"\n")
+
+
+@pytest.mark.parametrize("line", ['{"A": %s, "B": 1, "C": 2}', "[%s, 1, 2]", "A:%s,B:1,C:2", "%s,1,2"])
+def test_a_number_of_hundreds_of_digits_is_infinite_in_every_notation(line):
+    assert parse_line((line % ("9" * 400)).encode()).values == (math.inf, 1.0, 2.0)
 
 
 def test_a_layout_is_recognised_from_the_first_good_lines():

@@ -50,10 +50,12 @@ def _in_words(found: "Examination") -> Iterator[str]:
     if found.channels:
         yield "channel    offset pC   noise pC  drift pC/s  50 Hz pC  60 Hz pC"
     for channel in found.channels:
-        hums = "".join(f"{'?' if hum is None else f'{hum:.2f}':>10s}" for hum in channel.hum_pC)
-        yield (
-            f"{channel.name:8.8s} {channel.offset_pC:11.2f} {channel.noise_pC:10.3f}"
-            f" {channel.drift_pC_per_s:11.2f}{hums}"
-        )
+        figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
+        columns = zip(figures, (12, 11, 12, 10, 10), (2, 3, 2, 2, 2), strict=True)
+        yield f"{channel.name:8.8s}" + "".join(_column(*column) for column in columns)
     yield "missing to get a touch: nothing" if not found.missing else "missing to get a touch:"
     yield from (f"- {words}" for words in found.missing)
+
+
+def _column(figure: float | None, width: int, digits: int) -> str:
+    return f"{'?' if figure is None else f'{figure:.{digits}f}':>{width}s}"

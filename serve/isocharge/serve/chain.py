@@ -23,6 +23,9 @@ from isocharge.serve.leak import Leak, LeakRule, undo_leak
 from isocharge.serve.tare import Tare, TareRule, look_for_tare
 from isocharge.serve.touching import Touch, TouchRule, next_touch
 
+LARGEST_PC = 1e9
+"""A larger charge is no reading, finite or not: a chain that sums it loses no digit that counts (1e-7 pC)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Chain:
@@ -43,6 +46,13 @@ class Chain:
     tare: TareRule | None = field(default_factory=TareRule)
     leak: LeakRule | None = None
     touch: TouchRule | None = field(default_factory=TouchRule)
+
+    def raw(self, values: Array) -> Array:
+        """The first stage: what the device sent, shape (electrodes,), as charges, pC."""
+        if self.gain_pC is None:
+            return values
+        with np.errstate(over="ignore"):  # a damaged number may be the largest there is
+            return values * self.gain_pC
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,14 +114,14 @@ class Reading:
 
 
 def advance(
-    chain: Chain, state: ChainState, values: Array, t_s: float, dt_s: float, *, limited: bool = False
+    chain: Chain, state: ChainState, raw_pC: Array, t_s: float, dt_s: float, *, limited: bool = False
 ) -> tuple[ChainState, Reading]:
-    """Take the next frame through all stages.
+    """Take the next frame through all stages after the gain.
 
     Args:
         chain: The rules.
         state: After the frame before.
-        values: As they came, in the device's unit, shape (electrodes,).
+        raw_pC: As they came, as charges (`Chain.raw`), shape (electrodes,), pC.
         t_s: The device's clock, s.
         dt_s: Since the frame before, s.
         limited: Whether the device says that an amplifier is at its limit.
@@ -119,7 +129,6 @@ def advance(
     Raises:
         TareError: If the film is not left alone for long enough to tare.
     """
-    raw_pC = values if chain.gain_pC is None else values * chain.gain_pC
     limited = limited or (chain.limit_pC is not None and bool((np.abs(raw_pC) >= chain.limit_pC).any()))
     hum, quiet_pC = (state.hum, raw_pC) if chain.hum is None else remove_hum(chain.hum, state.hum, raw_pC, t_s, dt_s)
     if state.tare is None:

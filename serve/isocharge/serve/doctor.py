@@ -10,6 +10,7 @@ import numpy as np
 
 from isocharge.errors import PortError
 from isocharge.serve.arrays import Array
+from isocharge.serve.chain import LARGEST_PC
 from isocharge.serve.device import ANY_BOARD, Device
 from isocharge.serve.device_clock import DeviceClock
 from isocharge.serve.frames import Frame, Parser, SequenceGaps
@@ -29,7 +30,7 @@ SURE = 0.5
 
 @dataclass(frozen=True)
 class ChannelHealth:
-    """One channel at rest, in the device's unit after its gain, pC.
+    """One channel at rest, in the device's unit after its gain, pC; None where not one value is a charge.
 
     Attributes:
         name: As the device calls it, or its place.
@@ -38,14 +39,16 @@ class ChannelHealth:
         drift_pC_per_s: Slope.
         hum_pC: Amplitude at 50 and at 60 Hz; None where the rate is too low to tell.
         span_pC: From the smallest to the largest value.
+        unusable: Values that are no charges: not finite, or larger than any film's.
     """
 
     name: str
-    offset_pC: float
-    noise_pC: float
-    drift_pC_per_s: float
-    hum_pC: tuple[float | None, float | None]
-    span_pC: float
+    offset_pC: float | None = None
+    noise_pC: float | None = None
+    drift_pC_per_s: float | None = None
+    hum_pC: tuple[float | None, float | None] = (None, None)
+    span_pC: float | None = None
+    unusable: int = 0
 
 
 @dataclass(frozen=True)
@@ -197,7 +200,9 @@ def _channels(heard: Hearing, device: Device) -> Iterator[ChannelHealth]:
     times_s = np.array([heard.times_s[k] for k in kept])
     names = last.names or tuple(str(k + 1) for k in range(values.shape[1]))
     for name, column in zip(names, values.T, strict=True):
-        yield _health(name, column * _gain(device, name), times_s - times_s[0], _rate(heard))
+        with np.errstate(over="ignore"):
+            charge_pC = column * _gain(device, name)
+        yield _health(name, charge_pC, times_s - times_s[0], _rate(heard))
 
 
 def _gain(device: Device, channel: str) -> float:
@@ -209,7 +214,10 @@ def _gain(device: Device, channel: str) -> float:
 
 def _health(name: str, charge_pC: Array, t_s: Array, rate_Hz: float) -> ChannelHealth:
     """Offset, slope and hum by least squares, and what is left as noise."""
-    good = np.isfinite(charge_pC)
+    good = np.abs(charge_pC) <= LARGEST_PC
+    unusable = int(np.count_nonzero(~good))
+    if unusable == good.size:
+        return ChannelHealth(name, unusable=unusable)
     charge_pC, t_s = charge_pC[good], t_s[good]
     told = [hum for hum in HUMS_HZ if rate_Hz > 2.2 * hum and t_s.size and t_s[-1] > 0.5]
     turns = [2.0 * np.pi * hum * t_s for hum in told]
@@ -224,6 +232,7 @@ def _health(name: str, charge_pC: Array, t_s: Array, rate_Hz: float) -> ChannelH
         float(fit[1]),
         (amplitudes.get(50.0), amplitudes.get(60.0)),
         float(np.ptp(charge_pC)),
+        unusable,
     )
 
 
@@ -252,17 +261,19 @@ def _missing(
 
 def _missing_in_channels(channels: tuple[ChannelHealth, ...], rule: TareRule) -> Iterator[str]:
     for channel in channels:
-        if channel.noise_pC > rule.noise_limit_pC:
-            yield f"quiet on channel {channel.name}: {channel.noise_pC:.3g} pC rms, for a tare {rule.noise_limit_pC:g}"
-        if abs(channel.offset_pC) > rule.offset_limit_pC:
+        if channel.unusable:
+            yield f"charges on channel {channel.name}: {channel.unusable} values are no numbers, or absurd"
+        if (noise_pC := channel.noise_pC or 0.0) > rule.noise_limit_pC:
+            yield f"quiet on channel {channel.name}: {noise_pC:.3g} pC rms, for a tare {rule.noise_limit_pC:g}"
+        if abs(channel.offset_pC or 0.0) > rule.offset_limit_pC:
             yield (
                 f"rest near zero on channel {channel.name}: {channel.offset_pC:.4g} pC, a tare takes "
                 f"{rule.offset_limit_pC:g} (is something lying on the film? are these counts? then [gain])"
             )
         if channel.span_pC == 0.0:
             yield f"life on channel {channel.name}: every value is {channel.offset_pC:g}"
-        if abs(channel.drift_pC_per_s) > DRIFT_LIMIT_PC_PER_S:
-            yield f"a steady channel {channel.name}: it drifts by {channel.drift_pC_per_s:.2g} pC/s"
+        if abs(drift := channel.drift_pC_per_s or 0.0) > DRIFT_LIMIT_PC_PER_S:
+            yield f"a steady channel {channel.name}: it drifts by {drift:.2g} pC/s"
         for frequency, hum in zip(HUMS_HZ, channel.hum_pC, strict=True):
             if hum is not None and hum > HUM_LIMIT_PC:
                 yield f"[hum] frequency_Hz = {frequency:g} (device file): channel {channel.name} hums by {hum:.2g} pC"

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-import numpy as np
-
 from isocharge.errors import PortError
 from isocharge.serve.arrays import Array, Reals
-from isocharge.serve.chain import Chain, ChainState, Reading, advance
+from isocharge.serve.chain import LARGEST_PC, Chain, ChainState, Reading, advance
 from isocharge.serve.channels import ChannelPicker
 from isocharge.serve.common_mode import NO_WARMING, CommonModeRule, follow_warming
 from isocharge.serve.device import ANY_BOARD, Device
@@ -168,12 +166,12 @@ class TouchStream:
         self._news = ()
         values = self._picker.pick(frame)
         self._since_s += when.step_s
-        if not math.isfinite(sum(frame.values)) and not np.isfinite(values).all():
-            gain = 1.0 if self._chain.gain_pC is None else self._chain.gain_pC
-            return Reading(values * gain, None, None, contact=False), when, (*flags, INVALID)
+        raw_pC = self._chain.raw(values)
+        if not math.hypot(*raw_pC.tolist()) <= LARGEST_PC:
+            return Reading(raw_pC, None, None, contact=False), when, (*flags, INVALID)
         device_s = when.host_s if when.device_us is None else when.device_us * 1e-6
         limited = bool(frame.flags & SATURATED_BIT)
-        self._state, reading = advance(self._chain, self._state, values, device_s, self._since_s, limited=limited)
+        self._state, reading = advance(self._chain, self._state, raw_pC, device_s, self._since_s, limited=limited)
         if self._warming_rule is not None:
             flags += self._follow_warming(self._warming_rule, reading, self._since_s)
         self._since_s = 0.0

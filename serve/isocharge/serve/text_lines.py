@@ -120,7 +120,7 @@ def _teleplot(text: str) -> Line:
 
 def _json(text: str) -> Line:
     try:
-        content = json.loads(text)
+        content = json.loads(text, parse_int=float)  # hundreds of digits become infinite, as those of other notations
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
     if isinstance(content, list) and content and all(map(_is_number, content)):
