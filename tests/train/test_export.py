@@ -10,9 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from isocharge.errors import TrainingError
 from isocharge.simulate import noise_model
 from isocharge.train.evaluate import noisy_charges
 from isocharge.train.export import export_onnx
+from isocharge.train.release import _check_finite
 
 CASES = {
     "clean": lambda charge: charge,
@@ -95,6 +97,15 @@ def test_any_finite_charges_have_a_finite_answer_near_the_networks(fit, session,
 def test_every_answer_is_finite(fit, session, case):
     for output in answers(session, CASES[case](fit.held.charge_pC)):
         assert np.isfinite(output).all()
+
+
+def test_a_network_that_runs_off_the_numbers_is_not_released(fit, graph):
+    _check_finite(graph, 3)
+    steep = copy.deepcopy(fit.network)
+    with torch.no_grad():
+        steep.contact.straight.weight *= 1e3
+    with pytest.raises(TrainingError, match=r"answers contact = .* expected finite numbers for any charges"):
+        _check_finite(export_onnx(steep, {}), 3)
 
 
 @pytest.mark.parametrize("case", ["negative", "zero", "tiny", "huge"])

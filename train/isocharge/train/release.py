@@ -34,6 +34,7 @@ from isocharge.train.descent import Progress
 from isocharge.train.evaluate import Predict, measure_errors, misfit_noise, noisy_charges
 from isocharge.train.export import export_onnx
 from isocharge.train.fit import Fit, Warn, fit_network
+from isocharge.train.network import HIGHEST_PC, LOWEST_PC
 
 GOLDEN = 64
 """Golden vectors per model: half clean, a quarter noisy, a quarter absurd."""
@@ -110,6 +111,7 @@ def train_model(
         about = _metadata(fit, dataset, folder.resolve().name, version, command)
         graph = export_onnx(fit.network, about.to_props())
         good, absurd = _golden_charges(fit)
+        _check_finite(graph, len(dataset.sensor.electrode_names))
         _compare(graph, fit, absurd, ABSURD)
         _compare(graph, fit, _many_charges(fit), 1.0)
         written = write_model(folder, graph, about, np.concatenate([good, absurd]), model_card(about, fit))
@@ -194,6 +196,22 @@ def _many_charges(fit: Fit) -> np.ndarray:
     return noisy_charges(fit.held[rows], misfit_noise(noise_model(fit.config.training.noise)), seed=3).astype(
         np.float32
     )
+
+
+def _check_finite(graph: bytes, n_electrode: int) -> None:
+    """The graph goes on straight in the logarithms beyond its presses: its answers must stay finite up to the ends.
+
+    Raises:
+        TrainingError: If one does not.
+    """
+    ends = np.random.default_rng(4).choice(np.float32([LOWEST_PC, HIGHEST_PC]), (COMPARED, n_electrode))
+    for name, rows in run(open_session(graph, "the exported graph"), ends).items():
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        if bad.size:
+            raise TrainingError(
+                f"the network answers {name} = {rows[bad[0]]} to the charges {ends[bad[0]]} pC; expected finite "
+                "numbers for any charges: train with more steps or another seed"
+            )
 
 
 def _compare(graph: bytes, fit: Fit, charge_pC: np.ndarray, slack: float) -> None:
