@@ -47,7 +47,8 @@ class Equilibrium:
         status: "converged" or "failed".
         message: One sentence.
         iterations: Linear solves.
-        residual: Out-of-balance force over load.
+        residual: Out-of-balance force over load; of a linear theory the size of the correction that it asked
+            for, in the energy norm.
         seconds: Process CPU time of mesh and solve.
         proven_error: Difference of the charges from those on a mesh of one order less, if that was solved too.
     """
