@@ -1,6 +1,9 @@
 """What tests of several stages share."""
 
+import os
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -17,5 +20,42 @@ def command(monkeypatch, capsys):
             main()
         out, err = capsys.readouterr()
         return int(done.value.code or 0), out, err
+
+    return run
+
+
+@pytest.fixture
+def start_command():
+    """Start `isocharge ...` in a process of its own, which ends with the test."""
+    started = []
+
+    def start(*words):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "isocharge.cli", *map(str, words)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def shell():
+    """Run lines of a README in bash, this environment's `isocharge` first on the path: what they print."""
+
+    def run(script, cwd=None, timeout=280):
+        environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+        words = ["bash", "-ec", script]
+        done = subprocess.run(
+            words, cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
 
     return run

@@ -1,9 +1,6 @@
 """What README.md and train/README.md show is true: every example runs, every module is listed."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -25,32 +22,21 @@ def test_python_examples_print_what_they_promise(example, capsys):
     assert numbers[:3] == pytest.approx(wanted, rel=0.02)
 
 
-def test_command_line_example_runs_line_by_line(tmp_path):
+def test_command_line_example_runs_line_by_line(tmp_path, shell):
     (example,) = (block for block in blocks(README, "sh") if "simulate point" in block)
     (tmp_path / "train").symlink_to(ROOT / "train")
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    run = subprocess.run(
-        ["bash", "-ec", example],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert run.returncode == 0, run.stderr
-    assert '"charge_pC"' in run.stdout
-    assert run.stdout.count('"frame_id": "three-25um-biaxial"') > 800  # 5 s at 200 Hz
+    printed = shell(example, cwd=tmp_path)
+    assert '"charge_pC"' in printed
+    assert printed.count('"frame_id": "three-25um-biaxial"') > 800  # 5 s at 200 Hz
     assert (tmp_path / "models/mine/1/model.onnx").is_file()
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_study_examples_run(tmp_path):
+def test_study_examples_run(tmp_path, shell):
     (example,) = (block for block in blocks(README, "sh") if "simulate paper" in block)
     sweep = "isocharge simulate sweep three-25um-biaxial --samples 3000 -o presses"
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    subprocess.run(["bash", "-ec", f"{sweep}\n{example}"], cwd=tmp_path, env=environment, timeout=3600, check=True)
+    shell(f"{sweep}\n{example}", cwd=tmp_path, timeout=3600)
     assert (tmp_path / "paper" / "paper.md").is_file()
     assert (tmp_path / "report" / "report.md").is_file()
 

@@ -55,9 +55,9 @@ def new_folder(path: Path) -> Iterator[Path]:
     try:
         draft.mkdir(parents=True)
         yield draft
-        _sync_folder(draft)
+        sync_folder(draft)
         _rename(draft, path)
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
     except BaseException as error:
         shutil.rmtree(draft, ignore_errors=True)
         for parent in missing:
@@ -84,7 +84,7 @@ def _remove_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Make renames in a folder survive a power cut."""
     handle = os.open(folder, os.O_RDONLY)
     try:

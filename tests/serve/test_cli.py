@@ -4,9 +4,8 @@ import csv
 import json
 import signal
 import socket
-import subprocess
-import sys
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,8 +15,6 @@ from isocharge.cli.serve import serve_app
 from isocharge.errors import ChargeError, InputError, ModelError, OutputExists, PortError, PortLost, SensorError
 from isocharge.serve import BinaryParser, Port, Script, VirtualSensor, wander
 from isocharge.serve.pseudo_port import PseudoPort
-
-PROGRAM = [sys.executable, "-c", "from isocharge.cli.serve import serve_app; serve_app()"]
 
 
 @pytest.fixture
@@ -38,21 +35,8 @@ def run(*arguments, stdin=None):
 
 
 @pytest.fixture
-def start():
-    """A command in a process of its own, ended with the test."""
-    started = []
-
-    def start(*arguments):
-        process = subprocess.Popen(
-            PROGRAM + [str(a) for a in arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        started.append(process)
-        return process
-
-    yield start
-    for process in started:
-        process.kill()
-        process.communicate()
+def start(start_command):
+    return partial(start_command, "serve")
 
 
 @pytest.fixture

@@ -7,8 +7,6 @@ import re
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 
 import pytest
 import tritonclient.grpc
@@ -16,31 +14,17 @@ import tritonclient.grpc
 from isocharge.cli.http import BATCH, BODY_BYTES, CONNECTIONS, HEADER_S, IDLE_S
 from isocharge.serve.limits import Limits
 
-PROGRAM = [sys.executable, "-c", "from isocharge.cli import main; main()", "serve", "http"]
 BODY = json.dumps(
     {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}]}
 )
 
 
 @pytest.fixture
-def start(models):
-    """Start the command; its process ends with the test."""
-    started = []
-
+def start(models, start_command):
     def start(*words, folder=models):
-        process = subprocess.Popen(
-            [*PROGRAM, "--models", str(folder), *map(str, words)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        started.append(process)
-        return process
+        return start_command("serve", "http", "--models", folder, *words)
 
-    yield start
-    for process in started:
-        process.kill()
-        process.communicate()
+    return start
 
 
 def ask(url, method="POST", path="/v2/models/linear/infer", body=BODY):

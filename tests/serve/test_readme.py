@@ -1,7 +1,6 @@
 """What serve/README.md shows is true: its examples run, its frame is a frame, its tables are complete."""
 
 import json
-import os
 import re
 import shutil
 import socket
@@ -40,7 +39,7 @@ def test_example_runs(example, capsys, start_http):
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="the example uses curl")
-def test_http_example_runs():
+def test_http_example_runs(shell):
     (example,) = (block for block in re.findall(r"```sh\n(.*?)```", README, re.DOTALL) if "curl" in block)
     ports = {"8000": "", "8001": ""}
     with ExitStack() as stack:
@@ -50,10 +49,8 @@ def test_http_example_runs():
             ports[port] = str(free.getsockname()[1])
     for port, free in ports.items():
         example = example.replace(port, free)
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    words = ["bash", "-ec", f"trap 'kill $!; wait' EXIT\n{example}"]
-    run = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=60, check=True)
-    outputs = json.loads(run.stdout[run.stdout.index("{") :])["outputs"]
+    printed = shell(f"trap 'kill $!; wait' EXIT\n{example}", timeout=60)
+    outputs = json.loads(printed[printed.index("{") :])["outputs"]
     assert outputs[0]["data"] == pytest.approx([3.0, -2.0, 1.0], abs=0.02)
 
 
@@ -100,7 +97,7 @@ def test_lines_of_text_are_read(row):
     assert len(frame.values) == 3
 
 
-def test_recording_example_runs_line_by_line(tmp_path):
+def test_recording_example_runs_line_by_line(tmp_path, shell):
     """The commands as they stand, with a sensor that stops by itself and the files in one folder."""
     (example,) = (block for block in re.findall(r"```sh\n(.*?)```", README, re.DOTALL) if "doctor" in block)
     lines = [line.split("  #")[0] for line in example.replace("/tmp/", f"{tmp_path}/").splitlines()]
@@ -110,17 +107,7 @@ def test_recording_example_runs_line_by_line(tmp_path):
     waiting = f"while [ ! -e {tmp_path}/film ]; do sleep 0.1; done"
     script = "\n".join([lines[0], lines[1], waiting, *lines[2:-1], f"{lines[-1]} > again.jsonl", "kill %1", "wait"])
     (tmp_path / "presses.csv").write_text("A,B,C\n850,840,846\n")
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    run = subprocess.run(
-        ["bash", "-ec", script.replace("--seconds 10", "--seconds 2").replace("doctor", "doctor --seconds 1")],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert run.returncode == 0, run.stderr
-    assert "binary frames of isocharge" in run.stdout
+    printed = shell(script.replace("--seconds 10", "--seconds 2").replace("doctor", "doctor --seconds 1"), cwd=tmp_path)
+    assert "binary frames of isocharge" in printed
     assert (tmp_path / "again.jsonl").read_text() == (tmp_path / "touch.jsonl").read_text()
     assert len((tmp_path / "touch.jsonl").read_text().splitlines()) > 300

@@ -11,7 +11,6 @@ A part counts only once its checksum is there and fits; whatever else is found i
 
 import fcntl
 import json
-import os
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from isocharge.errors import InputError, OutputError, OutputExists, SolveError, TrainingError
-from isocharge.files import new_folder, refuse_existing, sha256_of, write_whole
+from isocharge.files import new_folder, refuse_existing, sha256_of, sync_folder, write_whole
 
 Warn = Callable[[str], object]
 """Told what a person should know."""
@@ -80,11 +79,11 @@ class Draft:
     def publish(self) -> None:
         """Give the data the target's name, in a way that survives a power cut, and remove the draft."""
         with refusals(self.target):
-            _sync(self.data)
+            sync_folder(self.data)
             refuse_existing(self.target)
             self.data.rename(self.target)
             with suppress(OSError):  # the data are safe; only their name might not outlive a power cut
-                _sync(self.target.parent)
+                sync_folder(self.target.parent)
         self.remove()
 
     def remove(self) -> None:
@@ -219,11 +218,3 @@ def _differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
                 yield from _differences(there.get(key), here.get(key), f"{name}.{key}" if name else key)
     else:
         yield f"{name or 'run.json'} is {there} there, {here} here"
-
-
-def _sync(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
