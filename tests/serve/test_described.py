@@ -5,6 +5,7 @@ CRC-16/X-25 over all but the header), OptoForce OMD 3-axis (AA 07 08 0A; counter
 big-endian), Robotiq FT 300 (20 4E; six i16 in 0.01 N and 0.001 Nm; CRC-16/Modbus). Their bytes are packed by hand here.
 """
 
+import math
 import struct
 import tomllib
 from itertools import pairwise
@@ -199,6 +200,18 @@ fields = [{name = "seq", type = "u8"}, {name = "t_ms", type = "u8"}, {name = "A"
     assert (parser.seq_modulus, parser.t_us_modulus) == (256, 256_000)
 
 
+@pytest.mark.parametrize("name", ["seq", "t_us", "t_s"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_number_or_clock_that_is_no_number_costs_its_frame_only(name, value):
+    """Without a checksum nothing else tells that the line was damaged."""
+    fields = f'fields = [{{name = "{name}", type = "f32"}}, {{name = "A", type = "f32"}}]'
+    described = layout(f'sync = "20 4E"\nlength = 10\n{fields}')
+    good, bad = (b"\x20\x4e" + struct.pack("<ff", number, 1.0) for number in (2.0, value))
+    parser = DescribedParser(described)
+    assert [frame.values for frame in parser.feed(good + bad + good)] == [(1.0,), (1.0,)]
+    assert (parser.counts.frames, parser.counts.malformed, parser.counts.bytes_dropped) == (2, 1, 10)
+
+
 WRONG = [
     ("length = 16", "length = 17", r"expected length = 16 for these fields, got 17"),
     ('sync = "20 4E"', 'sync = "hello"', r"sync in hexadecimal"),
@@ -207,7 +220,8 @@ WRONG = [
     ('checksum = "crc-16/modbus"', 'cheksum = "crc-16/modbus"', r"only the keys .*got \['cheksum'\]"),
     ('type = "i16"', 'type = "i24"', r"a field's type pad, u8"),
     ('name = "Fy"', 'name = "Fx"', r"field names that differ"),
-    ("scale = 0.01", "scale = 0", r"a scale that is not 0, got 0"),
+    ("scale = 0.01", "scale = 0", r"a finite scale that is not 0, got 0"),
+    ("scale = 0.01", "scale = nan", r"a finite scale that is not 0, got nan"),
     ("length = 16", 'length = 16\nbyte_order = "middle"', r"byte_order little or big, got 'middle'"),
     ("length = 16", "length = 16\nchecksum_from = 15", r"checksum_from inside the frame, got 15"),
 ]

@@ -99,7 +99,9 @@ def test_nobody_listens():
             sink.send("{}")
 
 
-@pytest.mark.parametrize("address", ["127.0.0.1", "127.0.0.1:x", "no.such.host.invalid:1"])
+@pytest.mark.parametrize(
+    "address", ["127.0.0.1", "127.0.0.1:x", "127.0.0.1:70000", "no.such.host.invalid:1", f"{'a' * 70}.com:9"]
+)
 def test_addresses_that_are_none(address):
     with pytest.raises(InputError, match="expected HOST:PORT, as in 127"):
         UdpSink(address)

@@ -146,6 +146,29 @@ def test_a_damaged_line_in_the_middle_is_said(tmp_path, film, predictor):
         replay(path, predictor)
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "5",
+        "null",
+        "[1]",
+        "{}",
+        '{"timestamp": 1.0}',
+        '{"timestamp": 1.0, "latency_us": "soon"}',
+        '{"chunk": [1.0, 2]}',
+        '{"chunk": [1.0, 2, 0.0, "no base64!"]}',
+        '{"chunk": [1.0, 1e999, 0.0, "AAAA"]}',
+    ],
+)
+def test_a_line_of_json_that_is_none_of_ours_is_damaged_too(tmp_path, film, predictor, line):
+    path = tmp_path / "touch.rec"
+    record(path, film, predictor)
+    first, *lines = path.read_text().split("\n")
+    path.write_text("\n".join([first, line, *lines]))
+    with pytest.raises(RecordingError, match="line 2: damaged"):
+        list(Recording(path).events())
+
+
 def test_latest_gives_a_record_for_the_newest_frame_of_a_chunk(predictor):
     path = TouchStream(predictor, ANY_BOARD, policy=Policy.latest)
     data = b"".join(encode_frame(Frame(k, 5000 * k, (0.0, 0.0, 0.0))) for k in range(10))

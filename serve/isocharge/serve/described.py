@@ -17,6 +17,7 @@ Types are u8, u16, u32, i8, i16, i32, f32, f64, and `pad` with `count` bytes. Th
 one byte where a checksum does not fit, so a sync pattern inside the data costs no intact frame.
 """
 
+import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -171,9 +172,9 @@ def _field(entry: Mapping[str, Any], where: str) -> Field:
     name, scale = entry.get("name"), entry.get("scale", 1.0)
     _expect(isinstance(name, str) and name != "", where, "a name for each field", entry)
     _expect(
-        isinstance(scale, int | float) and not isinstance(scale, bool) and scale != 0,
+        isinstance(scale, int | float) and not isinstance(scale, bool) and scale != 0 and math.isfinite(scale),
         where,
-        "a scale that is not 0",
+        "a finite scale that is not 0",
         scale,
     )
     return Field(str(name), TYPES[entry["type"]], float(scale))
@@ -232,13 +233,18 @@ class DescribedParser:
             self.counts.drop(size)
 
     def _decode(self, data: bytes) -> Frame | None:
-        """The frame in exactly its bytes, or None, counted, if the checksum does not fit."""
+        """The frame in exactly its bytes, or None, counted, if its checksum, number or clock is none."""
         end = len(data) - self.layout.check.size
         if self.layout.checked(data[:end]) != data[end:]:
             self.counts.refuse(1, damaged=True)
             return None
+        try:
+            frame = self._frame(self.layout.body.unpack_from(data, len(self.layout.sync)))
+        except (OverflowError, ValueError):  # a number or clock in floating point that is no number
+            self.counts.refuse(1)
+            return None
         self.counts.accept()
-        return self._frame(self.layout.body.unpack_from(data, len(self.layout.sync)))
+        return frame
 
     def _frame(self, counts: Sequence[Any]) -> Frame:
         return Frame(

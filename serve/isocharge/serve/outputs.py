@@ -58,8 +58,10 @@ class UdpSink:
         """
         host, _, port = address.rpartition(":")
         try:
+            if not 0 < int(port) < 1 << 16:
+                raise ValueError("no such port")
             found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: a part of the name is too long
             raise InputError(f"UDP address {address!r}: expected HOST:PORT, as in 127.0.0.1:9870 ({error})") from error
         self._family, self._address = found[0], found[4]
         self._socket: socket.socket | None = None

@@ -134,31 +134,44 @@ class Recording:
             RecordingError: If a line other than the last one is damaged.
         """
         chunk, latencies_us = None, []
-        for content in self._lines():
-            if "timestamp" in content:
-                latencies_us.append(content["latency_us"])
+        for entry in self._entries():
+            if isinstance(entry, float):
+                latencies_us.append(entry)
                 continue
             if chunk is not None:
                 yield Event(chunk, tuple(latencies_us))
-            chunk, latencies_us = None, []
-            if "chunk" in content:
-                timestamp, clock_ns, outage_s, data = content["chunk"]
-                chunk = Chunk(base64.b64decode(data), timestamp, clock_ns, outage_s)
-            elif "tare" in content:
+            chunk, latencies_us = entry, []
+            if chunk is None:
                 yield Event(None)
         if chunk is not None:
             yield Event(chunk, tuple(latencies_us))
 
-    def _lines(self) -> Iterator[dict[str, Any]]:
+    def _entries(self) -> Iterator[Chunk | float | None]:
+        """What each line says."""
         with self._path.open(encoding="utf-8", errors="replace") as file:
             next(file)
             for number, line in enumerate(file, start=2):
                 if not line.endswith("\n"):
                     return  # the power went while it was written
                 try:
-                    yield json.loads(line)
-                except ValueError as error:
+                    entry = _entry(json.loads(line))
+                except (ArithmeticError, KeyError, TypeError, ValueError) as error:
                     raise RecordingError(f"{self._path}, line {number}: damaged ({error})") from error
+                yield entry
+
+
+def _entry(content: dict[str, Any]) -> Chunk | float | None:
+    """A chunk, the latency of a record (us), or None: the wish for a new tare.
+
+    Raises:
+        ArithmeticError, KeyError, TypeError, ValueError: If it is none of these.
+    """
+    if "timestamp" in content:
+        return float(content["latency_us"])
+    if "tare" in content:
+        return None
+    timestamp, clock_ns, outage_s, data = content["chunk"]
+    return Chunk(base64.b64decode(data, validate=True), float(timestamp), int(clock_ns), float(outage_s))
 
 
 class RecordedClock:
