@@ -56,6 +56,8 @@ from isocharge.serve.text import TextParser
 from isocharge.serve.touching import TouchRule
 
 SECTIONS = {"frames", "channels", "gain", "saturation", "hum", "tare", "leak", "touch", "common_mode"}
+LARGEST, TIMES_S = 1e9, {"settle_s": 1e-3, "relax_s": 1e-3}
+"""Largest setting of a rule, and the smallest of those that are divided by."""
 STAGES: dict[str, type] = {"hum": HumRule, "tare": TareRule, "touch": TouchRule}
 
 
@@ -243,9 +245,11 @@ def _types(rule: type) -> dict[str, type]:
 def _check_types(table: Mapping[str, Any], types: Mapping[str, type], where: str) -> None:
     for key, value in table.items():
         kind = bool if key == "on" else types[key]
-        good = isinstance(value, bool) if kind is bool else _is_number(value) and value >= 0
+        least = TIMES_S.get(key, 0)
+        good = isinstance(value, bool) if kind is bool else _is_number(value) and least <= value <= LARGEST
         good = good and (kind is not int or isinstance(value, int))
-        _expect(good, f"{where}: {key}", {bool: "true or false", int: "a whole number"}.get(kind, "a number"), value)
+        expected = {bool: "true or false", int: "a whole number"}.get(kind, "a number")
+        _expect(good, f"{where}: {key}", expected if kind is bool else f"{expected} from {least} to {LARGEST:g}", value)
 
 
 def _is_number(value: object) -> bool:

@@ -105,7 +105,7 @@ def _learn(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array, dt_s:
     limit_pC = np.maximum(rule.clip_pC, rule.clip_sigmas * math.sqrt(2.0) * noise_pC)
     clipped_pC = np.minimum(np.maximum(surplus_pC, -limit_pC), limit_pC)
     learned_s, age_s = leak.learned_s + dt_s, leak.next_age_s + dt_s
-    inflow = leak.inflow_pC_per_s + clipped_pC / min(rule.settle_s, learned_s)
+    inflow = leak.inflow_pC_per_s + clipped_pC / max(min(rule.settle_s, learned_s), dt_s)  # no more than all of it
     if age_s < rule.look_back_s:
         return leak._replace(inflow_pC_per_s=inflow, next_age_s=age_s, learned_s=learned_s)
     return Leak(leak.charge_pC, leak.output_pC, inflow, leak.next_pC_per_s, inflow, 0.0, learned_s)
