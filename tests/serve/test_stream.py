@@ -130,6 +130,13 @@ def test_a_number_that_no_film_sends_costs_its_frame_only(film, predictor, damag
     assert records[-1].contact
 
 
+@pytest.mark.parametrize("data", [b"", b"hello, film\n"])
+def test_a_file_without_a_frame_is_said(predictor, data):
+    """However short it is: silence must not be taken for a film that is left alone."""
+    with pytest.raises(PortError, match=f"no intact frame among the first {len(data)} bytes"):
+        list(stream([Chunk(data, 1e9, 0)] if data else [], predictor))
+
+
 def test_another_number_of_charges(play):
     with pytest.raises(ChargeError, match=r"model linear/1 expects 3 charges \('A', 'B', 'C'\), frame 10 has 4"):
         play(Frame(10, 0, (1.0, 2.0, 3.0, 4.0)))

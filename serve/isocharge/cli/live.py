@@ -212,6 +212,7 @@ def _follow(
         finally:
             if recorder:
                 recorder.chunk(chunk, lines)
+    path.finish()
 
 
 def _replayed(

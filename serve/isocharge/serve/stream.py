@@ -73,6 +73,7 @@ def stream(
     path = TouchStream(predictor, chain=chain, parser=parser, gaps=gaps)
     for chunk in chunks:
         yield from path.feed(chunk)
+    path.finish()
 
 
 class TouchStream:
@@ -150,6 +151,14 @@ class TouchStream:
         else:
             _check_recognised(self.parser)
 
+    def finish(self) -> None:
+        """Nothing more comes, as at the end of a file.
+
+        Raises:
+            PortError: If there was not one intact frame.
+        """
+        _check_recognised(self.parser, allowed=-1)
+
     def _begin_anew(self) -> None:
         """After an outage: nothing that came before goes on, and the film may have been touched meanwhile."""
         self.counts.outages += 1
@@ -195,9 +204,9 @@ class TouchStream:
         return self._scribe.predictor.predict_batch(charge_pC).misfit
 
 
-def _check_recognised(parser: Parser) -> None:
+def _check_recognised(parser: Parser, allowed: int = BYTES_TO_RECOGNISE) -> None:
     counts = parser.counts
-    if counts.frames == 0 and counts.bytes_dropped > BYTES_TO_RECOGNISE:
+    if counts.frames == 0 and counts.bytes_dropped > allowed:
         raise PortError(
             f"no intact frame among the first {counts.bytes_dropped} bytes ({counts.crc_errors} with a wrong CRC, "
             f"{counts.malformed} of another form); {parser.format}: check baud rate and device"
