@@ -204,7 +204,7 @@ def _check_finite(graph: bytes, n_electrode: int) -> None:
     Raises:
         TrainingError: If one does not.
     """
-    ends = np.random.default_rng(4).choice(np.float32([LOWEST_PC, HIGHEST_PC]), (COMPARED, n_electrode))
+    ends = np.random.default_rng(4).choice([LOWEST_PC, HIGHEST_PC], (COMPARED, n_electrode)).astype(np.float32)
     for name, rows in run(open_session(graph, "the exported graph"), ends).items():
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if bad.size:
