@@ -20,9 +20,9 @@ def rest(n, seed=0, sigma=1.0):
 
 def run(frames, chain=None):
     """All readings of raw frames, shape (n, 3)."""
-    chain, state, readings = chain or Chain(), ChainState.start(3), []
-    for k, values in enumerate(frames):
-        state, reading = advance(chain, state, chain.raw(values), k / RATE_HZ, 1 / RATE_HZ)
+    state, readings = ChainState.start(3), []
+    for k, raw in enumerate(frames):
+        state, reading = advance(chain or Chain(), state, raw, k / RATE_HZ, 1 / RATE_HZ)
         readings.append(reading)
     return readings
 

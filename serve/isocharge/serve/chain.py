@@ -114,14 +114,14 @@ class Reading:
 
 
 def advance(
-    chain: Chain, state: ChainState, raw_pC: Array, t_s: float, dt_s: float, *, limited: bool = False
+    chain: Chain, state: ChainState, values: Array, t_s: float, dt_s: float, *, limited: bool = False
 ) -> tuple[ChainState, Reading]:
-    """Take the next frame through all stages after the gain.
+    """Take the next frame through all stages.
 
     Args:
         chain: The rules.
         state: After the frame before.
-        raw_pC: As they came, as charges (`Chain.raw`), shape (electrodes,), pC.
+        values: As they came, in the device's unit, shape (electrodes,).
         t_s: The device's clock, s.
         dt_s: Since the frame before, s.
         limited: Whether the device says that an amplifier is at its limit.
@@ -129,6 +129,7 @@ def advance(
     Raises:
         TareError: If the film is not left alone for long enough to tare.
     """
+    raw_pC = chain.raw(values)
     limited = limited or (chain.limit_pC is not None and bool((np.abs(raw_pC) >= chain.limit_pC).any()))
     hum, quiet_pC = (state.hum, raw_pC) if chain.hum is None else remove_hum(chain.hum, state.hum, raw_pC, t_s, dt_s)
     if state.tare is None:

@@ -180,7 +180,7 @@ class TouchStream:
             return Reading(raw_pC, None, None, contact=False), when, (*flags, INVALID)
         device_s = when.host_s if when.device_us is None else when.device_us * 1e-6
         limited = bool(frame.flags & SATURATED_BIT)
-        self._state, reading = advance(self._chain, self._state, raw_pC, device_s, self._since_s, limited=limited)
+        self._state, reading = advance(self._chain, self._state, values, device_s, self._since_s, limited=limited)
         if self._warming_rule is not None:
             flags += self._follow_warming(self._warming_rule, reading, self._since_s)
         self._since_s = 0.0
