@@ -76,7 +76,7 @@ def test_apart_is_the_relative_difference():
 
 
 def test_where_proof_is_needed():
-    inside, rim = (9e-3, 0.0), (31e-3, 0.0)
+    inside, rim = (9e-3, 0.0), (26.5e-3, 0.0)
     assert not needs_proof(FILM, Circle(0.4e-3), rim, 1e-3)
     assert needs_proof(FILM, Circle(0.6e-3), rim, 1e-3)
     assert not needs_proof(FILM, Polygon.rectangle(4e-3, 2e-3), inside, 1e-3)

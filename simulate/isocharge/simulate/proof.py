@@ -16,7 +16,7 @@ from isocharge.simulate.probe import Polygon, Probe
 from isocharge.simulate.sensor import Film
 from isocharge.simulate.theory import ACCURACY
 
-INNER = 0.7
+INNER = 0.6
 """Share of the film's radius within which the shapes of the elements tell enough."""
 
 LARGE = 0.08
