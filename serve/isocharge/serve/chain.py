@@ -49,10 +49,12 @@ class Chain:
 
     def raw(self, values: Array) -> Array:
         """The first stage: what the device sent, shape (electrodes,), as charges, pC."""
-        if self.gain_pC is None:
-            return values
-        with np.errstate(over="ignore"):  # a damaged number may be the largest there is
-            return values * self.gain_pC
+        return values if self.gain_pC is None else values * self.gain_pC
+
+    @property
+    def largest(self) -> float:
+        """The largest value that can be a reading, in the device's unit."""
+        return LARGEST_PC if self.gain_pC is None else LARGEST_PC / float(np.abs(self.gain_pC).max())
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+import numpy as np
+
 from isocharge.errors import PortError
 from isocharge.serve.arrays import Array, Reals
-from isocharge.serve.chain import LARGEST_PC, Chain, ChainState, Reading, advance
+from isocharge.serve.chain import Chain, ChainState, Reading, advance
 from isocharge.serve.channels import ChannelPicker
 from isocharge.serve.common_mode import NO_WARMING, CommonModeRule, follow_warming
 from isocharge.serve.device import ANY_BOARD, Device
@@ -115,6 +117,7 @@ class TouchStream:
         self.clock = DeviceClock()
         self.counts = StreamCounts()
         self._chain = chain or device.chain(electrodes)
+        self._largest = self._chain.largest
         self._picker = ChannelPicker(electrodes, device.channels, predictor.metadata.label)
         self._scribe = _Scribe.of(predictor)
         self._state = ChainState.start(len(electrodes))
@@ -175,9 +178,9 @@ class TouchStream:
         self._news = ()
         values = self._picker.pick(frame)
         self._since_s += when.step_s
-        raw_pC = self._chain.raw(values)
-        if not math.hypot(*raw_pC.tolist()) <= LARGEST_PC:
-            return Reading(raw_pC, None, None, contact=False), when, (*flags, INVALID)
+        if not math.hypot(*values.tolist()) <= self._largest:
+            with np.errstate(over="ignore"):  # it may be the largest number there is
+                return Reading(self._chain.raw(values), None, None, contact=False), when, (*flags, INVALID)
         device_s = when.host_s if when.device_us is None else when.device_us * 1e-6
         limited = bool(frame.flags & SATURATED_BIT)
         self._state, reading = advance(self._chain, self._state, values, device_s, self._since_s, limited=limited)

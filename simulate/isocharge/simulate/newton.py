@@ -91,7 +91,9 @@ def solve_linear(film: ElasticFilm, assembly: Assembly) -> NewtonResult:
         size = _energy_norm(film, field, step[:, 2], balance[:, 2])
         field = field + step
         if size <= REFINED:
-            return NewtonResult(field, True, solves, size, f"linear theory, solved to round-off: corrected by {size:.0e}")
+            return NewtonResult(
+                field, True, solves, size, f"linear theory, solved to round-off: corrected by {size:.0e}"
+            )
     return NewtonResult(field, False, solves, size, "the linear system is too near to singular")
 
 
