@@ -49,7 +49,7 @@ def random_matrices(mesh: Template, components: int, seed: int) -> np.ndarray:
 def test_solution_is_the_dense_one(resolution, corners, components):
     mesh = template(resolution, corners)
     matrix, right = random_matrices(mesh, components, 1), np.random.default_rng(1).standard_normal((mesh.n_node, 3))
-    solution = Assembly(mesh, components).solve(matrix, right)
+    solution = Assembly(mesh, components).factor(matrix).solve(right)
     np.testing.assert_allclose(solution, dense_solution(mesh, matrix, right), atol=1e-12)
     assert not solution[mesh.on_rim].any()
 
@@ -60,24 +60,31 @@ def test_tangent_of_a_film_is_solved_like_the_dense_one(mesh, bending):
     elastic = ElasticFilm(mesh.geometry, Groups(0.01, 1.0, 5.0 if bending == 0.0 else 0.0, bending, 0.34))
     field = 0.01 * mesh.random_field(1)
     matrix, right = elastic.tangent(field, 0.0 if bending == 0.0 else 1.0), -elastic.residual(field)
-    solution = Assembly(mesh.template, elastic.components).solve(matrix, right)
+    solution = Assembly(mesh.template, elastic.components).factor(matrix).solve(right)
     expected = dense_solution(mesh.template, matrix, right)
     np.testing.assert_allclose(solution, expected, atol=1e-8 * np.abs(expected).max())
 
 
+def test_one_factor_serves_many_right_hand_sides(mesh):
+    matrix, rights = random_matrices(mesh.template, 3, 5), [mesh.random_field(seed) for seed in range(3)]
+    factor = Assembly(mesh.template, 3).factor(matrix)
+    for right in rights:
+        np.testing.assert_allclose(factor.solve(right), dense_solution(mesh.template, matrix, right), atol=1e-12)
+
+
 def test_right_hand_side_is_left_alone(mesh):
     right = np.ones((mesh.template.n_node, 3))
-    Assembly(mesh.template, 4).solve(random_matrices(mesh.template, 4, 0), right)
+    Assembly(mesh.template, 4).factor(random_matrices(mesh.template, 4, 0)).solve(right)
     assert np.all(right == 1.0)
 
 
 def test_fixed_values_of_the_right_hand_side_are_ignored(mesh):
     matrix, right = random_matrices(mesh.template, 3, 0), mesh.random_field(0)
-    solver = Assembly(mesh.template, 3)
-    first = solver.solve(matrix, right)
+    factor = Assembly(mesh.template, 3).factor(matrix)
+    first = factor.solve(right)
     right[mesh.template.on_rim] = 1e6
     right[mesh.template.on_axis, 1] = 1e6
-    np.testing.assert_array_equal(solver.solve(matrix, right), first)
+    np.testing.assert_array_equal(factor.solve(right), first)
 
 
 def test_assembly_is_made_once():

@@ -46,7 +46,7 @@ class Equilibrium:
         groups: Dimensionless groups of the scene.
         status: "converged" or "failed".
         message: One sentence.
-        iterations: Linear solves.
+        iterations: Newton steps, that is tangents; of a linear theory solves with its one.
         residual: Out-of-balance force over load; of a linear theory the size of the correction that it asked
             for, in the energy norm.
         seconds: Process CPU time of mesh and solve.

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.simulate.arrays import Array
-from isocharge.simulate.assembly import Assembly
+from isocharge.simulate.assembly import Assembly, Factor
 from isocharge.simulate.elastic import ElasticFilm
 from isocharge.simulate.scaling import Groups
 
@@ -29,6 +29,9 @@ PATIENCE = 8
 REFINEMENTS, REFINED = 5, 1e-5
 """Corrections of a linear solve, and their size in the energy norm from which on no other is needed."""
 
+CHORD_FROM, CHORD_KEEPS = 0.15, 0.3
+"""Share of the residual that a step leaves, below which its tangent is used again; the share each use must beat."""
+
 ROUND_OFF = 1e-9
 """Size of a Newton step in the energy norm, relative to the load's work, from which on only round-off is left."""
 
@@ -40,7 +43,7 @@ class NewtonResult:
     Attributes:
         field: Nodal (U1, U2, W), shape (n_node, 3).
         converged: Whether the residual is below the tolerance or as low as round-off lets it.
-        iterations: Linear solves done.
+        iterations: Newton steps, of a linear theory solves.
         residual: Out-of-balance force: the larger of transverse over load and in-plane over in-plane force. Of a linear
             theory the size of the correction that it asked for, in the energy norm.
         message: One sentence for people.
@@ -82,12 +85,12 @@ def solve_linear(film: ElasticFilm, assembly: Assembly) -> NewtonResult:
     error), whose size in the energy norm tells how well W was solved.
     """
     flat = np.zeros((assembly.free.shape[0], 3))
-    tangent = film.tangent(flat)
-    field, size = assembly.solve(tangent, -film.residual(flat)), np.inf
+    factor = assembly.factor(film.tangent(flat))
+    field, size = factor.solve(-film.residual(flat)), np.inf
     for solves in range(2, 2 + REFINEMENTS):
         balance = film.residual(field)
         balance[:, 2] = _linear_residual(film, field)[:, 2]
-        step = assembly.solve(tangent, -balance)
+        step = factor.solve(-balance)
         size = _energy_norm(film, field, step[:, 2], balance[:, 2])
         field = field + step
         if size <= REFINED:
@@ -130,7 +133,8 @@ def solve_newton(
             return NewtonResult(field, True, iteration, relative, f"converged in {iteration} steps")
         if iteration == MAX_ITERATIONS or _stalled(sizes):
             return NewtonResult(field, False, iteration, relative, f"no progress any more after {iteration} steps")
-        step = assembly.solve(film.tangent(field, _guard(film, relative)), -residual)
+        factor = assembly.factor(film.tangent(field, _guard(film, relative)))
+        step = factor.solve(-residual)
         sizes.append(_energy_norm(film, field, step, residual))
         if sizes[-1] <= ROUND_OFF:
             return NewtonResult(field, True, iteration, relative, f"converged to round-off in {iteration} steps")
@@ -140,7 +144,7 @@ def solve_newton(
             taken = _line_search(film, field, step, residual, free)
         if taken is None:
             return NewtonResult(field, False, iteration, relative, "no step lowers the energy any more")
-        field, residual = taken
+        field, residual = _again(film, factor, *taken, relative, tolerance, free)
     raise AssertionError("the loop returns")
 
 
@@ -181,13 +185,39 @@ def _local_step(
     return (trial, residual) if _relative(film, trial, residual * free) < 0.5 * relative else None
 
 
+def _again(
+    film: ElasticFilm,
+    factor: Factor,
+    field: Array,
+    residual: Array,
+    before: float,
+    tolerance: float,
+    free: np.ndarray,
+) -> tuple[Array, Array]:
+    """Further steps with the same tangent while they pay, which cost a seventh of one with its own (chord method).
+
+    A step that left the share s of the residual says that the next with its tangent will leave about 2 s (Kelley 1995).
+    """
+    relative = _relative(film, field, residual * free)
+    if relative > CHORD_FROM * before:
+        return field, residual
+    while relative > tolerance:
+        trial = field + factor.solve(-residual)
+        trial_residual = film.residual(trial)
+        left = _relative(film, trial, trial_residual * free)
+        if not left < CHORD_KEEPS * relative:
+            break
+        field, residual, relative = trial, trial_residual, left
+    return field, residual
+
+
 def _downhill(film: ElasticFilm, assembly: Assembly, field: Array, residual: Array, step: Array) -> Array:
     """A step that goes downhill: the given one, or with more and more tension in the tangent."""
     tension = 0.05 * GUARD_TENSION * float(np.cbrt(film.groups.load)) ** 2
     for _ in range(12):
         if np.isfinite(step).all() and float(np.sum(step * residual)) < 0.0:
             break
-        step = assembly.solve(film.tangent(field, tension), -residual)
+        step = assembly.factor(film.tangent(field, tension)).solve(-residual)
         tension *= 2.0
     return step
 
