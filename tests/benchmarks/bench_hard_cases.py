@@ -16,7 +16,6 @@ import json
 import multiprocessing
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -86,8 +85,9 @@ def charges(solved: Equilibrium) -> list[np.ndarray]:
     return [touch_charge(replace(sensor, film=solved.film), solved) for sensor in SENSORS]
 
 
-def solve(seed: int, number: int) -> dict[str, Any]:
+def solve(seed_and_number: tuple[int, int]) -> dict[str, Any]:
     """One draw and what became of it."""
+    seed, number = seed_and_number
     film, probe, at, force = draw(seed, number)
     entry: dict[str, Any] = {
         "number": number,
@@ -149,14 +149,13 @@ def record(draws: int, seed: int, jobs: int, log: Path | None) -> dict[str, Any]
     entries = [json.loads(line) for line in log.read_text().splitlines()] if log and log.exists() else []
     known = {entry["number"] for entry in entries}
     began = time.time()
-    workers = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), max_tasks_per_child=FRESH)
-    with workers:
-        running = [workers.submit(solve, seed, number) for number in range(draws) if number not in known]
-        for future in as_completed(running):
-            entries.append(future.result())
+    missing = [(seed, number) for number in range(draws) if number not in known]
+    with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=FRESH) as workers:
+        for entry in workers.imap_unordered(solve, missing):
+            entries.append(entry)
             if log:
                 with log.open("a") as file:
-                    file.write(json.dumps(entries[-1]) + "\n")
+                    file.write(json.dumps(entry) + "\n")
             if len(entries) % 20 == 0:
                 print(f"{len(entries)} of {draws}, {time.time() - began:.0f} s", file=sys.stderr, flush=True)
     return {"seed": seed, "draws": sorted(entries, key=lambda entry: int(entry["number"]))[:draws]}
