@@ -13,8 +13,8 @@ test: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest tests/simulate tests/train -n 2 --dist loadfile # all arithmetic: both cores
-	$(BIN)/python -m pytest --ignore tests/simulate --ignore tests/train # processes, ports and clocks: one at a time
+	$(BIN)/python -m pytest --ignore tests/serve --ignore tests/test_live.py -n 2 --dist loadfile # arithmetic: both cores
+	$(BIN)/python -m pytest tests/serve tests/test_live.py # ports and clocks: one at a time
 
 test-all: $(VENV)/installed
 	$(BIN)/python -m pytest -m "slow or not slow"
