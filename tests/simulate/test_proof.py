@@ -23,6 +23,12 @@ BESIDE_THE_RIM = {
 """Thickness, pretension, Poisson's ratio, probe, distance from the centre in mm, force: scenes of which the shapes of
 the elements promise 0.1 % or better and miss by up to 70 times."""
 
+INSIDE = {
+    "a taut film under a needle": (16.06e-6, 18.99e6, 0.271, Circle(0.1916e-3), 23.39, 4.0),
+    "a plate under a needle": (0.4e-3, 0.0, 0.11, Circle(0.157e-3), 25.5, 1.2e-5),
+}
+"""Just within where two meshes are compared: the shapes' promise was 1.3 times too good here."""
+
 
 def worst_error(film: Film, rough, fine) -> float:
     """Of a charge of the built-in layouts, relative to the largest of a layout."""
@@ -37,15 +43,15 @@ def worst_error(film: Film, rough, fine) -> float:
 @pytest.mark.parametrize(
     "scene",
     [
-        pytest.param(scene, id=name, marks=[pytest.mark.slow] if i > 1 else [])
-        for i, (name, scene) in enumerate(BESIDE_THE_RIM.items())
+        pytest.param(scene, id=name, marks=[pytest.mark.slow] if i > 3 else [])
+        for i, (name, scene) in enumerate((INSIDE | BESIDE_THE_RIM).items())
     ],
 )
-def test_the_estimate_holds_beside_the_rim(scene):
+def test_the_estimate_holds(scene):
     """Against a mesh two orders higher with more rings, evenly and at the rim."""
     thickness, pretension, poisson, probe, distance, force = scene
     film = Film(45e-3, thickness, 3e9, poisson, pretension)
-    at = (distance * 1e-3 * np.cos(0.7), distance * 1e-3 * np.sin(0.7))
+    at = (distance * 1e-3 * np.cos(0.34), distance * 1e-3 * np.sin(0.34))
     solved = press(film, probe, at, force)
     mesh = solved.resolution
     finer = replace(mesh, order=mesh.order + 2, rings=mesh.rings + 1, rim=mesh.rim and mesh.rim + 1)

@@ -28,8 +28,8 @@ RIM_RINGS = 0.8
 TOO_COARSE = 0.05
 """Relative error of a charge, as the mesh's shape foretells it, above which a press is refused."""
 
-SAFETY = 1.5
-"""Over the error that shape and decay foretell, in the inner two thirds of the film; beside the rim too little."""
+SAFETY = 2.0
+"""Over the error that shape and decay foretell, in the inner 0.6 of the film's radius; beside the rim too little."""
 
 LEAST_ERROR = 5e-5
 """What thin rings at the rim and the electrodes' integration points leave, however smooth the rest is."""
