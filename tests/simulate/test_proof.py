@@ -105,3 +105,13 @@ def test_what_a_finer_mesh_cannot_hold_is_said():
     """A film of 7 um under 9 N beside the rim wrinkles."""
     with pytest.raises(SolveError, match="wrinkles"):
         press(Film(45e-3, 7e-6, 3e9, 0.3), Polygon.triangle(2.6e-3, 0.3), (39.2e-3, 0.0), 8.9)
+
+
+def test_different_equilibria_are_no_answer(monkeypatch):
+    """Meshes that differ by a tenth are not two views of one film; by less, the difference is the estimate."""
+    scene = FILM, Circle(1e-3), (32e-3, 0.0), 1.0
+    monkeypatch.setattr("isocharge.simulate.solve.apart", lambda *_: 0.09)
+    assert press(*scene).estimated_error == pytest.approx(0.09)
+    monkeypatch.setattr("isocharge.simulate.solve.apart", lambda *_: 0.11)
+    with pytest.raises(SolveError, match=r"order \d+ and one of order \d+ find charges that differ by 11%"):
+        press(*scene)

@@ -25,6 +25,9 @@ LARGE = 0.08
 MOST_ORDERS = 3
 """How many orders are tried beyond the first mesh."""
 
+ANOTHER = 0.1
+"""Difference above which two meshes have found different equilibria, of which a film that wrinkles has many."""
+
 RINGS, AROUND = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8), 12
 """Where charges are compared: places on rings about the film's centre, in film radii, and how many on each."""
 

@@ -24,7 +24,7 @@ from isocharge.simulate.meshing import (
 from isocharge.simulate.newton import GUARD_BELOW, NewtonResult, schwerin_start, solve_linear, solve_newton
 from isocharge.simulate.placement import Placement
 from isocharge.simulate.probe import Probe
-from isocharge.simulate.proof import MOST_ORDERS, apart, needs_proof
+from isocharge.simulate.proof import ANOTHER, MOST_ORDERS, apart, needs_proof
 from isocharge.simulate.scaling import Groups, amplitude_squared
 from isocharge.simulate.sensor import Film
 from isocharge.simulate.template import Resolution, Template
@@ -205,6 +205,7 @@ def _proven(scene: _Scene, accuracy: float, start: Equilibrium | None) -> Equili
     """Solve on meshes of rising order until two agree to half of the accuracy, or `MOST_ORDERS` have been tried.
 
     Where a still finer mesh finds no rest, what two meshes agreed on stands, with their difference as its error.
+    Two that have found different equilibria are no answer.
     """
     solved = scene.solve(scene.resolution(accuracy), start)
     for _ in range(MOST_ORDERS):
@@ -212,11 +213,18 @@ def _proven(scene: _Scene, accuracy: float, start: Equilibrium | None) -> Equili
             return solved
         finer = scene.solve(replace(solved.resolution, order=solved.resolution.order + 1), solved)
         if finer.status != "converged" and solved.proven_error is not None:
-            return solved
+            break
         error = apart(solved, finer) if finer.status == "converged" else None
         solved = replace(finer, iterations=solved.iterations + finer.iterations, proven_error=error)
         if error is not None and error <= 0.5 * accuracy:
-            return solved
+            break
+    if solved.proven_error is not None and solved.proven_error > ANOTHER:
+        return replace(
+            solved,
+            status="failed",
+            message=f"a mesh of order {solved.resolution.order - 1} and one of order {solved.resolution.order} find "
+            f"charges that differ by {solved.proven_error:.0%}",
+        )
     return solved
 
 
@@ -238,6 +246,6 @@ def _why(solved: Equilibrium, tolerance: float) -> str:
     )
     return (
         f"no equilibrium at {solved.force:.4g} N, position ({x * 1e3:.4g}, {y * 1e3:.4g}) mm: {solved.message}; "
-        f"residual {solved.residual:.2g} > {tolerance:.2g} after {solved.iterations} steps"
+        f"residual {solved.residual:.2g} ({tolerance:.2g} asked for) after {solved.iterations} steps"
         + (wrinkles if smallest < 0.0 else "")
     )
