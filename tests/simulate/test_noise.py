@@ -6,7 +6,7 @@ from scipy import stats
 
 from isocharge.errors import InputError
 from isocharge.simulate import load_amplifier, noise_model
-from isocharge.simulate.amplifier import LEVELS
+from isocharge.simulate.amplifier import AMPLIFIER_LEVELS
 
 
 @pytest.mark.parametrize(("charge", "sigma"), [(0.0, 1e-12), (500e-12, np.sqrt(2.0) * 1e-12), (3e-9, 6.0827625e-12)])
@@ -60,7 +60,7 @@ def test_unknown_level_names_the_known_ones():
         noise_model("loud")
 
 
-@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("level", AMPLIFIER_LEVELS)
 def test_a_level_is_the_same_noise_for_all(level):
     """Training and limits take charges one by one, the virtual sensor in time: from one level the same noise."""
     assert noise_model(level) == load_amplifier(level).noise

@@ -5,7 +5,7 @@ A charge amplifier is a leaky integrator, tau = R C: a step of charge decays by 
     v[n] = exp(-dt / tau) v[n-1] + g (q[n] - q[n-1]) + b dt,
 
 with q the film's charge (touch, and pyroelectricity, common to all electrodes), g the gain and b the bias current; then
-come offset, hum, white noise, clipping and the converter's steps. The sizes in `LEVELS` that the film does not give -
+come offset, hum, white noise, clipping and the converter's steps. The sizes in the levels that the film does not give -
 hum, offset, bias, mismatch - are engineering choices for a tidy and a bad electric neighbourhood, not measurements.
 The memoryless part is `isocharge.simulate.noise`, and the levels `clean` and `reference` are nothing else.
 """
@@ -22,7 +22,7 @@ from scipy.signal import lfilter
 
 from isocharge.errors import InputError
 from isocharge.simulate.arrays import Array
-from isocharge.simulate.noise import NoiseModel, noise_model
+from isocharge.simulate.noise import NOISE_LEVELS, NoiseModel
 
 PVDF_PYRO = 30e-6 * 9e-6
 """C/K on an electrode of 9 mm^2: 30 uC/(m^2 K)."""
@@ -157,7 +157,7 @@ class Measurement:
 
 
 BENCH = Amplifier(
-    noise=noise_model("bench"),
+    noise=NOISE_LEVELS["bench"],
     tau=10.0,
     tau_mismatch=0.05,
     gain_mismatch=0.01,
@@ -168,11 +168,11 @@ BENCH = Amplifier(
     limit=1500e-12,
     bits=16,
 )
-LEVELS = {
-    "clean": Amplifier(noise=noise_model("clean")),
-    "reference": Amplifier(noise=noise_model("reference")),
+AMPLIFIER_LEVELS = {
+    "clean": Amplifier(noise=NOISE_LEVELS["clean"]),
+    "reference": Amplifier(noise=NOISE_LEVELS["reference"]),
     "bench": BENCH,
-    "surgery": replace(BENCH, noise=noise_model("surgery"), hum=5e-12, step=0.5),
+    "surgery": replace(BENCH, noise=NOISE_LEVELS["surgery"], hum=5e-12, step=0.5),
 }
 
 PICO, UNIT = 1e-12, 1.0
@@ -206,10 +206,10 @@ def load_amplifier(level: str) -> Amplifier:
     Raises:
         InputError: If there is no such level or file, or a key is unknown or no number in its range.
     """
-    if level in LEVELS:
-        return LEVELS[level]
+    if level in AMPLIFIER_LEVELS:
+        return AMPLIFIER_LEVELS[level]
     if not level.endswith(".toml"):
-        raise InputError(f"noise level: expected one of {', '.join(LEVELS)}, or a TOML file, got {level!r}")
+        raise InputError(f"noise level: expected one of {', '.join(AMPLIFIER_LEVELS)}, or a TOML file, got {level!r}")
     try:
         table = tomllib.loads(Path(level).read_text("utf-8"))
     except (OSError, ValueError) as error:
@@ -218,9 +218,9 @@ def load_amplifier(level: str) -> Amplifier:
 
 
 def _from_table(table: Mapping[str, Any], where: str) -> Amplifier:
-    like = LEVELS.get(table.get("like", "clean"))
+    like = AMPLIFIER_LEVELS.get(table.get("like", "clean"))
     if like is None:
-        raise InputError(f"{where}: like: expected one of {', '.join(LEVELS)}, got {table['like']!r}")
+        raise InputError(f"{where}: like: expected one of {', '.join(AMPLIFIER_LEVELS)}, got {table['like']!r}")
     for key, value in table.items():
         _check(key, value, where)
     noise = NoiseModel(

@@ -13,16 +13,14 @@ import fcntl
 import json
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from isocharge.errors import InputError, OutputError, OutputExists, SolveError, TrainingError
 from isocharge.files import new_folder, refuse_existing, sha256_of, sync_folder, write_whole
-
-Warn = Callable[[str], object]
-"""Told what a person should know."""
+from isocharge.progress import Warn
 
 
 class Draft:

@@ -8,7 +8,7 @@ place of the electrode, with the probe on it included. How well it does is measu
 built.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.errors import SceneError, SolveError
+from isocharge.progress import Progress
 from isocharge.simulate.arrays import Array, Complexes, Integers
 from isocharge.simulate.blas import single_threaded_blas
 from isocharge.simulate.charge import COARSE, FINE, NEAR, ReadoutPoints, contact_charge, touch_charge
@@ -31,9 +32,6 @@ from isocharge.simulate.solve import check_scene, press
 from isocharge.simulate.spectral import tensor_values
 from isocharge.simulate.template import Resolution
 from isocharge.simulate.theory import ACCURACY, Theory, theory_for
-
-Progress = Callable[[int, int], None]
-"""Called with (done, total)."""
 
 CHUNK = 256
 """Presses evaluated at once: keeps the working arrays within some 100 MB."""

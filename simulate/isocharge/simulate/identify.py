@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 
 from isocharge.errors import SolveError
+from isocharge.progress import Progress
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge_spline import ChargeSpline
 from isocharge.simulate.folds import Rings, scaled_jacobian, singular_values
-from isocharge.simulate.forward import ForwardMap, Progress
+from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.limits import limits_at
 from isocharge.simulate.noise import NoiseModel
 from isocharge.simulate.probe import Probe

@@ -58,7 +58,7 @@ class NoiseModel:
         return {"name": table["name"], "white_pC": float(f"{self.white * 1e12:.12g}"), "gain": self.gain}
 
 
-LEVELS = {
+NOISE_LEVELS = {
     "clean": NoiseModel("clean", 0.0, 0.0),
     "reference": NoiseModel("reference", 1e-12, 2e-3),
     "bench": NoiseModel("bench", 0.3e-12, 0.0),
@@ -79,8 +79,8 @@ def noise_model(level: str) -> NoiseModel:
     Raises:
         InputError: If there is no such level or file, or a key is unknown or no number in its range.
     """
-    if level in LEVELS:
-        return LEVELS[level]
+    if level in NOISE_LEVELS:
+        return NOISE_LEVELS[level]
     from isocharge.simulate.amplifier import load_amplifier  # which builds on this module
 
     return load_amplifier(level).noise

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from isocharge.errors import SceneError
+from isocharge.progress import Progress
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge_spline import ChargeSpline
-from isocharge.simulate.forward import ForwardMap, Progress
+from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.limits import ChargeModel, cramer_rao
 from isocharge.simulate.noise import NoiseModel
 from isocharge.simulate.probe import Circle

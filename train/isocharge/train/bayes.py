@@ -6,7 +6,6 @@ print(bayes_limit(scene).position_rms_mm)
 Both functions keep their results in the cache folder (`isocharge.train.cache`).
 """
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from isocharge.errors import ChargeError, InputError
 from isocharge.files import sha256_of
+from isocharge.progress import Progress
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge_spline import ChargeSpline
 from isocharge.simulate.forward import ForwardMap
@@ -25,9 +25,6 @@ from isocharge.simulate.sensor_file import sensor_to_dict
 from isocharge.simulate.workers import made_by
 from isocharge.train.cache import kept
 from isocharge.train.posterior import CHUNK, STEP, Posterior
-
-Progress = Callable[[int, int], None]
-"""Called with (done, total)."""
 
 PRESSES = 4000
 """Test presses of `bayes_limit`: the rms is then known to 3 %, its ratio to an estimator's on the same ones better."""

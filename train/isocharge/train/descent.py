@@ -27,9 +27,6 @@ RISE = 0.1
 REPORT_EVERY = 200
 """Steps between two looks at presses that are kept aside."""
 
-Progress = Callable[[int, int, str], None]
-"""Called with (steps done, steps in all, a line about the state)."""
-
 
 @dataclass(frozen=True)
 class Task:

@@ -7,7 +7,7 @@ the nearest known contact is searched for beforehand.
 """
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -19,12 +19,13 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from isocharge.errors import ConfigError, DatasetError
+from isocharge.progress import StageProgress, Warn
 from isocharge.simulate.dataset import Dataset
 from isocharge.simulate.noise import NoiseModel, noise_model
 from isocharge.train.charge_field import ChargeField, Domain
 from isocharge.train.checkpoint import Checkpoint
 from isocharge.train.config import FitConfig, TrainingConfig
-from isocharge.train.descent import Descent, Progress, Task
+from isocharge.train.descent import Descent, Task
 from isocharge.train.evaluate import misfit_noise, noisy_charges
 from isocharge.train.network import Features, InverseNetwork, squeezed
 from isocharge.train.second_order import FIRST, levenberg_marquardt
@@ -37,9 +38,6 @@ WARM_UP = 0.15
 
 WATCHED = 0.5
 """Positions that are watched while it trains, over those that are held out."""
-
-Warn = Callable[[str], object]
-"""Told what a person should know."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ class Fit:
 def fit_network(
     dataset: Dataset,
     config: FitConfig,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
     *,
     checkpoint: Checkpoint | None = None,
     warn: Warn = warnings.warn,
@@ -160,7 +158,7 @@ class _Training:
         watched: Presses,
         config: TrainingConfig,
         checkpoint: Checkpoint,
-        progress: Progress | None,
+        progress: StageProgress | None,
     ) -> None:
         self.network, self.field, self.train, self.watched = network, field, train, watched
         self.config, self.checkpoint, self.progress = config, checkpoint, progress

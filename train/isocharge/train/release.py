@@ -18,6 +18,7 @@ import onnxruntime
 import torch
 
 from isocharge.errors import TrainingError
+from isocharge.progress import StageProgress, Warn
 from isocharge.serve.metadata import ModelMetadata
 from isocharge.serve.model import check_target, write_model
 from isocharge.serve.session import open_session, run
@@ -30,10 +31,9 @@ from isocharge.train.card import model_card
 from isocharge.train.charge_field import Domain
 from isocharge.train.checkpoint import Checkpoint
 from isocharge.train.config import FitConfig
-from isocharge.train.descent import Progress
 from isocharge.train.evaluate import Predict, measure_errors, misfit_noise, noisy_charges
 from isocharge.train.export import export_onnx
-from isocharge.train.fit import Fit, Warn, fit_network
+from isocharge.train.fit import Fit, fit_network
 from isocharge.train.network import HIGHEST_PC, LOWEST_PC
 
 GOLDEN = 64
@@ -80,7 +80,7 @@ def train_model(
     command: str = "",
     version: int = 1,
     fresh: bool = False,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
     warn: Warn = warnings.warn,
 ) -> Release:
     """Train a model on a dataset and write it. Killed and called again with the same arguments, it goes on.

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from isocharge.progress import Progress
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.drawn import DrawnTriangulation
-from isocharge.simulate.forward import Progress
 from isocharge.simulate.noise import noise_model
 from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.study import FORCE, Study, sample

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from isocharge.files import new_folder
+from isocharge.progress import Progress
 from isocharge.simulate.drawing import save_picture
-from isocharge.simulate.forward import Progress
 from isocharge.simulate.paper.accuracy import Accuracy
 from isocharge.simulate.paper.choices import Choices
 from isocharge.simulate.paper.claims import claims, what_choices_change

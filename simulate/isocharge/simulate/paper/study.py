@@ -9,12 +9,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from isocharge.errors import SolveError
+from isocharge.progress import Progress
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge import touch_charge
 from isocharge.simulate.charge_spline import ChargeSpline
 from isocharge.simulate.curves import Curves, Mapping
 from isocharge.simulate.equilibrium import Equilibrium
-from isocharge.simulate.forward import ForwardMap, Progress
+from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.paper.choices import PAPER, Choices
 from isocharge.simulate.probe import Probe
 from isocharge.simulate.sampling import lattice

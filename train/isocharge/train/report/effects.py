@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.errors import IsochargeError
+from isocharge.progress import Announce
 from isocharge.simulate import Sensor, parse_probe
 from isocharge.simulate.arrays import Array
 from isocharge.simulate.noise import NoiseModel
@@ -44,8 +45,6 @@ ONE_NEWTON = (0.8, 1.25)
 NOISE_SEED = 515
 """Of the noise on every case's charges, relative to the bench's."""
 
-Progress = Callable[[str], None]
-
 
 @dataclass(frozen=True)
 class Case:
@@ -66,7 +65,7 @@ class Case:
     known: bool = True
 
 
-def cases(bench: Bench, clean: Presses, settings: Settings, progress: Progress) -> Iterator[Case]:
+def cases(bench: Bench, clean: Presses, settings: Settings, progress: Announce) -> Iterator[Case]:
     """Every case, from clean test presses of the bench."""
     sweep = bench.sweep()
 
@@ -161,7 +160,7 @@ def threshold_of(released: ReleasedModel, clean: Presses, bench: Bench, draws: i
     return float(np.percentile(np.concatenate(misfits), 100.0 - FALSE_ALARMS))
 
 
-def remaining(task: Task, bench: Bench, clean: Presses, progress: Progress) -> list[dict[str, Any]]:
+def remaining(task: Task, bench: Bench, clean: Presses, progress: Announce) -> list[dict[str, Any]]:
     """A known dead electrode: methods fitted anew to the charges that remain. Nothing for fewer than three of those."""
     names = bench.sensor.electrode_names
     if len(names) < 4:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.progress import Announce
 from isocharge.simulate import Dataset, ForwardMap
 from isocharge.simulate.arrays import Array
 from isocharge.train.evaluate import noisy_charges
@@ -32,9 +33,6 @@ from isocharge.train.rivals import (
 )
 from isocharge.train.rivals.linear_band import BAND_N
 from isocharge.train.split import Presses, presses_of, split_by_position
-
-Progress = Callable[[str], None]
-"""Told what comes next."""
 
 TIMED = 64
 """Presses that single predictions go through in turn."""
@@ -117,7 +115,7 @@ def roster(dataset: Dataset, film: ForwardMap, settings: Settings) -> list[tuple
 
 
 def fit_all(
-    estimators: list[tuple[str, Estimator]], released: ReleasedModel, task: Task, test: Test, progress: Progress
+    estimators: list[tuple[str, Estimator]], released: ReleasedModel, task: Task, test: Test, progress: Announce
 ) -> list[Method]:
     """Fit every method and let all of its forms answer the test presses; the released model comes first."""
     given: list[Fitted] = [released, released.contact_only()]
@@ -136,7 +134,7 @@ def answers(fitted: Fitted, test: Test) -> Array:
     return fitted.told(test.presses.contact[:, 2]).predict(test.charge_pC)
 
 
-def timed(methods: list[Method], test: Test, settings: Settings, progress: Progress) -> list[Method]:
+def timed(methods: list[Method], test: Test, settings: Settings, progress: Announce) -> list[Method]:
     """The same methods with their times and sizes, taken when all of them are fitted."""
     force, charge = test.presses.contact[:, 2], test.charge_pC
     singles = {

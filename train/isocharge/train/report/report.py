@@ -10,6 +10,7 @@ import numpy as np
 
 from isocharge.errors import ModelError
 from isocharge.files import new_folder, write_whole
+from isocharge.progress import StageProgress
 from isocharge.serve import ModelMetadata
 from isocharge.simulate import Dataset, Samples, sensor_to_dict
 from isocharge.simulate.arrays import Array
@@ -31,9 +32,6 @@ FORMAT_VERSION = 1
 COMPARED = ("Gauss-Newton", "polynomial ridge", "lookup table, interpolated", "gradient boosting", "linear band")
 """Methods beside the released model in the pictures of effects; of their forms the last, the plain one."""
 
-Progress = Callable[[int, int, str], None]
-"""Called with (steps done, steps in all, what comes next)."""
-
 
 @dataclass
 class Steps:
@@ -46,7 +44,7 @@ class Steps:
     """
 
     total: int
-    tell: Progress | None
+    tell: StageProgress | None
     done: int = 0
 
     def __call__(self, words: str) -> None:
@@ -67,7 +65,7 @@ def write_report(
     settings: Settings | None = None,
     *,
     command: str = "",
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
 ) -> dict[str, Any]:
     """Measure every method on every dataset and write `report.md`, `report.json` and the pictures.
 
