@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from isocharge.errors import OutputExists, SceneError, SolveError
+from isocharge.resumable_run import draft_of, open_draft
 from isocharge.simulate import Circle, Resolution, Sweep, Theory, load_sensor, run_sweep
-from isocharge.simulate.draft import draft_of, open_draft
 from isocharge.simulate.sweep import Solver
 
 SENSOR = load_sensor("three-25um-biaxial")

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from isocharge.errors import OutputExists
+from isocharge.resumable_run import keep_draft
 from isocharge.simulate import Circle, Sweep, read_dataset, run_sweep
-from isocharge.simulate.draft import keep_draft
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, checkpoint, fit_network, train_model
 from isocharge.train.checkpoint import Checkpoint
 

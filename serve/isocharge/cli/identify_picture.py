@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disk
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.drawing import FELT, INK, draw_electrodes
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from isocharge.cli.terminal import progress_rows, say
 from isocharge.errors import InputError
 
 if TYPE_CHECKING:
+    from isocharge.arrays import Array
     from isocharge.simulate import Equilibrium, Probe, Sensor
-    from isocharge.simulate.arrays import Array
     from isocharge.simulate.workers import Workers
 
 simulate_app = typer.Typer(no_args_is_help=True, help="From a press to the charges of the electrodes.")
@@ -174,8 +174,8 @@ def sweep_command(
 
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
+    from isocharge.resumable_run import refuse_finished
     from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
-    from isocharge.simulate.draft import refuse_finished
 
     if workers and cluster:
         raise InputError("expected either --workers or --cluster, got both")

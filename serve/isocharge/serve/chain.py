@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from isocharge.serve.arrays import Array
+from isocharge.arrays import Array
 from isocharge.serve.flags import NEGATIVE, SATURATED, TARE
 from isocharge.serve.hum import Hum, HumRule, remove_hum
 from isocharge.serve.leak import Leak, LeakRule, undo_leak

@@ -5,8 +5,8 @@ from operator import itemgetter
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import ChargeError
-from isocharge.serve.arrays import Array
 from isocharge.serve.frames import Frame
 
 

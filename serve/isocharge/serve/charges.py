@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from isocharge.arrays import Singles
 from isocharge.errors import ChargeError
-from isocharge.serve.arrays import Singles
 
 SQUARES = 1e38
 """If the squares of some charges add up to no more than this, each of them is finite and fits into float32."""

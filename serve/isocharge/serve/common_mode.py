@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.serve.arrays import Array, Reals
+from isocharge.arrays import Array, Reals
 
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
 """Common charges at which the misfit is looked at, about the one so far, pC."""

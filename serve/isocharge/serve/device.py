@@ -41,8 +41,8 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import DeviceError
-from isocharge.serve.arrays import Array
 from isocharge.serve.binary import BinaryParser
 from isocharge.serve.chain import Chain
 from isocharge.serve.common_mode import CommonModeRule

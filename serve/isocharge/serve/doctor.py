@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import PortError
-from isocharge.serve.arrays import Array
 from isocharge.serve.chain import LARGEST_PC
 from isocharge.serve.device import ANY_BOARD, Device
 from isocharge.serve.device_clock import DeviceClock

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from isocharge.serve.arrays import Array, Booleans, Reals
+from isocharge.arrays import Array, Booleans, Reals
 from isocharge.serve.flags import MISFIT, OUTSIDE
 from isocharge.serve.metadata import ModelMetadata
 from isocharge.serve.predictor import Contact, Contacts

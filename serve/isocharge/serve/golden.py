@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
+from isocharge.arrays import Singles
 from isocharge.errors import ModelError
 from isocharge.files import sha256_of
-from isocharge.serve.arrays import Singles
 from isocharge.serve.session import INPUT, OUTPUTS, run
 
 RELATIVE = 1e-5

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from isocharge.serve.arrays import Array
+from isocharge.arrays import Array
 
 LEAST_TURN = 0.02
 """Where the hum hardly turns between two frames, as a phasor's step squared, nothing can be learned."""

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.serve.arrays import Array
+from isocharge.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)

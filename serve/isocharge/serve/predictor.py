@@ -17,8 +17,8 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import ArrayLike
 
+from isocharge.arrays import Array, Singles
 from isocharge.errors import ChargeError, ModelError
-from isocharge.serve.arrays import Array, Singles
 from isocharge.serve.charges import as_batch, as_press
 from isocharge.serve.metadata import ModelMetadata
 from isocharge.serve.model import Model, load_model

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from isocharge.arrays import Array, Booleans
 from isocharge.errors import SceneError
-from isocharge.serve.arrays import Array, Booleans
 
 REST_S = 1.0
 """Nothing touches for so long at the start: time to tare."""

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 
 import onnxruntime as ort
 
+from isocharge.arrays import Singles
 from isocharge.errors import ModelError
-from isocharge.serve.arrays import Singles
 
 INPUT = "charge_pC"
 OUTPUTS = {"contact": 3, "contact_std": 3, "misfit": 1}

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Array, Reals
 from isocharge.errors import PortError
-from isocharge.serve.arrays import Array, Reals
 from isocharge.serve.chain import Chain, ChainState, Reading, advance
 from isocharge.serve.channels import ChannelPicker
 from isocharge.serve.common_mode import NO_WARMING, CommonModeRule, follow_warming

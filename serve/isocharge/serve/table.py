@@ -10,8 +10,8 @@ from typing import TextIO
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import ChargeError
-from isocharge.serve.arrays import Array
 from isocharge.serve.domain import Domain
 from isocharge.serve.predictor import Contacts, Predictor
 from isocharge.serve.record import PredictionRecord

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import TareError
-from isocharge.serve.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.serve.arrays import Array
+from isocharge.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import PortError, SceneError
-from isocharge.serve.arrays import Array
 from isocharge.serve.binary import encode_frame
 from isocharge.serve.faults import Faults, corrupt
 from isocharge.serve.frames import SEQ_MODULUS, T_US_MODULUS, Frame

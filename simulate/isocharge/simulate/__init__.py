@@ -22,10 +22,11 @@ with require("simulate"):
     from isocharge.simulate.limits import ChargeFunction, CramerRao, limits_at
     from isocharge.simulate.noise import NoiseModel, noise_model
     from isocharge.simulate.probe import Circle, Polygon, Probe, parse_probe
+    from isocharge.simulate.sampling import Sweep
     from isocharge.simulate.sensor import Calibration, Electrode, Film, Piezo, Sensor
     from isocharge.simulate.sensor_file import built_in_sensors, load_sensor, sensor_from_dict, sensor_to_dict
     from isocharge.simulate.solve import press
-    from isocharge.simulate.sweep import Sweep, run_sweep, solve_maps, write_sweep
+    from isocharge.simulate.sweep import run_sweep, solve_maps, write_sweep
     from isocharge.simulate.template import Resolution
     from isocharge.simulate.theory import Theory, theory_for
     from isocharge.simulate.triangulation import Fix, Meeting, Triangulation

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
+from isocharge.arrays import Array
 from isocharge.errors import InputError
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.noise import NOISE_LEVELS, NoiseModel
 
 PVDF_PYRO = 30e-6 * 9e-6

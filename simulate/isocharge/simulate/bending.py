@@ -25,7 +25,7 @@ tension), so the matrix is quasi-definite and needs no pivoting (Vanderbei 1995)
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.geometry import Geometry
 
 SHIFT = 5.0

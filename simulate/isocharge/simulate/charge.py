@@ -15,8 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import SensorError
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.equilibrium import Equilibrium
 from isocharge.simulate.polygon import area_in_disk, shared_area
 from isocharge.simulate.probe import Circle, Probe

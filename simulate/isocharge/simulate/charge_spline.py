@@ -15,8 +15,8 @@ from scipy.interpolate import NdBSpline
 from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
+from isocharge.arrays import Array
 from isocharge.errors import SceneError
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.sampling import lattice, sunflower
 from isocharge.simulate.scaling import amplitude_squared

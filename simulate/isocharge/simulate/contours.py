@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 from contourpy import LineType, contour_generator
 
+from isocharge.arrays import Array
 from isocharge.errors import SceneError
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge_spline import ChargeSpline, onto_disk
 from isocharge.simulate.curves import electrode_index
 from isocharge.simulate.forward import ForwardMap

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import Polynomial
 
+from isocharge.arrays import Array
 from isocharge.errors import SceneError, SensorError
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.probe import Probe
 from isocharge.simulate.sensor import Sensor

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import DatasetError, SensorError
 from isocharge.files import new_folder, sha256_of, write_whole
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.sensor import Sensor
 from isocharge.simulate.sensor_file import sensor_from_dict, sensor_to_dict
 

@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disk
 from matplotlib.patches import Polygon as Patch
 
+from isocharge.arrays import Array
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing, write_whole
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.contours import Contour
 from isocharge.simulate.curves import Curves, Mapping
 from isocharge.simulate.forward import ForwardMap

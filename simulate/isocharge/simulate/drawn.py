@@ -15,8 +15,8 @@ from itertools import combinations, product
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from isocharge.arrays import Array
 from isocharge.errors import ChargeError, SensorError
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.curves import Curves
 from isocharge.simulate.triangulation import AMBIGUOUS, APART, TOLERANCE, Fix, Meeting
 

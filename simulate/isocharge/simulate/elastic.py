@@ -7,7 +7,7 @@ in the units of `isocharge.simulate.membrane`, as a function of the nodal field 
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.bending import Bending
 from isocharge.simulate.geometry import Geometry
 from isocharge.simulate.membrane import Membrane

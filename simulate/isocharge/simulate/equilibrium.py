@@ -10,8 +10,8 @@ from typing import Literal
 
 import numpy as np
 
+from isocharge.arrays import Array, Complexes, Integers
 from isocharge.errors import SceneError
-from isocharge.simulate.arrays import Array, Complexes, Integers
 from isocharge.simulate.geometry import Geometry, film_gradient
 from isocharge.simulate.membrane import strain, stress, turn_stress
 from isocharge.simulate.meshing import LEAST_ERROR, mesh_error, place, template_for

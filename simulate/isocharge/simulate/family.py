@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.membrane import turn_stress
 from isocharge.simulate.spectral import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.template import Template

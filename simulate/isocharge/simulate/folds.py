@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array, Booleans
+from isocharge.arrays import Array, Booleans
 from isocharge.simulate.limits import ChargeModel
 from isocharge.simulate.noise import NoiseModel
 

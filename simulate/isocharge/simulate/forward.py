@@ -15,9 +15,9 @@ from functools import cached_property
 
 import numpy as np
 
+from isocharge.arrays import Array, Complexes, Integers
 from isocharge.errors import SceneError, SolveError
 from isocharge.progress import Progress
-from isocharge.simulate.arrays import Array, Complexes, Integers
 from isocharge.simulate.blas import single_threaded_blas
 from isocharge.simulate.charge import COARSE, FINE, NEAR, ReadoutPoints, contact_charge, touch_charge
 from isocharge.simulate.equilibrium import Equilibrium

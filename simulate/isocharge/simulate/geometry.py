@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array, Complexes, Integers
+from isocharge.arrays import Array, Complexes, Integers
 from isocharge.simulate.spectral import lobatto_nodes, lobatto_quadrature, tensor_basis
 from isocharge.simulate.template import Template
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import SolveError
 from isocharge.progress import Progress
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge_spline import ChargeSpline
 from isocharge.simulate.folds import Rings, scaled_jacobian, singular_values
 from isocharge.simulate.forward import ForwardMap

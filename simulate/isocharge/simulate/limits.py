@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.noise import NoiseModel
 
 SMALLEST = 1e-14

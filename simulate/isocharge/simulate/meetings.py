@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.ndimage import minimum_filter
 
-from isocharge.simulate.arrays import Array, Integers
+from isocharge.arrays import Array, Integers
 from isocharge.simulate.charge_spline import ChargeSpline, onto_disk
 
 NODE_SPACING = 0.6e-3

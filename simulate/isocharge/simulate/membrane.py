@@ -18,7 +18,7 @@ that the variation of E' is sym(F_ia v_i,b) for all three components alike.
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.geometry import Geometry
 from isocharge.simulate.scaling import Groups
 

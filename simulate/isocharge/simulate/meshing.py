@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import SceneError
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.geometry import Geometry
 from isocharge.simulate.placement import CLEARANCE, Placement, template
 from isocharge.simulate.probe import Polygon, Probe

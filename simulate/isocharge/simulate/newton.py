@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.assembly import Assembly, Factor
 from isocharge.simulate.elastic import ElasticFilm
 from isocharge.simulate.scaling import Groups

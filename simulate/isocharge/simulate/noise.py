@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array, Complexes, Integers
+from isocharge.arrays import Array, Complexes, Integers
 from isocharge.simulate.probe import Circle, Polygon, Probe
 from isocharge.simulate.template import Resolution, Template
 

@@ -12,8 +12,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from isocharge.arrays import Array, Complexes
 from isocharge.errors import SceneError
-from isocharge.simulate.arrays import Array, Complexes
 from isocharge.simulate.polygon import area_of, centroid_of, is_convex
 
 NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"

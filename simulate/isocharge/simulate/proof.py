@@ -9,7 +9,7 @@ the error of the finer one.
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.equilibrium import Equilibrium
 from isocharge.simulate.meshing import farthest
 from isocharge.simulate.probe import Polygon, Probe

@@ -14,8 +14,8 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.stats import qmc
 
+from isocharge.arrays import Array, Complexes, Integers
 from isocharge.errors import SceneError
-from isocharge.simulate.arrays import Array, Complexes, Integers
 from isocharge.simulate.probe import Probe
 
 MOST_SAMPLES = 10_000_000

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.sensor import Film
 
 TAUT = 1.6

@@ -8,8 +8,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import SensorError
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.polygon import area_of, is_convex, overlap
 
 Readout = Literal["area", "edge"]

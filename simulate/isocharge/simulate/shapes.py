@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import SceneError
 from isocharge.progress import Progress
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge_spline import ChargeSpline
 from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.limits import ChargeModel, cramer_rao

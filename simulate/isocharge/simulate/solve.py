@@ -5,8 +5,8 @@ from time import process_time
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import SceneError, SolveError
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.assembly import Assembly, assembly
 from isocharge.simulate.blas import single_threaded_blas
 from isocharge.simulate.elastic import ElasticFilm

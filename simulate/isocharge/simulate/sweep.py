@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Array, Integers
 from isocharge.errors import SceneError
 from isocharge.progress import Progress, Warn
-from isocharge.simulate.arrays import Array, Integers
+from isocharge.resumable_run import Draft, open_draft, refusals, refuse_finished
 from isocharge.simulate.blas import single_threaded_blas
 from isocharge.simulate.dataset import Samples, pack_shard, shard_entry, shard_name, write_dataset, write_manifest
-from isocharge.simulate.draft import Draft, open_draft, refusals, refuse_finished
 from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.probe import Probe
 from isocharge.simulate.sampling import MOST_SAMPLES as MOST_SAMPLES

@@ -17,7 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array, Integers
+from isocharge.arrays import Array, Integers
 from isocharge.simulate.spectral import lobatto_nodes
 
 SQUARE = 4

@@ -17,8 +17,8 @@ from itertools import combinations
 
 import numpy as np
 
+from isocharge.arrays import Array, Integers
 from isocharge.errors import ChargeError, SceneError, SensorError
-from isocharge.simulate.arrays import Array, Integers
 from isocharge.simulate.charge_spline import ChargeSpline, onto_disk
 from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.meetings import FLAT, Candidates, Nodes, step_to_meet

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from isocharge.simulate.arrays import Array, Integers
+from isocharge.arrays import Array, Integers
 from isocharge.simulate.force_curve import ForceCurve
 from isocharge.simulate.limits import ChargeModel, limits_at
 from isocharge.simulate.noise import NoiseModel

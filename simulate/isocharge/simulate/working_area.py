@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.charge_spline import ChargeSpline
 from isocharge.simulate.folds import Rings, fold_points
 from isocharge.simulate.forward import ForwardMap

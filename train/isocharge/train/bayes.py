@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import ChargeError, InputError
 from isocharge.files import sha256_of
 from isocharge.progress import Progress
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge_spline import ChargeSpline
 from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.noise import NoiseModel, noise_model

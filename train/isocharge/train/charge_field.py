@@ -16,8 +16,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.linalg import cho_factor, cho_solve
 
+from isocharge.arrays import Array, Integers
 from isocharge.errors import TrainingError
-from isocharge.simulate.arrays import Array, Integers
 
 CANDIDATES = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
 """Degrees tried in turn, in position and in force."""

@@ -1,6 +1,6 @@
 """The state of a training run, kept every few seconds, so that a killed run goes on and ends with the same weights.
 
-Each stage has a part of its own in the run's draft (`isocharge.simulate.draft`): written whole, with a checksum.
+Each stage has a part of its own in the run's draft (`isocharge.resumable_run`): written whole, with a checksum.
 """
 
 import io
@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from isocharge.simulate.draft import Draft
+from isocharge.resumable_run import Draft
 
 EVERY_S = 3.0
 """Seconds between two writes of a stage that is under way."""

@@ -15,7 +15,7 @@ from onnx import TensorProto, helper, numpy_helper
 from scipy.linalg import block_diag
 from torch import nn
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.train.network import HIGHEST_PC, LOWEST_PC, MISFIT_UNIT, InverseNetwork
 
 OPSET, IR_VERSION = 17, 8

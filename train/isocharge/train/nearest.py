@@ -10,7 +10,7 @@ curvature joins the second derivatives; then the nearest point of a disk is foun
 import numpy as np
 from scipy.stats import qmc
 
-from isocharge.simulate.arrays import Array, Integers
+from isocharge.arrays import Array, Integers
 from isocharge.simulate.noise import NoiseModel
 from isocharge.train.charge_field import ChargeField
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.train.charge_field import Domain
 
 LOWEST_PC, HIGHEST_PC = 1.0, 1e6

@@ -18,8 +18,8 @@ from functools import cached_property
 
 import numpy as np
 
+from isocharge.arrays import Array, Booleans, Integers
 from isocharge.errors import ChargeError, InputError
-from isocharge.simulate.arrays import Array, Booleans, Integers
 from isocharge.simulate.charge_spline import ChargeSpline, onto_disk
 from isocharge.simulate.folds import singular_values
 from isocharge.simulate.force_curve import ForceCurve

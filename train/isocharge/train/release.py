@@ -17,14 +17,14 @@ import onnx
 import onnxruntime
 import torch
 
+from isocharge.arrays import Array
 from isocharge.errors import TrainingError
 from isocharge.progress import StageProgress, Warn
+from isocharge.resumable_run import keep_draft
 from isocharge.serve.metadata import ModelMetadata
 from isocharge.serve.model import check_target, write_model
 from isocharge.serve.session import open_session, run
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.dataset import Dataset
-from isocharge.simulate.draft import keep_draft
 from isocharge.simulate.noise import noise_model
 from isocharge.simulate.sensor_file import sensor_to_dict
 from isocharge.train.card import model_card

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import DatasetError
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.dataset import Dataset, Samples
 from isocharge.train.charge_field import Domain
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.noise import NoiseModel
 from isocharge.train.charge_field import ChargeField
 from isocharge.train.nearest import nearest_contact, search

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.noise import NoiseModel
 from isocharge.simulate.working_area import working_area
 from isocharge.train.charge_field import ChargeField, Domain

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Singles
 from isocharge.errors import RequestError
-from isocharge.serve.arrays import Singles
 from isocharge.serve.v2.infer import InferAnswer, InferRequest
 from isocharge.serve.v2.request import NOT_HERE
 from isocharge.serve.v2.tensors import charges_from_bytes, charges_from_values, check_head, check_outputs

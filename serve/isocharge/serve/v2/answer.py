@@ -4,7 +4,7 @@ from typing import Any
 
 import orjson
 
-from isocharge.serve.arrays import Singles
+from isocharge.arrays import Singles
 from isocharge.serve.v2.infer import InferAnswer
 
 

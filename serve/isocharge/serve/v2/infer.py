@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from isocharge.serve.arrays import Singles
+from isocharge.arrays import Singles
 from isocharge.serve.predictor import BoundPress
 from isocharge.serve.session import INPUT, OUTPUTS
 from isocharge.serve.shelf import Served

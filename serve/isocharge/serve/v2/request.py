@@ -4,8 +4,8 @@ from typing import Any
 
 import orjson
 
+from isocharge.arrays import Singles
 from isocharge.errors import RequestError
-from isocharge.serve.arrays import Singles
 from isocharge.serve.v2.infer import InferRequest
 from isocharge.serve.v2.tensors import Head, charges_from_bytes, charges_from_values, check_head, check_outputs
 

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from isocharge.arrays import Singles
 from isocharge.errors import RequestError, TooLarge
-from isocharge.serve.arrays import Singles
 from isocharge.serve.charges import as_singles
 from isocharge.serve.session import INPUT, OUTPUTS
 

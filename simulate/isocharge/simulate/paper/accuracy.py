@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.progress import Progress
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.drawn import DrawnTriangulation
 from isocharge.simulate.noise import noise_model
 from isocharge.simulate.paper.choices import PAPER

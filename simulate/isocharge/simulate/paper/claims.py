@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.charge import contact_charge, thermal_charge
 from isocharge.simulate.curves import Mapping
 from isocharge.simulate.paper.accuracy import Accuracy, Errors, unnoticed

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.contours import ContourField
 from isocharge.simulate.drawing import (
     COLOURS,

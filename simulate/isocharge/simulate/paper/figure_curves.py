@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.curves import Curves, Mapping
 from isocharge.simulate.drawing import COLOURS, PRESSED, draw_curves, new_figure
 from isocharge.simulate.drawn import draw_contour

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.collections import LineCollection
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.charge import contact_charge
 from isocharge.simulate.curves import Mapping
 from isocharge.simulate.drawing import (

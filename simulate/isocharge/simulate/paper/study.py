@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+from isocharge.arrays import Array
 from isocharge.errors import SolveError
 from isocharge.progress import Progress
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.charge import touch_charge
 from isocharge.simulate.charge_spline import ChargeSpline
 from isocharge.simulate.curves import Curves, Mapping

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.drawing import COLOURS, FELT, INK, new_figure
 from isocharge.simulate.paper.choices import PAPER, normalised_cubic
 from isocharge.simulate.paper.entry import Entry, Row

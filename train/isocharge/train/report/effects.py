@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import IsochargeError
 from isocharge.progress import Announce
 from isocharge.simulate import Sensor, parse_probe
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.noise import NoiseModel
 from isocharge.train.evaluate import noisy_charges
 from isocharge.train.report.bench import Bench, press_on

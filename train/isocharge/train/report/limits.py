@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.simulate import ChargeSpline, ForwardMap
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.limits import CramerRao, limits_at
 from isocharge.train.bayes import Scene, bayes_estimate
 from isocharge.train.report.bench import Bench

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array, Integers
+from isocharge.arrays import Array, Integers
 from isocharge.train.charge_field import Domain
 from isocharge.train.evaluate import noisy_charges, position_error
 from isocharge.train.report.bench import Bench

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.train.evaluate import position_error
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.progress import Announce
 from isocharge.simulate import Dataset, ForwardMap
-from isocharge.simulate.arrays import Array
 from isocharge.train.evaluate import noisy_charges
 from isocharge.train.report.bench import Bench
 from isocharge.train.report.measures import errors, pareto, rounded

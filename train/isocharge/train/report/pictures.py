@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
+from isocharge.arrays import Integers
 from isocharge.simulate import Sensor
-from isocharge.simulate.arrays import Integers
 from isocharge.simulate.drawing import (
     INK,
     draw_electrodes,

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.arrays import Array
 from isocharge.errors import ModelError
 from isocharge.files import new_folder, write_whole
 from isocharge.progress import StageProgress
 from isocharge.serve import ModelMetadata
 from isocharge.simulate import Dataset, Samples, sensor_to_dict
-from isocharge.simulate.arrays import Array
 from isocharge.train.report import effects, maps, pictures
 from isocharge.train.report.bench import Bench, press_on
 from isocharge.train.report.limits import BAYES, CRAMER_RAO, Limits, limits_of

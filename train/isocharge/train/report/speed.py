@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.drawing import INK, new_figure
 from isocharge.train.report.colours import GREY, LIMIT_STYLES, RELEASED
 

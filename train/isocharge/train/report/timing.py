@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 
 WARM_UP = 0.2
 """Share of a round's calls that only warm up."""

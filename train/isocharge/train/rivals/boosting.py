@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from sklearn.ensemble import HistGradientBoostingRegressor
 
-from isocharge.simulate.arrays import Array, Integers
+from isocharge.arrays import Array, Integers
 from isocharge.train.charge_field import Domain
 from isocharge.train.rivals.estimator import Fitted, Task, best_of
 from isocharge.train.rivals.features import LogFeatures, affine_fit, with_one

@@ -13,7 +13,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.noise import NoiseModel
 from isocharge.train.charge_field import Domain
 from isocharge.train.evaluate import noisy_charges, position_error

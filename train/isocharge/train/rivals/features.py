@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.train.network import LOWEST_PC, Features
 
 RULERS = ((1.0, 1.0), (0.1, 0.03), (0.03, 0.03))

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.train.charge_field import ChargeField, Domain
 from isocharge.train.rivals.estimator import Fitted, Task
 from isocharge.train.rivals.features import LogFeatures

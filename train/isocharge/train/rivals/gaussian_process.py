@@ -13,7 +13,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Kernel, WhiteKernel
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.train.charge_field import Domain
 from isocharge.train.rivals.estimator import Fitted, Task
 from isocharge.train.rivals.features import LogFeatures

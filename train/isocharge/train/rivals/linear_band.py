@@ -12,8 +12,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.spatial import cKDTree
 
+from isocharge.arrays import Array
 from isocharge.errors import DatasetError
-from isocharge.simulate.arrays import Array
 from isocharge.train.rivals.estimator import Fitted, Task, best_of
 from isocharge.train.split import Presses
 

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from sklearn.linear_model import LinearRegression
 from sklearn.neighbors import KNeighborsRegressor
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.train.charge_field import Domain
 from isocharge.train.rivals.estimator import Fitted, Task, best_of
 from isocharge.train.rivals.features import RULERS, LogFeatures, affine_fit, with_one

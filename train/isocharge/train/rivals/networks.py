@@ -19,9 +19,9 @@ import torch
 from onnx import TensorProto, helper
 from torch import nn
 
+from isocharge.arrays import Array
 from isocharge.serve import Predictor
 from isocharge.serve.session import open_session
-from isocharge.simulate.arrays import Array
 from isocharge.simulate.dataset import Dataset
 from isocharge.train.config import FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.export import IR_VERSION, OPSET, GraphBuilder

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.train.charge_field import Domain
 from isocharge.train.rivals.estimator import Fitted, Task, best_of
 from isocharge.train.rivals.features import RULERS, LogFeatures

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.simulate.arrays import Array
+from isocharge.arrays import Array
 from isocharge.simulate.forward import ForwardMap
 from isocharge.simulate.triangulation import Triangulation
 from isocharge.train.rivals.estimator import Fitted, Task

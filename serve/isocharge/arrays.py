@@ -1,4 +1,4 @@
-"""The array types of public signatures: float64 for computing, float32 for what a model takes and gives."""
+"""The array types of public signatures: float64 unless a docstring says otherwise."""
 
 from typing import Any
 
@@ -12,7 +12,13 @@ Singles = NDArray[np.float32]
 """Float32 array, the number type of every model tensor."""
 
 Reals = NDArray[np.floating[Any]]
-"""Array of either."""
+"""Array of float64 or float32."""
+
+Integers = NDArray[np.intp]
+"""Array of indices."""
 
 Booleans = NDArray[np.bool_]
-"""Array of yes and no."""
+"""Array of yes and no, often of rows to take."""
+
+Complexes = NDArray[np.complex128]
+"""Points of the plane as x + iy."""
