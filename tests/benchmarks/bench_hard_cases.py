@@ -34,7 +34,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.theory import ACCURACY
+from isocharge.simulate.mechanics.theory import ACCURACY
 
 SENSORS = tuple(load_sensor(name) for name in ("three-25um-biaxial", "four-25um-uniaxial"))
 RADIUS = 45e-3

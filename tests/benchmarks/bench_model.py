@@ -15,7 +15,7 @@ from bench_predictor import machine
 
 from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
-from isocharge.simulate.sensor_file import sensor_from_dict
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.train.bayes import BayesLimit, Scene, bayes_estimate
 from isocharge.train.report.measures import coverage
 from isocharge.train.report.report import inner_radius

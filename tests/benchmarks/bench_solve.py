@@ -33,8 +33,8 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.charge import ReadoutPoints
-from isocharge.simulate.meshing import template_for
+from isocharge.simulate.forward.readout import ReadoutPoints
+from isocharge.simulate.mesh.placement import template_for
 
 SENSORS = tuple(load_sensor(name) for name in built_in_sensors())
 FILM, PROBE = SENSORS[0].film, Circle(1e-3)

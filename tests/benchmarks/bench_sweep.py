@@ -34,7 +34,7 @@ from isocharge.simulate import (
     run_sweep,
     touch_charge,
 )
-from isocharge.simulate.workers import local_workers
+from isocharge.simulate.execution.workers import local_workers
 
 PROBES = ("circle:1.0", "rectangle:4.0x2.0", "triangle:4.0")
 FINER = Resolution(order=7, around=16, rings=8, rim=2)

@@ -27,11 +27,10 @@ from isocharge.simulate import (
     load_sensor,
     write_sweep,
 )
-from isocharge.simulate.geometry import Geometry
-from isocharge.simulate.meshing import place, template_for
-from isocharge.simulate.placement import Placement
-from isocharge.simulate.scaling import Groups
-from isocharge.simulate.template import Template
+from isocharge.simulate.mechanics.scaling import Groups
+from isocharge.simulate.mesh.elements import Geometry
+from isocharge.simulate.mesh.placement import Placement, place, template_for
+from isocharge.simulate.mesh.template import Template
 
 DATA = Path(__file__).parents[1] / "data"
 TURNED = Polygon.rectangle(4e-3, 2e-3, 0.3)

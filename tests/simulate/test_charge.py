@@ -20,7 +20,7 @@ from isocharge.simulate import (
     thermal_charge,
     touch_charge,
 )
-from isocharge.simulate.charge import COARSE, FINE, ReadoutPoints
+from isocharge.simulate.forward.readout import COARSE, FINE, ReadoutPoints
 
 AREA, D31, D32 = 9e-6, 20e-12, 2e-12
 

@@ -7,7 +7,7 @@ import pytest
 
 from isocharge.errors import SceneError
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Resolution, Theory, load_sensor
-from isocharge.simulate.sampling import sunflower
+from isocharge.simulate.numerics.disk import sunflower
 
 RADIUS, FORCES = 4e-3, (0.2, 1.0)
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)

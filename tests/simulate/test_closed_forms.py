@@ -22,7 +22,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.theory import named
+from isocharge.simulate.mechanics.theory import named
 
 REFINED = Resolution(order=7, around=8, rings=6)
 WITH_RIM = Resolution(order=7, around=8, rings=6, rim=2)
@@ -331,7 +331,7 @@ class Axisymmetric:
 
 
 def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float, at: np.ndarray) -> Axisymmetric:
-    """Solve for (u, phi = r S_r (1 + A^2 u'), w) in the scaled variables of isocharge.simulate.membrane, load one.
+    """Solve for (u, phi = r S_r (1 + A^2 u'), w) in the scaled variables of mechanics.membrane, load one.
 
     Radial balance is phi' = S_theta (1 + A^2 u / r), vertical balance r S_r w' = - min(1, (r / R)^2) / 2 pi.
     """

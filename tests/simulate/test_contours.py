@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from isocharge.errors import SceneError, SensorError
 from isocharge.simulate import Circle, ContourField, Electrode, ForwardMap, Resolution, Sensor, Theory, load_sensor
-from isocharge.simulate.charge_spline import ChargeSpline
+from isocharge.simulate.forward.charge_spline import ChargeSpline
 
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = {"theory": Theory(stretching=True, bending=False, pretensioned=False), "resolution": Resolution(4, 8, 4)}

@@ -17,8 +17,8 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.elastic import ElasticFilm
-from isocharge.simulate.geometry import Geometry
+from isocharge.simulate.mechanics.energy import ElasticFilm
+from isocharge.simulate.mesh.elements import Geometry
 
 ORDERS = (3, 4, 5, 6)
 PROBES = {"circle": Circle(1e-3), "rectangle": Polygon.rectangle(4e-3, 2e-3, 0.5)}

@@ -12,7 +12,7 @@ import pytest
 
 from isocharge.errors import DatasetError, OutputError, OutputExists
 from isocharge.simulate import Samples, load_sensor, read_dataset, write_dataset
-from isocharge.simulate.dataset import COLUMNS
+from isocharge.simulate.dataset.card import COLUMNS
 
 
 def samples(count: int = 5, seed: int = 0) -> Samples:

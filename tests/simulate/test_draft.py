@@ -15,7 +15,7 @@ import pytest
 from isocharge.errors import OutputExists, SceneError, SolveError
 from isocharge.resumable_run import draft_of, open_draft
 from isocharge.simulate import Circle, Resolution, Sweep, Theory, load_sensor, run_sweep
-from isocharge.simulate.sweep import Solver
+from isocharge.simulate.solver.settings import Solver
 
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = Solver(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))

@@ -7,8 +7,8 @@ import pytest
 
 from isocharge.errors import SceneError
 from isocharge.simulate import Circle, Film, Polygon, Resolution, Theory, load_sensor, press, touch_charge
-from isocharge.simulate.equilibrium import LINEAR_STRESS
-from isocharge.simulate.membrane import stress, turn_stress
+from isocharge.simulate.mechanics.stress import stress, turn_stress
+from isocharge.simulate.solver.equilibrium import LINEAR_STRESS
 
 FULL = Theory(stretching=True, bending=True, pretensioned=False)
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import ChargeFunction, ChargeSpline, Circle, ForwardMap, load_sensor, noise_model, working_area
-from isocharge.simulate.folds import Rings, fold_points, scaled_jacobian, singular_values, turned_over
-from isocharge.simulate.limits import limits_at
-from isocharge.simulate.twins import find_twins, nearest_contact
+from isocharge.simulate.identifiability.ambiguities import find_twins, nearest_contact
+from isocharge.simulate.identifiability.cramer_rao import limits_at
+from isocharge.simulate.identifiability.folds import fold_points, scaled_jacobian, singular_values, turned_over
+from isocharge.simulate.numerics.disk import Rings
 
 REFERENCE = noise_model("reference")
 CREASE = 3e-3

@@ -19,8 +19,8 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.family import Family
-from isocharge.simulate.forward import INTERPOLATION_ERROR
+from isocharge.simulate.forward.family import Family
+from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
 QUICK = {"radius": 4e-3, "force_range": (0.7, 1.0), "theory": MEMBRANE, "resolution": Resolution(5, 8, 4)}
@@ -265,7 +265,7 @@ def test_impossible_families_are_refused(arguments, message):
 
 def test_a_map_that_interpolates_badly_is_refused(monkeypatch):
     """An error that cannot be reached is not passed over."""
-    monkeypatch.setattr("isocharge.simulate.forward.INTERPOLATION_ERROR", 1e-13)
+    monkeypatch.setattr("isocharge.simulate.forward.forward_map.INTERPOLATION_ERROR", 1e-13)
     with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to .* only, expected 1e-13"):
         ForwardMap.build(
             load_sensor("three-25um-biaxial"), Circle(1e-3), **{**QUICK, "resolution": Resolution(3, 8, 2)}

@@ -17,8 +17,8 @@ from isocharge.simulate import (
     load_sensor,
     noise_model,
 )
-from isocharge.simulate.identify import identify, map_to_search, search_radius
-from isocharge.simulate.shapes import (
+from isocharge.simulate.identifiability.identification import identify, map_to_search, search_radius
+from isocharge.simulate.identifiability.probe_discrimination import (
     inner_forces,
     mistake,
     size_limit,

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.stats import norm
 
 from isocharge.simulate import ChargeFunction, NoiseModel, limits_at, noise_model
-from isocharge.simulate.limits import cramer_rao
+from isocharge.simulate.identifiability.cramer_rao import cramer_rao
 
 AT = np.array([[8.0, 0.0], [0.0, 8.0], [-8.0, 0.0], [0.0, -8.0]]) * 1e-3
 

@@ -8,8 +8,9 @@ from scipy.integrate import dblquad
 from scipy.spatial.transform import Rotation
 
 from isocharge.simulate import Circle, Polygon, Resolution
-from isocharge.simulate.membrane import Membrane, strain, stress, turn_stress
-from isocharge.simulate.scaling import Groups
+from isocharge.simulate.mechanics.membrane import Membrane
+from isocharge.simulate.mechanics.scaling import Groups
+from isocharge.simulate.mechanics.stress import strain, stress, turn_stress
 
 
 def groups(amplitude2: float, tension: float, poisson: float = 0.34) -> Groups:

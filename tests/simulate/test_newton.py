@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from isocharge.errors import SceneError, SolveError
-from isocharge.simulate import Circle, Polygon, Resolution, Theory, load_sensor, newton, press, touch_charge
-from isocharge.simulate.assembly import Assembly, Factor
-from isocharge.simulate.newton import schwerin_start
-from isocharge.simulate.scaling import Groups
+from isocharge.simulate import Circle, Polygon, Resolution, Theory, load_sensor, press, touch_charge
+from isocharge.simulate.mechanics.scaling import Groups
+from isocharge.simulate.solver import newton
+from isocharge.simulate.solver.assembly import Assembly, Factor
+from isocharge.simulate.solver.newton import schwerin_start
 
 FORCES = (1e-5, 1e-3, 0.1, 1.0, 10.0)
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
@@ -96,13 +97,13 @@ def test_start_of_a_much_thicker_film_still_converges(film):
 def test_failure_raises_a_full_sentence(film):
     message = r"no equilibrium at 1\.5 N, position \(2, -3\) mm: .*; residual .* \(1e-30 asked for\) after \d+ steps"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("isocharge.simulate.newton.ROUND_OFF", 0.0)
+        patch.setattr("isocharge.simulate.solver.newton.ROUND_OFF", 0.0)
         with pytest.raises(SolveError, match=message):
             press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, **FAILING)
 
 
 def test_failure_is_told_if_asked_not_to_raise(film, monkeypatch):
-    monkeypatch.setattr("isocharge.simulate.newton.ROUND_OFF", 0.0)
+    monkeypatch.setattr("isocharge.simulate.solver.newton.ROUND_OFF", 0.0)
     failed = press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, throw=False, **FAILING)
     assert failed.status == "failed"
     assert 0.0 < failed.residual < 1e-9
@@ -117,7 +118,7 @@ def test_round_off_is_not_a_failure(film):
 
 
 def test_steps_are_limited(film, monkeypatch):
-    monkeypatch.setattr("isocharge.simulate.newton.MAX_ITERATIONS", 2)
+    monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 2)
     failed = press(film, Circle(1e-3), (0.0, 0.0), 1.0, throw=False)
     assert (failed.status, failed.message) == ("failed", "no progress any more after 2 steps")
     assert failed.iterations == 4  # two at once, two with the load in parts
@@ -138,7 +139,7 @@ WRINKLES = r"no equilibrium at .* N, position \(.*\) mm: .* it wrinkles, which h
 
 def test_a_film_that_wrinkles_is_told(film, monkeypatch):
     """Stopped early, beside the rim, where it is compressed: the message says so. In the middle it does not."""
-    monkeypatch.setattr("isocharge.simulate.newton.MAX_ITERATIONS", 3)
+    monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 3)
     mesh = {"theory": FULL, "resolution": Resolution(5, 8, 6, 1)}
     with pytest.raises(SolveError, match=WRINKLES):
         press(film, Circle(1e-3), (0.0, 42e-3), 5.0, **mesh)

@@ -6,7 +6,7 @@ from scipy import stats
 
 from isocharge.errors import InputError
 from isocharge.simulate import load_amplifier, noise_model
-from isocharge.simulate.amplifier import AMPLIFIER_LEVELS
+from isocharge.simulate.measuring_chain.levels import AMPLIFIER_LEVELS
 
 
 @pytest.mark.parametrize(("charge", "sigma"), [(0.0, 1e-12), (500e-12, np.sqrt(2.0) * 1e-12), (3e-9, 6.0827625e-12)])

@@ -10,13 +10,15 @@ import pytest
 from PIL import Image
 
 from isocharge.errors import OutputExists
-from isocharge.simulate import Circle, drawing, load_sensor
-from isocharge.simulate.paper import Choices, study, write_paper
+from isocharge.simulate import Circle, load_sensor
+from isocharge.simulate.execution.workers import Workers
+from isocharge.simulate.paper import Choices, write_paper
+from isocharge.simulate.paper import solves as study
 from isocharge.simulate.paper.choices import PAPER, normalised_cubic
-from isocharge.simulate.paper.layouts import trilaterate
-from isocharge.simulate.paper.study import Presses, build_map, solve_presses
-from isocharge.simulate.paper.thickness import ChargeForce
-from isocharge.simulate.workers import Workers
+from isocharge.simulate.paper.equation_4 import ChargeForce
+from isocharge.simulate.paper.figure_layouts import trilaterate
+from isocharge.simulate.paper.solves import Presses, build_map, solve_presses
+from isocharge.simulate.plots import figure as drawing
 
 FIGURES = [f"Fig. {number}" for number in range(1, 13)]
 SMALL = replace(

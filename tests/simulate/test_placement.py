@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 
 from isocharge.errors import SceneError
 from isocharge.simulate import Circle, Film, Polygon, Probe, Resolution, Theory
-from isocharge.simulate.geometry import Geometry
-from isocharge.simulate.meshing import farthest, place, resolution_for, template_for
-from isocharge.simulate.placement import Placement
-from isocharge.simulate.template import Template
+from isocharge.simulate.mesh.elements import Geometry
+from isocharge.simulate.mesh.placement import Placement, place, template_for
+from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.sensor.probe import farthest
+from isocharge.simulate.solver.mesh_choice import resolution_for
 
 FILM = Film(1.0, 1e-3, 1.0, 0.3)
 FULL = Theory(stretching=True, bending=True, pretensioned=False)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from isocharge.simulate.polygon import area_in_disk, area_of, centroid_of, is_convex, overlap, shared_area
+from isocharge.simulate.numerics.polygon import area_in_disk, area_of, centroid_of, is_convex, overlap, shared_area
 
 SQUARE = np.array([0.0, 1.0, 1.0 + 1.0j, 1.0j])
 COMMON = settings(derandomize=True, deadline=None, max_examples=150)

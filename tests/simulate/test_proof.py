@@ -7,8 +7,8 @@ import pytest
 
 from isocharge.errors import SolveError
 from isocharge.simulate import Circle, Film, Polygon, Probe, Theory, load_sensor, press, touch_charge
-from isocharge.simulate.meshing import template_for
-from isocharge.simulate.proof import apart, needs_proof
+from isocharge.simulate.mesh.placement import template_for
+from isocharge.simulate.solver.mesh_comparison import apart, needs_proof
 
 FILM = Film(45e-3, 25e-6, 3e9, 0.34)
 SENSORS = ("three-25um-biaxial", "four-25um-uniaxial")
@@ -110,8 +110,8 @@ def test_what_a_finer_mesh_cannot_hold_is_said():
 def test_different_equilibria_are_no_answer(monkeypatch):
     """Meshes that differ by a tenth are not two views of one film; by less, the difference is the estimate."""
     scene = FILM, Circle(1e-3), (32e-3, 0.0), 1.0
-    monkeypatch.setattr("isocharge.simulate.solve.apart", lambda *_: 0.09)
+    monkeypatch.setattr("isocharge.simulate.solver.press.apart", lambda *_: 0.09)
     assert press(*scene).estimated_error == pytest.approx(0.09)
-    monkeypatch.setattr("isocharge.simulate.solve.apart", lambda *_: 0.11)
+    monkeypatch.setattr("isocharge.simulate.solver.press.apart", lambda *_: 0.11)
     with pytest.raises(SolveError, match=r"order \d+ and one of order \d+ find charges that differ by 11%"):
         press(*scene)

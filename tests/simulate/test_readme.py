@@ -16,7 +16,7 @@ from isocharge.simulate import (
     sensor_from_dict,
     touch_charge,
 )
-from isocharge.simulate.dataset import COLUMNS
+from isocharge.simulate.dataset.card import COLUMNS
 
 SIMULATE = Path(__file__).parents[2] / "simulate"
 README = (SIMULATE / "README.md").read_text("utf-8")

@@ -8,7 +8,7 @@ from scipy import stats
 
 from isocharge.errors import SceneError
 from isocharge.simulate import Circle, Polygon, Sweep
-from isocharge.simulate.sampling import lattice
+from isocharge.simulate.numerics.disk import lattice
 
 PROBES = (Circle(1e-3), Polygon.rectangle(4e-3, 2e-3), Polygon.triangle(4e-3))
 

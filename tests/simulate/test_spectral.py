@@ -8,7 +8,7 @@ from numpy.polynomial import Polynomial
 from scipy.interpolate import BarycentricInterpolator
 from scipy.special import legendre
 
-from isocharge.simulate.spectral import (
+from isocharge.simulate.numerics.interpolation import (
     barycentric_weights,
     basis,
     chebyshev_nodes,

@@ -24,7 +24,8 @@ from isocharge.simulate import (
     touch_charge,
     write_sweep,
 )
-from isocharge.simulate.sweep import SHARD, TASK, Solver
+from isocharge.simulate.dataset.sweep import SHARD, TASK
+from isocharge.simulate.solver.settings import Solver
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)

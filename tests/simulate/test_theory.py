@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from isocharge.errors import SceneError
 from isocharge.simulate import Circle, Film, Polygon, Theory, load_sensor, press, theory_for, touch_charge
-from isocharge.simulate.scaling import Groups, amplitude_squared
-from isocharge.simulate.theory import bending_length, choose, left_out, named
+from isocharge.simulate.mechanics.scaling import Groups, amplitude_squared
+from isocharge.simulate.mechanics.theory import bending_length, choose, left_out, named
 
 PROBE, AT = Circle(1e-3), (3e-3, -2e-3)
 

@@ -19,8 +19,8 @@ from isocharge.simulate import (
     load_sensor,
     noise_model,
 )
-from isocharge.simulate.charge_spline import ChargeSpline
-from isocharge.simulate.scaling import amplitude_squared
+from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.mechanics.scaling import amplitude_squared
 
 RADIUS, FORCES = 8e-3, (0.2, 2.0)
 QUICK = {"theory": Theory(stretching=True, bending=False, pretensioned=False), "resolution": Resolution(4, 8, 4)}

@@ -13,9 +13,9 @@ import pytest
 
 from isocharge.errors import InputError, MissingExtra, WorkersLost
 from isocharge.simulate import Circle, Resolution, Sweep, Theory, load_sensor, run_sweep
-from isocharge.simulate import workers as module
-from isocharge.simulate.sweep import Solver
-from isocharge.simulate.workers import Workers, dask_workers, local_workers
+from isocharge.simulate.execution import workers as module
+from isocharge.simulate.execution.workers import Workers, dask_workers, local_workers
+from isocharge.simulate.solver.settings import Solver
 
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = Solver(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))

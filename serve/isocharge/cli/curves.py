@@ -66,7 +66,7 @@ def curves_command(
 
 
 def _check_picture(output: Path) -> None:
-    from isocharge.simulate.drawing import check_picture
+    from isocharge.simulate.plots.figure import check_picture
 
     check_picture(output)
 
@@ -113,23 +113,25 @@ def _curves_table(curves: "Curves") -> str:
 
 
 def _draw_curves(sensor: "Sensor", curves: "Curves", smooth: "Curves", output: Path) -> None:
-    from isocharge.simulate import drawing
+    from isocharge.simulate.plots.curves import draw_curves
+    from isocharge.simulate.plots.figure import new_figure, save_picture
 
-    figure = drawing.new_figure(12.0, 5.6)
+    figure = new_figure(12.0, 5.6)
     left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
-    drawing.draw_curves(left, curves, smooth)
+    draw_curves(left, curves, smooth)
     _draw_scheme(right, sensor, curves.mapping)
     figure.suptitle(f"{sensor.name}, {curves.probe.notation}, {curves.force:g} N")
-    drawing.save_picture(figure, output)
+    save_picture(figure, output)
     say(f"drawn in {output}")
 
 
 def _draw_scheme(axes: Any, sensor: "Sensor", mapping: "Mapping") -> None:
-    from isocharge.simulate import drawing
+    from isocharge.simulate.plots.curves import draw_mapping
+    from isocharge.simulate.plots.film import draw_electrodes, frame_film
 
-    drawing.draw_mapping(axes, mapping)
-    drawing.draw_electrodes(axes, sensor, highlight=mapping.electrode)
-    drawing.frame_film(axes, sensor, mapping.reach + 1e-3, f"lines from {mapping.electrode}")
+    draw_mapping(axes, mapping)
+    draw_electrodes(axes, sensor, highlight=mapping.electrode)
+    frame_film(axes, sensor, mapping.reach + 1e-3, f"lines from {mapping.electrode}")
 
 
 def contours_command(
@@ -187,7 +189,7 @@ def contours_command(
 
 def _wanted(sensor: "Sensor", texts: list[str]) -> dict[str, tuple[float, ...]]:
     """Charges (C) by electrode from "A=650"."""
-    from isocharge.simulate.curves import electrode_index
+    from isocharge.simulate.sensor.sensor import electrode_index
 
     wanted: dict[str, tuple[float, ...]] = {}
     for text in texts:
@@ -290,24 +292,26 @@ def _draw_contours(
     meeting: dict[str, Any] | None,
     output: Path,
 ) -> None:
-    from isocharge.simulate import drawing
+    from isocharge.simulate.plots.curves import draw_contours
+    from isocharge.simulate.plots.figure import COLOURS, new_figure, save_picture
+    from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 
     made, radius = field.forward_map, field.table.radius
-    figure = drawing.new_figure(7.4, 8.0)
+    figure = new_figure(7.4, 8.0)
     axes = figure.subplots()
-    for name, colour in zip(made.sensor.electrode_names, drawing.COLOURS * len(found), strict=False):
+    for name, colour in zip(made.sensor.electrode_names, COLOURS * len(found), strict=False):
         pieces = [piece for contour in found.get(name, []) for piece in contour]
-        drawing.draw_contours(axes, pieces, colour, f"{name}, from the field")
+        draw_contours(axes, pieces, colour, f"{name}, from the field")
         for number, contour in enumerate(c for c in by_hand.get(name, []) if c is not None):
             label = f"{name}, drawn" if number == 0 else None
             axes.plot(*1e3 * contour.points.T, "--", color=colour, lw=0.9, label=label)
-    drawing.draw_electrodes(axes, made.sensor)
-    drawing.draw_working_area(axes, radius, f"within {1e3 * radius:g} mm")
+    draw_electrodes(axes, made.sensor)
+    draw_working_area(axes, radius, f"within {1e3 * radius:g} mm")
     place = meeting["at_mm"] if meeting else None
     corner = (-0.85 * radius, 0.85 * radius) if place is None else (1e-3 * place[0], 1e-3 * place[1])
-    drawing.draw_probe(axes, made.probe, corner, "probe" if place is None else "probe, where they meet")
+    draw_probe(axes, made.probe, corner, "probe" if place is None else "probe, where they meet")
     title = f"isocharge contours: {made.sensor.name}, {made.probe.notation}, {field.force:g} N"
-    drawing.frame_film(axes, made.sensor, radius, title)
+    frame_film(axes, made.sensor, radius, title)
     figure.legend(fontsize=8, loc="outside lower center", ncols=4)
-    drawing.save_picture(figure, output)
+    save_picture(figure, output)
     say(f"drawn in {output}")

@@ -14,7 +14,7 @@ from isocharge.files import new_folder, refuse_existing, write_whole
 
 if TYPE_CHECKING:
     from isocharge.simulate import ForwardMap, Probe, Sensor
-    from isocharge.simulate.identify import Identification
+    from isocharge.simulate.identifiability.identification import Identification
 
 PICTURE, NUMBERS = "identify.png", "identify.json"
 """Files in an output folder."""
@@ -53,7 +53,7 @@ def identify_command(
     Example: isocharge simulate identify three-25um-biaxial --probe circle:1.0 --error 0.5 -o limits
     """
     from isocharge.simulate import load_sensor, noise_model, parse_probe
-    from isocharge.simulate.identify import identify
+    from isocharge.simulate.identifiability.identification import identify
 
     if output is not None:
         refuse_existing(output)
@@ -80,7 +80,7 @@ def identify_command(
 
 def _solve(sensor: "Sensor", probe: "Probe", force: tuple[float, float], radius: float | None) -> "ForwardMap":
     from isocharge.simulate import ForwardMap
-    from isocharge.simulate.identify import map_to_search
+    from isocharge.simulate.identifiability.identification import map_to_search
 
     with progress(f"solving the film under {probe.notation}") as advance:
         if radius is None:
@@ -90,7 +90,7 @@ def _solve(sensor: "Sensor", probe: "Probe", force: tuple[float, float], radius:
 
 def _mistakes(found: "list[Identification]") -> list[dict[str, Any]]:
     """Each of the other probes taken for the first."""
-    from isocharge.simulate.shapes import inner_forces, mistake, spread_contacts
+    from isocharge.simulate.identifiability.probe_discrimination import inner_forces, mistake, spread_contacts
 
     first, rows = found[0], []
     for other in found[1:]:
@@ -108,7 +108,7 @@ def _name(probe: "Probe") -> str:
 
 def _size(made: "ForwardMap", found: "Identification") -> list[dict[str, Any]]:
     """How well the charges tell a circle's radius."""
-    from isocharge.simulate.shapes import size_told
+    from isocharge.simulate.identifiability.probe_discrimination import size_told
 
     forces, reach = [each.force for each in found.maps], found.area.radius
     with progress("solving the film under other radii") as advance:

@@ -11,10 +11,11 @@ from matplotlib.patches import Circle as Disk
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from isocharge.arrays import Array
-from isocharge.simulate.drawing import FELT, INK, draw_electrodes
+from isocharge.simulate.plots.figure import FELT, INK
+from isocharge.simulate.plots.film import draw_electrodes
 
 if TYPE_CHECKING:
-    from isocharge.simulate.identify import Identification, LimitMap
+    from isocharge.simulate.identifiability.identification import Identification, LimitMap
 
 SMALLEST_MM, LARGEST_MM = 0.02, 5.0
 """Errors at the ends of the colours."""

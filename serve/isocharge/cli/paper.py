@@ -30,8 +30,8 @@ def paper_command(
     Example: isocharge simulate paper -o paper
     """
     from isocharge.files import refuse_existing
+    from isocharge.simulate.execution.workers import cores, local_workers
     from isocharge.simulate.paper import Choices, write_paper
-    from isocharge.simulate.workers import cores, local_workers
 
     refuse_existing(output)
     began = time.perf_counter()

@@ -9,16 +9,8 @@ import numpy as np
 from matplotlib.patches import Circle as Disk
 
 from isocharge.arrays import Array
-from isocharge.simulate.drawing import (
-    FELT,
-    INK,
-    PRESSED,
-    draw_charge_map,
-    draw_electrodes,
-    draw_working_area,
-    frame_film,
-    new_figure,
-)
+from isocharge.simulate.plots.figure import FELT, INK, PRESSED, new_figure
+from isocharge.simulate.plots.film import draw_charge_map, draw_electrodes, draw_working_area, frame_film
 
 if TYPE_CHECKING:
     from isocharge.simulate import Equilibrium, ForwardMap

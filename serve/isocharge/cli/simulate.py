@@ -16,7 +16,7 @@ from isocharge.errors import InputError
 if TYPE_CHECKING:
     from isocharge.arrays import Array
     from isocharge.simulate import Equilibrium, Probe, Sensor
-    from isocharge.simulate.workers import Workers
+    from isocharge.simulate.execution.workers import Workers
 
 simulate_app = typer.Typer(no_args_is_help=True, help="From a press to the charges of the electrodes.")
 
@@ -67,7 +67,7 @@ def point_command(
     Example: isocharge simulate point three-25um-biaxial --probe triangle:4.0@30 --at 3,-2 --force 1.0
     """
     from isocharge.simulate import load_sensor, parse_probe, press, theory_for, thermal_charge, touch_charge
-    from isocharge.simulate.theory import named
+    from isocharge.simulate.mechanics.theory import named
 
     if not 1e-8 <= accuracy <= 1.0:
         raise InputError(f"--accuracy: expected a relative error from 1e-8 to 1, got {accuracy}")
@@ -214,7 +214,7 @@ def number_mm(text: str) -> float:
 def auto_radius(sensor: "Sensor", probes: "list[Probe]", force: tuple[float, float]) -> float:
     """Radius of the disk that is in the working area of every probe under `reference` noise, m."""
     from isocharge.simulate import noise_model, working_area
-    from isocharge.simulate.identify import map_to_search
+    from isocharge.simulate.identifiability.identification import map_to_search
 
     areas = []
     for probe in probes:
@@ -232,6 +232,6 @@ def auto_radius(sensor: "Sensor", probes: "list[Probe]", force: tuple[float, flo
 
 
 def _crew(workers: int | None, cluster: str | None) -> AbstractContextManager["Workers"]:
-    from isocharge.simulate.workers import cores, dask_workers, local_workers
+    from isocharge.simulate.execution.workers import cores, dask_workers, local_workers
 
     return dask_workers(cluster) if cluster else local_workers(workers or min(cores(), MOST_WORKERS))

@@ -10,27 +10,32 @@ charge = touch_charge(sensor, equilibrium)  # C, in the order of sensor.electrod
 from isocharge.extras import require
 
 with require("simulate"):
-    from isocharge.simulate.amplifier import Amplifier, Measurement, load_amplifier
-    from isocharge.simulate.charge import contact_charge, pretension_charge, thermal_charge, touch_charge
-    from isocharge.simulate.charge_spline import ChargeSpline
-    from isocharge.simulate.contours import Contour, ContourField
-    from isocharge.simulate.curves import Curves, Mapping
-    from isocharge.simulate.dataset import Dataset, Samples, read_dataset, write_dataset
-    from isocharge.simulate.drawn import DrawnContour, DrawnTriangulation, draw_contour
-    from isocharge.simulate.equilibrium import Equilibrium
-    from isocharge.simulate.forward import ForwardMap
-    from isocharge.simulate.limits import ChargeFunction, CramerRao, limits_at
-    from isocharge.simulate.noise import NoiseModel, noise_model
-    from isocharge.simulate.probe import Circle, Polygon, Probe, parse_probe
-    from isocharge.simulate.sampling import Sweep
-    from isocharge.simulate.sensor import Calibration, Electrode, Film, Piezo, Sensor
-    from isocharge.simulate.sensor_file import built_in_sensors, load_sensor, sensor_from_dict, sensor_to_dict
-    from isocharge.simulate.solve import press
-    from isocharge.simulate.sweep import run_sweep, solve_maps, write_sweep
-    from isocharge.simulate.template import Resolution
-    from isocharge.simulate.theory import Theory, theory_for
-    from isocharge.simulate.triangulation import Fix, Meeting, Triangulation
-    from isocharge.simulate.working_area import WorkingArea, working_area
+    from isocharge.simulate.contours.charge_curves import Curves, Mapping
+    from isocharge.simulate.contours.field_contours import Contour, ContourField
+    from isocharge.simulate.contours.fix import Fix, Meeting
+    from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTriangulation, draw_contour
+    from isocharge.simulate.contours.triangulation import Triangulation
+    from isocharge.simulate.dataset.sampling import Sweep
+    from isocharge.simulate.dataset.shards import Dataset, Samples, read_dataset, write_dataset
+    from isocharge.simulate.dataset.sweep import run_sweep, solve_maps, write_sweep
+    from isocharge.simulate.forward.charge_model import ChargeFunction
+    from isocharge.simulate.forward.charge_spline import ChargeSpline
+    from isocharge.simulate.forward.forward_map import ForwardMap
+    from isocharge.simulate.forward.readout import contact_charge, pretension_charge, thermal_charge, touch_charge
+    from isocharge.simulate.identifiability.cramer_rao import CramerRao, limits_at
+    from isocharge.simulate.identifiability.working_area import WorkingArea, working_area
+    from isocharge.simulate.measuring_chain.amplifier import Amplifier, Measurement
+    from isocharge.simulate.measuring_chain.noise import NoiseModel
+    from isocharge.simulate.measuring_chain.noise_file import load_amplifier, noise_model
+    from isocharge.simulate.mechanics.theory import Theory, theory_for
+    from isocharge.simulate.mesh.resolution import Resolution
+    from isocharge.simulate.sensor.electrode import Calibration, Electrode
+    from isocharge.simulate.sensor.film import Film, Piezo
+    from isocharge.simulate.sensor.probe import Circle, Polygon, Probe, parse_probe
+    from isocharge.simulate.sensor.sensor import Sensor
+    from isocharge.simulate.sensor.sensor_file import built_in_sensors, load_sensor, sensor_from_dict, sensor_to_dict
+    from isocharge.simulate.solver.equilibrium import Equilibrium
+    from isocharge.simulate.solver.press import press
 
 __all__ = [
     "Amplifier",

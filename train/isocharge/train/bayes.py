@@ -15,14 +15,15 @@ from isocharge.arrays import Array
 from isocharge.errors import ChargeError, InputError
 from isocharge.files import sha256_of
 from isocharge.progress import Progress
-from isocharge.simulate.charge_spline import ChargeSpline
-from isocharge.simulate.forward import ForwardMap
-from isocharge.simulate.noise import NoiseModel, noise_model
-from isocharge.simulate.probe import Probe
-from isocharge.simulate.sampling import Sweep
-from isocharge.simulate.sensor import Sensor
-from isocharge.simulate.sensor_file import sensor_to_dict
-from isocharge.simulate.workers import made_by
+from isocharge.simulate.dataset.sampling import Sweep
+from isocharge.simulate.execution.code_version import made_by
+from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.measuring_chain.noise_file import noise_model
+from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.cache import kept
 from isocharge.train.posterior import CHUNK, STEP, Posterior
 

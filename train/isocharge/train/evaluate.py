@@ -5,7 +5,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.noise import NoiseModel, noise_model
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.split import Presses
 
 Predict = Callable[[Array], tuple[Array, Array, Array]]

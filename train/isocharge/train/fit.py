@@ -20,8 +20,9 @@ from torch import Tensor
 
 from isocharge.errors import ConfigError, DatasetError
 from isocharge.progress import StageProgress, Warn
-from isocharge.simulate.dataset import Dataset
-from isocharge.simulate.noise import NoiseModel, noise_model
+from isocharge.simulate.dataset.shards import Dataset
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.charge_field import ChargeField, Domain
 from isocharge.train.checkpoint import Checkpoint
 from isocharge.train.config import FitConfig, TrainingConfig

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from isocharge.arrays import Array, Integers
-from isocharge.simulate.noise import NoiseModel
+from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.charge_field import ChargeField
 
 STEPS = 30

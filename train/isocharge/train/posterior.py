@@ -20,10 +20,11 @@ import numpy as np
 
 from isocharge.arrays import Array, Booleans, Integers
 from isocharge.errors import ChargeError, InputError
-from isocharge.simulate.charge_spline import ChargeSpline, onto_disk
-from isocharge.simulate.folds import singular_values
-from isocharge.simulate.force_curve import ForceCurve
-from isocharge.simulate.noise import NoiseModel
+from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.identifiability.folds import singular_values
+from isocharge.simulate.identifiability.force_profile import ForceCurve
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.numerics.disk import onto_disk
 
 CHUNK = 64
 """Presses integrated at once: keeps the working arrays within some 100 MB."""

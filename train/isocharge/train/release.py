@@ -24,9 +24,9 @@ from isocharge.resumable_run import keep_draft
 from isocharge.serve.metadata import ModelMetadata
 from isocharge.serve.model import check_target, write_model
 from isocharge.serve.session import open_session, run
-from isocharge.simulate.dataset import Dataset
-from isocharge.simulate.noise import noise_model
-from isocharge.simulate.sensor_file import sensor_to_dict
+from isocharge.simulate.dataset.shards import Dataset
+from isocharge.simulate.measuring_chain.noise_file import noise_model
+from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.card import model_card
 from isocharge.train.charge_field import Domain
 from isocharge.train.checkpoint import Checkpoint

@@ -6,7 +6,7 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import DatasetError
-from isocharge.simulate.dataset import Dataset, Samples
+from isocharge.simulate.dataset.shards import Dataset, Samples
 from isocharge.train.charge_field import Domain
 
 FEWEST = 500

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.noise import NoiseModel
+from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.charge_field import ChargeField
 from isocharge.train.nearest import nearest_contact, search
 from isocharge.train.network import HIGHEST_PC, LOWEST_PC

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.noise import NoiseModel
-from isocharge.simulate.working_area import working_area
+from isocharge.simulate.identifiability.working_area import working_area
+from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.charge_field import ChargeField, Domain
 
 SURE = 3e-4
@@ -24,7 +24,7 @@ SMALLEST_SHARE = 0.2
 
 @dataclass(frozen=True)
 class FieldModel:
-    """A `ChargeField` as the simulator's searches take it (`isocharge.simulate.limits.ChargeModel`): SI units.
+    """A `ChargeField` as the simulator's searches take it (`forward.charge_model.ChargeModel`): SI units.
 
     Attributes:
         field: The series.

@@ -6,18 +6,18 @@ from pathlib import Path
 
 from isocharge.files import new_folder
 from isocharge.progress import Progress
-from isocharge.simulate.drawing import save_picture
-from isocharge.simulate.paper.accuracy import Accuracy
+from isocharge.simulate.execution.workers import Workers
 from isocharge.simulate.paper.choices import Choices
 from isocharge.simulate.paper.claims import claims, what_choices_change
 from isocharge.simulate.paper.entry import Entry
+from isocharge.simulate.paper.equation_4 import eq_4
 from isocharge.simulate.paper.figure_contours import fig_9, fig_10, fig_11
 from isocharge.simulate.paper.figure_curves import fig_6, fig_8, fig_12
-from isocharge.simulate.paper.layouts import fig_1, fig_2, fig_3, fig_4, fig_5, fig_7
+from isocharge.simulate.paper.figure_layouts import fig_1, fig_2, fig_3, fig_4, fig_5, fig_7
 from isocharge.simulate.paper.page import as_json, page
-from isocharge.simulate.paper.study import Study, conduct
-from isocharge.simulate.paper.thickness import eq_4
-from isocharge.simulate.workers import Workers
+from isocharge.simulate.paper.solves import Study, conduct
+from isocharge.simulate.paper.triangulation_errors import Accuracy
+from isocharge.simulate.plots.figure import save_picture
 
 FIGURES = 15
 """Entries of the page."""

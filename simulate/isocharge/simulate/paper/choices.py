@@ -4,10 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.simulate.charge_spline import SPACING
-from isocharge.simulate.probe import Circle, Polygon, Probe
-from isocharge.simulate.sensor import Electrode, Readout, Sensor
-from isocharge.simulate.sensor_file import load_sensor
+from isocharge.simulate.forward.charge_spline import SPACING
+from isocharge.simulate.sensor.electrode import Electrode
+from isocharge.simulate.sensor.probe import Circle, Polygon, Probe
+from isocharge.simulate.sensor.sensor import Readout, Sensor
+from isocharge.simulate.sensor.sensor_file import load_sensor
 
 
 @dataclass(frozen=True)

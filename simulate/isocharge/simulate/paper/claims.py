@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.charge import contact_charge, thermal_charge
-from isocharge.simulate.curves import Mapping
-from isocharge.simulate.paper.accuracy import Accuracy, Errors, unnoticed
+from isocharge.simulate.contours.charge_curves import Mapping
+from isocharge.simulate.forward.readout import contact_charge, thermal_charge
 from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.layouts import TOUCHED
-from isocharge.simulate.paper.study import FORCE, Study, sample
+from isocharge.simulate.paper.figure_layouts import TOUCHED
+from isocharge.simulate.paper.solves import FORCE, Study, sample
+from isocharge.simulate.paper.triangulation_errors import Accuracy, Errors, unnoticed
 
 D33, PYRO, KELVIN = -30e-12, 30e-6, 0.1
 """Of PVDF, C/N and C/(m^2 K), and a temperature step (K) that a finger makes easily."""

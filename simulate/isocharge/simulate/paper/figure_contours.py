@@ -6,24 +6,16 @@ from typing import Any
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.contours import ContourField
-from isocharge.simulate.drawing import (
-    COLOURS,
-    FELT,
-    INK,
-    draw_contours,
-    draw_electrodes,
-    draw_probe,
-    draw_working_area,
-    frame_film,
-    new_figure,
-)
-from isocharge.simulate.drawn import DrawnContour, DrawnTriangulation
-from isocharge.simulate.paper.accuracy import BEYOND, Accuracy
+from isocharge.simulate.contours.field_contours import ContourField
+from isocharge.simulate.contours.fix import Meeting
+from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTriangulation
 from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.study import FORCE, Study
-from isocharge.simulate.triangulation import Meeting
+from isocharge.simulate.paper.solves import FORCE, Study
+from isocharge.simulate.paper.triangulation_errors import BEYOND, Accuracy
+from isocharge.simulate.plots.curves import draw_contours
+from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
+from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 
 LEVELS, AREA = 8, 11.5e-3
 """Contours of each electrode in Fig. 11, and how far from the centre they are followed, m: to the electrodes' end."""

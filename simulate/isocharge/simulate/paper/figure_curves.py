@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.curves import Curves, Mapping
-from isocharge.simulate.drawing import COLOURS, PRESSED, draw_curves, new_figure
-from isocharge.simulate.drawn import draw_contour
+from isocharge.simulate.contours.charge_curves import Curves, Mapping
+from isocharge.simulate.contours.graphical_method import draw_contour
 from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.study import FORCE, Study
-from isocharge.simulate.sensor import Piezo, Sensor
+from isocharge.simulate.paper.solves import FORCE, Study
+from isocharge.simulate.plots.curves import draw_curves
+from isocharge.simulate.plots.figure import COLOURS, PRESSED, new_figure
+from isocharge.simulate.sensor.film import Piezo
+from isocharge.simulate.sensor.sensor import Sensor
 
 FIG_6_DEG, FOUR_DEG = (35.0, 90.0), (110.0, 250.0)
 FINE = 97

@@ -10,9 +10,9 @@ import numpy as np
 
 from isocharge.errors import DatasetError
 from isocharge.simulate import Dataset, ForwardMap, Probe, Samples, Sensor, Sweep, noise_model, parse_probe, solve_maps
-from isocharge.simulate.noise import NoiseModel
-from isocharge.simulate.sweep import Solver
-from isocharge.simulate.theory import ACCURACY
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.mechanics.theory import ACCURACY
+from isocharge.simulate.solver.settings import Solver
 from isocharge.train.charge_field import Domain
 from isocharge.train.split import Presses, domain_of
 

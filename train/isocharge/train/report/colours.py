@@ -1,6 +1,6 @@
 """Colours and lines that the report's pictures have in common."""
 
-from isocharge.simulate.drawing import FELT
+from isocharge.simulate.plots.figure import FELT
 from isocharge.train.report.limits import BAYES, CRAMER_RAO
 
 GREY, RELEASED = "#8a95a5", FELT

@@ -10,7 +10,7 @@ from isocharge.arrays import Array
 from isocharge.errors import IsochargeError
 from isocharge.progress import Announce
 from isocharge.simulate import Sensor, parse_probe
-from isocharge.simulate.noise import NoiseModel
+from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.evaluate import noisy_charges
 from isocharge.train.report.bench import Bench, press_on
 from isocharge.train.report.measures import errors, rounded

@@ -8,7 +8,7 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.simulate import ChargeSpline, ForwardMap
-from isocharge.simulate.limits import CramerRao, limits_at
+from isocharge.simulate.identifiability.cramer_rao import CramerRao, limits_at
 from isocharge.train.bayes import Scene, bayes_estimate
 from isocharge.train.report.bench import Bench
 from isocharge.train.report.measures import errors, rms, rounded

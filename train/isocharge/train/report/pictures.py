@@ -11,14 +11,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
 from isocharge.arrays import Integers
 from isocharge.simulate import Sensor
-from isocharge.simulate.drawing import (
-    INK,
-    draw_electrodes,
-    draw_working_area,
-    frame_film,
-    new_figure,
-    save_picture,
-)
+from isocharge.simulate.plots.figure import INK, new_figure, save_picture
+from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
 from isocharge.train.charge_field import Domain
 from isocharge.train.report.colours import GREY, LIMIT_STYLES, LINES, RELEASED
 from isocharge.train.report.maps import COORDINATES, Draws

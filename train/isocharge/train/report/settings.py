@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from isocharge.simulate.theory import ACCURACY
+from isocharge.simulate.mechanics.theory import ACCURACY
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.noise import NoiseModel
+from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.charge_field import Domain
 from isocharge.train.evaluate import noisy_charges, position_error
 from isocharge.train.split import Presses

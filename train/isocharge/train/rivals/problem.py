@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.noise import NoiseModel
+from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.charge_field import ChargeField
 
 STIFF = 1e6

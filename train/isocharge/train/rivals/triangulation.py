@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.forward import ForwardMap
-from isocharge.simulate.triangulation import Triangulation
+from isocharge.simulate.contours.triangulation import Triangulation
+from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.train.rivals.estimator import Fitted, Task
 
 

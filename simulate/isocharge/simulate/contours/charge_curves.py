@@ -1,0 +1,154 @@
+"""Charge against distance on lines from an electrode: the mapping scheme of Mirbagheri et al. (2007, Fig. 2, 4 and 7).
+
+Lines leave the centre of an electrode at even angles and carry a press at even distances. The paper fits a polynomial
+to the charge along each line; see `drawn` for what it makes of them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import Polynomial
+
+from isocharge.arrays import Array
+from isocharge.errors import SceneError
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.sensor import Sensor, electrode_index
+
+STEP, LENGTH, ANGLE_STEP, HALF_ANGLE = 4e-3, 20e-3, np.deg2rad(10.0), np.deg2rad(70.0)
+"""The paper's step (m) and angle between lines (rad); ours: how long they are, how far to both sides of the centre."""
+
+MOST_PRESSES = 100_000
+"""Presses on a scheme's lines: more are a slip of the units."""
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """Where a scheme presses.
+
+    Attributes:
+        electrode: The one that the lines leave from.
+        origin: Its centre (x, y), m.
+        angle: Of each line from the drawn direction, anticlockwise, shape (n_line,), rad.
+        distance: From the origin, the same on each line, rising, shape (n_step,), m.
+    """
+
+    electrode: str
+    origin: tuple[float, float]
+    angle: Array
+    distance: Array
+
+    @classmethod
+    def lines(
+        cls,
+        sensor: Sensor,
+        electrode: str,
+        angles: tuple[float, float] | None = None,
+        angle_step: float = ANGLE_STEP,
+        step: float = STEP,
+        length: float = LENGTH,
+    ) -> "Mapping":
+        """Lines at even angles, the last one included whether or not it falls on the step.
+
+        Args:
+            sensor: Its calibration moves the electrodes.
+            electrode: Where the lines leave from.
+            angles: First and last angle, rad; HALF_ANGLE to both sides of the film's centre if absent.
+            angle_step: Between lines, rad.
+            step: Between presses on a line, and to the first, m.
+            length: Of the lines, m.
+
+        Raises:
+            SensorError: If there is no such electrode.
+            SceneError: If angles, steps or length give no press, or far too many.
+        """
+        centre = sensor.electrodes[electrode_index(sensor, electrode)].centre
+        x, y = sensor.calibration.place(np.array(centre))
+        inwards = np.arctan2(-y, -x) % (2.0 * np.pi)
+        first, last = angles if angles is not None else (inwards - HALF_ANGLE, inwards + HALF_ANGLE)
+        _check_lines(first, last, angle_step, step, length)
+        angle = np.arange(first, last - 1e-9, angle_step)
+        distance: Array = step * np.arange(1.0, int(length / step * (1.0 + 1e-9)) + 1.0)
+        return cls(electrode, (float(x), float(y)), np.append(angle, last), distance)
+
+    @property
+    def points(self) -> Array:
+        """Every press (x, y), shape (n_line, n_step, 2), m."""
+        direction = np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
+        points: Array = np.array(self.origin) + self.distance[None, :, None] * direction[:, None]
+        return points
+
+    @property
+    def reach(self) -> float:
+        """Distance of the farthest press from the film's centre, m: what a forward map must cover."""
+        return float(np.linalg.norm(self.points, axis=-1).max())
+
+    def finer(self, count: int) -> "Mapping":
+        """The same lines with `count` presses from the first to the last."""
+        distance = np.linspace(self.distance[0], self.distance[-1], count)
+        return Mapping(self.electrode, self.origin, self.angle, distance)
+
+
+def _check_lines(first: float, last: float, angle_step: float, step: float, length: float) -> None:
+    if not (np.isfinite([first, last]).all() and first <= last):
+        raise SceneError(f"angles: expected MIN <= MAX, got {np.rad2deg(first):g} to {np.rad2deg(last):g} degrees")
+    if not (np.isfinite(angle_step) and angle_step > 0.0):
+        raise SceneError(f"step of the angle: expected a positive number, got {np.rad2deg(angle_step):g} degrees")
+    if not (np.isfinite([step, length]).all() and 0.0 < step <= length):
+        raise SceneError(
+            f"expected 0 < step <= length, got a step of {step * 1e3:g} mm and lines of {length * 1e3:g} mm"
+        )
+    presses = ((last - first) / angle_step + 2.0) * length / step
+    if presses > MOST_PRESSES:
+        raise SceneError(f"expected at most {MOST_PRESSES} presses on the lines, got {presses:.3g}; take larger steps")
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Charges along the lines of a mapping.
+
+    Attributes:
+        mapping: Where was pressed.
+        electrodes: Names, in the order of the charges.
+        probe: The footprint.
+        force: N.
+        charge: Touch charges, shape (n_line, n_step, n_electrode), C.
+    """
+
+    mapping: Mapping
+    electrodes: tuple[str, ...]
+    probe: Probe
+    force: float
+    charge: Array
+
+    @classmethod
+    def of(cls, forward_map: ForwardMap, mapping: Mapping, force: float) -> "Curves":
+        """Evaluate a forward map on the lines.
+
+        Raises:
+            SceneError: If the map does not cover a press or the force.
+        """
+        points = mapping.points
+        x, y = points.reshape(-1, 2).T
+        charge = forward_map.forward(x, y, np.full(x.size, force)).reshape(*points.shape[:2], -1)
+        return cls(mapping, forward_map.sensor.electrode_names, forward_map.probe, force, charge)
+
+    @property
+    def own(self) -> Array:
+        """Charge of the electrode that the lines leave from, shape (n_line, n_step), C."""
+        own: Array = self.charge[..., self.electrodes.index(self.mapping.electrode)]
+        return own
+
+    def polynomials(self, degree: int) -> Sequence[Polynomial]:
+        """The paper's fit: charge (C) of the own electrode as a polynomial of the distance (m), one for each line.
+
+        Raises:
+            SceneError: If a line has fewer presses than the polynomial has coefficients.
+        """
+        distance = self.mapping.distance
+        if not 1 <= degree < distance.size:
+            raise SceneError(
+                f"degree: expected 1 to {distance.size - 1} for {distance.size} presses on a line, got {degree}"
+            )
+        return [Polynomial.fit(distance, line, degree) for line in self.own]

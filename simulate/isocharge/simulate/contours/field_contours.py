@@ -1,0 +1,162 @@
+"""Isocharge contours: where a press gives an electrode a wanted charge, for one probe and force.
+
+Traced on the tabled charges by marching squares, then every point is moved along the slope until the forward map itself
+gives the wanted charge there: within ON_CONTOUR. `drawn` makes the same contours the way the paper does.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from contourpy import LineType, contour_generator
+
+from isocharge.arrays import Array
+from isocharge.errors import SceneError
+from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.numerics.disk import onto_disk
+from isocharge.simulate.sensor.sensor import electrode_index
+
+GRID = 0.2e-3
+"""Spacing of the squares that are marched, m."""
+
+ON_CONTOUR, STEPS = 2e-8, 12
+"""Distance (m) from the contour at which a point is on it, and how many steps it may take there."""
+
+
+@dataclass(frozen=True)
+class Contour:
+    """One connected piece of a contour.
+
+    Attributes:
+        electrode: Whose charge.
+        charge: C.
+        points: (x, y) in order along it, shape (n, 2), m; the first again at the end if it is closed.
+    """
+
+    electrode: str
+    charge: float
+    points: Array
+
+    @property
+    def closed(self) -> bool:
+        """Whether it ends where it began."""
+        return bool(np.array_equal(self.points[0], self.points[-1]))
+
+
+@dataclass(frozen=True)
+class ContourField:
+    """Contours of a sensor under one probe and force, from the field.
+
+    Attributes:
+        forward_map: Gives the charges.
+        table: The same as splines, for slopes and for a first trace.
+        force: N.
+    """
+
+    forward_map: ForwardMap
+    table: ChargeSpline
+    force: float
+
+    @classmethod
+    def of(
+        cls, forward_map: ForwardMap, force: float, radius: float | None = None, spacing: float | None = None
+    ) -> "ContourField":
+        """Of presses within `radius` (m) of the centre, as far as the map reaches if absent; see `ChargeSpline.of`.
+
+        Raises:
+            SceneError: If the map does not cover the force or the radius.
+        """
+        low, high = forward_map.force_range
+        if not low * (1.0 - 1e-9) <= force <= high * (1.0 + 1e-9):
+            raise SceneError(f"force: expected {low:g} to {high:g} N, which the forward map covers, got {force:g} N")
+        return cls(forward_map, ChargeSpline.of(forward_map, radius, spacing), force)
+
+    def contours(self, electrode: str, charge: float) -> tuple[Contour, ...]:
+        """The pieces of an electrode's contour of a charge (C); none where no press gives it.
+
+        Raises:
+            SensorError: If there is no such electrode.
+            SceneError: If the charge is no number.
+        """
+        index = electrode_index(self.forward_map.sensor, electrode)
+        if not np.isfinite(charge):
+            raise SceneError(f"charge of {electrode!r}: expected a number, got {charge * 1e12:g} pC")
+        x, y, values = self._squares
+        unit = np.abs(values[..., index]).max()
+        traced = contour_generator(x, y, values[..., index] / unit, line_type=LineType.Separate).lines(charge / unit)
+        pieces = [piece for line in traced for piece in self._inside(np.asarray(line, dtype=float))]
+        refined = [self._onto_contour(piece, index, charge) for piece in pieces]
+        return tuple(Contour(electrode, charge, points) for points in refined if len(points) > 1)
+
+    def reach(self, electrode: str) -> tuple[float, float]:
+        """Smallest and largest charge of an electrode that is met on the squares, C."""
+        values = self._squares[2][..., electrode_index(self.forward_map.sensor, electrode)]
+        return float(np.min(values)), float(np.max(values))
+
+    def even_charges(self, electrode: str, count: int) -> Sequence[float]:
+        """So many charges between the smallest and the largest, C: in even ratios, or steps if the sign changes."""
+        low, high = self.reach(electrode)
+        spread = np.geomspace if low * high > 0.0 else np.linspace
+        return [float(charge) for charge in spread(low, high, count + 2)[1:-1]]
+
+    @cached_property
+    def _squares(self) -> tuple[Array, Array, Array]:
+        """Corners x and y of the squares, shape (n,), m, and charges there, shape (n, n, n_electrode), C.
+
+        Beyond the disk's edge the charges are those of the edge, so that the squares there are whole.
+        """
+        radius = self.table.radius
+        line = np.linspace(-radius, radius, 2 * int(np.ceil(radius / GRID)) + 1)
+        at = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        return line, line, self.table.first_order(at, self.force)[0].reshape(line.size, line.size, -1)
+
+    def _inside(self, line: Array) -> Sequence[Array]:
+        """The parts of a traced line that lie on the disk, each up to its edge."""
+        radius = self.table.radius
+        inside = np.hypot(line[:, 0], line[:, 1]) <= radius
+        if inside.all():
+            return [line]
+        starts, ends = (np.flatnonzero(np.diff(np.pad(inside, 1).astype(int)) == way) for way in (1, -1))
+        parts = []
+        for start, end in zip(starts, ends, strict=True):
+            before = [_onto_edge(line[start], line[start - 1], radius)] if start > 0 else []
+            after = [_onto_edge(line[end - 1], line[end], radius)] if end < len(line) else []
+            parts.append(np.array([*before, *line[start:end], *after]))
+        if inside[0] and inside[-1] and np.array_equal(line[0], line[-1]):  # one part, cut where the trace began
+            parts = [np.concatenate([parts[-1], parts[0][1:]]), *parts[1:-1]]
+        return parts
+
+    def _onto_contour(self, points: Array, index: int, charge: float) -> Array:
+        """The points moved along the slope to where the forward map gives the charge; others are dropped."""
+        at = points.copy()
+        away = np.full(len(at), np.inf)
+        for _ in range(STEPS):
+            active = np.flatnonzero(np.abs(away) > ON_CONTOUR)
+            if active.size == 0:
+                break
+            exact = self.forward_map.forward(at[active, 0], at[active, 1], np.full(active.size, self.force))
+            slope = self.table.first_order(at[active], self.force)[1][:, index]
+            squared = np.maximum(np.sum(slope**2, axis=1), 1e-300)
+            step = (charge - exact[:, index])[:, None] * slope / squared[:, None]
+            away[active] = np.linalg.norm(step, axis=1)
+            step *= np.minimum(1.0, GRID / np.maximum(away[active], 1e-300))[:, None]
+            at[active] = np.where(
+                (np.abs(away[active]) > ON_CONTOUR)[:, None],
+                onto_disk(at[active] + step, self.table.radius),
+                at[active],
+            )
+        if np.array_equal(points[0], points[-1]):
+            at[-1] = at[0]
+        kept: Array = at[np.abs(away) <= ON_CONTOUR]
+        return kept
+
+
+def _onto_edge(inner: Array, outer: Array, radius: float) -> Array:
+    """Where the segment from a point inside to one outside leaves the disk."""
+    way = outer - inner
+    a, b, c = way @ way, inner @ way, inner @ inner - radius**2
+    share = (-b + np.sqrt(b * b - a * c)) / a
+    edge: Array = inner + share * way * (1.0 - 1e-12)
+    return edge

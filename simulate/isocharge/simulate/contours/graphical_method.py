@@ -1,0 +1,186 @@
+"""Contours and triangulation as Mirbagheri et al. (2007) draw them.
+
+A polynomial is fitted to the charge along each line of a mapping scheme, its root is one point of the contour, and the
+points are joined by a spline (AutoCAD's SPLINE: cubic, through its points, parameter the length of the chords, free
+ends). Two contours are intersected as splines; the three crossings that lie together most closely are averaged.
+`contours` and `triangulation` do the same from the field, without the error of the drawing.
+"""
+
+from collections.abc import Mapping as Map
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations, product
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from isocharge.arrays import Array
+from isocharge.errors import ChargeError, SensorError
+from isocharge.simulate.contours.charge_curves import Curves
+from isocharge.simulate.contours.fix import AMBIGUOUS, APART, TOLERANCE, Fix, Meeting
+
+DEGREE = 4
+"""Of the polynomial along a line; the paper does not say its own. Lower ones miss the charge near the electrode."""
+
+PER_SPAN = 8
+"""Chords that a span of the spline is cut into before its crossings are refined."""
+
+
+@dataclass(frozen=True)
+class DrawnContour:
+    """A contour drawn by hand.
+
+    Attributes:
+        electrode: Whose charge.
+        charge: C.
+        knots: Roots on the lines, in the order of their angle, shape (n, 2), m; n >= 2.
+    """
+
+    electrode: str
+    charge: float
+    knots: Array
+
+    @property
+    def points(self) -> Array:
+        """Along the spline, shape (n, 2), m."""
+        points: Array = self._spline(self._parameters)
+        return points
+
+    @cached_property
+    def _spline(self) -> CubicSpline:
+        chords = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.knots, axis=0), axis=1))])
+        return CubicSpline(chords, self.knots, bc_type="natural")
+
+    @property
+    def _parameters(self) -> Array:
+        knots = self._spline.x
+        inner = np.linspace(knots[:-1], knots[1:], PER_SPAN, endpoint=False, axis=1).ravel()
+        parameters: Array = np.append(inner, knots[-1])
+        return parameters
+
+    def crossings(self, other: "DrawnContour") -> Array:
+        """Where two contours cross, shape (n, 2), m."""
+        starts = _chord_crossings(self.points, other.points)
+        mine, theirs = self._parameters, other._parameters
+        found = []
+        for i, s, j, t in starts:
+            at = np.array([mine[i] + s * (mine[i + 1] - mine[i]), theirs[j] + t * (theirs[j + 1] - theirs[j])])
+            for _ in range(4):  # Newton on the splines: the chords are within some um already
+                gap = self._spline(at[0]) - other._spline(at[1])
+                matrix = np.stack([self._spline(at[0], 1), -other._spline(at[1], 1)], axis=1)
+                at = at - np.linalg.lstsq(matrix, gap, rcond=None)[0]
+            found.append(self._spline(at[0]))
+        return np.array(found).reshape(-1, 2)
+
+
+def _chord_crossings(first: Array, second: Array) -> list[tuple[int, float, int, float]]:
+    """Chords of two polylines that cross: index and share along the first, index and share along the second."""
+    a, b = np.diff(first, axis=0)[:, None], np.diff(second, axis=0)[None]
+    between = second[None, :-1] - first[:-1, None]
+    with np.errstate(divide="ignore", invalid="ignore"):  # parallel chords do not cross
+        area = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+        s = (between[..., 0] * b[..., 1] - between[..., 1] * b[..., 0]) / area
+        t = (between[..., 0] * a[..., 1] - between[..., 1] * a[..., 0]) / area
+        rows, columns = np.nonzero((s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0))
+    return [(int(i), float(s[i, j]), int(j), float(t[i, j])) for i, j in zip(rows, columns, strict=True)]
+
+
+def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnContour | None:
+    """The contour of the electrode that the curves belong to, or None if fewer than two lines reach the charge.
+
+    Args:
+        curves: Charges along the lines of a mapping.
+        charge: C.
+        degree: Of the polynomial along each line.
+
+    Raises:
+        SceneError: If a line has too few presses for the degree.
+    """
+    mapping = curves.mapping
+    roots = [_root(polynomial, charge, mapping.distance) for polynomial in curves.polynomials(degree)]
+    direction = np.stack([np.cos(mapping.angle), np.sin(mapping.angle)], axis=1)
+    knots = np.array(mapping.origin) + np.array(roots)[:, None] * direction
+    knots = knots[np.isfinite(roots)]
+    return DrawnContour(mapping.electrode, charge, knots) if len(knots) > 1 else None
+
+
+def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) -> float:
+    """Where a line's polynomial has the charge, m: the nearest such place to the electrode, NaN if there is none.
+
+    Half a step before the first press still counts.
+    """
+    roots = (polynomial - charge).roots()
+    real = roots.real[np.abs(roots.imag) < 1e-9 * np.abs(distance[-1])]
+    inside = real[(real >= 0.5 * distance[0]) & (real <= distance[-1])]
+    return float(inside.min()) if inside.size else np.nan
+
+
+@dataclass(frozen=True)
+class DrawnTriangulation:
+    """Triangulation with drawn contours.
+
+    Attributes:
+        curves: One set for each electrode, each from that electrode, in the order of the charges.
+        degree: Of the polynomials.
+        tolerance: Distance (m) of crossings from their mean up to which contours meet.
+    """
+
+    curves: Sequence[Curves]
+    degree: int = DEGREE
+    tolerance: float = TOLERANCE
+
+    def __post_init__(self) -> None:
+        names = tuple(curves.mapping.electrode for curves in self.curves)
+        if len(names) < 3:
+            raise SensorError(f"triangulation needs at least three electrodes, got {names}")
+
+    def contours(self, charge: Array) -> tuple[DrawnContour | None, ...]:
+        """The contour of each charge, shape (n_electrode,), C."""
+        return tuple(draw_contour(c, float(q), self.degree) for c, q in zip(self.curves, charge, strict=True))
+
+    def locate(self, charge: Array) -> Fix:
+        """Positions of presses of the force that the curves were made with.
+
+        Args:
+            charge: Touch charges, shape (n, n_electrode), C.
+
+        Raises:
+            ChargeError: If the charges are not one for each electrode.
+        """
+        charge = np.asarray(charge, dtype=float)
+        if charge.ndim != 2 or charge.shape[1] != len(self.curves) or not np.isfinite(charge).all():
+            raise ChargeError(f"expected numbers of shape (n, {len(self.curves)}), got shape {charge.shape}")
+        found = [self._locate_one(row) for row in charge]
+        x, y, spread, status, triples = (np.array(column) for column in zip(*found, strict=True))
+        force = np.full(len(charge), self.curves[0].force)
+        return Fix(x, y, force, spread, status.astype(np.intp), triples.astype(np.intp))
+
+    def _locate_one(self, charge: Array) -> tuple[float, float, float, int, int]:
+        drawn = self.contours(charge)
+        if any(contour is None for contour in drawn):
+            return np.nan, np.nan, np.nan, int(Meeting.no_contour), 0
+        contours = [contour for contour in drawn if contour is not None]
+        pairs = {(i, j): contours[i].crossings(contours[j]) for i, j in combinations(range(len(contours)), 2)}
+        met = [self._meeting(pairs, triple) for triple in combinations(range(len(contours)), 3)]
+        means = [mean for mean, _, status in met if status is Meeting.met]
+        if not means:
+            twice = any(status is Meeting.twice for _, _, status in met)
+            return np.nan, np.nan, np.nan, int(Meeting.twice if twice else Meeting.apart), 0
+        x, y = np.mean(means, axis=0)
+        spread = max(spread for _, spread, status in met if status is Meeting.met)
+        return float(x), float(y), spread, int(Meeting.met), len(means)
+
+    def _meeting(self, pairs: Map[tuple[int, int], Array], triple: tuple[int, ...]) -> tuple[Array, float, Meeting]:
+        """Mean and spread of the crossings of three contours that lie together most closely."""
+        corners = [np.array(c) for c in product(*(pairs[pair] for pair in combinations(triple, 2)))]
+        means = [c.mean(axis=0) for c in corners]
+        spreads = [float(np.linalg.norm(c - m, axis=1).max()) for c, m in zip(corners, means, strict=True)]
+        order = np.argsort(spreads)
+        if not spreads or spreads[order[0]] > self.tolerance:
+            return np.full(2, np.nan), np.nan, Meeting.apart
+        best = order[0]
+        rivals = [i for i in order[1:] if np.linalg.norm(means[i] - means[best]) > APART]
+        if rivals and spreads[rivals[0]] <= AMBIGUOUS * spreads[best]:
+            return np.full(2, np.nan), np.nan, Meeting.twice
+        return means[best], spreads[best], Meeting.met

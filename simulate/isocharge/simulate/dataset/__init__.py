@@ -1,0 +1,4 @@
+"""Datasets of presses and charges: sampling plans, sweeps, and the file format.
+
+May import: forward and all below it.
+"""

@@ -1,0 +1,243 @@
+"""The dataset format: a folder of shards with a manifest and a data card. One reader and one writer for all producers.
+
+    manifest.json     format version, sensor, probes, ranges, seed, solver, columns, shards with sha256
+    README.md         the data card, for people
+    shard-00000.npz   x_mm, y_mm, force_N, probe, orientation_deg, charge_pC[n, electrode]
+
+A dataset appears whole: it is written under another name and renamed at the end. Data measured on a rig fits the same
+format; it has no solver and no seed.
+"""
+
+import io
+import json
+import zipfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.errors import DatasetError, SensorError
+from isocharge.files import new_folder, sha256_of, write_whole
+from isocharge.simulate.dataset.card import COLUMNS, _card
+from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Presses and their charges.
+
+    Attributes:
+        x_mm: Shape (n,).
+        y_mm: Shape (n,).
+        force_N: Shape (n,).
+        probe: Notation of the probe, shape (n,), text.
+        orientation_deg: Shape (n,).
+        charge_pC: Shape (n, n_electrode).
+    """
+
+    x_mm: Array
+    y_mm: Array
+    force_N: Array
+    probe: np.ndarray
+    orientation_deg: Array
+    charge_pC: Array
+
+    def __len__(self) -> int:
+        return len(self.x_mm)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Column name to array."""
+        return {name: getattr(self, name) for name in COLUMNS}
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset in memory.
+
+    Attributes:
+        sensor: The sensor that the charges belong to.
+        samples: All samples, shards in order.
+        manifest: The manifest as it was read.
+        sha256: Checksum of the manifest, which holds those of the shards: the dataset's identity.
+    """
+
+    sensor: Sensor
+    samples: Samples
+    manifest: dict[str, Any]
+    sha256: str
+
+
+def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about: dict[str, Any]) -> Path:
+    """Write a dataset.
+
+    Args:
+        folder: Where; must not exist yet.
+        sensor: The sensor.
+        shards: Samples, a shard at a time; consumed as they are written.
+        about: What made them, for the manifest: probes, ranges, seed, solver.
+
+    Returns:
+        The folder.
+
+    Raises:
+        OutputExists: If the folder is already there.
+        DatasetError: If a shard's columns disagree or hold numbers that are not finite.
+    """
+    with new_folder(folder) as partial:
+        entries = []
+        for number, samples in enumerate(shards):
+            name, data = pack_shard(number, samples, sensor)
+            write_whole(partial / name, data)
+            entries.append(shard_entry(name, len(samples), data))
+        write_manifest(partial, folder.name, sensor, entries, about)
+    return folder
+
+
+def pack_shard(number: int, samples: Samples, sensor: Sensor) -> tuple[str, bytes]:
+    """A shard's file name and content.
+
+    Raises:
+        DatasetError: If the columns disagree or hold numbers that are not finite.
+    """
+    name = shard_name(number)
+    _check_samples(samples, len(sensor.electrodes), name)
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **samples.columns())
+    return name, buffer.getvalue()
+
+
+def shard_name(number: int) -> str:
+    """File name of a shard."""
+    return f"shard-{number:05d}.npz"
+
+
+def shard_entry(name: str, samples: int, data: bytes) -> dict[str, Any]:
+    """What the manifest says of a shard."""
+    return {"file": name, "samples": samples, "sha256": sha256_of(data)}
+
+
+def write_manifest(
+    folder: Path, name: str, sensor: Sensor, entries: Sequence[dict[str, Any]], about: dict[str, Any]
+) -> None:
+    """Manifest and card of a dataset whose shards are in `folder` and which will be called `name`."""
+    manifest = {
+        "format_version": FORMAT_VERSION,
+        "package_version": metadata.version("isocharge"),
+        "sensor": sensor_to_dict(sensor),
+        "electrodes": list(sensor.electrode_names),
+        **about,
+        "columns": COLUMNS,
+        "samples": sum(entry["samples"] for entry in entries),
+        "shards": list(entries),
+    }
+    write_whole(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
+    write_whole(folder / "README.md", _card(name, manifest).encode())
+
+
+def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
+    shapes = {name: column.shape for name, column in samples.columns().items()}
+    expected = {name: (len(samples),) for name in COLUMNS} | {"charge_pC": (len(samples), n_electrode)}
+    if shapes != expected or len(samples) == 0:
+        raise DatasetError(f"{where}: expected columns of shapes {expected}, at least one sample, got {shapes}")
+    for name, column in samples.columns().items():
+        kinds = "U" if name == "probe" else "fiu"
+        if column.dtype.kind not in kinds:
+            raise DatasetError(
+                f"{where}: column {name}: expected {'text' if kinds == 'U' else 'numbers'}, got {column.dtype}"
+            )
+        if name != "probe" and not np.isfinite(column).all():
+            row = int(np.argwhere(~np.isfinite(column))[0][0])
+            raise DatasetError(f"{where}: column {name} holds {column[row]} in row {row}; every number must be finite")
+
+
+def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
+    """Read a dataset and check every shard against the manifest.
+
+    Args:
+        folder: Where it is.
+        sensor: The sensor that is expected; any if absent.
+
+    Raises:
+        DatasetError: If the folder is not a dataset, of another format version or sensor, damaged or incomplete; the
+            message names the file and what to do.
+    """
+    folder = Path(folder)
+    expected = sensor
+    manifest, checksum = _read_manifest(folder)
+    try:
+        sensor = sensor_from_dict(manifest["sensor"], f"{folder}/manifest.json")
+        if expected is not None and expected != sensor:
+            raise DatasetError(
+                f"{folder}/manifest.json: expected the sensor {expected.name!r}, got {_differs(sensor, expected)}; use "
+                "its own dataset, or make one"
+            )
+        if manifest["electrodes"] != list(sensor.electrode_names):
+            raise DatasetError(
+                f"{folder}/manifest.json: expected the sensor's electrodes in its order, "
+                f"{list(sensor.electrode_names)}, got {manifest['electrodes']}"
+            )
+        shards = [_read_shard(folder, entry, sensor) for entry in manifest["shards"]]
+    except (KeyError, TypeError) as error:
+        raise DatasetError(f"{folder}/manifest.json: key {error} is missing or of another type") from error
+    except SensorError as error:
+        raise DatasetError(str(error)) from error
+    if not shards:
+        raise DatasetError(f"{folder}/manifest.json: lists no shards")
+    joined = {name: np.concatenate([getattr(shard, name) for shard in shards]) for name in COLUMNS}
+    return Dataset(sensor, Samples(**joined), manifest, checksum)
+
+
+def _differs(sensor: Sensor, expected: Sensor) -> str:
+    """Its name, or what is not as expected under the same name."""
+    if sensor.name != expected.name:
+        return repr(sensor.name)
+    here, there = sensor_to_dict(sensor), sensor_to_dict(expected)
+    keys = sorted(key for key in here.keys() | there.keys() if here.get(key) != there.get(key))
+    return f"one of that name with another {', '.join(keys)}"
+
+
+def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
+    path = folder / "manifest.json"
+    if not path.is_file():
+        raise DatasetError(
+            f"{folder} is not a dataset: it has no manifest.json; make one with 'isocharge simulate sweep'"
+        )
+    data = path.read_bytes()
+    try:
+        manifest = json.loads(data)
+        version = manifest["format_version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{path}: not a manifest of a dataset: {error!r}") from error
+    if version != FORMAT_VERSION:
+        raise DatasetError(
+            f"{path}: format version {version} is not supported (this version reads {FORMAT_VERSION}); "
+            f"make the dataset again or upgrade isocharge"
+        )
+    return manifest, sha256_of(data)
+
+
+def _read_shard(folder: Path, entry: dict[str, Any], sensor: Sensor) -> Samples:
+    path = folder / Path(entry["file"]).name
+    if not path.is_file():
+        raise DatasetError(f"{path}: the manifest lists this shard, but it is not there; make the dataset again")
+    data = path.read_bytes()
+    checksum = sha256_of(data)
+    if checksum != entry["sha256"]:
+        raise DatasetError(
+            f"{path} is damaged: expected sha256 {entry['sha256'][:12]}..., got {checksum[:12]}...; make the dataset "
+            "again"
+        )
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            samples = Samples(**{name: arrays[name] for name in COLUMNS})
+    except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
+        raise DatasetError(f"{path}: not a shard with the columns {', '.join(COLUMNS)}: {error}") from error
+    _check_samples(samples, len(sensor.electrodes), str(path))
+    return samples

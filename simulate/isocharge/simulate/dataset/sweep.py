@@ -1,0 +1,252 @@
+"""A sweep: many presses spread over the working area and the forces, and their charges.
+
+A forward map is solved for every probe and evaluated for every press. Both are cut into tasks that do not depend on the
+workers, so neither do the bytes. What is finished is kept in a draft beside the dataset: a run that was killed goes on.
+"""
+
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict
+from itertools import tee
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isocharge.arrays import Array, Integers
+from isocharge.errors import SceneError
+from isocharge.progress import Progress, Warn
+from isocharge.resumable_run import Draft, open_draft, refusals, refuse_finished
+from isocharge.simulate.dataset.sampling import Presses
+from isocharge.simulate.dataset.sampling import Sweep as Sweep
+from isocharge.simulate.dataset.shards import (
+    Samples,
+    pack_shard,
+    shard_entry,
+    shard_name,
+    write_dataset,
+    write_manifest,
+)
+from isocharge.simulate.execution.blas import single_threaded_blas
+from isocharge.simulate.execution.checkpointed_map import Remembering
+from isocharge.simulate.execution.code_version import made_by
+from isocharge.simulate.execution.workers import AHEAD, Workers
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.mesh.resolution import Resolution
+from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor_file import sensor_to_dict
+from isocharge.simulate.solver.settings import Solver
+
+SHARD = 16384
+"""Samples per shard."""
+
+TASK = 8192
+"""Presses per task: long enough (a second) that sending the map along (12 MB) does not show."""
+
+SAMPLING = {
+    "sobol": "scrambled Sobol, uniform over the disk, log-uniform in force",
+    "random": "independent, uniform over the disk, log-uniform in force",
+    "grid": "grid: square lattice over the disk, forces in equal steps of the logarithm, evenly spread orientations",
+}
+
+
+def run_sweep(
+    folder: Path,
+    sensor: Sensor,
+    probes: Sequence[Probe],
+    sweep: Sweep,
+    *,
+    solver: Solver = Solver(),
+    executor: Executor | None = None,
+    ahead: int = AHEAD,
+    shard: int = SHARD,
+    fresh: bool = False,
+    progress: Progress | None = None,
+    sampled: Progress | None = None,
+    warn: Warn = warnings.warn,
+) -> Path:
+    """Simulate a sweep and write it as a dataset. Killed and called again with the same arguments, it goes on.
+
+    Args:
+        folder: Where; must not exist yet.
+        sensor: The sensor.
+        probes: The objects that press; they take turns.
+        sweep: What to sample.
+        solver: How the film is solved.
+        executor: Where the work is done; here and now if absent. The bytes written do not depend on it.
+        ahead: Tasks to hand out before the first is back; twice the number of workers keeps all of them busy.
+        shard: Samples per shard.
+        fresh: Throw away what an earlier run left.
+        progress: Told how many distances and orientations of a probe are solved.
+        sampled: Told how many samples are made.
+        warn: Told if a part of an earlier run is damaged; it is made again.
+
+    Returns:
+        The folder.
+
+    Raises:
+        SceneError: If a press cannot exist.
+        OutputExists: If the folder is already there, or an unfinished run of other settings; said before the work
+            begins.
+        OutputError: If the file system refuses; the finished work is kept.
+    """
+    folder, probes = Path(folder), tuple(probes)
+    refuse_finished(folder)
+    presses = sweep.over(probes)  # before anything is written: scipy's Sobol tables swallow an interrupt
+    workers = Workers(executor, ahead)
+    identity = _identity(sensor, probes, sweep, solver, shard)
+    with single_threaded_blas(), open_draft(folder, identity, fresh=fresh, warn=warn) as draft:
+        maps = tuple(
+            _build(sensor, probe, sweep, solver, Remembering(draft, f"solve-{number:02d}", executor), progress)
+            for number, probe in enumerate(probes)
+        )
+        entries = _draft_shards(draft, maps, presses, workers, shard, sampled)
+        with refusals(folder):
+            write_manifest(draft.data, folder.name, sensor, entries, _about(maps, sweep))
+    return folder
+
+
+def solve_maps(
+    sensor: Sensor,
+    probes: Sequence[Probe],
+    sweep: Sweep,
+    *,
+    solver: Solver = Solver(),
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> tuple[ForwardMap, ...]:
+    """A forward map for each probe, over the sweep's ranges."""
+    if not probes:
+        raise SceneError("probes: expected at least one, got none")
+    return tuple(_build(sensor, probe, sweep, solver, executor, progress) for probe in probes)
+
+
+def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
+    """Write a sweep's presses and charges, given the solved maps, here and now; see `run_sweep`."""
+    presses = sweep.over([made.probe for made in maps])
+    return write_dataset(folder, maps[0].sensor, _samples(maps, _cut(presses, SHARD), Workers()), _about(maps, sweep))
+
+
+def _build(
+    sensor: Sensor, probe: Probe, sweep: Sweep, solver: Solver, executor: Executor | None, progress: Progress | None
+) -> ForwardMap:
+    return ForwardMap.build(
+        sensor,
+        probe,
+        sweep.radius,
+        sweep.force_range,
+        theory=solver.theory,
+        accuracy=solver.accuracy,
+        resolution=solver.resolution,
+        executor=executor,
+        progress=progress,
+    )
+
+
+def _identity(sensor: Sensor, probes: Sequence[Probe], sweep: Sweep, solver: Solver, shard: int) -> dict[str, Any]:
+    """All that decides about the bytes."""
+    return {
+        "made_by": made_by(),
+        "sensor": sensor_to_dict(sensor),
+        "probes": [f"{probe.notation}@{np.rad2deg(probe.angle):.12g}" for probe in probes],
+        "sweep": asdict(sweep),
+        "solver": asdict(solver),
+        "shard": shard,
+    }
+
+
+def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
+    """What the manifest says of the sweep."""
+    return {
+        "probes": list(dict.fromkeys(made.probe.notation for made in maps)),
+        "ranges": {
+            "radius_mm": float(f"{sweep.radius * 1e3:.12g}"),
+            "force_N": list(sweep.force_range),
+            "orientation": sweep.orientation,
+        },
+        "sampling": SAMPLING[sweep.sampling],
+        "seed": sweep.seed,
+        "noise": "clean",
+        "solver": {
+            "theory": maps[0].theory.name,
+            "mesh": {made.probe.notation: _mesh_words(made.resolution) for made in maps},
+            "solves": sum(made.solves for made in maps),
+            "interpolation_error": max(made.error for made in maps),
+        },
+    }
+
+
+def _mesh_words(resolution: Resolution) -> str:
+    return ", ".join(f"{name} {value}" for name, value in asdict(resolution).items())
+
+
+def _draft_shards(
+    draft: Draft,
+    maps: Sequence[ForwardMap],
+    presses: Presses,
+    workers: Workers,
+    shard: int,
+    sampled: Progress | None,
+) -> list[dict[str, Any]]:
+    """Make the shards that the draft has not got; what the manifest says of each, in order."""
+    parts = dict(enumerate(_cut(presses, shard)))
+    entries: dict[int, dict[str, Any]] = {}
+    for number, part in parts.items():
+        if (data := draft.load(shard_name(number), final=True)) is not None:
+            entries[number] = shard_entry(shard_name(number), len(part), data)
+    done = sum(entry["samples"] for entry in entries.values())
+    missing = [number for number in parts if number not in entries]
+    if sampled:
+        sampled(done, len(presses))
+    made = _samples(maps, (parts[number] for number in missing), workers)
+    for number, samples in zip(missing, made, strict=True):
+        name, data = pack_shard(number, samples, maps[0].sensor)
+        draft.save(name, data, final=True)
+        entries[number] = shard_entry(name, len(samples), data)
+        done += len(samples)
+        if sampled:
+            sampled(done, len(presses))
+    return [entries[number] for number in parts]
+
+
+def _cut(presses: Presses, size: int) -> Iterator[Presses]:
+    for start in range(0, len(presses), size):
+        yield presses[start : start + size]
+
+
+def _samples(maps: Sequence[ForwardMap], shards: Iterable[Presses], workers: Workers) -> Iterator[Samples]:
+    """Samples of each shard, in order; the workers run ahead of the one that is taken."""
+    shards, coming = tee(shards)
+    tasks = ((maps[number], part[rows]) for part in coming for number, rows in _tasks(part, len(maps)))
+    charges = workers.in_order(_charges, tasks)
+    notation = np.array([made.probe.notation for made in maps])
+    angle = np.array([made.probe.angle for made in maps])
+    for part in shards:
+        charge = np.empty((len(part), len(maps[0].sensor.electrodes)))
+        for _, rows in _tasks(part, len(maps)):
+            charge[rows] = next(charges)
+        turned = np.rad2deg(angle[part.probe] + part.turn)
+        yield Samples(
+            x_mm=part.x * 1e3,
+            y_mm=part.y * 1e3,
+            force_N=part.force,
+            probe=notation[part.probe],
+            orientation_deg=np.mod(np.round(turned, 9), 360.0),
+            charge_pC=charge * 1e12,
+        )
+
+
+def _tasks(part: Presses, probes: int) -> Iterator[tuple[int, Integers]]:
+    """How a shard is cut into tasks: number of the probe and rows of the shard."""
+    for number in range(probes):
+        rows = np.flatnonzero(part.probe == number)
+        for start in range(0, rows.size, TASK):
+            yield number, rows[start : start + TASK]
+
+
+def _charges(task: tuple[ForwardMap, Presses]) -> Array:
+    """Touch charges of a task's presses, shape (n, n_electrode), C."""
+    made, presses = task
+    return made.forward(presses.x, presses.y, presses.force, presses.turn)

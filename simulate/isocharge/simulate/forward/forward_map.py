@@ -1,0 +1,253 @@
+"""The forward map: charges for many presses from a few solves.
+
+Presses of one probe form a family in distance from the centre, force and, unless the probe is round, orientation; the
+angle of the position is a turn. Seen from the probe, the stress at the nodes of the template is a smooth function of
+all of them. It is solved on Chebyshev nodes in distance and the force's logarithm and on evenly spread orientations,
+interpolated as a field, and the charge is integrated from the interpolated field for every press anew: exact about the
+place of the electrode, with the probe on it included. How well it does is measured against direct solves when it is
+built.
+"""
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from isocharge.arrays import Array, Complexes, Integers
+from isocharge.errors import SceneError, SolveError
+from isocharge.progress import Progress
+from isocharge.simulate.execution.blas import single_threaded_blas
+from isocharge.simulate.forward.family import TURNS, Family
+from isocharge.simulate.forward.readout import COARSE, FINE, NEAR, ReadoutPoints, contact_charge, touch_charge
+from isocharge.simulate.forward.solve_family import _check_family, _solve_family
+from isocharge.simulate.mechanics.scaling import amplitude_squared
+from isocharge.simulate.mechanics.stress import turn_stress
+from isocharge.simulate.mechanics.theory import ACCURACY, Theory, theory_for
+from isocharge.simulate.mesh.placement import Placement, template_for
+from isocharge.simulate.mesh.resolution import Resolution
+from isocharge.simulate.numerics.interpolation import tensor_values
+from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.solver.mesh_choice import layer_for
+from isocharge.simulate.solver.press import press
+
+CHUNK = 256
+"""Presses evaluated at once: keeps the working arrays within some 100 MB."""
+
+INTERPOLATION_ERROR = 5e-4
+"""Largest relative error of any charge against direct solves that a forward map may have."""
+
+SMALL = 0.1
+"""Share of a press's largest charge below which an error counts as if the charge were that large."""
+
+CHECKS = 10
+"""Direct solves that a forward map is compared with."""
+
+
+@dataclass(frozen=True)
+class ForwardMap:
+    """Touch charges of a sensor under one probe as a function of (x, y, F) and orientation.
+
+    Attributes:
+        sensor: The sensor.
+        probe: The footprint.
+        family: Where it was solved: distances, forces, orientations.
+        theory: Which terms were in.
+        resolution: Mesh of the solves.
+        layer: Width of its thin rings at the rim over the film's radius.
+        table: Scaled stress C : E' at the nodes of every element, in a frame that turns with the probe; shape
+            (n_distance * n_force * n_turn, n_element * n_local * 3).
+        error: Largest relative error of a charge against the direct solves that the build compared with.
+    """
+
+    sensor: Sensor
+    probe: Probe
+    family: Family
+    theory: Theory
+    resolution: Resolution
+    layer: float
+    table: Array
+    error: float
+
+    @classmethod
+    def build(
+        cls,
+        sensor: Sensor,
+        probe: Probe,
+        radius: float = 8e-3,
+        force_range: tuple[float, float] = (0.05, 2.0),
+        *,
+        theory: Theory | None = None,
+        accuracy: float = ACCURACY,
+        resolution: Resolution | None = None,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+    ) -> "ForwardMap":
+        """Solve a family and check it.
+
+        Args:
+            sensor: The sensor.
+            probe: The footprint.
+            radius: Largest distance of a press from the centre, m.
+            force_range: Smallest and largest force, N.
+            theory: Which terms to model; the fewest that the accuracy allows over the forces if absent.
+            accuracy: Relative error of a charge that is wanted.
+            resolution: Mesh; the coarsest that carries the outermost press well if absent.
+            executor: Where the solves run; here and now if absent. The result does not depend on it.
+            progress: Told how many solves are done.
+
+        Raises:
+            SceneError: If some presses cannot exist.
+            SolveError: If an equilibrium or the wanted interpolation error was not reached.
+        """
+        film = sensor.film
+        _check_family(film, probe, radius, force_range)
+        theory = theory or theory_for(sensor, probe, force_range, accuracy)
+        middle = float(np.sqrt(force_range[0] * force_range[1]))
+        layer = layer_for(film, middle)
+        if resolution is None:
+            outermost = press(film, probe, (radius, 0.0), middle, theory=theory, accuracy=accuracy, layer=layer)
+            resolution = outermost.resolution
+        error = np.inf
+        for count, turns in (((5, 3), TURNS), ((8, 5), 2 * TURNS), ((13, 8), 3 * TURNS)):
+            family = Family.spread(radius, force_range, count, probe.period, turns)
+            table = _solve_family(film, probe, sensor.surface, family, theory, resolution, layer, executor, progress)
+            made = cls(sensor, probe, family, theory, resolution, layer, table, error)
+            error = _check_against_solves(made)
+            if error <= INTERPOLATION_ERROR:
+                return cls(sensor, probe, family, theory, resolution, layer, table, error)
+        raise SolveError(
+            f"the forward map of {sensor.name} up to {radius * 1e3:g} mm and {force_range[1]:g} N interpolates to "
+            f"{error:.2g} only, expected {INTERPOLATION_ERROR:g}; ask for a smaller radius or range of forces"
+        )
+
+    @property
+    def radius(self) -> float:
+        """Presses up to this distance from the centre are covered, m."""
+        return self.family.radius
+
+    @property
+    def force_range(self) -> tuple[float, float]:
+        """Smallest and largest force covered, N."""
+        return self.family.force_range
+
+    @property
+    def solves(self) -> int:
+        """How many equilibria the map was made from."""
+        return self.family.distance.size * self.family.force.size * self.family.solved_turns.size
+
+    def forward(self, x: Array, y: Array, force: Array, orientation: Array | float = 0.0) -> Array:
+        """Touch charges.
+
+        Args:
+            x: Positions, shape (n,), m.
+            y: Positions, shape (n,), m.
+            force: Forces, shape (n,), N; where zero the film is untouched and the charges are zero.
+            orientation: How far the probe is turned further, shape (n,) or a number, rad, anticlockwise.
+
+        Returns:
+            Shape (n, n_electrode), C.
+
+        Raises:
+            SceneError: If a press lies outside the covered radius or forces.
+        """
+        x, y, force, orientation = np.broadcast_arrays(
+            *(np.asarray(value, dtype=float) for value in (x, y, force, orientation))
+        )
+        touched = np.flatnonzero(force != 0.0)
+        self._check_inside(x[touched], y[touched], force[touched])
+        charge = np.zeros((x.size, len(self.sensor.electrodes)))
+        with single_threaded_blas():
+            for start in range(0, touched.size, CHUNK):
+                chunk = touched[start : start + CHUNK]
+                charge[chunk] = self._charges(x[chunk] + 1j * y[chunk], force[chunk], orientation[chunk])
+        return charge
+
+    def _check_inside(self, x: Array, y: Array, force: Array) -> None:
+        distance, slack = np.hypot(x, y), 1.0 + 1e-9
+        low, high = self.force_range
+        wrong = ~((distance <= self.radius * slack) & (force >= low / slack) & (force <= high * slack))
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            raise SceneError(
+                f"press {i} at ({x[i] * 1e3:.4g}, {y[i] * 1e3:.4g}) mm with {force[i]:.4g} N is outside the forward "
+                f"map: expected at most {self.radius * 1e3:g} mm from the centre and {low:g} to {high:g} N"
+            )
+
+    def _charges(self, at: Complexes, force: Array, orientation: Array) -> Array:
+        """Charges of one chunk of presses, shape (n, n_electrode)."""
+        turn = orientation - np.angle(at)
+        field = self.family.weights(np.abs(at), force, turn) @ self.table
+        mesh = template_for(self.probe, self.resolution)
+        placement = Placement.of(mesh, self.probe, np.abs(at), self.sensor.film.radius, self.layer, turn)
+        charge = np.empty((at.size, len(self.sensor.electrodes)))
+        near, (fine, coarse) = self._near(at), self._readouts
+        for readout, chosen in ((fine, near), (coarse, ~near)):
+            press_index, electrode = np.nonzero(chosen)
+            charge[press_index, electrode] = self._read(
+                readout, field, placement, at, turn + self.probe.angle, press_index, electrode
+            )
+        scale = self.sensor.film.young * amplitude_squared(self.sensor.film, force)
+        scaled: Array = charge * scale[:, None]
+        if self.sensor.piezo.d33 != 0.0:
+            for i, e in zip(*np.nonzero(near), strict=True):
+                probe = self.probe.turned(float(orientation[i]))
+                scaled[i, e] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])[e]
+        return scaled
+
+    @cached_property
+    def _readouts(self) -> tuple[ReadoutPoints, ReadoutPoints]:
+        """The fine and the coarse rule for the charges."""
+        return ReadoutPoints.of(self.sensor, FINE), ReadoutPoints.of(self.sensor, COARSE)
+
+    def _near(self, at: Complexes) -> np.ndarray:
+        """Which electrodes need the fine rule for which presses, shape (n, n_electrode)."""
+        corners = [self.sensor.calibration.place(np.array(e.corners)) for e in self.sensor.electrodes]
+        centre = np.array([c.mean(axis=0) @ [1.0, 1j] for c in corners])
+        reach = np.array([np.linalg.norm(c - c.mean(axis=0), axis=1).max() for c in corners])
+        near: np.ndarray = np.abs(at[:, None] - centre) < reach + self.probe.reach + NEAR
+        return near
+
+    def _read(
+        self,
+        readout: ReadoutPoints,
+        field: Array,
+        placement: Placement,
+        at: Complexes,
+        frame: Array,
+        press_index: Integers,
+        electrode: Integers,
+    ) -> Array:
+        """Scaled charges of pairs of press and electrode, shape (n_pair,).
+
+        `frame` is the angle of the probe, and of the field's stress, from the direction of the press, shape (n,).
+        """
+        mesh, angle = template_for(self.probe, self.resolution), np.angle(at[press_index])
+        points = readout.points[electrode] @ np.array([1.0, 1j]) / self.sensor.film.radius
+        film = points * np.exp(-1j * angle)[:, None]
+        mirrored = (film.imag < 0.0) & mesh.half
+        film = np.where(mesh.half, film.real + 1j * np.abs(film.imag), film)
+        element, xi, eta = placement[press_index].locate(mesh, film)
+        values = tensor_values(self.resolution.order, xi.ravel(), eta.ravel())
+        nodal = field.reshape(len(field), mesh.n_element, -1, 3)[press_index[:, None], element]
+        local = np.matmul(values[:, None, :], nodal.reshape(*values.shape, 3)).reshape(*film.shape, 3)
+        local[mirrored, 2] *= -1.0
+        stress = turn_stress(local, (angle if mesh.half else angle + frame[press_index])[:, None])
+        charge: Array = np.einsum("kpc,kpc->k", stress, readout.weights[electrode])
+        return charge
+
+
+def _check_against_solves(made: ForwardMap) -> float:
+    """Largest relative error of a charge over presses between the nodes and at the edge of the family."""
+    errors = []
+    for distance, angle, force, turn in made.family.probes_between(CHECKS):
+        x, y = distance * np.cos(angle), distance * np.sin(angle)
+        solved = press(
+            made.sensor.film, made.probe.turned(turn), (x, y), force, theory=made.theory, resolution=made.resolution
+        )
+        direct = touch_charge(made.sensor, solved)
+        mapped = made.forward(np.array([x]), np.array([y]), np.array([force]), turn)[0]
+        scale = np.maximum(np.abs(direct), SMALL * np.abs(direct).max())
+        errors.append((np.abs(mapped - direct) / scale).max())
+    return float(np.max(errors))

@@ -1,0 +1,171 @@
+"""Contacts far apart with the same charges, and the contact that explains charges best.
+
+A map without folds may still bring two distant contacts to the same charges, as a sheet may come to lie on itself
+without a crease. Twins are looked for over the whole film at once.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from isocharge.arrays import Array, Integers
+from isocharge.simulate.forward.charge_model import ChargeModel
+from isocharge.simulate.identifiability.cramer_rao import limits_at
+from isocharge.simulate.identifiability.force_profile import ForceCurve
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.numerics.disk import lattice
+from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
+
+ALIKE = 3.0
+"""Distance of the charges, in standard deviations, up to which two contacts count as alike."""
+
+APART, WIDTHS = 1e-3, 6.0
+"""Twins are farther from each other than this (m), and than so many standard deviations of the position."""
+
+FORCES = 8
+"""Forces at which a twin's charges are tabulated."""
+
+POLISH, DAMPING = 8, 1e-3
+"""Levenberg and Marquardt's steps for a twin, and their damping."""
+
+EXPONENT = 2.0 / 3.0
+"""Of the charge over the force, roughly: what is tabulated is what remains."""
+
+
+@dataclass(frozen=True)
+class Twins:
+    """Pairs of contacts with the same charges, the nearest to the centre first.
+
+    Attributes:
+        first: (x, y, F), shape (n, 3), m and N.
+        second: The same for its twin.
+        distance: Between their charges, in standard deviations, shape (n,).
+    """
+
+    first: Array
+    second: Array
+    distance: Array
+
+    @classmethod
+    def none(cls) -> "Twins":
+        """No pair."""
+        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @property
+    def reach(self) -> Array:
+        """How far from the centre the outer one of each pair is, shape (n,), m."""
+        reach: Array = np.maximum(np.hypot(*self.first[:, :2].T), np.hypot(*self.second[:, :2].T))
+        return reach
+
+
+def find_twins(model: ChargeModel, noise: NoiseModel, force: float, places: int = 1000) -> Twins:
+    """Contacts far apart whose charges are alike within the noise.
+
+    For each place of a square lattice, pressed with `force`, every other place is tried with the force that fits best
+    there; the best two are improved by least squares.
+
+    Args:
+        model: The charges.
+        noise: Of the readings.
+        force: Of the first of each pair, N; the twin may have any.
+        places: Of the lattice: 1,000 take some 3 s with splines.
+    """
+    unit = lattice(places)
+    position = model.radius * (1.0 - 1e-9) * np.stack([unit.real, unit.imag], axis=1)
+    first = np.concatenate([position, np.full((len(position), 1), force)], axis=1)
+    charge = model.charge(first)
+    apart = np.maximum(APART, WIDTHS * limits_at(model, first, noise).position)
+    pairs, start = _candidates(model, noise, position, charge, apart)
+    second, distance = nearest_contact(model, noise, charge[pairs], start)
+    far = np.hypot(*(second - first[pairs])[:, :2].T) > apart[pairs]
+    kept = np.flatnonzero(far & (distance < ALIKE))
+    found = Twins(first[pairs[kept]], second[kept], distance[kept])
+    order = np.argsort(found.reach, kind="stable")
+    return Twins(found.first[order], found.second[order], found.distance[order])
+
+
+def _candidates(
+    model: ChargeModel, noise: NoiseModel, position: Array, charge: Array, apart: Array
+) -> tuple[Integers, Array]:
+    """Numbers of places and contacts (x, y, F) elsewhere that may be their twins."""
+    curve, terms = _tabulate(model, position)
+    near = cKDTree(position)
+    neighbours = near.query(position, min(9, len(position)))[1]
+    numbers, contacts = [], []
+    for i, own in enumerate(charge):
+        both = np.broadcast_to(own, charge.shape)
+        logs = curve.best(terms, both, noise)
+        known = curve.charge(logs, terms)
+        chi2 = ((both - known) ** 2 / noise.variance(known)).sum(axis=1)
+        lowest = chi2 <= chi2[neighbours].min(axis=1)
+        elsewhere = np.flatnonzero(lowest & (np.hypot(*(position - position[i]).T) > apart[i]))
+        best = elsewhere[np.argsort(chi2[elsewhere])[:2]]
+        numbers.append(np.full(best.size, i))
+        contacts.append(np.concatenate([position[best], np.exp(logs[best])[:, None]], axis=1))
+    return np.concatenate(numbers), np.concatenate(contacts)
+
+
+def _tabulate(model: ChargeModel, position: Array) -> tuple[ForceCurve, Array]:
+    """Charges at every place as a function of the force."""
+    low, high = np.log(model.force_range)
+    nodes = chebyshev_nodes(FORCES, low, high) if high > low else np.array([low])
+    rows = [
+        model.charge(np.concatenate([position, np.full((len(position), 1), np.exp(node))], axis=1)) for node in nodes
+    ]
+    terms = np.stack([row / np.exp(EXPONENT * node) for row, node in zip(rows, nodes, strict=True)], axis=1)
+    barycentric = barycentric_weights(nodes)
+
+    def weights(logs: Array) -> Array:
+        by_force: Array = lagrange_values(nodes, barycentric, logs) * np.exp(EXPONENT * logs)[:, None]
+        return by_force
+
+    return ForceCurve.of(weights, model.force_range), terms
+
+
+def nearest_contact(model: ChargeModel, noise: NoiseModel, charge: Array, start: Array) -> tuple[Array, Array]:
+    """Contacts that explain charges best, by least squares from a start.
+
+    Args:
+        model: The charges of contacts.
+        noise: Of the readings.
+        charge: To be explained, shape (n, n_electrode), C.
+        start: Contacts (x, y, F) to start from, shape (n, 3), m and N.
+
+    Returns:
+        Contacts within the model's domain, shape (n, 3), and how far their charges are from those given, in standard
+        deviations, shape (n,).
+    """
+    contact, chi2 = start, _chi2(model, noise, charge, start)
+    damping = np.full(len(start), DAMPING)
+    for _ in range(POLISH):
+        known = model.charge(contact)
+        weighted = model.jacobian(contact) / noise.sigma(known)[..., None]
+        normal = np.einsum("nei,nej->nij", weighted, weighted)
+        diagonal = np.einsum("nii->ni", normal)
+        pull = np.einsum("nei,ne->ni", weighted, (charge - known) / noise.sigma(known))
+        held = normal + (damping[:, None] * diagonal)[:, :, None] * np.eye(3)
+        step = np.linalg.solve(held, pull[..., None])[..., 0]
+        tried = _inside(model, contact, step)
+        fresh = _chi2(model, noise, charge, tried)
+        better = fresh < chi2
+        contact, chi2 = np.where(better[:, None], tried, contact), np.where(better, fresh, chi2)
+        damping = np.where(better, 0.1 * damping, 10.0 * damping)
+    return contact, np.sqrt(chi2)
+
+
+def _chi2(model: ChargeModel, noise: NoiseModel, charge: Array, contact: Array) -> Array:
+    known = model.charge(contact)
+    chi2: Array = ((charge - known) ** 2 / noise.variance(known)).sum(axis=1)
+    return chi2
+
+
+def _inside(model: ChargeModel, contact: Array, step: Array) -> Array:
+    """Contacts moved by steps in (x, y, ln F) and brought back onto the disk and into the range of forces."""
+    position = contact[:, :2] + step[:, :2]
+    shrink = np.minimum(1.0, model.radius * (1.0 - 1e-9) / np.maximum(np.hypot(*position.T), 1e-300))
+    force = np.clip(contact[:, 2] * np.exp(np.clip(step[:, 2], -1.0, 1.0)), *model.force_range)
+    return np.concatenate([position * shrink[:, None], force[:, None]], axis=1)

@@ -1,0 +1,73 @@
+"""The Cramer-Rao limit: how well an unbiased estimator can tell a contact from noisy charges, at best.
+
+With J = d(Q)/d(x, y, ln F, ...) the Fisher information is J' diag(i) J, i what one reading tells about its charge
+(`NoiseModel.information`), and the covariance of an unbiased estimate is at least its inverse (Kay 1993, ch. 3).
+An estimator that knows the prior may do better where the charges say little: that is the Bayes limit, in train.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.simulate.forward.charge_model import ChargeModel
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+
+SMALLEST = 1e-14
+"""Smallest eigenvalue of a scaled information that counts as more than rounding; limits stop there, some 1e7 times
+above the others, instead of becoming infinite."""
+
+NOTHING = 1e-60
+"""Information (1/m^2, or without unit) below which a parameter is not told at all."""
+
+
+@dataclass(frozen=True)
+class CramerRao:
+    """Limits of some contacts.
+
+    Attributes:
+        covariance: Of (x, y, ln F, ...), shape (n, p, p): m, m, and without unit.
+    """
+
+    covariance: Array
+
+    @property
+    def position(self) -> Array:
+        """Root of the mean square distance from the true position, shape (n,), m."""
+        position: Array = np.sqrt(self.covariance[:, 0, 0] + self.covariance[:, 1, 1])
+        return position
+
+    @property
+    def force(self) -> Array:
+        """Standard deviation of the force over the force, shape (n,)."""
+        return self.parameter(2)
+
+    def parameter(self, number: int) -> Array:
+        """Standard deviation of one parameter, shape (n,)."""
+        deviation: Array = np.sqrt(self.covariance[:, number, number])
+        return deviation
+
+
+def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel) -> CramerRao:
+    """Limits from charges and their derivatives.
+
+    Args:
+        charge: Shape (n, n_electrode), C.
+        jacobian: d(Q)/d(parameters), shape (n, n_electrode, p); the first three are x, y, ln F.
+        noise: Of the readings, not clean.
+    """
+    return CramerRao(_invert(np.einsum("nei,ne,nej->nij", jacobian, noise.information(charge), jacobian)))
+
+
+def limits_at(model: ChargeModel, contact: Array, noise: NoiseModel) -> CramerRao:
+    """Limits at contacts (x, y, F), shape (n, 3), m and N."""
+    return cramer_rao(model.charge(contact), model.jacobian(contact), noise)
+
+
+def _invert(information: Array) -> Array:
+    """Of symmetric matrices, shape (n, p, p), of any scale in each parameter, hardly singular or wholly so."""
+    size = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), NOTHING))
+    both = size[:, :, None] * size[:, None, :]
+    values, vectors = np.linalg.eigh(information / both)
+    inverse: Array = np.einsum("nik,nk,njk->nij", vectors, 1.0 / np.maximum(values, SMALLEST), vectors) / both
+    return inverse

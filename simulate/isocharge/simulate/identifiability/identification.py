@@ -1,0 +1,188 @@
+"""What the charges of a sensor can tell about a contact: limits over the film, folds, working area, in numbers."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.errors import SolveError
+from isocharge.progress import Progress
+from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.identifiability.cramer_rao import limits_at
+from isocharge.simulate.identifiability.folds import scaled_jacobian, singular_values
+from isocharge.simulate.identifiability.working_area import ERROR, WorkingArea, working_area
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.numerics.disk import Rings
+from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.sensor import Sensor
+
+CLEAR = 0.75
+"""Share of the film's radius up to which is looked at most: nearer to the rim presses cost ever more."""
+
+RETREAT, RETREATS = 0.9, 3
+"""Factor by which to look less far where the charges cannot be interpolated, and how often at most."""
+
+
+@dataclass(frozen=True)
+class LimitMap:
+    """Cramer-Rao limits under one force on rings about the centre.
+
+    Attributes:
+        force: N.
+        rings: The positions.
+        position: Position error, root mean square, shape (n_ring, n_angle), m.
+        relative_force: Error of the force over the force, shape (n_ring, n_angle).
+        condition: Largest over smallest standard deviation of the position by direction, shape (n_ring, n_angle).
+    """
+
+    force: float
+    rings: Rings
+    position: Array
+    relative_force: Array
+    condition: Array
+
+    @classmethod
+    def of(cls, charges: ChargeSpline, noise: NoiseModel, force: float, rings: Rings) -> "LimitMap":
+        """At every position of the rings."""
+        contact = rings.contacts(force)
+        limits = limits_at(charges, contact, noise)
+        largest, smallest = singular_values(scaled_jacobian(charges, contact, noise)).T
+        values = (limits.position, limits.force, largest / np.maximum(smallest, 1e-12 * largest))
+        return cls(force, rings, *(rings.per_ring(value) for value in values))
+
+    def summary(self, radius: float) -> dict[str, float]:
+        """Over the disk, each position with its area."""
+        inside = self.rings.distance <= radius * (1.0 + 1e-9)
+        area = np.repeat(self.rings.distance[inside], self.position.shape[1])
+        position, force = 1e3 * self.position[inside].ravel(), 1e2 * self.relative_force[inside].ravel()
+        return {
+            "force_N": self.force,
+            "position_median_mm": _quantile(position, area, 0.5),
+            "position_rms_mm": float(np.sqrt(np.average(position**2, weights=area))),
+            "position_worst_mm": float(position.max()),
+            "force_median_percent": _quantile(force, area, 0.5),
+            "force_rms_percent": float(np.sqrt(np.average(force**2, weights=area))),
+            "force_worst_percent": float(force.max()),
+            "condition_worst": float(self.condition[inside].max()),
+        }
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What the charges can tell.
+
+    Attributes:
+        sensor: The sensor.
+        probe: The footprint.
+        noise: Of the readings.
+        charges: Its charges as splines.
+        area: The working area, with folds and twins.
+        maps: Limits under the least force, 1 N if that is in the range, and the greatest.
+    """
+
+    sensor: Sensor
+    probe: Probe
+    noise: NoiseModel
+    charges: ChargeSpline = field(repr=False)
+    area: WorkingArea
+    maps: tuple[LimitMap, ...] = field(repr=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON; what is infinite is None."""
+        area, rings = self.area, self.maps[0].rings
+        return {
+            "sensor": self.sensor.name,
+            "probe": self.probe.notation,
+            "noise": self.noise.to_dict(),
+            "force_N": list(area.force_range),
+            "working_area": {
+                "radius_mm": 1e3 * area.radius,
+                "why": area.why,
+                "fold_radius_mm": _finite(1e3 * area.fold_radius),
+                "twin_radius_mm": _finite(1e3 * area.twin_radius),
+                "error_radius_mm": 1e3 * area.error_radius,
+                "unfolded_radius_mm": 1e3 * area.unfolded,
+                "error_mm": 1e3 * area.error,
+                "searched_mm": 1e3 * area.searched,
+                "words": area.words,
+            },
+            "limits_in_working_area": [made.summary(area.radius) for made in self.maps] if area.radius else [],
+            "by_distance": {
+                "distance_mm": (1e3 * rings.distance).tolist(),
+                **{
+                    f"{name}_position_mm_at_{made.force:g}_N": (1e3 * of(made.position, axis=1)).tolist()
+                    for made in self.maps
+                    for name, of in (("median", np.median), ("worst", np.max))
+                },
+            },
+            "folds_mm": (1e3 * area.folds).round(3).tolist(),
+            "twins": _twin_rows(area),
+        }
+
+
+def identify(
+    forward_map: ForwardMap, noise: NoiseModel, *, error: float = ERROR, charges: ChargeSpline | None = None
+) -> Identification:
+    """Find out what the charges can tell within the radius and the forces of a forward map: some 10 s.
+
+    Args:
+        forward_map: The charges.
+        noise: Of the readings, not clean.
+        error: Largest Cramer-Rao position error allowed in the working area, m.
+        charges: The map as splines, if they are there already.
+    """
+    charges = charges or ChargeSpline.of(forward_map)
+    low, high = forward_map.force_range
+    forces = sorted({low, min(max(low, 1.0), high), high})
+    rings = Rings.spread(forward_map.radius)
+    maps = tuple(LimitMap.of(charges, noise, force, rings) for force in forces)
+    area = working_area(charges, noise, error=error)
+    return Identification(forward_map.sensor, forward_map.probe, noise, charges, area, maps)
+
+
+def search_radius(sensor: Sensor, probe: Probe) -> float:
+    """How far from the centre to look for the working area, m: to the outermost corner of an electrode.
+
+    Electrodes that surround the working area bound it, mostly by a fold through themselves.
+    """
+    corners = np.concatenate([sensor.calibration.place(np.array(e.corners)) for e in sensor.electrodes])
+    return min(float(np.hypot(*corners.T).max()), CLEAR * sensor.film.radius - probe.reach)
+
+
+def map_to_search(
+    sensor: Sensor, probe: Probe, force_range: tuple[float, float], progress: Progress | None = None
+) -> ForwardMap:
+    """A forward map that reaches as far as the working area is looked for, or nearly: where the charges are too rough
+    to interpolate so far out, less far.
+
+    Raises:
+        SceneError: If some presses cannot exist.
+        SolveError: If an equilibrium or the wanted interpolation error was not reached.
+    """
+    radius = search_radius(sensor, probe)
+    for _ in range(RETREATS):
+        try:
+            return ForwardMap.build(sensor, probe, radius, force_range, progress=progress)
+        except SolveError:
+            radius *= RETREAT
+    return ForwardMap.build(sensor, probe, radius, force_range, progress=progress)
+
+
+def _quantile(values: Array, weights: Array, share: float) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, share * total[-1])])
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _twin_rows(area: WorkingArea, most: int = 20) -> list[dict[str, Any]]:
+    def contact(row: Array) -> dict[str, float]:
+        return {"x_mm": 1e3 * float(row[0]), "y_mm": 1e3 * float(row[1]), "force_N": float(row[2])}
+
+    rows = zip(area.twins.first[:most], area.twins.second[:most], area.twins.distance[:most], strict=True)
+    return [{"first": contact(a), "second": contact(b), "sigmas_apart": float(d)} for a, b, d in rows]

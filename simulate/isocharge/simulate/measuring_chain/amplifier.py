@@ -1,0 +1,151 @@
+"""The measuring chain forwards: what film, amplifier and converter make of touch charges, in time.
+
+A charge amplifier is a leaky integrator, tau = R C: a step of charge decays by 1/e within tau. So reading n is
+
+    v[n] = exp(-dt / tau) v[n-1] + g (q[n] - q[n-1]) + b dt,
+
+with q the film's charge (touch, and pyroelectricity, common to all electrodes), g the gain and b the bias current; then
+come offset, hum, white noise, clipping and the converter's steps. The sizes in the levels that the film does not give -
+hum, offset, bias, mismatch - are engineering choices for a tidy and a bad electric neighbourhood, not measurements.
+The memoryless part is `measuring_chain.noise`, and the levels `clean` and `reference` are nothing else.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.signal import lfilter
+
+from isocharge.arrays import Array
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+
+PVDF_PYRO = 30e-6 * 9e-6
+"""C/K on an electrode of 9 mm^2: 30 uC/(m^2 K)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Amplifier:
+    """A measuring chain of any number of channels; SI units.
+
+    Attributes:
+        noise: Memoryless noise of each reading.
+        tau: Time constant of the leak, s; infinite for none.
+        tau_mismatch, gain_mismatch: Standard deviation of a channel's relative error.
+        hum: Amplitude of the mains hum, C; its phase differs between channels.
+        hum_frequency: Hz.
+        offset: Standard deviation of a channel's constant output, C.
+        bias: Current that every channel integrates, A; its sign differs.
+        pyro: Charge per temperature, C/K, on every electrode.
+        temperature_rms: Of the film's slow wandering, K.
+        temperature_time: In which it wanders, s: twice a first-order lag, so smooth, as a film with a mass is.
+        step: Temperature step, K.
+        step_at, step_time: When it begins and how long it takes, s.
+        limit: Largest charge that can be read, C; infinite for any.
+        bits: Of the converter between both limits; 0 for none.
+    """
+
+    noise: NoiseModel
+    tau: float = math.inf
+    tau_mismatch: float = 0.0
+    gain_mismatch: float = 0.0
+    hum: float = 0.0
+    hum_frequency: float = 50.0
+    offset: float = 0.0
+    bias: float = 0.0
+    pyro: float = PVDF_PYRO
+    temperature_rms: float = 0.0
+    temperature_time: float = 20.0
+    step: float = 0.0
+    step_at: float = 10.0
+    step_time: float = 5.0
+    limit: float = math.inf
+    bits: int = 0
+
+    def start(self, electrodes: int, rate: float, rng: np.random.Generator) -> "Measurement":
+        """Switch it on: mismatches are drawn, and it has settled.
+
+        Args:
+            electrodes: Number of channels.
+            rate: Readings per second, Hz.
+            rng: Of this and of everything that follows.
+        """
+        tau = self.tau * (1.0 + self.tau_mismatch * rng.standard_normal(electrodes))
+        gain = 1.0 + self.gain_mismatch * rng.standard_normal(electrodes)
+        bias = self.bias * rng.choice([-1.0, 1.0], electrodes)
+        offset = self.offset * rng.standard_normal(electrodes)
+        phase = rng.uniform(0.0, 2.0 * np.pi, electrodes)
+        return Measurement(self, rate, rng, tau, gain, bias, offset, phase)
+
+
+@dataclass
+class Measurement:
+    """An amplifier at work: call it with the charges block by block. The drawn channels are there to be looked at.
+
+    Attributes:
+        amplifier, rate, rng: As started.
+        tau, gain, bias, offset, phase: Of each channel, shape (electrodes,), SI units.
+    """
+
+    amplifier: Amplifier
+    rate: float
+    rng: np.random.Generator
+    tau: Array
+    gain: Array
+    bias: Array
+    offset: Array
+    phase: Array
+    _readings: int = 0
+    _charge: Array = field(init=False)
+    _output: Array = field(init=False)
+    _warmth: tuple[float, float] = field(init=False)
+
+    def __post_init__(self) -> None:
+        deviation = math.sqrt(2.0) * self.amplifier.temperature_rms
+        first, second = deviation * self.rng.standard_normal(2)
+        self._warmth = first, 0.5 * first + 0.5 * second  # the stationary law of a lag behind a lag
+        self._charge = np.full_like(self.gain, self.amplifier.pyro * self._warmth[1])
+        self._output = np.zeros_like(self.gain)
+        if math.isfinite(self.amplifier.tau):
+            self._output = self.bias / (1.0 - np.exp(-1.0 / (self.rate * self.tau))) / self.rate
+
+    def __call__(self, charge: Array) -> Array:
+        """Readings of the next touch charges, both of shape (n, electrodes), C."""
+        time = (self._readings + np.arange(len(charge))) / self.rate
+        self._readings += len(charge)
+        film = charge + (self.amplifier.pyro * self._temperature(time))[:, np.newaxis]
+        output = self._integrate(film) + self.offset
+        turn = 2.0 * np.pi * self.amplifier.hum_frequency * time[:, np.newaxis] + self.phase
+        noisy = self.amplifier.noise.add(output + self.amplifier.hum * np.sin(turn), self.rng)
+        return self._convert(noisy)
+
+    def _temperature(self, time: Array) -> Array:
+        """Above the mean, shape (n,), K."""
+        part = self.amplifier
+        keep = math.exp(-1.0 / (self.rate * part.temperature_time))
+        kicks = math.sqrt(2.0 * (1.0 - keep * keep)) * part.temperature_rms * self.rng.standard_normal(time.size)
+        first = lfilter([1.0], [1.0, -keep], kicks, zi=[keep * self._warmth[0]])[0]
+        second = lfilter([1.0 - keep], [1.0, -keep], first, zi=[keep * self._warmth[1]])[0]
+        self._warmth = float(first[-1]), float(second[-1])
+        warm: Array = second + part.step * np.clip((time - part.step_at) / part.step_time, 0.0, 1.0)
+        return warm
+
+    def _integrate(self, film: Array) -> Array:
+        """The amplifier's output, shape (n, electrodes), C."""
+        steps = self.gain * np.diff(film, axis=0, prepend=self._charge[np.newaxis]) + self.bias / self.rate
+        self._charge = film[-1]
+        keep = np.exp(-1.0 / (self.rate * self.tau))
+        output = np.empty_like(steps)
+        for k, kept in enumerate(keep):
+            output[:, k] = lfilter([1.0], [1.0, -kept], steps[:, k], zi=[kept * self._output[k]])[0]
+        self._output = output[-1]
+        return output
+
+    def _convert(self, output: Array) -> Array:
+        """Clipped, and in the converter's steps."""
+        limit, bits = self.amplifier.limit, self.amplifier.bits
+        clipped = np.clip(output, -limit, limit)
+        if not bits:
+            return clipped
+        step = 2.0 * limit / (1 << bits)
+        rounded: Array = np.clip(np.round(clipped / step), -(1 << bits - 1), (1 << bits - 1) - 1) * step
+        return rounded

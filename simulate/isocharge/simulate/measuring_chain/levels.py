@@ -1,0 +1,34 @@
+"""The named levels of the measuring chain: clean, reference, bench, surgery, as noise and as amplifier."""
+
+from dataclasses import replace
+
+from isocharge.simulate.measuring_chain.amplifier import Amplifier
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+
+NOISE_LEVELS = {
+    "clean": NoiseModel("clean", 0.0, 0.0),
+    "reference": NoiseModel("reference", 1e-12, 2e-3),
+    "bench": NoiseModel("bench", 0.3e-12, 0.0),
+    "surgery": NoiseModel("surgery", 1e-12, 0.0),
+}
+"""By name; of `bench` and `surgery` the memoryless part, the rest is in `measuring_chain.amplifier`."""
+
+BENCH = Amplifier(
+    noise=NOISE_LEVELS["bench"],
+    tau=10.0,
+    tau_mismatch=0.05,
+    gain_mismatch=0.01,
+    hum=1e-12,
+    offset=2e-12,
+    bias=0.5e-12,
+    temperature_rms=0.05,
+    limit=1500e-12,
+    bits=16,
+)
+
+AMPLIFIER_LEVELS = {
+    "clean": Amplifier(noise=NOISE_LEVELS["clean"]),
+    "reference": Amplifier(noise=NOISE_LEVELS["reference"]),
+    "bench": BENCH,
+    "surgery": replace(BENCH, noise=NOISE_LEVELS["surgery"], hum=5e-12, step=0.5),
+}

@@ -1,0 +1,58 @@
+"""The noise model: what the measuring chain adds to the charges. Training, limits and the virtual sensor use this one.
+
+This is its memoryless part, independent between channels and readings:
+
+    sigma^2 = white^2 + (gain * Q)^2.
+
+What has a memory - leak, hum, drift, temperature, mismatch, clipping - is `measuring_chain.amplifier`.
+"""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from isocharge.arrays import Array
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Independent Gaussian noise of each reading.
+
+    Attributes:
+        name: Level.
+        white: Standard deviation that every reading has, C.
+        gain: Standard deviation in proportion to the charge, dimensionless.
+    """
+
+    name: str
+    white: float
+    gain: float
+
+    def sigma(self, charge: Array) -> Array:
+        """Standard deviation for charges of any shape, C; the same shape."""
+        return np.hypot(self.white, self.gain * np.asarray(charge))
+
+    def variance(self, charge: Array) -> Array:
+        """Square of `sigma`, C^2; faster where there are many."""
+        variance: Array = self.white**2 + (self.gain * np.asarray(charge)) ** 2
+        return variance
+
+    def information(self, charge: Array) -> Array:
+        """What a reading tells about its true charge, 1/C^2: one over the variance of the best unbiased estimate.
+
+        Of a Gaussian whose mean and standard deviation both depend on the charge (Kay 1993, eq. 3.31),
+        (1 + 2 (d sigma / dQ)^2) / sigma^2.
+        """
+        variance = self.variance(charge)
+        information: Array = (1.0 + 2.0 * (self.gain**2 * np.asarray(charge)) ** 2 / variance) / variance
+        return information
+
+    def add(self, charge: Array, rng: np.random.Generator) -> Array:
+        """Noisy readings of charges of any shape, C."""
+        noisy: Array = charge + self.sigma(charge) * rng.standard_normal(np.shape(charge))
+        return noisy
+
+    def to_dict(self) -> dict[str, float | str]:
+        """For metadata: white in pC."""
+        table = asdict(self)
+        return {"name": table["name"], "white_pC": float(f"{self.white * 1e12:.12g}"), "gain": self.gain}

@@ -1,0 +1,88 @@
+"""The dimensionless groups of a scene, and the amplitude that makes its solution a number of order one.
+
+Under a central force F a slack membrane, a taut one and a plate sink by
+
+    w / a = A,   F / (E h a) ~ A^3,   (pretension / E) A,   16 pi b A   with b = (h / a)^2 / (12 (1 - poisson^2))
+
+(Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). Their sum is a cubic for A that holds everywhere
+between. The in-plane displacement goes with A^2. What is left of the scene are ratios.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.simulate.sensor.film import Film
+
+TAUT = 1.6
+"""Force over deflection of a taut membrane, in units of pretension * thickness: 2 pi / ln(a / R), R = 0.02 a."""
+
+BENT = 16.0 * np.pi
+"""Force over deflection of a clamped plate under a central point load, in units of its stiffness over a^2."""
+
+
+@dataclass(frozen=True)
+class Groups:
+    """The dimensionless groups that fix the problem; E is Young's modulus, h the thickness, a the film's radius.
+
+    Attributes:
+        amplitude2: A^2, the square of the amplitude that scales deflection by film radius.
+        load: Force over E h a A^3.
+        tension: Pretension over E A^2.
+        bending: Bending stiffness over E h a^2 A^2, that is b / A^2; 0 leaves bending out.
+        poisson: Poisson's ratio.
+    """
+
+    amplitude2: float
+    load: float
+    tension: float
+    bending: float
+    poisson: float
+
+    @classmethod
+    def of(cls, film: Film, force: float, *, bending: bool) -> "Groups":
+        """The groups of a film under a force (N), with or without bending."""
+        amplitude2 = float(amplitude_squared(film, force))
+        return cls(
+            amplitude2=amplitude2,
+            load=force / (film.young * film.thickness * film.radius * amplitude2**1.5),
+            tension=film.pretension / (film.young * amplitude2),
+            bending=slenderness(film) / amplitude2 if bending else 0.0,
+            poisson=film.poisson,
+        )
+
+    @property
+    def height(self) -> float:
+        """Deflection of the middle over a A, roughly: one, where the groups are what `of` makes them."""
+        linear = TAUT * self.tension + BENT * self.bending
+        return float(_root(linear, self.load))
+
+    @property
+    def induced(self) -> float:
+        """Roughly, the share of the load that the stress induced by the deflection carries: 0 linear, 1 slack."""
+        return self.height**3 / self.load
+
+    def stiffened(self, tension: float) -> "Groups":
+        """The same scene with more tension."""
+        return replace(self, tension=self.tension + tension)
+
+
+def slenderness(film: Film) -> float:
+    """b: bending stiffness over E h a^2."""
+    return (film.thickness / film.radius) ** 2 / (12.0 * (1.0 - film.poisson**2))
+
+
+def amplitude_squared(film: Film, force: Array | float) -> Any:
+    """A^2, of the shape and type of `force` (N)."""
+    linear = TAUT * film.pretension / film.young + BENT * slenderness(film)
+    return _root(linear, force / (film.young * film.thickness * film.radius)) ** 2
+
+
+def _root(linear: float, right: Array | float) -> Any:
+    """The real root of x^3 + linear x = right, both not negative."""
+    scale = np.sqrt(linear / 3.0)
+    if linear == 0.0:
+        return np.cbrt(right)
+    return 2.0 * scale * np.sinh(np.arcsinh(right / (2.0 * scale**3)) / 3.0)

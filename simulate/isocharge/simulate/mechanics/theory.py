@@ -1,0 +1,155 @@
+"""Which terms a scene needs: the choice between the film's theories, and what the rest would have changed.
+
+One formulation, two switches. *Bending* matters within l = sqrt(D / N) of the rim, the probe and any readout at the
+film's surface, N the tension force between them; where pretension and induced tension are small it carries the load.
+*Stretching* is the stress that the deflection induces acting back on the deflection: without it the film is linear, and
+the charges follow from the linear deflection in a second step. Pretension costs nothing and is always in.
+
+    stretching  bending   theory
+    no          yes       linear plate, pre-tensioned linear plate
+    no          no        pre-tensioned linear membrane
+    yes         no        nonlinear membrane
+    yes         yes       nonlinear membrane + bending
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.errors import SceneError
+from isocharge.simulate.mechanics.scaling import Groups, slenderness
+from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.sensor import Sensor
+
+ACCURACY = 1e-3
+"""Relative error of a charge that is good enough where nothing else is asked for."""
+
+LINEAR_WEIGHT = 4.0
+"""Relative error of a charge of the linear theories over the share of the load that induced stress carries."""
+
+LOCAL_WEIGHT = 0.4
+"""The same over the strain that a taut film's slope induces at the footprint, by that of the pretension."""
+
+BENDING_WEIGHT = 1.5
+"""Worst relative error of a charge without bending over the bending length: 1.41 in the solutions of tests/data."""
+
+MOSTLY_BENT = 0.3
+"""Bending length over film radius above which a membrane says nothing about a film; its error is then infinite."""
+
+PROBE_WEIGHT = 4.0
+"""Relative error of a taut film's charge without bending over the squared bending length at the probe by its reach."""
+
+INDUCED_STRAIN = 0.44
+"""Radial strain that a slack membrane's rim is stretched by, over A^2."""
+
+
+@dataclass(frozen=True)
+class Theory:
+    """What is modelled.
+
+    Attributes:
+        stretching: Whether the stress that the deflection induces acts back on it.
+        bending: Whether the film resists bending.
+        pretensioned: Whether there is pretension.
+    """
+
+    stretching: bool
+    bending: bool
+    pretensioned: bool
+
+    @property
+    def name(self) -> str:
+        """What an engineer calls it."""
+        if self.stretching:
+            return "nonlinear membrane + bending" if self.bending else "nonlinear membrane"
+        kind = "linear plate" if self.bending else "linear membrane"
+        return f"pre-tensioned {kind}" if self.pretensioned else kind
+
+
+def bending_length(film: Film, force: float) -> float:
+    """l / a: how far a clamped edge bends the film, over the film's radius."""
+    groups = Groups.of(film, force, bending=True)
+    tension = groups.tension + INDUCED_STRAIN * groups.height**2
+    return float(np.sqrt(groups.bending / tension))
+
+
+def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
+    """Relative change of a charge by bending at the footprint, where pretension and no induced tension holds the film.
+
+    It goes with the square of the bending length over the footprint's reach. The tension at the footprint is the
+    pretension and what a slack membrane under this load has there, S = E W'^2 / 2 with S W' in balance with the load,
+    W'^3 = F / (pi R h E); where the latter rules, the deflection gives way and charges hardly change.
+    """
+    slope2 = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young)) ** 2
+    pretension = film.pretension / film.young
+    strain = pretension + 0.5 * slope2
+    length2 = slenderness(film) / strain * (film.radius / probe.reach) ** 2
+    return PROBE_WEIGHT * float(length2 * pretension / strain)
+
+
+def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
+    """Strain that the slope F / (2 pi R h T) of a taut film induces at the footprint, over that of the pretension T.
+
+    Where the bending length exceeds the footprint, bending keeps the slope smaller.
+    """
+    if film.pretension == 0.0:
+        return 0.0
+    slope = force / (2.0 * np.pi * probe.reach * film.thickness * film.pretension)
+    length2 = slenderness(film) * film.young / film.pretension * (film.radius / probe.reach) ** 2
+    return float(0.5 * slope**2 * film.young / film.pretension / (1.0 + length2) ** 2)
+
+
+def left_out(film: Film, probe: Probe, force: float, theory: Theory) -> float:
+    """Relative error of a charge to expect from what a theory leaves out; infinite where it has no meaning."""
+    error = 0.0
+    if not theory.stretching:
+        if not theory.bending and film.pretension == 0.0:
+            return np.inf
+        error += LINEAR_WEIGHT * Groups.of(film, force, bending=theory.bending).induced
+        error += LOCAL_WEIGHT * induced_at_probe(film, probe, force)
+    if not theory.bending:
+        length = bending_length(film, force)
+        error += BENDING_WEIGHT * length + bending_at_probe(film, probe, force)
+        error += np.inf if length > MOSTLY_BENT else 0.0
+    return error
+
+
+def choose(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
+    """The cheapest theory whose error stays within the wanted accuracy, the full one if none does."""
+    tense = film.pretension > 0.0
+    cheap_first = (
+        Theory(stretching=False, bending=False, pretensioned=tense),
+        Theory(stretching=False, bending=True, pretensioned=tense),
+        Theory(stretching=True, bending=False, pretensioned=tense),
+    )
+    for theory in cheap_first:
+        if left_out(film, probe, force, theory) <= 0.5 * accuracy:
+            return theory
+    return Theory(stretching=True, bending=True, pretensioned=tense)
+
+
+def theory_for(sensor: Sensor, probe: Probe, force_range: tuple[float, float], accuracy: float = ACCURACY) -> Theory:
+    """The fewest terms that serve every force (N) of a range and the surface that a sensor reads."""
+    ends = [choose(sensor.film, probe, force, accuracy) for force in force_range]
+    return Theory(
+        stretching=any(end.stretching for end in ends),
+        bending=any(end.bending for end in ends) or sensor.surface != "middle",
+        pretensioned=ends[0].pretensioned,
+    )
+
+
+def named(name: str, film: Film) -> Theory:
+    """The theory of this name, "linear plate", "linear membrane", "nonlinear membrane" or with " + bending".
+
+    Raises:
+        SceneError: If there is no such theory, or it cannot hold this film.
+    """
+    tense = film.pretension > 0.0
+    options = [Theory(stretching, bending, tense) for stretching in (False, True) for bending in (False, True)]
+    found = [theory for theory in options if name in (theory.name, theory.name.removeprefix("pre-tensioned "))]
+    if not found:
+        raise SceneError(f"theory: expected one of {[theory.name for theory in options]}, got {name!r}")
+    if found[0].name == "linear membrane":
+        raise SceneError("theory 'linear membrane': a film without pretension has no stiffness in it; set a pretension")
+    return found[0]

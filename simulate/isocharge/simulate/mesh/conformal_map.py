@@ -1,0 +1,103 @@
+"""The disk automorphism that carries the mesh to the probe, and how sectors and rings are graded on it."""
+
+import numpy as np
+
+from isocharge.arrays import Array, Complexes
+from isocharge.simulate.mesh.resolution import Resolution
+from isocharge.simulate.mesh.template import Template
+
+CLEARANCE = 0.4
+"""Room between a polygon's farthest corner and the circle round it, in units of that corner's distance."""
+
+LARGEST_TURN = 0.2
+"""How far (rad) a sector's side is turned at most from the ray through its corner: clustered corners would fold it."""
+
+INNER_SHARE, OUTER_SHARE = 0.25, 0.35
+"""Beside the rim: that room, and the room between circle and rim, over that between polygon and rim."""
+
+GRADING = 0.65
+"""How much of the map's stretching round the rim the sectors take up there: none 0, all 1."""
+
+
+def _conformal(at: Array, radius: Array) -> tuple[Array, Array]:
+    """(c, rho) that carry |z| = rho onto the circle of this centre and radius (film radius one); see the module."""
+    outer, inner = np.arctanh(at + radius), np.arctanh(at - radius)
+    return np.tanh(0.5 * (outer + inner)), np.tanh(0.5 * (outer - inner))
+
+
+def _enclosing(corners: Complexes, at: Array) -> tuple[Array, Array]:
+    """Centre and radius of a circle inside the film round each polygon: about the centroid where there is room."""
+    gap = 1.0 - np.abs(corners).max(axis=-1)
+
+    def radius(centre: Array) -> Array:
+        reach = np.abs(corners - centre[..., None]).max(axis=-1)
+        room = np.minimum(CLEARANCE * reach, INNER_SHARE * gap)
+        total: Array = reach + room
+        return total
+
+    fits = at + radius(at) <= 1.0 - OUTER_SHARE * gap
+    if np.all(fits):
+        return at, radius(at)
+    low, high = np.zeros(at.shape), at.copy()
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        inside = middle + radius(middle) <= 1.0 - OUTER_SHARE * gap
+        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+    centre = np.where(fits, at, low)
+    return centre, radius(centre)
+
+
+def _sectors(mesh: Template, corners: Complexes, centre: Array, radius: Array, pull: Array) -> Array:
+    """Angles on the template's circle, where rays from the polygon's hub meet it.
+
+    Their directions lie between those of the polygon's corners and an even spread where there is room between polygon
+    and circle, else nearer to the polygon, lest elements fold. `pull` is c rho.
+    """
+    hub = corners[..., -1:]
+    stops = corners @ mesh.boundary[:: mesh.split].T
+    angle = np.unwrap(np.angle(stops - hub), axis=-1)
+    even = np.linspace(0.0, 2.0 * np.pi / mesh.copies, angle.shape[-1])
+    even = even + np.mean(angle[..., :-1] - even[:-1], axis=-1)[..., None]
+    reach = np.abs(corners - centre[..., None]).max(axis=-1)
+    evenness = 0.5 * np.minimum((radius / reach - 1.0) / CLEARANCE, 1.0)[..., None]
+    mixed = angle + LARGEST_TURN * np.tanh(evenness * (even - angle) / LARGEST_TURN)
+    share = np.arange(mesh.split) / mesh.split
+    steps = (mixed[..., :-1, None] + share * np.diff(mixed, axis=-1)[..., None]).reshape(*mixed.shape[:-1], -1)
+    ray = np.exp(1j * np.concatenate([steps, mixed[..., -1:]], axis=-1))
+    away = hub - centre[..., None]
+    along = (away * np.conj(ray)).real
+    point = away + ray * (np.sqrt(along**2 + radius[..., None] ** 2 - np.abs(away) ** 2) - along)
+    first = np.angle(point[..., :1])
+    turned = np.cumsum(np.mod(np.angle(point[..., 1:] / point[..., :-1]), 2.0 * np.pi), axis=-1)
+    return _stretched(np.concatenate([first, first + turned], axis=-1), (1.0 + pull) / (1.0 - pull))
+
+
+def _graded(angle: Array, c: Array, rho: Array) -> Array:
+    """Angles on the rim, from those on the circle: moved towards pi, where the map compresses the far side of the film.
+
+    Even spacing on the circle of the film has done some of it.
+    """
+    stretch = ((1.0 + c) / (1.0 - c)) ** GRADING * (1.0 - c * rho) / (1.0 + c * rho)
+    return _stretched(angle, np.maximum(stretch, 1.0))
+
+
+def _stretched(angle: Array, factor: Array) -> Array:
+    """Angles whose half has its tangent multiplied: what the map does to angles on a circle about its centre.
+
+    |z| = rho is carried onto its circle with the factor (1 - c rho) / (1 + c rho), rho = 1 onto the rim.
+    """
+    turns = 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
+    stretched: Array = turns + 2.0 * np.arctan(factor[..., None] * np.tan(0.5 * (angle - turns)))
+    return stretched
+
+
+def _rings(resolution: Resolution, rho: Array, layer: Array) -> Array:
+    """Edges of the rings: even steps, then thin rings, each a third of what is left of the layer."""
+    even = np.linspace(0.0, 1.0, resolution.rings + 1)
+    if resolution.rim == 0:
+        return np.broadcast_to(even, (*rho.shape, even.size))
+    thin = np.minimum(-layer / np.log(rho), 1.0 / (resolution.rings + 1))[..., None]
+    inner = even * (1.0 - thin)
+    outer = 1.0 - thin * 3.0 ** -np.arange(1.0, resolution.rim + 1)
+    outer[..., -1] = 1.0
+    return np.concatenate([inner, outer], axis=-1)

@@ -1,0 +1,232 @@
+"""Where the mesh lies: a conformal map of the disk carries the rings, straight blocks fill the footprint.
+
+The disk automorphism
+
+    Z = (z + c) / (1 + c z),   0 <= c < 1,
+
+carries rings about the template's centre onto the film (Z in units of the film's radius, the probe on the positive x
+axis), circles to circles, so that with
+
+    al = (atanh(p + R) + atanh(p - R)) / 2,   be = (atanh(p + R) - atanh(p - R)) / 2,   c = tanh al,   rho = tanh be
+
+the circle |z| = rho becomes the circle of radius R about p, exactly. Inside that circle blocks are blended between the
+straight edges of the footprint's polygon and the circle, on the film itself, so that the edges stay straight and the
+load is integrated over the footprint and nothing else. Nodal fields are smooth functions of the position, and points
+of the film are found in the mesh by closed formulas and, inside the circle, a few steps of Newton.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Self
+
+import numpy as np
+
+from isocharge.arrays import Array, Complexes, Integers
+from isocharge.simulate.mesh.conformal_map import _conformal, _enclosing, _graded, _rings, _sectors
+from isocharge.simulate.mesh.resolution import Resolution
+from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.probe import Circle, Polygon, Probe
+
+CORE = 0.45
+"""Half side of the virtual square in a circular footprint over its radius: corners at 0.64 of it."""
+
+DIAGONALS = np.array([0.25, 0.75, 1.25, 1.75])
+"""Directions of its corners, in units of pi."""
+
+NEWTON_STEPS = 20
+"""For finding a point inside the circle; six do where blocks are well shaped."""
+
+OVERSHOOT = 0.1
+"""How far outside of its element a point may be sought."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A template's place on the film; the attributes may have leading axes, one placement per press.
+
+    Attributes:
+        c: The map's parameter, shape (...).
+        rho: Radius of the circle in the template, shape (...).
+        corners: Corners of the footprint's polygon and, last, its centroid, the hub, on the film, in units of its
+            radius, shape (..., n_corner + 1).
+        start: Angles of the sectors on the circle, shape (..., n_sector + 1).
+        end: Angles of the sectors on the rim, shape (..., n_sector + 1).
+        depth: Edges of the rings, 0 on the circle and 1 on the rim, shape (..., n_ring + 1).
+    """
+
+    c: Array
+    rho: Array
+    corners: Complexes
+    start: Array
+    end: Array
+    depth: Array
+
+    @classmethod
+    def of(
+        cls, mesh: Template, probe: Probe, distance: Array, film_radius: float, layer: float, turn: Array | float = 0.0
+    ) -> Self:
+        """Place a template under a press on the positive x axis.
+
+        Args:
+            mesh: The template; its number of corners must be the probe's.
+            probe: The footprint, turned as it is when the press lies on the x axis.
+            distance: Distance of the footprint's centroid from the film's centre, m, any shape.
+            film_radius: m.
+            layer: Width of the thin rings at the rim over the film's radius.
+            turn: How far the footprint is turned further, rad, the shape of `distance` or a number.
+        """
+        at = np.asarray(distance, dtype=float) / film_radius
+        if isinstance(probe, Circle):
+            centre, radius = at, np.full(at.shape, probe.radius / film_radius)
+            corners = at[..., None] + radius[..., None] * CORE * np.sqrt(2.0) * np.exp(1j * np.pi * DIAGONALS)
+        else:
+            turned = np.exp(1j * np.broadcast_to(turn, at.shape))[..., None]
+            corners = at[..., None] + probe.outline / film_radius * turned
+            centre, radius = _enclosing(corners, at)
+        corners = np.concatenate([corners, at[..., None]], axis=-1)
+        c, rho = _conformal(centre, radius)
+        start = _sectors(mesh, corners, centre, radius, c * rho)
+        depth = _rings(mesh.resolution, rho, layer * (1.0 + c) / (1.0 - c))
+        return cls(c, rho, corners, start, _graded(start, c, rho), depth)
+
+    def __getitem__(self, which: Integers) -> "Placement":
+        """Some of the placements."""
+        return Placement(*(value[which] for value in self._values()))
+
+    def batch(self) -> "Placement":
+        """One placement as a batch of one."""
+        return Placement(*(np.asarray(value)[None] for value in self._values()))
+
+    def _values(self) -> tuple[Any, ...]:
+        return self.c, self.rho, self.corners, self.start, self.end, self.depth
+
+    def to_film(self, z: Complexes) -> Complexes:
+        """Template points, shape (..., n), to film points (unit radius)."""
+        c = self.c[..., None]
+        film: Complexes = (z + c) / (1.0 + c * z)
+        return film
+
+    def to_template(self, film: Complexes) -> Complexes:
+        """Film points (unit radius), shape (..., n), to template points."""
+        c = self.c[..., None]
+        z: Complexes = (film - c) / (1.0 - c * film)
+        return z
+
+    def element_points(self, mesh: Template) -> Complexes:
+        """Film points of every element's nodes for one placement, shape (n_element, (order + 1)^2), unit radius."""
+        v, t = 0.5 * (mesh.xi + 1.0), 0.5 * (mesh.eta + 1.0)
+        a, b, c, d = (mesh.straight @ self.corners).T[:, :, None]
+        inner = (1.0 - v) * (a + t * (b - a)) + v * (c + t * (d - c))
+        sector = np.arange(mesh.n_sector)[:, None]
+        low, high = self.start[sector], self.start[sector + 1]
+        arc = self.to_film(self.rho * np.exp(1j * (low + t * (high - low))))
+        inner[mesh.n_quad :] += v * arc
+        depth = self.depth[:-1, None] + v * np.diff(self.depth)[:, None]
+        swept = depth[:, None]
+        angles = (1.0 - swept) * (low + t * (high - low)) + swept * (self.end[sector] + t * np.diff(self.end)[:, None])
+        outside = self.to_film(np.exp((1.0 - swept) * np.log(self.rho) + 1j * angles))
+        return np.concatenate([inner, outside.reshape(-1, v.size)])
+
+    def locate(self, mesh: Template, film: Complexes) -> tuple[Integers, Array, Array]:
+        """Find film points in the mesh, so many for each placement.
+
+        Args:
+            mesh: The template.
+            film: Points (unit radius), shape (k, n) where the attributes have one leading axis of length k; in the
+                upper half for a half template.
+
+        Returns:
+            Element, xi and eta, each of shape (k, n).
+        """
+        z = self.to_template(film)
+        element, v, t = self._locate_rings(mesh, z)
+        inside = np.nonzero(np.abs(z) <= self.rho[:, None])
+        if inside[0].size:
+            element[inside], v[inside], t[inside] = self[inside[0]]._locate_inner(mesh, film[inside])
+        return element, 2.0 * v - 1.0, 2.0 * t - 1.0
+
+    def _locate_rings(self, mesh: Template, z: Complexes) -> tuple[Integers, Array, Array]:
+        with np.errstate(divide="ignore"):
+            depth = np.clip(1.0 - np.log(np.abs(z)) / np.log(self.rho)[:, None], 0.0, 1.0)
+        ring = np.sum(self.depth[:, None, 1:-1] <= depth[..., None], axis=-1)
+        low, high = (np.take_along_axis(self.depth, ring + i, axis=1) for i in (0, 1))
+
+        def edge(number: Integers) -> Array:
+            start, end = (np.take_along_axis(angles, number, axis=1) for angles in (self.start, self.end))
+            at: Array = start + depth * (end - start)
+            return at
+
+        angle = np.angle(z)
+        if not mesh.half:
+            first = edge(np.zeros_like(ring))
+            angle = first + np.mod(angle - first, 2.0 * np.pi)
+        turn = (self.end - self.start)[:, None, 1:-1]
+        sector = np.sum(self.start[:, None, 1:-1] + depth[..., None] * turn <= angle[..., None], axis=-1)
+        before, after = edge(sector), edge(sector + 1)
+        return (
+            mesh.n_inner + ring * mesh.n_sector + sector,
+            (depth - low) / (high - low),
+            (angle - before) / (after - before),
+        )
+
+    def _locate_inner(self, mesh: Template, film: Complexes) -> tuple[Integers, Array, Array]:
+        """Points inside the circle, one for each placement; all of shape (n,)."""
+        a, b, c, d = np.moveaxis(np.einsum("ekn,pn->pek", mesh.straight, self.corners), -1, 0)
+        circle = self.to_film(self.rho[:, None] * np.exp(1j * self.start))
+        c[:, mesh.n_quad :], d[:, mesh.n_quad :] = circle[:, :-1], circle[:, 1:]
+        at = film[:, None]
+        sides = [_left(a, c, at), _left(d, b, at), _left(b, a, at), _left(c, d, at)]
+        sides[3][:, mesh.n_quad :] = np.inf
+        element = np.argmax(np.min(sides, axis=0), axis=1)
+        pick = np.arange(film.size), element
+        return element, *self._invert(mesh, film, element, *(corner[pick] for corner in (a, b, c, d)))
+
+    def _invert(
+        self, mesh: Template, film: Complexes, element: Integers, a: Complexes, b: Complexes, c: Complexes, d: Complexes
+    ) -> tuple[Array, Array]:
+        """(v, t) of points in given elements inside the circle: Newton on two equations, to round-off in a few."""
+        arc = element >= mesh.n_quad
+        sector = np.where(arc, element - mesh.n_quad, 0)
+        v, t = np.full(film.shape, 0.5), np.full(film.shape, 0.5)
+        low, high = (np.take_along_axis(self.start, (sector + i)[:, None], axis=1)[:, 0] for i in (0, 1))
+        for _ in range(NEWTON_STEPS):
+            z = self.rho * np.exp(1j * (low + t * (high - low)))
+            turned = 1j * (high - low) * z * (1.0 - self.c**2) / (1.0 + self.c * z) ** 2
+            outer = np.where(arc, (z + self.c) / (1.0 + self.c * z), c + t * (d - c))
+            by_t = (1.0 - v) * (b - a) + v * np.where(arc, turned, d - c)
+            inner = a + t * (b - a)
+            by_v = outer - inner
+            miss = inner + v * by_v - film
+            determinant = (np.conj(by_v) * by_t).imag
+            v = np.clip(v - (np.conj(miss) * by_t).imag / determinant, -OVERSHOOT, 1.0 + OVERSHOOT)
+            t = np.clip(t - (np.conj(by_v) * miss).imag / determinant, -OVERSHOOT, 1.0 + OVERSHOOT)
+        return v, t
+
+
+def _left(start: Complexes, end: Complexes, at: Complexes) -> Array:
+    """Distance of points to the left of directed lines."""
+    way = end - start
+    left: Array = ((at - start) * np.conj(way)).imag / np.maximum(np.abs(way), 1e-300)
+    return left
+
+
+@lru_cache(maxsize=16)
+def template(resolution: Resolution, corners: int) -> Template:
+    """The template of a resolution for a polygon of so many corners, 0 for a circle; made once."""
+    mesh = Template(resolution, corners)
+    turn = np.linspace(0.0, 2.0 * np.pi, max(corners, 3), endpoint=False)
+    sample: Probe = Polygon.of(0.1 * np.stack([np.cos(turn), np.sin(turn)], axis=1)) if corners else Circle(0.1)
+    mesh.number(Placement.of(mesh, sample, np.array(0.1), 1.0, 0.05).element_points(mesh))
+    return mesh
+
+
+def template_for(probe: Probe, resolution: Resolution) -> Template:
+    """The template that follows a probe's outline."""
+    return template(resolution, len(probe.corners) if isinstance(probe, Polygon) else 0)
+
+
+def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> Placement:
+    """Where the template lies, the press turned onto the positive x axis; `layer` over the film's radius."""
+    turned = probe.turned(-float(np.arctan2(at[1], at[0])))
+    return Placement.of(template_for(probe, resolution), turned, np.array(np.hypot(*at)), film.radius, layer)

@@ -1,0 +1,4 @@
+"""Numerics without physics: interpolation, points of a disk, convex polygons, Gauss rules.
+
+May import: nothing of isocharge.simulate.
+"""

@@ -1,0 +1,250 @@
+"""Fig. 1 to 5 and 7: the principle, the mapping schemes, the layout, the mesh."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from matplotlib.collections import LineCollection
+
+from isocharge.arrays import Array
+from isocharge.simulate.contours.charge_curves import Mapping
+from isocharge.simulate.forward.readout import contact_charge
+from isocharge.simulate.numerics.interpolation import tensor_values
+from isocharge.simulate.paper.choices import PAPER
+from isocharge.simulate.paper.entry import Entry, Row
+from isocharge.simulate.paper.solves import FINEST, FORCE, MESHES, Study
+from isocharge.simulate.plots.curves import draw_mapping
+from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
+from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
+from isocharge.simulate.sensor.sensor import Sensor
+
+FIG_4_DEG, FIG_7_DEG = (35.0, 145.0), PAPER.fig_8_deg
+"""Lines from A, the half that Fig. 6 shows and its mirror image; lines from B."""
+
+
+def fig_1(study: Study) -> Entry:
+    """The principle: three distances."""
+    sensor = study.choices.sensor("three")
+    centres, at = np.array([e.centre for e in sensor.electrodes]), np.array(study.choices.shown)
+    distance = np.linalg.norm(centres - at, axis=1)
+    found, second = trilaterate(centres, distance), _mirrored(centres[0], centres[1], at)
+    figure = new_figure(6.4, 6.0)
+    axes = figure.subplots()
+    angle = np.linspace(0.0, 2.0 * np.pi, 200)
+    for name, centre, r, colour in zip("abc", 1e3 * centres, 1e3 * distance, COLOURS, strict=False):
+        axes.plot(*centre, "s", color=colour)
+        axes.annotate(name, centre, xytext=(6, 6), textcoords="offset points", color=colour)
+        circle = centre[:, None] + r * np.array([np.cos(angle), np.sin(angle)])
+        axes.plot(*circle, color=colour, lw=1.0, label=f"{r:.2f} mm from {name}")
+    axes.plot(*1e3 * found, "o", color=INK, label="all three meet")
+    axes.plot(*1e3 * second, "x", color=INK, label="a and b meet again")
+    axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="Fig. 1: position from three distances")
+    axes.legend(fontsize=8)
+    error = 1e3 * float(np.linalg.norm(found - at))
+    again = f"twice, {1e3 * float(np.linalg.norm(second - at)):.2f} mm apart"
+    return Entry(
+        "Fig. 1",
+        "Three distances from three known points give a position (eq. 1); two give two.",
+        figure,
+        [
+            Row("three circles", "one point", f"one point, {error:.1g} mm from the press", "round-off"),
+            Row("two circles", "two intersections", again, "the mirror image in the line through their centres"),
+        ],
+        {"error_mm": error},
+    )
+
+
+def trilaterate(centres: Array, distance: Array) -> Array:
+    """Eq. 1 for three circles, shape (2,): each difference of two of them is linear in the position."""
+    matrix = 2.0 * (centres[1:] - centres[0])
+    right = distance[0] ** 2 - distance[1:] ** 2 + np.sum(centres[1:] ** 2, axis=1) - np.sum(centres[0] ** 2)
+    found: Array = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    return found
+
+
+def _mirrored(first: Array, second: Array, at: Array) -> Array:
+    """Mirror image in the line through two points."""
+    along = (second - first) / np.linalg.norm(second - first)
+    mirrored: Array = 2.0 * (first + along * ((at - first) @ along)) - at
+    return mirrored
+
+
+def fig_2(study: Study) -> Entry:
+    """The mapping scheme about one electrode."""
+    sensor = study.choices.sensor("three")
+    mapping = Mapping.lines(sensor, "A", (0.0, 2.0 * np.pi - np.deg2rad(10.0)), length=study.choices.length)
+    figure = new_figure(6.4, 6.2)
+    axes = figure.subplots()
+    draw_mapping(axes, mapping)
+    draw_electrodes(axes, sensor, highlight="A")
+    axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="Fig. 2: mapping scheme")
+    figure.legend(fontsize=8, loc="outside lower center", ncols=2)
+    step, turn = 1e3 * float(np.diff(mapping.distance)[0]), float(np.rad2deg(np.diff(mapping.angle)[0]))
+    length = f"{1e3 * mapping.distance[-1]:g} mm"
+    return Entry(
+        "Fig. 2",
+        "Lines and circles about the centre of an electrode; a press at each intersection.",
+        figure,
+        [
+            Row("radial and angular increments", "4 mm, 10°", f"{step:g} mm, {turn:g}°", "as given"),
+            Row("length of the lines", "not given", length, "our choice: across the working area from any electrode"),
+        ],
+    )
+
+
+def fig_3(study: Study) -> Entry:
+    """The layout with three sensing elements, and as the text has it."""
+    sensor, printed = study.choices.sensor("three"), study.choices.as_printed()
+    figure = new_figure(11.0, 5.6)
+    left, right = figure.subplots(1, 2)
+    for axes, shown, title in ((left, sensor, "Fig. 3: layout, equilateral"), (right, printed, "as the text has it")):
+        draw_electrodes(axes, shown)
+        draw_working_area(axes, shown.film.radius, "clamped rim")
+        corners = 1e3 * np.array([e.centre for e in shown.electrodes] + [shown.electrodes[0].centre])
+        axes.plot(*corners.T, color=FELT, lw=0.8, label="between the centres")
+        axes.set(xlim=(-47, 47), ylim=(-47, 47), aspect="equal", xlabel="x (drawn), mm", ylabel="y, mm", title=title)
+    left.legend(fontsize=8, loc="lower left")
+    (sides, angles), (printed_sides, _) = _triangle(sensor), _triangle(printed)
+    directions = ", ".join(f"{angle:.0f}°" for angle in angles)
+    why = "60° and 120° are the directions from A to B and C; from the centre they give no equilateral triangle"
+    return Entry(
+        "Fig. 3",
+        "Three electrodes of 3 mm, 10 mm from the centre of a film clamped at 45 mm.",
+        figure,
+        [
+            Row("sides of the triangle", "equal", _lengths(sides), "by construction"),
+            Row("angles to B and C", "60° and 120° from the centre", f"{directions} from A", why),
+            Row(
+                "sides, with 60° and 120° from the centre",
+                "equal",
+                _lengths(printed_sides),
+                "the sentence contradicts it",
+            ),
+        ],
+        {"sides_mm": sides, "sides_as_printed_mm": printed_sides},
+    )
+
+
+def _triangle(sensor: Sensor) -> tuple[list[float], list[float]]:
+    """Sides AB, BC, CA (mm) and directions from A to B and C (degrees)."""
+    a, b, c = (1e3 * complex(*e.centre) for e in sensor.electrodes)
+    return [abs(b - a), abs(c - b), abs(a - c)], [float(np.rad2deg(np.angle(z - a))) for z in (b, c)]
+
+
+def _lengths(sides: list[float]) -> str:
+    return ", ".join(f"{side:.2f}" for side in sides) + " mm"
+
+
+def _scheme(study: Study, heading: str, electrode: str, angles: tuple[float, float]) -> Entry:
+    sensor = study.choices.sensor("three")
+    ends = (np.deg2rad(angles[0]), np.deg2rad(angles[1]))
+    mapping = Mapping.lines(sensor, electrode, ends, length=study.choices.length)
+    figure = new_figure(6.8, 6.8)
+    axes = figure.subplots()
+    draw_mapping(axes, mapping)
+    draw_electrodes(axes, sensor, highlight=electrode)
+    draw_working_area(axes, study.choices.radius, f"working area, {1e3 * study.choices.radius:g} mm")
+    draw_probe(axes, study.choices.triangle, (float(mapping.points[3, 1, 0]), float(mapping.points[3, 1, 1])), "probe")
+    frame_film(axes, sensor, mapping.reach, f"{heading}: lines from {electrode}")
+    figure.legend(fontsize=8, loc="outside lower center", ncols=4)
+    over = touching(study, sensor, mapping)
+    overlap = dict(zip(sensor.electrode_names, over.sum(axis=0).tolist(), strict=True))
+    words = f"{over.any(axis=1).sum()} of {len(over)} presses: " + ", ".join(f"{n} on {e}" for e, n in overlap.items())
+    return Entry(
+        heading,
+        f"Lines from electrode {electrode} at {angles[0]:g}° to {angles[1]:g}° from the drawn direction.",
+        figure,
+        [Row("probe over an electrode", "a small overlap with B in some", words, "triangle of 4 mm, our choice")],
+        {"presses_over_an_electrode": overlap},
+    )
+
+
+TOUCHED = 1e-3
+"""Share of the probe that must lie on an electrode to count: less is the round-off of areas."""
+
+
+def touching(study: Study, sensor: Sensor, mapping: Mapping) -> np.ndarray:
+    """Which presses of a scheme overlap which electrode under the triangle, shape (n, n_electrode)."""
+    pressed = replace(
+        sensor, piezo=replace(sensor.piezo, d33=-1.0)
+    )  # so that the contact's charge is the share covered
+    points = mapping.points.reshape(-1, 2)
+    covered = [contact_charge(pressed, study.choices.triangle, (x, y), FORCE) for x, y in points]
+    return np.asarray(np.array(covered) > TOUCHED)
+
+
+def fig_4(study: Study) -> Entry:
+    """The scheme from A."""
+    return _scheme(study, "Fig. 4", "A", FIG_4_DEG)
+
+
+def fig_7(study: Study) -> Entry:
+    """The scheme from B."""
+    return _scheme(study, "Fig. 7", "B", FIG_7_DEG)
+
+
+def fig_5(study: Study) -> Entry:
+    """The mesh, and what its fineness is worth."""
+    shown = study.shown
+    figure = new_figure(15.0, 5.0)
+    whole, near, errors = figure.subplots(1, 3)
+    for axes, reach, title in ((whole, 46.0, "Fig. 5: mesh, whole film"), (near, 8.0, "at the probe")):
+        _draw_mesh(axes, study)
+        x, y = (0.0, 0.0) if axes is whole else (1e3 * shown.at[0], 1e3 * shown.at[1])
+        draw_electrodes(axes, study.choices.sensor("three"), names=axes is near, ink="#2e6f9e")
+        axes.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", title=title)
+        axes.set(xlabel="x, mm", ylabel="y, mm")
+    unknowns, error, seconds = mesh_errors(study)
+    errors.loglog(unknowns, 100.0 * error, "o-", color=FELT, label="ours, the shown press")
+    errors.axhline(0.1, color=INK, lw=0.8, ls=":", label="0.1 %")
+    errors.set_xticks(unknowns, [f"{n:,}" for n in unknowns])
+    errors.minorticks_off()
+    errors.set(xlabel="unknowns", ylabel="worst charge against the finest mesh, %", title="error against mesh")
+    errors.grid(alpha=0.3, which="both")
+    errors.legend(fontsize=8)
+    enough = int(np.argmax(error < 1e-3))
+    order, count = shown.resolution.order, shown.mesh.nodes.shape[0]
+    ours = f"{count} quadrilaterals of order {order}, {3 * shown.mesh.n_node} unknowns"
+    why = "high order on a mesh that follows the probe; the solution is smooth outside of it"
+    fixed = (
+        "README, Speed against error: 13,000 quadratic triangles of dolfinx 0.08 % in 13 s, 13,000 linear ones of "
+        "CalculiX 3 %: too many for a good element, and not enough for one like SHELL63"
+    )
+    return Entry(
+        "Fig. 5",
+        "Elements under a triangular probe: the whole film, at the probe, and the error against the unknowns.",
+        figure,
+        [
+            Row("elements", f"{PAPER.elements[0]:,} to {PAPER.elements[1]:,} triangles", ours, why),
+            Row(
+                "fine enough?",
+                "captures the entire geometry well enough",
+                f"0.1 % of a charge takes {unknowns[enough]:,} unknowns and {seconds[enough]:.2f} s",
+                fixed,
+            ),
+        ],
+        {
+            "unknowns": unknowns.tolist(),
+            "worst_relative_error": error.tolist(),
+            "cpu_s": seconds.tolist(),
+            "meshes_order_around_rings_rim": [*MESHES],
+            "finest": FINEST,
+        },
+    )
+
+
+def mesh_errors(study: Study) -> tuple[Array, Array, Array]:
+    """Unknowns, worst relative error of a charge against the finest mesh, CPU seconds of every mesh but that."""
+    charges, unknowns, seconds = zip(*study.meshes, strict=True)
+    error = np.abs(np.array(charges[:-1]) / charges[-1] - 1.0).max(axis=1)
+    return np.array(unknowns[:-1]), error, np.array(seconds[:-1])
+
+
+def _draw_mesh(axes: Any, study: Study) -> None:
+    shown = study.shown
+    along, one = np.linspace(-1.0, 1.0, 13), np.ones(13)
+    xi, eta = np.concatenate([along, one, -along, -one]), np.concatenate([-one, along, one, -along])
+    turn = 1e3 * shown.film.radius * np.exp(1j * np.angle(complex(*shown.at)))
+    z = shown.placement.element_points(shown.mesh) @ tensor_values(shown.resolution.order, xi, eta).T * turn
+    axes.add_collection(LineCollection(list(np.stack([z.real, z.imag], axis=-1)), colors=INK, linewidths=0.5))
+    draw_probe(axes, shown.probe, shown.at)

@@ -1,0 +1,263 @@
+"""Everything that is solved for the page, once: forward maps and single presses, on all workers."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from time import process_time
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from isocharge.arrays import Array
+from isocharge.errors import SolveError
+from isocharge.progress import Progress
+from isocharge.simulate.contours.charge_curves import Curves, Mapping
+from isocharge.simulate.execution.workers import Workers
+from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.forward.readout import touch_charge
+from isocharge.simulate.mechanics.theory import Theory
+from isocharge.simulate.mesh.resolution import Resolution
+from isocharge.simulate.numerics.disk import lattice
+from isocharge.simulate.paper.choices import PAPER, Choices
+from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.solver.equilibrium import Equilibrium
+from isocharge.simulate.solver.press import press
+
+FORCE = 1.0
+"""The paper's, N."""
+
+SLACK = 1.0 + 1e-6
+"""So that the outermost press of a scheme lies inside its map."""
+
+MESHES = ((2, 6, 3, 1), (3, 8, 4, 1), (4, 8, 5, 1), (5, 8, 5, 1), (6, 8, 6, 1))
+
+FINEST = (8, 12, 7, 2)
+"""Order, around, rings, rim of the meshes that are compared, and of what with."""
+
+CHAIN_ACCURACY = 2e-3
+"""Of the presses of the thickness study, where some tenths of a percent cannot be seen."""
+
+
+@dataclass(frozen=True)
+class Presses:
+    """Single presses to solve, the same way each: charges of some sensors.
+
+    Attributes:
+        sensors: All with the same film.
+        probe: The footprint.
+        at: (x, y) of each, m.
+        force: Of each, N; each is started from the one before.
+        accuracy: Relative error of a charge that is wanted.
+    """
+
+    sensors: tuple[Sensor, ...]
+    probe: Probe
+    at: tuple[tuple[float, float], ...]
+    force: tuple[float, ...]
+    accuracy: float = 1e-3
+
+
+def solve_presses(job: Presses) -> Array:
+    """Touch charges, shape (n_sensor, n_press, n_electrode), C; all sensors have as many electrodes."""
+    start: Equilibrium | None = None
+    charge = []
+    for at, force in zip(job.at, job.force, strict=True):
+        start = press(job.sensors[0].film, job.probe, at, force, accuracy=job.accuracy, start=start)
+        charge.append([touch_charge(sensor, start) for sensor in job.sensors])
+    return np.moveaxis(np.array(charge), 1, 0)
+
+
+@dataclass(frozen=True)
+class MapJob:
+    """A forward map to build at 1 N."""
+
+    sensor: Sensor
+    probe: Probe
+    radius: float
+
+
+def build_map(job: MapJob) -> ForwardMap:
+    """The forward map of a job."""
+    return ForwardMap.build(job.sensor, job.probe, job.radius, (FORCE, FORCE))
+
+
+@dataclass(frozen=True)
+class MeshJob:
+    """One press on one mesh."""
+
+    sensor: Sensor
+    probe: Probe
+    at: tuple[float, float]
+    mesh: tuple[int, int, int, int]
+
+
+def solve_mesh(job: MeshJob) -> tuple[Array, int, float]:
+    """Charges, unknowns and CPU seconds; NaN charges where the mesh gives no equilibrium."""
+    began, theory = process_time(), Theory(stretching=True, bending=True, pretensioned=False)
+    try:
+        solved = press(job.sensor.film, job.probe, job.at, FORCE, theory=theory, resolution=Resolution(*job.mesh))
+    except SolveError:
+        return np.full(len(job.sensor.electrodes), np.nan), 0, process_time() - began
+    charge = touch_charge(job.sensor, solved)
+    return charge, 3 * solved.mesh.n_node, process_time() - began
+
+
+def run(job: tuple[Callable[[Any], Any], Any]) -> Any:
+    """A task as a worker gets it."""
+    function, argument = job
+    return function(argument)
+
+
+@dataclass(frozen=True)
+class Study:
+    """What was solved.
+
+    Attributes:
+        choices: What the paper leaves open.
+        maps: Forward maps at 1 N by probe ("triangle", "rectangle", "circle"); any layout, film direction and readout
+            shares them, since they hold the film's stress.
+        eq_4: Where the press of eq. 4 must have been, and how much larger our charges are there: (x, y) in m, factor.
+        chains: Charges of the films of `choices`, shape (n_thickness, n_pretension, n_force, 3), C.
+        meshes: Of MESHES and FINEST: charges, unknowns, CPU seconds.
+        variants: Charges of named variations, see `_variants`.
+        shown: The film under one triangular press, for its mesh and stress.
+    """
+
+    choices: Choices
+    maps: dict[str, ForwardMap]
+    eq_4: tuple[tuple[float, float], float]
+    chains: Array
+    meshes: tuple[tuple[Array, int, float], ...]
+    variants: dict[str, Array]
+    shown: Equilibrium
+
+    def film(self, probe: str, sensor: Sensor) -> ForwardMap:
+        """The map of a probe, read by a sensor with the same film."""
+        return replace(self.maps[probe], sensor=sensor)
+
+    def scheme(self, probe: str, sensor: Sensor) -> tuple[Curves, ...]:
+        """Charge curves from every electrode, as far to both sides of the centre as contours need."""
+        film = self.film(probe, sensor)
+        names, length = sensor.electrode_names, self.choices.length
+        return tuple(Curves.of(film, Mapping.lines(sensor, name, length=length), FORCE) for name in names)
+
+    def charges(self, probe: str, sensor: Sensor, at: Array) -> Array:
+        """Touch charges of presses of 1 N at (x, y), shape (n, 2), m; (n, n_electrode), C."""
+        return self.film(probe, sensor).forward(at[:, 0], at[:, 1], np.full(len(at), FORCE))
+
+    @property
+    def places(self) -> Array:
+        """Presses spread over the working area, shape (n, 2), m."""
+        z = self.choices.radius * lattice(self.choices.presses) * np.exp(0.1j)  # off the lines of symmetry
+        return np.stack([z.real, z.imag], axis=1)
+
+
+def conduct(choices: Choices, workers: Workers, progress: Progress | None = None) -> Study:
+    """Solve everything. `progress` is told how many tasks are done."""
+    sensor = choices.sensor("three")
+    first = _map_jobs(choices)
+    variants = _variants(choices)
+    meshes = [(solve_mesh, MeshJob(sensor, choices.triangle, choices.shown, mesh)) for mesh in (*MESHES, FINEST)]
+    chains = len(choices.thickness) * len(choices.pretension)
+    bar = _Counter(len(first) + len(variants) + len(meshes) + chains, progress)
+    early = bar.over(
+        workers,
+        [*((build_map, job) for job in first.values()), *((solve_presses, j) for j in variants.values()), *meshes],
+    )
+    maps = dict(zip(first, early, strict=False))
+    read = dict(zip(variants, early[len(first) :], strict=False))
+    eq_4 = find_eq_4(replace(maps["triangle"], sensor=sensor), choices)
+    late = bar.over(workers, [(solve_presses, job) for job in _chain_jobs(choices, eq_4[0])])
+    charges = np.array(late)[:, 0].reshape(len(choices.thickness), len(choices.pretension), len(choices.force), -1)
+    shown = press(sensor.film, choices.triangle, choices.shown, FORCE)
+    return Study(choices, maps, eq_4, charges, tuple(early[len(first) + len(variants) :]), read, shown)
+
+
+class _Counter:
+    """Runs tasks and says how many are done."""
+
+    def __init__(self, total: int, progress: Progress | None) -> None:
+        self._done, self._total, self._progress = 0, total, progress
+
+    def over(self, workers: Workers, jobs: Sequence[tuple[Callable[[Any], Any], Any]]) -> list[Any]:
+        results = []
+        for result in workers.in_order(run, jobs):
+            results.append(result)
+            self._done += 1
+            if self._progress:
+                self._progress(self._done, self._total)
+        return results
+
+
+def _map_jobs(choices: Choices) -> dict[str, MapJob]:
+    sensor = choices.sensor("three")
+    layouts = (sensor, choices.sensor("four"))
+    lines = [Mapping.lines(s, name, length=choices.length) for s in layouts for name in s.electrode_names]
+    reach = SLACK * max(mapping.reach for mapping in lines)
+    ends = (np.deg2rad(PAPER.fig_8_deg[0]), np.deg2rad(PAPER.fig_8_deg[1]))
+    printed = SLACK * Mapping.lines(choices.as_printed(), "B", ends, length=choices.printed_length).reach
+    return {
+        "rectangle": MapJob(sensor, choices.rectangle, max(reach, printed)),
+        "triangle": MapJob(sensor, choices.triangle, reach),
+        "circle": MapJob(sensor, choices.circle, reach),
+    }
+
+
+def _chain_jobs(choices: Choices, at: tuple[float, float]) -> list[Presses]:
+    """Charge against force of every film, at the place of eq. 4."""
+    sensor, count = choices.sensor("three"), len(choices.force)
+    return [
+        Presses((replace(sensor, film=film),), choices.triangle, (at,) * count, choices.force, CHAIN_ACCURACY)
+        for film in (
+            replace(sensor.film, thickness=thickness, pretension=pretension)
+            for thickness in choices.thickness
+            for pretension in choices.pretension
+        )
+    ]
+
+
+TAUT = 0.5e6
+"""Pretension of a film that is not known to be taut, Pa."""
+
+UNSUSPECTED = 24
+"""Presses with a probe or a film other than the one that the contours were made for."""
+
+
+def sample(choices: Choices) -> tuple[tuple[float, float], ...]:
+    """Presses of the variations, m."""
+    places = 0.9 * choices.radius * lattice(min(UNSUSPECTED, choices.presses)) * np.exp(0.1j)
+    return tuple((float(z.real), float(z.imag)) for z in places)
+
+
+def _variants(choices: Choices) -> dict[str, Presses]:
+    """Presses with another probe or film than our choice, by name; at the same places, 1 N, paper's readout."""
+    sensor, at = choices.sensor("three"), sample(choices)
+
+    def presses(film: Film, probe: Probe) -> Presses:
+        return Presses((replace(sensor, film=film),), probe, at, (FORCE,) * len(at))
+
+    found = {f"probe {probe.notation}": presses(sensor.film, probe) for probe in choices.probes}
+    found[f"pretension {TAUT * 1e-6:g} MPa"] = presses(replace(sensor.film, pretension=TAUT), choices.triangle)
+    for young in choices.young:
+        found[f"E {young * 1e-9:g} GPa"] = presses(replace(sensor.film, young=young), choices.triangle)
+    for poisson in choices.poisson:
+        found[f"nu {poisson:g}"] = presses(replace(sensor.film, poisson=poisson), choices.triangle)
+    return found
+
+
+def find_eq_4(film: ForwardMap, choices: Choices) -> tuple[tuple[float, float], float]:
+    """Where the ratios of eq. 4's charges at 1 N put the press: (x, y) in m, and our charges there over the paper's."""
+    table = ChargeSpline.of(film, 1.2 * choices.radius, choices.spacing)
+    wanted = np.array([sum(cubic) for cubic in PAPER.cubics]) * 1e-12
+
+    def miss(at_mm: Array) -> Array:
+        charge = table.first_order(1e-3 * at_mm[None], FORCE)[0][0]
+        away: Array = np.log(charge[1:] / charge[0]) - np.log(wanted[1:] / wanted[0])
+        return away
+
+    found = least_squares(miss, np.array([0.0, -4.0])).x * 1e-3
+    factor = table.first_order(found[None], FORCE)[0][0] / wanted
+    return (float(found[0]), float(found[1])), float(np.mean(factor))

@@ -1,0 +1,4 @@
+"""What the sensor is and what presses it: film, electrodes, probe, and their TOML file.
+
+May import: numerics.
+"""

@@ -1,0 +1,98 @@
+"""Electrodes, and where calibration found them on a real film."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.errors import SensorError
+from isocharge.simulate.numerics.polygon import area_of, is_convex
+from isocharge.simulate.sensor.film import Film
+
+
+@dataclass(frozen=True)
+class Electrode:
+    """One sensing element.
+
+    Attributes:
+        name: As in the sensor file.
+        corners: Corners of a convex polygon, anticlockwise, m.
+        square: Whether it was made by `of_square`; only squares have the edges that the edge readout averages over.
+    """
+
+    name: str
+    corners: tuple[tuple[float, float], ...]
+    square: bool = False
+
+    @classmethod
+    def of_square(cls, name: str, centre: tuple[float, float], side: float) -> "Electrode":
+        """A square along the axes, centre and side in m; the first corner is the lower left one."""
+        (x, y), half = centre, 0.5 * side
+        corners = ((x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half))
+        return cls(name, corners, square=True)
+
+    @property
+    def area(self) -> float:
+        """m^2."""
+        return area_of(np.array(self.corners))
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Mean of the corners, m."""
+        x, y = np.mean(self.corners, axis=0)
+        return float(x), float(y)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What calibration found on a real film.
+
+    Attributes:
+        gain: Charge read over charge collected, by electrode name; missing names count as 1.
+        shift: How far the electrodes sit from where the layout says, m.
+        rotation: How far they are turned about the film's centre before the shift, rad, anticlockwise.
+    """
+
+    gain: dict[str, float] = field(default_factory=dict)
+    shift: tuple[float, float] = (0.0, 0.0)
+    rotation: float = 0.0
+
+    def place(self, points: Array) -> Array:
+        """Layout positions, shape (..., 2), to positions on the real film."""
+        c, s = np.cos(self.rotation), np.sin(self.rotation)
+        placed: Array = points @ np.array([[c, s], [-s, c]]) + np.array(self.shift)
+        return placed
+
+
+def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration) -> None:
+    corners = np.array(electrode.corners)
+    if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
+        raise SensorError(
+            f"electrode {electrode.name!r}: expected at least three corners (x, y), got {corners.tolist()}"
+        )
+    if not is_convex(corners):
+        raise SensorError(
+            f"electrode {electrode.name!r}: expected a convex polygon with its corners anticlockwise, "
+            f"got {(corners * 1e3).tolist()} mm"
+        )
+    side = float(corners[1, 0] - corners[0, 0])
+    square = Electrode.of_square(electrode.name, electrode.centre, side).corners
+    if electrode.square and not (len(corners) == 4 and np.allclose(corners, square, rtol=0.0, atol=1e-9 * side)):
+        raise SensorError(
+            f"electrode {electrode.name!r}: expected the corners of a square along the axes, "
+            f"got {(corners * 1e3).tolist()} mm; make squares with Electrode.of_square"
+        )
+    placed = calibration.place(corners)
+    if not np.linalg.norm(placed, axis=1).max() < film.radius:
+        x, y = 1e3 * placed.mean(axis=0)
+        reach = 1e3 * np.linalg.norm(placed - placed.mean(axis=0), axis=1).max()
+        size = f"half side {_mm(500.0 * side)} mm" if electrode.square else f"corners up to {_mm(reach)} mm from it"
+        raise SensorError(
+            f"electrode {electrode.name!r} lies outside the film: centre ({_mm(x)}, {_mm(y)}) mm, {size}, "
+            f"film radius {_mm(1e3 * film.radius)} mm"
+        )
+
+
+def _mm(value: float) -> str:
+    """For messages, the value already in mm."""
+    return str(float(f"{value:.6g}"))

@@ -1,0 +1,205 @@
+"""The object that presses: its footprint and the notation for it.
+
+`circle:1.0` (radius), `rectangle:4.0x2.0` (along x and y), `triangle:4.0` (equilateral side, a corner to +y),
+`polygon:x,y;x,y;...` (convex), lengths in mm, each optionally turned: `@30` (degrees, anticlockwise). The position of
+a probe is the centroid of its footprint.
+"""
+
+import math
+import re
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from isocharge.arrays import Array, Complexes
+from isocharge.errors import SceneError
+from isocharge.simulate.numerics.polygon import area_of, centroid_of, is_convex
+
+NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+
+NOTATION = re.compile(
+    rf"(?:(?P<circle>circle):(?P<radius>{NUMBER})"
+    rf"|(?P<rectangle>rectangle):(?P<width>{NUMBER})x(?P<height>{NUMBER})"
+    rf"|(?P<triangle>triangle):(?P<side>{NUMBER})"
+    rf"|(?P<polygon>polygon):(?P<corners>{NUMBER},{NUMBER}(?:;{NUMBER},{NUMBER})+))"
+    rf"(?:@(?P<angle>{NUMBER}))?"
+)
+
+MOST_CORNERS = 64
+"""Corners of a polygon above which a mesh that follows them is not worth its unknowns: use a circle."""
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A circular footprint of `radius` (m) that presses uniformly."""
+
+    radius: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.radius) and self.radius > 0.0):
+            raise SceneError(f"probe radius: expected a positive number, got {self.radius} m")
+
+    @property
+    def notation(self) -> str:
+        """As on the command line, the radius in mm."""
+        return f"circle:{_mm(self.radius)}"
+
+    @property
+    def area(self) -> float:
+        """m^2."""
+        return float(np.pi * self.radius**2)
+
+    @property
+    def reach(self) -> float:
+        """Distance of the footprint's farthest point from its centroid, m."""
+        return self.radius
+
+    @property
+    def angle(self) -> float:
+        """How far the footprint is turned: nothing for a circle."""
+        return 0.0
+
+    @property
+    def period(self) -> float:
+        """Smallest turn that maps the footprint onto itself, rad: a circle looks the same at every angle."""
+        return 0.0
+
+    def turned(self, _angle: float) -> "Circle":
+        """The footprint turned about its centroid."""
+        return self
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """A convex polygonal footprint that presses uniformly.
+
+    Attributes:
+        corners: (x, y) relative to the centroid, anticlockwise, m, before turning.
+        angle: How far it is turned about the centroid, anticlockwise, rad.
+        name: What to call it, "rectangle", "triangle" or "polygon".
+    """
+
+    corners: tuple[tuple[float, float], ...]
+    angle: float = 0.0
+    name: str = "polygon"
+
+    def __post_init__(self) -> None:
+        at = np.array(self.corners, dtype=float)
+        if at.ndim != 2 or at.shape[1:] != (2,) or not 3 <= len(at) <= MOST_CORNERS or not np.isfinite(at).all():
+            raise SceneError(f"probe: expected 3 to {MOST_CORNERS} corners (x, y), got {self.corners}")
+        if not np.isfinite(self.angle):
+            raise SceneError(f"probe angle: expected a finite number, got {self.angle}")
+        if not is_convex(at):
+            raise SceneError(
+                f"probe: expected a convex polygon with its corners anticlockwise, got {(1e3 * at).tolist()} mm"
+            )
+        if not np.linalg.norm(centroid_of(at)) <= 1e-9 * np.linalg.norm(at, axis=1).max():
+            raise SceneError(
+                f"probe: expected corners relative to their centroid, got {(1e3 * at).tolist()} mm; use Polygon.of"
+            )
+
+    @classmethod
+    def of(cls, corners: Array, angle: float = 0.0, name: str = "polygon") -> "Polygon":
+        """From corners (x, y) anywhere, anticlockwise, shape (n, 2), m: they are moved onto their centroid."""
+        at = np.asarray(corners, dtype=float)
+        if at.ndim == 2 and at.shape[0] >= 3 and at.shape[1] == 2 and is_convex(at):
+            at = at - centroid_of(at)
+        return cls(tuple((float(x), float(y)) for x, y in at), angle, name)
+
+    @classmethod
+    def rectangle(cls, width: float, height: float, angle: float = 0.0) -> "Polygon":
+        """Sides along x and y, m."""
+        _check_positive(width=width, height=height)
+        x, y = 0.5 * width, 0.5 * height
+        return cls(((x, y), (-x, y), (-x, -y), (x, -y)), angle, "rectangle")
+
+    @classmethod
+    def triangle(cls, side: float, angle: float = 0.0) -> "Polygon":
+        """Equilateral, one corner to +y; side in m."""
+        _check_positive(side=side)
+        turn = np.exp(1j * (0.5 * np.pi + 2.0 * np.pi / 3.0 * np.arange(3))) * side / np.sqrt(3.0)
+        return cls(tuple((float(z.real), float(z.imag)) for z in turn), angle, "triangle")
+
+    @property
+    def notation(self) -> str:
+        """As on the command line, lengths in mm, without the angle."""
+        at = np.array(self.corners)
+        if self.name == "rectangle":
+            return f"rectangle:{_mm(2.0 * at[0, 0])}x{_mm(2.0 * at[0, 1])}"
+        if self.name == "triangle":
+            return f"triangle:{_mm(float(np.linalg.norm(at[1] - at[0])))}"
+        return "polygon:" + ";".join(f"{_mm(x)},{_mm(y)}" for x, y in at)
+
+    @property
+    def area(self) -> float:
+        """m^2."""
+        return area_of(np.array(self.corners))
+
+    @property
+    def reach(self) -> float:
+        """Distance of the footprint's farthest point from its centroid, m."""
+        return float(np.linalg.norm(np.array(self.corners), axis=1).max())
+
+    @property
+    def outline(self) -> Complexes:
+        """Corners as x + iy relative to the centroid, turned, anticlockwise, shape (n,), m."""
+        outline: Complexes = np.array(self.corners) @ np.array([1.0, 1j]) * np.exp(1j * self.angle)
+        return outline
+
+    @property
+    def period(self) -> float:
+        """Smallest turn that maps the footprint onto itself, rad."""
+        z = np.array(self.corners) @ np.array([1.0, 1j])
+        for step in range(1, z.size):
+            turn = np.exp(2j * np.pi * step / z.size)
+            if z.size % step == 0 and np.allclose(np.roll(z, -step), z * turn, rtol=0.0, atol=1e-9 * self.reach):
+                return float(math.tau * step / z.size)
+        return math.tau
+
+    def turned(self, angle: float) -> "Polygon":
+        """The footprint turned about its centroid by a further angle (rad)."""
+        return replace(self, angle=self.angle + angle)
+
+
+Probe: TypeAlias = Circle | Polygon
+
+
+def parse_probe(text: str) -> Probe:
+    """Read a probe's notation; see the module.
+
+    Raises:
+        SceneError: If the notation is wrong or the footprint impossible.
+    """
+    match = NOTATION.fullmatch(text.strip())
+    if match is None:
+        raise SceneError(
+            f"probe {text!r}: expected 'circle:R', 'rectangle:WxH', 'triangle:S' or 'polygon:X,Y;X,Y;X,Y' in mm, each "
+            "optionally turned as in 'triangle:4.0@30' (degrees)"
+        )
+    angle = float(np.deg2rad(float(match["angle"] or 0.0)))
+    if match["circle"]:
+        return Circle(float(match["radius"]) * 1e-3)
+    if match["rectangle"]:
+        return Polygon.rectangle(float(match["width"]) * 1e-3, float(match["height"]) * 1e-3, angle)
+    if match["triangle"]:
+        return Polygon.triangle(float(match["side"]) * 1e-3, angle)
+    corners = np.array([[float(value) for value in corner.split(",")] for corner in match["corners"].split(";")])
+    return Polygon.of(corners * 1e-3, angle)
+
+
+def _check_positive(**sizes: float) -> None:
+    for name, value in sizes.items():
+        if not (np.isfinite(value) and value > 0.0):
+            raise SceneError(f"probe {name}: expected a positive number, got {value} m")
+
+
+def _mm(metres: float) -> float:
+    return float(f"{metres * 1e3:.12g}")
+
+
+def farthest(probe: Probe, at: tuple[float, float]) -> float:
+    """Distance of the footprint's farthest point from the film's centre, m."""
+    if isinstance(probe, Polygon):
+        return float(np.abs(complex(*at) + probe.outline).max())
+    return float(np.hypot(*at)) + probe.radius

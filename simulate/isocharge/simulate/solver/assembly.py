@@ -1,0 +1,132 @@
+"""From element matrices to a linear solve: condensation of the elements' interiors, then a sparse direct solver.
+
+A node inside an element touches no other element, so its unknowns are eliminated element by element in dense algebra,
+and only the skeleton is factorised: 2.3 times fewer unknowns at order 4. Everything that depends on the template alone
+(numbering, sparsity, where each entry goes) is done once.
+
+Unknowns per node are U1, U2, W and, with bending, the carried Laplacian (see `mechanics.bending`). On the rim
+the first three are fixed; on the line of symmetry of a half template U2 is.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import SuperLU, splu
+
+from isocharge.arrays import Array, Integers
+from isocharge.simulate.mesh.placement import template
+from isocharge.simulate.mesh.resolution import Resolution
+from isocharge.simulate.mesh.template import Template
+
+
+class Assembly:
+    """Factorises K for one template and number of unknowns per node.
+
+    Attributes:
+        components: Unknowns per node.
+        free: Which are not fixed, shape (n_node, components).
+        inner_global: Numbers of the elements' interior unknowns, shape (n_element, n_inner).
+        outer_global: Numbers of those on the elements' edges, shape (n_element, n_outer).
+        skeleton: Numbers of those that are left to factorise.
+    """
+
+    def __init__(self, mesh: Template, components: int) -> None:
+        line = np.arange(mesh.resolution.order + 1)
+        on_edge = (line == line[0]) | (line == line[-1])
+        shell = (on_edge[:, None] | on_edge[None, :]).ravel()
+        self.components = components
+        self.free = _free(mesh, components)
+        self._outer, self._inner = self._unknowns(np.flatnonzero(shell)), self._unknowns(np.flatnonzero(~shell))
+        unknown = self._unknowns(mesh.nodes)
+        self.inner_global = unknown[:, self._inner]
+        self.outer_global = unknown[:, self._outer]
+        in_skeleton = np.zeros(self.free.size, dtype=bool)
+        in_skeleton[self.outer_global.ravel()] = True
+        self.skeleton = np.flatnonzero(in_skeleton & self.free.ravel())
+        number = np.full(self.free.size, -1, dtype=np.intp)
+        number[self.skeleton] = np.arange(self.skeleton.size)
+        self._pattern(number[self.outer_global])
+
+    def _unknowns(self, nodes: Integers) -> Integers:
+        """Numbers of the unknowns of nodes: shape (..., n) to (..., components * n), components fast."""
+        count = self.components
+        return (count * nodes[..., None] + np.arange(count)).reshape(*nodes.shape[:-1], -1)
+
+    def _pattern(self, number: Integers) -> None:
+        """Compressed columns of the skeleton matrix and where each element entry goes; fixed ones go past the end."""
+        shape, size = (*number.shape, number.shape[1]), self.skeleton.size
+        row, column = np.broadcast_to(number[:, :, None], shape), np.broadcast_to(number[:, None, :], shape)
+        free = (row >= 0) & (column >= 0)
+        key, place = np.unique(column[free] * size + row[free], return_inverse=True)
+        self._place = np.full(shape, key.size, dtype=np.intp)
+        self._place[free] = place
+        self._place = self._place.ravel()
+        self._indices = (key % size).astype(np.int32)
+        self._indptr = np.concatenate([[0], np.cumsum(np.bincount(key // size, minlength=size))]).astype(np.int32)
+
+    def factor(self, matrix: Array) -> "Factor":
+        """Factorise K.
+
+        Args:
+            matrix: Element matrices, shape (n_element, n_local, components, n_local, components), symmetric.
+
+        Returns:
+            What solves K x = b for any b.
+        """
+        inner, outer = self._inner, self._outer
+        size = matrix.shape[1] * self.components
+        matrix = matrix.reshape(-1, size, size)
+        interior, coupling = matrix[:, inner[:, None], inner], matrix[:, inner[:, None], outer]
+        reduced = np.linalg.solve(interior, coupling).astype(float, copy=False)
+        schur = matrix[:, outer[:, None], outer] - coupling.transpose(0, 2, 1) @ reduced
+        return Factor(self, interior, coupling, reduced, self._factor_skeleton(schur))
+
+    def _factor_skeleton(self, schur: Array) -> SuperLU:
+        data = np.bincount(self._place, schur.ravel(), self._indices.size + 1)[:-1]
+        skeleton = csc_matrix((data, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
+        return splu(skeleton, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+class Factor:
+    """A factorised K."""
+
+    def __init__(self, assembly: Assembly, interior: Array, coupling: Array, reduced: Array, skeleton: SuperLU) -> None:
+        self._assembly = assembly
+        self._interior, self._coupling, self._reduced, self._skeleton = interior, coupling, reduced, skeleton
+
+    def solve(self, right: Array) -> Array:
+        """Solve for the free unknowns.
+
+        Args:
+            right: Right-hand side for (U1, U2, W) on every node, shape (n_node, 3); fixed values are ignored.
+
+        Returns:
+            (U1, U2, W), shape (n_node, 3), zero where fixed.
+        """
+        parts = self._assembly
+        padded = np.zeros(parts.free.shape)
+        padded[:, :3] = right
+        flat = padded.ravel()
+        inside = np.linalg.solve(self._interior, flat[parts.inner_global][..., None])
+        carried = self._coupling.transpose(0, 2, 1) @ inside
+        shifted = flat - np.bincount(parts.outer_global.ravel(), carried.ravel(), flat.size)
+        solution = np.zeros(flat.size)
+        solution[parts.skeleton] = self._skeleton.solve(shifted[parts.skeleton])
+        back = self._reduced @ solution[parts.outer_global][..., None]
+        solution[parts.inner_global] = (inside - back)[..., 0]
+        return solution.reshape(parts.free.shape)[:, :3]
+
+
+def _free(mesh: Template, components: int) -> np.ndarray:
+    """Which unknowns are not fixed by clamping or symmetry, shape (n_node, components)."""
+    free = np.ones((mesh.n_node, components), dtype=bool)
+    free[mesh.on_rim, :3] = False
+    free[mesh.on_axis, 1] = False
+    return free
+
+
+@lru_cache(maxsize=16)
+def assembly(resolution: Resolution, corners: int, components: int) -> Assembly:
+    """The assembly of a template, made once."""
+    return Assembly(template(resolution, corners), components)
