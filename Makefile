@@ -44,7 +44,7 @@ report: $(VENV)/installed
 	$(BIN)/isocharge train report build/three-25um-biaxial build/four-25um-biaxial -o report
 
 # The gRPC messages, compiled; a test compares them with their source.
-PROTO := serve/isocharge/serve/grpc
+PROTO := serve/isocharge/serve/network/grpc
 proto: $(VENV)/installed
 	$(BIN)/python -m grpc_tools.protoc -I $(PROTO) --descriptor_set_out=$(PROTO)/inference.binpb inference.proto
 

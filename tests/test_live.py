@@ -17,7 +17,7 @@ from isocharge.serve import (
     device_from_table,
     encode_frame,
 )
-from isocharge.serve.chain import ChainState, advance
+from isocharge.serve.signal_chain.chain import ChainState, advance
 from isocharge.simulate import load_amplifier
 
 RATE_HZ = 200.0

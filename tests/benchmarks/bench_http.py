@@ -29,7 +29,7 @@ import tritonclient.http
 from bench_predictor import machine
 
 from isocharge.serve import find_model, load_model
-from isocharge.serve.session import OUTPUTS
+from isocharge.serve.model.session import OUTPUTS
 
 HERE = Path(__file__).parent
 PACKAGES = {"fastapi": ["fastapi", "uvicorn[standard]", "onnxruntime"], "mlserver": ["mlserver", "onnxruntime"]}

@@ -18,7 +18,7 @@ import numpy as np
 import onnxruntime as ort
 
 from isocharge.serve import Predictor, find_model
-from isocharge.serve.session import open_session
+from isocharge.serve.model.session import open_session
 
 
 def machine() -> dict[str, str]:

@@ -15,10 +15,10 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from isocharge.serve import ModelMetadata, Predictor, write_model
-from isocharge.serve.http import App, HttpServer
-from isocharge.serve.listen import Address
-from isocharge.serve.shelf import open_shelf
-from isocharge.serve.v2 import Handler
+from isocharge.serve.network.address import Address
+from isocharge.serve.network.http import App, HttpServer
+from isocharge.serve.network.model_store import open_shelf
+from isocharge.serve.network.protocol import Handler
 
 NAMES = ("A", "B", "C", "D")
 PC_PER_N, LEVER_MM, RADIUS_MM = 800.0, 20.0, 8.0

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.serve import BinaryParser, Frame, encode_frame
-from isocharge.serve.binary import CRC, DELIMITER, LONGEST_PIECE, crc16
-from isocharge.serve.cobs import cobs_decode, cobs_encode
+from isocharge.serve.frames.binary import CRC, DELIMITER, LONGEST_PIECE, crc16
+from isocharge.serve.frames.cobs import cobs_decode, cobs_encode
 
 FLOATS = st.floats(width=32, allow_nan=False)
 FRAMES = st.builds(

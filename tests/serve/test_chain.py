@@ -5,9 +5,9 @@ import pytest
 
 from isocharge.errors import TareError
 from isocharge.serve import Chain, TareRule, TouchRule
-from isocharge.serve.chain import ChainState, advance
-from isocharge.serve.tare import measure_tare
-from isocharge.serve.touching import Touch, next_touch
+from isocharge.serve.signal_chain.chain import ChainState, advance
+from isocharge.serve.signal_chain.contact import Touch, next_touch
+from isocharge.serve.signal_chain.tare import measure_tare
 
 RULE, OFFSET = TareRule(), np.array([12.0, -7.0, 3.0])
 RATE_HZ = 200.0

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.errors import DeviceError
-from isocharge.serve.checksums import checksum
+from isocharge.serve.frames.checksums import checksum
 
 CATALOGUE = {
     "crc-8": 0xF4,

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from isocharge.cli.serve import serve_app
 from isocharge.errors import ChargeError, InputError, ModelError, OutputExists, PortError, PortLost, SensorError
 from isocharge.serve import BinaryParser, Port, Script, VirtualSensor, wander
-from isocharge.serve.pseudo_port import PseudoPort
+from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pytest
 import tritonclient.grpc
 
 from isocharge.cli.http import BATCH, BODY_BYTES, CONNECTIONS, HEADER_S, IDLE_S
-from isocharge.serve.limits import Limits
+from isocharge.serve.network.limits import Limits
 
 BODY = json.dumps(
     {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}]}

@@ -8,10 +8,10 @@ electrodes differ, it does not.
 import numpy as np
 import pytest
 
-from isocharge.serve.chain import ChainState
-from isocharge.serve.common_mode import NO_WARMING, CommonModeRule, follow_warming
-from isocharge.serve.leak import Leak
-from isocharge.serve.tare import Tare
+from isocharge.serve.signal_chain.chain import ChainState
+from isocharge.serve.signal_chain.leak import Leak
+from isocharge.serve.signal_chain.tare import Tare
+from isocharge.serve.signal_chain.thermal import NO_WARMING, CommonModeRule, follow_warming
 
 ANGLE = 2 * np.pi * np.arange(4) / 4
 ALIKE = np.column_stack([np.ones(4), np.cos(ANGLE) / 20, np.sin(ANGLE) / 20])

@@ -10,8 +10,8 @@ from tritonclient.grpc.model_config_pb2 import ModelConfig
 
 from isocharge.errors import ChargeError
 from isocharge.serve import Predictor, check_golden, find_model, load_model
-from isocharge.serve.repository import model_names
-from isocharge.serve.session import OUTPUTS
+from isocharge.serve.model.repository import model_names
+from isocharge.serve.model.session import OUTPUTS
 
 MODELS = Path(__file__).parents[2] / "models"
 NAMES = model_names(MODELS)

@@ -5,9 +5,9 @@ import pytest
 
 from isocharge.errors import ChargeError, DeviceError
 from isocharge.serve import AutoParser, BinaryParser, DescribedParser, Frame, TextParser, load_device
-from isocharge.serve.chain import ChainState, advance
-from isocharge.serve.channels import ChannelPicker
-from isocharge.serve.device import ANY_BOARD
+from isocharge.serve.live.channels import ChannelPicker
+from isocharge.serve.live.device_file import ANY_BOARD
+from isocharge.serve.signal_chain.chain import ChainState, advance
 
 ELECTRODES = ("A", "B", "C")
 FULL = """

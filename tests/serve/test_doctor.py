@@ -11,8 +11,8 @@ import pytest
 from isocharge.cli.doctor import _in_words
 from isocharge.errors import PortError
 from isocharge.serve import Script, VirtualSensor, device_from_table, encode_text, examine
-from isocharge.serve.doctor import _health
-from isocharge.serve.pseudo_port import PseudoPort
+from isocharge.serve.live.port_check import _health
+from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 
 BAUD = (115200,)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Contact, Contacts, Domain
-from isocharge.serve.domain import MISFIT_LIMIT, inside_polygon
+from isocharge.serve.prediction.validity import MISFIT_LIMIT, inside_polygon
 
 GOOD = Contact(1.0, -2.0, 0.5, 0.1, 0.1, 0.01, 0.3)
 

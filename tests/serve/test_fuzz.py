@@ -19,7 +19,7 @@ from isocharge.serve import (
     encode_text,
     frame_layout,
 )
-from isocharge.serve.faults import corrupt
+from isocharge.serve.virtual_sensor.faults import corrupt
 
 LAYOUT = frame_layout(
     {

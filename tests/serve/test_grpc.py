@@ -14,12 +14,12 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from tritonclient.grpc import service_pb2
 
 from isocharge.errors import InputError, ListenError
-from isocharge.serve.grpc import grpc_server
-from isocharge.serve.grpc.messages import METHODS, SERVICE
-from isocharge.serve.limits import Limits
-from isocharge.serve.tls import Tls
-from isocharge.serve.token import Token
-from isocharge.serve.v2 import Handler
+from isocharge.serve.network.grpc import grpc_server
+from isocharge.serve.network.grpc.messages import METHODS, SERVICE
+from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.tls import Tls
+from isocharge.serve.network.token import Token
 
 PROTO = Path(__file__).parents[2] / "serve/isocharge/serve/grpc/inference.proto"
 

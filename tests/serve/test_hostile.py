@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve.shelf import open_shelf
-from isocharge.serve.v2 import Handler
+from isocharge.serve.network.model_store import open_shelf
+from isocharge.serve.network.protocol import Handler
 
 INFER = "/v2/models/linear/infer"
 SETTINGS = settings(max_examples=300, derandomize=True, deadline=None)

@@ -17,12 +17,12 @@ import pytest
 import trustme
 
 from isocharge.serve import Predictor
-from isocharge.serve.http import App, HttpServer
-from isocharge.serve.limits import Limits
-from isocharge.serve.listen import Address
-from isocharge.serve.tls import Tls
-from isocharge.serve.token import Token
-from isocharge.serve.v2 import Handler
+from isocharge.serve.network.address import Address
+from isocharge.serve.network.http import App, HttpServer
+from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.tls import Tls
+from isocharge.serve.network.token import Token
 
 INFER = "/v2/models/linear/infer"
 BODY = json.dumps(

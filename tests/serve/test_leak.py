@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Chain, LeakRule, TareRule
-from isocharge.serve.chain import ChainState, advance
-from isocharge.serve.leak import Leak, undo_leak
+from isocharge.serve.signal_chain.chain import ChainState, advance
+from isocharge.serve.signal_chain.leak import Leak, undo_leak
 
 RATE_HZ, TAU_S = 200.0, 2.0
 

@@ -7,10 +7,10 @@ import pytest
 import trustme
 
 from isocharge.errors import InputError, ListenError, TokenError
-from isocharge.serve.http import App, HttpServer
-from isocharge.serve.listen import Address, check_exposure
-from isocharge.serve.tls import Tls
-from isocharge.serve.token import Token
+from isocharge.serve.network.address import Address, check_exposure
+from isocharge.serve.network.http import App, HttpServer
+from isocharge.serve.network.tls import Tls
+from isocharge.serve.network.token import Token
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, te
 from isocharge.errors import ChargeError, ModelError, OutputExists
 from isocharge.files import sha256_of
 from isocharge.serve import check_golden, load_model, write_model
-from isocharge.serve.golden import make_golden
+from isocharge.serve.model.golden import make_golden
 
 
 @pytest.fixture
@@ -162,7 +162,7 @@ def test_golden_vectors_are_checked_before_a_version_appears(film, tmp_path, mon
         golden.outputs["contact"][0] += 1.0
         return golden
 
-    monkeypatch.setattr("isocharge.serve.model.make_golden", wrong)
+    monkeypatch.setattr("isocharge.serve.model.model_folder.make_golden", wrong)
     with pytest.raises(ModelError, match=r"contact\[0, .\] is"):
         write(film, tmp_path / "linear")
     assert list(tmp_path.iterdir()) == []

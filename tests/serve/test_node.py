@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from isocharge.serve import find_model, load_model
-from isocharge.serve.golden import check_answers
-from isocharge.serve.repository import model_names
-from isocharge.serve.session import OUTPUTS
+from isocharge.serve.model.golden import check_answers
+from isocharge.serve.model.repository import model_names
+from isocharge.serve.model.session import OUTPUTS
 
 MODELS = Path(__file__).parents[2] / "models"
 PACKAGE = "onnxruntime-web@1"

@@ -11,7 +11,7 @@ import serial
 
 from isocharge.errors import PortError, PortLost
 from isocharge.serve import Port
-from isocharge.serve.pseudo_port import PORT_BUFFER, PseudoPort
+from isocharge.serve.virtual_sensor.pseudo_port import PORT_BUFFER, PseudoPort
 
 
 @pytest.fixture

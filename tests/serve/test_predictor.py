@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from isocharge.errors import ChargeError, ModelError
 from isocharge.serve import Predictor
-from isocharge.serve.predictor import BoundPress
+from isocharge.serve.prediction.bound_press import BoundPress
 
 PRESSES = st.lists(st.floats(0.0, 5000.0, width=32), min_size=3, max_size=3).filter(lambda q: sum(q) > 1.0)
 

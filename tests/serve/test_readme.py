@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from isocharge.serve import Frame, TextParser, encode_frame, flags, load_device
-from isocharge.serve.cobs import cobs_decode
-from isocharge.serve.limits import Limits
-from isocharge.serve.shelf import open_shelf
-from isocharge.serve.v2 import Handler
+from isocharge.serve.frames.cobs import cobs_decode
+from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.model_store import open_shelf
+from isocharge.serve.network.protocol import Handler
 
 SERVE = Path(__file__).parents[2] / "serve"
 README = (SERVE / "README.md").read_text()

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.serve import AutoParser, Frame, encode_frame, encode_text
-from isocharge.serve.text import TEXT_FORMATS
+from isocharge.serve.frames.text_encoder import TEXT_FORMATS
 
 ENCODERS = {"binary": encode_frame} | {name: lambda frame, name=name: encode_text(frame, name) for name in TEXT_FORMATS}
 

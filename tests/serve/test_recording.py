@@ -11,7 +11,7 @@ import pytest
 
 from isocharge.errors import OutputError, OutputExists, RecordingError
 from isocharge.serve import Chunk, Frame, Policy, RecordedClock, Recorder, Recording, TouchStream, encode_frame
-from isocharge.serve.device import ANY_BOARD, device_from_table
+from isocharge.serve.live.device_file import ANY_BOARD, device_from_table
 
 DEVICE = {"tare": {"frames": 10}, "leak": {"tau_s": 10.0}, "hum": {"frequency_Hz": 50.0}}
 
@@ -95,7 +95,7 @@ def test_a_full_disk_leaves_a_readable_file(tmp_path, film, predictor, monkeypat
         room[0] -= taken
         return taken
 
-    monkeypatch.setattr("isocharge.serve.recording.os.write", write_until_full)
+    monkeypatch.setattr("isocharge.serve.port.recording.os.write", write_until_full)
     lines = record(path, film, predictor)
     assert len(lines) > 60
     assert path.stat().st_size < 9000

@@ -6,7 +6,7 @@ import pytest
 
 from isocharge.errors import ModelError
 from isocharge.serve import find_model
-from isocharge.serve.repository import model_names
+from isocharge.serve.model.repository import model_names
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def roots(tmp_path, monkeypatch):
     here.mkdir(parents=True)
     given.mkdir()
     monkeypatch.chdir(here.parent)
-    monkeypatch.setattr("isocharge.serve.repository._shipped", lambda: tmp_path / "shipped")
+    monkeypatch.setattr("isocharge.serve.model.repository._shipped", lambda: tmp_path / "shipped")
     return {"given": given, "variable": variable, "here": here, "shipped": tmp_path / "shipped"}
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from isocharge.errors import ModelError, ModelNotFound
 from isocharge.files import sha256_of
-from isocharge.serve.shelf import open_shelf
-from isocharge.serve.v2.infer import InferRequest, infer
+from isocharge.serve.network.model_store import open_shelf
+from isocharge.serve.network.protocol.infer import InferRequest, infer
 
 
 @pytest.fixture

@@ -8,8 +8,9 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from isocharge.serve import Frame, TextParser, encode_text
-from isocharge.serve.text import LONGEST_LINE, TEXT_FORMATS
-from isocharge.serve.text_lines import Notation, parse_line
+from isocharge.serve.frames.text import LONGEST_LINE
+from isocharge.serve.frames.text_encoder import TEXT_FORMATS
+from isocharge.serve.frames.text_lines import Notation, parse_line
 
 README_OF_TELEPLOT = [
     ("myValue:1234", ("myValue",), (1234.0,)),

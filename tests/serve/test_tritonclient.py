@@ -12,7 +12,7 @@ import tritonclient.http.aio
 from tritonclient.utils import InferenceServerException
 
 from isocharge.serve import Predictor
-from isocharge.serve.grpc import grpc_server
+from isocharge.serve.network.grpc import grpc_server
 
 CLIENTS = ("http", "aio", "grpc")
 

@@ -10,10 +10,10 @@ import orjson
 import pytest
 
 from isocharge.errors import InputError, ModelNotFound, TokenError
-from isocharge.serve.limits import Limits
-from isocharge.serve.v2 import Handler
-from isocharge.serve.v2.encoding import compress, decompress
-from isocharge.serve.v2.status import grpc_status, http_status
+from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.encoding import compress, decompress
+from isocharge.serve.network.protocol.status import grpc_status, http_status
 
 INFER = "/v2/models/linear/infer"
 

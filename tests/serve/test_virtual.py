@@ -19,7 +19,7 @@ from isocharge.serve import (
     encode_text,
     wander,
 )
-from isocharge.serve.faults import corrupt
+from isocharge.serve.virtual_sensor.faults import corrupt
 
 
 def steady(n=10, rate_Hz=200.0, force_N=1.0):

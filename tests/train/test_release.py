@@ -11,7 +11,7 @@ from scipy.stats import halfnorm
 
 from isocharge.errors import OutputExists
 from isocharge.serve import Predictor, find_model
-from isocharge.serve.repository import model_names
+from isocharge.serve.model.repository import model_names
 from isocharge.simulate import Circle, Sweep, noise_model, sensor_from_dict, solve_maps
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, train_model
 from isocharge.train.evaluate import measure_errors

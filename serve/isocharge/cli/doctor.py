@@ -32,7 +32,7 @@ def doctor_command(
     from json import dumps
 
     from isocharge.serve import Predictor, examine
-    from isocharge.serve.doctor import BAUDS
+    from isocharge.serve.live.port_check import BAUDS
 
     electrodes = Predictor(model, models=models).metadata.electrodes if model else ()
     found = examine(

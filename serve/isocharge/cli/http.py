@@ -12,12 +12,12 @@ from isocharge.errors import InputError
 from isocharge.extras import require
 
 if TYPE_CHECKING:
-    from isocharge.serve.tls import Tls
-    from isocharge.serve.token import Token
-    from isocharge.serve.v2 import Handler
+    from isocharge.serve.network.protocol import Handler
+    from isocharge.serve.network.tls import Tls
+    from isocharge.serve.network.token import Token
 
 BATCH, BODY_BYTES, CONNECTIONS, IDLE_S, HEADER_S = 4096, 1 << 20, 1024, 75.0, 10.0
-"""The defaults of `isocharge.serve.limits`, which help must not import; a test compares them."""
+"""The defaults of `isocharge.serve.network.limits`, which help must not import; a test compares them."""
 
 
 def http_command(
@@ -63,13 +63,13 @@ def http_command(
     Example: isocharge serve http --port 8000
     """
     with require("http"):
-        from isocharge.serve.http import App, HttpServer
-    from isocharge.serve.limits import Limits
-    from isocharge.serve.listen import Address, check_exposure
-    from isocharge.serve.shelf import open_shelf
-    from isocharge.serve.tls import Tls
-    from isocharge.serve.token import Token
-    from isocharge.serve.v2 import Handler
+        from isocharge.serve.network.http import App, HttpServer
+    from isocharge.serve.network.address import Address, check_exposure
+    from isocharge.serve.network.limits import Limits
+    from isocharge.serve.network.model_store import open_shelf
+    from isocharge.serve.network.protocol import Handler
+    from isocharge.serve.network.tls import Tls
+    from isocharge.serve.network.token import Token
 
     address = Address(host, port, uds)
     check_exposure(address if grpc_port is None else Address(host), token=token is not None, insecure=insecure)
@@ -104,5 +104,5 @@ def _grpc(
         return nullcontext("")
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # its core would say in its own way what our errors say
     with require("grpc"):
-        from isocharge.serve.grpc import grpc_server
+        from isocharge.serve.network.grpc import grpc_server
     return grpc_server(handler, host, port, token, tls)

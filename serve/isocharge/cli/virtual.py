@@ -20,7 +20,7 @@ from isocharge.errors import InputError, OutputExists
 
 if TYPE_CHECKING:
     from isocharge.serve import Script, VirtualSensor
-    from isocharge.serve.virtual import Encode
+    from isocharge.serve.virtual_sensor.sensor import Encode
     from isocharge.simulate import Amplifier, ForwardMap
 
 SCRIPT_S = 60.0

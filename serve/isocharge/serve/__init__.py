@@ -7,34 +7,37 @@
 `serve/README.md` says what is in which module.
 """
 
-from isocharge.serve.binary import BinaryParser, encode_frame
-from isocharge.serve.chain import Chain
-from isocharge.serve.described import DescribedParser, FrameLayout, frame_layout
-from isocharge.serve.device import Device, device_from_table, load_device
-from isocharge.serve.device_clock import DeviceClock
-from isocharge.serve.doctor import Examination, examine
-from isocharge.serve.domain import Domain
-from isocharge.serve.faults import Faults
-from isocharge.serve.frames import Frame, FrameCounts, Parser, SequenceGaps
-from isocharge.serve.hum import HumRule
-from isocharge.serve.leak import LeakRule
-from isocharge.serve.metadata import ModelMetadata
-from isocharge.serve.model import Model, check_golden, load_model, write_model
-from isocharge.serve.outputs import UdpSink, csv_header, csv_line
-from isocharge.serve.port import Chunk, Port
-from isocharge.serve.predictor import Contact, Contacts, Predictor
-from isocharge.serve.recognise import AutoParser
-from isocharge.serve.record import PredictionRecord
-from isocharge.serve.recording import RecordedClock, Recorder, Recording
-from isocharge.serve.repository import find_model
-from isocharge.serve.script import Script, read_script, wander
-from isocharge.serve.source import open_source
-from isocharge.serve.stream import Policy, TouchStream, stream
-from isocharge.serve.table import read_charges, table_records, write_contacts
-from isocharge.serve.tare import Tare, TareRule
-from isocharge.serve.text import TextParser, encode_text
-from isocharge.serve.touching import TouchRule
-from isocharge.serve.virtual import Truth, VirtualSensor
+from isocharge.serve.frames.autodetect import AutoParser
+from isocharge.serve.frames.binary import BinaryParser, encode_frame
+from isocharge.serve.frames.frame import Frame, FrameCounts, Parser
+from isocharge.serve.frames.frame_layout import FrameLayout, frame_layout
+from isocharge.serve.frames.layout_parser import DescribedParser
+from isocharge.serve.frames.sequence import SequenceGaps
+from isocharge.serve.frames.text import TextParser
+from isocharge.serve.frames.text_encoder import encode_text
+from isocharge.serve.live.device_file import Device, device_from_table, load_device
+from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
+from isocharge.serve.live.port_check import Examination, examine
+from isocharge.serve.live.stream import Policy, TouchStream, stream
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.model_folder import Model, check_golden, load_model, write_model
+from isocharge.serve.model.repository import find_model
+from isocharge.serve.port.device_clock import DeviceClock
+from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
+from isocharge.serve.port.serial_port import Chunk, Port
+from isocharge.serve.port.source import open_source
+from isocharge.serve.prediction.predictor import Contact, Contacts, Predictor
+from isocharge.serve.prediction.record import PredictionRecord
+from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
+from isocharge.serve.prediction.validity import Domain
+from isocharge.serve.signal_chain.chain import Chain
+from isocharge.serve.signal_chain.contact import TouchRule
+from isocharge.serve.signal_chain.hum import HumRule
+from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve.signal_chain.tare import Tare, TareRule
+from isocharge.serve.virtual_sensor.faults import Faults
+from isocharge.serve.virtual_sensor.script import Script, read_script, wander
+from isocharge.serve.virtual_sensor.sensor import Truth, VirtualSensor
 
 __all__ = [
     "AutoParser",

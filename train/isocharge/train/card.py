@@ -1,6 +1,6 @@
 """The model card: what a model is for, what it reaches, what it cannot do, and how to make it again."""
 
-from isocharge.serve.metadata import ModelMetadata
+from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.evaluate import misfit_noise
 from isocharge.train.fit import Fit

@@ -21,9 +21,9 @@ from isocharge.arrays import Array
 from isocharge.errors import TrainingError
 from isocharge.progress import StageProgress, Warn
 from isocharge.resumable_run import keep_draft
-from isocharge.serve.metadata import ModelMetadata
-from isocharge.serve.model import check_target, write_model
-from isocharge.serve.session import open_session, run
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.model_folder import check_target, write_model
+from isocharge.serve.model.session import open_session, run
 from isocharge.simulate.dataset.shards import Dataset
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict

@@ -21,7 +21,7 @@ from torch import nn
 
 from isocharge.arrays import Array
 from isocharge.serve import Predictor
-from isocharge.serve.session import open_session
+from isocharge.serve.model.session import open_session
 from isocharge.simulate.dataset.shards import Dataset
 from isocharge.train.config import FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.export import IR_VERSION, OPSET, GraphBuilder

@@ -1,0 +1,4 @@
+"""From bytes to frames: every wire format, knowing no port.
+
+May import: flags.
+"""

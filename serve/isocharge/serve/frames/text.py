@@ -1,0 +1,241 @@
+"""Frames from lines of text, whose layout is recognised from the first good lines; and lines from frames.
+
+A layout is recognised when it has come three times in a row: three rows of the same width or names, or three times the
+same cycle of lines with one name each. A cycle is cut before the name that sorts first (number and clock before the
+rest), because a reader may come in the middle of one; for the same reason a first line of bare numbers is dropped.
+After that a line of another layout is dropped and counted. Text has no checksum: a damaged digit in a line that is
+otherwise whole cannot be noticed.
+
+Some names mean something: `seq` counts frames; `t_us`, `t_ms` or `t_s` is the device's clock. All others are channels.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from isocharge.serve.frames.frame import T_US_MODULUS, Frame, FrameCounts, Splitter
+from isocharge.serve.frames.sequence import SEQ_MODULUS
+from isocharge.serve.frames.text_lines import SEQ, TIMES_US, Line, Notation, parse_line
+
+LONGEST_LINE = 4096
+
+LONGEST_CYCLE = 64
+
+TIMES_TO_RECOGNISE = 3
+
+MOST_VALUES = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What a line, or a cycle of lines, holds.
+
+    Attributes:
+        notation: How it is written.
+        names: Of all values; empty for CSV without header.
+        width: Number of values.
+        lines: Lines in a cycle; 1 for rows.
+        channels: Places of the channels among the values.
+        seq, time: Places of number and clock, or None.
+        us: What one unit of the clock is, us.
+    """
+
+    notation: Notation
+    names: tuple[str, ...]
+    width: int
+    lines: int
+    channels: tuple[int, ...]
+    seq: int | None
+    time: int | None
+    us: float
+
+    @classmethod
+    def of(cls, notation: Notation, names: tuple[str, ...], width: int, lines: int) -> "Layout":
+        """The layout of values with these names."""
+        seq = names.index(SEQ) if SEQ in names else None
+        time = next((names.index(name) for name in TIMES_US if name in names), None)
+        channels = tuple(at for at in range(width) if at not in (seq, time))
+        return cls(notation, names, width, lines, channels, seq, time, 1.0 if time is None else TIMES_US[names[time]])
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels; empty if they have none."""
+        return tuple(self.names[at] for at in self.channels) if self.names else ()
+
+    def frame(self, values: Sequence[float]) -> Frame:
+        """The frame of a row.
+
+        Raises:
+            ValueError: If number or clock is not finite.
+        """
+        seq = None if self.seq is None else _whole(values[self.seq])
+        t_us = None if self.time is None else _whole(values[self.time] * self.us)
+        return Frame(seq, t_us, tuple(values[at] for at in self.channels), names=self.channel_names)
+
+
+def _whole(value: float) -> int:
+    if not math.isfinite(value):
+        raise ValueError(f"expected a number or time, got {value}")
+    return round(value)
+
+
+class TextParser:
+    """Bytes in, frames out; the layout is found out, or `columns` names those of a CSV without header."""
+
+    seq_modulus = SEQ_MODULUS
+
+    def __init__(self, columns: tuple[str, ...] = ()) -> None:
+        self.counts = FrameCounts()
+        self.layout: Layout | None = None
+        self._columns = columns
+        self._lines = Splitter(b"\n", LONGEST_LINE, self.counts)
+        self._history: list[tuple[Line, int]] = []
+        self._cycle: dict[str, float] = {}
+        self._cycle_bytes = 0
+        self._first = True
+
+    @property
+    def t_us_modulus(self) -> int:
+        """Clocks of boards count in 32 bits, us or ms."""
+        return T_US_MODULUS * round(self.layout.us) if self.layout else T_US_MODULUS
+
+    @property
+    def format(self) -> str:
+        """The layout in words."""
+        if self.layout is None:
+            return "text of a layout that is not clear yet"
+        names = ", ".join(self.layout.names) or f"{self.layout.width} columns without names"
+        return f"text, {self.layout.notation}: {names}"
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that end within `data`; an unfinished line is kept for the next call."""
+        return [frame for line in self._lines.feed(data) for frame in self._take(line)]
+
+    def forget(self) -> None:
+        """Drop what is unfinished: what comes next is from another connection."""
+        self._lines.forget()
+        self._drop_cycle()
+        self._first = True
+
+    def _take(self, data: bytes) -> list[Frame]:
+        """The frames that this line completes, usually one."""
+        size, first, self._first = len(data) + 1, self._first, False
+        try:
+            line = parse_line(data)
+        except ValueError:
+            self._refuse(size)
+            return []
+        if first and line.notation is Notation.csv:  # "801.2" may have been cut to "1.2": nothing would show it
+            self._refuse(size)
+            return []
+        if line.notation is Notation.nothing:
+            return []
+        if line.notation is Notation.header:
+            return self._name_columns(line, size)
+        return self._recognise(line, size) if self.layout is None else self._read(line, size)
+
+    def _refuse(self, size: int) -> None:
+        """Count a bad line; what had been gathered towards a layout does not count any more."""
+        self.counts.refuse(size)
+        for _, length in self._history:
+            self.counts.refuse(length)
+        self._history.clear()
+
+    def _name_columns(self, header: Line, size: int) -> list[Frame]:
+        """A header names the columns, also when it comes again after a reset of the board."""
+        if self.layout is not None and (self.layout.notation is not Notation.csv or self._columns):
+            self.counts.refuse(size)
+        elif self.layout is not None and self.layout.width == len(header.names):
+            self.layout = Layout.of(Notation.csv, header.names, self.layout.width, 1)
+        elif self.layout is None and not self._columns:
+            self._columns = header.names
+        return []
+
+    def _recognise(self, line: Line, size: int) -> list[Frame]:
+        """Wait until lines repeat; then read those that were kept."""
+        self._history.append((line, size))
+        period = _period([kept for kept, _ in self._history])
+        if not period or len(line.values) > MOST_VALUES:
+            while len(self._history) > TIMES_TO_RECOGNISE * LONGEST_CYCLE:
+                self.counts.refuse(self._history.pop(0)[1])
+            return []
+        self.layout = self._layout([kept for kept, _ in self._history[-period:]])
+        kept, self._history = self._history, []
+        for _, length in kept[: -TIMES_TO_RECOGNISE * period]:
+            self.counts.refuse(length)
+        return [frame for old, length in kept[-TIMES_TO_RECOGNISE * period :] for frame in self._read(old, length)]
+
+    def _layout(self, lines: list[Line]) -> Layout:
+        first, width = lines[0], len(lines[0].values)
+        if len(lines) > 1:
+            names = sorted({name for line in lines for name in line.names}, key=_before)
+            return Layout.of(first.notation, tuple(names), len(names), len(lines))
+        names_of_csv = self._columns if len(self._columns) == width else ()
+        return Layout.of(first.notation, first.names or names_of_csv, width, 1)
+
+    def _read(self, line: Line, size: int) -> list[Frame]:
+        layout = self.layout
+        assert layout is not None
+        if line.notation is not layout.notation:
+            self.counts.refuse(size)
+            return []
+        if layout.lines > 1:
+            return self._gather(layout, line, size)
+        if len(line.values) != layout.width or (line.names and line.names != layout.names):
+            self.counts.refuse(size)
+            return []
+        return self._frame(layout, line.values, size)
+
+    def _gather(self, layout: Layout, line: Line, size: int) -> list[Frame]:
+        """A line of a cycle: the frame, if it is the last one."""
+        new = [name for name in line.names if name not in TIMES_US]
+        if not set(line.names) <= set(layout.names) or not new:
+            self.counts.refuse(size)
+            return []
+        if new[0] == _start(layout) or new[0] in self._cycle:
+            self._drop_cycle()
+        self._cycle |= dict(zip(line.names, line.values, strict=True))
+        self._cycle_bytes += size
+        if len(self._cycle) < layout.width:
+            return []
+        values, size = [self._cycle[name] for name in layout.names], self._cycle_bytes
+        self._cycle, self._cycle_bytes = {}, 0
+        return self._frame(layout, values, size)
+
+    def _drop_cycle(self) -> None:
+        """A cycle that was not finished is lost."""
+        if self._cycle:
+            self.counts.refuse(self._cycle_bytes)
+        self._cycle, self._cycle_bytes = {}, 0
+
+    def _frame(self, layout: Layout, values: Sequence[float], size: int) -> list[Frame]:
+        try:
+            frame = layout.frame(values)
+        except ValueError:
+            self.counts.refuse(size)
+            return []
+        self.counts.accept()
+        return [frame]
+
+
+def _before(name: str) -> tuple[bool, str]:
+    """Sort key: number and clock before the channels."""
+    return name != SEQ and name not in TIMES_US, name
+
+
+def _start(layout: Layout) -> str:
+    """The name that a cycle begins with: a clock that comes with every value is no beginning."""
+    return next(name for name in layout.names if name not in TIMES_US)
+
+
+def _period(lines: list[Line]) -> int:
+    """Length of the cycle that has just come three times in a row, 0 if there is none; a long one needs names."""
+    signatures = [line.signature for line in lines]
+    last = signatures[-1]
+    back = signatures[-2::-1]
+    period = back.index(last) + 1 if last in back else 0
+    if period > 1 and last[0] not in (Notation.pairs, Notation.teleplot):
+        return 0
+    tail = signatures[-TIMES_TO_RECOGNISE * period :] if period else []
+    repeats = len(tail) == TIMES_TO_RECOGNISE * period and tail == tail[:period] * TIMES_TO_RECOGNISE
+    return period if repeats else 0

@@ -1,0 +1,148 @@
+"""One line of text from a board: which of the usual notations it is, and its names and numbers.
+
+| notation | example |
+|---|---|
+| CSV, also with semicolons, tabs or blanks; header or not | `12, 801.2, 799.5, 803.3` |
+| name:value, several in a line or one | `A:801.2,B:799.5,C:803.3` |
+| Teleplot (github.com/nesnes/teleplot) | `>A:1627551892437:801.2§pC` (time in ms and unit as you like) |
+| JSON object or list | `{"seq": 12, "A": 801.2}` |
+
+Blank lines and lines that begin with # say nothing. Numbers are those that Python's `float` reads, without underscores.
+"""
+
+import json
+import re
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+SEQ = "seq"
+
+TIMES_US = {"t_us": 1.0, "t_ms": 1e3, "t_s": 1e6}
+"""Names under which a device sends its clock, and what they are in us."""
+
+TELEPLOT_TIME = "t_ms"
+
+_CELL = re.compile(r"\s*[,;\t]\s*|\s+")
+
+_PAIR = re.compile(r"\s*([^\s:=,;]+)\s*[:=]\s*([^\s:=,;]+)\s*(?:[,;]\s*|\s|$)")
+
+_NAME = re.compile(r"[^\W\d][\w.\[\]/-]*")
+
+
+class Notation(StrEnum):
+    """How a line is written."""
+
+    csv = "CSV"
+    header = "CSV header"
+    pairs = "name:value"
+    teleplot = "Teleplot"
+    json = "JSON"
+    nothing = "nothing"
+
+
+class Line(NamedTuple):
+    """What a line says.
+
+    Attributes:
+        notation: How it is written.
+        names: Of the values; none for CSV; only names for a header.
+        values: Numbers.
+    """
+
+    notation: Notation
+    names: tuple[str, ...] = ()
+    values: tuple[float, ...] = ()
+
+    @property
+    def signature(self) -> tuple[Notation, tuple[str, ...], int]:
+        """Equal for lines of one layout."""
+        return self.notation, self.names, len(self.values)
+
+
+NOTHING = Line(Notation.nothing)
+
+
+def parse_line(data: bytes) -> Line:
+    """Read a line without its end.
+
+    Raises:
+        ValueError: If it is written in no known notation.
+    """
+    text = data.decode("utf-8").strip()
+    if not text or text[0] == "#":
+        return NOTHING
+    if text[0] in "{[":
+        return _json(text)
+    if text[0] == ">":
+        return _teleplot(text)
+    return _pairs(text) if ":" in text or "=" in text else _csv(text)
+
+
+def _number(text: str) -> float:
+    if "_" in text:
+        raise ValueError(f"expected a number, got {text!r}")
+    return float(text)
+
+
+def _csv(text: str) -> Line:
+    cells = _CELL.split(text.rstrip(",; \t"))
+    try:
+        return Line(Notation.csv, (), tuple(map(_number, cells)))
+    except ValueError:
+        if all(map(_NAME.fullmatch, cells)) and len(set(cells)) == len(cells):
+            return Line(Notation.header, tuple(cells))
+        raise
+
+
+def _pairs(text: str) -> Line:
+    pairs, at = {}, 0
+    while at < len(text):
+        match = _PAIR.match(text, at)
+        if match is None or match[1] in pairs:
+            raise ValueError(f"expected name:value, got {text[at:]!r}")
+        pairs[match[1]] = _number(match[2])
+        at = match.end()
+    return Line(Notation.pairs, tuple(pairs), tuple(pairs.values()))
+
+
+def _teleplot(text: str) -> Line:
+    """The latest of the values in a line; words and points of x-y plots are nothing that is measured over time."""
+    content, _, flags = text[1:].partition("|")
+    name, _, values = content.partition(":")
+    if not name.strip() or not values:
+        raise ValueError(f"expected >name:value, got {text!r}")
+    if "t" in flags or "xy" in flags:
+        return NOTHING
+    *stamp, value = values.rstrip("; ").rpartition(";")[2].partition("§")[0].split(":")
+    if len(stamp) > 1:
+        raise ValueError(f"expected >name:time:value, got {text!r}")
+    pairs = {TELEPLOT_TIME: _number(stamp[0])} if stamp else {}
+    pairs[name.strip()] = _number(value)
+    return Line(Notation.teleplot, tuple(pairs), tuple(pairs.values()))
+
+
+def _json(text: str) -> Line:
+    try:
+        content = json.loads(text, parse_int=float)  # hundreds of digits become infinite, as those of other notations
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+    if isinstance(content, list) and content and all(map(_is_number, content)):
+        return Line(Notation.csv, (), tuple(map(float, content)))
+    numbers = dict(_numbers("", content))
+    if not numbers:
+        raise ValueError(f"expected numbers, got {text!r}")
+    return Line(Notation.json, tuple(numbers), tuple(numbers.values()))
+
+
+def _numbers(name: str, content: Any) -> "list[tuple[str, float]]":
+    """Every number of a JSON value by the path to it, `charge.A` or `charge.0`, at most two levels deep."""
+    if _is_number(content):
+        return [(name, float(content))]
+    if name.count(".") >= 2 or not isinstance(content, dict | list):
+        return []
+    items = content.items() if isinstance(content, dict) else enumerate(content)
+    return [pair for key, value in items for pair in _numbers(f"{name}.{key}" if name else str(key), value)]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

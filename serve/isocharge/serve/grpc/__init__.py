@@ -1,8 +1,0 @@
-"""The Open Inference Protocol over gRPC: `inference.GRPCInferenceService` on the same models as HTTP."""
-
-from isocharge.extras import require
-
-with require("grpc"):
-    from isocharge.serve.grpc.server import grpc_server
-
-__all__ = ["grpc_server"]

@@ -1,9 +1,0 @@
-"""The Open Inference Protocol over HTTP: an ASGI application, and the server that runs it within bounds."""
-
-from isocharge.extras import require
-
-with require("http"):
-    from isocharge.serve.http.app import App
-    from isocharge.serve.http.server import HttpServer
-
-__all__ = ["App", "HttpServer"]

@@ -1,0 +1,164 @@
+"""The model folder: its one writer and its one reader.
+
+    <name>/config.pbtxt            for Triton
+    <name>/<version>/model.onnx    charge_pC -> contact, contact_std, misfit; the metadata is inside
+    <name>/<version>/golden.json   charges, answers, tolerances, and the checksum of model.onnx
+    <name>/<version>/card.md       for people
+
+A version appears whole or not at all: it is written under a temporary name, read back as a user would read it, and
+only then renamed.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import onnxruntime as ort
+from numpy.typing import ArrayLike
+
+from isocharge.errors import ModelError, OutputExists
+from isocharge.files import new_folder, refuse_existing, sha256_of, write_whole
+from isocharge.serve.model.charges import as_batch
+from isocharge.serve.model.golden import Golden, check_answers, make_golden, read_golden
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.session import check_interface, open_session, run
+from isocharge.serve.model.triton_config import triton_config
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+"""Model names: safe in paths, URLs and config.pbtxt."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model that was read and checked: its version folder, metadata, golden vectors, and a session to run it."""
+
+    folder: Path
+    metadata: ModelMetadata
+    golden: Golden
+    session: ort.InferenceSession
+
+
+def load_model(folder: Path) -> Model:
+    """Read and check a model.
+
+    Args:
+        folder: The version folder, as `find_model` gives it.
+
+    Raises:
+        ModelError: If a file is missing or damaged, or the model is of another format.
+    """
+    path = folder / "model.onnx"
+    data, golden = _read(path), read_golden(folder / "golden.json")
+    _check_intact(data, golden, path)
+    session = open_session(data, str(path))
+    metadata = ModelMetadata.from_props(session.get_modelmeta().custom_metadata_map, str(path))
+    check_interface(session, len(metadata.electrodes), str(path))
+    _check_fits(golden, metadata, folder)
+    return Model(folder, metadata, golden, session)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read ({error.strerror}); copy or export the model again") from error
+
+
+def _check_intact(data: bytes, golden: Golden, path: Path) -> None:
+    if sha256_of(data) != golden.sha256:
+        raise ModelError(
+            f"{path}: expected sha256 {golden.sha256} (golden.json), got {sha256_of(data)} over {len(data)} bytes; "
+            "the file is damaged or changed: copy or export it again"
+        )
+
+
+def _check_fits(golden: Golden, metadata: ModelMetadata, folder: Path) -> None:
+    shape = golden.charge_pC.shape
+    if len(shape) != 2 or shape[0] == 0 or shape[1] != len(metadata.electrodes):
+        raise ModelError(
+            f"{folder / 'golden.json'}: expected charges of shape (n, {len(metadata.electrodes)}) with n > 0, "
+            f"got {shape}; copy or export the model again"
+        )
+
+
+def check_golden(model: Model) -> None:
+    """Compute a model's golden vectors anew.
+
+    Raises:
+        ModelError: If this machine gets other answers than golden.json has.
+    """
+    check_answers(model.golden, run(model.session, model.golden.charge_pC), str(model.folder / "model.onnx"))
+
+
+def write_model(
+    folder: Path, onnx_model: bytes, metadata: ModelMetadata, golden_charge_pC: ArrayLike, card: str
+) -> Path:
+    """Write a new version of a model.
+
+    Args:
+        folder: The model's folder; it has the model's name and may exist already, with other versions.
+        onnx_model: The graph, with `metadata.to_props()` in its metadata_props.
+        metadata: The same metadata.
+        golden_charge_pC: Charges to answer in golden.json, shape (n, electrodes), pC.
+        card: Text of the model card.
+
+    Returns:
+        The version folder.
+
+    Raises:
+        OutputExists: If this version is there already, or a file has the folder's name.
+        ChargeError: If the golden charges do not fit the electrodes.
+        ModelError: If the graph cannot be loaded as a reader loads it, or disagrees with `metadata`. After any error
+            nothing is left behind.
+    """
+    target = folder / str(metadata.version)
+    check_target(folder, metadata.version, metadata.electrodes)
+    if folder.resolve().name != metadata.name:
+        raise ModelError(f"{folder}: expected a folder named {metadata.name!r}, as the metadata names the model")
+    where = f"the new model {metadata.label}"
+    session = open_session(onnx_model, where)
+    check_interface(session, len(metadata.electrodes), where)
+    golden = make_golden(session, onnx_model, as_batch(golden_charge_pC, metadata.electrodes))
+    with new_folder(target) as draft:
+        write_whole(draft / "model.onnx", onnx_model)
+        write_whole(draft / "golden.json", golden.to_json().encode())
+        write_whole(draft / "card.md", card.encode())
+        _check_draft(draft, metadata)
+    write_whole(folder / "config.pbtxt", triton_config(metadata.name, len(metadata.electrodes)).encode())
+    return target
+
+
+def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> None:
+    """Refuse a place where a model version cannot be written; worth doing before the work, too.
+
+    Args:
+        folder: The model's folder, named as the model.
+        version: Number of the version to write.
+        electrodes: Of the model.
+
+    Raises:
+        OutputExists: If the version, or a file in the folder's place, is there already.
+        ModelError: If the folder's name is no model name, or the folder holds a model with other electrodes.
+    """
+    refuse_existing(folder / str(version))
+    if folder.exists() and not folder.is_dir():
+        raise OutputExists(f"{folder}: expected a folder or nothing, got a file; choose another place")
+    name = folder.resolve().name
+    if not NAME.fullmatch(name):
+        raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; name the folder so")
+    config, wanted = folder / "config.pbtxt", triton_config(name, len(electrodes))
+    if config.exists() and config.read_text(encoding="utf-8") != wanted:
+        raise ModelError(
+            f"{config}: describes a model other than one with the electrodes {electrodes}; use another model name"
+        )
+
+
+def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
+    """Read a new version back as a user would."""
+    model = load_model(draft)
+    inside, given = model.metadata.to_props(), metadata.to_props()
+    differing = [key for key in given if inside[key] != given[key]]
+    if differing:
+        key = differing[0]
+        raise ModelError(f"the graph's metadata disagree on {key!r}: expected {given[key]}, got {inside[key]}")
+    check_golden(model)

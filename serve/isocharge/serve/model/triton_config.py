@@ -1,0 +1,17 @@
+"""`config.pbtxt`, with which Triton serves a model folder as it stands."""
+
+from isocharge.serve.model.session import INPUT, OUTPUTS
+
+MAX_BATCH = 4096
+"""Largest batch that Triton may form; the graph itself takes any."""
+
+
+def triton_config(name: str, electrodes: int) -> str:
+    """The text of `config.pbtxt` for a model with this many electrodes; the batch dimension is Triton's to add."""
+    head = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
+    return head + _tensors("input", {INPUT: electrodes}) + _tensors("output", OUTPUTS)
+
+
+def _tensors(kind: str, widths: dict[str, int]) -> str:
+    lines = [f'  {{ name: "{name}" data_type: TYPE_FP32 dims: [ {width} ] }}' for name, width in widths.items()]
+    return f"{kind} [\n" + ",\n".join(lines) + "\n]\n"

@@ -1,0 +1,8 @@
+"""The Open Inference Protocol over gRPC: `inference.GRPCInferenceService` on the same models as HTTP."""
+
+from isocharge.extras import require
+
+with require("grpc"):
+    from isocharge.serve.network.grpc.server import grpc_server
+
+__all__ = ["grpc_server"]

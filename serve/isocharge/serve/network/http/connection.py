@@ -1,0 +1,227 @@
+"""HTTP on one connection: bounded, and without a detour for what is answered in microseconds.
+
+uvicorn's httptools protocol makes a task, an event and three dictionaries for each request before the application sees
+it: twice the time that the answer takes. So a request is kept until it is whole, and then answered on the spot; only
+what may take long, and what comes behind it on the same connection, goes through uvicorn as ASGI.
+
+uvicorn also bounds neither headers nor the time they take. A timer for each request would cost as much as parsing it,
+so a connection only notes by when it must have done its next step, and the server looks through the connections now
+and then (`close_overdue`).
+"""
+
+import asyncio
+import math
+import urllib.parse
+from collections.abc import Iterable
+from enum import Enum
+from functools import lru_cache
+from typing import Any
+
+import httptools
+import orjson
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+
+from isocharge.serve.network.http.app import App
+from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.protocol import Response
+
+UNSENT_BYTES = 1 << 22
+"""A client that asks on and on and takes no answer is hung up on when so much waits for it."""
+
+LINGER_SECONDS = 2.0
+"""A refused client may go on sending for so long; to hang up at once would take the refusal away from it again."""
+
+
+class Phase(Enum):
+    """What a connection waits for."""
+
+    IDLE = "a request"
+    HEADERS = "the end of the headers"
+    BODY = "the end of the body"
+    ANSWER = "our answer"
+
+
+class BoundedProtocol(HttpToolsProtocol):
+    """One connection; subclasses carry application and limits, because uvicorn makes protocols from their class."""
+
+    direct: App
+    limits = Limits()
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self.by = math.inf  # the loop's time, s
+        self._phase = self._timed = Phase.IDLE
+        self._chunk = self._fed = 0  # bytes of this piece, and of all since the request began
+        self._body = bytearray()
+        self._is_last = self._is_refused = False
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Take a connection, or say that there are too many."""
+        super().connection_made(transport)
+        self._allow(self.limits.header_seconds)
+        if len(self.connections) > self.limits.connections:
+            self._refuse(503, f"all {self.limits.connections} connections are taken; try again later")
+
+    def data_received(self, data: bytes) -> None:
+        """Parse; what is then still unfinished is counted and timed."""
+        if self._is_refused or self.transport.is_closing():
+            return
+        self._chunk = len(data)
+        self._fed += self._chunk
+        super().data_received(data)
+        if self._phase is Phase.HEADERS or self._phase is Phase.BODY:
+            self._unfinished()
+
+    def on_message_begin(self) -> None:
+        """A request begins, somewhere in this piece of data."""
+        self._phase, self._fed = Phase.HEADERS, self._chunk
+        self.url, self.headers, self._body = b"", [], bytearray()
+        self.expect_100_continue = False
+
+    def on_headers_complete(self) -> None:
+        """The headers are all there; they are measured if they can be too long at all."""
+        self._phase = Phase.BODY
+        if self._fed > self.limits.header_bytes and self._header_bytes() > self.limits.header_bytes:
+            self._refuse_headers()
+        elif self.expect_100_continue:
+            self.transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+
+    def on_body(self, body: bytes) -> None:
+        """A piece of the body, up to the limit."""
+        if not self._is_refused:
+            self._body += body
+        if len(self._body) > self.limits.body_bytes:
+            self._refuse(413, f"the body is larger than the {self.limits.body_bytes} bytes that are read")
+
+    def on_message_complete(self) -> None:
+        """The whole request is there: answer it, unless it was refused."""
+        if self._is_refused or self.transport.is_closing():
+            return
+        self._phase = Phase.ANSWER
+        path = _path(self.url)
+        if self.direct.blocks(path) or not (self.cycle is None or self.cycle.response_complete):
+            self._allow(math.inf)
+            self._answer_as_asgi()
+        else:
+            method = self.parser.get_method().decode("latin-1")
+            self._write(self.direct.answer(method, path, self.headers, bytes(self._body)), with_body=method != "HEAD")
+            self._rest()
+
+    def on_response_complete(self) -> None:
+        """uvicorn has sent an answer; as there, but without its timer."""
+        self.server_state.total_requests += 1
+        if self.transport.is_closing():
+            return
+        self.flow.resume_reading()
+        if self.pipeline:
+            self._start_asgi_task(*self.pipeline.pop())
+        else:
+            self._rest()
+
+    def pause_writing(self) -> None:
+        """The client does not take its answer; it has so long to go on."""
+        self._allow(self.limits.body_seconds)
+        super().pause_writing()
+        self.flow.pause_reading()
+
+    def resume_writing(self) -> None:
+        """The client has taken what there was."""
+        super().resume_writing()
+        self.flow.resume_reading()
+        self._allow(self.limits.idle_seconds)
+
+    def send_400_response(self, msg: str) -> None:
+        """What cannot be parsed at all."""
+        self._refuse(400, msg)
+
+    def shutdown(self) -> None:
+        """The server stops: a request that has begun is still answered, as the last one."""
+        self._is_last = True
+        if self._is_refused:
+            self.transport.abort()
+        elif self._phase not in (Phase.HEADERS, Phase.BODY):
+            super().shutdown()
+
+    def overdue(self) -> None:
+        """End a connection that took too long: with words to one that is sending, without to one that is not."""
+        if self._phase in (Phase.HEADERS, Phase.BODY) and not self._is_refused:
+            self._refuse(408, f"waited too long for {self._phase.value}")
+        else:
+            self.transport.abort()
+
+    def _answer_as_asgi(self) -> None:
+        """Let uvicorn have the whole request, now that there is something to wait for."""
+        url, headers, body = self.url, self.headers, bytes(self._body)
+        super().on_message_begin()
+        self.url = url
+        self.headers.extend(headers)
+        super().on_headers_complete()
+        super().on_body(body)
+        super().on_message_complete()
+
+    def _write(self, response: Response, *, with_body: bool) -> None:
+        """Send an answer in one piece."""
+        is_last = self._is_last or not self.parser.should_keep_alive()
+        parts = [STATUS_LINE[response.status]]
+        for name, value in response.headers:
+            parts += (name, b": ", value, b"\r\n")
+        parts += (b"connection: close\r\n\r\n" if is_last else b"\r\n", response.body if with_body else b"")
+        self.transport.write(b"".join(parts))
+        if is_last:
+            self.transport.close()
+        elif self.flow.write_paused and self.transport.get_write_buffer_size() > UNSENT_BYTES:
+            self.transport.abort()
+
+    def _rest(self) -> None:
+        """Wait for the next request."""
+        self._phase = self._timed = Phase.IDLE
+        self._allow(self.limits.idle_seconds)
+
+    def _unfinished(self) -> None:
+        if self._phase is Phase.HEADERS and self._fed > self.limits.header_bytes:
+            self._refuse_headers()
+        if self._timed is not self._phase and not self._is_refused:
+            self._timed = self._phase
+            self._allow(self.limits.header_seconds if self._phase is Phase.HEADERS else self.limits.body_seconds)
+
+    def _allow(self, seconds: float) -> None:
+        if not self.flow.write_paused:  # an answer that is not taken leaves no time for anything else
+            self.by = self.loop.time() + seconds
+
+    def _header_bytes(self) -> int:
+        return len(self.url) + sum(len(name) + len(value) + 4 for name, value in self.headers)
+
+    def _refuse_headers(self) -> None:
+        self._refuse(431, f"the request line and headers are longer than {self.limits.header_bytes} bytes")
+
+    def _refuse(self, status: int, words: str) -> None:
+        """Answer without asking the application, read no more requests, and hang up when the client does or soon."""
+        if self._is_refused or self.transport.is_closing():
+            return
+        self._is_refused = True
+        body = orjson.dumps({"error": words})
+        head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(body)
+        self.transport.write(b"".join([STATUS_LINE[status], head, body]))
+        if self.transport.can_write_eof():
+            self.transport.write_eof()
+            self._allow(LINGER_SECONDS)
+        else:
+            self.transport.close()
+
+
+@lru_cache(64)
+def _path(url: bytes) -> str:
+    """The path in a request line's target, percent signs undone, as ASGI has it."""
+    path = httptools.parse_url(url).path or b"/"
+    return urllib.parse.unquote_to_bytes(path).decode("utf-8", "replace")
+
+
+def bounded(app: App, limits: Limits) -> type[BoundedProtocol]:
+    """The protocol with this application and these limits."""
+    return type("BoundedProtocol", (BoundedProtocol,), {"direct": app, "limits": limits})
+
+
+def close_overdue(connections: Iterable[Any], now: float) -> None:
+    """End every connection whose time is over."""
+    for connection in [c for c in connections if c.by < now]:
+        connection.overdue()

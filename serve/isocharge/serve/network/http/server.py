@@ -1,0 +1,69 @@
+"""The HTTP server: where it listens, who may talk to it, and how it starts and stops."""
+
+import asyncio
+import logging
+
+import uvicorn
+
+from isocharge.serve.network.address import Address
+from isocharge.serve.network.http.app import App
+from isocharge.serve.network.http.connection import bounded, close_overdue
+from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.tls import Tls
+
+GRACE_SECONDS = 10
+"""What is in flight has so long to finish once the server is told to stop."""
+
+BACKLOG = 2048
+
+
+class _Uvicorn(uvicorn.Server):
+    """uvicorn, looking after overdue connections while it waits."""
+
+    async def on_tick(self, counter: int) -> bool:
+        close_overdue(list(self.server_state.connections), asyncio.get_running_loop().time())
+        return await super().on_tick(counter)
+
+
+class HttpServer:
+    """A server that listens from the moment it is made until it is closed, and answers while `run` runs."""
+
+    def __init__(self, app: App, address: Address, *, limits: Limits, tls: Tls | None = None) -> None:
+        """Listen.
+
+        Raises:
+            InputError: If a TLS file cannot be used.
+            ListenError: If the address is taken or impossible.
+        """
+        context = tls.context() if tls else None
+        config = uvicorn.Config(
+            app,
+            loop="uvloop",
+            http=bounded(app, limits),
+            ws="none",
+            lifespan="off",
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            date_header=False,
+            proxy_headers=False,
+            timeout_graceful_shutdown=GRACE_SECONDS,
+            ssl_context_factory=(lambda *_: context) if context else None,
+        )
+        self._server, self._address = _Uvicorn(config), address
+        self._socket = address.listen(BACKLOG)
+        self.url = address.url(self._socket, secure=tls is not None)
+
+    def run(self) -> None:
+        """Answer until SIGTERM or SIGINT, or `stop`; then finish what is in flight."""
+        logging.getLogger("uvicorn").setLevel(logging.CRITICAL)  # clients' mistakes are told to clients
+        self._server.run([self._socket])
+
+    def stop(self) -> None:
+        """Tell `run` to finish; from any thread."""
+        self._server.should_exit = True
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._socket.close()
+        self._address.release()

@@ -1,0 +1,209 @@
+"""The models that a server serves: every version of every model of its folders, loaded, checked, replaced whole.
+
+A version is checked as far as it can be before anybody is answered with it: checksum, metadata, shapes, and the golden
+vectors computed anew. One that fails is refused with the reason, and the others serve on. To load a model again reads
+its files into new sessions and then changes one reference: a request that is under way finishes with the version it
+began with, and a version whose new files are refused goes on with the old ones.
+"""
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+
+from isocharge.errors import ModelError, ModelNotFound
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.model_folder import Model, check_golden, load_model
+from isocharge.serve.model.repository import model_names, repositories, version_folders
+from isocharge.serve.network.statistics import Statistics
+from isocharge.serve.prediction.bound_press import BoundPress
+
+UNLOADED = "unloaded"
+"""The reason that the index gives for a model which somebody took off the shelf."""
+
+
+@dataclass(frozen=True)
+class Served:
+    """One version of a model that answers requests."""
+
+    model: Model
+    metadata: ModelMetadata
+    version: str
+    statistics: Statistics = field(default_factory=Statistics)
+    _own: threading.local = field(default_factory=threading.local, repr=False)
+
+    def press(self) -> BoundPress:
+        """Bound memory for one press, the calling thread's own."""
+        try:
+            return self._own.press  # type: ignore[no-any-return]
+        except AttributeError:
+            self._own.press = BoundPress(self.model.session, len(self.metadata.electrodes))
+            return self._own.press  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What is known of one model: the versions that serve, and why others do not (version to reason)."""
+
+    versions: Mapping[int, Served]
+    refused: Mapping[int, str]
+
+    @property
+    def latest(self) -> Served | None:
+        """The highest version that serves."""
+        return self.versions[max(self.versions)] if self.versions else None
+
+
+@dataclass(frozen=True)
+class IndexRow:
+    """One version in the repository index; `version` is empty for a model none of whose versions is known."""
+
+    name: str
+    version: str
+    state: str
+    reason: str
+
+
+class Shelf:
+    """Models by name and version. Reading is for any thread; loading and unloading take their turn."""
+
+    def __init__(self, folders: Callable[[], Mapping[str, Path]]) -> None:
+        """Load everything.
+
+        Args:
+            folders: Model name to model folder, asked anew for each load and index.
+
+        Raises:
+            ModelError: If there is no model, or none that is sound.
+        """
+        self._folders = folders
+        self._turn = threading.Lock()
+        self._entries: dict[str, Entry] = {}
+        self._answering: dict[tuple[str, str], Served] = {}
+        for name, folder in folders().items():
+            self._put(name, _read_entry(name, folder, {}))
+        if not self._answering:
+            raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'there is none'}")
+
+    def get(self, name: str, version: str = "") -> Served:
+        """The model to answer with; the highest version if none is given.
+
+        Raises:
+            ModelNotFound: If it does not serve; the message says what does.
+        """
+        served = self._answering.get((name, version))
+        if served is None:
+            asked = f"{name}/{version}" if version else name
+            serving = ", ".join(sorted(s.metadata.label for s in self.all())) or "no model"
+            raise ModelNotFound(f"model {asked!r:.200} is not found; serving: {serving}")
+        return served
+
+    def all(self) -> list[Served]:
+        """Every version that serves, by name and version."""
+        return [served for _, entry in sorted(self._entries.items()) for _, served in sorted(entry.versions.items())]
+
+    def named(self, name: str) -> list[Served]:
+        """Every version of one model that serves, ascending.
+
+        Raises:
+            ModelNotFound: If none does.
+        """
+        self.get(name)
+        return [served for served in self.all() if served.metadata.name == name]
+
+    def versions(self, name: str) -> list[str]:
+        """Versions of a model that serve, ascending."""
+        return [str(version) for version in sorted(self._entries[name].versions)]
+
+    def refusals(self) -> list[str]:
+        """Why files were refused, a sentence for each version."""
+        return [reason for _, entry in sorted(self._entries.items()) for _, reason in sorted(entry.refused.items())]
+
+    def index(self) -> list[IndexRow]:
+        """Every version that serves or was refused, and models that nobody has loaded."""
+        entries = dict(self._entries)
+        rows = [row for name, entry in sorted(entries.items()) for row in _rows(name, entry)]
+        return rows + [IndexRow(name, "", "UNAVAILABLE", "") for name in self._folders() if name not in entries]
+
+    def load(self, name: str) -> None:
+        """Read a model's files again and put all its versions in place of the old ones.
+
+        Raises:
+            ModelNotFound: If there is no such model in the folders.
+            ModelError: If a version is refused; the sound ones serve, and an old one stays in place of a refused one.
+        """
+        with self._turn:
+            folder = self._folders().get(name)
+            if folder is None:
+                raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
+            known = self._entries.get(name)
+            entry = _read_entry(name, folder, known.versions if known else {})
+            self._put(name, entry)
+        if entry.refused:
+            raise ModelError("; ".join(reason for _, reason in sorted(entry.refused.items())))
+
+    def unload(self, name: str) -> None:
+        """Take a model off; requests that are under way finish.
+
+        Raises:
+            ModelNotFound: If it does not serve.
+        """
+        with self._turn:
+            self.get(name)
+            versions = self._entries[name].versions
+            self._put(name, Entry({}, dict.fromkeys(versions, UNLOADED)))
+
+    def _put(self, name: str, entry: Entry) -> None:
+        """Change what serves in two assignments, each seen whole by whoever reads."""
+        answering = {key: served for key, served in self._answering.items() if key[0] != name}
+        answering |= {(name, str(version)): served for version, served in entry.versions.items()}
+        if entry.latest is not None:
+            answering[name, ""] = entry.latest
+        self._answering = answering
+        self._entries = self._entries | {name: entry}
+
+
+def open_shelf(models: Path | None = None) -> Shelf:
+    """The models of one folder; without it, of every place where `find_model` looks, the first place winning.
+
+    Raises:
+        ModelError: If `models` is not a folder, holds no model, or none that is sound.
+    """
+    roots = [models] if models is not None else repositories()
+    if models is not None and not model_names(models):
+        repositories(models)  # raises if the folder itself is missing
+        raise ModelError(f"{models}: expected models, <name>/<version>/model.onnx, found none; correct --models")
+    return Shelf(lambda: MappingProxyType({n: root / n for root in reversed(roots) for n in model_names(root)}))
+
+
+def _read_entry(name: str, folder: Path, old: Mapping[int, Served]) -> Entry:
+    """Load every version; one that is refused leaves the old one where it was."""
+    versions, refused = {}, {}
+    for version, path in version_folders(folder).items():
+        try:
+            versions[version] = _read(name, version, path)
+        except ModelError as error:
+            refused[version] = str(error)
+            if version in old:
+                versions[version] = old[version]
+    return Entry(versions, refused)
+
+
+def _read(name: str, version: int, folder: Path) -> Served:
+    model = load_model(folder)
+    if (model.metadata.name, model.metadata.version) != (name, version):
+        raise ModelError(
+            f"{folder}: expected the model {name}/{version}, as the folders say, got {model.metadata.label}; "
+            "move it into folders of its own name and version"
+        )
+    check_golden(model)
+    return Served(model, model.metadata, str(version))
+
+
+def _rows(name: str, entry: Entry) -> list[IndexRow]:
+    versions = sorted(set(entry.versions) | set(entry.refused))
+    return [
+        IndexRow(name, str(v), "READY" if v in entry.versions else "UNAVAILABLE", entry.refused.get(v, ""))
+        for v in versions
+    ]

@@ -1,0 +1,8 @@
+"""The Open Inference Protocol, version 2, without a transport: requests in, answers out, as plain values.
+
+HTTP (`isocharge.serve.network.http`) and gRPC (`isocharge.serve.network.grpc`) carry it; neither is imported here.
+"""
+
+from isocharge.serve.network.protocol.handler import Handler, Response
+
+__all__ = ["Handler", "Response"]

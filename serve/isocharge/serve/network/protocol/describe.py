@@ -1,0 +1,77 @@
+"""What the server says about itself and its models, as JSON objects; gRPC has messages of the same fields."""
+
+from importlib.metadata import version
+from typing import Any
+
+from isocharge.serve.model.session import INPUT, OUTPUTS
+from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.model_store import Served, Shelf
+
+EXTENSIONS = (
+    "binary_tensor_data",
+    "model_configuration",
+    "model_repository",
+    "model_repository(unload_dependents)",
+    "parameters",
+    "statistics",
+)
+
+PLATFORM = "onnxruntime_onnx"
+
+NO_LOAD_PARAMETERS = "load: parameters are not supported; put the files into the model's folder and load it again"
+
+
+def server_metadata() -> dict[str, Any]:
+    """Name, version and extensions."""
+    return {"name": "isocharge", "version": version("isocharge"), "extensions": list(EXTENSIONS)}
+
+
+def model_metadata(served: Served, shelf: Shelf) -> dict[str, Any]:
+    """Tensors of a model, and under `properties` everything that its file says about itself, as JSON texts."""
+    metadata = served.metadata
+    widths = {INPUT: len(metadata.electrodes)}
+    return {
+        "name": metadata.name,
+        "versions": shelf.versions(metadata.name),
+        "platform": PLATFORM,
+        "inputs": [_tensor(name, width) for name, width in widths.items()],
+        "outputs": [_tensor(name, width) for name, width in OUTPUTS.items()],
+        "properties": metadata.to_props(),
+    }
+
+
+def _tensor(name: str, width: int) -> dict[str, Any]:
+    return {"name": name, "datatype": "FP32", "shape": [-1, width]}
+
+
+def model_config(served: Served, limits: Limits) -> dict[str, Any]:
+    """A model's configuration as Triton would have it; unlike Triton by default, every version serves."""
+    return {
+        "name": served.metadata.name,
+        "platform": PLATFORM,
+        "backend": "onnxruntime",
+        "version_policy": {"all": {}},
+        "max_batch_size": limits.batch,
+        "input": [{"name": INPUT, "data_type": "TYPE_FP32", "dims": [len(served.metadata.electrodes)]}],
+        "output": [{"name": name, "data_type": "TYPE_FP32", "dims": [width]} for name, width in OUTPUTS.items()],
+    }
+
+
+def statistics_of(shelf: Shelf, name: str = "", version: str = "") -> dict[str, Any]:
+    """Counters of a version of a model, of all its versions, or of all models.
+
+    Raises:
+        ModelNotFound: If it does not serve.
+    """
+    models = [shelf.get(name, version)] if version else shelf.named(name) if name else shelf.all()
+    return {
+        "model_stats": [
+            {"name": served.metadata.name, "version": served.version, **served.statistics.to_json()}
+            for served in models
+        ]
+    }
+
+
+def repository_index(shelf: Shelf, *, ready: bool) -> list[dict[str, str]]:
+    """Every version in the repository; with `ready`, only what serves."""
+    return [vars(row) for row in shelf.index() if row.state == "READY" or not ready]

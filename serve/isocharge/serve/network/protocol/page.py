@@ -1,0 +1,75 @@
+"""The page for people: which models are served, with their cards, and how to ask them."""
+
+from html import escape
+
+from isocharge.serve.model.model_folder import Model
+from isocharge.serve.network.model_store import Served, Shelf
+from isocharge.serve.network.protocol.describe import server_metadata
+
+STYLE = """
+:root { color-scheme: light dark; --line: color-mix(in srgb, currentColor 18%, transparent) }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 52rem; margin: 0 auto; padding: 2rem 1.25rem 4rem }
+h1 { font-size: 1.9rem; margin: 0 } h2 { font-size: 1.3rem; margin: 0 }
+h3 { font-size: 1.05rem; margin: 1.4rem 0 .4rem }
+p { margin: .6rem 0 } a { color: #2563c9 } .quiet { opacity: .7 }
+article { border: 1px solid var(--line); border-radius: 12px; padding: 1.25rem 1.5rem; margin: 1.5rem 0 }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .25rem 1.25rem; margin: 1rem 0 } dt { opacity: .7 }
+dd { margin: 0 } table { border-collapse: collapse; margin: .6rem 0; font-size: .93rem }
+td, th { border-bottom: 1px solid var(--line); padding: .25rem 1rem .25rem 0; text-align: left }
+th:empty { padding: 0; border: 0 } summary { cursor: pointer; margin-top: .8rem }
+pre { background: color-mix(in srgb, currentColor 7%, transparent); border-radius: 8px; padding: .8rem 1rem;
+  white-space: pre-wrap; overflow-wrap: anywhere; font-size: .85rem } details h1 { font-size: 1.15rem; margin: 1rem 0 }
+details h2 { font-size: 1.05rem; margin: 1.2rem 0 .4rem }
+.refused { border-left: 4px solid #c2410c; padding-left: 1rem }
+@media (prefers-color-scheme: dark) { a { color: #7fb0ff } }
+"""
+
+
+def page(shelf: Shelf) -> str:
+    """The page as HTML; it loads nothing else."""
+    refused = "".join(f'<p class="refused">Refused: {escape(reason)}</p>' for reason in shelf.refusals())
+    articles = "".join(map(_article, shelf.all())) or "<p>No model is loaded.</p>"
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>isocharge</title><style>{STYLE}</style></head><body>
+<h1>isocharge</h1>
+<p>Where a piezoelectric tactile film is touched and how hard. This server speaks the Open Inference Protocol, version 2
+(<a href="openapi.json">openapi.json</a>). <span class="quiet">Version {escape(server_metadata()["version"])}</span></p>
+{refused}{articles}</body></html>
+"""
+
+
+def _article(served: Served) -> str:
+    metadata = served.metadata
+    low, high = metadata.force_range_N
+    facts = {
+        "sensor": metadata.frame_id,
+        "charges": f"{', '.join(metadata.electrodes)}, pC, in this order",
+        "forces": f"{low:g} to {high:g} N",
+        "probes": ", ".join(metadata.probes),
+    }
+    rows = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts.items())
+    path = f"v2/models/{metadata.name}/versions/{metadata.version}"
+    return f"""<article><h2>{escape(metadata.name)} <span class="quiet">version {metadata.version}</span></h2>
+<dl>{rows}</dl><pre>{escape(_example(served, path))}</pre>
+<p><a href="{path}">metadata</a> · <a href="{path}/config">configuration</a> · <a href="{path}/stats">statistics</a></p>
+<details open><summary>Model card</summary>{_card(served.model)}</details></article>
+"""
+
+
+def _example(served: Served, path: str) -> str:
+    press = ", ".join(f"{charge:.1f}" for charge in served.model.golden.charge_pC[0].tolist())
+    tensor = f'"name": "charge_pC", "datatype": "FP32", "shape": [1, {len(served.metadata.electrodes)}]'
+    body = f'{{"inputs": [{{{tensor}, "data": [{press}]}}]}}'
+    return f"SERVER=...  # the address of this page\ncurl $SERVER/{path}/infer -d '{body}'"
+
+
+def _card(model: Model) -> str:
+    """The card beside the model as HTML; markup in it stays text."""
+    try:
+        text = (model.folder / "card.md").read_text("utf-8")
+    except (OSError, UnicodeDecodeError):
+        return "<p>This model has no card.</p>"
+    from markdown_it import MarkdownIt  # a tenth of a second that a server's start is better without
+
+    return str(MarkdownIt("commonmark", {"html": False}).enable("table").render(text))

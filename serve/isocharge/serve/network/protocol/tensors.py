@@ -1,0 +1,126 @@
+"""Tensors of a request as charges: their names, number types and shapes, however they were carried."""
+
+import math
+import struct
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from isocharge.arrays import Singles
+from isocharge.errors import RequestError, TooLarge
+from isocharge.serve.model.charges import as_singles
+from isocharge.serve.model.session import INPUT, OUTPUTS
+
+DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
+"""Number types of charges, little-endian as the protocol has them."""
+
+
+class Head(NamedTuple):
+    """What a request says about its one input, checked: number type and shape (n, electrodes)."""
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, int]
+
+    @property
+    def nbytes(self) -> int:
+        """Size of its numbers in binary."""
+        return self.shape[0] * self.shape[1] * self.dtype.itemsize
+
+
+def check_head(name: Any, datatype: Any, shape: Any, electrodes: tuple[str, ...], batch: int) -> Head:
+    """Check what a request says about its input before anything of that size is touched.
+
+    Args:
+        name, datatype, shape: As they came.
+        electrodes: Of the model.
+        batch: Presses that one request may have.
+
+    Raises:
+        RequestError: If one is not what the model takes.
+        TooLarge: If there are more presses than `batch`.
+    """
+    if name != INPUT:
+        raise RequestError(f"expected one input named {INPUT!r}, got {name!r:.100}")
+    if not isinstance(datatype, str) or datatype not in DATATYPES:
+        raise RequestError(f"input {INPUT!r}: expected the datatype FP32 or FP64, got {datatype!r:.100}")
+    if not _is_shape(shape, len(electrodes)):
+        raise RequestError(
+            f"input {INPUT!r}: expected the shape [n, {len(electrodes)}] with n > 0, "
+            f"a column for each of {electrodes}, got {shape!r:.100}"
+        )
+    if shape[0] > batch:
+        raise TooLarge(f"input {INPUT!r}: expected at most {batch} presses in one request, got {shape[0]}")
+    return Head(DATATYPES[datatype], (shape[0], shape[1]))
+
+
+def _is_shape(shape: Any, width: int) -> bool:
+    if type(shape) is not list or len(shape) != 2:
+        return False
+    rows, columns = shape
+    return type(rows) is int and type(columns) is int and rows > 0 and columns == width
+
+
+def charges_from_bytes(raw: bytes | memoryview, head: Head, electrodes: tuple[str, ...]) -> Singles:
+    """Charges, shape (n, electrodes), pC, from little-endian numbers row by row.
+
+    Raises:
+        RequestError: If the bytes are fewer or more than the shape says.
+        ChargeError: If a charge is not finite.
+    """
+    if len(raw) != head.nbytes:
+        raise RequestError(
+            f"input {INPUT!r}: expected {head.nbytes} bytes of binary data for the shape {list(head.shape)} "
+            f"of {head.dtype.itemsize} bytes each, got {len(raw)}"
+        )
+    # A copy: what follows a JSON text may lie at any address, and a runtime expects numbers at even ones.
+    return as_singles(np.frombuffer(raw, head.dtype).reshape(head.shape).copy(), electrodes)
+
+
+def charges_from_values(values: Any, head: Head, electrodes: tuple[str, ...]) -> Singles:
+    """Charges, shape (n, electrodes), pC, from a list of numbers, flat or nested as the shape.
+
+    Raises:
+        RequestError: If there are no numbers, or not as many as the shape says.
+        ChargeError: If a charge is not finite.
+    """
+    rows, columns = head.shape
+    try:
+        # For a few numbers, struct is several times faster than making and testing arrays. True and 1.0 are equal:
+        # what may be one or the other is looked at below.
+        if len(values) == rows * columns and math.isfinite(sum(values)) and not (True in values or False in values):
+            return np.frombuffer(struct.pack(f"={len(values)}f", *values), np.float32).reshape(head.shape)
+    except (TypeError, OverflowError, struct.error):
+        pass
+    return _examined(values, head, electrodes)
+
+
+def _examined(values: Any, head: Head, electrodes: tuple[str, ...]) -> Singles:
+    """Values that may be rows, or wrong; it is said how."""
+    if type(values) is not list:
+        raise RequestError(f"input {INPUT!r}: expected `data`, a list of numbers, got {values!r:.100}")
+    try:
+        numbers = np.asarray(values)
+    except (ValueError, OverflowError) as error:
+        raise RequestError(f"input {INPUT!r}: expected a list of numbers, or rows of them ({error})") from error
+    rows, columns = head.shape
+    if numbers.dtype.kind not in "fiu" or numbers.shape not in ((rows * columns,), head.shape):
+        raise RequestError(
+            f"input {INPUT!r}: expected numbers for the shape {list(head.shape)}, flat or in rows, "
+            f"got {numbers.dtype} of shape {list(numbers.shape)}"
+        )
+    return as_singles(numbers.reshape(head.shape), electrodes)
+
+
+def check_outputs(names: Sequence[Any]) -> tuple[str, ...]:
+    """The outputs that a request asks for, in its order; all of them if it names none.
+
+    Raises:
+        RequestError: If one is unknown, or asked for twice.
+    """
+    for name in names:
+        if not isinstance(name, str) or name not in OUTPUTS:
+            raise RequestError(f"expected outputs out of {list(OUTPUTS)}, got {name!r:.100}")
+    if len(set(names)) < len(names):
+        raise RequestError(f"expected each output once, got {list(names)!r:.200}")
+    return tuple(names) or tuple(OUTPUTS)

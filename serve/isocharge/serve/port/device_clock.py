@@ -1,0 +1,99 @@
+"""The device's clock: unwrapped, and fitted to the host's.
+
+Arrival times jitter by what the kernel, the cable and the reader's own work take; the device's clock does not, but it
+runs at a rate of its own. A delay-locked loop of second order (Adriaensen, "Using a DLL to filter time", 2005) follows
+the arrivals with a small bandwidth and gives each reading a smooth host time. The first seconds have a larger
+bandwidth, so that it locks soon.
+"""
+
+import math
+from typing import NamedTuple
+
+BANDWIDTH_HZ = 0.05
+
+FIRST_BANDWIDTH_HZ = 1.0
+
+LOST_S = 1.0
+"""An arrival that is off by more says that the clock was set or the device began anew."""
+
+
+class ReadingTime(NamedTuple):
+    """When a reading was taken.
+
+    Attributes:
+        host_s: Unix seconds: the device's clock fitted to arrivals, or the arrival for want of one.
+        device_us: The device's clock without its wraps, us; None if the device sends none.
+        step_s: Since the reading before, s; 0 for the first one after a start.
+    """
+
+    host_s: float
+    device_us: int | None
+    step_s: float
+
+
+class DeviceClock:
+    """Follows one device; feed it every reading in order.
+
+    Attributes:
+        rate: Host seconds per device second.
+        restarts: Times that the device's clock jumped.
+    """
+
+    def __init__(self) -> None:
+        self.rate = 1.0
+        self.restarts = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """The next reading is the first one of a new connection."""
+        self._raw_us: int | None = None
+        self._device_us = 0
+        self._host_s = 0.0
+        self._fitted_us: int | None = None
+        self._age_s = 0.0
+        self._last_s: float | None = None
+
+    def read(self, t_us: int | None, modulus: int, arrived_s: float) -> ReadingTime:
+        """The time of the next reading.
+
+        Args:
+            t_us: The device's clock as sent, us; None for want of one.
+            modulus: The time at which it begins again, us.
+            arrived_s: When the reading's chunk arrived, unix s.
+        """
+        if t_us is None:
+            step_s = 0.0 if self._last_s is None else max(0.0, arrived_s - self._last_s)
+            self._last_s = arrived_s
+            return ReadingTime(arrived_s, None, step_s)
+        step_us = self._unwrap(t_us, modulus)
+        host_s = arrived_s if self._fitted_us is None else self._predict(self._device_us)
+        return ReadingTime(host_s, self._device_us, step_us * 1e-6)
+
+    def arrived(self, at_s: float) -> None:
+        """The latest reading was the last one of a chunk that arrived then (unix s): the fit follows it."""
+        if self._raw_us is None:
+            return
+        late_s = 0.0 if self._fitted_us is None else at_s - self._predict(self._device_us)
+        if self._fitted_us is None or abs(late_s) > LOST_S:
+            self._host_s, self._fitted_us, self._age_s, self.rate = at_s, self._device_us, 0.0, 1.0
+            return
+        step_s = (self._device_us - self._fitted_us) * 1e-6
+        self._age_s += step_s
+        turn = min(0.5, 2.0 * math.pi * max(BANDWIDTH_HZ, FIRST_BANDWIDTH_HZ / (1.0 + self._age_s)) * step_s)
+        self._host_s = self._predict(self._device_us) + math.sqrt(2.0) * turn * late_s
+        self.rate += turn * turn * late_s / step_s if step_s > 0.0 else 0.0
+        self._fitted_us = self._device_us
+
+    def _predict(self, device_us: int) -> float:
+        return self._host_s + self.rate * (device_us - (self._fitted_us or 0)) * 1e-6
+
+    def _unwrap(self, t_us: int, modulus: int) -> int:
+        """Step since the reading before, us; 0 where the clock jumped back or ahead by half its range."""
+        last, self._raw_us = self._raw_us, t_us
+        step = 0 if last is None else (t_us - last) % modulus
+        if last is None or step >= modulus // 2:
+            self.restarts += last is not None
+            self._device_us, self._fitted_us = t_us, None
+            return 0
+        self._device_us += step
+        return step

@@ -1,0 +1,193 @@
+"""Recordings: what came through the port and what was made of it, one line of JSON each, as it happens.
+
+    {"isocharge_recording": 1, "model": "three/1", "policy": "every", "device": {...}}
+    {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
+    {"timestamp": ..., ...}                       the records of that chunk, as they went out
+    {"tare": true}                                somebody asked for a new tare here
+
+A recording is played through the same path. Everything is computed anew except `latency_us`, which belongs to that run
+is taken from its record; so the same model gives the same records, bit for bit. Whole lines are written at once; a
+line that a full disk or a power cut left unfinished is ignored.
+"""
+
+import base64
+import json
+import logging
+import os
+from collections import deque
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+from isocharge.errors import OutputError, RecordingError
+from isocharge.files import refuse_existing
+from isocharge.serve.port.serial_port import Chunk
+
+VERSION = 1
+
+KIND = "isocharge_recording"
+
+log = logging.getLogger(__name__)
+
+
+class Recorder:
+    """Writes a recording.
+
+    Attributes:
+        path: The file.
+        failed: Whether writing had to stop: the disk is full. What was written until then is whole.
+    """
+
+    def __init__(self, path: Path, model: str, policy: str, device: Mapping[str, Any]) -> None:
+        """Describe a recording; the file is made on entering the context."""
+        self.path = path
+        self.failed = False
+        self._header = {KIND: VERSION, "model": model, "policy": policy, "device": dict(device)}
+        self._descriptor = -1
+        self._good = 0
+
+    def __enter__(self) -> Self:
+        """Make the file.
+
+        Raises:
+            OutputExists: If it is already there.
+            OutputError: If it cannot be made.
+        """
+        refuse_existing(self.path)
+        try:
+            self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        except OSError as error:
+            raise OutputError(f"{self.path} cannot be written: {error.strerror}; choose another file") from error
+        self._write(json.dumps(self._header))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the file."""
+        os.close(self._descriptor)
+
+    def chunk(self, chunk: Chunk, records: list[str]) -> None:
+        """Write a chunk and the records that were made of it."""
+        data = base64.b64encode(chunk.data).decode()
+        head = json.dumps({"chunk": [chunk.timestamp, chunk.clock_ns, chunk.outage_s, data]})
+        self._write("\n".join([head, *records]))
+
+    def tare(self) -> None:
+        """Write that somebody asked for a new tare."""
+        self._write('{"tare": true}')
+
+    def _write(self, lines: str) -> None:
+        """Write whole lines or none."""
+        if self.failed:
+            return
+        data = f"{lines}\n".encode()
+        try:
+            for_now = memoryview(data)
+            while for_now:
+                for_now = for_now[os.write(self._descriptor, for_now) :]
+        except OSError as error:
+            self.failed = True
+            os.ftruncate(self._descriptor, self._good)
+            log.error("%s: recording stopped (%s); what was written until now is whole", self.path, error.strerror)
+            return
+        self._good += len(data)
+
+
+class Event(NamedTuple):
+    """What happened next: a chunk with the latencies of its records (us), or the wish for a new tare (no chunk)."""
+
+    chunk: Chunk | None
+    latencies_us: tuple[float, ...] = ()
+
+
+class Recording:
+    """A recording that is read.
+
+    Attributes:
+        model: The model's label, `name/version`.
+        policy: Which frames got a record.
+        device: The device file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read the first line.
+
+        Raises:
+            RecordingError: If it cannot be read, or is no recording of this version.
+        """
+        self._path = path
+        try:
+            with path.open(encoding="utf-8") as file:
+                header = json.loads(file.readline())
+            self.model, self.policy, self.device = (header[key] for key in ("model", "policy", "device"))
+            version = header[KIND]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise RecordingError(f"{path}: expected a recording of `serve stream --record` ({error!r})") from error
+        if version != VERSION:
+            raise RecordingError(f"{path}: recording version {version} is not supported (this version reads {VERSION})")
+
+    def events(self) -> Iterator[Event]:
+        """What happened, in its order.
+
+        Raises:
+            RecordingError: If a line other than the last one is damaged.
+        """
+        chunk, latencies_us = None, []
+        for entry in self._entries():
+            if isinstance(entry, float):
+                latencies_us.append(entry)
+                continue
+            if chunk is not None:
+                yield Event(chunk, tuple(latencies_us))
+            chunk, latencies_us = entry, []
+            if chunk is None:
+                yield Event(None)
+        if chunk is not None:
+            yield Event(chunk, tuple(latencies_us))
+
+    def _entries(self) -> Iterator[Chunk | float | None]:
+        """What each line says."""
+        with self._path.open(encoding="utf-8", errors="replace") as file:
+            next(file)
+            for number, line in enumerate(file, start=2):
+                if not line.endswith("\n"):
+                    return  # the power went while it was written
+                try:
+                    entry = _entry(json.loads(line))
+                except (ArithmeticError, KeyError, TypeError, ValueError) as error:
+                    raise RecordingError(f"{self._path}, line {number}: damaged ({error})") from error
+                yield entry
+
+
+def _entry(content: dict[str, Any]) -> Chunk | float | None:
+    """A chunk, the latency of a record (us), or None: the wish for a new tare.
+
+    Raises:
+        ArithmeticError, KeyError, TypeError, ValueError: If it is none of these.
+    """
+    if "timestamp" in content:
+        return float(content["latency_us"])
+    if "tare" in content:
+        return None
+    timestamp, clock_ns, outage_s, data = content["chunk"]
+    return Chunk(base64.b64decode(data, validate=True), float(timestamp), int(clock_ns), float(outage_s))
+
+
+class RecordedClock:
+    """The clock of a replay: it stands where it stood when each record was made."""
+
+    def __init__(self) -> None:
+        self._base_ns = 0
+        self._latencies_us: deque[float] = deque()
+
+    def set(self, event: Event) -> None:
+        """The next records are those of this chunk."""
+        self._base_ns = event.chunk.clock_ns if event.chunk else 0
+        self._latencies_us = deque(event.latencies_us)
+
+    def __call__(self) -> int:
+        """Nanoseconds, on the clock of `Chunk.clock_ns`; the arrival itself if there is no record."""
+        latency_us = self._latencies_us.popleft() if self._latencies_us else 0.0
+        return self._base_ns + round(latency_us * 1e3)

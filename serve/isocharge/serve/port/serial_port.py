@@ -1,0 +1,194 @@
+"""A serial port as a context manager and an iterator of chunks, each with the host time of its arrival.
+
+Any URL that pyserial knows will do: `/dev/ttyACM0`, a pseudo-terminal, `socket://host:port`, `rfc2217://host:port`,
+`loop://`. Asked to, a port that goes away or falls silent is opened again for ever; the first chunk after an outage
+says how long it was.
+"""
+
+import io
+import logging
+import os
+import select
+import termios
+import time
+from collections.abc import Iterator
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import serial
+
+from isocharge.errors import PortError, PortLost
+
+RETRY_S = 0.1
+"""First pause before opening again; each one is twice as long,"""
+
+LONGEST_RETRY_S = 2.0
+"""up to this."""
+
+MOST_BYTES = 65536
+
+log = logging.getLogger(__name__)
+
+
+class Chunk(NamedTuple):
+    """Bytes as they came.
+
+    Attributes:
+        data: At least one byte.
+        timestamp: Host time of arrival, unix seconds.
+        clock_ns: The same moment on `time.perf_counter_ns`, for latencies.
+        outage_s: How long the port had been away just before, s; 0 if it had not.
+    """
+
+    data: bytes
+    timestamp: float
+    clock_ns: int
+    outage_s: float = 0.0
+
+
+class Port:
+    """An open port; iterate over it to get `Chunk`s, for ever.
+
+    Attributes:
+        url: Device path or pyserial URL.
+        outages: Times that it came back.
+
+    Example:
+        >>> with Port("/dev/ttyACM0") as port:  # doctest: +SKIP
+        ...     for chunk in port:
+        ...         print(chunk.data)
+    """
+
+    def __init__(self, url: str, *, baud: int = 115200, silence_s: float = 5.0, reconnect: bool = False) -> None:
+        """Describe a port; it is opened on entering the context.
+
+        Args:
+            url: Device path or pyserial URL.
+            baud: Bits per second; without meaning for USB and pseudo-terminals.
+            silence_s: Time without a byte after which the port counts as lost, s.
+            reconnect: Whether to open a lost port again, for ever, instead of raising.
+        """
+        self.url = url
+        self.outages = 0
+        self._baud = baud
+        self._silence_s = silence_s
+        self._reconnect = reconnect
+        self._serial: serial.SerialBase | None = None
+        self._descriptor: int | None = None
+
+    def __enter__(self) -> Self:
+        """Open the port and forget what had piled up in it.
+
+        Raises:
+            PortError: If it cannot be opened.
+        """
+        try:
+            self._serial = serial.serial_for_url(self.url, baudrate=self._baud, timeout=self._silence_s, exclusive=True)
+            self._serial.reset_input_buffer()  # a tty does so by itself, a socket does not
+        except (OSError, ValueError, termios.error) as error:
+            self._close()
+            raise PortError(
+                f"{self.url}: cannot be opened at {self._baud} baud ({error}); check the cable and the name, that no "
+                "other program has it open, and that you may read it (on Linux, the group 'dialout')"
+            ) from error
+        _ask_for_low_latency(self._serial)
+        self._descriptor = _descriptor(self._serial)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the port."""
+        self._close()
+
+    def _close(self) -> None:
+        if self._serial is not None:
+            self._serial.close()
+        self._serial = self._descriptor = None
+
+    def __iter__(self) -> Iterator[Chunk]:
+        """Chunks as they arrive.
+
+        Raises:
+            PortLost: If the port goes away or stays silent for `silence_s`, and is not to be opened again.
+            PortError: If the port is not open.
+        """
+        outage_s = 0.0
+        while True:
+            lost_s = time.monotonic()
+            try:
+                data = self._read()
+            except PortLost as error:
+                data = self._come_back(error)
+                outage_s = time.monotonic() - lost_s
+                self.outages += 1
+            yield Chunk(data, time.time(), time.perf_counter_ns(), outage_s)
+            outage_s = 0.0
+
+    def _come_back(self, reason: PortLost) -> bytes:
+        """Open again and again until there is data: the first bytes."""
+        if not self._reconnect:
+            raise reason
+        log.warning("%s; trying again until it is back", reason)
+        pause_s = RETRY_S
+        while True:
+            self._close()
+            time.sleep(pause_s)
+            pause_s = min(2.0 * pause_s, LONGEST_RETRY_S)
+            try:
+                self.__enter__()
+                return self._read()
+            except PortError:
+                continue
+
+    def _read(self) -> bytes:
+        """Wait for a byte and take all that came with it.
+
+        Raises:
+            PortLost: If the port went away, or nothing came in time.
+        """
+        if self._serial is None:
+            raise PortError(f"{self.url}: not open; use `with Port(...) as port`")
+        try:
+            data = self._read_directly() if self._descriptor is not None else self._read_by_pyserial()
+        except (OSError, termios.error) as error:  # pyserial lets both through; termios.error is not an OSError
+            raise PortLost(
+                f"{self.url}: went away while it was read ({error}); check the plug and the cable"
+            ) from error
+        if not data:
+            raise PortLost(
+                f"{self.url}: no data for {self._silence_s:g} s; check that the board is powered and sends, "
+                f"and that {self._baud} baud is its speed"
+            )
+        return data
+
+    def _read_directly(self) -> bytes:
+        """Two system calls for all that is there: pyserial takes five, and one for every byte of a socket."""
+        assert self._descriptor is not None
+        if not select.select([self._descriptor], [], [], self._silence_s)[0]:
+            return b""
+        data = os.read(self._descriptor, MOST_BYTES)
+        if not data:
+            raise OSError("it is readable and has no data: it was unplugged, or the other end has closed")
+        return data
+
+    def _read_by_pyserial(self) -> bytes:
+        assert self._serial is not None
+        first: bytes = self._serial.read(1)
+        return first + self._serial.read(self._serial.in_waiting) if first else first
+
+
+def _ask_for_low_latency(port: serial.SerialBase) -> None:
+    """USB adapters collect bytes for 16 ms unless asked not to; other ports have no such mode, each says so its way."""
+    try:
+        port.set_low_latency_mode(True)
+    except (AttributeError, NotImplementedError, OSError, ValueError):
+        return
+
+
+def _descriptor(port: serial.SerialBase) -> int | None:
+    """What the operating system reads from; None for ports that live inside pyserial."""
+    try:
+        return int(port.fileno())
+    except (AttributeError, io.UnsupportedOperation):
+        return None

@@ -1,0 +1,89 @@
+"""The prediction record: one shape for every carrier - JSON lines today, and whatever else comes.
+
+A field that a carrier does not have is None (null): a CSV file has no device time, a film that nobody touches has no
+position.
+"""
+
+import json
+from dataclasses import dataclass, fields
+from typing import Any
+
+from isocharge.serve.prediction.predictor import Contact
+
+DECIMALS = 6
+"""Of numbers in JSON: 1 nm, 1 uN, 1 aC, 1 us, all far below what a sensor resolves."""
+
+Charges = dict[str, float | None]
+"""Electrode name to charge, pC; None where the device sent no number."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictionRecord:
+    """One reading of a sensor and what the model makes of it.
+
+    Attributes:
+        timestamp: Host time of the reading, unix seconds: the device's clock fitted to the arrivals; the arrival itself
+            where the device sends no clock.
+        t_device_us: The device's clock, us, without its wraps.
+        seq: The device's sequence number, as sent.
+        x_mm, y_mm: Position in the frame `frame_id`, mm; None out of contact.
+        force_N: Force, N; 0 out of contact.
+        x_std_mm, y_std_mm, force_std_N: Standard deviations; None out of contact.
+        misfit: Distance from the nearest single contact the model knows, in standard deviations; None out of contact.
+        contact: Whether something touches.
+        charge_pC: Touch charges, as the model got them.
+        charge_raw_pC: Charges as they came from the device, after its gain.
+        tare_pC: What was subtracted.
+        flags: Short words, see `isocharge.serve.flags`.
+        latency_us: From the arrival of the reading's last byte to this record, us.
+        model: `name/version`.
+        frame_id: Name of the sensor.
+    """
+
+    timestamp: float | None
+    t_device_us: int | None
+    seq: int | None
+    x_mm: float | None
+    y_mm: float | None
+    force_N: float | None
+    x_std_mm: float | None
+    y_std_mm: float | None
+    force_std_N: float | None
+    misfit: float | None
+    contact: bool
+    charge_pC: Charges | None
+    charge_raw_pC: Charges | None
+    tare_pC: Charges | None
+    flags: tuple[str, ...]
+    latency_us: float | None
+    model: str
+    frame_id: str
+
+    def to_json(self) -> str:
+        """One line of strictly valid JSON, keys in the order above, numbers to six decimals.
+
+        Raises:
+            ValueError: If a number is not finite.
+        """
+        return _ENCODE({name: _plain(getattr(self, name)) for name in FIELDS})
+
+
+FIELDS = tuple(field.name for field in fields(PredictionRecord))
+
+UNKNOWN: dict[str, Any] = dict.fromkeys(Contact._fields)
+"""What a record says of the contact when nothing was computed."""
+
+OUT_OF_CONTACT: dict[str, Any] = UNKNOWN | {"force_N": 0.0}
+"""What a record says of the contact when there is none."""
+
+_ENCODE = json.JSONEncoder(allow_nan=False).encode
+
+
+def _plain(value: Any) -> Any:
+    """What JSON has a notation for. Classes are compared, not asked for: this runs 20 times for each record."""
+    kind = value.__class__
+    if kind is float:
+        return round(value, DECIMALS)
+    if kind is dict:
+        return {name: charge if charge is None else round(charge, DECIMALS) for name, charge in value.items()}
+    return value

@@ -1,0 +1,82 @@
+"""Where a model may be trusted: the check of a contact against what the model was trained for."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from isocharge.arrays import Array, Booleans, Reals
+from isocharge.serve.flags import MISFIT, OUTSIDE
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.prediction.predictor import Contact, Contacts
+
+MISFIT_LIMIT = 5.0
+"""Standard deviations, for a model that does not say what misfit one good press in a thousand exceeds."""
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Where a model may be trusted.
+
+    Attributes:
+        corners_mm: Working area, a polygon of shape (n, 2), mm.
+        force_range_N: Smallest and largest force, N.
+        misfit_limit: In standard deviations.
+    """
+
+    corners_mm: Array
+    force_range_N: tuple[float, float]
+    misfit_limit: float = MISFIT_LIMIT
+
+    @classmethod
+    def of(cls, metadata: ModelMetadata) -> "Domain":
+        """The domain that a model's metadata state."""
+        limit = max(MISFIT_LIMIT, metadata.errors.get("misfit_p999", MISFIT_LIMIT))
+        return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit)
+
+    @cached_property
+    def safe_mm2(self) -> float:
+        """Square of the radius about the origin that is inside the area for sure, mm^2; 0 if the origin is outside."""
+        zero = np.zeros(1)
+        start, end = self.corners_mm, np.roll(self.corners_mm, -1, axis=0)
+        along = end - start
+        share = np.clip(-(start * along).sum(axis=1) / np.maximum((along * along).sum(axis=1), 1e-30), 0.0, 1.0)
+        nearest = ((start + share[:, np.newaxis] * along) ** 2).sum(axis=1).min()
+        return float(nearest) if inside_polygon(zero, zero, self.corners_mm)[0] else 0.0
+
+    def flags(self, contact: Contact) -> tuple[str, ...]:
+        """The words that one contact earns."""
+        low, high = self.force_range_N
+        inside = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm < self.safe_mm2
+        if inside and low <= contact.force_N <= high and contact.misfit <= self.misfit_limit:
+            return ()  # nearly all contacts, and without an array
+        return self.batch_flags(Contacts(*np.array(contact, dtype=np.float32)[:, np.newaxis]))[0]
+
+    def batch_flags(self, contacts: Contacts) -> list[tuple[str, ...]]:
+        """The words that each of n contacts earns."""
+        low, high = self.force_range_N
+        outside = ~inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm)
+        outside |= (contacts.force_N < low) | (contacts.force_N > high)
+        misfit = contacts.misfit > self.misfit_limit
+        return [
+            (OUTSIDE,) * is_outside + (MISFIT,) * is_misfit
+            for is_outside, is_misfit in zip(outside.tolist(), misfit.tolist(), strict=True)
+        ]
+
+
+def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
+    """Whether points lie inside a polygon, by counting the edges to their right.
+
+    Args:
+        x, y: Points, shape (n,), in the unit of the corners.
+        corners: Shape (m, 2), in order; the last one may repeat the first.
+
+    Returns:
+        Shape (n,). Points on the edge itself may be counted either way.
+    """
+    (x0, y0), (x1, y1) = corners.T[..., np.newaxis], np.roll(corners, -1, axis=0).T[..., np.newaxis]
+    crosses = (y0 > y) != (y1 > y)
+    with np.errstate(divide="ignore", invalid="ignore"):  # horizontal edges never cross
+        edge_x = x0 + (y - y0) * (x1 - x0) / (y1 - y0)
+    inside: Booleans = np.count_nonzero(crosses & (x < edge_x), axis=0) % 2 == 1
+    return inside

@@ -1,0 +1,263 @@
+"""A virtual sensor: a pseudo-terminal that sends frames like a board, from any forward map.
+
+The touch charges of the whole script are computed before it plays; the amplifier, which has a memory, takes them a
+block at a time. The writer keeps absolute deadlines, so the rate does not drift. It never waits for a reader: a frame
+that does not fit into the port's buffer is withheld whole, and counted, and its number is missing in what the reader
+sees. Faults on demand: `isocharge.serve.virtual_sensor.faults`.
+"""
+
+import itertools
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.errors import PortError, SceneError
+from isocharge.serve.frames.binary import encode_frame
+from isocharge.serve.frames.frame import T_US_MODULUS, Frame
+from isocharge.serve.frames.sequence import SEQ_MODULUS
+from isocharge.serve.virtual_sensor.faults import Faults, corrupt
+from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
+from isocharge.serve.virtual_sensor.script import Script
+
+ForwardMap = Callable[[Array, Array, Array], Array]
+"""`charge_pC(x_mm, y_mm, force_N)`: arrays of shape (n,) to touch charges of shape (n, electrodes), pC."""
+
+Noise = Callable[[Array, np.random.Generator], Array]
+"""`noise(charge_pC, rng)`: charges of shape (n, electrodes), pC, to what an amplifier makes of them.
+
+It is called block by block in the order of time, so it may have a memory.
+"""
+
+Encode = Callable[[Frame], bytes]
+"""The bytes of a frame, or of several lines that make one."""
+
+BLOCK_S = 0.5
+"""The amplifier takes so much at a time, s."""
+
+
+class Truth(NamedTuple):
+    """What was pressed in one frame.
+
+    Attributes:
+        x_mm, y_mm: Position, mm; not a number where nothing touches.
+        force_N: Force, N; 0 where nothing touches.
+        charge_pC: Touch charges without noise and offset, shape (electrodes,), pC.
+        sent_s: When the frame was written, on `time.perf_counter`, s.
+    """
+
+    x_mm: float
+    y_mm: float
+    force_N: float
+    charge_pC: Array
+    sent_s: float
+
+
+class VirtualSensor:
+    """Plays a script, over and over, from entering the context to leaving it.
+
+    Readers may come and go. The counters start anew with each playing.
+
+    Attributes:
+        withheld: Frames that did not fit into the port, because nobody read.
+        lost: Frames that a fault swallowed.
+        corrupted: Frames that a fault damaged.
+        unplugged: Times that the port vanished and came back.
+
+    Example:
+        >>> with VirtualSensor(charges, wander(seed=1)) as sensor:  # doctest: +SKIP
+        ...     with Port(sensor.url) as port:
+        ...         records = stream(port, predictor)
+    """
+
+    def __init__(
+        self,
+        charge_pC: ForwardMap,
+        script: Script,
+        *,
+        noise: Noise | None = None,
+        offset_pC: Sequence[float] | None = None,
+        seed: int = 0,
+        encode: Encode = encode_frame,
+        faults: Faults | None = None,
+        link: Path | None = None,
+    ) -> None:
+        """Compute what will be played.
+
+        Args:
+            charge_pC: Forward map; called once, for the frames in which something touches.
+            script: What is pressed.
+            noise: Of the amplifier; None for clean charges.
+            offset_pC: Constant charge on each electrode, pC, for the reader to tare away; by default up to 20 pC
+                drawn at random.
+            seed: Of noise, offset and faults.
+            encode: The frame format.
+            faults: What goes wrong.
+            link: A symbolic link to the port, kept while it plays; without, one is made if the port is to vanish, for
+                it comes back under another name.
+
+        Raises:
+            SceneError: If the forward map gives charges of another shape, or not finite.
+        """
+        self._rng = np.random.default_rng(seed)
+        self._script, self._noise, self._encode = script, noise, encode
+        self._faults, self._link = faults or Faults(), link
+        self._clean_pC = _clean_charges(charge_pC, script)
+        electrodes = self._clean_pC.shape[1]
+        drawn_pC = self._rng.uniform(-20.0, 20.0, electrodes)
+        self._offset_pC = drawn_pC if offset_pC is None else np.asarray(offset_pC)
+        self._block = max(1, round(BLOCK_S * script.rate_Hz))
+        self._sent_s = np.full(SEQ_MODULUS, np.nan)
+        self._stop = threading.Event()
+        self._writer: threading.Thread | None = None
+        self._port: PseudoPort | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._start()
+
+    def _start(self) -> None:
+        self._first_url = ""
+        self._frames = self.withheld = self.lost = self.corrupted = self.unplugged = 0
+        self._played_pC: list[tuple[float, ...]] = []
+
+    @property
+    def url(self) -> str:
+        """Path to read from.
+
+        Raises:
+            PortError: Outside the context.
+        """
+        if self._writer is None:
+            raise PortError("the virtual sensor does not play; use `with VirtualSensor(...) as sensor`")
+        return str(self._link) if self._link else self._first_url
+
+    @property
+    def port_path(self) -> str:
+        """The device path of the pseudo-terminal that was opened first."""
+        return self._first_url
+
+    @property
+    def sent(self) -> int:
+        """Frames that were written."""
+        return self._frames - self.withheld - self.lost
+
+    def __enter__(self) -> Self:
+        """Open the port and begin to play."""
+        self._start()
+        if self._link is None and self._faults.unplug_every_s > 0.0:
+            self._folder = tempfile.TemporaryDirectory(prefix="isocharge-")
+            self._link = Path(self._folder.name) / "film"
+        self._plug()
+        assert self._port is not None
+        self._first_url = self._port.url
+        self._stop.clear()
+        self._writer = threading.Thread(target=self._play, name="virtual sensor", daemon=True)
+        self._writer.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop, and make the port vanish."""
+        self._stop.set()
+        if self._writer is not None:
+            self._writer.join()
+        self._unplug()
+        self._writer = None
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = self._link = None
+
+    def _plug(self) -> None:
+        port = PseudoPort()
+        try:
+            if self._link:
+                self._link.symlink_to(port.url)
+        except OSError:
+            port.close()
+            raise
+        self._port = port
+
+    def _unplug(self) -> None:
+        if self._port is None:
+            return
+        if self._link:
+            self._link.unlink(missing_ok=True)
+        self._port.close()
+        self._port = None
+
+    def truth(self, seq: int) -> Truth:
+        """What was pressed in the latest frame with this number.
+
+        Raises:
+            SceneError: If there was none yet.
+        """
+        latest = self._frames - 1
+        frame = latest - (latest - seq) % SEQ_MODULUS
+        if frame < 0 or not 0 <= seq < SEQ_MODULUS:
+            raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest, SEQ_MODULUS - 1)}")
+        at, script = frame % len(self._script), self._script
+        x_mm, y_mm, force_N = (float(values[at]) for values in (script.x_mm, script.y_mm, script.force_N))
+        return Truth(x_mm, y_mm, force_N, self._clean_pC[at], float(self._sent_s[seq]))
+
+    def _play(self) -> None:
+        start = time.perf_counter()
+        for frame in itertools.count():
+            if frame % self._block == 0:
+                self._played_pC = self._measure(frame)
+            due = start + frame / self._script.rate_Hz
+            if self._stop.wait(max(0.0, due - time.perf_counter())):
+                return
+            self._send(frame)
+
+    def _measure(self, first: int) -> list[tuple[float, ...]]:
+        """What the amplifier makes of the next block."""
+        clean_pC = self._clean_pC.take(range(first, first + self._block), axis=0, mode="wrap")
+        played_pC = clean_pC if self._noise is None else self._noise(clean_pC, self._rng)
+        return [tuple(row) for row in (played_pC + self._offset_pC).tolist()]
+
+    def _send(self, frame: int) -> None:
+        t_s = frame / self._script.rate_Hz
+        seq, t_us = frame % SEQ_MODULUS, round(t_s * (1e6 + self._faults.clock_ppm)) % T_US_MODULUS
+        self._sent_s[seq] = time.perf_counter()
+        self._frames = frame + 1  # before writing: a quick reader asks for the truth at once
+        port = self._plugged(t_s)
+        if port is None or self._faults.in_gap(t_s) or self._hit(self._faults.lose_share):
+            self.lost += 1
+            return
+        whole = self._encode(Frame(seq, t_us, self._played_pC[frame % self._block]))
+        data = corrupt(whole, self._faults.corrupt_share, self._rng) if self._faults.corrupt_share else whole
+        self.corrupted += data != whole
+        if not port.write_whole(data):
+            self.withheld += 1
+
+    def _hit(self, share: float) -> bool:
+        return share > 0.0 and self._rng.random() < share
+
+    def _plugged(self, t_s: float) -> PseudoPort | None:
+        """The port, if it is there at this time; it vanishes and comes back here."""
+        if self._faults.unplugged(t_s):
+            self._unplug()
+        elif self._port is None:
+            self._plug()
+            self.unplugged += 1
+        return self._port
+
+
+def _clean_charges(charge_pC: ForwardMap, script: Script) -> Array:
+    """Touch charges of a whole script, shape (n, electrodes), pC; zero where nothing touches."""
+    touching = script.touching
+    pressed = charge_pC(script.x_mm[touching], script.y_mm[touching], script.force_N[touching])
+    if pressed.ndim != 2 or len(pressed) != touching.sum() or not np.isfinite(pressed).all():
+        raise SceneError(
+            f"forward map: expected finite charges of shape ({touching.sum()}, electrodes), got shape "
+            f"{pressed.shape} with {np.count_nonzero(~np.isfinite(pressed))} not finite"
+        )
+    charges = np.zeros((len(script), pressed.shape[1]))
+    charges[touching] = pressed
+    return charges
