@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from isocharge.cli import terminal
+from isocharge.cli.shared import terminal
 
 SENSOR = "three-25um-biaxial"
 

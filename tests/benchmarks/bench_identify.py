@@ -12,10 +12,10 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from isocharge.cli.identify_picture import TICKS, draw_limit_map
 from isocharge.files import write_whole
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 from isocharge.simulate.identifiability.identification import identify, search_radius
+from isocharge.simulate.plots.limit_map import TICKS, draw_limit_map
 
 SENSORS = ("three-25um-biaxial", "three-25um-uniaxial", "four-25um-biaxial", "four-25um-uniaxial")
 

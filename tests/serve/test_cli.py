@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from isocharge.cli.serve import serve_app
+from isocharge.cli.serve.app import serve_app
 from isocharge.errors import ChargeError, InputError, ModelError, OutputExists, PortError, PortLost, SensorError
 from isocharge.serve import BinaryParser, Port, Script, VirtualSensor, wander
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort

@@ -11,7 +11,7 @@ import socket
 import pytest
 import tritonclient.grpc
 
-from isocharge.cli.http import BATCH, BODY_BYTES, CONNECTIONS, HEADER_S, IDLE_S
+from isocharge.cli.serve.http import BATCH, BODY_BYTES, CONNECTIONS, HEADER_S, IDLE_S
 from isocharge.serve.network.limits import Limits
 
 BODY = json.dumps(

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from isocharge.cli.doctor import _in_words
+from isocharge.cli.serve.doctor import _in_words
 from isocharge.errors import PortError
 from isocharge.serve import Script, VirtualSensor, device_from_table, encode_text, examine
 from isocharge.serve.live.port_check import _health

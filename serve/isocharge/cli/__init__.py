@@ -1,7 +1,7 @@
 """The command `isocharge`: the composition root, the only part that sees all stages.
 
-Each stage has its sub-commands in a module here; a sub-command imports its stage when it runs, so that help is instant.
-Data go to stdout, words for people to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage or input.
+Each stage has its commands in a package here, one file a command; a command imports its stage when it runs, so that
+help is instant. Data go to stdout, words for people to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage or input.
 """
 
 import signal
@@ -9,13 +9,10 @@ import sys
 
 import typer
 
-from isocharge.cli.curves import contours_command, curves_command
-from isocharge.cli.demo import demo_command
-from isocharge.cli.identify import identify_command
-from isocharge.cli.paper import paper_command
-from isocharge.cli.serve import serve_app
-from isocharge.cli.simulate import simulate_app
-from isocharge.cli.train import train_app
+from isocharge.cli.demo.command import demo_command
+from isocharge.cli.serve.app import serve_app
+from isocharge.cli.simulate.app import simulate_app
+from isocharge.cli.train.app import train_app
 from isocharge.errors import InputError, IsochargeError
 
 app = typer.Typer(
@@ -25,10 +22,6 @@ app = typer.Typer(
     help="Where a piezoelectric tactile film is touched and how hard, from three or four charges.",
 )
 app.command("demo")(demo_command)
-simulate_app.command("curves")(curves_command)
-simulate_app.command("contours")(contours_command)
-simulate_app.command("identify")(identify_command)
-simulate_app.command("paper")(paper_command)
 app.add_typer(simulate_app, name="simulate")
 app.add_typer(train_app, name="train")
 app.add_typer(serve_app, name="serve")

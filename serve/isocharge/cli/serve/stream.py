@@ -1,72 +1,24 @@
-"""`isocharge serve stream` and `isocharge serve replay`: the live path, and a recording of it.
-
-Data go to stdout, words for people to stderr. Everything heavy is imported inside the command that needs it.
-"""
+"""`isocharge serve stream`: prediction records from a port as they come."""
 
 import logging
 import signal
-import sys
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from enum import StrEnum
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.stopping import until_stopped
-from isocharge.cli.terminal import say
+from isocharge.cli.serve.options import DeviceOption, ModelsOption, Output, OutputOption, PolicyName, board_of
+from isocharge.cli.serve.record_output import LATENCIES, _closing_line, _pass_on, _writer
+from isocharge.cli.shared.stopping import until_stopped
+from isocharge.cli.shared.terminal import say
 
 if TYPE_CHECKING:
-    from isocharge.serve import (
-        Chunk,
-        Device,
-        PredictionRecord,
-        RecordedClock,
-        Recorder,
-        Recording,
-        TouchStream,
-    )
-
-LATENCIES = 100_000
-"""The closing line's percentiles are over so many latest records at most."""
-
-Lines = Callable[["PredictionRecord", str], None]
-"""Takes each record and its line of JSON."""
-
-ModelsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--models", metavar="DIR", help="Folder of models in which a name is looked up first. (default: none)"
-    ),
-]
-DeviceOption = Annotated[
-    Path | None,
-    typer.Option("--device", metavar="FILE", help="What is known about the board, TOML. (default: nothing)"),
-]
-
-
-class Output(StrEnum):
-    """What goes to stdout."""
-
-    json = "json"
-    csv = "csv"
-    none = "none"
-
-
-class PolicyName(StrEnum):
-    """Which frames get a record."""
-
-    every = "every"
-    latest = "latest"
-
-
-OutputOption = Annotated[
-    Output, typer.Option("--output", help="On stdout: lines of JSON, CSV with a header, or nothing.")
-]
+    from isocharge.serve import Chunk, Device, PredictionRecord, Recorder, TouchStream
 
 
 def stream_command(
@@ -139,43 +91,6 @@ def stream_command(
         raise typer.Exit(1)
 
 
-def replay_command(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Recording of `serve stream --record`.")],
-    model: Annotated[
-        str | None, typer.Option("--model", metavar="MODEL", help="Another model. (default: the one of the recording)")
-    ] = None,
-    models: ModelsOption = None,
-    real_time: Annotated[bool, typer.Option("--real-time/--fast", help="At the pace of then, or all at once.")] = False,
-    output: OutputOption = Output.json,
-    udp: Annotated[
-        str | None, typer.Option("--udp", metavar="HOST:PORT", help="Also send each record there. (default: no)")
-    ] = None,
-) -> None:
-    """Play a recording through the same path: the same model gives the same records, bit for bit.
-
-    Example: isocharge serve replay touch.rec --real-time
-    """
-    from isocharge.serve import Policy, Predictor, RecordedClock, Recording, TouchStream, device_from_table
-
-    recording, clock = Recording(file), RecordedClock()
-    predictor = Predictor(model or recording.model, models=models)
-    board = device_from_table(recording.device, str(file))
-    path = TouchStream(predictor, board, policy=Policy(recording.policy), now_ns=clock)
-    latencies: deque[float] = deque(maxlen=LATENCIES)
-    with ExitStack() as stack:
-        stack.enter_context(until_stopped())
-        write = _writer(stack, output, udp, predictor.metadata.electrodes)
-        _pass_on(_replayed(recording, path, clock, real_time), write, latencies)
-    say(_closing_line(path, latencies))
-
-
-def board_of(path: Path | None) -> "Device":
-    from isocharge.serve import load_device
-    from isocharge.serve.live.device_file import ANY_BOARD
-
-    return load_device(path) if path else ANY_BOARD
-
-
 def _with_offset_limit(board: "Device", offset_limit_pC: float | None) -> "Device":
     """The board with another limit in its file, so that a recording keeps it."""
     from isocharge.serve import device_from_table
@@ -215,55 +130,6 @@ def _follow(
     path.finish()
 
 
-def _replayed(
-    recording: "Recording", path: "TouchStream", clock: "RecordedClock", real_time: bool
-) -> "Iterator[tuple[PredictionRecord, str]]":
-    """Records with their lines; as many for each chunk as there were."""
-    ahead_s: float | None = None
-    for event in recording.events():
-        clock.set(event)
-        if event.chunk is None:
-            path.tare()
-            continue
-        if real_time:
-            ahead_s = time.time() - event.chunk.timestamp if ahead_s is None else ahead_s
-            time.sleep(max(0.0, event.chunk.timestamp + ahead_s - time.time()))
-        for number, record in enumerate(path.feed(event.chunk)):
-            if number < len(event.latencies_us):
-                yield record, record.to_json()
-
-
-def _pass_on(records: "Iterable[tuple[PredictionRecord, str]]", write: Lines, latencies: deque[float]) -> None:
-    """Write records as they come; a new tare is said, latencies are kept."""
-    tare = None
-    for record, line in records:
-        write(record, line)
-        if record.tare_pC != tare:
-            tare = record.tare_pC
-            if tare is not None:
-                say("tared: " + ", ".join(f"{name} {charge:.2f} pC" for name, charge in tare.items()))
-        if record.latency_us is not None:
-            latencies.append(record.latency_us)
-
-
-def _writer(stack: ExitStack, output: Output, udp: str | None, electrodes: tuple[str, ...]) -> Lines:
-    """What writes each record: to stdout at once, and to the network."""
-    from isocharge.serve import UdpSink, csv_header, csv_line
-
-    sink = stack.enter_context(UdpSink(udp)) if udp else None
-    if output is Output.csv:
-        print(csv_header(electrodes), flush=True)
-
-    def write(record: "PredictionRecord", line: str) -> None:
-        if sink:
-            sink.send(line)
-        if output is not Output.none:
-            sys.stdout.write((line if output is Output.json else csv_line(record, electrodes)) + "\n")
-            sys.stdout.flush()
-
-    return write
-
-
 @contextmanager
 def _alarm(seconds: float | None) -> Iterator[None]:
     """As if Ctrl-C were pressed after some time, also where nothing comes from the port."""
@@ -300,18 +166,3 @@ def _log_to_stderr() -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
-
-
-def _closing_line(path: "TouchStream", latencies: deque[float]) -> str:
-    counts, gaps, own = path.parser.counts, path.gaps, path.counts
-    said = (
-        f"{counts.frames} frames, {gaps.lost} lost, {gaps.repeated} repeated, {gaps.restarts} restarts; "
-        f"{counts.crc_errors} CRC errors, {counts.malformed} malformed, {counts.bytes_dropped} bytes dropped, "
-        f"{counts.resyncs} resynchronisations; {own.outages} reconnects, {own.skipped} skipped"
-    )
-    if not latencies:
-        return said
-    import numpy as np
-
-    p50, p99 = np.percentile(latencies, (50, 99))
-    return f"{said}; last byte to record p50 {p50:.0f} us, p99 {p99:.0f} us"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.terminal import say
+from isocharge.cli.shared.terminal import say
 from isocharge.errors import InputError
 from isocharge.extras import require
 

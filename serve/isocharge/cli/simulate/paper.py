@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.terminal import progress_rows, say
+from isocharge.cli.shared.terminal import progress_rows, say
 
 ROWS = (("solving the films", "tasks"), ("triangulating", ""), ("drawing", "figures"))
 """Titles and units of the progress."""

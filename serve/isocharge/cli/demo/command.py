@@ -8,14 +8,13 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
-from isocharge.cli.terminal import progress, say, this_command
-from isocharge.cli.virtual import virtual_sensor
+from isocharge.cli.shared.terminal import progress, say, this_command
+from isocharge.cli.shared.virtual_sensor import virtual_sensor
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from isocharge.serve import PredictionRecord, Predictor
     from isocharge.simulate import ForwardMap, Sweep
     from isocharge.train import Release
@@ -168,7 +167,7 @@ def _draw(
     """Test presses of another seed through the exported model, and the page; returns position and force errors."""
     import numpy as np
 
-    from isocharge.cli.pictures import Page, draw_page
+    from isocharge.cli.demo.page import Page, draw_page
     from isocharge.serve import Predictor
     from isocharge.simulate import Sweep, noise_model, press
     from isocharge.train.evaluate import position_error

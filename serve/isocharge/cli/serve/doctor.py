@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.live import DeviceOption, ModelsOption, board_of
+from isocharge.cli.serve.options import DeviceOption, ModelsOption, board_of
 
 if TYPE_CHECKING:
     from isocharge.serve import Examination

@@ -1,4 +1,4 @@
-"""`isocharge train ...`: a dataset, or a sensor, to a model."""
+"""`isocharge train fit`: a dataset, or a sensor, to a model."""
 
 import json as json_module
 from pathlib import Path
@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.report import report_command
-from isocharge.cli.simulate import PROBE_HELP, auto_radius, number_mm
-from isocharge.cli.terminal import progress, say, this_command
+from isocharge.cli.shared.options import PROBE_HELP, auto_radius, number_mm
+from isocharge.cli.shared.terminal import progress, say, this_command
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing
 
@@ -19,11 +18,7 @@ if TYPE_CHECKING:
 SAMPLES = 24_000
 """Presses that are simulated where no dataset is given."""
 
-train_app = typer.Typer(no_args_is_help=True, help="From a dataset to a model.")
-train_app.command("report")(report_command)
 
-
-@train_app.command("fit")
 def fit_command(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="models/NAME", help="Model folder; its name is the model's.")

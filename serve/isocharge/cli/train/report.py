@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.terminal import progress, say, this_command
+from isocharge.cli.shared.terminal import progress, say, this_command
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing
 

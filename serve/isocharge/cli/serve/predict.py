@@ -1,4 +1,4 @@
-"""`isocharge serve ...`: charges to contacts from a file and from a port, and a virtual sensor to try it on.
+"""`isocharge serve predict`: charges from a file to contacts.
 
 Data go to stdout, words for people to stderr. Everything heavy is imported inside the command that needs it.
 """
@@ -11,26 +11,13 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.doctor import doctor_command
-from isocharge.cli.http import http_command
-from isocharge.cli.live import ModelsOption, replay_command, stream_command
-from isocharge.cli.stopping import until_stopped
-from isocharge.cli.virtual import virtual_command
+from isocharge.cli.serve.options import ModelsOption
+from isocharge.cli.shared.stopping import until_stopped
 from isocharge.errors import InputError
-
-serve_app = typer.Typer(
-    no_args_is_help=True, help="Charges to contacts: from a file, from a port, over HTTP, from a virtual sensor."
-)
-serve_app.command("stream")(stream_command)
-serve_app.command("replay")(replay_command)
-serve_app.command("doctor")(doctor_command)
-serve_app.command("virtual")(virtual_command)
-serve_app.command("http")(http_command)
 
 ModelArgument = Annotated[str, typer.Argument(metavar="MODEL", help="Model name, or path of a model folder.")]
 
 
-@serve_app.command("predict")
 def predict_command(
     model: ModelArgument,
     file: Annotated[

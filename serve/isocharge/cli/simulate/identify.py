@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from isocharge.cli.simulate import PROBE_HELP, SensorArgument
-from isocharge.cli.terminal import progress, say
+from isocharge.cli.shared.options import PROBE_HELP, SensorArgument
+from isocharge.cli.shared.terminal import progress, say
 from isocharge.errors import InputError
 from isocharge.files import new_folder, refuse_existing, write_whole
 
@@ -150,7 +150,7 @@ def _size_words(row: dict[str, Any]) -> str:
 
 
 def _write(output: Path, found: "Identification", numbers: dict[str, Any]) -> None:
-    from isocharge.cli.identify_picture import draw_identification
+    from isocharge.simulate.plots.limit_map import draw_identification
 
     text = json_module.dumps(numbers, indent=1).encode()
     if output.suffix == ".png":

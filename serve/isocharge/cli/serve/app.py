@@ -1,0 +1,20 @@
+"""`isocharge serve ...`: its commands, one file each."""
+
+import typer
+
+from isocharge.cli.serve.doctor import doctor_command
+from isocharge.cli.serve.http import http_command
+from isocharge.cli.serve.predict import predict_command
+from isocharge.cli.serve.replay import replay_command
+from isocharge.cli.serve.stream import stream_command
+from isocharge.cli.serve.virtual import virtual_command
+
+serve_app = typer.Typer(
+    no_args_is_help=True, help="Charges to contacts: from a file, from a port, over HTTP, from a virtual sensor."
+)
+serve_app.command("predict")(predict_command)
+serve_app.command("stream")(stream_command)
+serve_app.command("replay")(replay_command)
+serve_app.command("doctor")(doctor_command)
+serve_app.command("virtual")(virtual_command)
+serve_app.command("http")(http_command)

@@ -1,0 +1,66 @@
+"""`isocharge serve replay`: the records of a recording, again."""
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from isocharge.cli.serve.options import ModelsOption, Output, OutputOption
+from isocharge.cli.serve.record_output import LATENCIES, _closing_line, _pass_on, _writer
+from isocharge.cli.shared.stopping import until_stopped
+from isocharge.cli.shared.terminal import say
+
+if TYPE_CHECKING:
+    from isocharge.serve import PredictionRecord, RecordedClock, Recording, TouchStream
+
+
+def replay_command(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Recording of `serve stream --record`.")],
+    model: Annotated[
+        str | None, typer.Option("--model", metavar="MODEL", help="Another model. (default: the one of the recording)")
+    ] = None,
+    models: ModelsOption = None,
+    real_time: Annotated[bool, typer.Option("--real-time/--fast", help="At the pace of then, or all at once.")] = False,
+    output: OutputOption = Output.json,
+    udp: Annotated[
+        str | None, typer.Option("--udp", metavar="HOST:PORT", help="Also send each record there. (default: no)")
+    ] = None,
+) -> None:
+    """Play a recording through the same path: the same model gives the same records, bit for bit.
+
+    Example: isocharge serve replay touch.rec --real-time
+    """
+    from isocharge.serve import Policy, Predictor, RecordedClock, Recording, TouchStream, device_from_table
+
+    recording, clock = Recording(file), RecordedClock()
+    predictor = Predictor(model or recording.model, models=models)
+    board = device_from_table(recording.device, str(file))
+    path = TouchStream(predictor, board, policy=Policy(recording.policy), now_ns=clock)
+    latencies: deque[float] = deque(maxlen=LATENCIES)
+    with ExitStack() as stack:
+        stack.enter_context(until_stopped())
+        write = _writer(stack, output, udp, predictor.metadata.electrodes)
+        _pass_on(_replayed(recording, path, clock, real_time), write, latencies)
+    say(_closing_line(path, latencies))
+
+
+def _replayed(
+    recording: "Recording", path: "TouchStream", clock: "RecordedClock", real_time: bool
+) -> "Iterator[tuple[PredictionRecord, str]]":
+    """Records with their lines; as many for each chunk as there were."""
+    ahead_s: float | None = None
+    for event in recording.events():
+        clock.set(event)
+        if event.chunk is None:
+            path.tare()
+            continue
+        if real_time:
+            ahead_s = time.time() - event.chunk.timestamp if ahead_s is None else ahead_s
+            time.sleep(max(0.0, event.chunk.timestamp + ahead_s - time.time()))
+        for number, record in enumerate(path.feed(event.chunk)):
+            if number < len(event.latencies_us):
+                yield record, record.to_json()
