@@ -16,9 +16,9 @@ from bench_predictor import machine
 from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
-from isocharge.train.bayes import BayesLimit, Scene, bayes_estimate
+from isocharge.train.bayes.limit import BayesLimit, Scene, bayes_estimate
+from isocharge.train.report.build import inner_radius
 from isocharge.train.report.measures import coverage
-from isocharge.train.report.report import inner_radius
 
 RELEASED = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial")
 FALSE_ALARMS = 0.01

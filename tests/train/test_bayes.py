@@ -8,8 +8,8 @@ import pytest
 from isocharge.errors import ChargeError, InputError
 from isocharge.simulate import ChargeSpline, Circle, noise_model
 from isocharge.train import BayesLimit, Scene, bayes_estimate, bayes_limit
-from isocharge.train import cache as cache_module
-from isocharge.train.cache import cache_folder, kept
+from isocharge.train.bayes import cache as cache_module
+from isocharge.train.bayes.cache import cache_folder, kept
 
 
 @pytest.fixture(scope="module")

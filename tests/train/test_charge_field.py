@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from isocharge.errors import TrainingError
-from isocharge.train.charge_field import ChargeField, Domain
+from isocharge.train.data.charge_field import ChargeField
+from isocharge.train.data.domain import Domain
 
 FORCES = (0.05, 2.0)
 

@@ -13,8 +13,9 @@ import torch
 from isocharge.errors import OutputExists
 from isocharge.resumable_run import keep_draft
 from isocharge.simulate import Circle, Sweep, read_dataset, run_sweep
-from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, checkpoint, fit_network, train_model
-from isocharge.train.checkpoint import Checkpoint
+from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network, train_model
+from isocharge.train.training import checkpoint
+from isocharge.train.training.checkpoint import Checkpoint
 
 NOISY = FitConfig(
     NetworkConfig((12, 12), (10, 10)), TrainingConfig(steps=230, misfit_steps=210, misfit_charges=1_000, batch=64)

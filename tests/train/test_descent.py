@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from isocharge.errors import TrainingError
-from isocharge.train.checkpoint import Checkpoint
-from isocharge.train.descent import REPORT_EVERY, Descent, Task
-from isocharge.train.network import Perceptron
+from isocharge.train.training.checkpoint import Checkpoint
+from isocharge.train.training.descent import REPORT_EVERY, Descent, Task
+from isocharge.train.training.network import Perceptron
 
 
 def task(scores, steps=20 * REPORT_EVERY, settle=0):

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from isocharge.errors import TrainingError
 from isocharge.simulate import noise_model
-from isocharge.train.evaluate import noisy_charges
-from isocharge.train.export import export_onnx
-from isocharge.train.release import _check_finite
+from isocharge.train.data.presses import noisy_charges
+from isocharge.train.release.export import export_onnx
+from isocharge.train.release.release import _check_finite
 
 CASES = {
     "clean": lambda charge: charge,

@@ -10,8 +10,9 @@ import torch
 from isocharge.errors import ConfigError, InputError, TrainingError
 from isocharge.simulate import Dataset, Samples, noise_model
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network
-from isocharge.train.evaluate import measure_errors, noisy_charges, position_error
-from isocharge.train.release import predict_with
+from isocharge.train.data.presses import noisy_charges, position_error
+from isocharge.train.release.evaluate import measure_errors
+from isocharge.train.release.release import predict_with
 
 TINY = FitConfig(
     NetworkConfig(hidden=(16, 16), misfit_hidden=(8, 8)),

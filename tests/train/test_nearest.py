@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from isocharge.simulate import noise_model
-from isocharge.train.nearest import into_domain, nearest_contact, search
+from isocharge.train.data.nearest_contact import into_domain, nearest_contact, search
 
 NOISE = noise_model("reference")
 FAULTS = {

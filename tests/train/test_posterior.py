@@ -8,7 +8,7 @@ from scipy import stats
 
 from isocharge.errors import ChargeError, InputError
 from isocharge.simulate import ChargeSpline, NoiseModel, noise_model
-from isocharge.train.posterior import Posterior
+from isocharge.train.bayes.posterior import Posterior
 
 REFERENCE = noise_model("reference")
 

@@ -14,8 +14,8 @@ from isocharge.serve import Predictor, find_model
 from isocharge.serve.model.repository import model_names
 from isocharge.simulate import Circle, Sweep, noise_model, sensor_from_dict, solve_maps
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, train_model
-from isocharge.train.evaluate import measure_errors
-from isocharge.train.split import Presses
+from isocharge.train.data.presses import Presses
+from isocharge.train.release.evaluate import measure_errors
 
 QUICK = FitConfig(
     NetworkConfig((24, 24), (24, 24)), TrainingConfig(steps=200, misfit_steps=50, misfit_charges=2_000, batch=256)

@@ -12,7 +12,7 @@ from isocharge.cli import main
 from isocharge.errors import DatasetError, ModelError, OutputExists
 from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, run_sweep, write_dataset
 from isocharge.train.report import QUICK, write_report
-from isocharge.train.report.report import inner_radius
+from isocharge.train.report.build import inner_radius
 
 ROOT = Path(__file__).parents[2]
 MODEL = ROOT / "models" / "three-25um-biaxial" / "1"

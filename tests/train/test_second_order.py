@@ -6,7 +6,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import nn
 
-from isocharge.train.second_order import levenberg_marquardt
+from isocharge.train.training.levenberg_marquardt import levenberg_marquardt
 
 
 class Decay(nn.Module):

@@ -7,7 +7,7 @@ import pytest
 
 from isocharge.errors import DatasetError
 from isocharge.simulate import Samples
-from isocharge.train.split import domain_of, presses_of, split_by_position
+from isocharge.train.data.presses import domain_of, presses_of, split_by_position
 
 
 def with_samples(dataset, **columns):

@@ -8,8 +8,9 @@ import pytest
 from isocharge.errors import DatasetError
 from isocharge.simulate import ChargeFunction, Circle, Sweep, load_sensor, noise_model, read_dataset, run_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network
-from isocharge.train.charge_field import ChargeField, Domain
-from isocharge.train.unfolded import FieldModel, unfolded
+from isocharge.train.data.charge_field import ChargeField
+from isocharge.train.data.domain import Domain
+from isocharge.train.data.fold_free import FieldModel, unfolded
 
 TINY = FitConfig(NetworkConfig((8, 8), (8, 8)), TrainingConfig(steps=5, misfit_steps=5, misfit_charges=1_000))
 
@@ -60,7 +61,7 @@ def test_three_uniaxial_electrodes_fold_inside_five_mm_and_the_user_is_told(tmp_
 
 
 def test_where_nothing_is_left_it_is_refused(dataset, monkeypatch):
-    monkeypatch.setattr("isocharge.train.fit.unfolded", lambda field, _: replace(field.domain, radius_mm=0.8))
+    monkeypatch.setattr("isocharge.train.training.fit.unfolded", lambda field, _: replace(field.domain, radius_mm=0.8))
     with pytest.raises(DatasetError, match=r"folds 0\.8 mm from the centre, of 8 mm asked for"):
         fit_network(dataset, TINY)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from isocharge.train.charge_field import Domain
+from isocharge.train.data.domain import Domain
 from isocharge.train.report.maps import FORCES, RINGS, SECTORS, _cell_words, _cells, by_force, force_bins
 
 DOMAIN = Domain(8.0, (0.05, 2.0))

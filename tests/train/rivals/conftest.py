@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import noise_model
-from isocharge.train.charge_field import Domain
-from isocharge.train.rivals import Task
-from isocharge.train.split import Presses
+from isocharge.train.baselines import Task
+from isocharge.train.data.domain import Domain
+from isocharge.train.data.presses import Presses
 
 DOMAIN = Domain(8.0, (0.05, 2.0))
 

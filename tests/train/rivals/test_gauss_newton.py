@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 
-from isocharge.train.evaluate import noisy_charges
-from isocharge.train.rivals import GaussNewton
-from isocharge.train.rivals.problem import damped_step
+from isocharge.train.baselines import GaussNewton
+from isocharge.train.baselines.problem import damped_step
+from isocharge.train.data.presses import noisy_charges
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,8 @@
 import numpy as np
 from sklearn.linear_model import LinearRegression
 
-from isocharge.train.rivals import InterpolatedTable, NearestEntry, NearestNeighbours
-from isocharge.train.rivals.table import affine_maps
+from isocharge.train.baselines import InterpolatedTable, NearestEntry, NearestNeighbours
+from isocharge.train.baselines.table import affine_maps
 
 
 def test_the_mean_of_the_nearest_by_brute_force(task, test_presses):

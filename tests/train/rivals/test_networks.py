@@ -5,11 +5,8 @@ import pytest
 import torch
 
 from isocharge.simulate import noise_model
-from isocharge.train.charge_field import Domain
-from isocharge.train.export import export_onnx
-from isocharge.train.network import Features, InverseNetwork
-from isocharge.train.rivals import Network, Task
-from isocharge.train.rivals.networks import (
+from isocharge.train.baselines import Network, Task
+from isocharge.train.baselines.networks import (
     BoundNetwork,
     Folded,
     NumpyNetwork,
@@ -18,7 +15,10 @@ from isocharge.train.rivals.networks import (
     contact_graph,
     contact_of,
 )
-from isocharge.train.split import domain_of, presses_of, split_by_position
+from isocharge.train.data.domain import Domain
+from isocharge.train.data.presses import domain_of, presses_of, split_by_position
+from isocharge.train.release.export import export_onnx
+from isocharge.train.training.network import Features, InverseNetwork
 
 CHARGE = np.random.default_rng(0).uniform(100.0, 1500.0, (400, 3))
 

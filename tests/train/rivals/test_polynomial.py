@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from sklearn.preprocessing import PolynomialFeatures
 
-from isocharge.train.rivals import PolynomialRidge
-from isocharge.train.rivals.polynomial import lower_monomials, monomials
+from isocharge.train.baselines import PolynomialRidge
+from isocharge.train.baselines.polynomial import lower_monomials, monomials
 
 
 @pytest.mark.parametrize(("variables", "degree"), [(3, 5), (4, 3), (2, 7)])

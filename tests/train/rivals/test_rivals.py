@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.train.evaluate import noisy_charges, position_error
-from isocharge.train.rivals import (
+from isocharge.train.baselines import (
     GaussianProcess,
     GaussNewton,
     GradientBoosting,
@@ -14,6 +13,7 @@ from isocharge.train.rivals import (
     NearestNeighbours,
     PolynomialRidge,
 )
+from isocharge.train.data.presses import noisy_charges, position_error
 
 ALLOWED_MM = {
     PolynomialRidge(): 0.1,

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import noise_model
-from isocharge.train.evaluate import position_error
-from isocharge.train.rivals import Task, Triangulate
-from isocharge.train.split import Presses, domain_of, presses_of, split_by_position
+from isocharge.train.baselines import Task, Triangulate
+from isocharge.train.data.presses import Presses, domain_of, position_error, presses_of, split_by_position
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,11 @@ print(release.metadata.errors)
 from isocharge.extras import require
 
 with require("train"):
-    from isocharge.train.bayes import BayesLimit, Scene, bayes_estimate, bayes_limit
-    from isocharge.train.config import FitConfig, NetworkConfig, TrainingConfig, load_config
-    from isocharge.train.evaluate import measure_errors
-    from isocharge.train.fit import Fit, fit_network
-    from isocharge.train.release import Release, train_model
+    from isocharge.train.bayes.limit import BayesLimit, Scene, bayes_estimate, bayes_limit
+    from isocharge.train.release.evaluate import measure_errors
+    from isocharge.train.release.release import Release, train_model
+    from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
+    from isocharge.train.training.fit import Fit, fit_network
 
 __all__ = [
     "BayesLimit",

@@ -116,7 +116,7 @@ class Live:
     @property
     def error_mm(self) -> "np.ndarray":
         """Distance between felt and pressed, mm, (n,)."""
-        from isocharge.train.evaluate import position_error
+        from isocharge.train.data.presses import position_error
 
         return position_error(self.felt, self.pressed)
 
@@ -170,7 +170,7 @@ def _draw(
     from isocharge.cli.demo.page import Page, draw_page
     from isocharge.serve import Predictor
     from isocharge.simulate import Sweep, noise_model, press
-    from isocharge.train.evaluate import position_error
+    from isocharge.train.data.presses import position_error
 
     x, y, force, _ = Sweep(sweep.radius, sweep.force_range, 4096, sweep.seed + 1).presses()
     charge = noise_model("reference").add(film.forward(x, y, force), np.random.default_rng(sweep.seed + 1))

@@ -8,7 +8,7 @@ write_report(Path("report"), [(read_dataset(Path("presses")), find_model("three-
 from isocharge.extras import require
 
 with require("train"):
-    from isocharge.train.report.report import write_report
+    from isocharge.train.report.build import write_report
     from isocharge.train.report.settings import QUICK, Settings
 
 __all__ = ["QUICK", "Settings", "write_report"]

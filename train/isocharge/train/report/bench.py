@@ -13,8 +13,8 @@ from isocharge.simulate import Dataset, ForwardMap, Probe, Samples, Sensor, Swee
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.mechanics.theory import ACCURACY
 from isocharge.simulate.solver.settings import Solver
-from isocharge.train.charge_field import Domain
-from isocharge.train.split import Presses, domain_of
+from isocharge.train.data.domain import Domain
+from isocharge.train.data.presses import Presses, domain_of
 
 FURTHER = 1.03
 """How much further than the dataset the test's solves reach, in distance and force."""

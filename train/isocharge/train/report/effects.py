@@ -11,12 +11,11 @@ from isocharge.errors import IsochargeError
 from isocharge.progress import Announce
 from isocharge.simulate import Sensor, parse_probe
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.train.evaluate import noisy_charges
+from isocharge.train.baselines import Fitted, GaussNewton, PolynomialRidge, ReleasedModel, Task
+from isocharge.train.data.presses import Presses, noisy_charges
 from isocharge.train.report.bench import Bench, press_on
 from isocharge.train.report.measures import errors, rounded
 from isocharge.train.report.settings import Settings
-from isocharge.train.rivals import Fitted, GaussNewton, PolynomialRidge, ReleasedModel, Task
-from isocharge.train.split import Presses
 
 LEVELS = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Factors on the noise."""

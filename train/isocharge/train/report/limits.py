@@ -9,10 +9,10 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.simulate import ChargeSpline, ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import CramerRao, limits_at
-from isocharge.train.bayes import Scene, bayes_estimate
+from isocharge.train.bayes.limit import Scene, bayes_estimate
+from isocharge.train.data.presses import Presses
 from isocharge.train.report.bench import Bench
 from isocharge.train.report.measures import errors, rms, rounded
-from isocharge.train.split import Presses
 
 BAYES, CRAMER_RAO = "Bayes limit", "Cramér-Rao"
 """Their names in pictures."""

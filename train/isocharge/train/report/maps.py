@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 
 from isocharge.arrays import Array, Integers
-from isocharge.train.charge_field import Domain
-from isocharge.train.evaluate import noisy_charges, position_error
+from isocharge.train.baselines import ReleasedModel
+from isocharge.train.data.domain import Domain
+from isocharge.train.data.presses import Presses, noisy_charges, position_error
 from isocharge.train.report.bench import Bench
 from isocharge.train.report.limits import CRAMER_RAO
 from isocharge.train.report.measures import coverage, rms, rounded
-from isocharge.train.rivals import ReleasedModel
-from isocharge.train.split import Presses
 
 DRAW_SEED = 90_000
 """Of the draws of the noise, relative to the bench's."""

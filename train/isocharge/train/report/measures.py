@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.train.evaluate import position_error
+from isocharge.train.data.presses import position_error
 
 
 def rms(values: Array) -> float:

@@ -10,12 +10,7 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.progress import Announce
 from isocharge.simulate import Dataset, ForwardMap
-from isocharge.train.evaluate import noisy_charges
-from isocharge.train.report.bench import Bench
-from isocharge.train.report.measures import errors, pareto, rounded
-from isocharge.train.report.settings import Settings
-from isocharge.train.report.timing import latencies, throughputs
-from isocharge.train.rivals import (
+from isocharge.train.baselines import (
     Estimator,
     Fitted,
     GaussianProcess,
@@ -31,8 +26,12 @@ from isocharge.train.rivals import (
     Task,
     Triangulate,
 )
-from isocharge.train.rivals.linear_band import BAND_N
-from isocharge.train.split import Presses, presses_of, split_by_position
+from isocharge.train.baselines.linear_band import BAND_N
+from isocharge.train.data.presses import Presses, noisy_charges, presses_of, split_by_position
+from isocharge.train.report.bench import Bench
+from isocharge.train.report.measures import errors, pareto, rounded
+from isocharge.train.report.settings import Settings
+from isocharge.train.report.timing import latencies, throughputs
 
 TIMED = 64
 """Presses that single predictions go through in turn."""

@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from isocharge.train.baselines.linear_band import BAND_N
 from isocharge.train.report.effects import FALSE_ALARMS, FARTHEST, GAIN_OFF, PRETENSION_OFF
-from isocharge.train.rivals.linear_band import BAND_N
 
 
 def page(record: dict[str, Any]) -> str:

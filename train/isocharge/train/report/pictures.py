@@ -1,4 +1,4 @@
-"""The report's pictures of errors, coverage and effects, from its record and the draws behind it."""
+"""Colours and lines that the report's pictures have in common."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,12 +11,21 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
 from isocharge.arrays import Integers
 from isocharge.simulate import Sensor
-from isocharge.simulate.plots.figure import INK, new_figure, save_picture
+from isocharge.simulate.plots.figure import FELT, INK, new_figure, save_picture
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
-from isocharge.train.charge_field import Domain
-from isocharge.train.report.colours import GREY, LIMIT_STYLES, LINES, RELEASED
+from isocharge.train.data.domain import Domain
+from isocharge.train.report.limits import BAYES, CRAMER_RAO
 from isocharge.train.report.maps import COORDINATES, Draws
 from isocharge.train.report.measures import rms
+
+GREY, RELEASED = "#8a95a5", FELT
+"""Colours of what is beside the point, and of the released model."""
+
+LINES = ("#2b6cb0", "#2f7f6f", "#c47f17", "#7a5195", "#8c564b", "#4c9be8")
+"""Colours of methods where kinds do not tell them apart."""
+
+LIMIT_STYLES = {BAYES: "-", CRAMER_RAO: ":"}
+"""How the limits are drawn."""
 
 
 def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Figure:

@@ -9,7 +9,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter
 
 from isocharge.arrays import Array
 from isocharge.simulate.plots.figure import INK, new_figure
-from isocharge.train.report.colours import GREY, LIMIT_STYLES, RELEASED
+from isocharge.train.report.pictures import GREY, LIMIT_STYLES, RELEASED
 
 KINDS = {"paper": "#7a5195", "learnt": "#2f7f6f", "fitted map": "#c47f17", "network": "#2b6cb0"}
 """Colours of the kinds of methods."""

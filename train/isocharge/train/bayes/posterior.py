@@ -1,0 +1,188 @@
+"""The posterior of a contact given noisy charges, by dense integration: what no estimator can beat on average.
+
+The prior is uniform over the disk and in the logarithm of the force. Charges are Gaussian about Q(c) with the sigma of
+the true charge, so the likelihood carries its normalisation,
+
+    p(Q | x, y, ln F) = prod_e exp(-(Q_e - q_e)^2 / (2 sigma_e^2)) / sigma_e,   q = Q(x, y, F),   sigma_e = sigma(q_e).
+
+Positions are integrated over square cells, cut in four where the posterior may have mass until they are small against
+its width; wherever that mass lies, in one place or several, in an ellipse or a sickle, it is found, because a cell is
+left only when no contact in it can explain the charges. In each cell the force is integrated about its best value by
+Gauss and Legendre's rule, cut off at the ends of the range. The midpoint rule on a Gaussian is exact to 1e-5 with cells
+of 1.25 standard deviations (Trefethen and Weideman 2014); only the edge of the disk wants more.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from isocharge.arrays import Array, Integers
+from isocharge.errors import ChargeError, InputError
+from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.identifiability.folds import singular_values
+from isocharge.simulate.identifiability.force_profile import ForceCurve
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.numerics.disk import onto_disk
+from isocharge.train.bayes.cells import Cells
+
+CHUNK = 64
+"""Presses integrated at once: keeps the working arrays within some 100 MB."""
+
+ACROSS = 32
+"""Cells across the disk to begin with."""
+
+MOST_CUTS = 10
+"""How often a cell may be cut in four: down to a thirty-thousandth of the disk."""
+
+STEP = 1.25
+"""Largest side of a cell in standard deviations of the position, in the direction that the charges tell best."""
+
+MARGIN = 36.0
+"""Excess of a cell's chi-squared over the press's smallest above which it holds nothing: exp(-18)."""
+
+NEAR = 9.0
+"""The same below which a cell on the edge of the disk matters: the press is then integrated with more care."""
+
+WIDTH, NODES = 5.0, 12
+"""Half width of the force's integral in standard deviations, and its points: to 1e-4 together."""
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Integrates over the contacts that may have given some charges.
+
+    Attributes:
+        charges: Charges of a contact.
+        noise: Of the readings.
+        radius: Of the disk of the prior, m.
+        step: Largest side of a cell in standard deviations; half of it is the check.
+    """
+
+    charges: ChargeSpline
+    noise: NoiseModel
+    radius: float
+    step: float = STEP
+
+    def __post_init__(self) -> None:
+        if self.noise.white <= 0.0:
+            raise InputError(f"noise: expected white noise above 0 pC, got {self.noise.name!r}: nothing to integrate")
+        if not 0.0 < self.radius <= self.charges.radius * (1.0 + 1e-9):
+            raise InputError(
+                f"radius: expected up to {self.charges.radius * 1e3:g} mm, where the charges are known, got "
+                f"{self.radius * 1e3:g} mm"
+            )
+
+    def mean_and_std(self, charge: Array) -> tuple[Array, Array]:
+        """Of noisy charges, shape (n, n_electrode), C: each (n, 3) for x, y, F in m and N.
+
+        The mean of the force is E[1/F] / E[1/F^2], of all estimates the one with the least mean square relative error.
+        """
+        charge = np.asarray(charge, dtype=float)
+        if charge.ndim != 2 or charge.shape[1] != self.charges.electrodes or not np.isfinite(charge).all():
+            raise ChargeError(
+                f"expected finite charges of shape (n, {self.charges.electrodes}), got shape {charge.shape}"
+            )
+        parts = [self._integrate(charge[start : start + CHUNK]) for start in range(0, len(charge), CHUNK)]
+        mean, std = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        return mean, std
+
+    @cached_property
+    def _curve(self) -> ForceCurve:
+        return ForceCurve.of(self.charges.by_force, self.charges.force_range)
+
+    @cached_property
+    def _roots(self) -> tuple[Cells, Array, Array]:
+        """The first cells, their terms, and the steepest slope of each scaled charge in them, (n, n_electrode)."""
+        side = 2.0 * self.radius / ACROSS
+        line = side * (np.arange(ACROSS) + 0.5) - self.radius
+        centre = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        centre = centre[np.hypot(*np.maximum(np.abs(centre) - 0.5 * side, 0.0).T) < self.radius]
+        cells = Cells(np.zeros(len(centre), dtype=np.intp), np.arange(len(centre)), centre, side)
+        corner = 0.5 * side * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
+        slopes = self.charges.slopes(onto_disk((centre[:, None] + corner).reshape(-1, 2), self.radius))
+        steepest = np.linalg.norm(slopes, axis=-1).max(axis=1).reshape(len(centre), len(corner), -1).max(axis=1)
+        return cells, self.charges.terms(onto_disk(centre, self.radius)), steepest
+
+    def _integrate(self, charge: Array) -> tuple[Array, Array]:
+        found = list(self._cells(charge))
+        side = np.concatenate([np.full(len(cells), cells.side) for cells in found])
+        press = np.concatenate([cells.press for cells in found])
+        shares, centres = zip(*(cells.inside(self.radius) for cells in found), strict=True)
+        order = np.argsort(press, kind="stable")
+        share, press, centre = np.concatenate(shares)[order], press[order], np.concatenate(centres)[order]
+        logs, weight = self._over_force(centre, charge[press])
+        weight += np.log(share * side[order] ** 2)[:, None]
+        return _moments(press, centre, logs, weight)
+
+    def _cells(self, charge: Array) -> Iterator[Cells]:
+        """Cells that hold all of the mass, small against its width; every press in cells of one size."""
+        roots, terms, steepest = self._roots
+        press, root = (axis.ravel() for axis in np.indices((len(charge), len(roots))))
+        cells, terms = Cells(press, root, roots.centre[root], roots.side), terms[root]
+        for cut in range(MOST_CUTS + 1):
+            logs = self._curve.best(terms, charge[cells.press], self.noise)
+            chi2, reach = self._fit(terms, logs, charge[cells.press], steepest[cells.root])
+            best = np.full(len(charge), np.inf)
+            np.minimum.at(best, cells.press, chi2)
+            excess = np.maximum(np.sqrt(chi2) - np.sqrt(0.5) * cells.side * reach, 0.0) ** 2 - best[cells.press]
+            kept = np.flatnonzero(excess <= MARGIN)
+            stiffest = np.zeros(len(charge))
+            np.maximum.at(stiffest, cells.press[kept], self._stiffness(cells.centre[kept], terms[kept], logs[kept]))
+            cut_off = np.zeros(len(charge), dtype=bool)
+            cut_off[cells.press[cells.on_edge(self.radius) & (chi2 <= best[cells.press] + NEAR)]] = True
+            done = (stiffest * cells.side <= self.step)[cells.press] | (cut == MOST_CUTS)
+            ready = cells[done & (chi2 <= best[cells.press] + MARGIN)]
+            yield ready[~cut_off[ready.press]]
+            yield from ready[cut_off[ready.press]].finer(self.radius)
+            cells = cells[kept][~done[kept]].cut(self.radius)
+            if not len(cells):
+                return
+            terms = self.charges.terms(onto_disk(cells.centre, self.radius))
+
+    def _fit(self, terms: Array, logs: Array, charge: Array, steepest: Array) -> tuple[Array, Array]:
+        """Chi-squared at each cell, and how fast its root can change with the place at most, 1/m."""
+        by_force = self.charges.by_force(logs)
+        known = np.einsum("nk,nke->ne", by_force, terms)
+        deviation = (charge - known) / self.noise.sigma(known)
+        steep = steepest * by_force.sum(axis=1)[:, None] / self.noise.sigma(known)
+        return np.einsum("ne,ne->n", deviation, deviation), np.sqrt(np.einsum("ne,ne->n", steep, steep))
+
+    def _stiffness(self, position: Array, terms: Array, logs: Array) -> Array:
+        """One over the smallest standard deviation of the position if it lay here, the force unknown; shape (n,)."""
+        by_force, slopes = self.charges.by_force(logs), self.charges.slopes(onto_disk(position, self.radius))
+        known = np.einsum("nk,nke->ne", by_force, terms)
+        moved = np.einsum("nk,nkei->nei", by_force, slopes)
+        jacobian = np.concatenate([moved, self._curve.slope(logs, known)[..., None]], axis=2)
+        return singular_values(jacobian / self.noise.sigma(known)[..., None])[:, 0]
+
+    def _over_force(self, position: Array, charge: Array) -> tuple[Array, Array]:
+        """Points of the integral over the force's logarithm at each place, and the logarithms of their weights times
+        the likelihood; both (n, NODES)."""
+        terms = self.charges.terms(position)
+        best = self._curve.best(terms, charge, self.noise)
+        known = self._curve.charge(best, terms)
+        reach = WIDTH / np.linalg.norm(self._curve.slope(best, known) / self.noise.sigma(known), axis=1)
+        low, high = np.maximum(best - reach, self._curve.ends[0]), np.minimum(best + reach, self._curve.ends[1])
+        nodes, weights = np.polynomial.legendre.leggauss(NODES)
+        logs = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * nodes
+        known = np.einsum("nmk,nke->enm", self.charges.by_force(logs), terms)
+        variance = self.noise.variance(known)
+        exponents = ((charge.T[:, :, None] - known) ** 2 / variance).sum(axis=0) + np.log(variance.prod(axis=0))
+        return logs, np.log(weights * (high - low)[:, None]) - 0.5 * exponents
+
+
+def _moments(press: Integers, place: Array, logs: Array, weight: Array) -> tuple[Array, Array]:
+    """Mean and standard deviation of (x, y, F) of every press, from the points at its places, `press` ascending."""
+    first = np.flatnonzero(np.diff(press, prepend=-1))
+    largest = np.maximum.reduceat(weight.max(axis=1), first)
+    mass = np.exp(weight - np.repeat(largest, np.diff(first, append=press.size))[:, None])
+    force, total = np.exp(logs), mass.sum(axis=1)
+    columns = [total, *(total * place.T), *(total * place.T**2)]
+    columns += [(mass * force**power).sum(axis=1) for power in (1, 2, -1, -2)]
+    sums = np.add.reduceat(np.stack(columns, axis=1), first)
+    x, y, x2, y2, f, f2, inverse, inverse2 = (sums[:, 1:] / sums[:, :1]).T
+    mean = np.stack([x, y, inverse / inverse2], axis=1)
+    variance = np.stack([x2 - x**2, y2 - y**2, f2 - f**2], axis=1)
+    return mean, np.sqrt(np.maximum(variance, 0.0))

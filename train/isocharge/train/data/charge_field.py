@@ -1,0 +1,154 @@
+"""The forward map as a short series fitted to a dataset: what charges a contact gives, with derivatives, cheaply.
+
+Without pretension Q = F^(2/3) g(x, y) nearly, with g smooth, so ln Q is expanded in Chebyshev polynomials
+
+    ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
+
+with r the radius of the working area and l the logarithm of the force scaled to [-1, 1]. The coefficients follow from
+linear least squares. Training needs it to find the contact nearest to any charges, and to see folds; the model itself
+does without. A dataset of several probes gives their mean.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from scipy.linalg import cho_factor, cho_solve
+
+from isocharge.arrays import Array, Integers
+from isocharge.errors import TrainingError
+from isocharge.train.data.domain import Domain
+
+CANDIDATES = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
+"""Degrees tried in turn, in position and in force."""
+
+ROWS_PER_TERM = 40
+"""Presses used for each coefficient at most. Near the edge of the disk, where the series is worst, more help most."""
+
+FEWEST_PER_TERM = 8
+"""Fewer presses for a coefficient than this leave the slopes at the rim to chance."""
+
+CHUNK = 4096
+"""Presses whose terms are held at once."""
+
+RIDGE = 1e-9
+"""Weight of the coefficients' own size in the fit, relative: the square's corners lie outside the disk, where nothing
+holds the polynomials."""
+
+GOOD_ENOUGH = 1.5e-4
+"""Root-mean-square relative error of the charges at which no higher degree is tried: a tenth of the reference noise."""
+
+
+@dataclass(frozen=True)
+class ChargeField:
+    """Charges as a function of the contact.
+
+    Attributes:
+        domain: Where it holds.
+        series: Coefficients of ln Q (Q in pC), shape (degree + 1, degree + 1, force_degree + 1, n_electrode).
+        error: Root-mean-square relative error on samples that the fit did not see.
+    """
+
+    domain: Domain
+    series: Array
+    error: float
+
+    @classmethod
+    def fit(cls, domain: Domain, contact: Array, charge_pC: Array, held: tuple[Array, Array]) -> "ChargeField":
+        """Least squares on (contact, charge), the degree chosen on `held`.
+
+        Args:
+            domain: Where the contacts lie.
+            contact: (x_mm, y_mm, force_N), shape (n, 3).
+            charge_pC: Clean charges, shape (n, n_electrode), all positive.
+            held: Contacts and charges to measure the error on.
+
+        Raises:
+            TrainingError: If there are too few samples for the smallest degree.
+        """
+        best: ChargeField | None = None
+        unit, target = domain.to_unit(contact), np.log(charge_pC)
+        for degree, force_degree in CANDIDATES:
+            count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
+            if FEWEST_PER_TERM * count > len(unit):
+                break
+            rows = slice(0, ROWS_PER_TERM * count)
+            field = cls(domain, _least_squares(unit[rows], target[rows], degree, force_degree), np.inf)
+            error = float(np.sqrt(np.mean((field.charge_pC(held[0]) / held[1] - 1.0) ** 2)))
+            if best is None or error < best.error:
+                best = cls(domain, field.series, error)
+            if error < GOOD_ENOUGH:
+                break
+        if best is None:
+            raise TrainingError(
+                f"expected at least {FEWEST_PER_TERM * 56} presses to fit the charges by, got {len(unit)}"
+            )
+        return best
+
+    def charge_pC(self, contact: Array) -> Array:
+        """Charges of contacts (x_mm, y_mm, force_N): shape (n, 3) to (n, n_electrode)."""
+        charge: Array = np.exp(self.log_charge(self.domain.to_unit(contact))[:, 0])
+        return charge
+
+    def log_charge(self, unit: Array) -> Array:
+        """ln Q and its derivatives by the unit coordinates: contacts (n, 3) in them to (n, 4, n_electrode)."""
+        degree, _, orders, n_electrode = (size - 1 for size in self.series.shape)
+        parts = [self._some_logs(some, degree, orders) for some in np.array_split(unit, len(unit) // CHUNK + 1)]
+        return np.concatenate(parts).reshape(len(unit), 4, n_electrode + 1)
+
+    def with_slopes(self) -> Array:
+        """Series of ln Q and of its derivatives by the unit coordinates, side by side.
+
+        Returns:
+            Shape (degree + 1, degree + 1, force_degree + 1, 4, n_electrode).
+        """
+        return np.stack([self.series, *(_derivative(self.series, axis) for axis in range(3))], axis=3)
+
+    def _some_logs(self, unit: Array, degree: int, force_degree: int) -> Array:
+        plane, in_force = _terms(unit, degree, force_degree)
+        by_force = (plane @ self._rows).reshape(len(unit), in_force.shape[1], -1)
+        logs: Array = (in_force[:, None, :] @ by_force)[:, 0]
+        return logs
+
+    @cached_property
+    def _rows(self) -> Array:
+        """The series and its derivatives by term of the plane, shape (n_term, (force_degree + 1) 4 n_electrode)."""
+        all_four = np.stack([self.series, *(_derivative(self.series, axis) for axis in range(3))])
+        of_terms = all_four[:, *_plane_terms(self.series.shape[0] - 1)]  # (4, n_term, force_degree + 1, n_electrode)
+        rows: Array = of_terms.transpose(1, 2, 0, 3).reshape(of_terms.shape[1], -1)
+        return rows
+
+
+def _plane_terms(degree: int) -> tuple[Integers, Integers]:
+    """Degrees in x and y of the terms."""
+    of_x, of_y = np.nonzero(np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) <= degree)
+    return of_x, of_y
+
+
+def _terms(unit: Array, degree: int, force_degree: int) -> tuple[Array, Array]:
+    """Products of the polynomials in x and y, (n, n_term), and the polynomials in the force, (n, force_degree + 1)."""
+    inside = np.clip(unit, -1.0, 1.0)
+    in_x, in_y = (chebyshev.chebvander(inside[:, axis], degree).astype(float) for axis in range(2))
+    of_x, of_y = _plane_terms(degree)
+    return in_x[:, of_x] * in_y[:, of_y], chebyshev.chebvander(inside[:, 2], force_degree).astype(float)
+
+
+def _least_squares(unit: Array, target: Array, degree: int, force_degree: int) -> Array:
+    """Series for targets of shape (n, k), by the normal equations: double precision is plenty for these polynomials."""
+    count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
+    normal, moment = RIDGE * len(unit) * np.eye(count), np.zeros((count, target.shape[1]))
+    for some in np.array_split(np.arange(len(unit)), len(unit) // CHUNK + 1):
+        plane, in_force = _terms(unit[some], degree, force_degree)
+        columns = (plane[:, :, None] * in_force[:, None, :]).reshape(len(some), -1)
+        normal += columns.T @ columns
+        moment += columns.T @ target[some]
+    series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
+    solution = cho_solve(cho_factor(normal), moment)
+    series[_plane_terms(degree)] = solution.reshape(-1, force_degree + 1, target.shape[1])
+    return series
+
+
+def _derivative(series: Array, axis: int) -> Array:
+    """Series of the derivative by one unit coordinate, padded to the same shape."""
+    return np.pad(chebyshev.chebder(series, axis=axis), [(0, int(k == axis)) for k in range(4)])

@@ -1,0 +1,126 @@
+"""Charges that the misfit is learned from: of good presses, of bad ones, and of none at all.
+
+The misfit network answers whatever charges come in, so it has to have seen all kinds: presses with their noise, charges
+off the image of the forward map by any distance, wrong gains, dying electrodes, forces far outside, two presses at once
+(their charges added: the film is not linear, so this is only like two presses), and charges drawn from a box that holds
+everything. Three or four electrodes make a space small enough to be covered.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.train.data.charge_field import ChargeField
+from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
+from isocharge.train.data.nearest_contact import nearest_contact, search
+from isocharge.train.data.presses import Presses
+
+KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
+"""Share of each kind."""
+
+FAR = 6.0
+"""Distance above which a press's own place may not be the nearest: searched as the others are."""
+
+
+@dataclass(frozen=True)
+class Strange:
+    """Charges and how far from any known contact they are.
+
+    Attributes:
+        charge_pC: Shape (n, n_electrode), pC.
+        miss: (Q - Q(c)) / sigma at the nearest known contact c, shape (n, n_electrode).
+    """
+
+    charge_pC: Array
+    miss: Array
+
+
+def strange_charges(presses: Presses, field: ChargeField, noise: NoiseModel, count: int, seed: int) -> Strange:
+    """Draw charges of every kind and find their nearest contacts.
+
+    Args:
+        presses: To start from.
+        field: The forward map that says what is known.
+        noise: Noise of good presses, and the unit of distance.
+        count: How many.
+        seed: Of all that is drawn.
+    """
+    rng = np.random.default_rng(seed)
+    rows = rng.integers(len(presses), size=count)
+    own = presses[rows]
+    kinds = np.array(list(KINDS))[rng.choice(len(KINDS), size=count, p=list(KINDS.values()))]
+    charge = np.empty_like(own.charge_pC)
+    for kind in KINDS:
+        charge[kinds == kind] = _DRAW[kind](rng, own.charge_pC[kinds == kind], presses.charge_pC, noise)
+    charge = np.clip(charge, LOWEST_PC, HIGHEST_PC)
+    return Strange(charge, _misses(field, charge, noise, own, np.isin(kinds, ("noisy", "moved"))))
+
+
+def _misses(field: ChargeField, charge: Array, noise: NoiseModel, own: Presses, near: np.ndarray) -> Array:
+    """Those `near` their own press start there, and the field is shifted to be right there; the others search."""
+    miss, at = np.empty_like(charge), np.flatnonzero(near)
+    start = field.domain.to_unit(own.contact[at])
+    shift = np.log(own.charge_pC[at]) - field.log_charge(start)[:, 0]
+    miss[at] = nearest_contact(field, charge[at], noise, start, shift)[1]
+    far = np.flatnonzero(~near | (np.linalg.norm(np.where(near[:, None], miss, 0.0), axis=1) > FAR))
+    searched = search(field, charge[far], noise)[1]
+    keep = near[far] & ((miss[far] ** 2).sum(axis=1) < (searched**2).sum(axis=1))
+    miss[far] = np.where(keep[:, None], miss[far], searched)
+    return miss
+
+
+def _noisy(rng: np.random.Generator, charge: Array, _: Array, noise: NoiseModel) -> Array:
+    return noise.add(1e-12 * charge, rng) * 1e12
+
+
+def _moved(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
+    """In any direction, by a thousandth up to a factor of seven."""
+    size = 10.0 ** rng.uniform(-3.0, 0.3, (len(charge), 1))
+    moved: Array = charge * np.exp(size * rng.standard_normal(charge.shape))
+    return moved
+
+
+def _gains(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
+    """Half of the electrodes off by 15 %."""
+    off = rng.random(charge.shape) < 0.5
+    wrong: Array = charge * np.exp(0.15 * off * rng.standard_normal(charge.shape))
+    return wrong
+
+
+def _dying(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
+    """One electrode keeps a share of its charge, down to a thousandth."""
+    dead = rng.integers(charge.shape[1], size=(len(charge), 1)) == np.arange(charge.shape[1])
+    left: Array = np.where(dead, charge * 10.0 ** rng.uniform(-3.0, 0.0, (len(charge), 1)), charge)
+    return left
+
+
+def _scaled(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
+    """All by a common factor from a hundredth to a hundred, and a little each."""
+    common = 10.0 ** rng.uniform(-2.0, 2.0, (len(charge), 1))
+    scaled: Array = charge * common * np.exp(0.05 * rng.standard_normal(charge.shape))
+    return scaled
+
+
+def _two(rng: np.random.Generator, charge: Array, others: Array, _: NoiseModel) -> Array:
+    both: Array = charge + others[rng.integers(len(others), size=len(charge))]
+    return both
+
+
+def _any(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
+    """Between what counts as nothing and 10 nC, or what counts as most."""
+    decades = np.where(rng.random((len(charge), 1)) < 0.3, np.log10(HIGHEST_PC), 4.0)
+    drawn: Array = 10.0 ** (decades * rng.random(charge.shape))
+    return drawn
+
+
+_DRAW = {
+    "noisy": _noisy,
+    "moved": _moved,
+    "gains": _gains,
+    "dying": _dying,
+    "scaled": _scaled,
+    "two": _two,
+    "any": _any,
+}

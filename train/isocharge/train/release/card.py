@@ -1,0 +1,92 @@
+"""The model card: what a model is for, what it reaches, what it cannot do, and how to make it again."""
+
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.simulate.measuring_chain.noise_file import noise_model
+from isocharge.train.data.presses import misfit_noise
+from isocharge.train.training.fit import Fit
+
+
+def model_card(metadata: ModelMetadata, fit: Fit) -> str:
+    """The text of `card.md`."""
+    errors, (low, high), noise = metadata.errors, metadata.force_range_N, metadata.noise
+    electrodes = ", ".join(metadata.electrodes)
+    return f"""# {metadata.name}, version {metadata.version}
+
+Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of one press out.
+
+| | |
+|---|---|
+| input | `charge_pC`, float32 [n, {len(metadata.electrodes)}], touch charges of {electrodes} in pC |
+| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each), `misfit` |
+| working area | within {fit.network.domain.radius_mm:g} mm of the centre{_folded(fit)} |
+| forces | {low:g} to {high:g} N |
+| probes | {", ".join(metadata.probes)}{_unknown_probe(metadata)} |
+| trained for the noise | {noise["name"]}: {noise["white_pC"]:g} pC and {100 * float(noise["gain"]):g} % |
+
+## Measured on {len(fit.held)} presses that training never saw
+
+Forces log-uniform, positions uniform over the working area.
+
+| error | with that noise | clean charges |
+|---|---|---|
+| position, median | {errors["position_median_mm"]:g} mm | {errors["clean_position_median_mm"]:g} mm |
+| position, rms | {errors["position_rms_mm"]:g} mm | |
+| position, 95 % | {errors["position_p95_mm"]:g} mm | {errors["clean_position_p95_mm"]:g} mm |
+| position, 99 % | {errors["position_p99_mm"]:g} mm | |
+| force, median | {errors["force_median_percent"]:g} % | |
+| force, rms | {errors["force_rms_percent"]:g} % | |
+| force, 99 % | {errors["force_p99_percent"]:g} % | |
+| coverage of the 68 % intervals | {100 * errors["coverage_68"]:.3g} % | |
+| coverage of the 95 % intervals | {100 * errors["coverage_95"]:.3g} % | |
+
+The misfit is the distance, in units of the noise{_unit(fit)}, of the charges from the nearest single contact that the
+model knows; a network gives it, learned from exact searches. 1 % of good presses exceed {errors["misfit_p99"]:g},
+0.1 % exceed {errors["misfit_p999"]:g}.
+{_what_misfit_sees(metadata)}
+
+## Limits
+
+- The truth behind these figures is the simulator, not a film. On a real film, pretension and gains that
+  nobody has measured matter more.
+- One press at a time. Outside the working area and forces the answer is finite and wrong; the misfit is then large in
+  many cases, not in all.
+- The deviations hold for the noise named above; gains that are off by 1 % add more than all of it.
+
+## Make it again
+
+```bash
+{metadata.made_with["command"] or "(made by a program, see metadata)"}
+```
+"""
+
+
+def _folded(fit: Fit) -> str:
+    if fit.asked == fit.network.domain:
+        return ""
+    return f" (of {fit.asked.radius_mm:g} mm asked for: beyond, two contacts give the same charges)"
+
+
+def _unknown_probe(metadata: ModelMetadata) -> str:
+    return "; which of them presses is not known to the model" if len(metadata.probes) > 1 else ""
+
+
+def _unit(fit: Fit) -> str:
+    noise = noise_model(fit.config.training.noise)
+    unit = misfit_noise(noise)
+    return "" if unit == noise else f" `{unit.name}` (1 pC and 0.2 %)"
+
+
+def _what_misfit_sees(metadata: ModelMetadata) -> str:
+    errors = metadata.errors
+    found = ""
+    if "found_dead_electrode" in errors:
+        found = (
+            f"Of presses of about 1 N the former finds {100 * errors['found_gain_20_percent']:.3g} % where one gain\n"
+            f"is off by 20 %, and {100 * errors['found_dead_electrode']:.3g} % where one electrode is dead."
+        )
+    if len(metadata.electrodes) == 3:
+        return (
+            "Three charges and three unknowns: nearly every triple fits some contact, so it sees only what leads out\n"
+            f"of the working area or the forces.\n{found}"
+        )
+    return f"Charges that disagree with each other (a wrong gain, a dead electrode, two presses) raise it.\n{found}"

@@ -1,0 +1,280 @@
+"""The report: measure everything, write the record, the pictures and the page; whole or not at all."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.errors import ModelError
+from isocharge.files import new_folder, write_whole
+from isocharge.progress import StageProgress
+from isocharge.serve import ModelMetadata
+from isocharge.simulate import Dataset, Samples, sensor_to_dict
+from isocharge.train.baselines import Fitted, ReleasedModel, Task
+from isocharge.train.data.presses import domain_of
+from isocharge.train.report import effects, maps, pictures
+from isocharge.train.report.bench import Bench, press_on
+from isocharge.train.report.limits import BAYES, CRAMER_RAO, Limits, limits_of
+from isocharge.train.report.measures import rounded
+from isocharge.train.report.methods import Method, Test, fit_all, roster, table, task_of, timed
+from isocharge.train.report.page import page
+from isocharge.train.report.settings import Settings
+from isocharge.train.report.speed import AXES, speed_plot
+from isocharge.train.report.timing import machine, one_thread
+from isocharge.train.report.verdict import verdict
+
+FORMAT_VERSION = 1
+
+COMPARED = ("Gauss-Newton", "polynomial ridge", "lookup table, interpolated", "gradient boosting", "linear band")
+"""Methods beside the released model in the pictures of effects; of their forms the last, the plain one."""
+
+
+@dataclass
+class Steps:
+    """Counts what is done.
+
+    Attributes:
+        total: Steps in all, as far as is known.
+        tell: Told about them.
+        done: Steps done.
+    """
+
+    total: int
+    tell: StageProgress | None
+    done: int = 0
+
+    def __call__(self, words: str) -> None:
+        """One more step begins."""
+        self.done += 1
+        self.total = max(self.total, self.done)
+        self.say(words)
+
+    def say(self, words: str) -> None:
+        """News of the present step."""
+        if self.tell:
+            self.tell(self.done - 1, self.total, words)
+
+
+def write_report(
+    folder: Path,
+    subjects: Sequence[tuple[Dataset, Path]],
+    settings: Settings | None = None,
+    *,
+    command: str = "",
+    progress: StageProgress | None = None,
+) -> dict[str, Any]:
+    """Measure every method on every dataset and write `report.md`, `report.json` and the pictures.
+
+    Args:
+        folder: Where; must not exist yet.
+        subjects: Datasets, each with the version folder of the released model for it.
+        settings: How much work; the full report if absent.
+        command: How to make this report again, for the page.
+        progress: Told about steps.
+
+    Returns:
+        The record, as in `report.json`.
+
+    Raises:
+        OutputExists: If the folder is already there.
+        DatasetError: If a dataset cannot teach the methods.
+        ModelError: If a model is for another layout or knows less than its dataset.
+    """
+    settings = settings or Settings()
+    prepared = [_Subject.of(dataset, model, settings) for dataset, model in subjects]
+    steps = Steps(sum(subject.steps for subject in prepared), progress)
+    with new_folder(folder) as draft, one_thread():
+        sections = [subject.measure(draft, stem, steps) for stem, subject in _stems(prepared)]
+        record = {
+            "format_version": FORMAT_VERSION,
+            "command": command,
+            "machine": machine(),
+            "settings": asdict(settings),
+            "datasets": sections,
+        }
+        write_whole(draft / "report.json", (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
+        write_whole(draft / "report.md", page(record).encode())
+    return record
+
+
+def _stems(subjects: "list[_Subject]") -> "list[tuple[str, _Subject]]":
+    """Names for the pictures: the sensor's, with a number where two datasets share it."""
+    names = [subject.bench.sensor.name for subject in subjects]
+    return [
+        (name if names.count(name) == 1 else f"{name}-{number}", subject)
+        for number, (name, subject) in enumerate(zip(names, subjects, strict=True), start=1)
+    ]
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """One dataset and its model."""
+
+    dataset: Dataset
+    released: ReleasedModel
+    task: Task
+    bench: Bench
+    settings: Settings
+
+    @classmethod
+    def of(cls, dataset: Dataset, model: Path, settings: Settings) -> "_Subject":
+        released = ReleasedModel(model)
+        dataset = _known_to(released.predictor.metadata, dataset)
+        if len(dataset.samples) > settings.learn_from:
+            dataset = replace(dataset, samples=_rows(dataset.samples, np.arange(settings.learn_from)))
+        bench = Bench.of(dataset, settings.presses, settings.seed)
+        task = task_of(dataset, bench, settings)
+        return cls(dataset, released, task, bench, settings)
+
+    @property
+    def steps(self) -> int:
+        """How many times progress is told something, roughly."""
+        remaining = 0 if len(self.bench.sensor.electrodes) < 4 else len(self.bench.sensor.electrodes)
+        return 22 + len(self.settings.sizes) + 2 * self.settings.rounds + len(self.settings.shapes) + remaining
+
+    def measure(self, folder: Path, stem: str, steps: Steps) -> dict[str, Any]:
+        """Everything about this dataset: its section of the record, its pictures written."""
+        settings, bench = self.settings, self.bench
+        steps("solving the film for limits and contours")
+        films = bench.films(further=1.0, accuracy=settings.accuracy)
+        steps("solving the film for the test presses")
+        test = Test.of(bench, press_on(films if settings.quick else bench.films(), bench.sweep()))
+        steps("integrating the Bayes limit")
+        limits = limits_of(bench, films, test.presses, test.charge_pC, settings.limited, steps.say)
+        methods = fit_all(roster(self.dataset, films[0], settings), self.released, self.task, test, steps)
+        methods = timed(methods, test, settings, steps)
+        section = self._section(test, limits, methods, steps)
+        section["pictures"] = _draw(folder, stem, section, self._draws(test), bench, settings, steps)
+        return section
+
+    def _section(self, test: Test, limits: Limits, methods: list[Method], steps: Steps) -> dict[str, Any]:
+        bench, truth = self.bench, test.presses.contact
+        records = table(methods, test, limits.bayes)
+        draws = self._draws(test)
+        threshold = effects.threshold_of(self.released, test.presses, bench, self.settings.draws)
+        cases = effects.cases(bench, test.presses, self.settings, steps)
+        return {
+            "sensor": bench.sensor.name,
+            "electrodes": list(bench.sensor.electrode_names),
+            "probes": [probe.notation for probe in bench.probes],
+            "radius_mm": bench.domain.radius_mm,
+            "force_N": list(bench.domain.force_range_N),
+            "noise": bench.noise.to_dict(),
+            "dataset_sha256": self.dataset.sha256,
+            "presses": {"train": len(self.task.train), "validation": len(self.task.validation), "test": len(truth)},
+            "model": _model_record(self.released),
+            "limits": limits.record(truth),
+            "methods": records,
+            "verdict": verdict(records),
+            "by_force": maps.by_force(bench.domain, truth, _lines(methods, limits), limits.position_mm),
+            "worst_regions": maps.worst_regions(bench.domain, draws, limits.bayes, methods[0].contact, truth),
+            "calibration": maps.calibration(bench.domain, draws),
+            "alarm_threshold": rounded(threshold),
+            "cases": effects.measure(cases, self.released, _compared(methods), threshold),
+            "without_one": effects.remaining(self.task, bench, test.presses, steps),
+        }
+
+    def _draws(self, test: Test) -> maps.Draws:
+        return maps.Draws(self.released, test.presses, self.bench, self.settings.draws)
+
+
+def _rows(samples: Samples, rows: np.ndarray) -> Samples:
+    return Samples(**{name: column[rows] for name, column in samples.columns().items()})
+
+
+def _known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
+    """The presses of the dataset that lie in the model's working area, which may be the smaller one.
+
+    Raises:
+        ModelError: If the model is for another sensor, or knows fewer forces.
+    """
+    here, there = sensor_to_dict(dataset.sensor), dict(model.sensor)
+    keys = sorted(key for key in (here.keys() | there.keys()) - {"name"} if here.get(key) != there.get(key))
+    if keys:
+        raise ModelError(
+            f"model {model.label}: expected the dataset's sensor {here['name']!r}, got {there.get('name')!r} with "
+            f"another {', '.join(keys)}; choose its own model with --model, or train one"
+        )
+    domain, (low, high) = domain_of(dataset), model.force_range_N
+    least, most = domain.force_range_N
+    if least * SLACK < low or most > high * SLACK:
+        raise ModelError(
+            f"model {model.label}: knows forces from {low:g} to {high:g} N, the dataset reaches from {least:.4g} to "
+            f"{most:.4g} N; sweep within that, or train one"
+        )
+    radius = inner_radius(model.working_area_mm)
+    if domain.radius_mm <= radius * SLACK:
+        return dataset
+    inside = np.hypot(dataset.samples.x_mm, dataset.samples.y_mm) <= radius
+    ranges = {**dataset.manifest.get("ranges", {}), "radius_mm": radius}
+    samples = _rows(dataset.samples, np.flatnonzero(inside))
+    return replace(dataset, samples=samples, manifest={**dataset.manifest, "ranges": ranges})
+
+
+SLACK = 1.0 + 1e-6
+"""By how much a range may be passed: rounding."""
+
+
+def inner_radius(polygon_mm: Sequence[tuple[float, float]]) -> float:
+    """Radius of the largest disk about the origin in a convex polygon, mm, to 0.001 mm."""
+    corners = np.array(polygon_mm)
+    along = np.roll(corners, -1, axis=0) - corners
+    distances = np.abs(along[:, 0] * corners[:, 1] - along[:, 1] * corners[:, 0]) / np.hypot(*along.T)
+    return round(float(distances.min()), 3)
+
+
+def _model_record(released: ReleasedModel) -> dict[str, Any]:
+    metadata = released.predictor.metadata
+    return {
+        "label": metadata.label,
+        "probes": list(metadata.probes),
+        "noise": metadata.noise["name"],
+        "dataset_sha256": metadata.dataset_sha256,
+        "card_errors": dict(metadata.errors),
+    }
+
+
+def _compared(methods: list[Method]) -> list[Fitted]:
+    """One form of each method that the effects are shown for; its last is the plain one."""
+    last = {method.fitted.name: method.fitted for method in methods}
+    return [last[name] for name in COMPARED if name in last]
+
+
+def _lines(methods: list[Method], limits: Limits) -> dict[str, Array]:
+    """Contacts for the picture of error against force."""
+    last = {method.fitted.name: method.contact for method in methods}
+    lines = {BAYES: limits.bayes} if limits.bayes is not None else {}
+    released = methods[0].fitted.name
+    return {**lines, released: methods[0].contact, **{name: last[name] for name in COMPARED if name in last}}
+
+
+def _draw(
+    folder: Path,
+    stem: str,
+    section: dict[str, Any],
+    draws: maps.Draws,
+    bench: Bench,
+    settings: Settings,
+    steps: Steps,
+) -> dict[str, list[str]]:
+    released = section["methods"][0]["name"]
+    known = {BAYES: section["limits"]["bayes"], CRAMER_RAO: section["limits"]["cramer_rao"]}
+    limits = {name: limit["position_rms_mm"] for name, limit in known.items() if limit}
+    own = section["methods"][0]["errors"]["position_rms_mm"]
+
+    def speed(plot: str) -> Callable[[], Any]:
+        return lambda: speed_plot(section["methods"], plot, limits, settings.batch)
+
+    drawings: dict[str, Callable[[], Any]] = {
+        **{plot: speed(plot) for plot in AXES},
+        "maps": lambda: pictures.error_maps(bench.sensor, bench.domain, draws),
+        "force": lambda: pictures.against_force(section["by_force"], released),
+        "calibration": lambda: pictures.calibration(section["calibration"]),
+        "noise": lambda: pictures.noise_effect(section["cases"], released),
+        "effects": lambda: pictures.wrong_world(section["cases"], released, own),
+    }
+    return pictures.draw_all(folder, stem, drawings, steps)

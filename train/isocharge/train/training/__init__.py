@@ -1,0 +1,4 @@
+"""The network and how it is trained: configuration, optimisers, checkpoint.
+
+May import: data.
+"""

@@ -1,0 +1,272 @@
+"""Training: a dataset in, a trained `InverseNetwork` out.
+
+The contact network learns mean and standard deviation by maximum likelihood on charges with fresh noise in every step;
+the first steps learn the mean by least squares, because a likelihood with free deviations is slow to find it. Without
+noise Levenberg-Marquardt finishes the mean. The misfit network learns from charges of all kinds, whose distance from
+the nearest known contact is searched for beforehand.
+"""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from threadpoolctl import threadpool_limits
+from torch import Tensor
+
+from isocharge.errors import ConfigError, DatasetError
+from isocharge.progress import StageProgress, Warn
+from isocharge.simulate.dataset.shards import Dataset
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.measuring_chain.noise_file import noise_model
+from isocharge.train.data.charge_field import ChargeField
+from isocharge.train.data.domain import Domain
+from isocharge.train.data.fold_free import SMALLEST_SHARE, unfolded
+from isocharge.train.data.misfit_charges import Strange, strange_charges
+from isocharge.train.data.presses import Presses, domain_of, misfit_noise, noisy_charges, presses_of, split_by_position
+from isocharge.train.training.checkpoint import Checkpoint
+from isocharge.train.training.config import FitConfig, TrainingConfig
+from isocharge.train.training.descent import Descent, Task
+from isocharge.train.training.levenberg_marquardt import FIRST, levenberg_marquardt
+from isocharge.train.training.misfit_data import WATCHED, _Learned
+from isocharge.train.training.network import Features, InverseNetwork
+
+WARM_UP = 0.15
+"""Share of the steps that learn the mean by least squares."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A trained model and what it was not shown.
+
+    Attributes:
+        network: The model.
+        field: The forward map that the misfit was learned with.
+        held: Presses kept for measuring errors.
+        config: What it was trained with.
+        asked: The domain of the dataset; larger than the network's where the map folds.
+    """
+
+    network: InverseNetwork
+    field: ChargeField
+    held: Presses
+    config: FitConfig
+    asked: Domain
+
+
+def fit_network(
+    dataset: Dataset,
+    config: FitConfig,
+    progress: StageProgress | None = None,
+    *,
+    checkpoint: Checkpoint | None = None,
+    warn: Warn = warnings.warn,
+) -> Fit:
+    """Train on a dataset.
+
+    Args:
+        dataset: Clean charges; noise is added here.
+        config: Sizes, steps, seed.
+        progress: Told about steps, loss and errors on presses that are kept aside.
+        checkpoint: Keeps the state, so that a stopped run goes on.
+        warn: Told where the map folds.
+
+    Raises:
+        ConfigError: If the noise level is unknown.
+        DatasetError: If the dataset cannot train an inverse.
+        TrainingError: If the loss is not finite.
+    """
+    training = config.training
+    noise_model(training.noise)  # an unknown level is said before the work
+    asked, presses = domain_of(dataset), presses_of(dataset)
+    _check_electrodes(dataset, config)
+    with _threads_and_seed(training):
+        domain, presses = _without_folds(asked, presses, training, warn)
+        rest, held = split_by_position(presses, training.hold_out, training.seed)
+        train, watched = split_by_position(rest, WATCHED * training.hold_out, training.seed + 1)
+        field = _field(domain, train, watched)
+        network = InverseNetwork(
+            domain, Features.fit(train.charge_pC), config.network.hidden, config.network.misfit_hidden
+        )
+        _Training(network, field, train, watched, training, checkpoint or Checkpoint(), progress).run()
+    network.eval()
+    return Fit(network, field, held, config, asked)
+
+
+def _field(domain: Domain, train: Presses, watched: Presses) -> ChargeField:
+    return ChargeField.fit(domain, train.contact, train.charge_pC, (watched.contact, watched.charge_pC))
+
+
+def _check_electrodes(dataset: Dataset, config: FitConfig) -> None:
+    names, wanted = dataset.sensor.electrode_names, config.network.electrodes
+    if wanted and wanted != len(names):
+        raise ConfigError(
+            f"network.electrodes: the configuration is for {wanted} electrodes, the dataset of {dataset.sensor.name!r} "
+            f"has {len(names)} ({', '.join(names)}); use another dataset or leave the key out"
+        )
+
+
+def _without_folds(asked: Domain, presses: Presses, training: TrainingConfig, warn: Warn) -> tuple[Domain, Presses]:
+    """The largest disk in which the map does not fold, and the presses in it."""
+    field = _field(asked, *split_by_position(presses, training.hold_out, training.seed))
+    domain = unfolded(field, misfit_noise(noise_model(training.noise)))
+    if domain == asked:
+        return asked, presses
+    if domain.radius_mm < SMALLEST_SHARE * asked.radius_mm:
+        raise DatasetError(
+            f"the map from contacts to charges folds {domain.radius_mm:g} mm from the centre, of {asked.radius_mm:g} "
+            "mm asked for: beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
+        )
+    inside = presses[np.hypot(presses.contact[:, 0], presses.contact[:, 1]) <= domain.radius_mm]
+    warn(
+        f"the map from contacts to charges folds beyond {domain.radius_mm:g} mm: two contacts give the same charges "
+        f"there; the model is trained for {domain.radius_mm:g} mm, not {asked.radius_mm:g} mm, on {len(inside)} of "
+        f"{len(presses)} presses"
+    )
+    return domain, inside
+
+
+@contextmanager
+def _threads_and_seed(training: TrainingConfig) -> Iterator[None]:
+    """Seed and thread count for the block, the caller's own restored after it.
+
+    BLAS is held to the same number: its threads spin at barriers, and a busy second core makes them many times slower.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(training.threads)
+    try:
+        with threadpool_limits(training.threads, user_api="blas"), torch.random.fork_rng(devices=[]):
+            torch.manual_seed(training.seed)
+            yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+class _Training:
+    """One run: data as tensors, and the stages one after the other."""
+
+    def __init__(
+        self,
+        network: InverseNetwork,
+        field: ChargeField,
+        train: Presses,
+        watched: Presses,
+        config: TrainingConfig,
+        checkpoint: Checkpoint,
+        progress: StageProgress | None,
+    ) -> None:
+        self.network, self.field, self.train, self.watched = network, field, train, watched
+        self.config, self.checkpoint, self.progress = config, checkpoint, progress
+        self.noise = noise_model(config.noise)
+        self.charge = torch.tensor(train.charge_pC).float()
+        self.unit = torch.tensor(field.domain.to_unit(train.contact)).float()
+        self.watched_charge = torch.tensor(noisy_charges(watched, self.noise, config.seed)).float()
+        self.watched_unit = torch.tensor(field.domain.to_unit(watched.contact)).float()
+        self.total = config.steps + config.finish_steps + config.misfit_steps
+
+    def run(self) -> None:
+        config = self.config
+        contact = Task(
+            "contact",
+            self.network.contact,
+            self._contact_loss,
+            self._contact_score,
+            config.steps,
+            round(WARM_UP * config.steps),
+        )
+        self._descend(contact, 0)
+        if config.finish_steps:
+            self._finish()
+        strange = _Learned.of(self.network, self._strange_charges(), config)
+        misfit = Task("misfit", self.network.missing, strange.loss, strange.score, config.misfit_steps)
+        self._descend(misfit, config.steps + config.finish_steps)
+
+    def _descend(self, task: Task, before: int) -> None:
+        descent = Descent(task, self.config.learning_rate, self.config.patience, self.config.seed)
+        descent.run(self.checkpoint, lambda step, words: self._tell(before + step, words))
+
+    def _tell(self, done: int, words: str) -> None:
+        if self.progress:
+            self.progress(done, self.total, words)
+
+    def _contact_loss(self, step: int, random: torch.Generator) -> Tensor:
+        rows = torch.randint(len(self.charge), (min(self.config.batch, len(self.charge)),), generator=random)
+        mean, log_std = self.network.posterior(_noisy(self.charge[rows], self.noise, random))
+        warm_up = step < round(WARM_UP * self.config.steps)
+        return (_start_loss if warm_up else _likelihood_loss)(mean, log_std, self.unit[rows])
+
+    def _contact_score(self) -> tuple[float, str]:
+        with torch.no_grad():
+            mean, log_std = self.network.posterior(self.watched_charge)
+            loss = _likelihood_loss(mean, log_std, self.watched_unit).item()
+            off = ((mean - self.watched_unit) * self.network.scale) ** 2
+        position, force = off[:, :2].sum(dim=1).mean().sqrt().item(), off[:, 2].mean().sqrt().item()
+        return loss, f"{loss:.3f} on watched presses: {position:.4f} mm and {100.0 * force:.3f} % of force rms"
+
+    def _finish(self) -> None:
+        """Levenberg-Marquardt for the mean in double precision; the deviations are then those of watched presses."""
+        part = self.network.contact.double()
+        inputs, wanted = self.network.inputs(self.charge).double(), self.unit.double()
+        state = self.checkpoint.load("finish") or {"step": 0, "damping": FIRST, "part": part.state_dict()}
+        part.load_state_dict(state["part"])
+        step = state["step"]
+        left = self.config.finish_steps - step
+        for square, damping in levenberg_marquardt(part, inputs, wanted, left, state["damping"]):
+            step += 1
+            state = {"step": step, "damping": damping, "part": part.state_dict()}
+            self.checkpoint.save("finish", partial(_as_it_is, state))
+            self._tell(self.config.steps + step, f"finish: {square:.3g}, {self._mean_off()}")
+        self.checkpoint.save("finish", lambda: {**state, "step": self.config.finish_steps}, now=True)
+        self._constant_deviations()
+        part.float()
+
+    def _mean_off(self) -> str:
+        with torch.no_grad():
+            mean = self.network.contact(self.network.inputs(self.watched_charge).double())[:, :3]
+            off = ((mean - self.watched_unit) * self.network.scale).double() ** 2
+        return f"{off[:, :2].sum(dim=1).mean().sqrt():.5f} mm and {100.0 * off[:, 2].mean().sqrt():.4f} % of force rms"
+
+    def _constant_deviations(self) -> None:
+        """Root-mean-square errors of the watched presses as the deviations, whatever the charges."""
+        last, straight = self.network.contact.layers()[-1], self.network.contact.straight
+        with torch.no_grad():
+            off = self.network.contact(self.network.inputs(self.watched_charge).double())[:, :3] - self.watched_unit
+            last.weight[3:] = straight.weight[3:] = 0.0
+            last.bias[3:] = 0.5 * (off**2).mean(dim=0).log()
+
+    def _strange_charges(self) -> Strange:
+        """Charges for the misfit; searching for their nearest contacts takes long enough to be kept."""
+        if (kept := self.checkpoint.load("charges")) is not None:
+            return Strange(*(kept[name].numpy() for name in ("charge_pC", "miss")))
+        made = strange_charges(
+            self.train, self.field, misfit_noise(self.noise), self.config.misfit_charges, self.config.seed
+        )
+        self.checkpoint.save(
+            "charges", lambda: {name: torch.tensor(getattr(made, name)) for name in ("charge_pC", "miss")}, now=True
+        )
+        return made
+
+
+def _as_it_is(state: dict[str, Any]) -> dict[str, Any]:
+    return state
+
+
+def _noisy(charge_pC: Tensor, noise: NoiseModel, random: torch.Generator) -> Tensor:
+    sigma = torch.hypot(torch.tensor(1e12 * noise.white), noise.gain * charge_pC)
+    return charge_pC + sigma * torch.randn(charge_pC.shape, generator=random)
+
+
+def _start_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:
+    """Least squares for the mean; the deviations follow it without pulling at it."""
+    squares = (mean - unit) ** 2
+    follow = log_std + 0.5 * squares.detach() * torch.exp(-2.0 * log_std)
+    return (30.0 * squares + 0.1 * follow).sum(dim=1).mean()
+
+
+def _likelihood_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:
+    """Negative logarithm of a Gaussian likelihood, but for a constant."""
+    return (log_std + 0.5 * ((mean - unit) * torch.exp(-log_std)) ** 2).sum(dim=1).mean()

@@ -1,0 +1,141 @@
+"""The inverse: charges in; contact, standard deviations and misfit out. The torch twin of the exported graph.
+
+Features are whitened logarithms of the charges: a force multiplies all charges nearly alike, so ratios carry the
+position and the common factor the force. One perceptron gives mean and log standard deviation of (x, y, ln F). A second
+one gives the misfit
+
+    min over known contacts c of |(Q - Q(c)) / sigma|
+
+as the length of a vector, (Q - Q(c)) / sigma at the nearest contact: that vector is smooth where its length is not, on
+the image of the forward map. Lengths from a tenth to thousands are brought into reach of a network by asinh.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from isocharge.arrays import Array
+from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, Domain
+
+MISFIT_UNIT = 5.0
+"""Standard deviations up to which the misfit is learned about linearly; beyond, its logarithm is."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Whitened logarithms of the charges: x = (ln(clip(Q) / typical) - mean) @ matrix.
+
+    Attributes:
+        typical: The power of two nearest to each charge's geometric mean, shape (n_electrode,), pC: dividing by it
+            costs a float32 no digit, and the logarithms are small enough to keep theirs.
+        mean: Of the logarithms, shape (n_electrode,).
+        matrix: Shape (n_electrode, n_electrode).
+    """
+
+    typical: Array
+    mean: Array
+    matrix: Array
+
+    @classmethod
+    def fit(cls, charge_pC: Array) -> "Features":
+        """From clean charges, shape (n, n_electrode): zero mean, unit covariance along the principal axes."""
+        within = np.clip(charge_pC, LOWEST_PC, HIGHEST_PC)
+        typical = 2.0 ** np.round(np.log2(within).mean(axis=0))
+        logs = np.log(within / typical)
+        mean = logs.mean(axis=0)
+        _, singular, axes = np.linalg.svd(logs - mean, full_matrices=False)
+        return cls(typical, mean, axes.T * (np.sqrt(len(logs)) / np.maximum(singular, 1e-12)))
+
+
+class Perceptron(nn.Module):
+    """Linear layers with tanh between them, and beside them one straight from the inputs to the outputs.
+
+    The logarithm of the force is nearly linear in those of the charges, and has to be right to a thousandth of its
+    range: with the straight layer the others need only learn what is bent.
+    """
+
+    def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int) -> None:
+        super().__init__()
+        widths = (inputs, *hidden)
+        layers: list[nn.Module] = []
+        for before, after in pairwise(widths):
+            layers += [nn.Linear(before, after), nn.Tanh()]
+        self.bent = nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
+        self.straight = nn.Linear(inputs, outputs, bias=False)
+        nn.init.zeros_(self.straight.weight)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Shape (n, inputs) to (n, outputs)."""
+        out: Tensor = self.bent(inputs) + self.straight(inputs)
+        return out
+
+    def layers(self) -> list[nn.Linear]:
+        """The bent way's layers, first to last."""
+        return [layer for layer in self.bent if isinstance(layer, nn.Linear)]
+
+    def hidden_matrices(self) -> list[Tensor]:
+        """Weights from one hidden layer to the next."""
+        return [layer.weight for layer in self.layers()[1:-1]]
+
+
+class InverseNetwork(nn.Module):
+    """The whole model.
+
+    Args:
+        domain: The contacts it knows.
+        features: Normalisation.
+        hidden: Widths of the contact network.
+        misfit_hidden: Widths of the misfit network.
+    """
+
+    centre: Tensor
+    scale: Tensor
+    typical: Tensor
+    logs_mean: Tensor
+    whitening: Tensor
+
+    def __init__(
+        self, domain: Domain, features: Features, hidden: tuple[int, ...], misfit_hidden: tuple[int, ...]
+    ) -> None:
+        super().__init__()
+        n_electrode = features.typical.size
+        self.domain, self.features = domain, features
+        self.contact = Perceptron(n_electrode, hidden, 6)
+        self.missing = Perceptron(n_electrode, misfit_hidden, n_electrode)
+        for name, values in (
+            ("centre", domain.centre),
+            ("scale", domain.scale),
+            ("typical", features.typical),
+            ("logs_mean", features.mean),
+            ("whitening", features.matrix),
+        ):
+            self.register_buffer(name, torch.tensor(values).float())
+
+    def inputs(self, charge_pC: Tensor) -> Tensor:
+        """What both perceptrons see, finite for any charges (n, n_electrode), pC."""
+        logs = torch.log(charge_pC.clamp(LOWEST_PC, HIGHEST_PC) / self.typical)
+        return (logs - self.logs_mean) @ self.whitening
+
+    def posterior(self, charge_pC: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log standard deviation of the unit coordinates, each (n, 3)."""
+        out = self.contact(self.inputs(charge_pC))
+        return out[:, :3], out[:, 3:]
+
+    def forward(self, charge_pC: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
+        mean, log_std = self.posterior(charge_pC)
+        value, std = mean * self.scale + self.centre, torch.exp(log_std) * self.scale
+        force = torch.exp(value[:, 2:])
+        contact = torch.cat([value[:, :2], force], dim=1)
+        contact_std = torch.cat([std[:, :2], std[:, 2:] * force], dim=1)
+        squeezed = torch.linalg.vector_norm(self.missing(self.inputs(charge_pC)), dim=1, keepdim=True)
+        return contact, contact_std, MISFIT_UNIT * torch.sinh(squeezed)
+
+
+def squeezed(miss: Tensor) -> Tensor:
+    """What the misfit network learns: `miss`, shape (n, n_electrode), its length brought to asinh(length / unit)."""
+    length: Tensor = torch.linalg.vector_norm(miss, dim=1, keepdim=True)
+    return miss * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=1e-9))
