@@ -14,7 +14,7 @@ from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, run_swe
 from isocharge.train.report import QUICK, write_report
 from isocharge.train.report.build import inner_radius
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 MODEL = ROOT / "models" / "three-25um-biaxial" / "1"
 PICTURES = {"latency", "throughput", "memory", "maps", "force", "calibration", "noise", "effects"}
 

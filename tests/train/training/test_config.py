@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from isocharge.errors import ConfigError
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, load_config
 
-CONFIGS = Path(__file__).parents[2] / "train" / "configs"
+CONFIGS = Path(__file__).parents[3] / "train" / "configs"
 
 
 def write(folder, text):

@@ -13,7 +13,7 @@ from isocharge.serve.model.golden import check_answers
 from isocharge.serve.model.repository import model_names
 from isocharge.serve.model.session import OUTPUTS
 
-MODELS = Path(__file__).parents[2] / "models"
+MODELS = Path(__file__).parents[3] / "models"
 PACKAGE = "onnxruntime-web@1"
 
 SCRIPT = """

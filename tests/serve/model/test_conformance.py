@@ -13,7 +13,7 @@ from isocharge.serve import Predictor, check_golden, find_model, load_model
 from isocharge.serve.model.repository import model_names
 from isocharge.serve.model.session import OUTPUTS
 
-MODELS = Path(__file__).parents[2] / "models"
+MODELS = Path(__file__).parents[3] / "models"
 NAMES = model_names(MODELS)
 
 

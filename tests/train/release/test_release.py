@@ -20,7 +20,7 @@ from isocharge.train.release.evaluate import measure_errors
 QUICK = FitConfig(
     NetworkConfig((24, 24), (24, 24)), TrainingConfig(steps=200, misfit_steps=50, misfit_charges=2_000, batch=256)
 )
-MODELS = Path(__file__).parents[2] / "models"
+MODELS = Path(__file__).parents[3] / "models"
 LOW, HIGH, RADIUS = 0.05, 2.0, 8.0
 
 

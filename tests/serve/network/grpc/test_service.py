@@ -21,7 +21,7 @@ from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.tls import Tls
 from isocharge.serve.network.token import Token
 
-PROTO = Path(__file__).parents[2] / "serve/isocharge/serve/grpc/inference.proto"
+PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inference.proto"
 
 
 @pytest.fixture
