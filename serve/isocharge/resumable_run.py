@@ -23,8 +23,8 @@ from isocharge.files import new_folder, refuse_existing, sha256_of, sync_folder,
 from isocharge.progress import Warn
 
 
-class Draft:
-    """Finished parts of a run; `open_draft` makes one.
+class ResumableRun:
+    """Finished parts of a run; `resume_folder` makes one.
 
     Attributes:
         target: The folder that the run makes.
@@ -42,7 +42,7 @@ class Draft:
         Raises:
             OutputError: If the file system refuses; what was saved before stays.
         """
-        with refusals(self.target):
+        with output_errors(self.target):
             write_whole(self._place(name, final), data)
             write_whole(self._parts / f"{name}.sha256", sha256_of(data).encode())
 
@@ -68,7 +68,7 @@ class Draft:
 
     def tidy(self) -> None:
         """Make the folders, and remove what a killed process was just writing."""
-        with refusals(self.target):
+        with output_errors(self.target):
             for folder in (self._parts, self.data):
                 folder.mkdir(exist_ok=True)
                 for torn in folder.glob(".*.draft"):
@@ -76,7 +76,7 @@ class Draft:
 
     def publish(self) -> None:
         """Give the data the target's name, in a way that survives a power cut, and remove the draft."""
-        with refusals(self.target):
+        with output_errors(self.target):
             sync_folder(self.data)
             refuse_existing(self.target)
             self.data.rename(self.target)
@@ -96,16 +96,16 @@ def draft_of(target: Path) -> Path:
 
 def refuse_finished(target: Path) -> None:
     """Raise OutputExists if the target is already there."""
-    draft = Draft(target)
+    draft = ResumableRun(target)
     if target.exists() and (draft.folder / "run.json").is_file() and not draft.data.exists():
         draft.remove()  # its process was killed after the target had its name and before the draft was gone
     refuse_existing(target)
 
 
 @contextmanager
-def open_draft(
+def resume_folder(
     target: Path, identity: Mapping[str, Any], *, fresh: bool = False, warn: Warn = warnings.warn
-) -> Iterator[Draft]:
+) -> Iterator[ResumableRun]:
     """Begin a run, or go on with one that was stopped; the target appears when the block ends well.
 
     Args:
@@ -122,18 +122,18 @@ def open_draft(
         OutputExists: If the target is already there, or the draft is another run's or in use.
         OutputError: If the file system refuses.
     """
-    with keep_draft(target, identity, fresh=fresh, warn=warn) as draft:
+    with resume_parts(target, identity, fresh=fresh, warn=warn) as draft:
         yield draft
         draft.publish()
 
 
 @contextmanager
-def keep_draft(
+def resume_parts(
     target: Path, identity: Mapping[str, Any], *, fresh: bool = False, warn: Warn = warnings.warn
-) -> Iterator[Draft]:
-    """As `open_draft`, but the block makes the target itself; the draft is gone when it ends well."""
+) -> Iterator[ResumableRun]:
+    """As `resume_folder`, but the block makes the target itself; the draft is gone when it ends well."""
     refuse_finished(target)
-    draft = Draft(target, warn)
+    draft = ResumableRun(target, warn)
     parents = [parent for parent in target.parents if not parent.exists()]
     try:
         with _claim(draft, json.loads(json.dumps(identity)), fresh):
@@ -152,14 +152,14 @@ def keep_draft(
 
 
 @contextmanager
-def _claim(draft: Draft, identity: dict[str, Any], fresh: bool) -> Iterator[None]:
+def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterator[None]:
     """Hold the draft of this run, made if there is none."""
     folder = draft.folder
     if fresh and (folder / "run.json").is_file():
         with _lock(folder):
             draft.remove()
     if not folder.exists():
-        with refusals(draft.target), new_folder(folder) as made:
+        with output_errors(draft.target), new_folder(folder) as made:
             (made / "lock").touch()
             write_whole(made / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
     with _lock(folder):
@@ -168,7 +168,7 @@ def _claim(draft: Draft, identity: dict[str, Any], fresh: bool) -> Iterator[None
 
 
 @contextmanager
-def refusals(target: Path) -> Iterator[None]:
+def output_errors(target: Path) -> Iterator[None]:
     """Say it in our words if the file system refuses."""
     try:
         yield
@@ -177,7 +177,7 @@ def refusals(target: Path) -> Iterator[None]:
             raise
         cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
         kept = f"what is done is kept in {draft_of(target)}; the same command goes on"
-        hint = "choose another output" if Draft(target).is_empty() else kept
+        hint = "choose another output" if ResumableRun(target).is_empty() else kept
         raise OutputError(f"{target} cannot be written: {cause.strerror or cause}; {hint}") from error
 
 

@@ -17,7 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 from isocharge.serve import ModelMetadata, Predictor, write_model
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import App, HttpServer
-from isocharge.serve.network.model_store import open_shelf
+from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 
 NAMES = ("A", "B", "C", "D")
@@ -144,7 +144,7 @@ def shelf(film, tmp_path):
     """The linear model in two versions, in a folder of the test's own."""
     film.write(tmp_path / "models")
     film.write(tmp_path / "models", version=2)
-    return open_shelf(tmp_path / "models")
+    return open_model_store(tmp_path / "models")
 
 
 @pytest.fixture

@@ -13,8 +13,8 @@ import pytest
 
 from isocharge.serve import Frame, TextParser, encode_frame, flags, load_device
 from isocharge.serve.frames.cobs import cobs_decode
-from isocharge.serve.network.limits import Limits
-from isocharge.serve.network.model_store import open_shelf
+from isocharge.serve.network.limits import ServerLimits
+from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 
 SERVE = Path(__file__).parents[2] / "serve"
@@ -33,7 +33,7 @@ def test_frame_example():
 @pytest.mark.parametrize("example", EXAMPLES, ids=range(len(EXAMPLES)))
 def test_example_runs(example, capsys, start_http):
     if "127.0.0.1:8000" in example:
-        example = example.replace("127.0.0.1:8000", start_http(Handler(open_shelf())).url.removeprefix("http://"))
+        example = example.replace("127.0.0.1:8000", start_http(Handler(open_model_store())).url.removeprefix("http://"))
     exec(compile(example, "serve/README.md", "exec"), {})
     assert capsys.readouterr().out
 
@@ -61,7 +61,7 @@ def test_every_option_and_bound_is_the_command_s():
     ).stdout
     section = README[README.index("## Over HTTP") : README.index("### How fast")]
     assert all(option in text for option in re.findall(r"`(--[a-z-]+)`", section))
-    limits = Limits()
+    limits = ServerLimits()
     assert f"| {limits.batch} |" in section
     assert (limits.header_seconds, limits.body_seconds, limits.idle_seconds) == (10.0, 30.0, 75.0)
     assert (limits.body_bytes, limits.header_bytes, limits.connections) == (1 << 20, 16 << 10, 1024)

@@ -27,7 +27,7 @@ from isocharge.simulate import (
     load_sensor,
     write_sweep,
 )
-from isocharge.simulate.mechanics.scaling import Groups
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.elements import Geometry
 from isocharge.simulate.mesh.placement import Placement, place, template_for
 from isocharge.simulate.mesh.template import Template
@@ -203,7 +203,7 @@ def made_up() -> Callable[..., Equilibrium]:
         template = template_for(probe, resolution)
         z = place(of, probe, at, resolution, 0.05).element_points(template).ravel()[template.first_seen]
         values = field(np.stack([z.real, z.imag], axis=1))
-        groups = Groups(amplitude2, 1.0, 0.0, 0.0, of.poisson)
+        groups = DimensionlessGroups(amplitude2, 1.0, 0.0, 0.0, of.poisson)
         return Equilibrium(
             of, probe, at, 1.0, theory, resolution, 0.05, values, groups, "converged", "made up", 0, 0.0, 0.0
         )

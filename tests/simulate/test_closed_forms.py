@@ -22,7 +22,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.mechanics.theory import named
+from isocharge.simulate.mechanics.theory import theory_by_name
 
 REFINED = Resolution(order=7, around=8, rings=6)
 WITH_RIM = Resolution(order=7, around=8, rings=6, rim=2)
@@ -275,7 +275,7 @@ def uniform(theory: str, film: Film, force: float) -> tuple[float, Callable[[flo
 def test_stress_and_charge_that_a_uniform_load_induces(name, film, force):
     probe, sensor = Circle(0.9999 * film.radius), replace(load_sensor("four-25um-uniaxial"), film=film)
     height, stress = uniform(name, film, force / 0.9999**2)
-    linear = named(name, film)
+    linear = theory_by_name(name, film)
     for theory in (linear, replace(linear, stretching=True)):
         resolution = Resolution(8, 8, 3, 2 if theory.bending else 0)
         solved = press(film, probe, (0.0, 0.0), force, theory=theory, resolution=resolution, layer=0.02)

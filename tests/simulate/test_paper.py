@@ -17,7 +17,7 @@ from isocharge.simulate.paper import solves as study
 from isocharge.simulate.paper.choices import PAPER, normalised_cubic
 from isocharge.simulate.paper.equation_4 import ChargeForce
 from isocharge.simulate.paper.figure_layouts import trilaterate
-from isocharge.simulate.paper.solves import Presses, build_map, solve_presses
+from isocharge.simulate.paper.solves import SolveJob, build_map, solve_presses
 from isocharge.simulate.plots import figure as drawing
 
 FIGURES = [f"Fig. {number}" for number in range(1, 13)]
@@ -109,7 +109,7 @@ def test_charges_on_the_page_are_presses(numbers):
     angle, distance = np.deg2rad(found["angle_deg"][2]), 1e-3 * found["distance_mm"][1]
     at = (float(distance * np.cos(angle)), float(-10e-3 + distance * np.sin(angle)))
     sensor = replace(load_sensor("three-25um-biaxial"), readout="edge")
-    direct = 1e12 * solve_presses(Presses((sensor,), SMALL.triangle, (at,), (1.0,)))[0, 0, 0]
+    direct = 1e12 * solve_presses(SolveJob((sensor,), SMALL.triangle, (at,), (1.0,)))[0, 0, 0]
     assert found["charge_pC"][2][1] == pytest.approx(direct, rel=2e-3)
 
 

@@ -12,7 +12,7 @@ import pytest
 import tritonclient.grpc
 
 from isocharge.cli.serve.http import BATCH, BODY_BYTES, CONNECTIONS, HEADER_S, IDLE_S
-from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.limits import ServerLimits
 
 BODY = json.dumps(
     {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}]}
@@ -142,7 +142,7 @@ def test_bad_starts(start, models, tmp_path):
 
 
 def test_the_options_defaults_are_the_limits():
-    limits = Limits()
+    limits = ServerLimits()
     assert (limits.batch, limits.body_bytes, limits.connections) == (BATCH, BODY_BYTES, CONNECTIONS)
     assert (limits.idle_seconds, limits.header_seconds) == (IDLE_S, HEADER_S)
 

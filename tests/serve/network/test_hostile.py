@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve.network.model_store import open_shelf
+from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 
 INFER = "/v2/models/linear/infer"
@@ -19,7 +19,7 @@ SETTINGS = settings(max_examples=300, derandomize=True, deadline=None)
 
 @pytest.fixture(scope="module")
 def handler(models):
-    return Handler(open_shelf(models))
+    return Handler(open_model_store(models))
 
 
 def check(response):

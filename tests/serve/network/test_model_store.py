@@ -10,7 +10,7 @@ import pytest
 
 from isocharge.errors import ModelError, ModelNotFound
 from isocharge.files import sha256_of
-from isocharge.serve.network.model_store import open_shelf
+from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol.infer import InferRequest, infer
 
 
@@ -51,7 +51,7 @@ DAMAGE = {
 def test_latest_is_by_number(film, tmp_path):
     for version in (2, 10, 9):
         film.write(tmp_path, version=version)
-    shelf = open_shelf(tmp_path)
+    shelf = open_model_store(tmp_path)
     assert shelf.get("linear").version == "10"
     assert shelf.get("linear", "9").version == "9"
     assert shelf.versions("linear") == ["2", "9", "10"]
@@ -63,7 +63,7 @@ def test_a_damaged_version_is_refused_and_others_serve(film, tmp_path, how, said
         film.write(tmp_path, version=version)
     film.write(tmp_path, name="other")
     spoil(tmp_path / "linear/2", how)
-    shelf = open_shelf(tmp_path)
+    shelf = open_model_store(tmp_path)
     assert shelf.get("linear").version == "1"
     assert states(shelf) == [("linear", "1", "READY"), ("linear", "2", "UNAVAILABLE"), ("other", "1", "READY")]
     (reason,) = shelf.refusals()
@@ -77,7 +77,7 @@ def test_a_model_in_another_ones_folder_is_refused(film, tmp_path):
     film.write(tmp_path)
     shutil.copytree(tmp_path / "linear", tmp_path / "other")
     shutil.copytree(tmp_path / "linear/1", tmp_path / "linear/2")
-    shelf = open_shelf(tmp_path)
+    shelf = open_model_store(tmp_path)
     assert [served.metadata.label for served in shelf.all()] == ["linear/1"]
     assert all(
         f"expected the model {name}" in reason
@@ -89,18 +89,18 @@ def test_a_model_in_another_ones_folder_is_refused(film, tmp_path):
 def test_a_folder_without_models(tmp_path, make):
     make(tmp_path / "models")
     with pytest.raises(ModelError, match=r"models: expected models, <name>/<version>/model.onnx, found none"):
-        open_shelf(tmp_path / "models")
+        open_model_store(tmp_path / "models")
 
 
 def test_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(ModelError, match="nowhere: expected a folder of models"):
-        open_shelf(tmp_path / "nowhere")
+        open_model_store(tmp_path / "nowhere")
 
 
 def test_no_sound_model_at_all(film, tmp_path):
     spoil(film.write(tmp_path), "bytes")
     with pytest.raises(ModelError, match=r"no model can be served: .*damaged or changed"):
-        open_shelf(tmp_path)
+        open_model_store(tmp_path)
 
 
 @pytest.mark.parametrize(("how", "said"), DAMAGE.items())

@@ -6,7 +6,7 @@ import pytest
 from isocharge.errors import TareError
 from isocharge.serve import Chain, TareRule, TouchRule
 from isocharge.serve.signal_chain.chain import ChainState, advance
-from isocharge.serve.signal_chain.contact import Touch, next_touch
+from isocharge.serve.signal_chain.contact import Touch, update_contact
 from isocharge.serve.signal_chain.tare import measure_tare
 
 RULE, OFFSET = TareRule(), np.array([12.0, -7.0, 3.0])
@@ -83,7 +83,7 @@ def test_a_new_tare_is_waited_for_for_ever():
 def touches(totals, rule=None, noise=ONE_PC):
     touch, seen = Touch(), []
     for total in totals:
-        touch = next_touch(rule or TouchRule(), touch, total, noise)
+        touch = update_contact(rule or TouchRule(), touch, total, noise)
         seen.append(touch.contact)
     return seen
 
@@ -153,7 +153,7 @@ def test_a_base_that_relaxes_to_zero_is_no_touch():
     def contacts(keep):
         touch, seen = Touch(last_pC=-100.0, base_pC=-100.0), False
         for total in totals.tolist():
-            touch = next_touch(TouchRule(), touch, total, ONE_PC, keep)
+            touch = update_contact(TouchRule(), touch, total, ONE_PC, keep)
             seen |= touch.contact
         return seen
 

@@ -11,7 +11,7 @@ import pytest
 from isocharge.serve.signal_chain.chain import ChainState
 from isocharge.serve.signal_chain.leak import Leak
 from isocharge.serve.signal_chain.tare import Tare
-from isocharge.serve.signal_chain.thermal import NO_WARMING, CommonModeRule, follow_warming
+from isocharge.serve.signal_chain.thermal import NO_DRIFT, ThermalRule, track_thermal_drift
 
 ANGLE = 2 * np.pi * np.arange(4) / 4
 ALIKE = np.column_stack([np.ones(4), np.cos(ANGLE) / 20, np.sin(ANGLE) / 20])
@@ -25,10 +25,10 @@ def misfit_of(film, sigma_pC=2.0):
 
 def warmed(film, ramp_pC, seed=0):
     """The common charge that is found while it rises in steps of 50 ms."""
-    press, rng, state, found = film @ [850.0, 3.0, -2.0], np.random.default_rng(seed), NO_WARMING, []
+    press, rng, state, found = film @ [850.0, 3.0, -2.0], np.random.default_rng(seed), NO_DRIFT, []
     for common_pC in ramp_pC:
         charge_pC = press + common_pC - state.charge_pC + rng.normal(0, 0.5, 4)
-        state = follow_warming(CommonModeRule(), state, charge_pC, misfit_of(film), 0.05)
+        state = track_thermal_drift(ThermalRule(), state, charge_pC, misfit_of(film), 0.05)
         found.append(state.charge_pC)
     return np.array(found), state
 
@@ -53,9 +53,9 @@ def test_a_quiet_film_stays_quiet():
 
 
 def test_the_model_is_asked_twenty_times_a_second():
-    asked, state = [], NO_WARMING
+    asked, state = [], NO_DRIFT
     for _ in range(1000):
-        state = follow_warming(CommonModeRule(), state, np.ones(4), lambda q: asked.append(q) or np.ones(5), 0.001)
+        state = track_thermal_drift(ThermalRule(), state, np.ones(4), lambda q: asked.append(q) or np.ones(5), 0.001)
     assert 19 <= len(asked) <= 20
 
 

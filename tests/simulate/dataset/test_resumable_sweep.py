@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from isocharge.errors import OutputExists, SceneError, SolveError
-from isocharge.resumable_run import draft_of, open_draft
+from isocharge.resumable_run import draft_of, resume_folder
 from isocharge.simulate import Circle, Resolution, Sweep, Theory, load_sensor, run_sweep
-from isocharge.simulate.solver.settings import Solver
+from isocharge.simulate.solver.settings import SolveSettings
 
 SENSOR = load_sensor("three-25um-biaxial")
-QUICK = Solver(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
+QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
 SWEEP = Sweep(radius=3e-3, force_range=(1.0, 1.0), samples=60, seed=7)
 
 
@@ -107,7 +107,7 @@ def test_what_does_not_change_the_bytes_may_change(stopped, whole):
     [
         ({"sweep": replace(SWEEP, samples=70)}, "sweep.samples is 60 there, 70 here"),
         ({"probes": (Circle(2e-3),)}, r"probes is \['circle:1.0@0'\] there, \['circle:2.0@0'\] here"),
-        ({"solver": Solver()}, "solver.resolution is .*; solver.theory is"),
+        ({"solver": SolveSettings()}, "solver.resolution is .*; solver.theory is"),
         ({"shard": 20}, "shard is 10 there, 20 here"),
     ],
 )  # fmt: skip
@@ -210,7 +210,7 @@ def test_an_existing_target_keeps_its_draft(stopped):
 
 
 def save_and_raise(target: Path, error: BaseException) -> None:
-    with open_draft(target, {"a": (1, 2)}) as draft:
+    with resume_folder(target, {"a": (1, 2)}) as draft:
         draft.save("part", b"1")
         raise error
 
@@ -225,7 +225,7 @@ def test_what_would_fail_again_leaves_nothing(tmp_path, error):
 def test_a_part_is_what_was_saved(tmp_path):
     with pytest.raises(Stopped):
         save_and_raise(tmp_path / "out", Stopped())
-    with open_draft(tmp_path / "out", {"a": [1, 2]}) as draft:
+    with resume_folder(tmp_path / "out", {"a": [1, 2]}) as draft:
         assert draft.load("part") == b"1"
         assert draft.load("other") is None
         (draft.data / "file").write_bytes(b"2")

@@ -25,11 +25,11 @@ from isocharge.simulate import (
     write_sweep,
 )
 from isocharge.simulate.dataset.sweep import SHARD, TASK
-from isocharge.simulate.solver.settings import Solver
+from isocharge.simulate.solver.settings import SolveSettings
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
-QUICK = Solver(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
+QUICK = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
 """A coarse membrane: half a second for a small family."""
 
 

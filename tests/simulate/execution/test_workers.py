@@ -15,10 +15,10 @@ from isocharge.errors import InputError, MissingExtra, WorkersLost
 from isocharge.simulate import Circle, Resolution, Sweep, Theory, load_sensor, run_sweep
 from isocharge.simulate.execution import workers as module
 from isocharge.simulate.execution.workers import Workers, dask_workers, local_workers
-from isocharge.simulate.solver.settings import Solver
+from isocharge.simulate.solver.settings import SolveSettings
 
 SENSOR = load_sensor("three-25um-biaxial")
-QUICK = Solver(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
+QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
 SWEEP = Sweep(radius=3e-3, force_range=(1.0, 1.0), samples=60, seed=7, orientation="random")
 
 
@@ -100,7 +100,7 @@ def waited(seconds: float) -> float:
 def test_a_worker_with_another_isocharge_is_refused(monkeypatch):
     """Its bytes might differ."""
     function = module.Checked(waited)
-    monkeypatch.setattr(module, "made_by", lambda: "isocharge 9.9")
+    monkeypatch.setattr(module, "code_fingerprint", lambda: "isocharge 9.9")
     with pytest.raises(WorkersLost, match=r"a worker runs isocharge 9\.9, expected isocharge 0\.1\.0 \([0-9a-f]{12}\)"):
         function(0.0)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import ChargeFunction, ChargeSpline, Circle, ForwardMap, load_sensor, noise_model, working_area
-from isocharge.simulate.identifiability.ambiguities import find_twins, nearest_contact
+from isocharge.simulate.identifiability.ambiguities import find_ambiguous_pairs, nearest_contact
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import fold_points, scaled_jacobian, singular_values, turned_over
 from isocharge.simulate.numerics.disk import Rings
@@ -81,7 +81,7 @@ def test_singular_values_are_the_deviations_by_direction():
 
 
 def test_twins_are_mirror_images_in_the_crease():
-    twins = find_twins(creased(), REFERENCE, 0.5, places=400)
+    twins = find_ambiguous_pairs(creased(), REFERENCE, 0.5, places=400)
     assert len(twins) > 20
     assert twins.first[:, 0] + twins.second[:, 0] == pytest.approx(2.0 * CREASE, abs=5e-4)
     assert twins.first[:, 1] == pytest.approx(twins.second[:, 1], abs=5e-4)
@@ -91,7 +91,7 @@ def test_twins_are_mirror_images_in_the_crease():
 
 
 def test_no_twins_where_the_sides_are_told_apart():
-    assert len(find_twins(creased(300.0), REFERENCE, 0.5, places=400)) == 0
+    assert len(find_ambiguous_pairs(creased(300.0), REFERENCE, 0.5, places=400)) == 0
 
 
 def test_the_nearest_contact_is_the_right_one():
@@ -149,7 +149,7 @@ def test_four_electrodes_are_usable_to_8_or_10_mm(area, name):
 
 def test_twins_of_a_biaxial_film_are_mirror_images_in_the_electrodes_circle(charges):
     """Inversion: the product of their distances from the centre is the square of the circle's radius, 10 mm."""
-    twins = find_twins(charges("four-25um-biaxial"), REFERENCE, 1.0, places=400)
+    twins = find_ambiguous_pairs(charges("four-25um-biaxial"), REFERENCE, 1.0, places=400)
     product = np.hypot(*twins.first[:, :2].T) * np.hypot(*twins.second[:, :2].T)
     assert len(twins) > 10
     assert np.median(product) == pytest.approx(1e-4, rel=0.05)

@@ -19,10 +19,10 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.identifiability.identification import identify, map_to_search, search_radius
 from isocharge.simulate.identifiability.probe_discrimination import (
+    explain_with_other_probe,
     inner_forces,
-    mistake,
+    radius_limits,
     size_limit,
-    size_told,
     spread_contacts,
 )
 
@@ -112,7 +112,7 @@ def test_what_no_charge_tells_is_not_told():
 
 def test_taken_for_another_probe():
     contact = spread_contacts(3e-3, 1.0, 50)
-    same, other = (mistake(sized(radius), sized(1e-3), REFERENCE, contact) for radius in (1e-3, 4e-3))
+    same, other = (explain_with_other_probe(sized(radius), sized(1e-3), REFERENCE, contact) for radius in (1e-3, 4e-3))
     assert same.sigmas == pytest.approx(0.0, abs=1e-3)
     assert same.shift == pytest.approx(0.0, abs=1e-8)
     assert (other.sigmas > 10.0).all()
@@ -137,7 +137,7 @@ def test_uniaxial_charges_tell_the_size_and_biaxial_ones_do_not(film):
 def test_size_needs_a_circle_and_four_charges(film, found):
     three = replace(film, sensor=load_sensor("three-25um-biaxial"))
     with pytest.raises(SceneError, match="at least four charges for x, y, F and the radius, got 3"):
-        size_told(three, found.charges, REFERENCE, [1.0], 4e-3)
+        radius_limits(three, found.charges, REFERENCE, [1.0], 4e-3)
 
 
 def test_forces_keep_off_the_ends():

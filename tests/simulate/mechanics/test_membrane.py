@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from isocharge.simulate import Circle, Polygon, Resolution
 from isocharge.simulate.mechanics.membrane import Membrane
-from isocharge.simulate.mechanics.scaling import Groups
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mechanics.stress import strain, stress, turn_stress
 
 
-def groups(amplitude2: float, tension: float, poisson: float = 0.34) -> Groups:
-    return Groups(amplitude2, 0.0, tension, 0.0, poisson)
+def groups(amplitude2: float, tension: float, poisson: float = 0.34) -> DimensionlessGroups:
+    return DimensionlessGroups(amplitude2, 0.0, tension, 0.0, poisson)
 
 
 def physical(slope: np.ndarray, amplitude2: float) -> np.ndarray:

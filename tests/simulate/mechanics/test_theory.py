@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from isocharge.errors import SceneError
 from isocharge.simulate import Circle, Film, Polygon, Theory, load_sensor, press, theory_for, touch_charge
-from isocharge.simulate.mechanics.scaling import Groups, amplitude_squared
-from isocharge.simulate.mechanics.theory import bending_length, choose, left_out, named
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared
+from isocharge.simulate.mechanics.theory import bending_length, choose_theory, modelling_error, theory_by_name
 
 PROBE, AT = Circle(1e-3), (3e-3, -2e-3)
 
@@ -42,19 +42,19 @@ def test_named_gives_what_was_named(film, name, tense):
     film = thick(film, 25.0, 1.0 if tense else 0.0)
     if name == "linear membrane" and not tense:
         with pytest.raises(SceneError, match="'linear membrane': a film without pretension has no stiffness in it"):
-            named(name, film)
+            theory_by_name(name, film)
     elif name.startswith("pre-tensioned") and not tense:
         with pytest.raises(SceneError, match=f"theory: expected one of .* got '{name}'"):
-            named(name, film)
+            theory_by_name(name, film)
     else:
-        found = named(name, film)
+        found = theory_by_name(name, film)
         assert found.name.removeprefix("pre-tensioned ") == name.removeprefix("pre-tensioned ")
         assert found.pretensioned == tense
 
 
 def test_unknown_name_is_shown(film):
     with pytest.raises(SceneError, match=r"theory: expected one of \['linear membrane', .*\], got 'shell'"):
-        named("shell", film)
+        theory_by_name("shell", film)
 
 
 @pytest.mark.parametrize(
@@ -73,13 +73,13 @@ def test_unknown_name_is_shown(film):
 )
 def test_choice(film, thickness_um, pretension_MPa, force, accuracy, name):
     film = thick(film, thickness_um, pretension_MPa)
-    assert choose(film, PROBE, force, accuracy).name == name
+    assert choose_theory(film, PROBE, force, accuracy).name == name
     assert press(film, PROBE, AT, force, accuracy=max(accuracy, 1e-4)).theory.pretensioned == (pretension_MPa > 0.0)
 
 
 def test_taut_thin_film_under_a_feather_is_linear(film):
     for thickness_um in (2.0, 25.0, 200.0):
-        assert not choose(thick(film, thickness_um, 10.0), PROBE, 1e-6, 1e-3).stretching
+        assert not choose_theory(thick(film, thickness_um, 10.0), PROBE, 1e-6, 1e-3).stretching
 
 
 @given(
@@ -92,10 +92,10 @@ def test_taut_thin_film_under_a_feather_is_linear(film):
 def test_choice_is_within_the_accuracy_or_everything(thickness, pretension, force, accuracy):
     """And asking for more never takes a term away."""
     film = Film(45e-3, thickness, 3e9, 0.34, pretension)
-    theory, finer = choose(film, PROBE, force, accuracy), choose(film, PROBE, force, 0.1 * accuracy)
-    assert theory.name.endswith("+ bending") or left_out(film, PROBE, force, theory) <= accuracy
-    assert left_out(film, PROBE, force, finer) <= left_out(film, PROBE, force, theory)
-    assert left_out(film, PROBE, force, Theory(True, True, pretension > 0.0)) == 0.0
+    theory, finer = choose_theory(film, PROBE, force, accuracy), choose_theory(film, PROBE, force, 0.1 * accuracy)
+    assert theory.name.endswith("+ bending") or modelling_error(film, PROBE, force, theory) <= accuracy
+    assert modelling_error(film, PROBE, force, finer) <= modelling_error(film, PROBE, force, theory)
+    assert modelling_error(film, PROBE, force, Theory(True, True, pretension > 0.0)) == 0.0
 
 
 @given(
@@ -112,7 +112,7 @@ def test_amplitude_solves_its_cubic(thickness, pretension, force, poisson):
     b = (thickness / 45e-3) ** 2 / (12.0 * (1.0 - poisson**2))
     total = a**3 + (1.6 * pretension / 3e9 + 16.0 * np.pi * b) * a
     assert total == pytest.approx(force / (3e9 * thickness * 45e-3), rel=1e-7)
-    groups = Groups.of(film, force, bending=True)
+    groups = DimensionlessGroups.of(film, force, bending=True)
     assert groups.height == pytest.approx(1.0, rel=1e-6)
     assert 0.0 <= groups.induced <= 1.0 + 1e-6
 
@@ -132,7 +132,7 @@ def test_bending_length_follows_thickness_and_force(film):
 def test_theory_for_a_sensor_serves_all_forces_and_the_surface(film):
     """Linear at the small end, nonlinear at the other: nonlinear; a surface needs bending."""
     sensor = replace(load_sensor("three-25um-biaxial"), film=thick(film, 300.0))
-    assert choose(sensor.film, PROBE, 1e-4, 1e-3).name == "linear plate"
+    assert choose_theory(sensor.film, PROBE, 1e-4, 1e-3).name == "linear plate"
     assert theory_for(sensor, PROBE, (1e-4, 1e-4)).name == "linear plate"
     assert theory_for(sensor, PROBE, (1e-4, 5.0)).name == "nonlinear membrane + bending"
     thin = replace(sensor, film=thick(film, 1.0))
@@ -143,12 +143,14 @@ def test_theory_for_a_sensor_serves_all_forces_and_the_surface(film):
 def test_theory_can_be_overridden(film):
     """The wrong one too: it says how wrong."""
     film = thick(film, 1000.0)
-    membrane = press(film, PROBE, AT, 1.0, theory=named("nonlinear membrane", film))
+    membrane = press(film, PROBE, AT, 1.0, theory=theory_by_name("nonlinear membrane", film))
     assert membrane.theory.name == "nonlinear membrane"
     assert membrane.estimated_error == np.inf
-    plate = press(film, PROBE, AT, 1.0, theory=named("linear plate", film))
+    plate = press(film, PROBE, AT, 1.0, theory=theory_by_name("linear plate", film))
     assert 0.005 < plate.estimated_error < 0.5
-    assert press(film, PROBE, AT, 1.0, theory=named("nonlinear membrane + bending", film)).estimated_error < 1e-3
+    assert (
+        press(film, PROBE, AT, 1.0, theory=theory_by_name("nonlinear membrane + bending", film)).estimated_error < 1e-3
+    )
 
 
 def draw(rng: np.random.Generator) -> tuple[Film, Circle | Polygon, tuple[float, float], float]:
@@ -168,12 +170,16 @@ def draw(rng: np.random.Generator) -> tuple[Film, Circle | Polygon, tuple[float,
 def difference(scene: tuple, accuracy: float) -> tuple[float, float, str]:
     """Real error of what is left out (of the worst charge, over the press's largest), its estimate, and the theory."""
     film, probe, at, force = scene
-    theory = choose(film, probe, force, accuracy)
+    theory = choose_theory(film, probe, force, accuracy)
     sensor = replace(load_sensor("three-25um-uniaxial"), film=film)
     full = press(film, probe, at, force, theory=Theory(True, True, film.pretension > 0.0))
     simple = press(film, probe, at, force, theory=theory, resolution=full.resolution, layer=full.layer)
     exact, charge = touch_charge(sensor, full), touch_charge(sensor, simple)
-    return float(np.abs(charge - exact).max() / np.abs(exact).max()), left_out(film, probe, force, theory), theory.name
+    return (
+        float(np.abs(charge - exact).max() / np.abs(exact).max()),
+        modelling_error(film, probe, force, theory),
+        theory.name,
+    )
 
 
 def scenes(seed: int, count: int, accuracy: float) -> list[tuple]:
@@ -181,7 +187,7 @@ def scenes(seed: int, count: int, accuracy: float) -> list[tuple]:
     rng, found = np.random.default_rng(seed), []
     while len(found) < count:
         scene = draw(rng)
-        if left_out(scene[0], scene[1], scene[3], choose(scene[0], scene[1], scene[3], accuracy)) > 0.0:
+        if modelling_error(scene[0], scene[1], scene[3], choose_theory(scene[0], scene[1], scene[3], accuracy)) > 0.0:
             found.append(scene)
     return found
 
@@ -208,4 +214,4 @@ def test_bending_matters_at_a_small_probe_on_a_taut_film(film):
     scene = (thick(film, 20.0, 10.0), Circle(0.1e-3), (5e-3, 3e-3), 1e-4)
     error, bound, name = difference(scene, 1e-2)
     assert error <= max(bound, 1e-5), (name, error, bound)
-    assert left_out(scene[0], scene[1], scene[3], Theory(True, False, True)) > 0.1
+    assert modelling_error(scene[0], scene[1], scene[3], Theory(True, False, True)) > 0.1

@@ -5,7 +5,7 @@ import pytest
 
 from isocharge.simulate import Resolution
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.scaling import Groups
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.placement import template
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.solver.assembly import Assembly, assembly
@@ -57,7 +57,7 @@ def test_solution_is_the_dense_one(resolution, corners, components):
 @pytest.mark.parametrize("bending", [0.0, 1e-7, 1e-3, 10.0])
 def test_tangent_of_a_film_is_solved_like_the_dense_one(mesh, bending):
     """Badly scaled and, with bending, indefinite: a matrix that is factorised without pivoting."""
-    elastic = ElasticFilm(mesh.geometry, Groups(0.01, 1.0, 5.0 if bending == 0.0 else 0.0, bending, 0.34))
+    elastic = ElasticFilm(mesh.geometry, DimensionlessGroups(0.01, 1.0, 5.0 if bending == 0.0 else 0.0, bending, 0.34))
     field = 0.01 * mesh.random_field(1)
     matrix, right = elastic.tangent(field, 0.0 if bending == 0.0 else 1.0), -elastic.residual(field)
     solution = Assembly(mesh.template, elastic.components).factor(matrix).solve(right)

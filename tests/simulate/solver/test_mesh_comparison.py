@@ -8,7 +8,7 @@ import pytest
 from isocharge.errors import SolveError
 from isocharge.simulate import Circle, Film, Polygon, Probe, Theory, load_sensor, press, touch_charge
 from isocharge.simulate.mesh.placement import template_for
-from isocharge.simulate.solver.mesh_comparison import apart, needs_proof
+from isocharge.simulate.solver.mesh_comparison import needs_second_mesh, relative_difference
 
 FILM = Film(45e-3, 25e-6, 3e9, 0.34)
 SENSORS = ("three-25um-biaxial", "four-25um-uniaxial")
@@ -77,18 +77,18 @@ def test_apart_is_the_relative_difference():
     film = replace(FILM, pretension=5e6)
     one = press(film, Circle(1e-3), (9e-3, 0.0), 1e-5, theory=theory)
     more = press(film, Circle(1e-3), (9e-3, 0.0), 1.01e-5, theory=theory)
-    assert apart(one, one) == 0.0
-    assert apart(one, more) == pytest.approx(1.0 - 1.0 / 1.01**2, rel=1e-3)
+    assert relative_difference(one, one) == 0.0
+    assert relative_difference(one, more) == pytest.approx(1.0 - 1.0 / 1.01**2, rel=1e-3)
 
 
 def test_where_proof_is_needed():
     inside, rim = (9e-3, 0.0), (26.5e-3, 0.0)
-    assert not needs_proof(FILM, Circle(0.4e-3), rim, 1e-3)
-    assert needs_proof(FILM, Circle(0.6e-3), rim, 1e-3)
-    assert not needs_proof(FILM, Polygon.rectangle(4e-3, 2e-3), inside, 1e-3)
-    assert needs_proof(FILM, Polygon.rectangle(8e-3, 2e-3), inside, 1e-3)
-    assert not needs_proof(FILM, Circle(4.2e-3), inside, 1e-3)
-    assert needs_proof(FILM, Circle(1e-3), inside, 5e-4)
+    assert not needs_second_mesh(FILM, Circle(0.4e-3), rim, 1e-3)
+    assert needs_second_mesh(FILM, Circle(0.6e-3), rim, 1e-3)
+    assert not needs_second_mesh(FILM, Polygon.rectangle(4e-3, 2e-3), inside, 1e-3)
+    assert needs_second_mesh(FILM, Polygon.rectangle(8e-3, 2e-3), inside, 1e-3)
+    assert not needs_second_mesh(FILM, Circle(4.2e-3), inside, 1e-3)
+    assert needs_second_mesh(FILM, Circle(1e-3), inside, 5e-4)
 
 
 def test_a_proven_press_starts_its_neighbour():

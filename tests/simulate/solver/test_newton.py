@@ -8,7 +8,7 @@ import pytest
 
 from isocharge.errors import SceneError, SolveError
 from isocharge.simulate import Circle, Polygon, Resolution, Theory, load_sensor, press, touch_charge
-from isocharge.simulate.mechanics.scaling import Groups
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.solver import newton
 from isocharge.simulate.solver.assembly import Assembly, Factor
 from isocharge.simulate.solver.newton import schwerin_start
@@ -169,7 +169,7 @@ def test_start_has_about_the_right_height(film, pretension, thickness):
     film = replace(film, pretension=pretension, thickness=thickness)
     solved = press(film, Circle(1e-3), (0.0, 0.0), 0.1, theory=FULL)
     z = solved.placement.to_template(solved.placement.element_points(solved.mesh).ravel()[solved.mesh.first_seen])
-    start = schwerin_start(z, float(solved.placement.rho), Groups.of(film, 0.1, bending=True))
+    start = schwerin_start(z, float(solved.placement.rho), DimensionlessGroups.of(film, 0.1, bending=True))
     assert 0.5 < start[:, 2].max() / solved.field[:, 2].max() < 2.0
     assert not start[solved.mesh.on_rim].any()
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import noise_model
-from isocharge.train.baselines import Task
-from isocharge.train.data.domain import Domain
-from isocharge.train.data.presses import Presses
+from isocharge.train.baselines import FittingTask
+from isocharge.train.data.domain import ContactDomain
+from isocharge.train.data.presses import LabelledPresses
 
-DOMAIN = Domain(8.0, (0.05, 2.0))
+DOMAIN = ContactDomain(8.0, (0.05, 2.0))
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class KnownMap:
         radius, angle = DOMAIN.radius_mm * np.sqrt(rng.random(count)), 2.0 * np.pi * rng.random(count)
         force = np.exp(rng.uniform(*np.log(DOMAIN.force_range_N), count))
         contact = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force])
-        return Presses(contact, self.charge_pC(contact))
+        return LabelledPresses(contact, self.charge_pC(contact))
 
 
 @pytest.fixture(scope="session", params=[3, 4])
@@ -62,7 +62,9 @@ def known(request):
 
 @pytest.fixture(scope="session")
 def task(known):
-    return Task(known.presses(3000, 1), known.presses(500, 2), DOMAIN, noise_model("reference"), copies=2, quick=True)
+    return FittingTask(
+        known.presses(3000, 1), known.presses(500, 2), DOMAIN, noise_model("reference"), copies=2, quick=True
+    )
 
 
 @pytest.fixture(scope="session")

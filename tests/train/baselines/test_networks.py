@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from isocharge.simulate import noise_model
-from isocharge.train.baselines import Network, Task
+from isocharge.train.baselines import FittingTask, Network
 from isocharge.train.baselines.networks import (
     BoundNetwork,
     Folded,
@@ -15,7 +15,7 @@ from isocharge.train.baselines.networks import (
     contact_graph,
     contact_of,
 )
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 from isocharge.train.data.presses import domain_of, presses_of, split_by_position
 from isocharge.train.release.export import export_onnx
 from isocharge.train.training.network import Features, InverseNetwork
@@ -28,7 +28,7 @@ def network():
     """Untrained: the forms have to agree on any weights."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
-        made = InverseNetwork(Domain(8.0, (0.05, 2.0)), Features.fit(CHARGE), (24, 24), (8, 8))
+        made = InverseNetwork(ContactDomain(8.0, (0.05, 2.0)), Features.fit(CHARGE), (24, 24), (8, 8))
         torch.nn.init.normal_(made.contact.straight.weight, std=0.3)
         return made.eval()
 
@@ -77,7 +77,7 @@ def test_the_contact_cut_out_of_a_released_graph(network, forms):
 
 def test_fitting_goes_through_the_pipeline(dataset):
     train, held = split_by_position(presses_of(dataset), 0.1, 0)
-    task = Task(train, held, domain_of(dataset), noise_model("reference"))
+    task = FittingTask(train, held, domain_of(dataset), noise_model("reference"))
     network = Network(dataset, hidden=(8, 8), steps=20)
     assert network.name == "network 8-8"
     made = network.fit(task)

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import noise_model
-from isocharge.train.baselines import Task, Triangulate
-from isocharge.train.data.presses import Presses, domain_of, position_error, presses_of, split_by_position
+from isocharge.train.baselines import FittingTask, Triangulate
+from isocharge.train.data.presses import LabelledPresses, domain_of, position_error, presses_of, split_by_position
 
 
 @pytest.fixture(scope="module")
 def forms(dataset, film):
     train, held = split_by_position(presses_of(dataset), 0.1, 0)
-    return Triangulate(film).fit(Task(train, held, domain_of(dataset), noise_model("reference")))
+    return Triangulate(film).fit(FittingTask(train, held, domain_of(dataset), noise_model("reference")))
 
 
 def test_clean_presses_are_found(dataset, forms):
-    presses = Presses.of(dataset.samples)[np.arange(60)]
+    presses = LabelledPresses.of(dataset.samples)[np.arange(60)]
     for form in forms:
         contact = form.told(presses.contact[:, 2]).predict(presses.charge_pC)
         found = np.isfinite(contact[:, 0])

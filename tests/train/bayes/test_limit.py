@@ -9,7 +9,7 @@ from isocharge.errors import ChargeError, InputError
 from isocharge.simulate import ChargeSpline, Circle, noise_model
 from isocharge.train import BayesLimit, Scene, bayes_estimate, bayes_limit
 from isocharge.train.bayes import cache as cache_module
-from isocharge.train.bayes.cache import cache_folder, kept
+from isocharge.train.bayes.cache import cache_folder, cached
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +83,7 @@ def only_file():
 
 def test_a_result_is_computed_once():
     count = Counted()
-    results = [kept("thing", {"a": 1}, count) for _ in range(3)]
+    results = [cached("thing", {"a": 1}, count) for _ in range(3)]
     assert results == [{"value": 1.5, "all": [1, 2]}] * 3
     assert count.calls == 1
 
@@ -91,7 +91,7 @@ def test_a_result_is_computed_once():
 def test_another_key_is_another_result():
     count = Counted()
     for key in ({"a": 1}, {"a": 2}, {"a": 1, "b": 0}, {"a": 1}):
-        kept("thing", key, count)
+        cached("thing", key, count)
     assert count.calls == 3
 
 
@@ -108,13 +108,13 @@ def test_another_key_is_another_result():
 )
 def test_a_damaged_file_is_computed_anew(damage):
     count = Counted()
-    kept("thing", {"a": 1}, count)
+    cached("thing", {"a": 1}, count)
     path = only_file()
     path.write_text(damage(path.read_text()))
-    assert kept("thing", {"a": 1}, count)["value"] == 1.5
+    assert cached("thing", {"a": 1}, count)["value"] == 1.5
     assert count.calls == 2
     assert json.loads(path.read_text())["result"]["value"] == 1.5
-    assert kept("thing", {"a": 1}, count)["value"] == 1.5
+    assert cached("thing", {"a": 1}, count)["value"] == 1.5
     assert count.calls == 2
 
 
@@ -122,7 +122,7 @@ def test_where_nothing_can_be_kept_it_still_answers(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("ISOCHARGE_CACHE", str(tmp_path / "file" / "below"))
     with pytest.warns(UserWarning, match="cannot be kept"):
-        assert kept("thing", {"a": 1}, Counted())["value"] == 1.5
+        assert cached("thing", {"a": 1}, Counted())["value"] == 1.5
 
 
 def test_where_it_is_kept(monkeypatch, tmp_path):

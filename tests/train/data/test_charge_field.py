@@ -5,7 +5,7 @@ import pytest
 
 from isocharge.errors import TrainingError
 from isocharge.train.data.charge_field import ChargeField
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 
 FORCES = (0.05, 2.0)
 
@@ -50,7 +50,7 @@ def test_the_series_is_what_numpy_evaluates(field):
 
 def test_a_known_series_is_recovered():
     """Charges made from a polynomial of low degree come back, but for the ridge."""
-    domain, rng = Domain(5.0, (0.1, 1.0)), np.random.default_rng(0)
+    domain, rng = ContactDomain(5.0, (0.1, 1.0)), np.random.default_rng(0)
 
     def charges(contact):
         x, y, force = contact.T
@@ -70,4 +70,4 @@ def test_a_known_series_is_recovered():
 def test_too_few_presses():
     contact, charge = presses(50, seed=0), np.ones((50, 3))
     with pytest.raises(TrainingError, match="expected at least 448 presses"):
-        ChargeField.fit(Domain(8.0, FORCES), contact, charge, (contact, charge))
+        ChargeField.fit(ContactDomain(8.0, FORCES), contact, charge, (contact, charge))

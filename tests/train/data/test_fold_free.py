@@ -9,8 +9,8 @@ from isocharge.errors import DatasetError
 from isocharge.simulate import ChargeFunction, Circle, Sweep, load_sensor, noise_model, read_dataset, run_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network
 from isocharge.train.data.charge_field import ChargeField
-from isocharge.train.data.domain import Domain
-from isocharge.train.data.fold_free import FieldModel, unfolded
+from isocharge.train.data.domain import ContactDomain
+from isocharge.train.data.fold_free import FieldModel, fold_free_domain
 
 TINY = FitConfig(NetworkConfig((8, 8), (8, 8)), TrainingConfig(steps=5, misfit_steps=5, misfit_charges=1_000))
 
@@ -19,7 +19,7 @@ def field_of(charges, radius=8.0):
     rng = np.random.default_rng(0)
     reach, angle = radius * np.sqrt(rng.uniform(size=6000)), rng.uniform(-np.pi, np.pi, 6000)
     contact = np.stack([reach * np.cos(angle), reach * np.sin(angle), np.exp(rng.uniform(-3, 0.7, 6000))], axis=1)
-    domain = Domain(radius, (np.exp(-3.0), np.exp(0.7)))
+    domain = ContactDomain(radius, (np.exp(-3.0), np.exp(0.7)))
     charge = charges(*contact.T)
     return ChargeField.fit(domain, contact[:5000], charge[:5000], (contact[5000:], charge[5000:]))
 
@@ -31,7 +31,7 @@ def test_a_fold_at_a_known_place(fold):
     def charges(x, y, force):
         return force[:, None] ** 0.7 * np.exp(np.stack([0 * x, 0.1 * (x - x**2 / (2 * fold)), 0.1 * y], axis=1))
 
-    domain = unfolded(field_of(charges), noise_model("reference"))
+    domain = fold_free_domain(field_of(charges), noise_model("reference"))
     assert domain.radius_mm == pytest.approx(min(fold, 8.0), abs=0.11)
 
 

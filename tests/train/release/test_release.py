@@ -14,7 +14,7 @@ from isocharge.serve import Predictor, find_model
 from isocharge.serve.model.repository import model_names
 from isocharge.simulate import Circle, Sweep, noise_model, sensor_from_dict, solve_maps
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, train_model
-from isocharge.train.data.presses import Presses
+from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.release.evaluate import measure_errors
 
 QUICK = FitConfig(
@@ -51,7 +51,7 @@ def presses(film, count, seed, within=RADIUS):
     radius, angle = within * np.sqrt(rng.uniform(size=count)), rng.uniform(-np.pi, np.pi, count)
     force = np.exp(rng.uniform(np.log(LOW), np.log(HIGH), count))
     contact = np.stack([radius * np.cos(angle), radius * np.sin(angle), force], axis=1)
-    return Presses(contact, 1e12 * film.forward(1e-3 * contact[:, 0], 1e-3 * contact[:, 1], force))
+    return LabelledPresses(contact, 1e12 * film.forward(1e-3 * contact[:, 0], 1e-3 * contact[:, 1], force))
 
 
 def predict(touch):

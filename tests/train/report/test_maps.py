@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 from isocharge.train.report.maps import FORCES, RINGS, SECTORS, _cell_words, _cells, by_force, force_bins
 
-DOMAIN = Domain(8.0, (0.05, 2.0))
+DOMAIN = ContactDomain(8.0, (0.05, 2.0))
 
 
 def presses(count):

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from isocharge.errors import OutputExists
-from isocharge.resumable_run import keep_draft
+from isocharge.resumable_run import resume_parts
 from isocharge.simulate import Circle, Sweep, read_dataset, run_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network, train_model
 from isocharge.train.training import checkpoint
@@ -66,10 +66,10 @@ def test_a_stopped_run_ends_with_the_same_weights(dataset, tmp_path, config, cal
     whole = weights(fit_network(dataset, config))
     for call in calls:
         target = tmp_path / f"after-{call}"
-        with pytest.raises(Killed), keep_draft(target, {}) as draft:
+        with pytest.raises(Killed), resume_parts(target, {}) as draft:
             fit_network(dataset, config, stop_after(call), checkpoint=Checkpoint(draft, Ticking()))
         done = []
-        with keep_draft(target, {}) as draft:
+        with resume_parts(target, {}) as draft:
             again = fit_network(
                 dataset, config, lambda step, *_, done=done: done.append(step), checkpoint=Checkpoint(draft)
             )
@@ -80,7 +80,7 @@ def test_a_stopped_run_ends_with_the_same_weights(dataset, tmp_path, config, cal
 
 def test_states_are_written_every_few_seconds_only(tmp_path):
     now = [0.0]
-    with keep_draft(tmp_path / "model", {}) as draft:
+    with resume_parts(tmp_path / "model", {}) as draft:
         keeper = Checkpoint(draft, lambda: now[0])
         made = []
         for second in range(10):
@@ -93,7 +93,7 @@ def test_states_are_written_every_few_seconds_only(tmp_path):
 
 def test_a_damaged_state_is_told_of_and_made_again(tmp_path):
     said = []
-    with keep_draft(tmp_path / "model", {}, warn=said.append) as draft:
+    with resume_parts(tmp_path / "model", {}, warn=said.append) as draft:
         Checkpoint(draft).save("stage", lambda: {"step": 1}, now=True)
         (draft.folder / "parts" / "stage").write_bytes(b"torn")
         assert Checkpoint(draft).load("stage") is None

@@ -5,7 +5,7 @@ import torch
 
 from isocharge.errors import TrainingError
 from isocharge.train.training.checkpoint import Checkpoint
-from isocharge.train.training.descent import REPORT_EVERY, Descent, Task
+from isocharge.train.training.descent import REPORT_EVERY, Descent, TrainingStage
 from isocharge.train.training.network import Perceptron
 
 
@@ -22,7 +22,7 @@ def task(scores, steps=20 * REPORT_EVERY, settle=0):
         seen.append({name: values.clone() for name, values in part.state_dict().items()})
         return next(given), "words"
 
-    return Task("stage", part, loss, score, steps, settle), seen
+    return TrainingStage("stage", part, loss, score, steps, settle), seen
 
 
 def run(made, patience=10**6):

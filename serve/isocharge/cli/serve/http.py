@@ -65,8 +65,8 @@ def http_command(
     with require("http"):
         from isocharge.serve.network.http import App, HttpServer
     from isocharge.serve.network.address import Address, check_exposure
-    from isocharge.serve.network.limits import Limits
-    from isocharge.serve.network.model_store import open_shelf
+    from isocharge.serve.network.limits import ServerLimits
+    from isocharge.serve.network.model_store import open_model_store
     from isocharge.serve.network.protocol import Handler
     from isocharge.serve.network.tls import Tls
     from isocharge.serve.network.token import Token
@@ -75,7 +75,7 @@ def http_command(
     check_exposure(address if grpc_port is None else Address(host), token=token is not None, insecure=insecure)
     if tls_key is not None and tls_cert is None:
         raise InputError("--tls-key: expected --tls-cert with it")
-    limits = Limits(
+    limits = ServerLimits(
         batch=max_batch,
         body_bytes=max_body_bytes,
         connections=max_connections,
@@ -84,7 +84,7 @@ def http_command(
     )
     secret = None if token is None else Token(token)
     tls = None if tls_cert is None else Tls(tls_cert, tls_key)
-    shelf = open_shelf(models)
+    shelf = open_model_store(models)
     for reason in shelf.refusals():
         say(f"refused: {reason}")
     handler = Handler(shelf, limits)

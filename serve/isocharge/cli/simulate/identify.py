@@ -90,13 +90,17 @@ def _solve(sensor: "Sensor", probe: "Probe", force: tuple[float, float], radius:
 
 def _mistakes(found: "list[Identification]") -> list[dict[str, Any]]:
     """Each of the other probes taken for the first."""
-    from isocharge.simulate.identifiability.probe_discrimination import inner_forces, mistake, spread_contacts
+    from isocharge.simulate.identifiability.probe_discrimination import (
+        explain_with_other_probe,
+        inner_forces,
+        spread_contacts,
+    )
 
     first, rows = found[0], []
     for other in found[1:]:
         reach = min(first.area.radius, other.area.radius)
         for force in inner_forces(first.area.force_range) if reach else ():
-            taken = mistake(other.charges, first.charges, first.noise, spread_contacts(reach, force))
+            taken = explain_with_other_probe(other.charges, first.charges, first.noise, spread_contacts(reach, force))
             rows.append({"probe": _name(other.probe), "within_mm": 1e3 * reach, **taken.to_dict()})
     return rows
 
@@ -108,11 +112,11 @@ def _name(probe: "Probe") -> str:
 
 def _size(made: "ForwardMap", found: "Identification") -> list[dict[str, Any]]:
     """How well the charges tell a circle's radius."""
-    from isocharge.simulate.identifiability.probe_discrimination import size_told
+    from isocharge.simulate.identifiability.probe_discrimination import radius_limits
 
     forces, reach = [each.force for each in found.maps], found.area.radius
     with progress("solving the film under other radii") as advance:
-        return [told.to_dict() for told in size_told(made, found.charges, found.noise, forces, reach, advance)]
+        return [told.to_dict() for told in radius_limits(made, found.charges, found.noise, forces, reach, advance)]
 
 
 def _table(numbers: dict[str, Any]) -> str:

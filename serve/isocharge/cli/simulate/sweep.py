@@ -86,7 +86,7 @@ def sweep_command(
     reach = auto_radius(film_sensor, probes, force) if radius == "auto" else 1e-3 * number_mm(radius)
     sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)
     try:
-        with _crew(workers, cluster) as crew, progress_rows(*SWEEP_ROWS) as (solving, sampled):
+        with _workers(workers, cluster) as crew, progress_rows(*SWEEP_ROWS) as (solving, sampled):
             run_sweep(
                 output,
                 film_sensor,
@@ -106,7 +106,7 @@ def sweep_command(
     say(f"{json_module.loads((output / 'manifest.json').read_text())['samples']} presses in {output}")
 
 
-def _crew(workers: int | None, cluster: str | None) -> AbstractContextManager["Workers"]:
+def _workers(workers: int | None, cluster: str | None) -> AbstractContextManager["Workers"]:
     from isocharge.simulate.execution.workers import cores, dask_workers, local_workers
 
     return dask_workers(cluster) if cluster else local_workers(workers or min(cores(), MOST_WORKERS))

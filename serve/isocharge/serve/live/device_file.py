@@ -54,7 +54,7 @@ from isocharge.serve.signal_chain.contact import TouchRule
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.tare import TareRule
-from isocharge.serve.signal_chain.thermal import CommonModeRule
+from isocharge.serve.signal_chain.thermal import ThermalRule
 
 SECTIONS = {"frames", "channels", "gain", "saturation", "hum", "tare", "leak", "touch", "common_mode"}
 
@@ -118,7 +118,7 @@ class Device:
             touch=rules["touch"],
         )
 
-    def common_mode(self, electrodes: tuple[str, ...]) -> CommonModeRule | None:
+    def common_mode(self, electrodes: tuple[str, ...]) -> ThermalRule | None:
         """How warming is followed; None if it is not.
 
         Raises:
@@ -131,7 +131,7 @@ class Device:
                 f"{self.where}: common_mode: expected four electrodes or more, the model has {electrodes}; with three "
                 "every charge triple fits some contact, and temperature cannot be told from force"
             )
-        return CommonModeRule(**{key: value for key, value in self.table["common_mode"].items() if key != "on"})
+        return ThermalRule(**{key: value for key, value in self.table["common_mode"].items() if key != "on"})
 
     def _is_on(self, stage: str) -> bool:
         return stage in self.table and bool(self.table[stage].get("on", True))
@@ -274,5 +274,5 @@ _CHECKS: dict[str, Callable[[Mapping[str, Any], str], None]] = {
     "tare": _check_rule(TareRule),
     "leak": _check_each("tau_s", _types(LeakRule), positive=True),
     "touch": _check_rule(TouchRule),
-    "common_mode": _check_rule(CommonModeRule),
+    "common_mode": _check_rule(ThermalRule),
 }

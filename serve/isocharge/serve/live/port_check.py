@@ -91,7 +91,7 @@ class Examination:
 
 
 @dataclass
-class Hearing:
+class Capture:
     """What came through a port in a while.
 
     Attributes:
@@ -137,7 +137,7 @@ def examine(
         PortError: If the port cannot be opened.
     """
     baud = _guess(url, bauds, device)
-    heard = _hear(url, baud, seconds, device)
+    heard = _capture(url, baud, seconds, device)
     channels = tuple(_channels(heard, device))
     numbered = bool(heard.frames) and heard.frames[0].seq is not None
     counts = heard.parser.counts
@@ -164,7 +164,7 @@ def _guess(url: str, bauds: tuple[int, ...], device: Device) -> int:
         return bauds[0]
     best, share = bauds[0], 0.0
     for baud in bauds:
-        heard = _hear(url, baud, TRY_S, device)
+        heard = _capture(url, baud, TRY_S, device)
         if heard.share > share:
             best, share = baud, heard.share
         if share > SURE or not heard.bytes_seen:  # silence is silence at any rate
@@ -172,8 +172,8 @@ def _guess(url: str, bauds: tuple[int, ...], device: Device) -> int:
     return best
 
 
-def _hear(url: str, baud: int, seconds: float, device: Device) -> Hearing:
-    heard, clock, began = Hearing(device.parser()), DeviceClock(), time.monotonic()
+def _capture(url: str, baud: int, seconds: float, device: Device) -> Capture:
+    heard, clock, began = Capture(device.parser()), DeviceClock(), time.monotonic()
     with Port(url, baud=baud, silence_s=min(1.0, seconds)) as port:
         try:
             for chunk in port:
@@ -191,12 +191,12 @@ def _hear(url: str, baud: int, seconds: float, device: Device) -> Hearing:
     return heard
 
 
-def _rate(heard: Hearing) -> float:
+def _rate(heard: Capture) -> float:
     span_s = heard.times_s[-1] - heard.times_s[0] if heard.times_s else 0.0
     return (len(heard.frames) - 1) / span_s if span_s > 0.0 else 0.0
 
 
-def _channels(heard: Hearing, device: Device) -> Iterator[ChannelHealth]:
+def _channels(heard: Capture, device: Device) -> Iterator[ChannelHealth]:
     """Each channel's health, from the frames that have as many values as the last one."""
     if not heard.frames:
         return
@@ -243,7 +243,7 @@ def _health(name: str, charge_pC: Array, t_s: Array, rate_Hz: float) -> ChannelH
 
 
 def _missing(
-    heard: Hearing, channels: tuple[ChannelHealth, ...], device: Device, electrodes: tuple[str, ...]
+    heard: Capture, channels: tuple[ChannelHealth, ...], device: Device, electrodes: tuple[str, ...]
 ) -> Iterator[str]:
     """What is missing to get a touch."""
     if not heard.bytes_seen:

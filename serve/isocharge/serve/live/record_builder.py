@@ -17,7 +17,7 @@ from isocharge.serve.signal_chain.chain import Reading
 
 
 @dataclass(frozen=True, slots=True)
-class _Scribe:
+class RecordBuilder:
     """Writes records; holds what is the same in each."""
 
     predictor: Predictor
@@ -27,7 +27,7 @@ class _Scribe:
     frame_id: str
 
     @classmethod
-    def of(cls, predictor: Predictor) -> "_Scribe":
+    def of(cls, predictor: Predictor) -> "RecordBuilder":
         metadata = predictor.metadata
         return cls(predictor, Domain.of(metadata), metadata.electrodes, metadata.label, metadata.frame_id)
 

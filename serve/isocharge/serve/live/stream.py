@@ -15,13 +15,13 @@ from isocharge.serve.frames.frame import SATURATED_BIT, Frame, Parser
 from isocharge.serve.frames.sequence import SequenceGaps
 from isocharge.serve.live.channels import ChannelPicker
 from isocharge.serve.live.device_file import ANY_BOARD, Device
-from isocharge.serve.live.record_builder import _Scribe
+from isocharge.serve.live.record_builder import RecordBuilder
 from isocharge.serve.port.device_clock import DeviceClock, ReadingTime
 from isocharge.serve.port.serial_port import Chunk
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.signal_chain.chain import Chain, ChainState, Reading, advance
-from isocharge.serve.signal_chain.thermal import NO_WARMING, CommonModeRule, follow_warming
+from isocharge.serve.signal_chain.thermal import NO_DRIFT, ThermalRule, track_thermal_drift
 
 BYTES_TO_RECOGNISE = 8192
 """After so many bytes without one intact frame, they are not frames at all."""
@@ -119,14 +119,14 @@ class TouchStream:
         self._chain = chain or device.chain(electrodes)
         self._largest = self._chain.largest
         self._picker = ChannelPicker(electrodes, device.channels, predictor.metadata.label)
-        self._scribe = _Scribe.of(predictor)
+        self._scribe = RecordBuilder.of(predictor)
         self._state = ChainState.start(len(electrodes))
         self._policy = policy
         self._now_ns = now_ns
         self._news: tuple[str, ...] = ()
         self._since_s = 0.0
         self._warming_rule = device.common_mode(electrodes)
-        self._warming = NO_WARMING
+        self._warming = NO_DRIFT
 
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
@@ -189,15 +189,15 @@ class TouchStream:
         self._since_s = 0.0
         return reading, when, flags
 
-    def _follow_warming(self, rule: CommonModeRule, reading: Reading, dt_s: float) -> tuple[str, ...]:
+    def _follow_warming(self, rule: ThermalRule, reading: Reading, dt_s: float) -> tuple[str, ...]:
         """Take what is found from the charges of the next frames on; the flags that it earns."""
         before = self._warming
         if not reading.contact or reading.charge_pC is None:
-            self._warming = NO_WARMING
+            self._warming = NO_DRIFT
             return ()
         if SATURATED in reading.flags:  # a clipped charge fits no contact, whatever the temperature
             return ()
-        self._warming = now = follow_warming(rule, before, reading.charge_pC, self._misfit, dt_s)
+        self._warming = now = track_thermal_drift(rule, before, reading.charge_pC, self._misfit, dt_s)
         if now.charge_pC != before.charge_pC:
             self._state = self._state.shifted(now.charge_pC - before.charge_pC)
         return (THERMAL,) * (abs(now.charge_pC) >= rule.tell_pC) + (BLIND,) * now.blind

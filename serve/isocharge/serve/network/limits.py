@@ -6,7 +6,7 @@ from isocharge.serve.model.triton_config import MAX_BATCH
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
+class ServerLimits:
     """Bounds of one server; the defaults fit the largest batch of four electrodes as JSON with all digits.
 
     Attributes:

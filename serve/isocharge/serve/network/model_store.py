@@ -24,7 +24,7 @@ UNLOADED = "unloaded"
 
 
 @dataclass(frozen=True)
-class Served:
+class LoadedVersion:
     """One version of a model that answers requests."""
 
     model: Model
@@ -43,14 +43,14 @@ class Served:
 
 
 @dataclass(frozen=True)
-class Entry:
+class ModelVersions:
     """What is known of one model: the versions that serve, and why others do not (version to reason)."""
 
-    versions: Mapping[int, Served]
+    versions: Mapping[int, LoadedVersion]
     refused: Mapping[int, str]
 
     @property
-    def latest(self) -> Served | None:
+    def latest(self) -> LoadedVersion | None:
         """The highest version that serves."""
         return self.versions[max(self.versions)] if self.versions else None
 
@@ -65,7 +65,7 @@ class IndexRow:
     reason: str
 
 
-class Shelf:
+class ModelStore:
     """Models by name and version. Reading is for any thread; loading and unloading take their turn."""
 
     def __init__(self, folders: Callable[[], Mapping[str, Path]]) -> None:
@@ -79,14 +79,14 @@ class Shelf:
         """
         self._folders = folders
         self._turn = threading.Lock()
-        self._entries: dict[str, Entry] = {}
-        self._answering: dict[tuple[str, str], Served] = {}
+        self._entries: dict[str, ModelVersions] = {}
+        self._answering: dict[tuple[str, str], LoadedVersion] = {}
         for name, folder in folders().items():
             self._put(name, _read_entry(name, folder, {}))
         if not self._answering:
             raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'there is none'}")
 
-    def get(self, name: str, version: str = "") -> Served:
+    def get(self, name: str, version: str = "") -> LoadedVersion:
         """The model to answer with; the highest version if none is given.
 
         Raises:
@@ -99,11 +99,11 @@ class Shelf:
             raise ModelNotFound(f"model {asked!r:.200} is not found; serving: {serving}")
         return served
 
-    def all(self) -> list[Served]:
+    def all(self) -> list[LoadedVersion]:
         """Every version that serves, by name and version."""
         return [served for _, entry in sorted(self._entries.items()) for _, served in sorted(entry.versions.items())]
 
-    def named(self, name: str) -> list[Served]:
+    def named(self, name: str) -> list[LoadedVersion]:
         """Every version of one model that serves, ascending.
 
         Raises:
@@ -152,9 +152,9 @@ class Shelf:
         with self._turn:
             self.get(name)
             versions = self._entries[name].versions
-            self._put(name, Entry({}, dict.fromkeys(versions, UNLOADED)))
+            self._put(name, ModelVersions({}, dict.fromkeys(versions, UNLOADED)))
 
-    def _put(self, name: str, entry: Entry) -> None:
+    def _put(self, name: str, entry: ModelVersions) -> None:
         """Change what serves in two assignments, each seen whole by whoever reads."""
         answering = {key: served for key, served in self._answering.items() if key[0] != name}
         answering |= {(name, str(version)): served for version, served in entry.versions.items()}
@@ -164,7 +164,7 @@ class Shelf:
         self._entries = self._entries | {name: entry}
 
 
-def open_shelf(models: Path | None = None) -> Shelf:
+def open_model_store(models: Path | None = None) -> ModelStore:
     """The models of one folder; without it, of every place where `find_model` looks, the first place winning.
 
     Raises:
@@ -174,10 +174,10 @@ def open_shelf(models: Path | None = None) -> Shelf:
     if models is not None and not model_names(models):
         repositories(models)  # raises if the folder itself is missing
         raise ModelError(f"{models}: expected models, <name>/<version>/model.onnx, found none; correct --models")
-    return Shelf(lambda: MappingProxyType({n: root / n for root in reversed(roots) for n in model_names(root)}))
+    return ModelStore(lambda: MappingProxyType({n: root / n for root in reversed(roots) for n in model_names(root)}))
 
 
-def _read_entry(name: str, folder: Path, old: Mapping[int, Served]) -> Entry:
+def _read_entry(name: str, folder: Path, old: Mapping[int, LoadedVersion]) -> ModelVersions:
     """Load every version; one that is refused leaves the old one where it was."""
     versions, refused = {}, {}
     for version, path in version_folders(folder).items():
@@ -187,10 +187,10 @@ def _read_entry(name: str, folder: Path, old: Mapping[int, Served]) -> Entry:
             refused[version] = str(error)
             if version in old:
                 versions[version] = old[version]
-    return Entry(versions, refused)
+    return ModelVersions(versions, refused)
 
 
-def _read(name: str, version: int, folder: Path) -> Served:
+def _read(name: str, version: int, folder: Path) -> LoadedVersion:
     model = load_model(folder)
     if (model.metadata.name, model.metadata.version) != (name, version):
         raise ModelError(
@@ -198,10 +198,10 @@ def _read(name: str, version: int, folder: Path) -> Served:
             "move it into folders of its own name and version"
         )
     check_golden(model)
-    return Served(model, model.metadata, str(version))
+    return LoadedVersion(model, model.metadata, str(version))
 
 
-def _rows(name: str, entry: Entry) -> list[IndexRow]:
+def _rows(name: str, entry: ModelVersions) -> list[IndexRow]:
     versions = sorted(set(entry.versions) | set(entry.refused))
     return [
         IndexRow(name, str(v), "READY" if v in entry.versions else "UNAVAILABLE", entry.refused.get(v, ""))

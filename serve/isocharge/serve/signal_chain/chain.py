@@ -18,7 +18,7 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.serve.flags import NEGATIVE, SATURATED, TARE
-from isocharge.serve.signal_chain.contact import Touch, TouchRule, next_touch
+from isocharge.serve.signal_chain.contact import Touch, TouchRule, update_contact
 from isocharge.serve.signal_chain.hum import Hum, HumRule, remove_hum
 from isocharge.serve.signal_chain.leak import Leak, LeakRule, undo_leak
 from isocharge.serve.signal_chain.tare import Tare, TareRule, look_for_tare
@@ -174,4 +174,4 @@ def _touch(chain: Chain, state: ChainState, charge_pC: Array, tare: Tare, dt_s: 
     if chain.touch is None:
         return Touch(contact=True)
     keep = 1.0 if chain.leak is None else math.exp(-dt_s / chain.leak.relax_s)
-    return next_touch(chain.touch, state.touch, float(charge_pC.sum()), tare.noise_pC, keep)
+    return update_contact(chain.touch, state.touch, float(charge_pC.sum()), tare.noise_pC, keep)

@@ -49,7 +49,7 @@ class Touch:
     below: bool = False
 
 
-def next_touch(rule: TouchRule, touch: Touch, total_pC: float, noise_pC: Array, keep: float = 1.0) -> Touch:
+def update_contact(rule: TouchRule, touch: Touch, total_pC: float, noise_pC: Array, keep: float = 1.0) -> Touch:
     """Contact with hysteresis.
 
     Args:

@@ -27,7 +27,7 @@ Misfit = Callable[[Array], Reals]
 
 
 @dataclass(frozen=True, slots=True)
-class CommonModeRule:
+class ThermalRule:
     """How warming is followed.
 
     Attributes:
@@ -46,7 +46,7 @@ class CommonModeRule:
 
 
 @dataclass(frozen=True, slots=True)
-class CommonMode:
+class ThermalDrift:
     """What is known of the warming in this touch.
 
     Attributes:
@@ -62,12 +62,12 @@ class CommonMode:
     blind: bool = False
 
 
-NO_WARMING = CommonMode()
+NO_DRIFT = ThermalDrift()
 
 
-def follow_warming(
-    rule: CommonModeRule, state: CommonMode, charge_pC: Array, misfit: Misfit, dt_s: float
-) -> CommonMode:
+def track_thermal_drift(
+    rule: ThermalRule, state: ThermalDrift, charge_pC: Array, misfit: Misfit, dt_s: float
+) -> ThermalDrift:
     """What is known after the next frame in contact.
 
     Args:
@@ -79,13 +79,13 @@ def follow_warming(
     """
     waited_s = state.waited_s + dt_s
     if waited_s < rule.every_s:
-        return CommonMode(state.charge_pC, state.variance_pC2, waited_s, state.blind)
+        return ThermalDrift(state.charge_pC, state.variance_pC2, waited_s, state.blind)
     predicted_pC2 = state.variance_pC2 + rule.wander_pC**2 * waited_s
     tried = charge_pC - TRIED_PC[:, np.newaxis]
     _, slope, curvature = (_SQUARES @ np.square(misfit(tried), dtype=float)).tolist()
     seen_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
     if seen_pC2 > rule.blind_pC**2:
-        return CommonMode(state.charge_pC, state.variance_pC2, 0.0, blind=True)
+        return ThermalDrift(state.charge_pC, state.variance_pC2, 0.0, blind=True)
     off_pC = min(max(-slope / (2.0 * curvature), float(TRIED_PC[0])), float(TRIED_PC[-1]))
     gain = predicted_pC2 / (predicted_pC2 + seen_pC2)
-    return CommonMode(state.charge_pC + gain * off_pC, (1.0 - gain) * predicted_pC2)
+    return ThermalDrift(state.charge_pC + gain * off_pC, (1.0 - gain) * predicted_pC2)

@@ -85,7 +85,7 @@ class Candidates:
 
 
 @dataclass(frozen=True)
-class Nodes:
+class SeedGrid:
     """A square grid over the disk with the charges there.
 
     Attributes:
@@ -101,7 +101,7 @@ class Nodes:
     side: int
 
     @classmethod
-    def of(cls, table: ChargeSpline) -> "Nodes":
+    def of(cls, table: ChargeSpline) -> "SeedGrid":
         """Over a table's disk, edge included."""
         side = 2 * max(4, int(np.ceil(table.radius / NODE_SPACING))) + 1
         line = np.linspace(-1.0, 1.0, side) * table.radius
@@ -166,7 +166,7 @@ class Nodes:
         return charge.min(axis=1), charge.max(axis=1)
 
 
-def step_to_meet(slope: Array, away: Array) -> Array:
+def gauss_newton_step(slope: Array, away: Array) -> Array:
     """The step that brings distances `away` to zero, or their squares to the least.
 
     Args:

@@ -18,7 +18,7 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import ChargeError, SceneError, SensorError
-from isocharge.simulate.contours.candidates import FLAT, Candidates, Nodes, step_to_meet
+from isocharge.simulate.contours.candidates import FLAT, Candidates, SeedGrid, gauss_newton_step
 from isocharge.simulate.contours.fix import AMBIGUOUS, APART, RESOLVED, TOLERANCE, Fix, Meeting
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
@@ -184,8 +184,8 @@ class Triangulation:
     # Where to begin
 
     @cached_property
-    def _nodes(self) -> Nodes:
-        return Nodes.of(self.table)
+    def _nodes(self) -> SeedGrid:
+        return SeedGrid.of(self.table)
 
     def _seeds(self, charge: Array, force: Array | None) -> Candidates:
         """Nodes that all contours pass by more closely than by their neighbours."""
@@ -224,7 +224,7 @@ class Triangulation:
             value, slope, by_force = self.table.first_order(at, force)
             away = (value - charge[seeds.press]) / self._gauge(slope, force)
             best = best.improved(at, force, np.sqrt(np.mean(away**2, axis=1)))
-            step = step_to_meet(self._unit_slopes(slope, by_force, force, fixed=fixed), away)
+            step = gauss_newton_step(self._unit_slopes(slope, by_force, force, fixed=fixed), away)
             at = onto_disk(at + step[:, :2], self.table.radius)
             if not fixed:
                 force = np.clip(force * np.exp(step[:, 2] / self.table.radius), *self.table.force_range)
@@ -270,7 +270,7 @@ class Triangulation:
             active = active[going]
             if active.size == 0:
                 break
-            step = step_to_meet((slope[:, pair] / gauge[..., None])[going], away[going])
+            step = gauss_newton_step((slope[:, pair] / gauge[..., None])[going], away[going])
             at[active] = onto_disk(at[active] + step, self.table.radius)
         return found
 

@@ -13,7 +13,7 @@ COLUMNS = {
 }
 
 
-def _card(name: str, manifest: dict[str, Any]) -> str:
+def data_card(name: str, manifest: dict[str, Any]) -> str:
     """The data card."""
     ranges, solver = manifest.get("ranges", {}), manifest.get("solver", {})
     lines = [

@@ -30,7 +30,7 @@ Orientation = Literal["fixed", "random"]
 
 
 @dataclass(frozen=True)
-class Presses:
+class SweepPresses:
     """Presses of a sweep, in its order.
 
     Attributes:
@@ -50,8 +50,8 @@ class Presses:
     def __len__(self) -> int:
         return self.x.size
 
-    def __getitem__(self, part: slice | Integers) -> "Presses":
-        return Presses(self.probe[part], self.x[part], self.y[part], self.force[part], self.turn[part])
+    def __getitem__(self, part: slice | Integers) -> "SweepPresses":
+        return SweepPresses(self.probe[part], self.x[part], self.y[part], self.force[part], self.turn[part])
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Sweep:
         """x, y (m), force (N) and orientation (rad) of every sample of a sweep with one probe, each of shape (n,)."""
         return self._of_probe(0, 1, FULL_TURN)
 
-    def over(self, probes: Sequence[Probe]) -> Presses:
+    def over(self, probes: Sequence[Probe]) -> SweepPresses:
         """Every press of a sweep with these probes, which take turns.
 
         Raises:
@@ -102,7 +102,7 @@ class Sweep:
         counts = [part[0].size for part in parts]
         order = np.argsort(np.concatenate([np.arange(count) for count in counts]), kind="stable")
         x, y, force, turn = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-        return Presses(np.repeat(np.arange(len(probes)), counts), x, y, force, turn)[order]
+        return SweepPresses(np.repeat(np.arange(len(probes)), counts), x, y, force, turn)[order]
 
     def _of_probe(self, number: int, probes: int, period: float) -> tuple[Array, Array, Array, Array]:
         if self.sampling == "grid":

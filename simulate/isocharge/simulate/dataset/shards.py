@@ -22,7 +22,7 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.errors import DatasetError, SensorError
 from isocharge.files import new_folder, sha256_of, write_whole
-from isocharge.simulate.dataset.card import COLUMNS, _card
+from isocharge.simulate.dataset.card import COLUMNS, data_card
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
@@ -138,7 +138,7 @@ def write_manifest(
         "shards": list(entries),
     }
     write_whole(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
-    write_whole(folder / "README.md", _card(name, manifest).encode())
+    write_whole(folder / "README.md", data_card(name, manifest).encode())
 
 
 def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:

@@ -17,9 +17,9 @@ import numpy as np
 from isocharge.arrays import Array, Integers
 from isocharge.errors import SceneError
 from isocharge.progress import Progress, Warn
-from isocharge.resumable_run import Draft, open_draft, refusals, refuse_finished
-from isocharge.simulate.dataset.sampling import Presses
+from isocharge.resumable_run import ResumableRun, output_errors, refuse_finished, resume_folder
 from isocharge.simulate.dataset.sampling import Sweep as Sweep
+from isocharge.simulate.dataset.sampling import SweepPresses
 from isocharge.simulate.dataset.shards import (
     Samples,
     pack_shard,
@@ -29,15 +29,15 @@ from isocharge.simulate.dataset.shards import (
     write_manifest,
 )
 from isocharge.simulate.execution.blas import single_threaded_blas
-from isocharge.simulate.execution.checkpointed_map import Remembering
-from isocharge.simulate.execution.code_version import made_by
+from isocharge.simulate.execution.checkpointed_map import CheckpointedExecutor
+from isocharge.simulate.execution.code_version import code_fingerprint
 from isocharge.simulate.execution.workers import AHEAD, Workers
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
-from isocharge.simulate.solver.settings import Solver
+from isocharge.simulate.solver.settings import SolveSettings
 
 SHARD = 16384
 """Samples per shard."""
@@ -58,7 +58,7 @@ def run_sweep(
     probes: Sequence[Probe],
     sweep: Sweep,
     *,
-    solver: Solver = Solver(),
+    solver: SolveSettings = SolveSettings(),
     executor: Executor | None = None,
     ahead: int = AHEAD,
     shard: int = SHARD,
@@ -97,13 +97,13 @@ def run_sweep(
     presses = sweep.over(probes)  # before anything is written: scipy's Sobol tables swallow an interrupt
     workers = Workers(executor, ahead)
     identity = _identity(sensor, probes, sweep, solver, shard)
-    with single_threaded_blas(), open_draft(folder, identity, fresh=fresh, warn=warn) as draft:
+    with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh, warn=warn) as draft:
         maps = tuple(
-            _build(sensor, probe, sweep, solver, Remembering(draft, f"solve-{number:02d}", executor), progress)
+            _build(sensor, probe, sweep, solver, CheckpointedExecutor(draft, f"solve-{number:02d}", executor), progress)
             for number, probe in enumerate(probes)
         )
         entries = _draft_shards(draft, maps, presses, workers, shard, sampled)
-        with refusals(folder):
+        with output_errors(folder):
             write_manifest(draft.data, folder.name, sensor, entries, _about(maps, sweep))
     return folder
 
@@ -113,7 +113,7 @@ def solve_maps(
     probes: Sequence[Probe],
     sweep: Sweep,
     *,
-    solver: Solver = Solver(),
+    solver: SolveSettings = SolveSettings(),
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> tuple[ForwardMap, ...]:
@@ -130,7 +130,12 @@ def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
 
 
 def _build(
-    sensor: Sensor, probe: Probe, sweep: Sweep, solver: Solver, executor: Executor | None, progress: Progress | None
+    sensor: Sensor,
+    probe: Probe,
+    sweep: Sweep,
+    solver: SolveSettings,
+    executor: Executor | None,
+    progress: Progress | None,
 ) -> ForwardMap:
     return ForwardMap.build(
         sensor,
@@ -145,10 +150,12 @@ def _build(
     )
 
 
-def _identity(sensor: Sensor, probes: Sequence[Probe], sweep: Sweep, solver: Solver, shard: int) -> dict[str, Any]:
+def _identity(
+    sensor: Sensor, probes: Sequence[Probe], sweep: Sweep, solver: SolveSettings, shard: int
+) -> dict[str, Any]:
     """All that decides about the bytes."""
     return {
-        "made_by": made_by(),
+        "made_by": code_fingerprint(),
         "sensor": sensor_to_dict(sensor),
         "probes": [f"{probe.notation}@{np.rad2deg(probe.angle):.12g}" for probe in probes],
         "sweep": asdict(sweep),
@@ -183,9 +190,9 @@ def _mesh_words(resolution: Resolution) -> str:
 
 
 def _draft_shards(
-    draft: Draft,
+    draft: ResumableRun,
     maps: Sequence[ForwardMap],
-    presses: Presses,
+    presses: SweepPresses,
     workers: Workers,
     shard: int,
     sampled: Progress | None,
@@ -211,12 +218,12 @@ def _draft_shards(
     return [entries[number] for number in parts]
 
 
-def _cut(presses: Presses, size: int) -> Iterator[Presses]:
+def _cut(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
     for start in range(0, len(presses), size):
         yield presses[start : start + size]
 
 
-def _samples(maps: Sequence[ForwardMap], shards: Iterable[Presses], workers: Workers) -> Iterator[Samples]:
+def _samples(maps: Sequence[ForwardMap], shards: Iterable[SweepPresses], workers: Workers) -> Iterator[Samples]:
     """Samples of each shard, in order; the workers run ahead of the one that is taken."""
     shards, coming = tee(shards)
     tasks = ((maps[number], part[rows]) for part in coming for number, rows in _tasks(part, len(maps)))
@@ -238,7 +245,7 @@ def _samples(maps: Sequence[ForwardMap], shards: Iterable[Presses], workers: Wor
         )
 
 
-def _tasks(part: Presses, probes: int) -> Iterator[tuple[int, Integers]]:
+def _tasks(part: SweepPresses, probes: int) -> Iterator[tuple[int, Integers]]:
     """How a shard is cut into tasks: number of the probe and rows of the shard."""
     for number in range(probes):
         rows = np.flatnonzero(part.probe == number)
@@ -246,7 +253,7 @@ def _tasks(part: Presses, probes: int) -> Iterator[tuple[int, Integers]]:
             yield number, rows[start : start + TASK]
 
 
-def _charges(task: tuple[ForwardMap, Presses]) -> Array:
+def _charges(task: tuple[ForwardMap, SweepPresses]) -> Array:
     """Touch charges of a task's presses, shape (n, n_electrode), C."""
     made, presses = task
     return made.forward(presses.x, presses.y, presses.force, presses.turn)

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.resumable_run import Draft
-from isocharge.simulate.execution.workers import Checked
+from isocharge.resumable_run import ResumableRun
+from isocharge.simulate.execution.workers import SameCodeOnly
 
 
-class Remembering(Executor):
+class CheckpointedExecutor(Executor):
     """An executor whose `map` keeps its results, if they are arrays, in a draft, and does not work for them again.
 
     The results of a call are named by their place in it and by the call's place among the others: both depend on the
     run alone.
     """
 
-    def __init__(self, draft: Draft, name: str, inner: Executor | None) -> None:
+    def __init__(self, draft: ResumableRun, name: str, inner: Executor | None) -> None:
         self._draft, self._name, self._inner, self._calls = draft, name, inner, 0
 
     def map(self, fn: Callable[..., Any], *iterables: Iterable[Any], **_options: Any) -> Iterator[Any]:
@@ -29,7 +29,7 @@ class Remembering(Executor):
         self._calls += 1
         kept = [self._load(name) for name in names]
         left = [job for job, result in zip(jobs, kept, strict=True) if result is None]
-        made = self._inner.map(Checked(Spread(fn)), left) if self._inner and left else map(Spread(fn), left)
+        made = self._inner.map(SameCodeOnly(Spread(fn)), left) if self._inner and left else map(Spread(fn), left)
         return self._merged(names, kept, iter(made))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:

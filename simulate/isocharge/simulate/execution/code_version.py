@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 @lru_cache(maxsize=1)
-def made_by() -> str:
+def code_fingerprint() -> str:
     """The code that results depend on: package, checksum of its source, libraries."""
     source = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):

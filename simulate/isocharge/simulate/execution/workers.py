@@ -19,7 +19,7 @@ from typing import Generic, TypeVar
 from isocharge.errors import InputError, WorkersLost
 from isocharge.extras import require
 from isocharge.simulate.execution.blas import single_threaded_blas
-from isocharge.simulate.execution.code_version import made_by
+from isocharge.simulate.execution.code_version import code_fingerprint
 
 Job = TypeVar("Job")
 
@@ -52,7 +52,7 @@ class Workers:
         pending: deque[Future[Result]] = deque()
         try:
             for job in jobs:
-                pending.append(self.executor.submit(Checked(function), job))
+                pending.append(self.executor.submit(SameCodeOnly(function), job))
                 if len(pending) >= self.ahead:
                     yield pending.popleft().result()
             while pending:
@@ -62,15 +62,17 @@ class Workers:
                 future.cancel()
 
 
-class Checked(Generic[Job, Result]):
+class SameCodeOnly(Generic[Job, Result]):
     """A function that a worker runs only if its isocharge is the one of who sent it: else its bytes would differ."""
 
     def __init__(self, function: Callable[[Job], Result]) -> None:
-        self._function, self._made_by = function, made_by()
+        self._function, self._made_by = function, code_fingerprint()
 
     def __call__(self, job: Job) -> Result:
-        if made_by() != self._made_by:
-            raise WorkersLost(f"a worker runs {made_by()}, expected {self._made_by}; install the same on all of them")
+        if code_fingerprint() != self._made_by:
+            raise WorkersLost(
+                f"a worker runs {code_fingerprint()}, expected {self._made_by}; install the same on all of them"
+            )
         return self._function(job)
 
 

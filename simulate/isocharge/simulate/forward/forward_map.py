@@ -20,7 +20,7 @@ from isocharge.progress import Progress
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.forward.family import TURNS, Family
 from isocharge.simulate.forward.readout import COARSE, FINE, NEAR, ReadoutPoints, contact_charge, touch_charge
-from isocharge.simulate.forward.solve_family import _check_family, _solve_family
+from isocharge.simulate.forward.solve_family import check_family, solve_family
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.stress import turn_stress
 from isocharge.simulate.mechanics.theory import ACCURACY, Theory, theory_for
@@ -102,7 +102,7 @@ class ForwardMap:
             SolveError: If an equilibrium or the wanted interpolation error was not reached.
         """
         film = sensor.film
-        _check_family(film, probe, radius, force_range)
+        check_family(film, probe, radius, force_range)
         theory = theory or theory_for(sensor, probe, force_range, accuracy)
         middle = float(np.sqrt(force_range[0] * force_range[1]))
         layer = layer_for(film, middle)
@@ -112,7 +112,7 @@ class ForwardMap:
         error = np.inf
         for count, turns in (((5, 3), TURNS), ((8, 5), 2 * TURNS), ((13, 8), 3 * TURNS)):
             family = Family.spread(radius, force_range, count, probe.period, turns)
-            table = _solve_family(film, probe, sensor.surface, family, theory, resolution, layer, executor, progress)
+            table = solve_family(film, probe, sensor.surface, family, theory, resolution, layer, executor, progress)
             made = cls(sensor, probe, family, theory, resolution, layer, table, error)
             error = _check_against_solves(made)
             if error <= INTERPOLATION_ERROR:

@@ -17,7 +17,7 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.errors import SensorError
 from isocharge.simulate.numerics.polygon import area_in_disk, shared_area
-from isocharge.simulate.numerics.quadrature import _gauss_line, _gauss_polygon, _gauss_square
+from isocharge.simulate.numerics.quadrature import gauss_line, gauss_polygon, gauss_square
 from isocharge.simulate.sensor.electrode import Electrode
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
@@ -132,17 +132,17 @@ def _per_area(sensor: Sensor, density: float) -> Array:
 def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
     """Points (n, 2) and shares of the mean (n, 3) for a mean over the electrode."""
     if electrode.square:
-        unit, share = _gauss_square(per_side)
+        unit, share = gauss_square(per_side)
         low, high = np.array(electrode.corners[0]), np.array(electrode.corners[2])
         points = low + unit * (high - low)
     else:
-        points, share = _gauss_polygon(np.array(electrode.corners), per_side)
+        points, share = gauss_polygon(np.array(electrode.corners), per_side)
     return points, np.repeat(share[:, None], 3, axis=1)
 
 
 def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
     """Points and shares for s11 over the left and right edges and s22 over the lower and upper ones (eq. 3)."""
-    at, share = _gauss_line(2 * per_side)
+    at, share = gauss_line(2 * per_side)
     lower, right, upper, left = (
         np.array(start) + at[:, None] * (np.array(end) - np.array(start))
         for start, end in zip(electrode.corners, electrode.corners[1:] + electrode.corners[:1], strict=True)

@@ -19,7 +19,7 @@ from isocharge.simulate.solver.equilibrium import Equilibrium
 from isocharge.simulate.solver.press import check_scene, press
 
 
-def _check_family(film: Film, probe: Probe, radius: float, force_range: tuple[float, float]) -> None:
+def check_family(film: Film, probe: Probe, radius: float, force_range: tuple[float, float]) -> None:
     low, high = force_range
     if not (0.0 < low <= high and np.isfinite(high)):
         raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {low} to {high}")
@@ -33,7 +33,7 @@ def _check_family(film: Film, probe: Probe, radius: float, force_range: tuple[fl
     check_scene(film, probe, (radius, 0.0), high)
 
 
-def _solve_family(
+def solve_family(
     film: Film,
     probe: Probe,
     surface: Surface,

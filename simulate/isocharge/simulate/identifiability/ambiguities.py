@@ -12,12 +12,12 @@ from scipy.spatial import cKDTree
 from isocharge.arrays import Array, Integers
 from isocharge.simulate.forward.charge_model import ChargeModel
 from isocharge.simulate.identifiability.cramer_rao import limits_at
-from isocharge.simulate.identifiability.force_profile import ForceCurve
+from isocharge.simulate.identifiability.force_profile import ForceProfile
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import lattice
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
-ALIKE = 3.0
+INDISTINGUISHABLE_SIGMAS = 3.0
 """Distance of the charges, in standard deviations, up to which two contacts count as alike."""
 
 APART, WIDTHS = 1e-3, 6.0
@@ -34,7 +34,7 @@ EXPONENT = 2.0 / 3.0
 
 
 @dataclass(frozen=True)
-class Twins:
+class AmbiguousPairs:
     """Pairs of contacts with the same charges, the nearest to the centre first.
 
     Attributes:
@@ -48,7 +48,7 @@ class Twins:
     distance: Array
 
     @classmethod
-    def none(cls) -> "Twins":
+    def none(cls) -> "AmbiguousPairs":
         """No pair."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
@@ -62,7 +62,7 @@ class Twins:
         return reach
 
 
-def find_twins(model: ChargeModel, noise: NoiseModel, force: float, places: int = 1000) -> Twins:
+def find_ambiguous_pairs(model: ChargeModel, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
     """Contacts far apart whose charges are alike within the noise.
 
     For each place of a square lattice, pressed with `force`, every other place is tried with the force that fits best
@@ -82,10 +82,10 @@ def find_twins(model: ChargeModel, noise: NoiseModel, force: float, places: int 
     pairs, start = _candidates(model, noise, position, charge, apart)
     second, distance = nearest_contact(model, noise, charge[pairs], start)
     far = np.hypot(*(second - first[pairs])[:, :2].T) > apart[pairs]
-    kept = np.flatnonzero(far & (distance < ALIKE))
-    found = Twins(first[pairs[kept]], second[kept], distance[kept])
+    kept = np.flatnonzero(far & (distance < INDISTINGUISHABLE_SIGMAS))
+    found = AmbiguousPairs(first[pairs[kept]], second[kept], distance[kept])
     order = np.argsort(found.reach, kind="stable")
-    return Twins(found.first[order], found.second[order], found.distance[order])
+    return AmbiguousPairs(found.first[order], found.second[order], found.distance[order])
 
 
 def _candidates(
@@ -109,7 +109,7 @@ def _candidates(
     return np.concatenate(numbers), np.concatenate(contacts)
 
 
-def _tabulate(model: ChargeModel, position: Array) -> tuple[ForceCurve, Array]:
+def _tabulate(model: ChargeModel, position: Array) -> tuple[ForceProfile, Array]:
     """Charges at every place as a function of the force."""
     low, high = np.log(model.force_range)
     nodes = chebyshev_nodes(FORCES, low, high) if high > low else np.array([low])
@@ -123,7 +123,7 @@ def _tabulate(model: ChargeModel, position: Array) -> tuple[ForceCurve, Array]:
         by_force: Array = lagrange_values(nodes, barycentric, logs) * np.exp(EXPONENT * logs)[:, None]
         return by_force
 
-    return ForceCurve.of(weights, model.force_range), terms
+    return ForceProfile.of(weights, model.force_range), terms
 
 
 def nearest_contact(model: ChargeModel, noise: NoiseModel, charge: Array, start: Array) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ FAR = 30.0
 
 
 @dataclass(frozen=True)
-class ForceCurve:
+class ForceProfile:
     """How the charges at a place depend on the force: weights(ln F) @ terms.
 
     Attributes:
@@ -32,7 +32,7 @@ class ForceCurve:
     exponent: Array
 
     @classmethod
-    def of(cls, weights: Callable[[Array], Array], force_range: tuple[float, float]) -> "ForceCurve":
+    def of(cls, weights: Callable[[Array], Array], force_range: tuple[float, float]) -> "ForceProfile":
         """Tabulate the exponent."""
         low, high = (float(end) for end in np.log(force_range))
         logs = np.linspace(low, high, 65) if high > low else np.array([low - 1e-3, low + 1e-3])

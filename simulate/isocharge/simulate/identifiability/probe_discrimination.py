@@ -24,7 +24,7 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.probe import Circle
 
-TOLD = 3.0
+DISTINGUISHABLE_SIGMAS = 3.0
 """Standard deviations by which charges must differ to tell two probes apart from one press."""
 
 INSIDE = 1.3
@@ -35,7 +35,7 @@ RADIUS_STEP = 0.1
 
 
 @dataclass(frozen=True)
-class Mistaken:
+class ProbeConfusion:
     """One probe taken for another, at some contacts.
 
     Attributes:
@@ -54,7 +54,7 @@ class Mistaken:
         """For JSON."""
         return {
             "force_N": float(self.contact[0, 2]),
-            "told_apart_share": float(np.mean(self.sigmas >= TOLD)),
+            "told_apart_share": float(np.mean(self.sigmas >= DISTINGUISHABLE_SIGMAS)),
             "sigmas_median": float(np.median(self.sigmas)),
             "sigmas_most": float(self.sigmas.max()),
             "position_error_median_mm": 1e3 * float(np.median(self.shift)),
@@ -64,11 +64,13 @@ class Mistaken:
         }
 
 
-def mistake(true: ChargeModel, taken: ChargeModel, noise: NoiseModel, contact: Array) -> Mistaken:
+def explain_with_other_probe(
+    true: ChargeModel, taken: ChargeModel, noise: NoiseModel, contact: Array
+) -> ProbeConfusion:
     """Explain the charges of contacts (x, y, F), shape (n, 3), under the true probe by contacts under the other."""
     explained, sigmas = nearest_contact(taken, noise, true.charge(contact), contact)
     shift = np.hypot(*(explained - contact)[:, :2].T)
-    return Mistaken(contact, sigmas, shift, explained[:, 2] / contact[:, 2])
+    return ProbeConfusion(contact, sigmas, shift, explained[:, 2] / contact[:, 2])
 
 
 def size_limit(
@@ -109,7 +111,7 @@ def spread_contacts(radius: float, force: float, count: int = 1000) -> Array:
 
 
 @dataclass(frozen=True)
-class SizeTold:
+class RadiusLimit:
     """How well the charges tell a circle's radius under one force.
 
     Attributes:
@@ -128,18 +130,18 @@ class SizeTold:
             "radius_std_median_percent": 1e2 * float(np.median(self.deviation)),
             "radius_std_best_percent": 1e2 * float(self.deviation[best]),
             "best_at_mm": (1e3 * self.contact[best, :2]).round(2).tolist(),
-            "told_share": float(np.mean(TOLD * self.deviation <= 1.0)),
+            "told_share": float(np.mean(DISTINGUISHABLE_SIGMAS * self.deviation <= 1.0)),
         }
 
 
-def size_told(
+def radius_limits(
     forward_map: ForwardMap,
     charges: ChargeModel,
     noise: NoiseModel,
     forces: Sequence[float],
     reach: float,
     progress: Progress | None = None,
-) -> list[SizeTold]:
+) -> list[RadiusLimit]:
     """How well the charges tell the radius of a circle within a disk: 10 s, for two more forward maps.
 
     Args:
@@ -163,7 +165,7 @@ def size_told(
         for sign in (-1.0, 1.0)
     )
     contacts = [spread_contacts(reach, force) for force in forces]
-    return [SizeTold(each, size_limit(smaller, charges, larger, noise, each)) for each in contacts]
+    return [RadiusLimit(each, size_limit(smaller, charges, larger, noise, each)) for each in contacts]
 
 
 def _of_radius(forward_map: ForwardMap, radius: float, progress: Progress | None) -> ForwardMap:

@@ -9,7 +9,7 @@ from isocharge.arrays import Array
 from isocharge.simulate.forward.charge_model import ChargeModel
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.identifiability.ambiguities import Twins, find_twins
+from isocharge.simulate.identifiability.ambiguities import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import fold_points
 from isocharge.simulate.measuring_chain.noise import NoiseModel
@@ -51,7 +51,7 @@ class WorkingArea:
     searched: float
     force_range: tuple[float, float]
     folds: Array
-    twins: Twins
+    twins: AmbiguousPairs
 
     @property
     def unfolded(self) -> float:
@@ -102,7 +102,7 @@ def working_area(
     folds = np.concatenate([fold_points(model, rings, force, noise) for force in forces])
     fold_radius = float(np.hypot(*folds.T).min()) if len(folds) else np.inf
     error_radius = min(_within(model, rings, force, noise, error) for force in forces)
-    pairs = find_twins(model, noise, low) if twins else Twins.none()
+    pairs = find_ambiguous_pairs(model, noise, low) if twins else AmbiguousPairs.none()
     twin_radius = float(pairs.reach[0]) if len(pairs) else np.inf
     ends: dict[Why, float] = {
         "searched": model.radius,
@@ -138,7 +138,7 @@ def _within(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel, e
     return float(np.interp(np.log(error), logs, rings.distance[first - 1 : first + 1]))
 
 
-def _twin_words(twins: Twins) -> str:
+def _twin_words(twins: AmbiguousPairs) -> str:
     (x, y, force), (other_x, other_y, other_force) = twins.first[0], twins.second[0]
     return (
         f"Contacts far apart may be alike, too: {force:.3g} N at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm and "

@@ -10,14 +10,14 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.simulate.mechanics.bending import Bending
 from isocharge.simulate.mechanics.membrane import Membrane
-from isocharge.simulate.mechanics.scaling import Groups
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.elements import Geometry
 
 
 class ElasticFilm:
     """The discrete film for one geometry and one set of groups."""
 
-    def __init__(self, geometry: Geometry, groups: Groups) -> None:
+    def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
         self.geometry = geometry
         self.groups = groups
         self.membrane = Membrane(geometry, groups)

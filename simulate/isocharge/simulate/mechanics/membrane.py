@@ -19,7 +19,7 @@ that the variation of E' is sym(F_ia v_i,b) for all three components alike.
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.mechanics.scaling import Groups
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mechanics.stress import strain, stress
 from isocharge.simulate.mesh.elements import Geometry
 
@@ -30,7 +30,7 @@ PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 class Membrane:
     """The discrete membrane: functions of the nodal field for one geometry and one set of groups."""
 
-    def __init__(self, geometry: Geometry, groups: Groups) -> None:
+    def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
         self.geometry = geometry
         self.groups = groups
         self._scale = np.array([groups.amplitude2, groups.amplitude2, 1.0])

@@ -16,15 +16,15 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.simulate.sensor.film import Film
 
-TAUT = 1.6
+MEMBRANE_STIFFNESS = 1.6
 """Force over deflection of a taut membrane, in units of pretension * thickness: 2 pi / ln(a / R), R = 0.02 a."""
 
-BENT = 16.0 * np.pi
+PLATE_STIFFNESS = 16.0 * np.pi
 """Force over deflection of a clamped plate under a central point load, in units of its stiffness over a^2."""
 
 
 @dataclass(frozen=True)
-class Groups:
+class DimensionlessGroups:
     """The dimensionless groups that fix the problem; E is Young's modulus, h the thickness, a the film's radius.
 
     Attributes:
@@ -42,7 +42,7 @@ class Groups:
     poisson: float
 
     @classmethod
-    def of(cls, film: Film, force: float, *, bending: bool) -> "Groups":
+    def of(cls, film: Film, force: float, *, bending: bool) -> "DimensionlessGroups":
         """The groups of a film under a force (N), with or without bending."""
         amplitude2 = float(amplitude_squared(film, force))
         return cls(
@@ -56,7 +56,7 @@ class Groups:
     @property
     def height(self) -> float:
         """Deflection of the middle over a A, roughly: one, where the groups are what `of` makes them."""
-        linear = TAUT * self.tension + BENT * self.bending
+        linear = MEMBRANE_STIFFNESS * self.tension + PLATE_STIFFNESS * self.bending
         return float(_root(linear, self.load))
 
     @property
@@ -64,7 +64,7 @@ class Groups:
         """Roughly, the share of the load that the stress induced by the deflection carries: 0 linear, 1 slack."""
         return self.height**3 / self.load
 
-    def stiffened(self, tension: float) -> "Groups":
+    def stiffened(self, tension: float) -> "DimensionlessGroups":
         """The same scene with more tension."""
         return replace(self, tension=self.tension + tension)
 
@@ -76,7 +76,7 @@ def slenderness(film: Film) -> float:
 
 def amplitude_squared(film: Film, force: Array | float) -> Any:
     """A^2, of the shape and type of `force` (N)."""
-    linear = TAUT * film.pretension / film.young + BENT * slenderness(film)
+    linear = MEMBRANE_STIFFNESS * film.pretension / film.young + PLATE_STIFFNESS * slenderness(film)
     return _root(linear, force / (film.young * film.thickness * film.radius)) ** 2
 
 

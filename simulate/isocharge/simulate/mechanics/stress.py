@@ -5,7 +5,7 @@ import numpy as np
 from isocharge.arrays import Array
 
 
-def _principal(total: Array) -> tuple[float, float]:
+def principal_stresses(total: Array) -> tuple[float, float]:
     """Smallest and largest principal value of (S11, S22, S12), shape (..., 3)."""
     mean = 0.5 * (total[..., 0] + total[..., 1])
     radius = np.hypot(0.5 * (total[..., 0] - total[..., 1]), total[..., 2])

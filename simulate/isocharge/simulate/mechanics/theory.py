@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.errors import SceneError
-from isocharge.simulate.mechanics.scaling import Groups, slenderness
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups, slenderness
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
@@ -69,7 +69,7 @@ class Theory:
 
 def bending_length(film: Film, force: float) -> float:
     """l / a: how far a clamped edge bends the film, over the film's radius."""
-    groups = Groups.of(film, force, bending=True)
+    groups = DimensionlessGroups.of(film, force, bending=True)
     tension = groups.tension + INDUCED_STRAIN * groups.height**2
     return float(np.sqrt(groups.bending / tension))
 
@@ -100,13 +100,13 @@ def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
     return float(0.5 * slope**2 * film.young / film.pretension / (1.0 + length2) ** 2)
 
 
-def left_out(film: Film, probe: Probe, force: float, theory: Theory) -> float:
+def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
     """Relative error of a charge to expect from what a theory leaves out; infinite where it has no meaning."""
     error = 0.0
     if not theory.stretching:
         if not theory.bending and film.pretension == 0.0:
             return np.inf
-        error += LINEAR_WEIGHT * Groups.of(film, force, bending=theory.bending).induced
+        error += LINEAR_WEIGHT * DimensionlessGroups.of(film, force, bending=theory.bending).induced
         error += LOCAL_WEIGHT * induced_at_probe(film, probe, force)
     if not theory.bending:
         length = bending_length(film, force)
@@ -115,7 +115,7 @@ def left_out(film: Film, probe: Probe, force: float, theory: Theory) -> float:
     return error
 
 
-def choose(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
+def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
     """The cheapest theory whose error stays within the wanted accuracy, the full one if none does."""
     tense = film.pretension > 0.0
     cheap_first = (
@@ -124,14 +124,14 @@ def choose(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
         Theory(stretching=True, bending=False, pretensioned=tense),
     )
     for theory in cheap_first:
-        if left_out(film, probe, force, theory) <= 0.5 * accuracy:
+        if modelling_error(film, probe, force, theory) <= 0.5 * accuracy:
             return theory
     return Theory(stretching=True, bending=True, pretensioned=tense)
 
 
 def theory_for(sensor: Sensor, probe: Probe, force_range: tuple[float, float], accuracy: float = ACCURACY) -> Theory:
     """The fewest terms that serve every force (N) of a range and the surface that a sensor reads."""
-    ends = [choose(sensor.film, probe, force, accuracy) for force in force_range]
+    ends = [choose_theory(sensor.film, probe, force, accuracy) for force in force_range]
     return Theory(
         stretching=any(end.stretching for end in ends),
         bending=any(end.bending for end in ends) or sensor.surface != "middle",
@@ -139,7 +139,7 @@ def theory_for(sensor: Sensor, probe: Probe, force_range: tuple[float, float], a
     )
 
 
-def named(name: str, film: Film) -> Theory:
+def theory_by_name(name: str, film: Film) -> Theory:
     """The theory of this name, "linear plate", "linear membrane", "nonlinear membrane" or with " + bending".
 
     Raises:

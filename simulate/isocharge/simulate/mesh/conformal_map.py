@@ -19,13 +19,13 @@ GRADING = 0.65
 """How much of the map's stretching round the rim the sectors take up there: none 0, all 1."""
 
 
-def _conformal(at: Array, radius: Array) -> tuple[Array, Array]:
+def automorphism_onto(at: Array, radius: Array) -> tuple[Array, Array]:
     """(c, rho) that carry |z| = rho onto the circle of this centre and radius (film radius one); see the module."""
     outer, inner = np.arctanh(at + radius), np.arctanh(at - radius)
     return np.tanh(0.5 * (outer + inner)), np.tanh(0.5 * (outer - inner))
 
 
-def _enclosing(corners: Complexes, at: Array) -> tuple[Array, Array]:
+def enclosing_circle(corners: Complexes, at: Array) -> tuple[Array, Array]:
     """Centre and radius of a circle inside the film round each polygon: about the centroid where there is room."""
     gap = 1.0 - np.abs(corners).max(axis=-1)
 
@@ -47,7 +47,7 @@ def _enclosing(corners: Complexes, at: Array) -> tuple[Array, Array]:
     return centre, radius(centre)
 
 
-def _sectors(mesh: Template, corners: Complexes, centre: Array, radius: Array, pull: Array) -> Array:
+def sector_angles(mesh: Template, corners: Complexes, centre: Array, radius: Array, pull: Array) -> Array:
     """Angles on the template's circle, where rays from the polygon's hub meet it.
 
     Their directions lie between those of the polygon's corners and an even spread where there is room between polygon
@@ -69,19 +69,19 @@ def _sectors(mesh: Template, corners: Complexes, centre: Array, radius: Array, p
     point = away + ray * (np.sqrt(along**2 + radius[..., None] ** 2 - np.abs(away) ** 2) - along)
     first = np.angle(point[..., :1])
     turned = np.cumsum(np.mod(np.angle(point[..., 1:] / point[..., :-1]), 2.0 * np.pi), axis=-1)
-    return _stretched(np.concatenate([first, first + turned], axis=-1), (1.0 + pull) / (1.0 - pull))
+    return stretch_angles(np.concatenate([first, first + turned], axis=-1), (1.0 + pull) / (1.0 - pull))
 
 
-def _graded(angle: Array, c: Array, rho: Array) -> Array:
+def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
     """Angles on the rim, from those on the circle: moved towards pi, where the map compresses the far side of the film.
 
     Even spacing on the circle of the film has done some of it.
     """
     stretch = ((1.0 + c) / (1.0 - c)) ** GRADING * (1.0 - c * rho) / (1.0 + c * rho)
-    return _stretched(angle, np.maximum(stretch, 1.0))
+    return stretch_angles(angle, np.maximum(stretch, 1.0))
 
 
-def _stretched(angle: Array, factor: Array) -> Array:
+def stretch_angles(angle: Array, factor: Array) -> Array:
     """Angles whose half has its tangent multiplied: what the map does to angles on a circle about its centre.
 
     |z| = rho is carried onto its circle with the factor (1 - c rho) / (1 + c rho), rho = 1 onto the rim.
@@ -91,7 +91,7 @@ def _stretched(angle: Array, factor: Array) -> Array:
     return stretched
 
 
-def _rings(resolution: Resolution, rho: Array, layer: Array) -> Array:
+def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
     """Edges of the rings: even steps, then thin rings, each a third of what is left of the layer."""
     even = np.linspace(0.0, 1.0, resolution.rings + 1)
     if resolution.rim == 0:

@@ -22,7 +22,13 @@ from typing import Any, Self
 import numpy as np
 
 from isocharge.arrays import Array, Complexes, Integers
-from isocharge.simulate.mesh.conformal_map import _conformal, _enclosing, _graded, _rings, _sectors
+from isocharge.simulate.mesh.conformal_map import (
+    automorphism_onto,
+    enclosing_circle,
+    rim_angles,
+    ring_edges,
+    sector_angles,
+)
 from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.sensor.film import Film
@@ -83,12 +89,12 @@ class Placement:
         else:
             turned = np.exp(1j * np.broadcast_to(turn, at.shape))[..., None]
             corners = at[..., None] + probe.outline / film_radius * turned
-            centre, radius = _enclosing(corners, at)
+            centre, radius = enclosing_circle(corners, at)
         corners = np.concatenate([corners, at[..., None]], axis=-1)
-        c, rho = _conformal(centre, radius)
-        start = _sectors(mesh, corners, centre, radius, c * rho)
-        depth = _rings(mesh.resolution, rho, layer * (1.0 + c) / (1.0 - c))
-        return cls(c, rho, corners, start, _graded(start, c, rho), depth)
+        c, rho = automorphism_onto(centre, radius)
+        start = sector_angles(mesh, corners, centre, radius, c * rho)
+        depth = ring_edges(mesh.resolution, rho, layer * (1.0 + c) / (1.0 - c))
+        return cls(c, rho, corners, start, rim_angles(start, c, rho), depth)
 
     def __getitem__(self, which: Integers) -> "Placement":
         """Some of the placements."""

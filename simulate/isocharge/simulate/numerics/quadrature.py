@@ -7,21 +7,21 @@ import numpy as np
 from isocharge.arrays import Array
 
 
-def _gauss_line(count: int) -> tuple[Array, Array]:
+def gauss_line(count: int) -> tuple[Array, Array]:
     """Gauss points and shares on [0, 1]."""
     at, weight = np.polynomial.legendre.leggauss(count)
     return 0.5 * (at + 1.0), 0.5 * weight
 
 
-def _gauss_square(count: int) -> tuple[Array, Array]:
-    at, share = _gauss_line(count)
+def gauss_square(count: int) -> tuple[Array, Array]:
+    at, share = gauss_line(count)
     x, y = np.meshgrid(at, at)
     return np.stack([x.ravel(), y.ravel()], axis=1), np.outer(share, share).ravel()
 
 
-def _gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
+def gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
     """A fan of triangles from the first corner, each a square folded onto a triangle (Duffy 1982)."""
-    unit, share = _gauss_square(count)
+    unit, share = gauss_square(count)
     s, t = unit[:, :1], unit[:, 1:]
     points, shares = [], []
     for second, third in pairwise(corners[1:]):

@@ -15,7 +15,7 @@ from isocharge.simulate.paper.figure_contours import fig_9, fig_10, fig_11
 from isocharge.simulate.paper.figure_curves import fig_6, fig_8, fig_12
 from isocharge.simulate.paper.figure_layouts import fig_1, fig_2, fig_3, fig_4, fig_5, fig_7
 from isocharge.simulate.paper.page import as_json, page
-from isocharge.simulate.paper.solves import Study, conduct
+from isocharge.simulate.paper.solves import Solves, solve_all
 from isocharge.simulate.paper.triangulation_errors import Accuracy
 from isocharge.simulate.plots.figure import save_picture
 
@@ -51,7 +51,7 @@ def write_paper(
     began = time.perf_counter()
     choices, workers = choices or Choices(), workers or Workers()
     with new_folder(output) as draft:
-        study = conduct(choices, workers, solved)
+        study = solve_all(choices, workers, solved)
         accuracy = Accuracy.of(study, workers, triangulated)
         entries = []
         for entry in make_entries(study, accuracy):
@@ -68,7 +68,7 @@ def write_paper(
     return tuple(entries)
 
 
-def make_entries(study: Study, accuracy: Accuracy) -> Iterator[Entry]:
+def make_entries(study: Solves, accuracy: Accuracy) -> Iterator[Entry]:
     """Every figure in the paper's order, then eq. 4, the claims and our choices."""
     for make in (fig_1, fig_2, fig_3, fig_4, fig_5, fig_6, fig_7, fig_8):
         yield make(study)

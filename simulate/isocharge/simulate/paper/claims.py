@@ -10,14 +10,14 @@ from isocharge.simulate.forward.readout import contact_charge, thermal_charge
 from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
 from isocharge.simulate.paper.figure_layouts import TOUCHED
-from isocharge.simulate.paper.solves import FORCE, Study, sample
-from isocharge.simulate.paper.triangulation_errors import Accuracy, Errors, unnoticed
+from isocharge.simulate.paper.solves import FORCE, Solves, sample
+from isocharge.simulate.paper.triangulation_errors import Accuracy, Errors, largest_change
 
 D33, PYRO, KELVIN = -30e-12, 30e-6, 0.1
 """Of PVDF, C/N and C/(m^2 K), and a temperature step (K) that a finger makes easily."""
 
 
-def claims(study: Study, accuracy: Accuracy) -> Entry:
+def claims(study: Solves, accuracy: Accuracy) -> Entry:
     """What the text says without a figure."""
     rows, numbers = [], {}
     for make in (_edges, _d33, _pyro, _stress):
@@ -30,7 +30,7 @@ def claims(study: Study, accuracy: Accuracy) -> Entry:
     return Entry("Claims", "What the text says, in numbers.", None, rows, numbers)
 
 
-def _edges(study: Study) -> tuple[Row, dict[str, object]]:
+def _edges(study: Solves) -> tuple[Row, dict[str, object]]:
     """Edge averages against the whole electrode."""
     places = study.places
     edge, area = (
@@ -49,7 +49,7 @@ def _edges(study: Study) -> tuple[Row, dict[str, object]]:
     return row, {"edge_against_area_percent": {"median": middle, "p95": most, "worst": worst}}
 
 
-def _d33(study: Study) -> tuple[Row, dict[str, object]]:
+def _d33(study: Solves) -> tuple[Row, dict[str, object]]:
     """The contact pressure where the probe covers part of B."""
     sensor = study.choices.sensor("three")
     taking = replace(sensor, piezo=replace(sensor.piezo, d33=D33))
@@ -71,7 +71,7 @@ def _d33(study: Study) -> tuple[Row, dict[str, object]]:
     return row, {"d33_pC": {"largest": 1e12 * extra.max(), "largest_share": share.max()}}
 
 
-def _pyro(study: Study) -> tuple[Row, dict[str, object]]:
+def _pyro(study: Solves) -> tuple[Row, dict[str, object]]:
     sensor = study.choices.sensor("three")
     warm = thermal_charge(replace(sensor, piezo=replace(sensor.piezo, pyro=PYRO)), KELVIN)[0]
     row = Row(
@@ -83,7 +83,7 @@ def _pyro(study: Study) -> tuple[Row, dict[str, object]]:
     return row, {"pyro_pC_per_0.1_K": 1e12 * warm}
 
 
-def _stress(study: Study) -> tuple[Row, dict[str, object]]:
+def _stress(study: Solves) -> tuple[Row, dict[str, object]]:
     largest = study.shown.principal_stress[1]
     row = Row(
         "the material stays linear",
@@ -134,7 +134,7 @@ def _known(accuracy: Accuracy) -> Row:
     )
 
 
-def what_choices_change(study: Study, accuracy: Accuracy) -> Entry:
+def what_choices_change(study: Solves, accuracy: Accuracy) -> Entry:
     """Sizes that the paper does not give."""
     rows = []
     film, piezo = study.choices.sensor("three").film, study.choices.sensor("three").piezo
@@ -148,7 +148,7 @@ def what_choices_change(study: Study, accuracy: Accuracy) -> Entry:
         kind, _, value = name.partition(" ")
         errors = accuracy.mistaken[name]
         position = f"{errors.percentile(50):.3f} mm" if errors.found_mm.size else "no contours met"
-        change = f"charges by {_signed(study, name)}, at most {100 * unnoticed(study, name):.1f} %"
+        change = f"charges by {_signed(study, name)}, at most {100 * largest_change(study, name):.1f} %"
         rows.append(
             Row(
                 f"{kind}: {value}",
@@ -165,11 +165,11 @@ def what_choices_change(study: Study, accuracy: Accuracy) -> Entry:
             f"eq. 4 agrees with d31 = {1e12 * piezo.d31 / study.eq_4[1]:.1f} pC/N, all else as ours",
         )
     )
-    found = {name: {"largest_change": unnoticed(study, name)} for name in study.variants}
+    found = {name: {"largest_change": largest_change(study, name)} for name in study.variants}
     return Entry("What the paper does not give", "Our choices, and what others would change.", None, rows, found)
 
 
-def _signed(study: Study, name: str) -> str:
+def _signed(study: Solves, name: str) -> str:
     """Median relative change of a charge, with its sign."""
     at: Array = np.array(sample(study.choices))
     charge = study.charges("triangle", study.choices.sensor("three"), at)

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from isocharge.arrays import Array
 from isocharge.simulate.paper.choices import PAPER, normalised_cubic
 from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.solves import Study
+from isocharge.simulate.paper.solves import Solves
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
 
 RANGE, BAND = (0.25, 2.0), 0.02
@@ -74,7 +74,7 @@ class ChargeForce:
         return fitted
 
 
-def films_of(study: Study) -> list[list[ChargeForce]]:
+def films_of(study: Solves) -> list[list[ChargeForce]]:
     """Of every thickness, every pretension."""
     choices = study.choices
     logs = np.log(np.array(choices.force))
@@ -87,7 +87,7 @@ def films_of(study: Study) -> list[list[ChargeForce]]:
     ]
 
 
-def eq_4(study: Study) -> Entry:
+def eq_4(study: Solves) -> Entry:
     """The cubic, which film has it, and where charge is linear."""
     films = films_of(study)
     figure = new_figure(15.5, 9.6)
@@ -112,7 +112,7 @@ def eq_4(study: Study) -> Entry:
     )
 
 
-def _rows_of_press(study: Study, films: list[list[ChargeForce]]) -> list[Row]:
+def _rows_of_press(study: Solves, films: list[list[ChargeForce]]) -> list[Row]:
     """Where eq. 4's press was, and how large its charges are."""
     (x, y), factor = study.eq_4
     pC, thick = [sum(cubic) for cubic in PAPER.cubics], films[-1]
@@ -226,7 +226,7 @@ def _linear_words(films: list[list[ChargeForce]]) -> str:
     return f"within {100 * LINEAR:g} %: {words}{more}{bends}"
 
 
-def _numbers(study: Study, films: list[list[ChargeForce]]) -> dict[str, Any]:
+def _numbers(study: Solves, films: list[list[ChargeForce]]) -> dict[str, Any]:
     (x, y), factor = study.eq_4
     return {
         "press_of_eq_4_mm": [1e3 * x, 1e3 * y],

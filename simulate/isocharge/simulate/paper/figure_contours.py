@@ -11,7 +11,7 @@ from isocharge.simulate.contours.fix import Meeting
 from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTriangulation
 from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.solves import FORCE, Study
+from isocharge.simulate.paper.solves import FORCE, Solves
 from isocharge.simulate.paper.triangulation_errors import BEYOND, Accuracy
 from isocharge.simulate.plots.curves import draw_contours
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
@@ -21,7 +21,7 @@ LEVELS, AREA = 8, 11.5e-3
 """Contours of each electrode in Fig. 11, and how far from the centre they are followed, m: to the electrodes' end."""
 
 
-def fig_9(study: Study, accuracy: Accuracy) -> Entry:
+def fig_9(study: Solves, accuracy: Accuracy) -> Entry:
     """Contours from the field, under a triangle."""
     sensor = study.choices.sensor("three")
     film, at = study.film("triangle", sensor), study.choices.shown
@@ -57,7 +57,7 @@ def fig_9(study: Study, accuracy: Accuracy) -> Entry:
     )
 
 
-def fig_10(study: Study, accuracy: Accuracy) -> Entry:
+def fig_10(study: Solves, accuracy: Accuracy) -> Entry:
     """The paper's own way, and how its 0.122 mm compares."""
     sensor, at = study.choices.sensor("three"), study.choices.shown
     contours = DrawnTriangulation(study.scheme("triangle", sensor), study.choices.degree)
@@ -165,7 +165,7 @@ def _distributions(axes: Any, accuracy: Accuracy, degree: int) -> None:
     axes.legend(fontsize=8)
 
 
-def fig_11(study: Study) -> Entry:
+def fig_11(study: Solves) -> Entry:
     """Contours of all four electrodes under a circle."""
     sensor = study.choices.sensor("four")
     film = study.film("circle", sensor)
@@ -222,7 +222,7 @@ def _one_electrode(axes: Any, field: ContourField, name: str, colour: str) -> No
             axes.annotate(f"{1e12 * q:.0f}", 1e3 * end, **label)
 
 
-def _apart_from_triangle(study: Study) -> tuple[float, float]:
+def _apart_from_triangle(study: Solves) -> tuple[float, float]:
     """Relative change of a charge from the circle to the triangle over the working area: median and largest."""
     sensor, places = study.choices.sensor("four"), study.places
     circle, triangle = (study.charges(probe, sensor, places) for probe in ("circle", "triangle"))

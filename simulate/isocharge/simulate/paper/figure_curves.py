@@ -9,7 +9,7 @@ from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from isocharge.simulate.contours.graphical_method import draw_contour
 from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.solves import FORCE, Study
+from isocharge.simulate.paper.solves import FORCE, Solves
 from isocharge.simulate.plots.curves import draw_curves
 from isocharge.simulate.plots.figure import COLOURS, PRESSED, new_figure
 from isocharge.simulate.sensor.film import Piezo
@@ -24,7 +24,7 @@ RATIOS = np.linspace(0.0, 2.0, 41)
 
 
 def curves_of(
-    study: Study, probe: str, sensor: Sensor, name: str, degrees: tuple[float, float], length: float | None = None
+    study: Solves, probe: str, sensor: Sensor, name: str, degrees: tuple[float, float], length: float | None = None
 ) -> tuple[Curves, Curves]:
     """Curves at the scheme's presses, and finely along the same lines."""
     ends = (np.deg2rad(degrees[0]), np.deg2rad(degrees[1]))
@@ -42,7 +42,7 @@ def numbers(curves: Curves) -> dict[str, object]:
     }
 
 
-def fig_6(study: Study) -> Entry:
+def fig_6(study: Solves) -> Entry:
     """Triangle, biaxial, from A; three electrodes as in the paper, and four."""
     figure = new_figure(12.6, 5.2)
     left, right = figure.subplots(1, 2)
@@ -81,7 +81,7 @@ def fig_6(study: Study) -> Entry:
     return Entry("Fig. 6", caption, figure, rows, found)
 
 
-def _example(study: Study, at: Curves, smooth: Curves) -> tuple[Row, Array]:
+def _example(study: Solves, at: Curves, smooth: Curves) -> tuple[Row, Array]:
     """The paper's example of a contour: distances (mm) at which the lines have 650 pC."""
     contour = draw_contour(at, 1e-12 * PAPER.contour_pC, study.choices.degree)
     knots = np.empty((0, 2)) if contour is None else contour.knots
@@ -106,7 +106,7 @@ def _spread(curves: Curves) -> Array:
     return spread
 
 
-def fig_8(study: Study) -> Entry:
+def fig_8(study: Solves) -> Entry:
     """Rectangle, biaxial, from B; and who is uppermost."""
     sensor = study.choices.sensor("three")
     at, smooth = curves_of(study, "rectangle", sensor, "B", PAPER.fig_8_deg)
@@ -192,7 +192,7 @@ def _extreme(curves: Curves, extreme: object) -> str:
     return ", ".join(f"{angle:.0f}°" for angle in _angles(curves, extreme))
 
 
-def _best_ratio(study: Study) -> tuple[float, float]:
+def _best_ratio(study: Solves) -> tuple[float, float]:
     """d32 over d31 with which the order of Fig. 8 holds at most distances, and the share of them."""
     sensor = study.choices.sensor("three")
     directions = (Piezo(d31=1e-12, d32=0.0), Piezo(d31=0.0, d32=1e-12))
@@ -206,7 +206,7 @@ def _best_ratio(study: Study) -> tuple[float, float]:
     return best[1], best[0]
 
 
-def fig_12(study: Study) -> Entry:
+def fig_12(study: Solves) -> Entry:
     """Triangle, uniaxial, from A, beside biaxial."""
     figure = new_figure(12.0, 5.2)
     found, rows = {}, []

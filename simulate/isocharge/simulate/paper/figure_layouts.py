@@ -12,7 +12,7 @@ from isocharge.simulate.forward.readout import contact_charge
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.paper.choices import PAPER
 from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.solves import FINEST, FORCE, MESHES, Study
+from isocharge.simulate.paper.solves import FINEST, FORCE, MESHES, Solves
 from isocharge.simulate.plots.curves import draw_mapping
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
@@ -22,7 +22,7 @@ FIG_4_DEG, FIG_7_DEG = (35.0, 145.0), PAPER.fig_8_deg
 """Lines from A, the half that Fig. 6 shows and its mirror image; lines from B."""
 
 
-def fig_1(study: Study) -> Entry:
+def fig_1(study: Solves) -> Entry:
     """The principle: three distances."""
     sensor = study.choices.sensor("three")
     centres, at = np.array([e.centre for e in sensor.electrodes]), np.array(study.choices.shown)
@@ -69,7 +69,7 @@ def _mirrored(first: Array, second: Array, at: Array) -> Array:
     return mirrored
 
 
-def fig_2(study: Study) -> Entry:
+def fig_2(study: Solves) -> Entry:
     """The mapping scheme about one electrode."""
     sensor = study.choices.sensor("three")
     mapping = Mapping.lines(sensor, "A", (0.0, 2.0 * np.pi - np.deg2rad(10.0)), length=study.choices.length)
@@ -92,7 +92,7 @@ def fig_2(study: Study) -> Entry:
     )
 
 
-def fig_3(study: Study) -> Entry:
+def fig_3(study: Solves) -> Entry:
     """The layout with three sensing elements, and as the text has it."""
     sensor, printed = study.choices.sensor("three"), study.choices.as_printed()
     figure = new_figure(11.0, 5.6)
@@ -135,7 +135,7 @@ def _lengths(sides: list[float]) -> str:
     return ", ".join(f"{side:.2f}" for side in sides) + " mm"
 
 
-def _scheme(study: Study, heading: str, electrode: str, angles: tuple[float, float]) -> Entry:
+def _scheme(study: Solves, heading: str, electrode: str, angles: tuple[float, float]) -> Entry:
     sensor = study.choices.sensor("three")
     ends = (np.deg2rad(angles[0]), np.deg2rad(angles[1]))
     mapping = Mapping.lines(sensor, electrode, ends, length=study.choices.length)
@@ -163,7 +163,7 @@ TOUCHED = 1e-3
 """Share of the probe that must lie on an electrode to count: less is the round-off of areas."""
 
 
-def touching(study: Study, sensor: Sensor, mapping: Mapping) -> np.ndarray:
+def touching(study: Solves, sensor: Sensor, mapping: Mapping) -> np.ndarray:
     """Which presses of a scheme overlap which electrode under the triangle, shape (n, n_electrode)."""
     pressed = replace(
         sensor, piezo=replace(sensor.piezo, d33=-1.0)
@@ -173,17 +173,17 @@ def touching(study: Study, sensor: Sensor, mapping: Mapping) -> np.ndarray:
     return np.asarray(np.array(covered) > TOUCHED)
 
 
-def fig_4(study: Study) -> Entry:
+def fig_4(study: Solves) -> Entry:
     """The scheme from A."""
     return _scheme(study, "Fig. 4", "A", FIG_4_DEG)
 
 
-def fig_7(study: Study) -> Entry:
+def fig_7(study: Solves) -> Entry:
     """The scheme from B."""
     return _scheme(study, "Fig. 7", "B", FIG_7_DEG)
 
 
-def fig_5(study: Study) -> Entry:
+def fig_5(study: Solves) -> Entry:
     """The mesh, and what its fineness is worth."""
     shown = study.shown
     figure = new_figure(15.0, 5.0)
@@ -233,14 +233,14 @@ def fig_5(study: Study) -> Entry:
     )
 
 
-def mesh_errors(study: Study) -> tuple[Array, Array, Array]:
+def mesh_errors(study: Solves) -> tuple[Array, Array, Array]:
     """Unknowns, worst relative error of a charge against the finest mesh, CPU seconds of every mesh but that."""
     charges, unknowns, seconds = zip(*study.meshes, strict=True)
     error = np.abs(np.array(charges[:-1]) / charges[-1] - 1.0).max(axis=1)
     return np.array(unknowns[:-1]), error, np.array(seconds[:-1])
 
 
-def _draw_mesh(axes: Any, study: Study) -> None:
+def _draw_mesh(axes: Any, study: Solves) -> None:
     shown = study.shown
     along, one = np.linspace(-1.0, 1.0, 13), np.ones(13)
     xi, eta = np.concatenate([along, one, -along, -one]), np.concatenate([-one, along, one, -along])

@@ -42,7 +42,7 @@ CHAIN_ACCURACY = 2e-3
 
 
 @dataclass(frozen=True)
-class Presses:
+class SolveJob:
     """Single presses to solve, the same way each: charges of some sensors.
 
     Attributes:
@@ -60,7 +60,7 @@ class Presses:
     accuracy: float = 1e-3
 
 
-def solve_presses(job: Presses) -> Array:
+def solve_presses(job: SolveJob) -> Array:
     """Touch charges, shape (n_sensor, n_press, n_electrode), C; all sensors have as many electrodes."""
     start: Equilibrium | None = None
     charge = []
@@ -112,7 +112,7 @@ def run(job: tuple[Callable[[Any], Any], Any]) -> Any:
 
 
 @dataclass(frozen=True)
-class Study:
+class Solves:
     """What was solved.
 
     Attributes:
@@ -155,7 +155,7 @@ class Study:
         return np.stack([z.real, z.imag], axis=1)
 
 
-def conduct(choices: Choices, workers: Workers, progress: Progress | None = None) -> Study:
+def solve_all(choices: Choices, workers: Workers, progress: Progress | None = None) -> Solves:
     """Solve everything. `progress` is told how many tasks are done."""
     sensor = choices.sensor("three")
     first = _map_jobs(choices)
@@ -173,7 +173,7 @@ def conduct(choices: Choices, workers: Workers, progress: Progress | None = None
     late = bar.over(workers, [(solve_presses, job) for job in _chain_jobs(choices, eq_4[0])])
     charges = np.array(late)[:, 0].reshape(len(choices.thickness), len(choices.pretension), len(choices.force), -1)
     shown = press(sensor.film, choices.triangle, choices.shown, FORCE)
-    return Study(choices, maps, eq_4, charges, tuple(early[len(first) + len(variants) :]), read, shown)
+    return Solves(choices, maps, eq_4, charges, tuple(early[len(first) + len(variants) :]), read, shown)
 
 
 class _Counter:
@@ -206,11 +206,11 @@ def _map_jobs(choices: Choices) -> dict[str, MapJob]:
     }
 
 
-def _chain_jobs(choices: Choices, at: tuple[float, float]) -> list[Presses]:
+def _chain_jobs(choices: Choices, at: tuple[float, float]) -> list[SolveJob]:
     """Charge against force of every film, at the place of eq. 4."""
     sensor, count = choices.sensor("three"), len(choices.force)
     return [
-        Presses((replace(sensor, film=film),), choices.triangle, (at,) * count, choices.force, CHAIN_ACCURACY)
+        SolveJob((replace(sensor, film=film),), choices.triangle, (at,) * count, choices.force, CHAIN_ACCURACY)
         for film in (
             replace(sensor.film, thickness=thickness, pretension=pretension)
             for thickness in choices.thickness
@@ -232,12 +232,12 @@ def sample(choices: Choices) -> tuple[tuple[float, float], ...]:
     return tuple((float(z.real), float(z.imag)) for z in places)
 
 
-def _variants(choices: Choices) -> dict[str, Presses]:
+def _variants(choices: Choices) -> dict[str, SolveJob]:
     """Presses with another probe or film than our choice, by name; at the same places, 1 N, paper's readout."""
     sensor, at = choices.sensor("three"), sample(choices)
 
-    def presses(film: Film, probe: Probe) -> Presses:
-        return Presses((replace(sensor, film=film),), probe, at, (FORCE,) * len(at))
+    def presses(film: Film, probe: Probe) -> SolveJob:
+        return SolveJob((replace(sensor, film=film),), probe, at, (FORCE,) * len(at))
 
     found = {f"probe {probe.notation}": presses(sensor.film, probe) for probe in choices.probes}
     found[f"pretension {TAUT * 1e-6:g} MPa"] = presses(replace(sensor.film, pretension=TAUT), choices.triangle)

@@ -13,7 +13,7 @@ from isocharge.simulate.contours.triangulation import Triangulation
 from isocharge.simulate.execution.workers import Workers
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.simulate.paper.choices import PAPER
-from isocharge.simulate.paper.solves import FORCE, Study, sample
+from isocharge.simulate.paper.solves import FORCE, Solves, sample
 
 LAYOUTS = ("three", "four")
 
@@ -87,7 +87,7 @@ class Accuracy:
     mistaken: Mapping[str, Errors]
 
     @classmethod
-    def of(cls, study: Study, workers: Workers, progress: Progress | None = None) -> "Accuracy":
+    def of(cls, study: Solves, workers: Workers, progress: Progress | None = None) -> "Accuracy":
         """Triangulate; `progress` is told how many of the methods are done."""
         degrees = [degree for degree in DEGREES if degree <= study.choices.degree]
         jobs = [(study, layout, degree, False) for layout in LAYOUTS for degree in degrees]
@@ -117,7 +117,7 @@ def _noisy(charge: Array) -> Array:
     return noise_model("reference").add(charge, np.random.default_rng(SEED))
 
 
-def _light(study: Study, layout: str, degree: int, noise: bool) -> tuple[DrawnTriangulation, Array, Array]:
+def _light(study: Solves, layout: str, degree: int, noise: bool) -> tuple[DrawnTriangulation, Array, Array]:
     """A task that carries curves and charges, not the maps."""
     sensor = study.choices.sensor(layout)
     charge = study.charges("triangle", sensor, study.places)
@@ -133,7 +133,7 @@ def _draw(job: tuple[DrawnTriangulation, Array, Array]) -> Errors:
     return Errors(contours.locate(charge), at)
 
 
-def unnoticed(study: Study, name: str) -> float:
+def largest_change(study: Solves, name: str) -> float:
     """Largest relative change of a charge that a variation makes, over the presses of the variations."""
     at = np.array(sample(study.choices))
     charge = study.charges("triangle", study.choices.sensor("three"), at)

@@ -12,9 +12,9 @@ import numpy as np
 
 from isocharge.arrays import Array, Complexes, Integers
 from isocharge.errors import SceneError
-from isocharge.simulate.mechanics.scaling import Groups
-from isocharge.simulate.mechanics.stress import _principal, strain, stress, turn_stress
-from isocharge.simulate.mechanics.theory import Theory, bending_length, left_out
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups
+from isocharge.simulate.mechanics.stress import principal_stresses, strain, stress, turn_stress
+from isocharge.simulate.mechanics.theory import Theory, bending_length, modelling_error
 from isocharge.simulate.mesh.elements import Geometry, film_gradient
 from isocharge.simulate.mesh.placement import Placement, place, template_for
 from isocharge.simulate.mesh.resolution import Resolution
@@ -62,7 +62,7 @@ class Equilibrium:
     resolution: Resolution
     layer: float
     field: Array
-    groups: Groups
+    groups: DimensionlessGroups
     status: Literal["converged", "failed"]
     message: str
     iterations: int
@@ -76,7 +76,7 @@ class Equilibrium:
 
         Infinite where the theory says nothing about this film.
         """
-        return self.mesh_error + left_out(self.film, self.probe, self.force, self.theory)
+        return self.mesh_error + modelling_error(self.film, self.probe, self.force, self.theory)
 
     @property
     def bending_length(self) -> float:
@@ -97,10 +97,12 @@ class Equilibrium:
 
         At the mid-surface, and where the theory has bending at both surfaces for the largest.
         """
-        middle = _principal(self.nodal_stress())
+        middle = principal_stresses(self.nodal_stress())
         largest = middle[1]
         if self.theory.bending:
-            largest = max(largest, *(_principal(self.nodal_stress(surface))[1] for surface in ("top", "bottom")))
+            largest = max(
+                largest, *(principal_stresses(self.nodal_stress(surface))[1] for surface in ("top", "bottom"))
+            )
         scale = self.film.young * self.groups.amplitude2
         return scale * middle[0] + self.film.pretension, scale * largest + self.film.pretension
 

@@ -37,13 +37,13 @@ PER_SIDE = 6
 """Gauss points along a patch's side."""
 
 
-def needs_proof(film: Film, probe: Probe, at: tuple[float, float], accuracy: float) -> bool:
+def needs_second_mesh(film: Film, probe: Probe, at: tuple[float, float], accuracy: float) -> bool:
     """Whether a press must be solved on two meshes to know how wrong it is."""
     large = isinstance(probe, Polygon) and probe.reach > LARGE * film.radius
     return large or farthest(probe, at) > INNER * film.radius or accuracy < ACCURACY
 
 
-def apart(one: Equilibrium, other: Equilibrium) -> float:
+def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     """Largest relative difference between two equilibria of a press, of patches' charges and of the deflection.
 
     A patch counts relative to the largest charge on its ring.

@@ -11,7 +11,7 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.scaling import Groups
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.solver.assembly import Assembly, Factor
 
 GUARD_TENSION = 0.4
@@ -56,7 +56,7 @@ class NewtonResult:
     message: str
 
 
-def schwerin_start(z: np.ndarray, rho: float, groups: Groups) -> Array:
+def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Array:
     """A first field: Schwerin's point-load shape in the template's coordinate, no in-plane displacement.
 
     W = (3 / pi)^(1/3) (1 - r^(2/3)) solves a point load on a slack membrane exactly at Poisson 1/3 (Schwerin 1929).

@@ -9,8 +9,8 @@ from isocharge.arrays import Array
 from isocharge.errors import SceneError, SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.scaling import Groups, amplitude_squared
-from isocharge.simulate.mechanics.theory import ACCURACY, Theory, choose
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared
+from isocharge.simulate.mechanics.theory import ACCURACY, Theory, choose_theory
 from isocharge.simulate.mesh.elements import Geometry
 from isocharge.simulate.mesh.placement import Placement, place, template_for
 from isocharge.simulate.mesh.resolution import Resolution
@@ -21,7 +21,7 @@ from isocharge.simulate.solver.assembly import Assembly, assembly
 from isocharge.simulate.solver.equilibrium import Equilibrium
 from isocharge.simulate.solver.error_estimate import shape_error
 from isocharge.simulate.solver.mesh_choice import layer_for, resolution_for, too_near_the_rim
-from isocharge.simulate.solver.mesh_comparison import ANOTHER, MOST_ORDERS, apart, needs_proof
+from isocharge.simulate.solver.mesh_comparison import ANOTHER, MOST_ORDERS, needs_second_mesh, relative_difference
 from isocharge.simulate.solver.newton import GUARD_BELOW, NewtonResult, schwerin_start, solve_linear, solve_newton
 
 LAYER_REUSE = (0.75, 2.0)
@@ -104,17 +104,17 @@ def press(
         SolveError: If no equilibrium was found and `throw` is set.
     """
     check_scene(film, probe, at, force)
-    theory = theory or choose(film, probe, force, accuracy)
+    theory = theory or choose_theory(film, probe, force, accuracy)
     began = process_time()
     scene = _Scene(film, probe, at, force, theory, layer or _layer(film, force, probe, resolution, start), tolerance)
     with single_threaded_blas():
-        if resolution is None and needs_proof(film, probe, at, accuracy):
-            solved = _proven(scene, accuracy, start)
+        if resolution is None and needs_second_mesh(film, probe, at, accuracy):
+            solved = _solve_until_meshes_agree(scene, accuracy, start)
         else:
             solved = scene.solve(resolution or scene.resolution(accuracy), start)
     solved = replace(solved, seconds=process_time() - began)
     if throw and solved.status != "converged":
-        raise SolveError(_why(solved, tolerance))
+        raise SolveError(_failure_reason(solved, tolerance))
     return solved
 
 
@@ -165,7 +165,7 @@ class _Scene:
         return mesh, place(self.film, self.probe, self.at, resolution, self.layer)
 
     def _elastic(self, geometry: Geometry, force: float) -> ElasticFilm:
-        return ElasticFilm(geometry, Groups.of(self.film, force, bending=self.theory.bending))
+        return ElasticFilm(geometry, DimensionlessGroups.of(self.film, force, bending=self.theory.bending))
 
     def _start(self, start: Equilibrium | None, resolution: Resolution, cold: Array) -> Array:
         """A neighbour's field where its mesh is the same, but perhaps for the order; else the cold start."""
@@ -195,7 +195,7 @@ class _Scene:
         return replace(failed, iterations=steps)
 
 
-def _proven(scene: _Scene, accuracy: float, start: Equilibrium | None) -> Equilibrium:
+def _solve_until_meshes_agree(scene: _Scene, accuracy: float, start: Equilibrium | None) -> Equilibrium:
     """Solve on meshes of rising order until two agree to half of the accuracy, or `MOST_ORDERS` have been tried.
 
     Where a still finer mesh finds no rest, what two meshes agreed on stands, with their difference as its error.
@@ -208,7 +208,7 @@ def _proven(scene: _Scene, accuracy: float, start: Equilibrium | None) -> Equili
         finer = scene.solve(replace(solved.resolution, order=solved.resolution.order + 1), solved)
         if finer.status != "converged" and solved.proven_error is not None:
             break
-        error = apart(solved, finer) if finer.status == "converged" else None
+        error = relative_difference(solved, finer) if finer.status == "converged" else None
         solved = replace(finer, iterations=solved.iterations + finer.iterations, proven_error=error)
         if error is not None and error <= 0.5 * accuracy:
             break
@@ -231,7 +231,7 @@ def _layer(film: Film, force: float, probe: Probe, resolution: Resolution | None
     return start.layer if same else own
 
 
-def _why(solved: Equilibrium, tolerance: float) -> str:
+def _failure_reason(solved: Equilibrium, tolerance: float) -> str:
     """Why there is no answer."""
     (x, y), smallest = solved.at, solved.principal_stress[0]
     wrinkles = (

@@ -7,7 +7,7 @@ from isocharge.simulate.mesh.resolution import Resolution
 
 
 @dataclass(frozen=True)
-class Solver:
+class SolveSettings:
     """How the film is solved in a sweep; what is absent is chosen by the scene, see `ForwardMap.build`.
 
     Attributes:

@@ -16,7 +16,7 @@ from tritonclient.grpc import service_pb2
 from isocharge.errors import InputError, ListenError
 from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE
-from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.tls import Tls
 from isocharge.serve.network.token import Token
@@ -95,7 +95,7 @@ def test_bad_requests_are_refused_with_the_reason(start, fields, status, said):
 
 
 def test_a_message_beyond_the_limit(start, shelf):
-    ask = start(handler=Handler(shelf, Limits(body_bytes=1000)))
+    ask = start(handler=Handler(shelf, ServerLimits(body_bytes=1000)))
     with pytest.raises(grpc.RpcError) as caught:
         ask("ModelInfer", model_name="linear", raw_input_contents=[bytes(2000)])
     assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED

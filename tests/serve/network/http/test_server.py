@@ -19,7 +19,7 @@ import trustme
 from isocharge.serve import Predictor
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import App, HttpServer
-from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.tls import Tls
 from isocharge.serve.network.token import Token
@@ -75,7 +75,7 @@ def refused(data):
 @pytest.fixture
 def limited(shelf, start_http):
     """Start a server with limits of the test's."""
-    return lambda **limits: start_http(Handler(shelf, Limits(**limits)))
+    return lambda **limits: start_http(Handler(shelf, ServerLimits(**limits)))
 
 
 @pytest.fixture
@@ -380,12 +380,12 @@ def pieces(*bodies, last=True):
 
 def test_as_an_asgi_application(shelf):
     """Any ASGI server may run it; a body may come in pieces, never end, or break off."""
-    app = App(Handler(shelf, Limits(body_bytes=1000)), Token("a"))
+    app = App(Handler(shelf, ServerLimits(body_bytes=1000)), Token("a"))
     ready, body = asyncio.run(through_asgi(app, "GET", "/v2/health/ready", pieces(b"")))
     assert (ready["status"], body["body"]) == (200, b'{"ready":true}')
     start, _ = asyncio.run(through_asgi(app, "GET", "/v2", pieces(b"")))
     assert start["status"] == 401
-    app = App(Handler(shelf, Limits(body_bytes=1000)))
+    app = App(Handler(shelf, ServerLimits(body_bytes=1000)))
     start, body = asyncio.run(through_asgi(app, "POST", INFER, pieces(BODY[:9], BODY[9:20], BODY[20:])))
     assert (start["status"], json.loads(body["body"])["model_name"]) == (200, "linear")
     start, _ = asyncio.run(through_asgi(app, "POST", INFER, pieces(*[bytes(300)] * 9, last=False)))

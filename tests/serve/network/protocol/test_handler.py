@@ -10,7 +10,7 @@ import orjson
 import pytest
 
 from isocharge.errors import InputError, ModelNotFound, TokenError
-from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.encoding import compress, decompress
 from isocharge.serve.network.protocol.status import grpc_status, http_status
@@ -328,7 +328,7 @@ def test_bad_compression(ask, way, body, status, said):
 
 
 def test_a_body_beyond_the_limit(shelf):
-    handler = Handler(shelf, Limits(body_bytes=100))
+    handler = Handler(shelf, ServerLimits(body_bytes=100))
     assert handler.answer("POST", INFER, [], bytes(101)).status == 413
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from sklearn.ensemble import HistGradientBoostingRegressor
 
 from isocharge.arrays import Array, Integers
-from isocharge.train.baselines.estimator import Fitted, Task, best_of
+from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
 from isocharge.train.baselines.features import LogFeatures, affine_fit, with_one
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 
 NAME = "gradient boosting"
 
@@ -36,7 +36,7 @@ class GradientBoosting:
     rate: float = 0.1
     name: str = NAME
 
-    def fit(self, task: Task) -> tuple[Fitted, ...]:
+    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Choose the leaves, and give both forms."""
         noisy = task.noisy_train(1 if task.quick else min(task.copies, 3))
         features, unit = LogFeatures.fit(noisy.charge_pC), task.domain.to_unit(noisy.contact)
@@ -57,7 +57,9 @@ class GradientBoosting:
         library = replace(made[leaves], choice=choice)
         return library, NumpyBoosting.of(library)
 
-    def _models(self, values: Array, unit: Array, leaves: int, task: Task) -> tuple[HistGradientBoostingRegressor, ...]:
+    def _models(
+        self, values: Array, unit: Array, leaves: int, task: FittingTask
+    ) -> tuple[HistGradientBoostingRegressor, ...]:
         settings = {
             "max_iter": 30 if task.quick else self.trees,
             "learning_rate": self.rate,
@@ -75,7 +77,7 @@ class SklearnBoosting(Fitted):
     features: LogFeatures
     plane: Array
     models: tuple[HistGradientBoostingRegressor, ...]
-    domain: Domain
+    domain: ContactDomain
     choice: str = ""
     name: str = NAME
     form: str = "scikit-learn"
@@ -110,7 +112,7 @@ class NumpyBoosting(Fitted):
     value: Array
     roots: Integers
     depth: int
-    domain: Domain
+    domain: ContactDomain
     choice: str = ""
     name: str = NAME
     form: str = "NumPy"

@@ -15,8 +15,8 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.train.data.domain import Domain
-from isocharge.train.data.presses import Presses, noisy_charges, position_error
+from isocharge.train.data.domain import ContactDomain
+from isocharge.train.data.presses import LabelledPresses, noisy_charges, position_error
 
 T = TypeVar("T")
 
@@ -25,7 +25,7 @@ FIRST_COPY, VALIDATION_COPY = 1000, 999
 
 
 @dataclass(frozen=True)
-class Task:
+class FittingTask:
     """What a method is fitted for.
 
     Attributes:
@@ -38,24 +38,24 @@ class Task:
         quick: Fewer candidates and smaller methods, to try things out.
     """
 
-    train: Presses
-    validation: Presses
-    domain: Domain
+    train: LabelledPresses
+    validation: LabelledPresses
+    domain: ContactDomain
     noise: NoiseModel
     seed: int = 0
     copies: int = 5
     quick: bool = False
 
-    def noisy_train(self, copies: int) -> Presses:
+    def noisy_train(self, copies: int) -> LabelledPresses:
         """The training presses so many times, each time with fresh noise on the charges."""
         charge = [noisy_charges(self.train, self.noise, self.seed + FIRST_COPY + copy) for copy in range(copies)]
-        return Presses(np.tile(self.train.contact, (copies, 1)), np.concatenate(charge))
+        return LabelledPresses(np.tile(self.train.contact, (copies, 1)), np.concatenate(charge))
 
     @cached_property
-    def noisy_validation(self) -> Presses:
+    def noisy_validation(self) -> LabelledPresses:
         """The validation presses with noise on the charges."""
         charge = noisy_charges(self.validation, self.noise, self.seed + VALIDATION_COPY)
-        return Presses(self.validation.contact, charge)
+        return LabelledPresses(self.validation.contact, charge)
 
     def validation_error(self, predict: Callable[[Array], Array]) -> float:
         """Root-mean-square position error on noisy validation charges, mm: what hyperparameters are chosen by."""
@@ -112,7 +112,7 @@ class Estimator(Protocol):
     def name(self) -> str:
         """The method's name, the same as its fitted forms carry."""
 
-    def fit(self, task: Task) -> tuple[Fitted, ...]:
+    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Fit at its best for root-mean-square error under the task's noise; every form that runs.
 
         Raises:
@@ -120,7 +120,7 @@ class Estimator(Protocol):
         """
 
 
-def best_of(task: Task, candidates: Iterable[T], fit: Callable[[T], Callable[[Array], Array]]) -> tuple[T, str]:
+def best_of(task: FittingTask, candidates: Iterable[T], fit: Callable[[T], Callable[[Array], Array]]) -> tuple[T, str]:
     """Fit with every candidate and keep the one whose validation error is smallest.
 
     Args:

@@ -19,11 +19,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from isocharge.arrays import Array
-from isocharge.train.baselines.estimator import Fitted, Task
+from isocharge.train.baselines.estimator import Fitted, FittingTask
 from isocharge.train.baselines.features import LogFeatures
 from isocharge.train.baselines.problem import Problem, damped_step
 from isocharge.train.data.charge_field import ChargeField
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 
 NAME = "Gauss-Newton"
 
@@ -56,7 +56,7 @@ class GaussNewton:
 
     name: str = NAME
 
-    def fit(self, task: Task) -> tuple[Fitted, ...]:
+    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Fit the forward map on clean presses, its degree by the validation presses; both forms."""
         held = (task.validation.contact, task.validation.charge_pC)
         field = ChargeField.fit(task.domain, task.train.contact, task.train.charge_pC, held)
@@ -86,7 +86,7 @@ class _GaussNewton(Fitted):
     features: LogFeatures
     points: Array
     unit: Array
-    domain: Domain
+    domain: ContactDomain
     choice: str = ""
     name: str = NAME
     form: str = ""

@@ -14,9 +14,9 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Kernel, WhiteKernel
 
 from isocharge.arrays import Array
-from isocharge.train.baselines.estimator import Fitted, Task
+from isocharge.train.baselines.estimator import Fitted, FittingTask
 from isocharge.train.baselines.features import LogFeatures
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 
 NAME = "Gaussian process"
 
@@ -37,7 +37,7 @@ class GaussianProcess:
     learnt_from: int = 500
     name: str = NAME
 
-    def fit(self, task: Task) -> tuple[Fitted, ...]:
+    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Lengths by marginal likelihood on a small subset, weights on a larger one; both forms."""
         noisy = task.noisy_train(1)
         rows = np.random.default_rng(task.seed).permutation(len(noisy))[: 300 if task.quick else self.points]
@@ -71,7 +71,7 @@ class SklearnProcess(Fitted):
 
     features: LogFeatures
     model: GaussianProcessRegressor
-    domain: Domain
+    domain: ContactDomain
     choice: str = ""
     name: str = NAME
     form: str = "scikit-learn"

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 
 from isocharge.arrays import Array
 from isocharge.errors import DatasetError
-from isocharge.train.baselines.estimator import Fitted, Task, best_of
-from isocharge.train.data.presses import Presses
+from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
+from isocharge.train.data.presses import LabelledPresses
 
 NAME = "linear band"
 
@@ -43,7 +43,7 @@ class LinearBand:
     degrees: tuple[int, ...] = (6, 10, 14)
     name: str = NAME
 
-    def fit(self, task: Task) -> tuple[Fitted, ...]:
+    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Slopes from the presses of the band; the degree by the validation presses, which have any force."""
         band = task.train[np.flatnonzero(task.train.contact[:, 2] <= BAND_N)]
         if len(band) < FEWEST:
@@ -57,7 +57,7 @@ class LinearBand:
         return (replace(made[degree], choice=choice),)
 
 
-def tabulate(band: Presses, degree: int, radius_mm: float) -> "BandTable":
+def tabulate(band: LabelledPresses, degree: int, radius_mm: float) -> "BandTable":
     """Slopes of the presses as a polynomial of the position, on a grid.
 
     ln(Q / F) is expanded in Chebyshev polynomials of x and y up to a total degree.

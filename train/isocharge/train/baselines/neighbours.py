@@ -17,9 +17,9 @@ from sklearn.linear_model import LinearRegression
 from sklearn.neighbors import KNeighborsRegressor
 
 from isocharge.arrays import Array
-from isocharge.train.baselines.estimator import Fitted, Task, best_of
+from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
 from isocharge.train.baselines.features import RULERS, LogFeatures, affine_fit, with_one
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 
 NAME = "k-nearest neighbours"
 
@@ -37,7 +37,7 @@ class NearestNeighbours:
     rulers: tuple[tuple[float, float], ...] = RULERS
     name: str = NAME
 
-    def fit(self, task: Task) -> tuple[Fitted, ...]:
+    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Choose k and the metric, and give both forms."""
         noisy = task.noisy_train(1 if task.quick else task.copies)
         whitened, unit = LogFeatures.fit(noisy.charge_pC), task.domain.to_unit(noisy.contact)
@@ -73,7 +73,7 @@ class TreeNeighbours(Fitted):
     plane: Array
     residual: Array
     k: int
-    domain: Domain
+    domain: ContactDomain
     choice: str = ""
     name: str = NAME
     form: str = "SciPy KD-tree"
@@ -118,7 +118,7 @@ class SklearnNeighbours(Fitted):
     features: LogFeatures
     linear: LinearRegression
     model: KNeighborsRegressor
-    domain: Domain
+    domain: ContactDomain
     choice: str
     name: str = NAME
     form: str = "scikit-learn"

@@ -22,7 +22,7 @@ from isocharge.arrays import Array
 from isocharge.serve import Predictor
 from isocharge.serve.model.session import open_session
 from isocharge.simulate.dataset.shards import Dataset
-from isocharge.train.baselines.estimator import Fitted, Task
+from isocharge.train.baselines.estimator import Fitted, FittingTask
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
 from isocharge.train.release.export import IR_VERSION, OPSET, GraphBuilder
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
@@ -86,7 +86,7 @@ class Network:
         """With its widths."""
         return f"network {'-'.join(map(str, self.hidden))}"
 
-    def fit(self, task: Task) -> tuple[Fitted, ...]:
+    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Train, and give the contact network in torch, ONNX Runtime (session.run, iobinding) and NumPy."""
         training = TrainingConfig(
             steps=self.steps,

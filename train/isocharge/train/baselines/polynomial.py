@@ -18,9 +18,9 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import PolynomialFeatures
 
 from isocharge.arrays import Array, Integers
-from isocharge.train.baselines.estimator import Fitted, Task, best_of
+from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
 from isocharge.train.baselines.features import LogFeatures
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 
 NAME = "polynomial ridge"
 
@@ -44,7 +44,7 @@ class PolynomialRidge:
     alphas: tuple[float, ...] = (1e-11, 1e-8)
     name: str = NAME
 
-    def fit(self, task: Task) -> tuple[Fitted, ...]:
+    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Choose degree and ridge, and give both forms."""
         noisy = task.noisy_train(1 if task.quick else task.copies)
         features, unit = LogFeatures.into_box(noisy.charge_pC), task.domain.to_unit(noisy.contact)
@@ -78,7 +78,7 @@ class SklearnPolynomial(Fitted):
 
     features: LogFeatures
     model: Pipeline
-    domain: Domain
+    domain: ContactDomain
     choice: str = ""
     name: str = NAME
     form: str = "scikit-learn"

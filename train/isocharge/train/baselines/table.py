@@ -13,9 +13,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from isocharge.arrays import Array
-from isocharge.train.baselines.estimator import Fitted, Task, best_of
+from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
 from isocharge.train.baselines.features import RULERS, LogFeatures
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 
 CHUNK = 100_000
 """Neighbours gathered at once."""
@@ -30,7 +30,7 @@ class NearestEntry:
 
     name: str = "lookup table, nearest entry"
 
-    def fit(self, task: Task) -> tuple[Fitted, ...]:
+    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """All training presses are entries; there is nothing to choose."""
         features = LogFeatures.fit(task.train.charge_pC)
         unit = task.domain.to_unit(task.train.contact)
@@ -57,7 +57,7 @@ class InterpolatedTable:
     copies: int = 5
     name: str = "lookup table, interpolated"
 
-    def fit(self, task: Task) -> tuple[Fitted, ...]:
+    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Choose the neighbourhoods: their size, their metric, and whether their presses are noisy."""
         noisy = task.noisy_train(1 if task.quick else self.copies)
         whitened = LogFeatures.fit(noisy.charge_pC)
@@ -124,7 +124,7 @@ class AffineTable(Fitted):
     features: LogFeatures
     tree: cKDTree
     maps: Array
-    domain: Domain
+    domain: ContactDomain
     name: str
     choice: str = ""
     affine: bool = True

@@ -10,7 +10,7 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.simulate.contours.triangulation import Triangulation
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.train.baselines.estimator import Fitted, Task
+from isocharge.train.baselines.estimator import Fitted, FittingTask
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Triangulate:
     film: ForwardMap
     name: str = "triangulation"
 
-    def fit(self, task: Task) -> tuple[Fitted, ...]:
+    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Table the forward map's contours within the domain; with the force unknown, and given."""
         made = Triangulation.from_map(self.film, radius=1e-3 * task.domain.radius_mm)
         choice = f"contours from {self.film.solves} solves"

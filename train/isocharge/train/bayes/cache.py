@@ -22,7 +22,7 @@ def cache_folder() -> Path:
     return (Path(shared) if shared else Path.home() / ".cache") / "isocharge"
 
 
-def kept(name: str, key: dict[str, Any], compute: Callable[[], Any]) -> Any:
+def cached(name: str, key: dict[str, Any], compute: Callable[[], Any]) -> Any:
     """The result of `compute`, from the cache if it is there, otherwise computed and kept.
 
     Args:

@@ -16,7 +16,7 @@ from isocharge.errors import ChargeError, InputError
 from isocharge.files import sha256_of
 from isocharge.progress import Progress
 from isocharge.simulate.dataset.sampling import Sweep
-from isocharge.simulate.execution.code_version import made_by
+from isocharge.simulate.execution.code_version import code_fingerprint
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.measuring_chain.noise import NoiseModel
@@ -24,7 +24,7 @@ from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
-from isocharge.train.bayes.cache import kept
+from isocharge.train.bayes.cache import cached
 from isocharge.train.bayes.posterior import CHUNK, STEP, Posterior
 
 PRESSES = 4000
@@ -64,7 +64,7 @@ class Scene:
             "radius_mm": self.radius_mm,
             "force_range_N": list(self.force_range_N),
             "noise": [self.noise.white, self.noise.gain],
-            "made_by": made_by(),
+            "made_by": code_fingerprint(),
             "method": METHOD,
             "step": STEP,
         }
@@ -148,7 +148,7 @@ def bayes_estimate(
         mean, std = _in_chunks(posterior, 1e-12 * charge, progress)
         return [np.round(part, 9).tolist() for part in (_to_mm(mean), _to_mm(std))]
 
-    contact, std = (np.array(part) for part in kept("bayes", key, compute))
+    contact, std = (np.array(part) for part in cached("bayes", key, compute))
     return contact, std
 
 
@@ -178,7 +178,7 @@ def bayes_limit(
         contact, std = bayes_estimate(scene, 1e12 * charge, forward_map=made, progress=progress)
         return BayesLimit.of(contact, std, np.stack([1e3 * x, 1e3 * y, force], axis=1)).to_dict()
 
-    return BayesLimit(**kept("bayes-limit", {**scene.key(), "presses": presses, "seed": seed}, compute))
+    return BayesLimit(**cached("bayes-limit", {**scene.key(), "presses": presses, "seed": seed}, compute))
 
 
 def _spline(scene: Scene, forward_map: ForwardMap | ChargeSpline | None) -> ChargeSpline:

@@ -22,7 +22,7 @@ from isocharge.arrays import Array, Integers
 from isocharge.errors import ChargeError, InputError
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.identifiability.folds import singular_values
-from isocharge.simulate.identifiability.force_profile import ForceCurve
+from isocharge.simulate.identifiability.force_profile import ForceProfile
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import onto_disk
 from isocharge.train.bayes.cells import Cells
@@ -89,8 +89,8 @@ class Posterior:
         return mean, std
 
     @cached_property
-    def _curve(self) -> ForceCurve:
-        return ForceCurve.of(self.charges.by_force, self.charges.force_range)
+    def _curve(self) -> ForceProfile:
+        return ForceProfile.of(self.charges.by_force, self.charges.force_range)
 
     @cached_property
     def _roots(self) -> tuple[Cells, Array, Array]:

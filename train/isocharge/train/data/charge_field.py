@@ -18,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from isocharge.arrays import Array, Integers
 from isocharge.errors import TrainingError
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 
 CANDIDATES = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
 """Degrees tried in turn, in position and in force."""
@@ -50,12 +50,12 @@ class ChargeField:
         error: Root-mean-square relative error on samples that the fit did not see.
     """
 
-    domain: Domain
+    domain: ContactDomain
     series: Array
     error: float
 
     @classmethod
-    def fit(cls, domain: Domain, contact: Array, charge_pC: Array, held: tuple[Array, Array]) -> "ChargeField":
+    def fit(cls, domain: ContactDomain, contact: Array, charge_pC: Array, held: tuple[Array, Array]) -> "ChargeField":
         """Least squares on (contact, charge), the degree chosen on `held`.
 
         Args:

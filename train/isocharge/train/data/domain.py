@@ -8,7 +8,7 @@ from isocharge.arrays import Array
 
 
 @dataclass(frozen=True)
-class Domain:
+class ContactDomain:
     """The contacts that a model knows: a disk and a range of forces.
 
     Attributes:

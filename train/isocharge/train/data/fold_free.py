@@ -11,7 +11,7 @@ from isocharge.arrays import Array
 from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.charge_field import ChargeField
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 
 SURE = 3e-4
 """Error of the fitted charges above which nothing is said: the slopes of a poor fit fold by themselves."""
@@ -56,11 +56,11 @@ class FieldModel:
         return by_contact
 
 
-def unfolded(field: ChargeField, noise: NoiseModel) -> Domain:
+def fold_free_domain(field: ChargeField, noise: NoiseModel) -> ContactDomain:
     """The domain without what lies beyond the nearest fold; as it is if there is none, or if nobody can say."""
     if field.error > SURE:
         return field.domain
     area = working_area(FieldModel(field), noise, twins=False)
     if not np.isfinite(area.fold_radius):
         return field.domain
-    return Domain(float(f"{1e3 * area.unfolded:.6g}"), field.domain.force_range_N)
+    return ContactDomain(float(f"{1e3 * area.unfolded:.6g}"), field.domain.force_range_N)

@@ -15,7 +15,7 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
 from isocharge.train.data.nearest_contact import nearest_contact, search
-from isocharge.train.data.presses import Presses
+from isocharge.train.data.presses import LabelledPresses
 
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
 """Share of each kind."""
@@ -25,7 +25,7 @@ FAR = 6.0
 
 
 @dataclass(frozen=True)
-class Strange:
+class MisfitExamples:
     """Charges and how far from any known contact they are.
 
     Attributes:
@@ -37,7 +37,9 @@ class Strange:
     miss: Array
 
 
-def strange_charges(presses: Presses, field: ChargeField, noise: NoiseModel, count: int, seed: int) -> Strange:
+def draw_misfit_examples(
+    presses: LabelledPresses, field: ChargeField, noise: NoiseModel, count: int, seed: int
+) -> MisfitExamples:
     """Draw charges of every kind and find their nearest contacts.
 
     Args:
@@ -55,10 +57,10 @@ def strange_charges(presses: Presses, field: ChargeField, noise: NoiseModel, cou
     for kind in KINDS:
         charge[kinds == kind] = _DRAW[kind](rng, own.charge_pC[kinds == kind], presses.charge_pC, noise)
     charge = np.clip(charge, LOWEST_PC, HIGHEST_PC)
-    return Strange(charge, _misses(field, charge, noise, own, np.isin(kinds, ("noisy", "moved"))))
+    return MisfitExamples(charge, _misses(field, charge, noise, own, np.isin(kinds, ("noisy", "moved"))))
 
 
-def _misses(field: ChargeField, charge: Array, noise: NoiseModel, own: Presses, near: np.ndarray) -> Array:
+def _misses(field: ChargeField, charge: Array, noise: NoiseModel, own: LabelledPresses, near: np.ndarray) -> Array:
     """Those `near` their own press start there, and the field is shifted to be right there; the others search."""
     miss, at = np.empty_like(charge), np.flatnonzero(near)
     start = field.domain.to_unit(own.contact[at])
@@ -89,7 +91,7 @@ def _gains(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) ->
     return wrong
 
 
-def _dying(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
+def _failing_electrode(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
     """One electrode keeps a share of its charge, down to a thousandth."""
     dead = rng.integers(charge.shape[1], size=(len(charge), 1)) == np.arange(charge.shape[1])
     left: Array = np.where(dead, charge * 10.0 ** rng.uniform(-3.0, 0.0, (len(charge), 1)), charge)
@@ -103,12 +105,12 @@ def _scaled(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -
     return scaled
 
 
-def _two(rng: np.random.Generator, charge: Array, others: Array, _: NoiseModel) -> Array:
+def _two_presses(rng: np.random.Generator, charge: Array, others: Array, _: NoiseModel) -> Array:
     both: Array = charge + others[rng.integers(len(others), size=len(charge))]
     return both
 
 
-def _any(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
+def _uniform_in_logs(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
     """Between what counts as nothing and 10 nC, or what counts as most."""
     decades = np.where(rng.random((len(charge), 1)) < 0.3, np.log10(HIGHEST_PC), 4.0)
     drawn: Array = 10.0 ** (decades * rng.random(charge.shape))
@@ -119,8 +121,8 @@ _DRAW = {
     "noisy": _noisy,
     "moved": _moved,
     "gains": _gains,
-    "dying": _dying,
+    "dying": _failing_electrode,
     "scaled": _scaled,
-    "two": _two,
-    "any": _any,
+    "two": _two_presses,
+    "any": _uniform_in_logs,
 }

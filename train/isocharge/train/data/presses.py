@@ -9,14 +9,14 @@ from isocharge.errors import DatasetError
 from isocharge.simulate.dataset.shards import Dataset, Samples
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 
 FEWEST = 500
 """Presses below which a fit makes no sense."""
 
 
 @dataclass(frozen=True)
-class Presses:
+class LabelledPresses:
     """Contacts and their clean charges.
 
     Attributes:
@@ -28,18 +28,18 @@ class Presses:
     charge_pC: Array
 
     @classmethod
-    def of(cls, samples: Samples) -> "Presses":
+    def of(cls, samples: Samples) -> "LabelledPresses":
         """From a dataset's columns."""
         return cls(np.stack([samples.x_mm, samples.y_mm, samples.force_N], axis=1), samples.charge_pC)
 
-    def __getitem__(self, rows: np.ndarray) -> "Presses":
-        return Presses(self.contact[rows], self.charge_pC[rows])
+    def __getitem__(self, rows: np.ndarray) -> "LabelledPresses":
+        return LabelledPresses(self.contact[rows], self.charge_pC[rows])
 
     def __len__(self) -> int:
         return len(self.contact)
 
 
-def domain_of(dataset: Dataset) -> Domain:
+def domain_of(dataset: Dataset) -> ContactDomain:
     """The working area and forces that the dataset covers: as its manifest says, or else as its samples show.
 
     Raises:
@@ -57,10 +57,10 @@ def domain_of(dataset: Dataset) -> Domain:
             f"manifest ranges: radius_mm {radius:g} and force_N [{low:g}, {high:g}] do not hold the samples, which "
             f"reach {reach:g} mm and {forces[0]:g} to {forces[1]:g} N"
         )
-    return Domain(radius, (low, high))
+    return ContactDomain(radius, (low, high))
 
 
-def split_by_position(presses: Presses, share: float, seed: int) -> tuple[Presses, Presses]:
+def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tuple[LabelledPresses, LabelledPresses]:
     """The presses at all but a share of the positions, and those at the share."""
     _, position = np.unique(np.round(presses.contact[:, :2], 6), axis=0, return_inverse=True)
     order = np.random.default_rng(seed).permutation(position.max() + 1)
@@ -68,19 +68,19 @@ def split_by_position(presses: Presses, share: float, seed: int) -> tuple[Presse
     return presses[~held], presses[held]
 
 
-def presses_of(dataset: Dataset) -> Presses:
+def presses_of(dataset: Dataset) -> LabelledPresses:
     """A dataset's presses, checked.
 
     Raises:
         DatasetError: If the dataset has too few presses or positions, fewer than three electrodes, or numbers that are
             not finite or charges that are not positive.
     """
-    presses = Presses.of(dataset.samples)
+    presses = LabelledPresses.of(dataset.samples)
     _check(presses)
     return presses
 
 
-def _check(presses: Presses) -> None:
+def _check(presses: LabelledPresses) -> None:
     finite = np.isfinite(presses.charge_pC).all(axis=1) & np.isfinite(presses.contact).all(axis=1)
     if not finite.all():
         row = int(np.argmin(finite))
@@ -111,7 +111,7 @@ def misfit_noise(noise: NoiseModel) -> NoiseModel:
     return noise if noise.white > 0.0 else noise_model("reference")
 
 
-def noisy_charges(presses: Presses, noise: NoiseModel, seed: int) -> Array:
+def noisy_charges(presses: LabelledPresses, noise: NoiseModel, seed: int) -> Array:
     """The presses' charges with noise, pC, shape (n, n_electrode)."""
     noisy: Array = noise.add(presses.charge_pC * 1e-12, np.random.default_rng(seed)) * 1e12
     return noisy

@@ -6,7 +6,7 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.train.data.presses import Presses, misfit_noise, noisy_charges, position_error
+from isocharge.train.data.presses import LabelledPresses, misfit_noise, noisy_charges, position_error
 
 Predict = Callable[[Array], tuple[Array, Array, Array]]
 """Charges (n, n_electrode), pC, to contact (n, 3), contact_std (n, 3) and misfit (n, 1)."""
@@ -21,7 +21,7 @@ AROUND_1_N = (0.8, 1.25)
 """Forces that count as 1 N where faults are looked for, N."""
 
 
-def measure_errors(predict: Predict, presses: Presses, noise: NoiseModel, seed: int = 1) -> Mapping[str, float]:
+def measure_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int = 1) -> Mapping[str, float]:
     """Errors with noise and on clean charges.
 
     Args:
@@ -60,7 +60,9 @@ def measure_errors(predict: Predict, presses: Presses, noise: NoiseModel, seed: 
     return {name: float(f"{value:.4g}") for name, value in errors.items()}
 
 
-def _found(predict: Predict, presses: Presses, noise: NoiseModel, limit: float, seed: int) -> Mapping[str, float]:
+def _found(
+    predict: Predict, presses: LabelledPresses, noise: NoiseModel, limit: float, seed: int
+) -> Mapping[str, float]:
     """Share of presses of about 1 N with a fault whose misfit is above the limit, every electrode in turn."""
     near = presses[(presses.contact[:, 2] > AROUND_1_N[0]) & (presses.contact[:, 2] < AROUND_1_N[1])]
     if not len(near):

@@ -20,14 +20,14 @@ import torch
 from isocharge.arrays import Array
 from isocharge.errors import TrainingError
 from isocharge.progress import StageProgress, Warn
-from isocharge.resumable_run import keep_draft
+from isocharge.resumable_run import resume_parts
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, write_model
 from isocharge.serve.model.session import open_session, run
 from isocharge.simulate.dataset.shards import Dataset
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
-from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, Domain
+from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain
 from isocharge.train.data.presses import misfit_noise, noisy_charges
 from isocharge.train.release.card import model_card
 from isocharge.train.release.evaluate import Predict, measure_errors
@@ -106,7 +106,7 @@ def train_model(
     """
     check_target(folder, version, dataset.sensor.electrode_names)
     config = config or FitConfig()
-    with keep_draft(folder / str(version), _identity(dataset, config), fresh=fresh, warn=warn) as draft:
+    with resume_parts(folder / str(version), _identity(dataset, config), fresh=fresh, warn=warn) as draft:
         fit = fit_network(dataset, config, progress, checkpoint=Checkpoint(draft), warn=warn)
         about = _metadata(fit, dataset, folder.resolve().name, version, command)
         graph = export_onnx(fit.network, about.to_props())
@@ -164,7 +164,7 @@ def _metadata(fit: Fit, dataset: Dataset, name: str, version: int, command: str)
     )
 
 
-def _polygon(domain: Domain) -> tuple[tuple[float, float], ...]:
+def _polygon(domain: ContactDomain) -> tuple[tuple[float, float], ...]:
     """The working area as a polygon that just contains the disk."""
     angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
     radius = domain.radius_mm / np.cos(np.pi / CORNERS)

@@ -12,16 +12,16 @@ from isocharge.errors import DatasetError
 from isocharge.simulate import Dataset, ForwardMap, Probe, Samples, Sensor, Sweep, noise_model, parse_probe, solve_maps
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.mechanics.theory import ACCURACY
-from isocharge.simulate.solver.settings import Solver
-from isocharge.train.data.domain import Domain
-from isocharge.train.data.presses import Presses, domain_of
+from isocharge.simulate.solver.settings import SolveSettings
+from isocharge.train.data.domain import ContactDomain
+from isocharge.train.data.presses import LabelledPresses, domain_of
 
 FURTHER = 1.03
 """How much further than the dataset the test's solves reach, in distance and force."""
 
 
 @dataclass(frozen=True)
-class Bench:
+class EvaluationScene:
     """What a dataset is about.
 
     Attributes:
@@ -36,14 +36,14 @@ class Bench:
 
     sensor: Sensor
     probes: tuple[Probe, ...]
-    domain: Domain
+    domain: ContactDomain
     turned: bool
     noise: NoiseModel
     seed: int
     presses: int
 
     @classmethod
-    def of(cls, dataset: Dataset, presses: int, seed: int, noise: str = "reference") -> "Bench":
+    def of(cls, dataset: Dataset, presses: int, seed: int, noise: str = "reference") -> "EvaluationScene":
         """From a dataset's columns and manifest.
 
         Raises:
@@ -73,7 +73,7 @@ class Bench:
     ) -> tuple[ForwardMap, ...]:
         """Forward maps of the sensor under its probes, or of another sensor, other probes, another reach."""
         return solve_maps(
-            sensor or self.sensor, probes or self.probes, self.sweep(further), solver=Solver(accuracy=accuracy)
+            sensor or self.sensor, probes or self.probes, self.sweep(further), solver=SolveSettings(accuracy=accuracy)
         )
 
 
@@ -91,7 +91,7 @@ def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
     return tuple(probes), bool(turned)
 
 
-def press_on(films: tuple[ForwardMap, ...], sweep: Sweep) -> Presses:
+def press_on(films: tuple[ForwardMap, ...], sweep: Sweep) -> LabelledPresses:
     """Clean charges of a sweep's presses from these forward maps, one for each probe."""
     presses = sweep.over([film.probe for film in films])
     charge = np.empty((len(presses), len(films[0].sensor.electrodes)))
@@ -99,4 +99,4 @@ def press_on(films: tuple[ForwardMap, ...], sweep: Sweep) -> Presses:
         rows = np.flatnonzero(presses.probe == number)
         chosen = presses[rows]
         charge[rows] = film.forward(chosen.x, chosen.y, chosen.force, chosen.turn)
-    return Presses(np.stack([1e3 * presses.x, 1e3 * presses.y, presses.force], axis=1), 1e12 * charge)
+    return LabelledPresses(np.stack([1e3 * presses.x, 1e3 * presses.y, presses.force], axis=1), 1e12 * charge)

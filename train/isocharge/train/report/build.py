@@ -14,13 +14,13 @@ from isocharge.files import new_folder, write_whole
 from isocharge.progress import StageProgress
 from isocharge.serve import ModelMetadata
 from isocharge.simulate import Dataset, Samples, sensor_to_dict
-from isocharge.train.baselines import Fitted, ReleasedModel, Task
+from isocharge.train.baselines import Fitted, FittingTask, ReleasedModel
 from isocharge.train.data.presses import domain_of
 from isocharge.train.report import effects, maps, pictures
-from isocharge.train.report.bench import Bench, press_on
-from isocharge.train.report.limits import BAYES, CRAMER_RAO, Limits, limits_of
+from isocharge.train.report.bench import EvaluationScene, press_on
+from isocharge.train.report.limits import BAYES, CRAMER_RAO, ErrorBounds, error_bounds
 from isocharge.train.report.measures import rounded
-from isocharge.train.report.methods import Method, Test, fit_all, roster, table, task_of, timed
+from isocharge.train.report.methods import EvaluationPresses, Method, all_methods, fit_all, table, task_of, timed
 from isocharge.train.report.page import page
 from isocharge.train.report.settings import Settings
 from isocharge.train.report.speed import AXES, speed_plot
@@ -116,8 +116,8 @@ class _Subject:
 
     dataset: Dataset
     released: ReleasedModel
-    task: Task
-    bench: Bench
+    task: FittingTask
+    bench: EvaluationScene
     settings: Settings
 
     @classmethod
@@ -126,7 +126,7 @@ class _Subject:
         dataset = _known_to(released.predictor.metadata, dataset)
         if len(dataset.samples) > settings.learn_from:
             dataset = replace(dataset, samples=_rows(dataset.samples, np.arange(settings.learn_from)))
-        bench = Bench.of(dataset, settings.presses, settings.seed)
+        bench = EvaluationScene.of(dataset, settings.presses, settings.seed)
         task = task_of(dataset, bench, settings)
         return cls(dataset, released, task, bench, settings)
 
@@ -142,16 +142,18 @@ class _Subject:
         steps("solving the film for limits and contours")
         films = bench.films(further=1.0, accuracy=settings.accuracy)
         steps("solving the film for the test presses")
-        test = Test.of(bench, press_on(films if settings.quick else bench.films(), bench.sweep()))
+        test = EvaluationPresses.of(bench, press_on(films if settings.quick else bench.films(), bench.sweep()))
         steps("integrating the Bayes limit")
-        limits = limits_of(bench, films, test.presses, test.charge_pC, settings.limited, steps.say)
-        methods = fit_all(roster(self.dataset, films[0], settings), self.released, self.task, test, steps)
+        limits = error_bounds(bench, films, test.presses, test.charge_pC, settings.limited, steps.say)
+        methods = fit_all(all_methods(self.dataset, films[0], settings), self.released, self.task, test, steps)
         methods = timed(methods, test, settings, steps)
         section = self._section(test, limits, methods, steps)
         section["pictures"] = _draw(folder, stem, section, self._draws(test), bench, settings, steps)
         return section
 
-    def _section(self, test: Test, limits: Limits, methods: list[Method], steps: Steps) -> dict[str, Any]:
+    def _section(
+        self, test: EvaluationPresses, limits: ErrorBounds, methods: list[Method], steps: Steps
+    ) -> dict[str, Any]:
         bench, truth = self.bench, test.presses.contact
         records = table(methods, test, limits.bayes)
         draws = self._draws(test)
@@ -178,7 +180,7 @@ class _Subject:
             "without_one": effects.remaining(self.task, bench, test.presses, steps),
         }
 
-    def _draws(self, test: Test) -> maps.Draws:
+    def _draws(self, test: EvaluationPresses) -> maps.Draws:
         return maps.Draws(self.released, test.presses, self.bench, self.settings.draws)
 
 
@@ -244,7 +246,7 @@ def _compared(methods: list[Method]) -> list[Fitted]:
     return [last[name] for name in COMPARED if name in last]
 
 
-def _lines(methods: list[Method], limits: Limits) -> dict[str, Array]:
+def _lines(methods: list[Method], limits: ErrorBounds) -> dict[str, Array]:
     """Contacts for the picture of error against force."""
     last = {method.fitted.name: method.contact for method in methods}
     lines = {BAYES: limits.bayes} if limits.bayes is not None else {}
@@ -257,7 +259,7 @@ def _draw(
     stem: str,
     section: dict[str, Any],
     draws: maps.Draws,
-    bench: Bench,
+    bench: EvaluationScene,
     settings: Settings,
     steps: Steps,
 ) -> dict[str, list[str]]:

@@ -11,9 +11,9 @@ from isocharge.errors import IsochargeError
 from isocharge.progress import Announce
 from isocharge.simulate import Sensor, parse_probe
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.train.baselines import Fitted, GaussNewton, PolynomialRidge, ReleasedModel, Task
-from isocharge.train.data.presses import Presses, noisy_charges
-from isocharge.train.report.bench import Bench, press_on
+from isocharge.train.baselines import Fitted, FittingTask, GaussNewton, PolynomialRidge, ReleasedModel
+from isocharge.train.data.presses import LabelledPresses, noisy_charges
+from isocharge.train.report.bench import EvaluationScene, press_on
 from isocharge.train.report.measures import errors, rounded
 from isocharge.train.report.settings import Settings
 
@@ -59,16 +59,16 @@ class Case:
 
     group: str
     name: str
-    presses: Presses
+    presses: LabelledPresses
     charge_pC: Array
     known: bool = True
 
 
-def cases(bench: Bench, clean: Presses, settings: Settings, progress: Announce) -> Iterator[Case]:
+def cases(bench: EvaluationScene, clean: LabelledPresses, settings: Settings, progress: Announce) -> Iterator[Case]:
     """Every case, from clean test presses of the bench."""
     sweep = bench.sweep()
 
-    def noisy(presses: Presses) -> Array:
+    def noisy(presses: LabelledPresses) -> Array:
         return noisy_charges(presses, bench.noise, bench.seed + NOISE_SEED)
 
     for level in LEVELS:
@@ -91,12 +91,12 @@ def _tauter(sensor: Sensor) -> Sensor:
     return replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension + PRETENSION_OFF))
 
 
-def _noisy(clean: Presses, bench: Bench, level: float) -> Array:
+def _noisy(clean: LabelledPresses, bench: EvaluationScene, level: float) -> Array:
     louder = NoiseModel(f"x {level:g}", level * bench.noise.white, level * bench.noise.gain)
     return noisy_charges(clean, louder, bench.seed + NOISE_SEED)
 
 
-def _wrong_gains(bench: Bench, clean: Presses, noisy: Array) -> Iterator[Case]:
+def _wrong_gains(bench: EvaluationScene, clean: LabelledPresses, noisy: Array) -> Iterator[Case]:
     """Gains off by some 1 %, each sensor differently; one off by 20 %; one dead."""
     rng = np.random.default_rng(bench.seed + NOISE_SEED)
     gains = 1.0 + GAIN_OFF * rng.standard_normal(noisy.shape)
@@ -112,7 +112,7 @@ def _wrong_gains(bench: Bench, clean: Presses, noisy: Array) -> Iterator[Case]:
         yield Case("dead electrode", f"{name} dead", clean, np.where(here, silence, noisy))
 
 
-def _outside(bench: Bench, noisy: Callable[[Presses], Array]) -> Iterator[Case]:
+def _outside(bench: EvaluationScene, noisy: Callable[[LabelledPresses], Array]) -> Iterator[Case]:
     """Presses beyond the working area, where the film is large enough."""
     try:
         films = bench.films(further=OUTSIDE, accuracy=ROUGH)
@@ -152,14 +152,16 @@ def _measured(case: Case, released: ReleasedModel, rivals: list[Fitted], thresho
     }
 
 
-def threshold_of(released: ReleasedModel, clean: Presses, bench: Bench, draws: int) -> float:
+def threshold_of(released: ReleasedModel, clean: LabelledPresses, bench: EvaluationScene, draws: int) -> float:
     """The misfit that 1 % of good test presses exceed."""
     seeds = range(bench.seed + NOISE_SEED + 1, bench.seed + NOISE_SEED + 1 + draws)
     misfits = [released.answer(noisy_charges(clean, bench.noise, seed))[2] for seed in seeds]
     return float(np.percentile(np.concatenate(misfits), 100.0 - FALSE_ALARMS))
 
 
-def remaining(task: Task, bench: Bench, clean: Presses, progress: Announce) -> list[dict[str, Any]]:
+def remaining(
+    task: FittingTask, bench: EvaluationScene, clean: LabelledPresses, progress: Announce
+) -> list[dict[str, Any]]:
     """A known dead electrode: methods fitted anew to the charges that remain. Nothing for fewer than three of those."""
     names = bench.sensor.electrode_names
     if len(names) < 4:
@@ -177,5 +179,5 @@ def remaining(task: Task, bench: Bench, clean: Presses, progress: Announce) -> l
     return records
 
 
-def _only(presses: Presses, kept: np.ndarray) -> Presses:
-    return Presses(presses.contact, presses.charge_pC[:, kept])
+def _only(presses: LabelledPresses, kept: np.ndarray) -> LabelledPresses:
+    return LabelledPresses(presses.contact, presses.charge_pC[:, kept])

@@ -10,8 +10,8 @@ from isocharge.arrays import Array
 from isocharge.simulate import ChargeSpline, ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import CramerRao, limits_at
 from isocharge.train.bayes.limit import Scene, bayes_estimate
-from isocharge.train.data.presses import Presses
-from isocharge.train.report.bench import Bench
+from isocharge.train.data.presses import LabelledPresses
+from isocharge.train.report.bench import EvaluationScene
 from isocharge.train.report.measures import errors, rms, rounded
 
 BAYES, CRAMER_RAO = "Bayes limit", "Cramér-Rao"
@@ -19,7 +19,7 @@ BAYES, CRAMER_RAO = "Bayes limit", "Cramér-Rao"
 
 
 @dataclass(frozen=True)
-class Limits:
+class ErrorBounds:
     """Both limits on the same presses.
 
     Attributes:
@@ -51,14 +51,14 @@ class Limits:
         }
 
 
-def limits_of(
-    bench: Bench,
+def error_bounds(
+    bench: EvaluationScene,
     films: tuple[ForwardMap, ...],
-    presses: Presses,
+    presses: LabelledPresses,
     noisy_pC: Array,
     limited: int,
     progress: Callable[[str], None],
-) -> Limits:
+) -> ErrorBounds:
     """Both limits.
 
     Args:
@@ -78,4 +78,4 @@ def limits_of(
             forward_map=charges,
             progress=lambda done, total: progress(f"integrating the Bayes limit: {done} of {total} presses"),
         )[0]
-    return Limits(bayes, limits_at(charges, presses.contact * np.array([1e-3, 1e-3, 1.0]), bench.noise))
+    return ErrorBounds(bayes, limits_at(charges, presses.contact * np.array([1e-3, 1e-3, 1.0]), bench.noise))

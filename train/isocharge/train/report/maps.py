@@ -8,9 +8,9 @@ import numpy as np
 
 from isocharge.arrays import Array, Integers
 from isocharge.train.baselines import ReleasedModel
-from isocharge.train.data.domain import Domain
-from isocharge.train.data.presses import Presses, noisy_charges, position_error
-from isocharge.train.report.bench import Bench
+from isocharge.train.data.domain import ContactDomain
+from isocharge.train.data.presses import LabelledPresses, noisy_charges, position_error
+from isocharge.train.report.bench import EvaluationScene
 from isocharge.train.report.limits import CRAMER_RAO
 from isocharge.train.report.measures import coverage, rms, rounded
 
@@ -42,7 +42,7 @@ class Draws:
         std: Their standard deviations.
     """
 
-    def __init__(self, released: ReleasedModel, clean: Presses, bench: Bench, draws: int) -> None:
+    def __init__(self, released: ReleasedModel, clean: LabelledPresses, bench: EvaluationScene, draws: int) -> None:
         answers = [
             released.answer(noisy_charges(clean, bench.noise, bench.seed + DRAW_SEED + draw))[:2]
             for draw in range(draws)
@@ -62,14 +62,14 @@ class Draws:
         return error
 
 
-def force_bins(domain: Domain, force_N: Array, bins: int = FORCE_BINS) -> tuple[Array, Integers]:
+def force_bins(domain: ContactDomain, force_N: Array, bins: int = FORCE_BINS) -> tuple[Array, Integers]:
     """Middles of bins of equal steps of log force, shape (bins,), N, and the bin of each press."""
     edges = np.geomspace(*domain.force_range_N, bins + 1)
     number = np.clip(np.searchsorted(edges, force_N, side="right") - 1, 0, bins - 1)
     return np.sqrt(edges[:-1] * edges[1:]), number
 
 
-def by_force(domain: Domain, truth: Array, found: dict[str, Array], cramer_rao_mm: Array) -> dict[str, Any]:
+def by_force(domain: ContactDomain, truth: Array, found: dict[str, Array], cramer_rao_mm: Array) -> dict[str, Any]:
     """Root-mean-square position error, mm, of several methods and Cramér-Rao's in bins of the force."""
     middle, number = force_bins(domain, truth[:, 2])
     lines = {}
@@ -82,7 +82,7 @@ def by_force(domain: Domain, truth: Array, found: dict[str, Array], cramer_rao_m
 
 
 def worst_regions(
-    domain: Domain, draws: Draws, bayes: Array | None, contact: Array, truth: Array
+    domain: ContactDomain, draws: Draws, bayes: Array | None, contact: Array, truth: Array
 ) -> list[dict[str, Any]]:
     """The cells in which the released model errs most.
 
@@ -118,7 +118,7 @@ def _over_bayes(bayes: Array, contact: Array, truth: Array, here: np.ndarray) ->
     return rounded(mine / limit, 3)
 
 
-def _cells(domain: Domain, truth: Array) -> Integers:
+def _cells(domain: ContactDomain, truth: Array) -> Integers:
     ring = np.minimum(RINGS * (np.hypot(*truth[:, :2].T) / domain.radius_mm) ** 2, RINGS - 1).astype(np.intp)
     angle = np.mod(np.arctan2(truth[:, 1], truth[:, 0]), 2.0 * np.pi)
     sector = np.minimum(SECTORS * angle / (2.0 * np.pi), SECTORS - 1).astype(np.intp)
@@ -126,7 +126,7 @@ def _cells(domain: Domain, truth: Array) -> Integers:
     return cell
 
 
-def _cell_words(domain: Domain, cell: int) -> dict[str, Any]:
+def _cell_words(domain: ContactDomain, cell: int) -> dict[str, Any]:
     ring, sector, force = cell // (SECTORS * FORCES), cell // FORCES % SECTORS, cell % FORCES
     radii = domain.radius_mm * np.sqrt(np.array([ring, ring + 1]) / RINGS)
     edges = np.geomspace(*domain.force_range_N, FORCES + 1)[force : force + 2]
@@ -137,7 +137,7 @@ def _cell_words(domain: Domain, cell: int) -> dict[str, Any]:
     }
 
 
-def calibration(domain: Domain, draws: Draws) -> dict[str, Any]:
+def calibration(domain: ContactDomain, draws: Draws) -> dict[str, Any]:
     """Coverage of the central intervals: at many levels, and at 68 and 95 % in terciles of force and radius."""
     covered = coverage(draws.contact, draws.std, draws.truth, LEVELS)
     return {
@@ -150,7 +150,7 @@ def calibration(domain: Domain, draws: Draws) -> dict[str, Any]:
 COORDINATES = ("x", "y", "force")
 
 
-def _parts(domain: Domain, draws: Draws) -> Iterator[dict[str, Any]]:
+def _parts(domain: ContactDomain, draws: Draws) -> Iterator[dict[str, Any]]:
     distance, force = np.hypot(*draws.truth[:, :2].T), draws.truth[:, 2]
     radii = domain.radius_mm * np.sqrt(np.arange(4) / 3)
     newtons = np.geomspace(*domain.force_range_N, 4)

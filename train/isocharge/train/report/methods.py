@@ -13,6 +13,7 @@ from isocharge.simulate import Dataset, ForwardMap
 from isocharge.train.baselines import (
     Estimator,
     Fitted,
+    FittingTask,
     GaussianProcess,
     GaussNewton,
     GradientBoosting,
@@ -23,12 +24,11 @@ from isocharge.train.baselines import (
     Network,
     PolynomialRidge,
     ReleasedModel,
-    Task,
     Triangulate,
 )
 from isocharge.train.baselines.linear_band import BAND_N
-from isocharge.train.data.presses import Presses, noisy_charges, presses_of, split_by_position
-from isocharge.train.report.bench import Bench
+from isocharge.train.data.presses import LabelledPresses, noisy_charges, presses_of, split_by_position
+from isocharge.train.report.bench import EvaluationScene
 from isocharge.train.report.measures import errors, pareto, rounded
 from isocharge.train.report.settings import Settings
 from isocharge.train.report.timing import latencies, throughputs
@@ -73,7 +73,7 @@ class Method:
 
 
 @dataclass(frozen=True)
-class Test:
+class EvaluationPresses:
     """Test presses.
 
     Attributes:
@@ -81,22 +81,22 @@ class Test:
         charge_pC: With noise, shape (n, n_electrode).
     """
 
-    presses: Presses
+    presses: LabelledPresses
     charge_pC: Array
 
     @classmethod
-    def of(cls, bench: Bench, presses: Presses) -> "Test":
+    def of(cls, bench: EvaluationScene, presses: LabelledPresses) -> "EvaluationPresses":
         """With one draw of the bench's noise."""
         return cls(presses, noisy_charges(presses, bench.noise, bench.seed + TEST_NOISE))
 
 
-def task_of(dataset: Dataset, bench: Bench, settings: Settings) -> Task:
+def task_of(dataset: Dataset, bench: EvaluationScene, settings: Settings) -> FittingTask:
     """What the methods are fitted for."""
     train, validation = split_by_position(presses_of(dataset), settings.hold_out, settings.seed)
-    return Task(train, validation, bench.domain, bench.noise, settings.seed, quick=settings.quick)
+    return FittingTask(train, validation, bench.domain, bench.noise, settings.seed, quick=settings.quick)
 
 
-def roster(dataset: Dataset, film: ForwardMap, settings: Settings) -> list[tuple[str, Estimator]]:
+def all_methods(dataset: Dataset, film: ForwardMap, settings: Settings) -> list[tuple[str, Estimator]]:
     """Every method with its kind."""
     networks = [Network(dataset, hidden, settings.steps, settings.hold_out) for hidden in settings.sizes]
     return [
@@ -114,7 +114,11 @@ def roster(dataset: Dataset, film: ForwardMap, settings: Settings) -> list[tuple
 
 
 def fit_all(
-    estimators: list[tuple[str, Estimator]], released: ReleasedModel, task: Task, test: Test, progress: Announce
+    estimators: list[tuple[str, Estimator]],
+    released: ReleasedModel,
+    task: FittingTask,
+    test: EvaluationPresses,
+    progress: Announce,
 ) -> list[Method]:
     """Fit every method and let all of its forms answer the test presses; the released model comes first."""
     given: list[Fitted] = [released, released.contact_only()]
@@ -128,12 +132,12 @@ def fit_all(
     return methods
 
 
-def answers(fitted: Fitted, test: Test) -> Array:
+def answers(fitted: Fitted, test: EvaluationPresses) -> Array:
     """Contacts of the noisy test presses."""
     return fitted.told(test.presses.contact[:, 2]).predict(test.charge_pC)
 
 
-def timed(methods: list[Method], test: Test, settings: Settings, progress: Announce) -> list[Method]:
+def timed(methods: list[Method], test: EvaluationPresses, settings: Settings, progress: Announce) -> list[Method]:
     """The same methods with their times and sizes, taken when all of them are fitted."""
     force, charge = test.presses.contact[:, 2], test.charge_pC
     singles = {
@@ -166,7 +170,7 @@ def _with_times(method: Method, durations: Array, per_second: float) -> Method:
     )
 
 
-def table(methods: list[Method], test: Test, bayes: Array | None) -> list[dict[str, Any]]:
+def table(methods: list[Method], test: EvaluationPresses, bayes: Array | None) -> list[dict[str, Any]]:
     """One record for each method, ready for JSON; errors over the limit where `bayes` gives its contacts."""
     truth = test.presses.contact
     band = truth[:, 2] <= BAND_N

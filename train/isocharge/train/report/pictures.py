@@ -13,7 +13,7 @@ from isocharge.arrays import Integers
 from isocharge.simulate import Sensor
 from isocharge.simulate.plots.figure import FELT, INK, new_figure, save_picture
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
-from isocharge.train.data.domain import Domain
+from isocharge.train.data.domain import ContactDomain
 from isocharge.train.report.limits import BAYES, CRAMER_RAO
 from isocharge.train.report.maps import COORDINATES, Draws
 from isocharge.train.report.measures import rms
@@ -28,7 +28,7 @@ LIMIT_STYLES = {BAYES: "-", CRAMER_RAO: ":"}
 """How the limits are drawn."""
 
 
-def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Figure:
+def error_maps(sensor: Sensor, domain: ContactDomain, draws: Draws) -> Figure:
     """Root-mean-square errors of the released model over the film."""
     figure = new_figure(11.5, 5.0)
     for axes, values, words in zip(

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from isocharge.resumable_run import Draft
+from isocharge.resumable_run import ResumableRun
 
 EVERY_S = 3.0
 """Seconds between two writes of a stage that is under way."""
@@ -24,7 +24,7 @@ class Checkpoint:
         clock: Seconds.
     """
 
-    def __init__(self, draft: Draft | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, draft: ResumableRun | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self._draft, self._clock = draft, clock
         self._written = clock()
 

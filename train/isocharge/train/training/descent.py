@@ -29,7 +29,7 @@ REPORT_EVERY = 200
 
 
 @dataclass(frozen=True)
-class Task:
+class TrainingStage:
     """What to train and how well it does.
 
     Attributes:
@@ -52,7 +52,7 @@ class Task:
 class Descent:
     """One run of a task; `run` goes on where a checkpoint says."""
 
-    def __init__(self, task: Task, rate: float, patience: int, seed: int) -> None:
+    def __init__(self, task: TrainingStage, rate: float, patience: int, seed: int) -> None:
         self.task, self.patience = task, patience
         self.optimisers = _optimisers(task.part, rate)
         self.random = torch.Generator().manual_seed(seed)

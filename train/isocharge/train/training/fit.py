@@ -24,13 +24,20 @@ from isocharge.simulate.dataset.shards import Dataset
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.data.charge_field import ChargeField
-from isocharge.train.data.domain import Domain
-from isocharge.train.data.fold_free import SMALLEST_SHARE, unfolded
-from isocharge.train.data.misfit_charges import Strange, strange_charges
-from isocharge.train.data.presses import Presses, domain_of, misfit_noise, noisy_charges, presses_of, split_by_position
+from isocharge.train.data.domain import ContactDomain
+from isocharge.train.data.fold_free import SMALLEST_SHARE, fold_free_domain
+from isocharge.train.data.misfit_charges import MisfitExamples, draw_misfit_examples
+from isocharge.train.data.presses import (
+    LabelledPresses,
+    domain_of,
+    misfit_noise,
+    noisy_charges,
+    presses_of,
+    split_by_position,
+)
 from isocharge.train.training.checkpoint import Checkpoint
 from isocharge.train.training.config import FitConfig, TrainingConfig
-from isocharge.train.training.descent import Descent, Task
+from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.levenberg_marquardt import FIRST, levenberg_marquardt
 from isocharge.train.training.misfit_data import WATCHED, _Learned
 from isocharge.train.training.network import Features, InverseNetwork
@@ -53,9 +60,9 @@ class Fit:
 
     network: InverseNetwork
     field: ChargeField
-    held: Presses
+    held: LabelledPresses
     config: FitConfig
-    asked: Domain
+    asked: ContactDomain
 
 
 def fit_network(
@@ -97,7 +104,7 @@ def fit_network(
     return Fit(network, field, held, config, asked)
 
 
-def _field(domain: Domain, train: Presses, watched: Presses) -> ChargeField:
+def _field(domain: ContactDomain, train: LabelledPresses, watched: LabelledPresses) -> ChargeField:
     return ChargeField.fit(domain, train.contact, train.charge_pC, (watched.contact, watched.charge_pC))
 
 
@@ -110,10 +117,12 @@ def _check_electrodes(dataset: Dataset, config: FitConfig) -> None:
         )
 
 
-def _without_folds(asked: Domain, presses: Presses, training: TrainingConfig, warn: Warn) -> tuple[Domain, Presses]:
+def _without_folds(
+    asked: ContactDomain, presses: LabelledPresses, training: TrainingConfig, warn: Warn
+) -> tuple[ContactDomain, LabelledPresses]:
     """The largest disk in which the map does not fold, and the presses in it."""
     field = _field(asked, *split_by_position(presses, training.hold_out, training.seed))
-    domain = unfolded(field, misfit_noise(noise_model(training.noise)))
+    domain = fold_free_domain(field, misfit_noise(noise_model(training.noise)))
     if domain == asked:
         return asked, presses
     if domain.radius_mm < SMALLEST_SHARE * asked.radius_mm:
@@ -153,8 +162,8 @@ class _Training:
         self,
         network: InverseNetwork,
         field: ChargeField,
-        train: Presses,
-        watched: Presses,
+        train: LabelledPresses,
+        watched: LabelledPresses,
         config: TrainingConfig,
         checkpoint: Checkpoint,
         progress: StageProgress | None,
@@ -170,7 +179,7 @@ class _Training:
 
     def run(self) -> None:
         config = self.config
-        contact = Task(
+        contact = TrainingStage(
             "contact",
             self.network.contact,
             self._contact_loss,
@@ -182,10 +191,10 @@ class _Training:
         if config.finish_steps:
             self._finish()
         strange = _Learned.of(self.network, self._strange_charges(), config)
-        misfit = Task("misfit", self.network.missing, strange.loss, strange.score, config.misfit_steps)
+        misfit = TrainingStage("misfit", self.network.missing, strange.loss, strange.score, config.misfit_steps)
         self._descend(misfit, config.steps + config.finish_steps)
 
-    def _descend(self, task: Task, before: int) -> None:
+    def _descend(self, task: TrainingStage, before: int) -> None:
         descent = Descent(task, self.config.learning_rate, self.config.patience, self.config.seed)
         descent.run(self.checkpoint, lambda step, words: self._tell(before + step, words))
 
@@ -238,11 +247,11 @@ class _Training:
             last.weight[3:] = straight.weight[3:] = 0.0
             last.bias[3:] = 0.5 * (off**2).mean(dim=0).log()
 
-    def _strange_charges(self) -> Strange:
+    def _strange_charges(self) -> MisfitExamples:
         """Charges for the misfit; searching for their nearest contacts takes long enough to be kept."""
         if (kept := self.checkpoint.load("charges")) is not None:
-            return Strange(*(kept[name].numpy() for name in ("charge_pC", "miss")))
-        made = strange_charges(
+            return MisfitExamples(*(kept[name].numpy() for name in ("charge_pC", "miss")))
+        made = draw_misfit_examples(
             self.train, self.field, misfit_noise(self.noise), self.config.misfit_charges, self.config.seed
         )
         self.checkpoint.save(

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from isocharge.train.data.misfit_charges import Strange
+from isocharge.train.data.misfit_charges import MisfitExamples
 from isocharge.train.training.config import TrainingConfig
-from isocharge.train.training.network import InverseNetwork, squeezed
+from isocharge.train.training.network import InverseNetwork, compress_length
 
 WATCHED = 0.5
 """Positions that are watched while it trains, over those that are held out."""
@@ -24,10 +24,10 @@ class _Learned:
     batch: int
 
     @classmethod
-    def of(cls, network: InverseNetwork, strange: Strange, config: TrainingConfig) -> "_Learned":
+    def of(cls, network: InverseNetwork, strange: MisfitExamples, config: TrainingConfig) -> "_Learned":
         inputs = network.inputs(torch.tensor(strange.charge_pC).float())
         watched = round(WATCHED * config.hold_out * len(inputs))
-        return cls(network, inputs, squeezed(torch.tensor(strange.miss)).float(), watched, config.batch)
+        return cls(network, inputs, compress_length(torch.tensor(strange.miss)).float(), watched, config.batch)
 
     def loss(self, _: int, random: torch.Generator) -> Tensor:
         rows = torch.randint(len(self.inputs) - self.watched, (self.batch,), generator=random)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from isocharge.arrays import Array
-from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, Domain
+from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain
 
 MISFIT_UNIT = 5.0
 """Standard deviations up to which the misfit is learned about linearly; beyond, its logarithm is."""
@@ -98,7 +98,7 @@ class InverseNetwork(nn.Module):
     whitening: Tensor
 
     def __init__(
-        self, domain: Domain, features: Features, hidden: tuple[int, ...], misfit_hidden: tuple[int, ...]
+        self, domain: ContactDomain, features: Features, hidden: tuple[int, ...], misfit_hidden: tuple[int, ...]
     ) -> None:
         super().__init__()
         n_electrode = features.typical.size
@@ -131,11 +131,11 @@ class InverseNetwork(nn.Module):
         force = torch.exp(value[:, 2:])
         contact = torch.cat([value[:, :2], force], dim=1)
         contact_std = torch.cat([std[:, :2], std[:, 2:] * force], dim=1)
-        squeezed = torch.linalg.vector_norm(self.missing(self.inputs(charge_pC)), dim=1, keepdim=True)
-        return contact, contact_std, MISFIT_UNIT * torch.sinh(squeezed)
+        compress_length = torch.linalg.vector_norm(self.missing(self.inputs(charge_pC)), dim=1, keepdim=True)
+        return contact, contact_std, MISFIT_UNIT * torch.sinh(compress_length)
 
 
-def squeezed(miss: Tensor) -> Tensor:
+def compress_length(miss: Tensor) -> Tensor:
     """What the misfit network learns: `miss`, shape (n, n_electrode), its length brought to asinh(length / unit)."""
     length: Tensor = torch.linalg.vector_norm(miss, dim=1, keepdim=True)
     return miss * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=1e-9))

@@ -22,7 +22,7 @@ import orjson
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
 from isocharge.serve.network.http.app import App
-from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Response
 
 UNSENT_BYTES = 1 << 22
@@ -45,7 +45,7 @@ class BoundedProtocol(HttpToolsProtocol):
     """One connection; subclasses carry application and limits, because uvicorn makes protocols from their class."""
 
     direct: App
-    limits = Limits()
+    limits = ServerLimits()
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
@@ -216,7 +216,7 @@ def _path(url: bytes) -> str:
     return urllib.parse.unquote_to_bytes(path).decode("utf-8", "replace")
 
 
-def bounded(app: App, limits: Limits) -> type[BoundedProtocol]:
+def bounded(app: App, limits: ServerLimits) -> type[BoundedProtocol]:
     """The protocol with this application and these limits."""
     return type("BoundedProtocol", (BoundedProtocol,), {"direct": app, "limits": limits})
 

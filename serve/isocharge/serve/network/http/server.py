@@ -8,7 +8,7 @@ import uvicorn
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http.app import App
 from isocharge.serve.network.http.connection import bounded, close_overdue
-from isocharge.serve.network.limits import Limits
+from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.tls import Tls
 
 GRACE_SECONDS = 10
@@ -28,7 +28,7 @@ class _Uvicorn(uvicorn.Server):
 class HttpServer:
     """A server that listens from the moment it is made until it is closed, and answers while `run` runs."""
 
-    def __init__(self, app: App, address: Address, *, limits: Limits, tls: Tls | None = None) -> None:
+    def __init__(self, app: App, address: Address, *, limits: ServerLimits, tls: Tls | None = None) -> None:
         """Listen.
 
         Raises:

@@ -4,8 +4,8 @@ from importlib.metadata import version
 from typing import Any
 
 from isocharge.serve.model.session import INPUT, OUTPUTS
-from isocharge.serve.network.limits import Limits
-from isocharge.serve.network.model_store import Served, Shelf
+from isocharge.serve.network.limits import ServerLimits
+from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 
 EXTENSIONS = (
     "binary_tensor_data",
@@ -26,7 +26,7 @@ def server_metadata() -> dict[str, Any]:
     return {"name": "isocharge", "version": version("isocharge"), "extensions": list(EXTENSIONS)}
 
 
-def model_metadata(served: Served, shelf: Shelf) -> dict[str, Any]:
+def model_metadata(served: LoadedVersion, shelf: ModelStore) -> dict[str, Any]:
     """Tensors of a model, and under `properties` everything that its file says about itself, as JSON texts."""
     metadata = served.metadata
     widths = {INPUT: len(metadata.electrodes)}
@@ -44,7 +44,7 @@ def _tensor(name: str, width: int) -> dict[str, Any]:
     return {"name": name, "datatype": "FP32", "shape": [-1, width]}
 
 
-def model_config(served: Served, limits: Limits) -> dict[str, Any]:
+def model_config(served: LoadedVersion, limits: ServerLimits) -> dict[str, Any]:
     """A model's configuration as Triton would have it; unlike Triton by default, every version serves."""
     return {
         "name": served.metadata.name,
@@ -57,7 +57,7 @@ def model_config(served: Served, limits: Limits) -> dict[str, Any]:
     }
 
 
-def statistics_of(shelf: Shelf, name: str = "", version: str = "") -> dict[str, Any]:
+def statistics_of(shelf: ModelStore, name: str = "", version: str = "") -> dict[str, Any]:
     """Counters of a version of a model, of all its versions, or of all models.
 
     Raises:
@@ -72,6 +72,6 @@ def statistics_of(shelf: Shelf, name: str = "", version: str = "") -> dict[str, 
     }
 
 
-def repository_index(shelf: Shelf, *, ready: bool) -> list[dict[str, str]]:
+def repository_index(shelf: ModelStore, *, ready: bool) -> list[dict[str, str]]:
     """Every version in the repository; with `ready`, only what serves."""
     return [vars(row) for row in shelf.index() if row.state == "READY" or not ready]

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import orjson
 
 from isocharge.errors import IsochargeError, ModelError, RequestError, TooLarge, UnknownPath, WrongMethod
-from isocharge.serve.network.limits import Limits
-from isocharge.serve.network.model_store import Served, Shelf
+from isocharge.serve.network.limits import ServerLimits
+from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol import describe
 from isocharge.serve.network.protocol.answer import write_answer
 from isocharge.serve.network.protocol.encoding import compress, decompress
@@ -58,10 +58,10 @@ Route = tuple[str, Callable[[Request], Response]]
 class Handler:
     """Answers requests from the models on a shelf."""
 
-    def __init__(self, shelf: Shelf, limits: Limits | None = None) -> None:
+    def __init__(self, shelf: ModelStore, limits: ServerLimits | None = None) -> None:
         """`limits` bound body and batch; the others are for transports."""
         self.shelf = shelf
-        self.limits = limits or Limits()
+        self.limits = limits or ServerLimits()
         self._fixed: dict[str, Route] = {
             "/": ("GET", self._page),
             "/openapi.json": ("GET", lambda _: _json(openapi(shelf, self.limits))),
@@ -126,7 +126,7 @@ class Handler:
             pass
         raise UnknownPath(f"{path[:200]}: nothing is served here; see /openapi.json")
 
-    def _served(self, asked: Request) -> Served:
+    def _served(self, asked: Request) -> LoadedVersion:
         return self.shelf.get(asked.name, asked.version)
 
     def _infer(self, asked: Request) -> Response:

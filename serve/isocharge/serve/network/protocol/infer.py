@@ -9,7 +9,7 @@ import numpy as np
 
 from isocharge.arrays import Singles
 from isocharge.serve.model.session import INPUT, OUTPUTS
-from isocharge.serve.network.model_store import Served
+from isocharge.serve.network.model_store import LoadedVersion
 from isocharge.serve.prediction.bound_press import BoundPress
 
 Written = TypeVar("Written")
@@ -54,7 +54,7 @@ class InferAnswer(NamedTuple):
     binary: frozenset[str]
 
 
-def infer(served: Served, request: InferRequest) -> InferAnswer:
+def infer(served: LoadedVersion, request: InferRequest) -> InferAnswer:
     """Run the model; may be called from any thread."""
     charges, names = request.charge_pC, request.outputs
     if len(charges) == 1:
@@ -72,7 +72,7 @@ def _one_press(press: BoundPress, charge_pC: Singles, names: tuple[str, ...]) ->
 
 
 def answer_inference(
-    served: Served, read: Callable[[], InferRequest], write: Callable[[InferAnswer], Written]
+    served: LoadedVersion, read: Callable[[], InferRequest], write: Callable[[InferAnswer], Written]
 ) -> Written:
     """Read a request, run the model, write the answer, and count it.
 

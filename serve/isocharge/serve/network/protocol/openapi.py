@@ -3,15 +3,15 @@
 from typing import Any
 
 from isocharge.serve.model.session import INPUT, OUTPUTS
-from isocharge.serve.network.limits import Limits
-from isocharge.serve.network.model_store import Shelf
+from isocharge.serve.network.limits import ServerLimits
+from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.describe import server_metadata
 from isocharge.serve.network.protocol.tensors import DATATYPES
 
 Json = dict[str, Any]
 
 
-def openapi(shelf: Shelf, limits: Limits) -> Json:
+def openapi(shelf: ModelStore, limits: ServerLimits) -> Json:
     """The document, OpenAPI 3.1."""
     models = sorted({served.metadata.name for served in shelf.all()})
     versions = sorted({str(served.metadata.version) for served in shelf.all()})
@@ -98,7 +98,7 @@ def _path_parameter(name: str, values: list[str]) -> Json:
     return {"name": name, "in": "path", "required": True, "schema": {"type": "string", "enum": values or ["none"]}}
 
 
-def _infer(widths: list[int], limits: Limits) -> Json:
+def _infer(widths: list[int], limits: ServerLimits) -> Json:
     """A request with its numbers as JSON; the number of numbers follows from the shape, which no schema can say."""
     shape = [{"type": "integer", "minimum": 1, "maximum": limits.batch}, {"enum": widths or [3]}]
     number = {"type": "number", "minimum": -1e30, "maximum": 1e30}

@@ -3,7 +3,7 @@
 from html import escape
 
 from isocharge.serve.model.model_folder import Model
-from isocharge.serve.network.model_store import Served, Shelf
+from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol.describe import server_metadata
 
 STYLE = """
@@ -25,7 +25,7 @@ details h2 { font-size: 1.05rem; margin: 1.2rem 0 .4rem }
 """
 
 
-def page(shelf: Shelf) -> str:
+def page(shelf: ModelStore) -> str:
     """The page as HTML; it loads nothing else."""
     refused = "".join(f'<p class="refused">Refused: {escape(reason)}</p>' for reason in shelf.refusals())
     articles = "".join(map(_article, shelf.all())) or "<p>No model is loaded.</p>"
@@ -39,7 +39,7 @@ def page(shelf: Shelf) -> str:
 """
 
 
-def _article(served: Served) -> str:
+def _article(served: LoadedVersion) -> str:
     metadata = served.metadata
     low, high = metadata.force_range_N
     facts = {
@@ -57,7 +57,7 @@ def _article(served: Served) -> str:
 """
 
 
-def _example(served: Served, path: str) -> str:
+def _example(served: LoadedVersion, path: str) -> str:
     press = ", ".join(f"{charge:.1f}" for charge in served.model.golden.charge_pC[0].tolist())
     tensor = f'"name": "charge_pC", "datatype": "FP32", "shape": [1, {len(served.metadata.electrodes)}]'
     body = f'{{"inputs": [{{{tensor}, "data": [{press}]}}]}}'
