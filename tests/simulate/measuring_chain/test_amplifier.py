@@ -117,12 +117,18 @@ def test_a_file_says_what_differs(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("tau = 1", "unknown key 'tau'; expected"),
-        ("tau_s = 0", "tau_s: expected a number in its range, got 0"),
+        ("tau = 1", "unknown key 'tau'; known are"),
+        ("tau_s = 0", "tau_s: expected a positive number or inf, got 0"),
         ("hum_pC = -1", "hum_pC: expected"),
         ("bits = 1.5", "bits: expected"),
+        ("bits = 33", "bits: expected a whole number from 0 to 32, got 33"),
+        ("bits = 16", r"mine\.toml: bits: a converter of 16 bits needs the largest charge that it reads"),
+        ('like = "bench"\nlimit_pC = inf', "bits: a converter of 16 bits needs"),
+        ("white_pC = inf", "white_pC: expected a number from 0, got inf"),
+        ("hum_pC = nan", "hum_pC: expected a number from 0, got nan"),
+        ("hum_pC = true", "hum_pC: expected a number from 0, got True"),
         ('like = "kitchen"', "like: expected one of clean, reference, bench, surgery, got 'kitchen'"),
-        ("tau_s", "cannot be read as TOML"),
+        ("tau_s", "not a TOML file"),
     ],
 )
 def test_wrong_files(tmp_path, text, said):
@@ -130,6 +136,15 @@ def test_wrong_files(tmp_path, text, said):
     path.write_text(text)
     with pytest.raises(InputError, match=said):
         load_amplifier(str(path))
+
+
+def test_infinity_is_no_leak_and_no_limit(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('like = "bench"\ntau_s = inf\nlimit_pC = inf\nbits = 0\n')
+    part = load_amplifier(str(path))
+    readings = part.start(3, 100.0, np.random.default_rng(1))(np.full((50, 3), 5e-9))
+    assert np.isfinite(readings).all()
+    assert readings[-1].min() > 4.5e-9
 
 
 def test_unknown_level():

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from isocharge.errors import InputError
-from isocharge.simulate import load_amplifier, noise_model
+from isocharge.simulate import NoiseModel, load_amplifier, noise_model
 from isocharge.simulate.measuring_chain.levels import AMPLIFIER_LEVELS
 
 
@@ -85,6 +85,12 @@ def test_a_wrong_file_is_refused(tmp_path, text, words):
     path.write_text(text)
     with pytest.raises(InputError, match=words):
         noise_model(str(path))
+
+
+@pytest.mark.parametrize(("white", "gain"), [(np.inf, 0.0), (np.nan, 0.0), (-1e-12, 0.0), (0.0, np.inf), (0.0, -1.0)])
+def test_noise_is_finite_and_not_negative(white, gain):
+    with pytest.raises(InputError, match="expected a finite number from 0"):
+        NoiseModel("mine", white, gain)
 
 
 def test_variance_is_the_square():

@@ -304,8 +304,8 @@ def test_wrong_type_is_named(path, value):
         (("electrodes", "A"), [8.0, 5.0], "electrodes 'A' and 'B' overlap"),
         (("calibration", "gain"), {"A": 0.0}, "calibration.gain.A: expected a positive number, got 0.0"),
         (("calibration", "gain"), {"Z": 1.0}, "calibration gain: no electrode named"),
-        (("readout",), "mean", r"readout: expected one of \('area', 'edge'\), got 'mean'"),
-        (("surface",), "inside", r"surface: expected one of \('middle', 'top', 'bottom'\), got 'inside'"),
+        (("readout",), "mean", r"readout: expected one of area, edge, got 'mean'"),
+        (("surface",), "inside", r"surface: expected one of middle, top, bottom, got 'inside'"),
         (("name",), "", "name: expected a text, got ''"),
         (("electrodes", "A"), {"polygon_mm": 3}, r"electrodes\.A\.polygon_mm: expected a list of \[x, y\], got 3"),
         (("electrodes", "A"), {"polygon_mm": [3]}, r"electrodes\.A\.polygon_mm: expected \[x, y\] in mm, got 3"),
@@ -349,7 +349,7 @@ def test_file_that_is_not_toml(tmp_path):
 def test_file_that_is_not_text(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_bytes(b"\xff\xfe\x00name")
-    with pytest.raises(SensorError, match=rf"^{path}: cannot be read as text"):
+    with pytest.raises(SensorError, match=rf"^{path}: not a TOML file: not text in UTF-8"):
         load_sensor(str(path))
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from isocharge.arrays import Array
+from isocharge.errors import InputError
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 PVDF_PYRO = 30e-6 * 9e-6
@@ -60,6 +61,13 @@ class Amplifier:
     step_time: float = 5.0
     limit: float = math.inf
     bits: int = 0
+
+    def __post_init__(self) -> None:
+        if self.bits and not math.isfinite(self.limit):
+            raise InputError(
+                f"bits: a converter of {self.bits} bits needs the largest charge that it reads, got a limit of "
+                f"{self.limit} C; give limit_pC beside bits, or bits = 0 for no converter"
+            )
 
     def start(self, electrodes: int, rate: float, rng: np.random.Generator) -> "Measurement":
         """Switch it on: mismatches are drawn, and it has settled.

@@ -7,11 +7,13 @@ This is its memoryless part, independent between channels and readings:
 What has a memory - leak, hum, drift, temperature, mismatch, clipping - is `measuring_chain.amplifier`.
 """
 
+import math
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from isocharge.arrays import Array
+from isocharge.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,12 @@ class NoiseModel:
     name: str
     white: float
     gain: float
+
+    def __post_init__(self) -> None:
+        for name in ("white", "gain"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise InputError(f"noise {self.name!r}: {name}: expected a finite number from 0, got {value}")
 
     def sigma(self, charge: Array) -> Array:
         """Standard deviation for charges of any shape, C; the same shape."""

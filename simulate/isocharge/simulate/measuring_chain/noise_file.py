@@ -1,7 +1,5 @@
 """Noise and amplifiers by the name of their level or from a TOML file."""
 
-import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,27 +9,34 @@ from isocharge.errors import InputError
 from isocharge.simulate.measuring_chain.amplifier import Amplifier
 from isocharge.simulate.measuring_chain.levels import AMPLIFIER_LEVELS, NOISE_LEVELS
 from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.tables import Table, read_toml
 
 PICO, UNIT = 1e-12, 1.0
 
-KEYS = {
-    "tau_s": ("tau", UNIT),
-    "tau_mismatch": ("tau_mismatch", UNIT),
-    "gain_mismatch": ("gain_mismatch", UNIT),
-    "hum_pC": ("hum", PICO),
-    "hum_Hz": ("hum_frequency", UNIT),
-    "offset_pC": ("offset", PICO),
-    "bias_pA": ("bias", PICO),
-    "pyro_pC_per_K": ("pyro", PICO),
-    "temperature_rms_K": ("temperature_rms", UNIT),
-    "temperature_time_s": ("temperature_time", UNIT),
-    "temperature_step_K": ("step", UNIT),
-    "temperature_step_at_s": ("step_at", UNIT),
-    "temperature_step_time_s": ("step_time", UNIT),
-    "limit_pC": ("limit", PICO),
-    "bits": ("bits", UNIT),
+NOT_NEGATIVE: dict[str, Any] = {"least": 0}
+POSITIVE: dict[str, Any] = {"above": 0.0}
+POSITIVE_OR_INFINITE: dict[str, Any] = {"above": 0.0, "or_infinite": True}
+ANY: dict[str, Any] = {}
+
+KEYS: dict[str, tuple[str, float, dict[str, Any]]] = {
+    "tau_s": ("tau", UNIT, POSITIVE_OR_INFINITE),
+    "tau_mismatch": ("tau_mismatch", UNIT, NOT_NEGATIVE),
+    "gain_mismatch": ("gain_mismatch", UNIT, NOT_NEGATIVE),
+    "hum_pC": ("hum", PICO, NOT_NEGATIVE),
+    "hum_Hz": ("hum_frequency", UNIT, POSITIVE),
+    "offset_pC": ("offset", PICO, NOT_NEGATIVE),
+    "bias_pA": ("bias", PICO, NOT_NEGATIVE),
+    "pyro_pC_per_K": ("pyro", PICO, NOT_NEGATIVE),
+    "temperature_rms_K": ("temperature_rms", UNIT, NOT_NEGATIVE),
+    "temperature_time_s": ("temperature_time", UNIT, POSITIVE),
+    "temperature_step_K": ("step", UNIT, ANY),
+    "temperature_step_at_s": ("step_at", UNIT, ANY),
+    "temperature_step_time_s": ("step_time", UNIT, POSITIVE),
+    "limit_pC": ("limit", PICO, POSITIVE_OR_INFINITE),
 }
-"""Keys of a TOML file: the attribute and what one unit is in SI. Besides: `like`, `white_pC`, `proportional`."""
+"""Numbers of a TOML file: the attribute of `Amplifier`, one unit in SI, and the bounds of the number."""
+
+OTHER_KEYS = ("like", "white_pC", "proportional", "bits")
 
 
 def load_amplifier(level: str) -> Amplifier:
@@ -39,49 +44,34 @@ def load_amplifier(level: str) -> Amplifier:
 
         like = "bench"       # optional: what is not said is as there
         white_pC = 0.5
-        tau_s = 1.0
+        tau_s = 1.0          # inf for no leak
 
     Raises:
-        InputError: If there is no such level or file, or a key is unknown or no number in its range.
+        InputError: If there is no such level or file, a key is unknown or no number in its range, or the converter has
+            bits and no limit.
     """
     if level in AMPLIFIER_LEVELS:
         return AMPLIFIER_LEVELS[level]
     if not level.endswith(".toml"):
         raise InputError(f"noise level: expected one of {', '.join(AMPLIFIER_LEVELS)}, or a TOML file, got {level!r}")
-    try:
-        table = tomllib.loads(Path(level).read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{level}: cannot be read as TOML ({error}); expected the description of noise") from error
-    return _from_table(table, level)
+    return _amplifier(read_toml(Path(level), "the description of noise", InputError), level)
 
 
-def _from_table(table: Mapping[str, Any], where: str) -> Amplifier:
-    like = AMPLIFIER_LEVELS.get(table.get("like", "clean"))
-    if like is None:
-        raise InputError(f"{where}: like: expected one of {', '.join(AMPLIFIER_LEVELS)}, got {table['like']!r}")
-    for key, value in table.items():
-        _check(key, value, where)
+def _amplifier(values: Mapping[str, Any], where: str) -> Amplifier:
+    table = Table(values, where, InputError).only(*KEYS, *OTHER_KEYS)
+    like = AMPLIFIER_LEVELS[table.choice("like", tuple(AMPLIFIER_LEVELS), "clean")]
     noise = NoiseModel(
         Path(where).stem,
-        table.get("white_pC", like.noise.white / PICO) * PICO,
-        table.get("proportional", like.noise.gain),
+        table.number("white_pC", like.noise.white / PICO, least=0) * PICO,
+        table.number("proportional", like.noise.gain, least=0),
     )
-    changes: dict[str, Any] = {KEYS[key][0]: value * KEYS[key][1] for key, value in table.items() if key in KEYS}
-    if "bits" in table:
-        changes["bits"] = table["bits"]
-    return replace(like, noise=noise, **changes)
-
-
-def _check(key: str, value: Any, where: str) -> None:
-    known = {*KEYS, "like", "white_pC", "proportional"}
-    if key not in known:
-        raise InputError(f"{where}: unknown key {key!r}; expected {', '.join(sorted(known))}")
-    signed = {"temperature_step_K", "temperature_step_at_s"}
-    positive = {"tau_s", "hum_Hz", "temperature_time_s", "temperature_step_time_s", "limit_pC"}
-    number = isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
-    good = key == "like" or (number and (key in signed or value >= 0) and (key not in positive or value > 0))
-    if not good or (key == "bits" and value not in range(33)):
-        raise InputError(f"{where}: {key}: expected a number in its range, got {value!r}")
+    changes = {
+        attribute: table.number(key, **bounds) * unit for key, (attribute, unit, bounds) in KEYS.items() if key in table
+    }
+    try:
+        return replace(like, noise=noise, bits=table.whole("bits", like.bits, least=0, most=32), **changes)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def noise_model(level: str) -> NoiseModel:
@@ -98,5 +88,4 @@ def noise_model(level: str) -> NoiseModel:
     """
     if level in NOISE_LEVELS:
         return NOISE_LEVELS[level]
-
     return load_amplifier(level).noise

@@ -1,6 +1,5 @@
 """The sensor file: TOML with units in its keys, to and from `Sensor`. Unknown keys are errors, and missing ones too."""
 
-import tomllib
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -12,6 +11,7 @@ from isocharge.errors import SensorError
 from isocharge.simulate.sensor.electrode import Calibration, Electrode
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.sensor import Readout, Sensor
+from isocharge.tables import Table, parse_toml, read_toml
 
 SECTIONS = ("name", "readout", "surface", "film", "piezo", "electrodes", "calibration")
 
@@ -33,30 +33,18 @@ def load_sensor(sensor: str | Path) -> Sensor:
     """
     if str(sensor) in built_in_sensors():
         text = (resources.files("isocharge.simulate") / "sensors" / f"{sensor}.toml").read_text("utf-8")
-        return _parse(text, str(sensor))
+        return sensor_from_dict(parse_toml(text, str(sensor), SensorError), str(sensor))
     path = Path(sensor)
     if not path.is_file():
         names = ", ".join(built_in_sensors())
         raise SensorError(f"no sensor {str(sensor)!r}: it is neither a built-in name ({names}) nor a file")
-    try:
-        text = path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SensorError(f"{path}: cannot be read as text: {error}") from error
-    return _parse(text, str(path))
-
-
-def _parse(text: str, where: str) -> Sensor:
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise SensorError(f"{where}: not a TOML file: {error}") from error
-    return sensor_from_dict(table, where)
+    return sensor_from_dict(read_toml(path, "a sensor file", SensorError), str(path))
 
 
 def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
     """Build a sensor from the tables of its file (units in the keys); `where` opens the error messages."""
     try:
-        return _build(_Section(table, "", SECTIONS))
+        return _build(Table(table, "", SensorError).only(*SECTIONS))
     except SensorError as error:
         raise SensorError(f"{where}: {error}") from error
 
@@ -113,57 +101,11 @@ def _tidy(value: float) -> float:
     return float(f"{value:.12g}")
 
 
-class _Section:
-    """One table of the file, read key by key, that knows its name and what keys it may have."""
-
-    def __init__(self, table: Any, name: str, keys: tuple[str, ...] | None) -> None:
-        if not isinstance(table, Mapping):
-            raise SensorError(f"{name + ': ' if name else ''}expected a table, got {table!r}")
-        self.table, self.prefix = table, f"{name}." if name else ""
-        unknown = [key for key in table if keys is not None and key not in keys]
-        if unknown:
-            raise SensorError(f"unknown key {self.prefix + unknown[0]!r}; known are {', '.join(keys or ())}")
-
-    def value(self, key: str, default: Any = None) -> Any:
-        if key in self.table:
-            return self.table[key]
-        if default is None:
-            raise SensorError(f"key {self.prefix + key!r} is missing")
-        return default
-
-    def number(self, key: str, default: float | None = None) -> float:
-        return _number(self.value(key, default), self.prefix + key)
-
-    def choice(self, key: str, options: tuple[str, ...]) -> str:
-        value = self.value(key, options[0])
-        if value not in options:
-            raise SensorError(f"{self.prefix + key}: expected one of {options}, got {value!r}")
-        return str(value)
-
-    def section(self, key: str, keys: tuple[str, ...] | None, optional: bool = False) -> "_Section":
-        return _Section(self.value(key, {} if optional else None), self.prefix + key, keys)
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise SensorError(f"{where}: expected a finite number, got {value!r}")
-    return float(value)
-
-
-def _pair(value: Any, where: str) -> tuple[float, float]:
-    if not isinstance(value, list) or len(value) != 2:
-        raise SensorError(f"{where}: expected [x, y] in mm, got {value!r}")
-    return 1e-3 * _number(value[0], where), 1e-3 * _number(value[1], where)
-
-
-def _build(file: _Section) -> Sensor:
-    name = file.value("name")
-    if not isinstance(name, str) or not name:
-        raise SensorError(f"name: expected a text, got {name!r}")
-    film = file.section("film", ("radius_mm", "thickness_um", "young_GPa", "poisson", "pretension_MPa"))
-    piezo = file.section("piezo", ("d31", "d32", "d33", "pyro_uC_per_m2_K"))
+def _build(file: Table) -> Sensor:
+    film = file.table("film").only("radius_mm", "thickness_um", "young_GPa", "poisson", "pretension_MPa")
+    piezo = file.table("piezo").only("d31", "d32", "d33", "pyro_uC_per_m2_K")
     return Sensor(
-        name=name,
+        name=file.text("name"),
         film=Film(
             radius=film.number("radius_mm") * 1e-3,
             thickness=film.number("thickness_um") * 1e-6,
@@ -177,40 +119,37 @@ def _build(file: _Section) -> Sensor:
             d33=piezo.number("d33", 0.0) * 1e-12,
             pyro=piezo.number("pyro_uC_per_m2_K", 0.0) * 1e-6,
         ),
-        electrodes=_electrodes(file.section("electrodes", None)),
-        readout=cast(Readout, file.choice("readout", get_args(Readout))),
-        surface=cast(Surface, file.choice("surface", get_args(Surface))),
-        calibration=_calibration(file),
+        electrodes=_electrodes(file.table("electrodes")),
+        readout=cast(Readout, file.choice("readout", get_args(Readout), "area")),
+        surface=cast(Surface, file.choice("surface", get_args(Surface), "middle")),
+        calibration=_calibration(file.table("calibration", {})),
     )
 
 
-def _electrodes(section: _Section) -> tuple[Electrode, ...]:
-    names = [key for key in section.table if key != "side_mm"]
-    return tuple(_electrode(section, name) for name in names)
+def _electrodes(table: Table) -> tuple[Electrode, ...]:
+    return tuple(_electrode(table, name) for name in table if name != "side_mm")
 
 
-def _electrode(section: _Section, name: str) -> Electrode:
-    value, where = section.table[name], f"electrodes.{name}"
-    if isinstance(value, Mapping):
-        corners = _Section(value, where, ("polygon_mm",)).value("polygon_mm")
-        if not isinstance(corners, list):
-            raise SensorError(f"{where}.polygon_mm: expected a list of [x, y], got {corners!r}")
-        return Electrode(name, tuple(_pair(corner, f"{where}.polygon_mm") for corner in corners))
-    side = section.number("side_mm")
-    if side <= 0.0:
-        raise SensorError(f"electrodes.side_mm: expected a positive number, got {side}")
-    return Electrode.of_square(name, _pair(value, where), side * 1e-3)
+def _electrode(table: Table, name: str) -> Electrode:
+    if isinstance(table.get(name), Mapping):
+        polygon = table.table(name).only("polygon_mm")
+        corners = polygon.sequence("polygon_mm", of="[x, y]")
+        return Electrode(name, tuple(_metres(polygon, "polygon_mm", corner) for corner in corners))
+    side = table.number("side_mm", above=0.0)
+    return Electrode.of_square(name, _metres(table, name, table.get(name)), side * 1e-3)
 
 
-def _calibration(file: _Section) -> Calibration:
-    section = file.section("calibration", ("gain", "shift_mm", "rotation_deg"), optional=True)
-    gain = section.section("gain", None, optional=True)
-    gains = {name: gain.number(name) for name in gain.table}
-    for name, value in gains.items():
-        if value <= 0.0:
-            raise SensorError(f"calibration.gain.{name}: expected a positive number, got {value}")
+def _metres(table: Table, key: str, point_mm: object) -> tuple[float, float]:
+    """A point of the plane, m."""
+    x_mm, y_mm = table.as_numbers(key, point_mm, count=2, of="[x, y] in mm")
+    return 1e-3 * x_mm, 1e-3 * y_mm
+
+
+def _calibration(table: Table) -> Calibration:
+    table.only("gain", "shift_mm", "rotation_deg")
+    gain = table.table("gain", {})
     return Calibration(
-        gain=gains,
-        shift=_pair(section.value("shift_mm", [0.0, 0.0]), "calibration.shift_mm"),
-        rotation=float(np.deg2rad(section.number("rotation_deg", 0.0))),
+        gain={name: gain.number(name, above=0.0) for name in gain},
+        shift=_metres(table, "shift_mm", table.get("shift_mm", [0.0, 0.0])),
+        rotation=float(np.deg2rad(table.number("rotation_deg", 0.0))),
     )
