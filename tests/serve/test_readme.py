@@ -67,11 +67,6 @@ def test_every_option_and_bound_is_the_command_s():
     assert (limits.body_bytes, limits.header_bytes, limits.connections) == (1 << 20, 16 << 10, 1024)
 
 
-def test_every_module_is_listed():
-    modules = {path.name for path in (SERVE / "isocharge/serve").glob("*.py")} - {"__init__.py", "arrays.py"}
-    assert modules == {name for name in re.findall(r"`(\w+\.py)`", README) if name != "__init__.py"}
-
-
 def test_every_flag_is_explained():
     words = {value for name, value in vars(flags).items() if name.isupper()}
     table = README[README.index("| flag |") : README.index("## Tare")]

@@ -48,11 +48,6 @@ def test_everything_public_exists():
         assert hasattr(isocharge.simulate, name)
 
 
-def test_every_module_is_listed():
-    modules = {path.name for path in (SIMULATE / "isocharge/simulate").glob("*.py")} - {"__init__.py"}
-    assert modules == set(re.findall(r"^\| `(\w+\.py)`", README, re.MULTILINE))
-
-
 def errors(case) -> tuple[float, float]:
     """Of a press's charges, over the largest, and of its deflection."""
     solved = press(case.film, case.probe, case.at, case.force)

@@ -239,15 +239,16 @@ import os, sys
 from pathlib import Path
 sys.path[:0] = {path!r}
 from isocharge.simulate import *
-from isocharge.simulate.sweep import Solver
-from isocharge.simulate.workers import local_workers
+from isocharge.simulate.solver.settings import SolveSettings
+from isocharge.simulate.execution.workers import local_workers
 
 def killed(done, total):
     if done >= {count}:
         os.kill(os.getpid(), 9)
 
 if __name__ == "__main__":
-    quick = Solver(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
+    membrane = Theory(stretching=True, bending=False, pretensioned=False)
+    quick = SolveSettings(theory=membrane, resolution=Resolution(4, 8, 4))
     sweep = Sweep(radius=3e-3, force_range=(1.0, 1.0), samples=60, seed=7)
     with local_workers({workers}) as workers:
         if workers.executor:

@@ -8,13 +8,14 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from isocharge.cli.shared.terminal import progress, say, this_command
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from isocharge.serve import PredictionRecord, Predictor
     from isocharge.simulate import ForwardMap, Sweep
     from isocharge.train import Release

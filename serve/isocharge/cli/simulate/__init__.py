@@ -1,4 +1,4 @@
 """`isocharge simulate ...`: one file a command.
 
-May import: isocharge.simulate, when a command runs; shared.
+May import: shared.
 """

@@ -1,4 +1,4 @@
 """`isocharge train ...`: one file a command.
 
-May import: isocharge.train and what it builds on, when a command runs; shared.
+May import: shared.
 """

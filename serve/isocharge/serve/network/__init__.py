@@ -1,4 +1,4 @@
 """What every server shares: model store, statistics, bounds, address, TLS, token.
 
-May import: prediction, model. Its packages: protocol (no transport), http, grpc.
+May import: prediction, model.
 """

@@ -1,4 +1,4 @@
 """Isocharge contours and triangulation: from the field, and graphically as the paper does.
 
-May import: forward and all below it.
+May import: forward, sensor, numerics.
 """

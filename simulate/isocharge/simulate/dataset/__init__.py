@@ -1,4 +1,4 @@
 """Datasets of presses and charges: sampling plans, sweeps, and the file format.
 
-May import: forward and all below it.
+May import: forward, solver, mesh, sensor, execution, numerics.
 """

@@ -1,4 +1,4 @@
 """From presses to charges, fast: the readout, the forward map from few solves, and its spline table.
 
-May import: solver and all below it.
+May import: solver, mechanics, mesh, sensor, execution, numerics.
 """

@@ -1,4 +1,4 @@
 """What charges can tell about a contact: Cramer-Rao limits, folds, ambiguities, working area, probe.
 
-May import: forward and all below it, measuring_chain.
+May import: forward, sensor, measuring_chain, numerics.
 """

@@ -1,4 +1,4 @@
 """Numerics without physics: interpolation, points of a disk, convex polygons, Gauss rules.
 
-May import: nothing of isocharge.simulate.
+May import: nothing else of isocharge.simulate.
 """

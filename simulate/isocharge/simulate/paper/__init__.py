@@ -1,5 +1,8 @@
 """Mirbagheri et al. (2007), reproduced: every figure and number of the paper with ours beside it.
 
+May import: plots, contours, identifiability, forward, solver, mechanics, mesh, sensor, measuring_chain, execution,
+numerics.
+
 from pathlib import Path
 from isocharge.simulate.paper import write_paper
 

@@ -1,5 +1,7 @@
 """Every other way from charges to contacts, behind one interface, for the report on speed against error.
 
+May import: release, training, data.
+
 from isocharge.train.baselines import PolynomialRidge, FittingTask
 
 library, plain = PolynomialRidge().fit(task)   # the same polynomial, by scikit-learn and by NumPy

@@ -1,4 +1,7 @@
-"""The Open Inference Protocol over gRPC: `inference.GRPCInferenceService` on the same models as HTTP."""
+"""The Open Inference Protocol over gRPC: `inference.GRPCInferenceService` on the same models as HTTP.
+
+May import: network.protocol, network.
+"""
 
 from isocharge.extras import require
 

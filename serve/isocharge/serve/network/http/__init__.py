@@ -1,4 +1,7 @@
-"""The Open Inference Protocol over HTTP: an ASGI application, and the server that runs it within bounds."""
+"""The Open Inference Protocol over HTTP: an ASGI application, and the server that runs it within bounds.
+
+May import: network.protocol, network.
+"""
 
 from isocharge.extras import require
 

@@ -1,5 +1,7 @@
 """The Open Inference Protocol, version 2, without a transport: requests in, answers out, as plain values.
 
+May import: network, prediction, model.
+
 HTTP (`isocharge.serve.network.http`) and gRPC (`isocharge.serve.network.grpc`) carry it; neither is imported here.
 """
 
