@@ -59,6 +59,7 @@ def test_numbers_are_finite_and_no_bools(value):
         ({"above": 0.0, "most": 1}, 1, 0, "a number above 0 and at most 1"),
         ({}, -1e300, 10**400, "a finite number"),
         ({"above": 0.0, "or_infinite": True}, math.inf, -math.inf, "a positive number or inf"),
+        ({"not_zero": True}, -1e-9, 0, "a finite number that is not 0"),
     ],
 )
 def test_bounds_of_numbers(bounds, good, wrong, expected):
@@ -95,6 +96,24 @@ def test_choices_and_lists():
     assert table(key=[1, 2.5]).numbers("key", count=2, of="[x, y] in mm") == (1.0, 2.5)
     with pytest.raises(SensorError, match=r"expected \[x, y\] in mm, got \[1, True\]"):
         table(key=[1, True]).numbers("key", count=2, of="[x, y] in mm")
+
+
+def test_texts_may_be_empty_where_that_has_a_meaning():
+    assert table(key="").text("key", or_empty=True) == ""
+    assert table(key=["", "a"]).texts("key", or_empty=True) == ("", "a")
+    with pytest.raises(SensorError, match=r"expected a list of names, got \['', 'a'\]"):
+        table(key=["", "a"]).texts("key", of="names")
+
+
+def test_tables_of_a_list_are_numbered():
+    first, second = table(key=[{"a": 1}, {"a": "x"}]).tables("key")
+    assert first.number("a") == 1.0
+    with pytest.raises(SensorError, match=r"^mine\.toml: film\.key\[2\]\.a: expected a finite number, got 'x'$"):
+        second.number("a")
+    with pytest.raises(SensorError, match=r"^mine\.toml: film\.key\[1\]: expected a table, got 3$"):
+        table(key=[3]).tables("key")
+    with pytest.raises(SensorError, match=r"^mine\.toml: film\.key: expected a list of tables, got 3$"):
+        table(key=3).tables("key")
 
 
 def test_without_a_file_a_message_begins_with_the_key():

@@ -132,13 +132,15 @@ class Table:
         most: float = math.inf,
         above: float = -math.inf,
         or_infinite: bool = False,
+        not_zero: bool = False,
     ) -> float:
         """A finite number from `least` to `most`, and greater than `above`; or, where that has a meaning, infinity."""
         value = self.get(key, default)
         if or_infinite and value == math.inf:
             return math.inf
-        if not is_number(value) or not least <= value <= most or not value > above:
-            self.refuse(key, _kind_of_number("number", least, most, above) + (" or inf" if or_infinite else ""), value)
+        if not is_number(value) or not least <= value <= most or not value > above or (not_zero and value == 0):
+            kind = _kind_of_number("number", least, most, above)
+            self.refuse(key, kind + " or inf" * or_infinite + " that is not 0" * not_zero, value)
         return float(value)
 
     def whole(self, key: str, default: Any = REQUIRED, *, least: int | None = None, most: int | None = None) -> int:
@@ -156,10 +158,10 @@ class Table:
             self.refuse(key, "true or false", value)
         return value
 
-    def text(self, key: str, default: Any = REQUIRED) -> str:
-        """A text that is not empty."""
+    def text(self, key: str, default: Any = REQUIRED, *, or_empty: bool = False) -> str:
+        """A text that is not empty, unless it may be."""
         value = self.get(key, default)
-        if not isinstance(value, str) or not value:
+        if not isinstance(value, str) or not (value or or_empty):
             self.refuse(key, "a text", value)
         return value
 
@@ -177,10 +179,10 @@ class Table:
             self.refuse(key, f"a list of {of}", value)
         return list(value)
 
-    def texts(self, key: str, default: Any = REQUIRED, *, of: str = "texts") -> tuple[str, ...]:
-        """A list of texts that are not empty."""
+    def texts(self, key: str, default: Any = REQUIRED, *, of: str = "texts", or_empty: bool = False) -> tuple[str, ...]:
+        """A list of texts that are not empty, unless they may be."""
         values = self.sequence(key, default, of=of)
-        if not all(isinstance(value, str) and value for value in values):
+        if not all(isinstance(value, str) and (value or or_empty) for value in values):
             self.refuse(key, f"a list of {of}", values)
         return tuple(values)
 
@@ -197,6 +199,14 @@ class Table:
     def table(self, key: str, default: Any = REQUIRED) -> "Table":
         """The table of a key."""
         return Table(self.get(key, default), self.where, self.error, self._name(key))
+
+    def tables(self, key: str, default: Any = REQUIRED) -> list["Table"]:
+        """The tables of a list; messages number them from 1."""
+        values = self.sequence(key, default, of="tables")
+        return [
+            Table(value, self.where, self.error, f"{self._name(key)}[{number}]")
+            for number, value in enumerate(values, start=1)
+        ]
 
     def _fail(self, message: str) -> NoReturn:
         raise self.error(f"{self.where}: {message}" if self.where else message)

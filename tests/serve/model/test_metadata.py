@@ -45,7 +45,7 @@ def test_other_format_version(film):
 def test_missing_key_is_named(film, key):
     props = film.metadata().to_props()
     del props[key]
-    with pytest.raises(ModelError, match=f"{WHERE}: the metadata has no '{key}'"):
+    with pytest.raises(ModelError, match=f"^{WHERE}: metadata: key '{key}' is missing; export the model again$"):
         ModelMetadata.from_props(props, WHERE)
 
 
@@ -55,19 +55,22 @@ def test_missing_key_is_named(film, key):
         ("name", '""', "expected a text, got ''"),
         ("version", "0", "expected a whole number from 1, got 0"),
         ("version", "true", "got True"),
-        ("sensor", "{}", "expected a text, got None"),
-        ("electrodes", '["A", "A"]', "electrode names that differ"),
-        ("electrodes", "[]", "a list of texts"),
-        ("working_area_mm", "[[0, 0], [1, 0]]", "at least three points"),
-        ("working_area_mm", "[[0, 0], [1, 0], [1]]", "two numbers"),
-        ("force_range_N", "[2.0, 0.05]", "a smaller and a larger number"),
-        ("errors", '{"position_mm": NaN}', "a finite number, got nan"),
-        ("probes", '"circle:1.0"', "a list of texts"),
-        ("noise", "{", "Expecting property name"),
+        ("sensor", "{}", "key 'sensor.name' is missing"),
+        ("sensor", '{"name": 3}', "sensor.name: expected a text, got 3"),
+        ("electrodes", '["A", "A"]', "expected names that differ, got .'A', 'A'"),
+        ("electrodes", "[]", r"expected one text or more, got \[\]"),
+        ("working_area_mm", "[[0, 0], [1, 0]]", "expected three points or more"),
+        ("working_area_mm", "[[0, 0], [1, 0], [1]]", r"expected points of two numbers, got \[1\]"),
+        ("force_range_N", "[2.0, 0.05]", r"expected a smaller and a larger number, got \[2.0, 0.05\]"),
+        ("force_range_N", "[0.05]", "expected a smaller and a larger number"),
+        ("errors", '{"position_mm": NaN}', "errors.position_mm: expected a finite number, got nan"),
+        ("probes", '"circle:1.0"', "expected a list of texts, got 'circle"),
+        ("noise", "{", "noise: expected JSON, got '{' .*Expecting property name"),
+        ("noise", "[" * 100_000, "noise: expected JSON"),
     ],
 )
 def test_wrong_value_is_shown(film, key, text, said):
-    with pytest.raises(ModelError, match=rf"{WHERE}: metadata '{key}': .*{said}"):
+    with pytest.raises(ModelError, match=rf"^{WHERE}: metadata: (?=.*{key}).*{said}.*; export the model again$"):
         ModelMetadata.from_props(film.metadata().to_props() | {key: text}, WHERE)
 
 

@@ -8,8 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
-from isocharge.errors import DeviceError
-
 
 @dataclass(frozen=True)
 class Crc:
@@ -65,7 +63,7 @@ def _xor(data: bytes) -> int:
 
 @dataclass(frozen=True)
 class Checksum:
-    """How to compute a checksum, and how many bytes it takes; none takes 0."""
+    """How to compute a checksum, and how many bytes it takes: 0 for a frame without one."""
 
     compute: Callable[[bytes], int]
     size: int
@@ -85,14 +83,3 @@ CHECKSUMS = {
     "crc-16/arc": Checksum(Crc(16, 0x8005, 0x0000, True, 0x0000), 2),
     "crc-32": Checksum(Crc(32, 0x04C11DB7, 0xFFFFFFFF, True, 0xFFFFFFFF), 4),
 }
-
-
-def checksum(name: str) -> Checksum:
-    """A checksum by its name.
-
-    Raises:
-        DeviceError: If there is none of this name.
-    """
-    if name not in CHECKSUMS:
-        raise DeviceError(f"checksum: expected one of {', '.join(CHECKSUMS)}, got {name!r}")
-    return CHECKSUMS[name]

@@ -1,26 +1,56 @@
-"""The layout of a frame as TOML describes it: sync, fields, checksum."""
+"""The layout of a described frame: a sync pattern, fields of fixed size, a checksum.
 
-import math
+    [frames]
+    format = "described"
+    sync = "20 4E"                 # hexadecimal
+    length = 16                    # of the whole frame, bytes; checked against the fields
+    byte_order = "little"          # or "big"; optional
+    checksum = "crc-16/modbus"     # a name of `isocharge.serve.frames.checksums`; optional, "none"
+    checksum_from = 0              # first byte that it covers; optional
+    fields = [                     # in their order, from after the sync to before the checksum
+        {name = "Fx", type = "i16", scale = 0.01},
+        ...
+    ]
+
+Types are u8, u16, u32, i8, i16, i32, f32, f64, and `pad` with `count` bytes. A field named `seq` is the frame's number,
+`t_us`, `t_ms` or `t_s` its clock, `flags` the bits of `isocharge.serve.frames.frame`; all others are channels.
+"""
+
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from isocharge.errors import DeviceError
-from isocharge.serve.frames.checksums import Checksum, checksum
+from isocharge.serve.frames.checksums import CHECKSUMS, Checksum
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.frames.text_lines import SEQ, TIMES_US
+from isocharge.tables import Table
 
 FLAGS = "flags"
+"""Name of the field that holds a frame's flags."""
 
 TYPES = {"u8": "B", "u16": "H", "u32": "I", "i8": "b", "i16": "h", "i32": "i", "f32": "f", "f64": "d"}
+"""Types of a field, with the letters of `struct`."""
+
+PADDING = "pad"
+"""Type of bytes that say nothing."""
+
+MOST_PADDING = 4096
+"""Largest padding, bytes: what no real frame has, so that a typing error cannot ask for a gigabyte."""
 
 BYTE_ORDERS = {"little": "<", "big": ">"}
 
 
 @dataclass(frozen=True)
 class Field:
-    """A field of a frame: its type in `struct`'s letters, and what one count is in the unit that is wanted."""
+    """A field of a frame.
+
+    Attributes:
+        name: Its meaning, or the channel's name.
+        letter: Its type as a letter of `struct`.
+        scale: Value of one count in the unit of the channel or clock.
+    """
 
     name: str
     letter: str
@@ -37,8 +67,8 @@ class FrameLayout:
     """A described frame.
 
     Attributes:
-        sync: What it begins with.
-        body: From after the sync to before the checksum.
+        sync: The bytes with which it begins.
+        body: The bytes between sync and checksum.
         fields: In the order of `body`, padding left out.
         check: The checksum.
         check_from: First byte that it covers.
@@ -103,63 +133,56 @@ def frame_layout(table: Mapping[str, Any], where: str) -> FrameLayout:
     Raises:
         DeviceError: If a key is missing, unknown or wrong, or the length is not that of the fields.
     """
-    known = {"sync", "length", "byte_order", "checksum", "checksum_from", "fields"}
-    _expect(set(table) <= known, where, f"only the keys {sorted(known)}", sorted(set(table) - known))
-    _expect({"sync", "length", "fields"} <= set(table), where, "the keys sync, length and fields", sorted(table))
-    order = table.get("byte_order", "little")
-    _expect(order in BYTE_ORDERS, where, "byte_order little or big", order)
-    entries = table["fields"]
-    _expect(isinstance(entries, list) and len(entries) > 0, where, "a list of fields", entries)
-    letters = "".join(_letters(entry, where) for entry in entries)
-    fields = tuple(_field(entry, where) for entry in entries if entry["type"] != "pad")
-    check = checksum(table.get("checksum", "none"))
-    start = table.get("checksum_from", 0)
+    frames = Table(table, where, DeviceError, "frames")
+    frames.only("sync", "length", "byte_order", "checksum", "checksum_from", "fields")
+    order = frames.choice("byte_order", tuple(BYTE_ORDERS), "little")
+    entries = frames.tables("fields")
+    letters = BYTE_ORDERS[order] + "".join(map(_letter, entries))
     layout = FrameLayout(
-        _sync(table["sync"], where), struct.Struct(BYTE_ORDERS[order] + letters), fields, check, start, order
+        sync=_sync(frames),
+        body=struct.Struct(letters),
+        fields=tuple(_field(entry) for entry in entries if entry.get("type") != PADDING),
+        check=CHECKSUMS[frames.choice("checksum", tuple(CHECKSUMS), "none")],
+        check_from=frames.whole("checksum_from", 0, least=0),
+        byte_order=order,
     )
-    _check(layout, table, where)
+    _check(layout, frames)
     return layout
 
 
-def _check(layout: FrameLayout, table: Mapping[str, Any], where: str) -> None:
+def _check(layout: FrameLayout, frames: Table) -> None:
+    """Refuse fields that do not make a frame, and a length or checksum that does not fit them."""
     names = [field.name for field in layout.fields]
-    _expect(len(set(names)) == len(names), where, "field names that differ", names)
-    _expect(len(layout.channels) > 0, where, "a field that is a channel", names)
-    _expect(layout.length == table["length"], where, f"length = {layout.length} for these fields", table["length"])
-    covered = isinstance(layout.check_from, int) and 0 <= layout.check_from < layout.length - layout.check.size
-    _expect(covered, where, "checksum_from inside the frame", layout.check_from)
+    if len(set(names)) < len(names):
+        frames.refuse("fields", "names that differ", names)
+    if not layout.channels:
+        frames.refuse("fields", "one or more that are channels", names)
+    if frames.whole("length") != layout.length:
+        frames.refuse("length", f"{layout.length} for these fields")
+    if layout.check_from >= layout.length - layout.check.size:
+        frames.refuse("checksum_from", f"less than {layout.length - layout.check.size}, inside the frame")
 
 
-def _expect(holds: bool, where: str, expected: str, value: object) -> None:
-    if not holds:
-        raise DeviceError(f"{where}: frames: expected {expected}, got {value!r}")
-
-
-def _sync(text: Any, where: str) -> bytes:
+def _sync(frames: Table) -> bytes:
+    text = frames.text("sync")
     try:
         sync = bytes.fromhex(text)
-    except (TypeError, ValueError):
+    except ValueError:
         sync = b""
-    _expect(len(sync) > 0, where, "sync in hexadecimal, as in '20 4E'", text)
+    if not sync:
+        frames.refuse("sync", "bytes in hexadecimal, as in '20 4E'")
     return sync
 
 
-def _letters(entry: Any, where: str) -> str:
-    _expect(isinstance(entry, dict) and set(entry) <= {"name", "type", "scale", "count"}, where, "a field", entry)
-    kind, count = entry.get("type"), entry.get("count", 1)
-    _expect(kind == "pad" or kind in TYPES, where, f"a field's type pad, {', '.join(TYPES)}", kind)
-    _expect(isinstance(count, int) and 1 <= count <= 4096, where, "count from 1 to 4096", count)
-    _expect(kind == "pad" or count == 1, where, "count with the type pad only", entry)
-    return f"{count}x" if kind == "pad" else TYPES[kind]
+def _letter(entry: Table) -> str:
+    """A field's type, or its padding, as `struct` writes it."""
+    kind = entry.only("name", "type", "scale", "count").choice("type", (PADDING, *TYPES))
+    if kind == PADDING:
+        return f"{entry.whole('count', 1, least=1, most=MOST_PADDING)}x"
+    if entry.get("count", 1) != 1:
+        entry.refuse("count", f"1, because only the type {PADDING} may have more")
+    return TYPES[kind]
 
 
-def _field(entry: Mapping[str, Any], where: str) -> Field:
-    name, scale = entry.get("name"), entry.get("scale", 1.0)
-    _expect(isinstance(name, str) and name != "", where, "a name for each field", entry)
-    _expect(
-        isinstance(scale, int | float) and not isinstance(scale, bool) and scale != 0 and math.isfinite(scale),
-        where,
-        "a finite scale that is not 0",
-        scale,
-    )
-    return Field(str(name), TYPES[entry["type"]], float(scale))
+def _field(entry: Table) -> Field:
+    return Field(entry.text("name"), TYPES[entry.text("type")], entry.number("scale", 1.0, not_zero=True))

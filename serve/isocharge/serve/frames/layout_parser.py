@@ -1,20 +1,6 @@
-"""Frames that a few words describe: a sync pattern, fields of fixed size, a checksum.
+"""Frames of one described layout (`isocharge.serve.frames.frame_layout`) from bytes.
 
-    [frames]
-    format = "described"
-    sync = "20 4E"                 # hexadecimal
-    length = 16                    # of the whole frame, bytes; checked against the fields
-    byte_order = "little"          # or "big"; optional
-    checksum = "crc-16/modbus"     # a name of `isocharge.serve.frames.checksums`; optional, "none"
-    checksum_from = 0              # first byte that it covers; optional
-    fields = [                     # in their order, from after the sync to before the checksum
-        {name = "Fx", type = "i16", scale = 0.01},
-        ...
-    ]
-
-Types are u8, u16, u32, i8, i16, i32, f32, f64, and `pad` with `count` bytes. The names `seq` and `t_us`, `t_ms` or
-`t_s` are number and clock, `flags` the bits of `frames.frame`; all others are channels. The parser goes on by
-one byte where a checksum does not fit, so a sync pattern inside the data costs no intact frame.
+Where a checksum does not fit, the parser goes on by one byte, so a sync pattern inside the data costs no intact frame.
 """
 
 from collections.abc import Sequence

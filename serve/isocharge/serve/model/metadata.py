@@ -6,12 +6,12 @@ frame that x and y refer to.
 """
 
 import json
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 from isocharge.errors import ModelError
+from isocharge.tables import Table, shown
 
 FORMAT_VERSION = 1
 
@@ -77,104 +77,79 @@ class ModelMetadata:
         Raises:
             ModelError: If the format version is another, or a key is missing or wrong.
         """
-        version = _read(props, "format_version", where)
-        if version != FORMAT_VERSION:
-            raise ModelError(
-                f"{where}: metadata format {version} is not supported (this version reads {FORMAT_VERSION}); "
-                "export it again or upgrade isocharge"
-            )
-        return cls(**{field.name: _read(props, field.name, where) for field in fields(cls)})
+        try:
+            version = _table(props, ("format_version",), where).whole("format_version", least=1)
+            if version == FORMAT_VERSION:
+                return cls(**_fields(_table(props, tuple(field.name for field in fields(cls)), where)))
+        except ModelError as error:
+            raise ModelError(f"{error}; export the model again") from error
+        raise ModelError(
+            f"{where}: metadata format {version} is not supported (this version reads {FORMAT_VERSION}); "
+            "export it again or upgrade isocharge"
+        )
 
 
 def _to_json(key: str, value: Any) -> str:
     try:
         return json.dumps(value, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise ModelError(f"model metadata {key!r}: expected a JSON value, got {value!r} ({error})") from error
+        raise ModelError(f"model metadata {key!r}: expected a JSON value, got {shown(value)} ({error})") from error
 
 
-def _read(props: Mapping[str, str], key: str, where: str) -> Any:
-    if key not in props:
-        raise ModelError(f"{where}: the metadata has no {key!r}; export the model with `isocharge train fit`")
-    try:
-        return _READERS[key](json.loads(props[key]))
-    except ValueError as error:
-        raise ModelError(f"{where}: metadata {key!r}: {error}; export the model again") from error
+def _table(props: Mapping[str, str], names: tuple[str, ...], where: str) -> Table:
+    """The values of these fields, as far as they are there."""
+    values: dict[str, Any] = {}
+    for name in names:
+        try:
+            values |= {name: json.loads(props[name])} if name in props else {}
+        except (ValueError, RecursionError) as error:
+            raise ModelError(f"{where}: metadata: {name}: expected JSON, got {shown(props[name])} ({error})") from error
+    return Table(values, f"{where}: metadata", ModelError)
 
 
-def _expect(holds: bool, expected: str, value: Any) -> None:
-    if not holds:
-        raise ValueError(f"expected {expected}, got {value!r}")
+def _fields(table: Table) -> dict[str, Any]:
+    """The arguments of `ModelMetadata`."""
+    sensor, errors = table.table("sensor"), table.table("errors")
+    sensor.text("name")
+    return {
+        "name": table.text("name"),
+        "version": table.whole("version", least=1),
+        "sensor": dict(sensor.values),
+        "electrodes": _electrodes(table),
+        "working_area_mm": _polygon(table, "working_area_mm"),
+        "probes": _texts(table, "probes"),
+        "force_range_N": _range(table, "force_range_N"),
+        "noise": dict(table.table("noise").values),
+        "dataset_sha256": table.text("dataset_sha256"),
+        "errors": {name: errors.number(name) for name in errors},
+        "made_with": dict(table.table("made_with").values),
+    }
 
 
-def _text(value: Any) -> str:
-    _expect(isinstance(value, str) and value != "", "a text", value)
-    return str(value)
+def _texts(table: Table, key: str) -> tuple[str, ...]:
+    texts = table.texts(key)
+    if not texts:
+        table.refuse(key, "one text or more")
+    return texts
 
 
-def _count(value: Any) -> int:
-    _expect(isinstance(value, int) and not isinstance(value, bool) and value > 0, "a whole number from 1", value)
-    return int(value)
-
-
-def _number(value: Any) -> float:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    _expect(is_number and math.isfinite(value), "a finite number", value)
-    return float(value)
-
-
-def _mapping(value: Any) -> dict[str, Any]:
-    _expect(isinstance(value, dict), "a JSON object", value)
-    return dict(value)
-
-
-def _sensor(value: Any) -> dict[str, Any]:
-    _text(_mapping(value).get("name"))
-    return dict(value)
-
-
-def _errors(value: Any) -> dict[str, float]:
-    return {name: _number(error) for name, error in _mapping(value).items()}
-
-
-def _texts(value: Any) -> tuple[str, ...]:
-    _expect(isinstance(value, list) and len(value) > 0, "a list of texts", value)
-    return tuple(map(_text, value))
-
-
-def _electrodes(value: Any) -> tuple[str, ...]:
-    names = _texts(value)
-    _expect(len(set(names)) == len(names), "electrode names that differ", value)
+def _electrodes(table: Table) -> tuple[str, ...]:
+    names = _texts(table, "electrodes")
+    if len(set(names)) < len(names):
+        table.refuse("electrodes", "names that differ")
     return names
 
 
-def _pair(value: Any) -> tuple[float, float]:
-    _expect(isinstance(value, list) and len(value) == 2, "two numbers", value)
-    return _number(value[0]), _number(value[1])
-
-
-def _range(value: Any) -> tuple[float, float]:
-    low, high = _pair(value)
-    _expect(low <= high, "a smaller and a larger number", value)
+def _range(table: Table, key: str) -> tuple[float, float]:
+    low, high = table.numbers(key, count=2, of="a smaller and a larger number")
+    if low > high:
+        table.refuse(key, "a smaller and a larger number")
     return low, high
 
 
-def _polygon(value: Any) -> tuple[tuple[float, float], ...]:
-    _expect(isinstance(value, list) and len(value) >= 3, "at least three points", value)
-    return tuple(map(_pair, value))
-
-
-_READERS: dict[str, Callable[[Any], Any]] = {
-    "name": _text,
-    "version": _count,
-    "sensor": _sensor,
-    "electrodes": _electrodes,
-    "working_area_mm": _polygon,
-    "probes": _texts,
-    "force_range_N": _range,
-    "noise": _mapping,
-    "dataset_sha256": _text,
-    "errors": _errors,
-    "made_with": _mapping,
-    "format_version": _count,
-}
+def _polygon(table: Table, key: str) -> tuple[tuple[float, float], ...]:
+    points = table.sequence(key, of="points")
+    if len(points) < 3:
+        table.refuse(key, "three points or more")
+    corners = [table.as_numbers(key, point, count=2, of="points of two numbers") for point in points]
+    return tuple((x, y) for x, y in corners)
