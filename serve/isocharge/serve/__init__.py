@@ -15,7 +15,8 @@ from isocharge.serve.frames.layout_parser import DescribedParser
 from isocharge.serve.frames.sequence import SequenceGaps
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_encoder import encode_text
-from isocharge.serve.live.device_file import Device, device_from_table, load_device
+from isocharge.serve.live.device import Device
+from isocharge.serve.live.device_file import device_from_table, load_device
 from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
 from isocharge.serve.live.port_check import Examination, examine
 from isocharge.serve.live.stream import Policy, TouchStream, stream

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from isocharge.errors import ChargeError, DeviceError
-from isocharge.serve import AutoParser, BinaryParser, DescribedParser, Frame, TextParser, load_device
+from isocharge.serve import AutoParser, BinaryParser, DescribedParser, Frame, TextParser, device_from_table, load_device
 from isocharge.serve.live.channels import ChannelPicker
-from isocharge.serve.live.device_file import ANY_BOARD
+from isocharge.serve.live.device import ANY_BOARD
+from isocharge.serve.live.device_file import with_offset_limit
 from isocharge.serve.signal_chain.chain import ChainState, advance
 
 ELECTRODES = ("A", "B", "C")
@@ -87,34 +88,62 @@ def test_formats(device):
 
 
 WRONG = [
-    ("[gane]\n", r"expected the sections channels, common_mode, frames.*got \['gane'\]"),
-    ("[tare]\nframe = 50\n", r"tare: expected the keys .*, got \['frame'\]"),
-    ("[tare]\nframes = 50.5\n", "tare: frames: expected a whole number from 0 to .*, got 50.5"),
-    ("[tare]\non = 1\n", "tare: on: expected true or false, got 1"),
-    ("[touch]\nfloor_pC = -3\n", "touch: floor_pC: expected a number from 0 to .*, got -3"),
-    ("[hum]\nsettle_s = 0\n", "hum: settle_s: expected a number from 0.001 to 1e"),
-    ("[leak]\ntau_s = 1.0\nrelax_s = 1e-300\n", "leak: relax_s: expected a number from 0.001 to 1e"),
-    ("[common_mode]\nblind_pC = 1e300\n", "blind_pC: expected a number from 0 to 1e"),
-    ("[gain]\n", "gain: expected the key pC_per_unit"),
-    ("[gain]\npC_per_unit = 0\n", "numbers that are not 0, got 0"),
-    ("[leak]\ntau_s = {A = -1.0}\n", "positive numbers"),
-    ('[leak]\ntau_s = 1.0\nlearn = "no"\n', "leak: learn: expected true or false"),
-    ("[saturation]\n", "the key limit_pC"),
-    ('[frames]\nformat = "morse"\n', "format auto, binary, text or described, got 'morse'"),
-    ('[frames]\nformat = "binary"\ncolumns = ["A"]\n', r"expected the keys format, got \['columns'\]"),
-    ('[frames]\nformat = "described"\nsync = "55"\n', "the keys sync, length and fields"),
-    ("[common_mode]\nevery = 1\n", "common_mode: expected the keys blind_pC"),
-    ("[channels]\nA = 0\n", "names of channels"),
-    ("channels = 3\n", "expected a section, got 3"),
-    ("frames =", "not TOML"),
+    ("[gane]\n", "unknown key 'gane'; known are name, frames, channels, gain"),
+    ("[tare]\nframe = 50\n", "unknown key 'tare.frame'; known are on, frames, noise_limit_pC"),
+    ("[tare]\nframes = 50.5\n", r"tare\.frames: expected a whole number from 0 to 1000000000, got 50\.5"),
+    ("[tare]\npatience = 2000000000\n", r"tare\.patience: expected a whole number from 0 to 1000000000"),
+    ("[tare]\non = 1\n", r"tare\.on: expected true or false, got 1"),
+    ("[touch]\nfloor_pC = -3\n", r"touch\.floor_pC: expected a number from 0 to .*, got -3"),
+    ("[touch]\nfloor_pC = true\n", r"touch\.floor_pC: expected a number from 0 to .*, got True"),
+    ("[hum]\nsettle_s = 0\n", r"hum\.settle_s: expected a number from 0\.001 to 1"),
+    ("[leak]\ntau_s = 1.0\nrelax_s = 1e-300\n", r"leak\.relax_s: expected a number from 0\.001 to 1"),
+    ("[common_mode]\nblind_pC = 1e300\n", r"common_mode\.blind_pC: expected a number from 0 to 1"),
+    ("[gain]\n", "key 'gain.pC_per_unit' is missing"),
+    ("[gain]\npC_per_unit = 0\n", r"gain\.pC_per_unit: expected a finite number that is not 0, got 0"),
+    ("[gain]\npC_per_unit = {A = 1.0, B = inf}\n", r"gain\.pC_per_unit\.B: expected a finite number .*, got inf"),
+    ("[gain]\npC_per_unit = 1.0\nlearn = true\n", r"unknown key 'gain\.learn'; known are on, pC_per_unit"),
+    ("[leak]\ntau_s = {A = -1.0}\n", r"leak\.tau_s\.A: expected a positive number, got -1\.0"),
+    ('[leak]\ntau_s = 1.0\nlearn = "no"\n', r"leak\.learn: expected true or false, got 'no'"),
+    ("[leak]\n", "key 'leak.tau_s' is missing"),
+    ("[saturation]\n", "key 'saturation.limit_pC' is missing"),
+    ('[frames]\nformat = "morse"\n', r"frames\.format: expected one of auto, binary, text, described, got 'morse'"),
+    ('[frames]\nformat = "binary"\ncolumns = ["A"]\n', r"unknown key 'frames\.columns'; known are format"),
+    ('[frames]\nformat = "text"\ncolumns = ["A", 2]\n', r"frames\.columns: expected a list of names, got \['A', 2\]"),
+    ('[frames]\nformat = "described"\nsync = "55"\n', r"key 'frames\.fields' is missing"),
+    ("[common_mode]\nevery = 1\n", "unknown key 'common_mode.every'; known are on, every_s"),
+    ("[channels]\nA = 0\n", r"channels\.A: expected a text, got 0"),
+    ("channels = 3\n", "channels: expected a table, got 3"),
+    ("frames =", "not a TOML file"),
 ]
 
 
 @pytest.mark.parametrize(("text", "said"), WRONG)
 def test_wrong_files(device, text, said):
-    with pytest.raises(DeviceError, match=said) as caught:
+    with pytest.raises(DeviceError, match=rf"device\.toml: .*{said}"):
         device(text)
-    assert "device.toml" in str(caught.value)
+
+
+def test_a_stage_that_is_switched_off_is_checked_all_the_same(device):
+    with pytest.raises(DeviceError, match=r"leak\.tau_s: expected a positive number"):
+        device("[leak]\non = false\ntau_s = 0\n")
+
+
+def test_the_table_is_kept_as_it_came(device):
+    """Recordings hold it; it makes the same device again."""
+    board = device(FULL)
+    again = device_from_table(board.table, board.where)
+    assert again == board
+    assert board.table["tare"] == {"frames": 50}
+
+
+def test_another_offset_limit_is_in_the_rule_and_in_the_table(device):
+    board = with_offset_limit(device(FULL), 250.0)
+    assert (board.tare.frames, board.tare.offset_limit_pC) == (50, 250.0)
+    assert board.table["tare"] == {"frames": 50, "offset_limit_pC": 250.0}
+    assert with_offset_limit(ANY_BOARD, 250.0).tare.offset_limit_pC == 250.0
+    assert ANY_BOARD.table == {}
+    with pytest.raises(DeviceError, match=r"device\.toml: tare\.offset_limit_pC: expected a number from 0"):
+        with_offset_limit(board, -1.0)
 
 
 def test_a_file_that_is_not_there(tmp_path):
@@ -165,7 +194,7 @@ def test_saturation_is_flagged_until_the_press_is_over(device):
 
 def test_warming_needs_four_electrodes(device):
     board = device("[common_mode]\nevery_s = 0.1\n")
-    assert board.common_mode(("A", "B", "C", "D")).every_s == 0.1
-    with pytest.raises(DeviceError, match="expected four electrodes or more"):
-        board.common_mode(ELECTRODES)
-    assert device("[common_mode]\non = false\n").common_mode(ELECTRODES) is None
+    assert board.chain(("A", "B", "C", "D")).thermal.every_s == 0.1
+    with pytest.raises(DeviceError, match=r"device\.toml: common_mode: expected four electrodes or more"):
+        board.chain(ELECTRODES)
+    assert device("[common_mode]\non = false\n").chain(ELECTRODES).thermal is None

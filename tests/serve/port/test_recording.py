@@ -11,7 +11,8 @@ import pytest
 
 from isocharge.errors import OutputError, OutputExists, RecordingError
 from isocharge.serve import Chunk, Frame, Policy, RecordedClock, Recorder, Recording, TouchStream, encode_frame
-from isocharge.serve.live.device_file import ANY_BOARD, device_from_table
+from isocharge.serve.live.device import ANY_BOARD
+from isocharge.serve.live.device_file import device_from_table
 
 DEVICE = {"tare": {"frames": 10}, "leak": {"tau_s": 10.0}, "hum": {"frequency_Hz": 50.0}}
 

@@ -1,10 +1,12 @@
 """The signal chain: what is tared, what counts as touch."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from isocharge.errors import TareError
-from isocharge.serve import Chain, TareRule, TouchRule
+from isocharge.serve import Chain, LeakRule, TareRule, TouchRule
 from isocharge.serve.signal_chain.chain import ChainState, advance
 from isocharge.serve.signal_chain.contact import Touch, update_contact
 from isocharge.serve.signal_chain.tare import measure_tare
@@ -139,6 +141,35 @@ def test_no_false_touch_in_two_and_a_half_minutes_of_noise():
     assert not any(r.contact for r in run(rest(30_000, seed=3)))
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.01e9, 1.7e308])
+@pytest.mark.parametrize("gain", [None, 0.5, 2.0])
+def test_an_invalid_frame_passes_no_stage(value, gain):
+    """The state after it is that before, but for the time that it took."""
+    chain, state = Chain(gain_pC=None if gain is None else np.full(3, gain)), ChainState.start(3)
+    for k, raw in enumerate(rest(150)):
+        state, _ = advance(chain, state, raw, k / RATE_HZ, 1 / RATE_HZ)
+    bad = np.array([1.0, value / (gain or 1.0), 2.0])
+    after, reading = advance(chain, state, bad, 150 / RATE_HZ, 0.25, flags=("gap",))
+    assert after == replace(state, invalid_s=0.25)
+    assert (reading.charge_pC, reading.tare, reading.contact, reading.flags) == (None, None, False, ("gap", "invalid"))
+
+
+def test_the_time_of_invalid_frames_counts_for_the_next():
+    """A leak is undone over all the time since the last valid frame: exp(-0.5 s / 1 s) of the output is left."""
+    chain = Chain(tare=None, touch=None, leak=LeakRule(np.ones(3), learn=False))
+    state = ChainState.start(3)
+    for values, dt_s in ((np.zeros(3), 0.1), (np.zeros(3), 0.1), (np.full(3, 100.0), 0.1), (np.full(3, np.nan), 0.2)):
+        state, _ = advance(chain, state, values, 0.0, dt_s)
+    state, reading = advance(chain, state, 100.0 * np.exp(np.full(3, -0.5)), 0.0, 0.3)
+    np.testing.assert_allclose(reading.charge_pC, 100.0)
+    assert state.invalid_s == 0.0
+
+
+def test_flags_of_the_frame_come_before_those_of_the_chain():
+    _, reading = advance(Chain(), ChainState.start(3), OFFSET, 0.0, 0.0, limited=True, flags=("gap",))
+    assert reading.flags == ("gap", "tare", "saturated")
+
+
 def test_advance_leaves_its_input_alone():
     state = ChainState.start(3)
     after, _ = advance(Chain(), state, OFFSET, 0.0, 0.0)
@@ -148,14 +179,14 @@ def test_advance_leaves_its_input_alone():
 
 def test_a_base_that_relaxes_to_zero_is_no_touch():
     """A long press may leave the charge below zero; as it relaxes, so does the base that a touch is measured from."""
-    totals, keep = -100.0 * np.exp(-np.arange(1000) / 200.0), float(np.exp(-1.0 / 200.0))
+    totals, decay = -100.0 * np.exp(-np.arange(1000) / 200.0), float(np.exp(-1.0 / 200.0))
 
-    def contacts(keep):
+    def contacts(decay):
         touch, seen = Touch(last_pC=-100.0, base_pC=-100.0), False
         for total in totals.tolist():
-            touch = update_contact(TouchRule(), touch, total, ONE_PC, keep)
+            touch = update_contact(TouchRule(), touch, total, ONE_PC, decay)
             seen |= touch.contact
         return seen
 
-    assert not contacts(keep)
+    assert not contacts(decay)
     assert contacts(1.0)

@@ -5,13 +5,16 @@ from it. On the biaxial film that space holds equal charges, and warming looks l
 electrodes differ, it does not.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from isocharge.serve.signal_chain.chain import ChainState
-from isocharge.serve.signal_chain.leak import Leak
+from isocharge.serve.signal_chain.chain import Chain, ChainState, advance
+from isocharge.serve.signal_chain.contact import Touch
+from isocharge.serve.signal_chain.leak import Leak, LeakRule
 from isocharge.serve.signal_chain.tare import Tare
-from isocharge.serve.signal_chain.thermal import NO_DRIFT, ThermalRule, track_thermal_drift
+from isocharge.serve.signal_chain.thermal import NO_DRIFT, ThermalDrift, ThermalRule, track_thermal_drift
 
 ANGLE = 2 * np.pi * np.arange(4) / 4
 ALIKE = np.column_stack([np.ones(4), np.cos(ANGLE) / 20, np.sin(ANGLE) / 20])
@@ -24,32 +27,32 @@ def misfit_of(film, sigma_pC=2.0):
 
 
 def warmed(film, ramp_pC, seed=0):
-    """The common charge that is found while it rises in steps of 50 ms."""
-    press, rng, state, found = film @ [850.0, 3.0, -2.0], np.random.default_rng(seed), NO_DRIFT, []
+    """The estimates of a common charge while it rises in steps of 50 ms, and the last state."""
+    press, rng, state, estimates = film @ [850.0, 3.0, -2.0], np.random.default_rng(seed), NO_DRIFT, []
     for common_pC in ramp_pC:
         charge_pC = press + common_pC - state.charge_pC + rng.normal(0, 0.5, 4)
         state = track_thermal_drift(ThermalRule(), state, charge_pC, misfit_of(film), 0.05)
-        found.append(state.charge_pC)
-    return np.array(found), state
+        estimates.append(state.charge_pC)
+    return np.array(estimates), state
 
 
 def test_a_step_of_half_a_kelvin_is_followed():
     ramp = np.concatenate([np.linspace(0, 135, 100), np.full(100, 135.0)])
-    found, state = warmed(UNIAXIAL, ramp)
-    assert np.abs(found - ramp).max() < 15.0
-    assert found[-50:] == pytest.approx(135.0, abs=5.0)
+    estimates, state = warmed(UNIAXIAL, ramp)
+    assert np.abs(estimates - ramp).max() < 15.0
+    assert estimates[-50:] == pytest.approx(135.0, abs=5.0)
     assert not state.blind
 
 
 def test_where_it_cannot_be_told_nothing_is_taken():
-    found, state = warmed(BIAXIAL, np.linspace(0, 135, 100))
-    assert not found.any()
+    estimates, state = warmed(BIAXIAL, np.linspace(0, 135, 100))
+    assert not estimates.any()
     assert state.blind
 
 
 def test_a_quiet_film_stays_quiet():
-    found, _ = warmed(UNIAXIAL, np.zeros(400))
-    assert np.abs(found).max() < 5.0
+    estimates, _ = warmed(UNIAXIAL, np.zeros(400))
+    assert np.abs(estimates).max() < 5.0
 
 
 def test_the_model_is_asked_twenty_times_a_second():
@@ -59,10 +62,60 @@ def test_the_model_is_asked_twenty_times_a_second():
     assert 19 <= len(asked) <= 20
 
 
-def test_a_shift_goes_into_the_leak_or_into_the_tare():
-    tare = Tare(np.full(4, 7.0), np.ones(4), 100)
-    bare = ChainState(np.empty((0, 4)), None, tare=tare)
-    np.testing.assert_array_equal(bare.shifted(3.0).tare.charge_pC, np.full(4, 10.0))
-    leaky = ChainState(np.empty((0, 4)), None, tare=tare, leak=Leak.start(np.zeros(4)))
-    np.testing.assert_array_equal(leaky.shifted(3.0).leak.charge_pC, np.full(4, -3.0))
-    np.testing.assert_array_equal(leaky.shifted(3.0).tare.charge_pC, tare.charge_pC)
+PRESS = UNIAXIAL @ [850.0, 3.0, -2.0]
+TARE = Tare(np.full(4, 7.0), np.ones(4), 100)
+
+
+def in_contact(**changes):
+    """The state of a chain in the middle of a press, just before an estimate is due."""
+    state = ChainState(np.empty((0, 4)), None, tare=TARE, touch=Touch(True, 1000.0, 1000.0))
+    return replace(state, drift=ThermalDrift(waited_s=1.0), **changes)
+
+
+def step(state, common_pC, *, chain=None, limited=False):
+    """The next frame: the press, and the same charge more on each electrode."""
+    values = PRESS + common_pC + TARE.charge_pC
+    chain = chain or Chain(thermal=ThermalRule())
+    return advance(chain, state, values, 0.0, 0.005, misfit=misfit_of(UNIAXIAL), limited=limited)
+
+
+def test_the_reading_is_corrected_in_the_frame_of_the_estimate():
+    """Without a leak the tare takes it, so raw charge, tare and touch charge of one frame fit together."""
+    after, reading = step(in_contact(), 15.0)
+    assert after.drift.charge_pC == pytest.approx(15.0, abs=1.0)
+    np.testing.assert_allclose(reading.charge_pC, PRESS + 15.0 - after.drift.charge_pC)
+    np.testing.assert_allclose(reading.raw_pC - reading.tare.charge_pC, reading.charge_pC)
+    np.testing.assert_array_equal(after.tare.charge_pC, reading.tare.charge_pC)
+    assert reading.flags == ("thermal",)
+    assert step(after, 15.0)[1].charge_pC == pytest.approx(reading.charge_pC)  # nor is it taken twice
+
+
+def test_with_a_leak_the_leak_takes_the_correction():
+    output_pC = PRESS + 15.0
+    state = in_contact(leak=Leak.start(output_pC)._replace(charge_pC=output_pC))
+    after, reading = step(state, 15.0, chain=Chain(leak=LeakRule(np.full(4, 1e9)), thermal=ThermalRule()))
+    np.testing.assert_allclose(reading.charge_pC, PRESS + 15.0 - after.drift.charge_pC, atol=1e-3)
+    np.testing.assert_array_equal(after.leak.charge_pC, reading.charge_pC)
+    np.testing.assert_array_equal(after.tare.charge_pC, TARE.charge_pC)
+    assert after.drift.charge_pC == pytest.approx(15.0, abs=1.0)
+
+
+def test_a_clipped_charge_says_nothing_about_warming():
+    after, reading = step(in_contact(), 15.0, limited=True)
+    assert after.drift == in_contact().drift
+    assert reading.flags == ("saturated",)
+    np.testing.assert_array_equal(after.tare.charge_pC, TARE.charge_pC)
+
+
+def test_every_touch_begins_without_warming_and_the_correction_stays():
+    after, _ = step(in_contact(), 15.0)
+    released, reading = advance(
+        Chain(thermal=ThermalRule()), after, after.tare.charge_pC, 0.0, 0.005, misfit=misfit_of(UNIAXIAL)
+    )
+    assert (reading.contact, released.drift) == (False, NO_DRIFT)
+    np.testing.assert_array_equal(reading.charge_pC, np.zeros(4))
+
+
+def test_the_stage_needs_a_model():
+    with pytest.raises(ValueError, match="needs the misfit of a model, got None"):
+        advance(Chain(thermal=ThermalRule()), in_contact(), PRESS, 0.0, 0.005)

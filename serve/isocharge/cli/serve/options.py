@@ -44,6 +44,6 @@ OutputOption = Annotated[
 
 def board_of(path: Path | None) -> "Device":
     from isocharge.serve import load_device
-    from isocharge.serve.live.device_file import ANY_BOARD
+    from isocharge.serve.live.device import ANY_BOARD
 
     return load_device(path) if path else ANY_BOARD

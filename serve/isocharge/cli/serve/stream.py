@@ -67,7 +67,7 @@ def stream_command(
     """
     from isocharge.serve import Policy, Predictor, Recorder, TouchStream, open_source
 
-    predictor, board = Predictor(model, models=models), _with_offset_limit(board_of(device), offset_limit_pC)
+    predictor, board = Predictor(model, models=models), _board(device, offset_limit_pC)
     path = TouchStream(predictor, board, policy=Policy(policy.value))
     latencies: deque[float] = deque(maxlen=LATENCIES)
     recorder = Recorder(record, predictor.metadata.label, policy.value, board.table) if record else None
@@ -91,14 +91,11 @@ def stream_command(
         raise typer.Exit(1)
 
 
-def _with_offset_limit(board: "Device", offset_limit_pC: float | None) -> "Device":
-    """The board with another limit in its file, so that a recording keeps it."""
-    from isocharge.serve import device_from_table
+def _board(device: Path | None, offset_limit_pC: float | None) -> "Device":
+    from isocharge.serve.live.device_file import with_offset_limit
 
-    if offset_limit_pC is None:
-        return board
-    tare = {**board.table.get("tare", {}), "offset_limit_pC": offset_limit_pC}
-    return device_from_table({**board.table, "tare": tare}, board.where)
+    board = board_of(device)
+    return board if offset_limit_pC is None else with_offset_limit(board, offset_limit_pC)
 
 
 def _awaited(port: str, wait: float) -> str:

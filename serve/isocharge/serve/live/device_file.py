@@ -2,11 +2,12 @@
 
     name = "bench board 3"         # optional
 
-    [frames]                       # optional; without, the format is recognised
-    format = "described"           # or "auto", "binary", "text"; with "described" the keys of serve/described.py
+    [frames]                       # optional; without it the format is recognised
+    format = "described"           # or "auto", "binary", "text"; the keys of "described" are those of
+                                   # isocharge.serve.frames.frame_layout
     columns = ["seq", "A", "B"]    # "auto" and "text": names of a CSV without header; optional
 
-    [channels]                     # electrode -> name in the frame; without, same names, or the same order
+    [channels]                     # electrode -> name in the frame; without it the same names, or the same order
     A = "adc0"
 
     [gain]                         # optional; a number for all channels, or one for each electrode
@@ -27,141 +28,38 @@
     [touch]
     floor_pC = 10.0
 
-    [common_mode]                  # warming told from force by the model; four electrodes or more
+    [common_mode]                  # warming separated from force by the model; four electrodes or more
 
-Each stage also takes the settings of its rule (see the modules), and `on = false`, which switches it off. Tare and
-touch are on without a section. An unknown key is an error.
+Each stage also takes the settings of its rule (see `isocharge.serve.signal_chain`), and `on = false`, which switches it
+off. Tare and touch are on without a section. An unknown key is an error.
 """
 
-import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import numpy as np
-
-from isocharge.arrays import Array
 from isocharge.errors import DeviceError
-from isocharge.serve.frames.autodetect import AutoParser
-from isocharge.serve.frames.binary import BinaryParser
-from isocharge.serve.frames.frame import Parser
-from isocharge.serve.frames.frame_layout import FrameLayout, frame_layout
-from isocharge.serve.frames.layout_parser import DescribedParser
-from isocharge.serve.frames.text import TextParser
-from isocharge.serve.signal_chain.chain import Chain
+from isocharge.serve.frames.frame_layout import frame_layout
+from isocharge.serve.live.device import ByElectrode, Device, FrameSettings, LeakSettings
 from isocharge.serve.signal_chain.contact import TouchRule
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
+from isocharge.tables import Table, read_toml
 
-SECTIONS = {"frames", "channels", "gain", "saturation", "hum", "tare", "leak", "touch", "common_mode"}
+SECTIONS = ("frames", "channels", "gain", "saturation", "hum", "tare", "leak", "touch", "common_mode")
 
-LARGEST, TIMES_S = 1e9, {"settle_s": 1e-3, "relax_s": 1e-3}
-"""Largest setting of a rule, and the smallest of those that are divided by."""
+FORMATS = ("auto", "binary", "text", "described")
 
-STAGES: dict[str, type] = {"hum": HumRule, "tare": TareRule, "touch": TouchRule}
+LARGEST = 1_000_000_000
+"""Largest setting of a rule, in the setting's unit."""
 
+SMALLEST_TIMES_S = {"settle_s": 1e-3, "relax_s": 1e-3}
+"""Smallest value of those settings that the chain divides by, s."""
 
-@dataclass(frozen=True)
-class Device:
-    """What is known about a board.
-
-    Attributes:
-        name: For people.
-        table: The whole file; recordings keep it.
-        where: The file, for messages.
-    """
-
-    name: str = "any board"
-    table: Mapping[str, Any] = field(default_factory=dict)
-    where: str = "device"
-
-    @property
-    def channels(self) -> Mapping[str, str]:
-        """Electrode to the name in the frame; empty where nothing is said."""
-        return dict(self.table.get("channels", {}))
-
-    @property
-    def layout(self) -> FrameLayout | None:
-        """Of described frames."""
-        table = dict(self.table.get("frames", {}))
-        return frame_layout(table, self.where) if table.pop("format", "auto") == "described" else None
-
-    def parser(self) -> Parser:
-        """A new parser for its frames."""
-        table = self.table.get("frames", {})
-        columns, layout = tuple(table.get("columns", ())), self.layout
-        if layout is not None:
-            return DescribedParser(layout)
-        parsers: dict[str, Callable[[], Parser]] = {
-            "auto": lambda: AutoParser(columns),
-            "binary": BinaryParser,
-            "text": lambda: TextParser(columns),
-        }
-        return parsers[table.get("format", "auto")]()
-
-    def chain(self, electrodes: tuple[str, ...]) -> Chain:
-        """The signal chain for these electrodes.
-
-        Raises:
-            DeviceError: If a table by electrode has other names.
-        """
-        rules = {name: self._rule(name) for name in STAGES}
-        return Chain(
-            gain_pC=self._each("gain", "pC_per_unit", electrodes),
-            limit_pC=self.table["saturation"]["limit_pC"] if self._is_on("saturation") else None,
-            hum=rules["hum"] if "hum" in self.table else None,
-            tare=rules["tare"],
-            leak=self._leak(electrodes),
-            touch=rules["touch"],
-        )
-
-    def common_mode(self, electrodes: tuple[str, ...]) -> ThermalRule | None:
-        """How warming is followed; None if it is not.
-
-        Raises:
-            DeviceError: If there are too few electrodes.
-        """
-        if not self._is_on("common_mode"):
-            return None
-        if len(electrodes) < 4:
-            raise DeviceError(
-                f"{self.where}: common_mode: expected four electrodes or more, the model has {electrodes}; with three "
-                "every charge triple fits some contact, and temperature cannot be told from force"
-            )
-        return ThermalRule(**{key: value for key, value in self.table["common_mode"].items() if key != "on"})
-
-    def _is_on(self, stage: str) -> bool:
-        return stage in self.table and bool(self.table[stage].get("on", True))
-
-    def _rule(self, stage: str) -> Any:
-        settings = dict(self.table.get(stage, {}))
-        return STAGES[stage](**settings) if settings.pop("on", True) else None
-
-    def _leak(self, electrodes: tuple[str, ...]) -> LeakRule | None:
-        tau_s = self._each("leak", "tau_s", electrodes)
-        if tau_s is None:
-            return None
-        settings = {key: value for key, value in self.table["leak"].items() if key not in ("on", "tau_s")}
-        return LeakRule(tau_s, **settings)
-
-    def _each(self, stage: str, key: str, electrodes: tuple[str, ...]) -> Array | None:
-        """A setting for each electrode, shape (electrodes,); None if the stage is off."""
-        if not self._is_on(stage):
-            return None
-        value = self.table[stage][key]
-        by_name = value if isinstance(value, dict) else dict.fromkeys(electrodes, value)
-        if set(by_name) != set(electrodes):
-            raise DeviceError(
-                f"{self.where}: {stage}.{key}: expected a number, or one for each of the electrodes {electrodes}, "
-                f"got {value}"
-            )
-        return np.array([by_name[name] for name in electrodes], dtype=float)
-
-
-ANY_BOARD = Device()
+Rule = TypeVar("Rule", HumRule, TareRule, TouchRule, ThermalRule)
 
 
 def load_device(path: Path) -> Device:
@@ -170,109 +68,112 @@ def load_device(path: Path) -> Device:
     Raises:
         DeviceError: If it cannot be read, or a key is unknown, missing or wrong.
     """
-    try:
-        table = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise DeviceError(f"{path}: cannot be read ({error.strerror}); expected a device file in TOML") from error
-    except ValueError as error:
-        raise DeviceError(f"{path}: not TOML in UTF-8: {error}") from error
-    return device_from_table(table, str(path))
+    return device_from_table(read_toml(path, "a device file", DeviceError), str(path))
 
 
 def device_from_table(table: Mapping[str, Any], where: str) -> Device:
-    """Check the content of a device file.
+    """Read the content of a device file.
+
+    Args:
+        table: Sections and keys as above.
+        where: The file, for messages.
 
     Raises:
         DeviceError: If a key is unknown, missing or wrong.
     """
-    unknown = set(table) - SECTIONS - {"name"}
-    _expect(not unknown, where, f"the sections {', '.join(sorted(SECTIONS))}", sorted(unknown))
-    for name in SECTIONS & set(table):
-        _expect(isinstance(table[name], dict), f"{where}: {name}", "a section", table[name])
-        _CHECKS[name](table[name], f"{where}: {name}")
-    device = Device(str(table.get("name", "unnamed board")), table, where)
-    device.parser()
-    return device
+    file = Table(table, where, DeviceError).only("name", *SECTIONS)
+    return Device(
+        name=str(file.get("name", "unnamed board")),
+        frames=_frames(file.table("frames", {})),
+        channels=_channels(file.table("channels", {})),
+        gain_pC=_gain(file),
+        limit_pC=_limit(file),
+        hum=_rule(file, "hum", HumRule, None),
+        tare=_rule(file, "tare", TareRule, TareRule()),
+        leak=_leak(file),
+        touch=_rule(file, "touch", TouchRule, TouchRule()),
+        common_mode=_rule(file, "common_mode", ThermalRule, None),
+        table=table,
+        where=where,
+    )
 
 
-def _expect(holds: bool, where: str, expected: str, value: object) -> None:
-    if not holds:
-        raise DeviceError(f"{where}: expected {expected}, got {value!r}")
+def with_offset_limit(device: Device, offset_limit_pC: float) -> Device:
+    """A board with another `offset_limit_pC` of its tare, pC; in its table too, so that a recording keeps it.
+
+    Raises:
+        DeviceError: If the limit is out of its range.
+    """
+    tare = {**device.table.get("tare", {}), "offset_limit_pC": offset_limit_pC}
+    return device_from_table({**device.table, "tare": tare}, device.where)
 
 
-def _check_frames(table: Mapping[str, Any], where: str) -> None:
-    kind = table.get("format", "auto")
-    _expect(kind in ("auto", "binary", "text", "described"), where, "format auto, binary, text or described", kind)
-    if kind != "described":  # the others are checked by what reads them
-        _check_keys(table, {"format"} | ({"columns"} if kind != "binary" else set()), where)
-        columns = table.get("columns", [])
-        names = isinstance(columns, list) and all(isinstance(name, str) for name in columns)
-        _expect(names, where, "columns as a list of names", columns)
+def _frames(table: Table) -> FrameSettings:
+    kind = table.choice("format", FORMATS, "auto")
+    if kind == "described":
+        layout = frame_layout({key: table.get(key) for key in table if key != "format"}, table.where)
+        return FrameSettings(kind, layout=layout)
+    table.only("format", *(() if kind == "binary" else ("columns",)))
+    return FrameSettings(kind, table.texts("columns", (), of="names", or_empty=True))
 
 
-def _check_keys(table: Mapping[str, Any], known: set[str], where: str) -> None:
-    _expect(set(table) <= known, where, f"the keys {', '.join(sorted(known))}", sorted(set(table) - known))
+def _channels(table: Table) -> dict[str, str]:
+    return {electrode: table.text(electrode, or_empty=True) for electrode in table}
 
 
-def _check_channels(table: Mapping[str, Any], where: str) -> None:
-    _expect(all(isinstance(name, str) for name in table.values()), where, "names of channels", dict(table))
+def _gain(file: Table) -> ByElectrode | None:
+    if "gain" not in file:
+        return None
+    table = file.table("gain").only("on", "pC_per_unit")
+    gain_pC = _by_electrode(table, "pC_per_unit", not_zero=True)
+    return gain_pC if table.flag("on", True) else None
 
 
-def _check_each(key: str, others: Mapping[str, type], positive: bool) -> Callable[[Mapping[str, Any], str], None]:
-    def check(table: Mapping[str, Any], where: str) -> None:
-        _check_keys(table, {"on", key, *others}, where)
-        _expect(key in table, where, f"the key {key}", sorted(table))
-        value = table[key]
-        for number in value.values() if isinstance(value, dict) else [value]:
-            good = _is_number(number) and number != 0 and (number > 0 or not positive)
-            _expect(good, f"{where}: {key}", "positive numbers" if positive else "numbers that are not 0", value)
-        _check_types({name: item for name, item in table.items() if name != key}, others, where)
-
-    return check
+def _limit(file: Table) -> float | None:
+    if "saturation" not in file:
+        return None
+    table = file.table("saturation").only("on", "limit_pC")
+    limit_pC = table.number("limit_pC", least=0, most=LARGEST)
+    return limit_pC if table.flag("on", True) else None
 
 
-def _check_rule(rule: type) -> Callable[[Mapping[str, Any], str], None]:
-    types = _types(rule)
-
-    def check(table: Mapping[str, Any], where: str) -> None:
-        _check_keys(table, {"on", *types}, where)
-        _check_types(table, types, where)
-
-    return check
-
-
-def _types(rule: type) -> dict[str, type]:
-    return {item.name: type(item.default) for item in fields(rule) if isinstance(item.default, int | float)}
+def _leak(file: Table) -> LeakSettings | None:
+    if "leak" not in file:
+        return None
+    table = file.table("leak")
+    learning = _settings(table, LeakRule, "tau_s")
+    leak = LeakSettings(_by_electrode(table, "tau_s", above=0.0), learning)
+    return leak if table.flag("on", True) else None
 
 
-def _check_types(table: Mapping[str, Any], types: Mapping[str, type], where: str) -> None:
-    for key, value in table.items():
-        kind = bool if key == "on" else types[key]
-        least = TIMES_S.get(key, 0)
-        good = isinstance(value, bool) if kind is bool else _is_number(value) and least <= value <= LARGEST
-        good = good and (kind is not int or isinstance(value, int))
-        expected = {bool: "true or false", int: "a whole number"}.get(kind, "a number")
-        _expect(good, f"{where}: {key}", expected if kind is bool else f"{expected} from {least} to {LARGEST:g}", value)
+def _by_electrode(table: Table, key: str, **bounds: Any) -> ByElectrode:
+    """One number for all electrodes, or one for each."""
+    name = f"{table.where}: {table.path}.{key}"
+    if not isinstance(table.get(key), Mapping):
+        return ByElectrode(table.number(key, **bounds), name)
+    numbers = table.table(key)
+    return ByElectrode({electrode: numbers.number(electrode, **bounds) for electrode in numbers}, name)
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+def _rule(file: Table, section: str, rule: type[Rule], default: Rule | None) -> Rule | None:
+    """The rule of a stage; the default without a section, None if it is switched off."""
+    if section not in file:
+        return default
+    table = file.table(section)
+    settings = _settings(table, rule)
+    return rule(**settings) if table.flag("on", True) else None
 
 
-def _check_saturation(table: Mapping[str, Any], where: str) -> None:
-    _expect("limit_pC" in table, where, "the key limit_pC", sorted(table))
-    _check_keys(table, {"on", "limit_pC"}, where)
-    _check_types(table, {"limit_pC": float}, where)
+def _settings(table: Table, rule: type, *others: str) -> dict[str, Any]:
+    """The settings of a rule that a section has, checked by the types of their defaults; `others` are known keys, too."""
+    defaults = {item.name: item.default for item in fields(rule) if isinstance(item.default, int | float)}
+    table.only("on", *others, *defaults)
+    return {key: _setting(table, key, default) for key, default in defaults.items() if key in table}
 
 
-_CHECKS: dict[str, Callable[[Mapping[str, Any], str], None]] = {
-    "frames": _check_frames,
-    "channels": _check_channels,
-    "gain": _check_each("pC_per_unit", {}, positive=False),
-    "saturation": _check_saturation,
-    "hum": _check_rule(HumRule),
-    "tare": _check_rule(TareRule),
-    "leak": _check_each("tau_s", _types(LeakRule), positive=True),
-    "touch": _check_rule(TouchRule),
-    "common_mode": _check_rule(ThermalRule),
-}
+def _setting(table: Table, key: str, default: float) -> float:
+    if isinstance(default, bool):
+        return table.flag(key)
+    if isinstance(default, int):
+        return table.whole(key, least=0, most=LARGEST)
+    return table.number(key, least=SMALLEST_TIMES_S.get(key, 0), most=LARGEST)

@@ -12,7 +12,7 @@ from isocharge.arrays import Array
 from isocharge.errors import PortError
 from isocharge.serve.frames.frame import Frame, Parser
 from isocharge.serve.frames.sequence import SequenceGaps
-from isocharge.serve.live.device_file import ANY_BOARD, Device
+from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.port.device_clock import DeviceClock
 from isocharge.serve.port.serial_port import Port
 from isocharge.serve.signal_chain.chain import LARGEST_PC
@@ -214,8 +214,7 @@ def _channels(heard: Capture, device: Device) -> Iterator[ChannelHealth]:
 def _gain(device: Device, channel: str) -> float:
     """pC per unit of a channel; 1 where the device file says nothing."""
     electrode = next((name for name, given in device.channels.items() if given == channel), channel)
-    value = device.table.get("gain", {}).get("pC_per_unit", 1.0)
-    return float(value.get(electrode, 1.0) if isinstance(value, dict) else value)
+    return 1.0 if device.gain_pC is None else device.gain_pC.of(electrode, 1.0)
 
 
 def _health(name: str, charge_pC: Array, t_s: Array, rate_Hz: float) -> ChannelHealth:
@@ -259,9 +258,9 @@ def _missing(
     if electrodes and len(channels) != len(electrodes) and not set(device.channels) >= set(electrodes):
         yield f"{len(channels)} channels, but the model has the electrodes {electrodes}: [channels] in a device file"
     yield from _missing_in_channels(channels, TareRule())
-    if heard.frames[0].t_us is None and "leak" in device.table:
+    if heard.frames[0].t_us is None and device.leak is not None:
         yield "a device clock (t_us, t_ms or t_s): without it the leak is undone by arrival times, which jitter"
-    if "leak" not in device.table:
+    if device.leak is None:
         yield "the amplifier's time constants ([leak] tau_s in a device file): without them held presses fade"
 
 

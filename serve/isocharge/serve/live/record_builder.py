@@ -18,7 +18,7 @@ from isocharge.serve.signal_chain.chain import Reading
 
 @dataclass(frozen=True, slots=True)
 class RecordBuilder:
-    """Writes records; holds what is the same in each."""
+    """Builds prediction records; holds what all of them share."""
 
     predictor: Predictor
     domain: Domain
@@ -28,37 +28,41 @@ class RecordBuilder:
 
     @classmethod
     def of(cls, predictor: Predictor) -> "RecordBuilder":
+        """The builder for a model."""
         metadata = predictor.metadata
         return cls(predictor, Domain.of(metadata), metadata.electrodes, metadata.label, metadata.frame_id)
 
     def record(
-        self,
-        chunk: Chunk,
-        frame: Frame,
-        reading: Reading,
-        when: ReadingTime,
-        flags: tuple[str, ...],
-        now_ns: Callable[[], int],
+        self, chunk: Chunk, frame: Frame, reading: Reading, when: ReadingTime, now_ns: Callable[[], int]
     ) -> PredictionRecord:
-        """What one reading means."""
-        felt, flags = self._feel(reading, flags + reading.flags)
+        """The record of one reading.
+
+        Args:
+            chunk: The bytes in which the frame ended.
+            frame: As the parser read it.
+            reading: The frame after the signal chain.
+            when: When it was taken.
+            now_ns: The clock of `chunk.clock_ns`, asked once everything is computed.
+        """
+        contact, flags = self._contact(reading)
         return PredictionRecord(
             timestamp=when.host_s,
             t_device_us=when.device_us,
             seq=frame.seq,
-            **felt,
+            **contact,
             contact=reading.contact,
-            charge_pC=self._named(reading.charge_pC),
-            charge_raw_pC=self._named(reading.raw_pC),
-            tare_pC=self._named(reading.tare.charge_pC if reading.tare else None),
+            charge_pC=self._by_electrode(reading.charge_pC),
+            charge_raw_pC=self._by_electrode(reading.raw_pC),
+            tare_pC=self._by_electrode(reading.tare.charge_pC if reading.tare else None),
             flags=flags,
             latency_us=(now_ns() - chunk.clock_ns) / 1e3,
             model=self.model,
             frame_id=self.frame_id,
         )
 
-    def _feel(self, reading: Reading, flags: tuple[str, ...]) -> tuple[dict[str, Any], tuple[str, ...]]:
-        """The fields of the contact, and the flags with those that the contact earns."""
+    def _contact(self, reading: Reading) -> tuple[dict[str, Any], tuple[str, ...]]:
+        """The fields of the contact, and the reading's flags with those of the contact."""
+        flags = reading.flags
         if INVALID in flags:
             return UNKNOWN, flags
         if not reading.contact or reading.charge_pC is None:
@@ -66,7 +70,7 @@ class RecordBuilder:
         contact = self.predictor.predict(reading.charge_pC)
         return contact._asdict(), flags + self.domain.flags(contact)
 
-    def _named(self, charge_pC: Array | None) -> Charges | None:
+    def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
         """Charges by electrode name; None for one that is not a number."""
         if charge_pC is None:
             return None

@@ -30,6 +30,11 @@ class ReadingTime(NamedTuple):
     device_us: int | None
     step_s: float
 
+    @property
+    def clock_s(self) -> float:
+        """The device's clock if it sends one, or else the arrival, s: times of one stream on one clock."""
+        return self.host_s if self.device_us is None else self.device_us * 1e-6
+
 
 class DeviceClock:
     """Follows one device; feed it every reading in order.

@@ -7,8 +7,12 @@ stage whose rule is None is switched off.
 2. saturation: a charge at the converter's limit, flagged until the press is over;
 3. hum: mains hum, followed and subtracted (`isocharge.serve.signal_chain.hum`);
 4. tare: mean and noise of quiet frames, subtracted from everything after (`isocharge.serve.signal_chain.tare`);
-5. leak: the amplifier's forgetting undone, its offset learned (`isocharge.serve.signal_chain.leak`);
-6. touch: contact with hysteresis (`isocharge.serve.signal_chain.contact`).
+5. leak: the amplifier's decay undone, its offset learned (`isocharge.serve.signal_chain.leak`);
+6. touch: contact with hysteresis (`isocharge.serve.signal_chain.contact`);
+7. thermal: the common charge of a warming film, estimated with the model and subtracted
+   (`isocharge.serve.signal_chain.thermal`).
+
+A frame with a value that cannot be a charge passes none of them; its time counts as part of the next frame's.
 """
 
 import math
@@ -17,14 +21,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.serve.flags import NEGATIVE, SATURATED, TARE
+from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
 from isocharge.serve.signal_chain.contact import Touch, TouchRule, update_contact
 from isocharge.serve.signal_chain.hum import Hum, HumRule, remove_hum
 from isocharge.serve.signal_chain.leak import Leak, LeakRule, undo_leak
 from isocharge.serve.signal_chain.tare import Tare, TareRule, look_for_tare
+from isocharge.serve.signal_chain.thermal import NO_DRIFT, Misfit, ThermalDrift, ThermalRule, track_thermal_drift
 
 LARGEST_PC = 1e9
-"""A larger charge is no reading, finite or not: a chain that sums it loses no digit that counts (1e-7 pC)."""
+"""Largest charge of a valid reading, pC: sums of such charges are exact to 1e-7 pC in double precision."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,12 +37,14 @@ class Chain:
     """The rules of all stages, in their order; None switches a stage off.
 
     Attributes:
-        gain_pC: What one unit of the device is, with sign, shape (electrodes,), pC.
+        gain_pC: Charge per unit of the device, with sign, shape (electrodes,), pC.
         limit_pC: Largest charge that the converter can show, pC.
         hum: How mains hum is followed.
-        tare: When frames are good for taring.
-        leak: The amplifier.
-        touch: When something touches; without, everything does.
+        tare: Which frames are quiet enough for a tare.
+        leak: The amplifier's decay.
+        touch: When something touches; without it, every tared frame is in contact.
+        thermal: How warming of the film is followed.
+        largest: Largest value of a valid reading, in the device's unit.
     """
 
     gain_pC: Array | None = None
@@ -46,15 +53,16 @@ class Chain:
     tare: TareRule | None = field(default_factory=TareRule)
     leak: LeakRule | None = None
     touch: TouchRule | None = field(default_factory=TouchRule)
+    thermal: ThermalRule | None = None
+    largest: float = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        steepest_pC = 1.0 if self.gain_pC is None else float(np.abs(self.gain_pC).max())
+        object.__setattr__(self, "largest", LARGEST_PC / steepest_pC)
 
     def raw(self, values: Array) -> Array:
         """The first stage: what the device sent, shape (electrodes,), as charges, pC."""
         return values if self.gain_pC is None else values * self.gain_pC
-
-    @property
-    def largest(self) -> float:
-        """The largest value that can be a reading, in the device's unit."""
-        return LARGEST_PC if self.gain_pC is None else LARGEST_PC / float(np.abs(self.gain_pC).max())
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +71,15 @@ class ChainState:
 
     Attributes:
         waiting_pC: The latest charges while there is no tare, shape (k, electrodes), pC.
+        hum: The hum that is subtracted.
         frames: Frames seen while looking for a tare.
-        patient: Whether looking for it is never given up.
-        tare: None until quiet frames were found.
-        hum, leak, touch: Of the stages; no leak before the tare.
+        patient: Whether the search for a tare never gives up.
+        tare: None until enough quiet frames have come.
+        leak: Charge and inflow; None before the tare.
+        touch: Contact and its thresholds.
         saturated: Whether a charge was at the limit in this press.
+        drift: Warming in this press.
+        invalid_s: Time covered by the invalid frames since the last valid one, s.
     """
 
     waiting_pC: Array
@@ -78,6 +90,8 @@ class ChainState:
     leak: Leak | None = None
     touch: Touch = field(default_factory=Touch)
     saturated: bool = False
+    drift: ThermalDrift = NO_DRIFT
+    invalid_s: float = 0.0
 
     @classmethod
     def start(cls, electrodes: int) -> "ChainState":
@@ -85,15 +99,9 @@ class ChainState:
         return cls(np.empty((0, electrodes)), Hum.start(electrodes))
 
     def without_tare(self) -> "ChainState":
-        """The film is tared anew, however long that takes; what is known about hum stays."""
-        return ChainState(self.waiting_pC[:0], replace(self.hum, raw_pC=None), patient=True)
-
-    def shifted(self, charge_pC: float) -> "ChainState":
-        """The same charge taken from every electrode from here on: by the leak's charge, or by the tare."""
-        if self.leak is not None:
-            return replace(self, leak=self.leak._replace(charge_pC=self.leak.charge_pC - charge_pC))
-        assert self.tare is not None
-        return replace(self, tare=replace(self.tare, charge_pC=self.tare.charge_pC + charge_pC))
+        """The state in which the film is tared again, however long that takes; what is known about hum stays."""
+        hum = replace(self.hum, raw_pC=None)
+        return ChainState(self.waiting_pC[:0], hum, patient=True, invalid_s=self.invalid_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +110,10 @@ class Reading:
 
     Attributes:
         raw_pC: What the device sent, as charges, shape (electrodes,), pC.
-        charge_pC: Touch charges, shape (electrodes,), pC; None while there is no tare.
+        charge_pC: Touch charges, shape (electrodes,), pC; None while there is no tare, and of an invalid frame.
         tare: What was subtracted.
         contact: Whether something touches.
-        flags: Words from `isocharge.serve.flags`.
+        flags: Words from `isocharge.serve.flags`: those that the frame had before the chain, and the chain's.
     """
 
     raw_pC: Array
@@ -116,7 +124,15 @@ class Reading:
 
 
 def advance(
-    chain: Chain, state: ChainState, values: Array, t_s: float, dt_s: float, *, limited: bool = False
+    chain: Chain,
+    state: ChainState,
+    values: Array,
+    t_s: float,
+    dt_s: float,
+    *,
+    limited: bool = False,
+    misfit: Misfit | None = None,
+    flags: tuple[str, ...] = (),
 ) -> tuple[ChainState, Reading]:
     """Take the next frame through all stages.
 
@@ -127,26 +143,41 @@ def advance(
         t_s: The device's clock, s.
         dt_s: Since the frame before, s.
         limited: Whether the device says that an amplifier is at its limit.
+        misfit: Of the model; the thermal stage needs it, the others do not.
+        flags: Words that the frame has already, to which the chain adds its own.
 
     Raises:
         TareError: If the film is not left alone for long enough to tare.
+        ValueError: If the chain has a thermal stage and no misfit is given.
     """
+    if not math.hypot(*values.tolist()) <= chain.largest:
+        return replace(state, invalid_s=state.invalid_s + dt_s), _invalid(chain, values, flags)
+    dt_s += state.invalid_s
     raw_pC = chain.raw(values)
     limited = limited or (chain.limit_pC is not None and bool((np.abs(raw_pC) >= chain.limit_pC).any()))
     hum, quiet_pC = (state.hum, raw_pC) if chain.hum is None else remove_hum(chain.hum, state.hum, raw_pC, t_s, dt_s)
     if state.tare is None:
-        return _look_for_tare(chain, state, hum, quiet_pC), _untared(raw_pC, limited)
-    output_pC = quiet_pC - state.tare.charge_pC
-    leak, charge_pC = _charge(chain, state, state.tare, output_pC, dt_s)
-    touch = _touch(chain, state, charge_pC, state.tare, dt_s)
+        untared = Reading(raw_pC, None, None, contact=False, flags=(*flags, TARE) + (SATURATED,) * limited)
+        return _look_for_tare(chain, state, hum, quiet_pC), untared
+    tare, output_pC = state.tare, quiet_pC - state.tare.charge_pC
+    leak, charge_pC = _charge(chain, state, tare, output_pC, dt_s)
+    touch = _touch(chain, state, charge_pC, tare, dt_s)
     saturated = limited or (state.saturated and touch.contact)
-    after = ChainState(state.waiting_pC, hum, state.frames, state.patient, state.tare, leak, touch, saturated)
-    flags = (SATURATED,) * saturated + (NEGATIVE,) * touch.below
-    return after, Reading(raw_pC, charge_pC, state.tare, touch.contact, flags)
+    drift = _drift(chain.thermal, state.drift, charge_pC, misfit, dt_s, contact=touch.contact, saturated=saturated)
+    if touch.contact and drift.charge_pC != state.drift.charge_pC:
+        change_pC = drift.charge_pC - state.drift.charge_pC
+        charge_pC = charge_pC - change_pC
+        leak, tare = _without_common_charge(leak, tare, change_pC)
+    after = ChainState(state.waiting_pC, hum, state.frames, state.patient, tare, leak, touch, saturated, drift)
+    flags += (SATURATED,) * saturated + (NEGATIVE,) * touch.below
+    if chain.thermal is not None and not saturated:
+        flags += (THERMAL,) * (abs(drift.charge_pC) >= chain.thermal.tell_pC) + (BLIND,) * drift.blind
+    return after, Reading(raw_pC, charge_pC, tare, touch.contact, flags)
 
 
-def _untared(raw_pC: Array, limited: bool) -> Reading:
-    return Reading(raw_pC, None, None, contact=False, flags=(TARE, SATURATED) if limited else (TARE,))
+def _invalid(chain: Chain, values: Array, flags: tuple[str, ...]) -> Reading:
+    with np.errstate(over="ignore"):  # a value may be the largest number that a double holds
+        return Reading(chain.raw(values), None, None, contact=False, flags=(*flags, INVALID))
 
 
 def _look_for_tare(chain: Chain, state: ChainState, hum: Hum, quiet_pC: Array) -> ChainState:
@@ -173,5 +204,31 @@ def _charge(chain: Chain, state: ChainState, tare: Tare, output_pC: Array, dt_s:
 def _touch(chain: Chain, state: ChainState, charge_pC: Array, tare: Tare, dt_s: float) -> Touch:
     if chain.touch is None:
         return Touch(contact=True)
-    keep = 1.0 if chain.leak is None else math.exp(-dt_s / chain.leak.relax_s)
-    return update_contact(chain.touch, state.touch, float(charge_pC.sum()), tare.noise_pC, keep)
+    decay = 1.0 if chain.leak is None else math.exp(-dt_s / chain.leak.relax_s)
+    return update_contact(chain.touch, state.touch, float(charge_pC.sum()), tare.noise_pC, decay)
+
+
+def _drift(
+    rule: ThermalRule | None,
+    drift: ThermalDrift,
+    charge_pC: Array,
+    misfit: Misfit | None,
+    dt_s: float,
+    *,
+    contact: bool,
+    saturated: bool,
+) -> ThermalDrift:
+    if rule is None or not contact:
+        return NO_DRIFT
+    if misfit is None:
+        raise ValueError("the thermal stage needs the misfit of a model, got None")
+    if saturated:  # a clipped charge fits no contact, whatever the temperature
+        return drift
+    return track_thermal_drift(rule, drift, charge_pC, misfit, dt_s)
+
+
+def _without_common_charge(leak: Leak | None, tare: Tare, change_pC: float) -> tuple[Leak | None, Tare]:
+    """Lower every charge from here on by the same amount: in the leak's charge if there is a leak, else in the tare."""
+    if leak is not None:
+        return leak._replace(charge_pC=leak.charge_pC - change_pC), tare
+    return None, replace(tare, charge_pC=tare.charge_pC + change_pC)

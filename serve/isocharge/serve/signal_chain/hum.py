@@ -1,9 +1,10 @@
-"""Mains hum, taken out by an adaptive notch.
+"""Mains hum, removed by an adaptive notch.
 
 A fixed notch rings after every touch: a step of 850 pC through a notch 1 Hz wide takes a second to settle. So the hum
-itself is followed, a sine of known frequency and slowly changing amplitude and phase in each channel, and subtracted
-(Widrow et al., "Adaptive noise cancelling", 1975; normalised least mean squares). It is learned on the *steps* between
-frames, in which a touch is short and the hum is not, and each step counts up to a limit only. Nothing is delayed.
+itself is estimated, a sine of known frequency and slowly changing amplitude and phase in each channel, and subtracted
+(Widrow et al., "Adaptive noise cancelling", 1975; normalised least mean squares). It is learned on the *differences* of
+consecutive frames, which hum changes all the time and a touch only briefly, and each difference is clipped. Nothing is
+delayed.
 """
 
 import cmath
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from isocharge.arrays import Array
 
 LEAST_TURN = 0.02
-"""Where the hum hardly turns between two frames, as a phasor's step squared, nothing can be learned."""
+"""Smallest squared step of the unit phasor between two frames, dimensionless, from which hum can be learned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,9 +25,9 @@ class HumRule:
     """How hum is followed.
 
     Attributes:
-        frequency_Hz: Of the mains, 50 or 60.
+        frequency_Hz: Frequency of the mains, 50 or 60 Hz.
         settle_s: Time constant of learning, s; the notch is 1 / (pi * settle_s) wide.
-        limit_pC: A step counts up to this much, pC.
+        limit_pC: Limit of a difference in learning, pC.
     """
 
     frequency_Hz: float = 50.0
@@ -36,12 +37,12 @@ class HumRule:
 
 @dataclass(frozen=True, slots=True)
 class Hum:
-    """What is known of the hum.
+    """The hum.
 
     Attributes:
         phasor_pC: Amplitude and phase in each channel, shape (electrodes,), complex, pC.
-        turn: The unit phasor of the frame before.
-        raw_pC: The charges of the frame before, shape (electrodes,), pC; None before the first.
+        turn: Unit phasor of the mains at the frame before.
+        raw_pC: Charges of the frame before, shape (electrodes,), pC; None before the first.
     """
 
     phasor_pC: NDArray[np.complex128]
@@ -55,7 +56,7 @@ class Hum:
 
 
 def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) -> tuple[Hum, Array]:
-    """The charges without hum, and what is known after this frame.
+    """The hum after this frame, and the charges without it.
 
     Args:
         rule: How to follow it.

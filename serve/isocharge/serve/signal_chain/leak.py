@@ -1,15 +1,16 @@
 """The leak of a charge amplifier undone.
 
-A charge amplifier is an integrator that forgets, tau = R C. What it puts out, v, is undone step by step,
+A charge amplifier is a leaky integrator with the time constant tau = R C. The touch charge q follows from its output v
+frame by frame,
 
     q[n] = q[n-1] + i[n] - b dt,        i[n] = v[n] - a v[n-1],        a = exp(-dt / tau),
 
-i the innovation, b the current that leaks in (pC/s): offset, bias and slow warming. b is learned on the innovation and
-only out of contact, where all of i is b dt and noise: learned on the output v it would diverge. What a touch adds
-before it is noticed must not count, so each innovation counts up to a limit, and a touch begins with the b of a moment
-before; after a release learning holds off.
+where i is the innovation and b the current that leaks in (pC/s): offset, bias and slow warming. b is learned on the
+innovation, and only out of contact, where i is nothing but b dt and noise; learned on the output v it would diverge.
+The first frames of a touch must not change b: each innovation is clipped, a touch begins with the b of `look_back_s`
+before, and after a release learning waits for `hold_off_s`.
 
-Out of contact the charge relaxes to zero: whatever is left then is error, and so is a slow warming of the film, which
+Out of contact the charge relaxes to zero, because any charge then is an error or a slow warming of the film, which
 gives every electrode the same charge.
 """
 
@@ -28,13 +29,13 @@ class LeakRule:
 
     Attributes:
         tau_s: Time constant of each channel, shape (electrodes,), s.
-        learn: Whether to learn what leaks in.
+        learn: Whether to learn the inflow b.
         settle_s: Time constant of learning, s.
-        hold_off_s: No learning for so long after a release, s.
-        clip_sigmas: An innovation counts up to so many of its standard deviations at rest,
-        clip_pC: but at least up to this, pC.
+        hold_off_s: Pause of learning after a release, s.
+        clip_sigmas: Limit of an innovation in learning, in its standard deviations at rest.
+        clip_pC: Smallest value of that limit, pC.
         relax_s: Time constant with which the charge relaxes to zero out of contact, s.
-        look_back_s: A touch begins with what had been learned so long before, s, or up to twice as long.
+        look_back_s: Age of the inflow with which a touch begins, s; it may be up to twice as old.
     """
 
     tau_s: Array
@@ -52,21 +53,21 @@ class Leak(NamedTuple):
 
     Attributes:
         charge_pC: Touch charge q, shape (electrodes,), pC.
-        output_pC: The amplifier's output v of the frame before, above tare, shape (electrodes,), pC.
-        inflow_pC_per_s: What leaks in, b, shape (electrodes,), pC/s.
-        sure_pC_per_s: b of a moment before, which no touch has spoilt.
-        next_pC_per_s: The b that becomes `sure` next.
-        next_age_s: How old that is, s.
-        learned_s: How long b has been learned, s; it begins as if zero had been found for a second.
-        hold_s: How long learning still holds off, s.
+        output_pC: Output v of the frame before, above tare, shape (electrodes,), pC.
+        inflow_pC_per_s: Inflow b, shape (electrodes,), pC/s.
+        trusted_pC_per_s: Inflow as learned at least `look_back_s` ago, before the touch could affect it.
+        candidate_pC_per_s: Inflow that becomes the trusted one when it is `look_back_s` old.
+        candidate_age_s: Its age, s.
+        learned_s: Effective averaging time of b so far, s; starts at 1 s with b = 0 as the prior.
+        hold_s: Time for which learning still pauses, s.
     """
 
     charge_pC: Array
     output_pC: Array
     inflow_pC_per_s: Array
-    sure_pC_per_s: Array
-    next_pC_per_s: Array
-    next_age_s: float = 0.0
+    trusted_pC_per_s: Array
+    candidate_pC_per_s: Array
+    candidate_age_s: float = 0.0
     learned_s: float = 1.0
     hold_s: float = 0.0
 
@@ -78,7 +79,7 @@ class Leak(NamedTuple):
 
 
 def undo_leak(rule: LeakRule, leak: Leak, output_pC: Array, noise_pC: Array, dt_s: float, *, contact: bool) -> Leak:
-    """What is known after the next frame.
+    """Charge and inflow after the next frame.
 
     Args:
         rule: The amplifier.
@@ -92,8 +93,8 @@ def undo_leak(rule: LeakRule, leak: Leak, output_pC: Array, noise_pC: Array, dt_
     surplus_pC = innovation_pC - leak.inflow_pC_per_s * dt_s
     charge_pC = leak.charge_pC + surplus_pC
     if contact:
-        sure = leak.sure_pC_per_s
-        return Leak(charge_pC, output_pC, sure, sure, sure, 0.0, leak.learned_s, rule.hold_off_s)
+        trusted = leak.trusted_pC_per_s
+        return Leak(charge_pC, output_pC, trusted, trusted, trusted, 0.0, leak.learned_s, rule.hold_off_s)
     charge_pC = charge_pC * math.exp(-dt_s / rule.relax_s)
     if leak.hold_s > 0.0 or not rule.learn:
         return leak._replace(charge_pC=charge_pC, output_pC=output_pC, hold_s=leak.hold_s - dt_s)
@@ -101,11 +102,11 @@ def undo_leak(rule: LeakRule, leak: Leak, output_pC: Array, noise_pC: Array, dt_
 
 
 def _learn(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array, dt_s: float) -> Leak:
-    """Correct what leaks in by a clipped surplus; let what was learned become sure, one look back after the other."""
+    """Correct the inflow by the clipped surplus; every `look_back_s` the candidate becomes the trusted inflow."""
     limit_pC = np.maximum(rule.clip_pC, rule.clip_sigmas * math.sqrt(2.0) * noise_pC)
     clipped_pC = np.minimum(np.maximum(surplus_pC, -limit_pC), limit_pC)
-    learned_s, age_s = leak.learned_s + dt_s, leak.next_age_s + dt_s
-    inflow = leak.inflow_pC_per_s + clipped_pC / max(min(rule.settle_s, learned_s), dt_s)  # no more than all of it
+    learned_s, age_s = leak.learned_s + dt_s, leak.candidate_age_s + dt_s
+    inflow = leak.inflow_pC_per_s + clipped_pC / max(min(rule.settle_s, learned_s), dt_s)  # at most the whole surplus
     if age_s < rule.look_back_s:
-        return leak._replace(inflow_pC_per_s=inflow, next_age_s=age_s, learned_s=learned_s)
-    return Leak(leak.charge_pC, leak.output_pC, inflow, leak.next_pC_per_s, inflow, 0.0, learned_s)
+        return leak._replace(inflow_pC_per_s=inflow, candidate_age_s=age_s, learned_s=learned_s)
+    return Leak(leak.charge_pC, leak.output_pC, inflow, leak.candidate_pC_per_s, inflow, 0.0, learned_s)

@@ -10,14 +10,14 @@ from isocharge.errors import TareError
 
 @dataclass(frozen=True, slots=True)
 class TareRule:
-    """When frames are good for taring.
+    """Which frames are quiet enough for a tare.
 
     Attributes:
-        frames: How many; 100 are 0.5 s at 200 Hz.
+        frames: Number of frames in a tare; 100 are 0.5 s at 200 Hz.
         noise_limit_pC: Largest standard deviation of a quiet electrode, pC. The reference noise is 1 pC.
-        offset_limit_pC: Largest mean of an idle electrode, pC. A press of 0.05 N on a 25 um film gives more than this
-            on the three electrodes' average; so does a larger one that is held still while we tare.
-        patience: Frames after which looking for quiet ones is given up; 0 for never.
+        offset_limit_pC: Largest mean of an idle electrode, pC. Any press from 0.05 N on a 25 um film gives more on the
+            average of three electrodes, also one that is held still during the tare.
+        patience: Frames after which the search for quiet ones is given up; 0 for never.
     """
 
     frames: int = 100
@@ -44,12 +44,12 @@ def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None
     """The tare of the latest frames, if they are enough and quiet.
 
     Args:
-        rule: What is enough and quiet.
+        rule: How many frames, and how quiet.
         waiting_pC: The latest frames, at most `rule.frames`, shape (k, electrodes), pC.
-        frames: Frames seen while looking.
+        frames: Frames seen during the search.
 
     Raises:
-        TareError: If patience is at its end.
+        TareError: If the search is given up.
     """
     if len(waiting_pC) < rule.frames:
         return None
@@ -65,7 +65,7 @@ def measure_tare(rule: TareRule, raw_pC: Array) -> Tare:
     """Mean and noise of frames with nothing on the film.
 
     Args:
-        rule: What is quiet.
+        rule: How quiet they must be.
         raw_pC: Charges as they came, shape (n, electrodes), pC.
 
     Raises:

@@ -1,0 +1,166 @@
+"""What is known about a board and its amplifier: its frames, its channels, and the rules of its signal chain."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.errors import DeviceError
+from isocharge.serve.frames.autodetect import AutoParser
+from isocharge.serve.frames.binary import BinaryParser
+from isocharge.serve.frames.frame import Parser
+from isocharge.serve.frames.frame_layout import FrameLayout
+from isocharge.serve.frames.layout_parser import DescribedParser
+from isocharge.serve.frames.text import TextParser
+from isocharge.serve.signal_chain.chain import Chain
+from isocharge.serve.signal_chain.contact import TouchRule
+from isocharge.serve.signal_chain.hum import HumRule
+from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve.signal_chain.tare import TareRule
+from isocharge.serve.signal_chain.thermal import ThermalRule
+
+LEAST_ELECTRODES_FOR_WARMING = 4
+"""Number of electrodes from which warming can be separated from force: a contact alone has three unknowns."""
+
+
+@dataclass(frozen=True)
+class ByElectrode:
+    """A setting that is one number for all electrodes, or one for each.
+
+    Attributes:
+        value: The number, or the numbers by electrode.
+        name: File and key, for messages.
+    """
+
+    value: float | Mapping[str, float]
+    name: str
+
+    def array(self, electrodes: tuple[str, ...]) -> Array:
+        """The setting of each electrode, shape (electrodes,).
+
+        Raises:
+            DeviceError: If the numbers are those of other electrodes.
+        """
+        numbers = self.value if isinstance(self.value, Mapping) else dict.fromkeys(electrodes, self.value)
+        if set(numbers) != set(electrodes):
+            raise DeviceError(
+                f"{self.name}: expected a number, or one for each of the electrodes {electrodes}, got {self.value}"
+            )
+        return np.array([numbers[name] for name in electrodes], dtype=float)
+
+    def of(self, electrode: str, default: float) -> float:
+        """The setting of one electrode; the default if there is none for it."""
+        return self.value.get(electrode, default) if isinstance(self.value, Mapping) else self.value
+
+
+@dataclass(frozen=True)
+class FrameSettings:
+    """What a board sends.
+
+    Attributes:
+        format: "auto", "binary", "text" or "described".
+        columns: Names for the columns of a CSV without header.
+        layout: Of described frames.
+    """
+
+    format: str = "auto"
+    columns: tuple[str, ...] = ()
+    layout: FrameLayout | None = None
+
+    def parser(self) -> Parser:
+        """A new parser."""
+        if self.layout is not None:
+            return DescribedParser(self.layout)
+        parsers: dict[str, Callable[[], Parser]] = {
+            "auto": lambda: AutoParser(self.columns),
+            "binary": BinaryParser,
+            "text": lambda: TextParser(self.columns),
+        }
+        return parsers[self.format]()
+
+
+@dataclass(frozen=True)
+class LeakSettings:
+    """The amplifier's decay.
+
+    Attributes:
+        tau_s: Time constant, s.
+        learning: The other settings of a `LeakRule` that the file has.
+    """
+
+    tau_s: ByElectrode
+    learning: Mapping[str, Any] = field(default_factory=dict)
+
+    def rule(self, electrodes: tuple[str, ...]) -> LeakRule:
+        """The rule for these electrodes.
+
+        Raises:
+            DeviceError: If the time constants are those of other electrodes.
+        """
+        return LeakRule(self.tau_s.array(electrodes), **self.learning)
+
+
+@dataclass(frozen=True)
+class Device:
+    """What is known about a board; a stage that is None is switched off.
+
+    Attributes:
+        name: For people.
+        frames: What it sends.
+        channels: Electrode to the channel's name in the frame; empty where nothing is known.
+        gain_pC: Charge per unit of each channel, pC.
+        limit_pC: Largest charge that the converter can show, pC.
+        hum, tare, leak, touch: Rules of the stages.
+        common_mode: How warming of the film is followed.
+        table: The content of the device file; recordings keep it.
+        where: The file, for messages.
+    """
+
+    name: str = "any board"
+    frames: FrameSettings = field(default_factory=FrameSettings)
+    channels: Mapping[str, str] = field(default_factory=dict)
+    gain_pC: ByElectrode | None = None
+    limit_pC: float | None = None
+    hum: HumRule | None = None
+    tare: TareRule | None = field(default_factory=TareRule)
+    leak: LeakSettings | None = None
+    touch: TouchRule | None = field(default_factory=TouchRule)
+    common_mode: ThermalRule | None = None
+    table: Mapping[str, Any] = field(default_factory=dict)
+    where: str = "device"
+
+    @property
+    def layout(self) -> FrameLayout | None:
+        """The layout of described frames; None for other formats."""
+        return self.frames.layout
+
+    def parser(self) -> Parser:
+        """A new parser for its frames."""
+        return self.frames.parser()
+
+    def chain(self, electrodes: tuple[str, ...]) -> Chain:
+        """The signal chain for these electrodes.
+
+        Raises:
+            DeviceError: If a setting is for other electrodes, or they are too few to follow warming.
+        """
+        if self.common_mode is not None and len(electrodes) < LEAST_ELECTRODES_FOR_WARMING:
+            raise DeviceError(
+                f"{self.where}: common_mode: expected four electrodes or more, the model has {electrodes}; with three "
+                "every set of charges fits some contact, and warming cannot be separated from force: remove the section"
+            )
+        return Chain(
+            gain_pC=None if self.gain_pC is None else self.gain_pC.array(electrodes),
+            limit_pC=self.limit_pC,
+            hum=self.hum,
+            tare=self.tare,
+            leak=None if self.leak is None else self.leak.rule(electrodes),
+            touch=self.touch,
+            thermal=self.common_mode,
+        )
+
+
+ANY_BOARD = Device()
+"""The board of which nothing is known."""
