@@ -1,10 +1,6 @@
 """What a board sends is found out from the bytes alone, however they are cut."""
 
-from itertools import pairwise
-
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from isocharge.serve import AutoParser, Frame, encode_frame, encode_text
 from isocharge.serve.frames.text_encoder import TEXT_FORMATS
@@ -24,22 +20,6 @@ def test_each_format_is_recognised_from_anywhere(name, start):
     assert len(got) >= 17
     assert [frame.values[0] for frame in got] == [frame.values[0] for frame in frames(20)][-len(got) :]
     assert ("binary" if name == "binary" else "text") in parser.format
-
-
-@settings(derandomize=True)
-@given(
-    st.sampled_from(sorted(ENCODERS)),
-    st.lists(st.one_of(st.integers(0, 5), st.binary(max_size=30)), max_size=15),
-    st.lists(st.integers(0, 600), max_size=10),
-)
-def test_chunking_never_changes_the_frames(name, pieces, cuts):
-    data = b"".join(p if isinstance(p, bytes) else ENCODERS[name](frames(6)[p]) for p in pieces)
-    whole, cut, bytewise = AutoParser(), AutoParser(), AutoParser()
-    expected = whole.feed(data)
-    edges = [0, *sorted(min(c, len(data)) for c in cuts), len(data)]
-    assert [f for a, b in pairwise(edges) for f in cut.feed(data[a:b])] == expected
-    assert [f for i in range(len(data)) for f in bytewise.feed(data[i : i + 1])] == expected
-    assert whole.counts == cut.counts == bytewise.counts
 
 
 def test_before_it_knows_all_bytes_count_as_dropped():

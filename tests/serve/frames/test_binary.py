@@ -2,7 +2,6 @@
 
 import binascii
 import struct
-from itertools import pairwise
 
 import pytest
 from cobs import cobs
@@ -21,7 +20,6 @@ FRAMES = st.builds(
     values=st.lists(FLOATS, max_size=8).map(tuple),
     flags=st.integers(0, 255),
 )
-JUNK = st.binary(min_size=1, max_size=40).map(lambda data: data.replace(DELIMITER, b"\x01"))
 
 
 def test_crc_has_the_published_check_value():
@@ -75,55 +73,6 @@ def test_longest_frame():
     parser = BinaryParser()
     assert len(encode_frame(frame)) <= LONGEST_PIECE + 1
     assert parser.feed(encode_frame(frame)) == [frame]
-
-
-PIECES = st.lists(st.one_of(FRAMES.map(encode_frame), JUNK, st.just(DELIMITER)), max_size=12)
-
-
-@settings(derandomize=True)
-@given(PIECES, st.lists(st.integers(0, 600), max_size=10))
-def test_chunking_never_changes_the_frames(pieces, cuts):
-    data = b"".join(pieces)
-    whole, cut, bytewise = BinaryParser(), BinaryParser(), BinaryParser()
-    frames = whole.feed(data)
-    edges = [0, *sorted(min(c, len(data)) for c in cuts), len(data)]
-    assert [f for a, b in pairwise(edges) for f in cut.feed(data[a:b])] == frames
-    assert [f for i in range(len(data)) for f in bytewise.feed(data[i : i + 1])] == frames
-    assert whole.counts == cut.counts == bytewise.counts
-
-
-class SkippingParser(BinaryParser):
-    """The planted fault: it skips a whole frame to resynchronise."""
-
-    def _take(self, piece):
-        if getattr(self, "skips", False):
-            self.skips = False
-            return None
-        dropped = self.counts.bytes_dropped
-        frame = super()._take(piece)
-        self.skips = self.counts.bytes_dropped > dropped
-        return frame
-
-
-def loses_no_intact_frame(parser_type):
-    """The property: whatever stands between two delimiters damages nothing but itself."""
-
-    @settings(derandomize=True, database=None)
-    @given(st.lists(st.tuples(FRAMES, st.none() | JUNK), min_size=1, max_size=8))
-    def check(pairs):
-        data = b"".join(encode_frame(frame) + (junk + DELIMITER if junk else b"") for frame, junk in pairs)
-        assert parser_type().feed(data) == [frame for frame, _ in pairs]
-
-    check()
-
-
-def test_no_intact_frame_is_lost():
-    loses_no_intact_frame(BinaryParser)
-
-
-def test_a_parser_that_skips_a_frame_is_caught():
-    with pytest.raises(AssertionError):
-        loses_no_intact_frame(SkippingParser)
 
 
 @settings(derandomize=True)

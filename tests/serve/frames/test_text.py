@@ -1,10 +1,9 @@
 """Lines of text: documented examples of each notation, recognition, and damage."""
 
 import math
-from itertools import pairwise
 
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.serve import Frame, TextParser, encode_text
@@ -139,68 +138,6 @@ def test_round_trip(frame, notation):
     if notation != "csv":
         assert got[-1].names == ("A", "B", "C")
         assert (got[-1].seq, got[-1].t_us) == (frame.seq, frame.t_us)
-
-
-JUNK = st.one_of(
-    st.binary(max_size=30), st.text(max_size=20).map(str.encode), st.sampled_from([b"A,B,C", b"1,2", b"\n"])
-)
-STREAMS = st.tuples(
-    st.sampled_from(sorted(TEXT_FORMATS)),
-    st.lists(st.one_of(FRAMES, FRAMES, JUNK.map(lambda b: b + b"\n")), max_size=14),
-)
-
-
-def joined(notation, pieces):
-    return b"".join(piece if isinstance(piece, bytes) else encode_text(piece, notation) for piece in pieces)
-
-
-@settings(derandomize=True)
-@given(STREAMS, st.lists(st.integers(0, 900), max_size=10))
-def test_chunking_never_changes_the_frames(stream, cuts):
-    data = joined(*stream)
-    whole, cut, bytewise = TextParser(), TextParser(), TextParser()
-    frames = whole.feed(data)
-    edges = [0, *sorted(min(c, len(data)) for c in cuts), len(data)]
-    assert [f for a, b in pairwise(edges) for f in cut.feed(data[a:b])] == frames
-    assert [f for i in range(len(data)) for f in bytewise.feed(data[i : i + 1])] == frames
-    assert whole.counts == cut.counts == bytewise.counts
-
-
-class SkippingParser(TextParser):
-    """The planted fault: it skips a whole line to resynchronise."""
-
-    def _take(self, data):
-        if getattr(self, "skips", False):
-            self.skips = False
-            return []
-        dropped = self.counts.bytes_dropped
-        frames = super()._take(data)
-        self.skips = self.counts.bytes_dropped > dropped
-        return frames
-
-
-def loses_no_intact_line(parser_type):
-    @settings(derandomize=True, database=None, phases=[Phase.generate])
-    @given(st.lists(st.tuples(FRAMES, st.none() | st.binary(min_size=1, max_size=20)), min_size=1, max_size=8))
-    def check(pairs):
-        parser, start = parser_type(), Frame(0, 0, (1.0, 2.0, 3.0))
-        parser.feed(encode_text(start, "json") * 3)
-        data = b"".join(
-            encode_text(f, "json") + (b"\x80" + junk.replace(b"\n", b"\r") + b"\n" if junk else b"")
-            for f, junk in pairs
-        )
-        assert [frame.seq for frame in parser.feed(data)] == [frame.seq for frame, _ in pairs]
-
-    check()
-
-
-def test_no_intact_line_is_lost():
-    loses_no_intact_line(TextParser)
-
-
-def test_a_parser_that_skips_a_line_is_caught():
-    with pytest.raises(AssertionError):
-        loses_no_intact_line(SkippingParser)
 
 
 def test_memory_is_bounded():

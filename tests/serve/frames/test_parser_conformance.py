@@ -1,0 +1,311 @@
+"""One list of what every parser must do, over all parsers and formats.
+
+Chunks never change frames or counters; what stands between two intact frames costs none of them, and a planted fault
+that does is caught; damage gives no wrong frame where there is a checksum; noise gives no crash and no growth.
+
+The short runs are part of every test run; 10 million bytes for each format are in `make test-all`.
+"""
+
+import tomllib
+import tracemalloc
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from isocharge.serve import (
+    AutoParser,
+    BinaryParser,
+    DescribedParser,
+    Frame,
+    FrameLayout,
+    Parser,
+    TextParser,
+    encode_frame,
+    encode_text,
+    frame_layout,
+)
+from isocharge.serve.frames.text_encoder import TEXT_FORMATS
+from isocharge.serve.virtual_sensor.faults import corrupt
+
+CHECKSUMMED = frame_layout(
+    {
+        "sync": "AA 55",
+        "length": 22,
+        "checksum": "crc-16/x-25",
+        "fields": [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
+        + [{"name": name, "type": "f32"} for name in "ABC"],
+    },
+    "test",
+)
+SOLD = sorted((Path(__file__).parents[2] / "data" / "frames").glob("*.toml"))
+
+
+class Format(NamedTuple):
+    """A parser and what it reads.
+
+    Attributes:
+        parser: A new parser.
+        encode: The bytes of a frame.
+        frames: Strategy of frames that the format can carry.
+        junk: Strategy of bytes that may stand before a frame without damage to it.
+        lead: Bytes after which the format is recognised.
+        tail: Bytes after which the last frame is complete whatever stood before it.
+        faulty: The same parser with a planted fault: it skips something intact to resynchronise.
+    """
+
+    parser: Callable[[], Parser]
+    encode: Callable[[Frame], bytes]
+    frames: st.SearchStrategy
+    junk: st.SearchStrategy
+    lead: bytes = b""
+    tail: bytes = b""
+    faulty: Callable[[], Parser] | None = None
+
+
+class SkipsAFrame:
+    """The planted fault, for any parser: after dropped bytes it skips a whole frame."""
+
+    def __init__(self, make):
+        self._parser, self._skips = make(), False
+
+    def feed(self, data):
+        frames = []
+        for byte in data:
+            dropped = self._parser.counts.bytes_dropped
+            new = self._parser.feed(bytes([byte]))
+            self._skips |= self._parser.counts.bytes_dropped > dropped
+            if new and self._skips:
+                new, self._skips = new[1:], False
+            frames += new
+        return frames
+
+
+class SkipsAPiece(BinaryParser):
+    """The planted fault: after a bad piece it skips the next one unread."""
+
+    def _take(self, piece):
+        if getattr(self, "skips", False):
+            self.skips = False
+            return None
+        dropped = self.counts.bytes_dropped
+        frame = super()._take(piece)
+        self.skips = self.counts.bytes_dropped > dropped
+        return frame
+
+
+class SkipsALine(TextParser):
+    """The planted fault: after a bad line it skips the next one unread."""
+
+    def _take(self, data):
+        if getattr(self, "skips", False):
+            self.skips = False
+            return []
+        dropped = self.counts.bytes_dropped
+        frames = super()._take(data)
+        self.skips = self.counts.bytes_dropped > dropped
+        return frames
+
+
+class SkipsALength(DescribedParser):
+    """The planted fault: where the checksum does not fit it goes on after the frame's length instead of by one byte."""
+
+    def feed(self, data):
+        data, at, frames = self._tail + data, 0, []
+        while (start := data.find(self.layout.sync, at)) >= 0 and start + self.layout.length <= len(data):
+            at = start + self.layout.length
+            frame = self._decode(data[start:at])
+            frames += [] if frame is None else [frame]
+        self._tail = data[start if start >= 0 else len(data) - len(self.layout.sync) + 1 :]
+        return frames
+
+
+SEQ, T_US = st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
+THREE = st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 3)
+PIECES = st.binary(min_size=1, max_size=40).map(lambda data: data.replace(b"\0", b"\x01") + b"\0")
+LINES = st.binary(max_size=20).map(lambda data: b"\x80" + data.replace(b"\n", b"\r") + b"\n")
+
+
+def binary(make=BinaryParser, lead=b"", faulty=SkipsAPiece):
+    floats = st.lists(st.floats(width=32, allow_nan=False), max_size=8).map(tuple)
+    frames = st.builds(Frame, seq=SEQ, t_us=T_US, values=floats, flags=st.integers(0, 255))
+    return Format(make, encode_frame, frames, PIECES, lead, faulty=faulty)
+
+
+def text(notation, make=TextParser, faulty=SkipsALine):
+    encode = partial(encode_text, notation=notation)
+    lead = b"\n" + encode(Frame(0, 0, (1.0, 2.0, 3.0))) * 3
+    return Format(make, encode, st.builds(Frame, seq=SEQ, t_us=T_US, values=THREE), LINES, lead, faulty=faulty)
+
+
+def described(layout: FrameLayout):
+    """Noise before its frames often has the sync pattern in it."""
+    counts = st.lists(st.integers(-32768, 32767), min_size=len(layout.channels), max_size=len(layout.channels))
+    values = counts.map(
+        lambda numbers: tuple(n * field.scale for n, field in zip(numbers, layout.channels, strict=True))
+    )
+    noise = st.one_of(st.just(layout.sync), st.just(layout.sync[:1]), st.binary(max_size=6))
+    return Format(
+        partial(DescribedParser, layout),
+        layout.encode,
+        st.builds(Frame, seq=st.integers(0, 32767), t_us=st.integers(0, 32767), values=values),
+        st.lists(noise, min_size=1, max_size=5).map(b"".join),
+        tail=bytes(layout.length),
+        faulty=partial(SkipsALength, layout),
+    )
+
+
+FAULTY_AUTO = partial(SkipsAFrame, AutoParser)
+FORMATS = {
+    "binary": binary(),
+    "described": described(CHECKSUMMED),
+    **{path.stem: described(frame_layout(tomllib.loads(path.read_text("utf-8")), path.name)) for path in SOLD},
+    **{name: text(name) for name in TEXT_FORMATS},
+    "auto binary": binary(AutoParser, encode_frame(Frame(0, 0, (1.0, 2.0, 3.0))), FAULTY_AUTO),
+    **{f"auto {name}": text(name, AutoParser, FAULTY_AUTO) for name in TEXT_FORMATS},
+}
+every_format = pytest.mark.parametrize("name", FORMATS)
+ANY_BYTES = st.one_of(
+    st.binary(max_size=30), st.text(max_size=20).map(str.encode), st.sampled_from([b"A,B,C\n", b"1,2\n", b"\0", b"\n"])
+)
+
+
+@every_format
+@settings(derandomize=True)
+@given(data=st.data())
+def test_chunks_never_change_frames_or_counters(name, data):
+    form = FORMATS[name]
+    pieces = data.draw(st.lists(st.one_of(form.frames.map(form.encode), form.junk, ANY_BYTES), max_size=12))
+    stream = data.draw(st.sampled_from([b"", form.lead])) + b"".join(pieces)
+    cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=10))
+    whole, cut, bytewise = form.parser(), form.parser(), form.parser()
+    frames = whole.feed(stream)
+    assert [f for a, b in pairwise([0, *sorted(cuts), len(stream)]) for f in cut.feed(stream[a:b])] == frames
+    assert [f for i in range(len(stream)) for f in bytewise.feed(stream[i : i + 1])] == frames
+    assert whole.counts == cut.counts == bytewise.counts
+
+
+def alone(form, frame):
+    """What a parser reads that gets nothing but this frame."""
+    parser = form.parser()
+    parser.feed(form.lead)
+    return parser.feed(form.encode(frame))
+
+
+def loses_no_intact_frame(form, make):
+    """The property: whatever stands between two frames damages nothing but itself."""
+
+    @settings(derandomize=True, database=None, phases=[Phase.generate])
+    @given(st.lists(st.tuples(st.none() | form.junk, form.frames), min_size=1, max_size=8))
+    def check(pairs):
+        parser = make()
+        parser.feed(form.lead)
+        stream = b"".join((junk or b"") + form.encode(frame) for junk, frame in pairs)
+        expected = [alone(form, frame) for _, frame in pairs]
+        assert all(len(frames) == 1 for frames in expected)
+        assert [[frame] for frame in parser.feed(stream + form.tail)] == expected
+
+    check()
+
+
+@every_format
+def test_no_intact_frame_is_lost(name):
+    loses_no_intact_frame(FORMATS[name], FORMATS[name].parser)
+
+
+@every_format
+def test_a_parser_that_skips_something_intact_is_caught(name):
+    with pytest.raises(AssertionError):
+        loses_no_intact_frame(FORMATS[name], FORMATS[name].faulty)
+
+
+@every_format
+def test_an_unfinished_frame_is_forgotten_with_its_connection(name):
+    """The first half of one frame and the second half of another make no frame."""
+    form, frame = FORMATS[name], Frame(1, 2, (100.0,) * channels(name))
+    parser = form.parser()
+    parser.feed(form.lead + form.encode(frame)[:-3])
+    before = parser.counts.frames
+    parser.forget()
+    assert parser.feed(form.encode(frame)[-3:]) == []
+    assert parser.counts.frames == before
+    assert parser.feed(form.encode(frame) * 4 + form.tail)[-1].values == alone(form, frame)[0].values
+
+
+def channels(name):
+    """Values in a frame of this format."""
+    path = next((path for path in SOLD if path.stem == name), None)
+    return 3 if path is None else len(frame_layout(tomllib.loads(path.read_text("utf-8")), name).channels)
+
+
+def frames_of_three(n, seed):
+    values = np.random.default_rng(seed).normal(0, 800, (n, 3)).astype(np.float32)
+    return [Frame(k % 65536, 1000 * k, tuple(row)) for k, row in enumerate(values.tolist())]
+
+
+@pytest.mark.parametrize("name", ["binary", "described", "auto binary"])
+@pytest.mark.parametrize("seed", range(4))
+def test_one_percent_of_bytes_damaged(name, seed):
+    """No wrong frame is taken, and none is lost that is intact between intact neighbours."""
+    form = FORMATS[name]
+    rng, sent = np.random.default_rng(seed), frames_of_three(2000, seed)
+    damaged = [corrupt(form.encode(frame), 0.01, rng) for frame in sent]
+    got = form.parser().feed(b"".join(damaged) + form.encode(sent[0]))
+    key = lambda frame: (frame.seq, frame.t_us, frame.values)  # noqa: E731
+    assert set(map(key, got)) <= set(map(key, sent))
+    after_intact_end = [True, *(data.endswith(b"\0") or name == "described" for data in damaged)]
+    intact = [f for f, data, ok in zip(sent, damaged, after_intact_end, strict=False) if ok and data == form.encode(f)]
+    assert 1000 < len(intact) < 1900
+    assert {key(frame) for frame in intact} <= set(map(key, got))
+
+
+FUZZED = [name for name in FORMATS if channels(name) == 3]
+
+
+def fuzz(name, size, seed=0):
+    """Feed damaged frames, noise, and both cut anyhow; the parser, the memory that it holds, and the bytes fed."""
+    form, fed = FORMATS[name], 0
+    rng, parser = np.random.default_rng(seed), FORMATS[name].parser()
+    clean = b"".join(map(form.encode, frames_of_three(2000, seed)))
+    tracemalloc.start()
+    try:
+        while fed < size:
+            share = rng.choice([0.0, 0.001, 0.01, 0.1])
+            data = corrupt(clean, share, rng) if rng.random() < 0.7 else rng.bytes(len(clean))
+            for chunk in np.split(np.frombuffer(data, np.uint8), np.sort(rng.integers(0, len(data), 40))):
+                parser.feed(chunk.tobytes())
+            fed += len(data)
+            held = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    return parser, held, fed, clean
+
+
+def check_fuzzed(name, size, seed=0):
+    """The parser holds little, has dropped no more than it got, and reads good frames again at once."""
+    parser, held, fed, clean = fuzz(name, size, seed)
+    counts, form = parser.counts, FORMATS[name]
+    assert held < 2_000_000
+    assert counts.bytes_dropped <= fed
+    before = counts.frames
+    assert before > 0
+    parser.feed(b"\n" + clean + form.tail)
+    assert parser.counts.frames - before >= 1999
+
+
+@pytest.mark.parametrize("name", FUZZED)
+def test_a_little_fuzz(name):
+    check_fuzzed(name, 200_000)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("name", FUZZED)
+def test_ten_million_bytes(name):
+    check_fuzzed(name, 10_000_000, seed=1)
