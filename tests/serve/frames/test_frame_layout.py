@@ -28,36 +28,36 @@ fields = [{name = "seq", type = "u8"}, {name = "t_ms", type = "u8"}, {name = "A"
 
 
 WRONG = [
-    ("length = 16", "length = 17", r"frames\.length: expected 16 for these fields, got 17"),
-    ('sync = "20 4E"', 'sync = "hello"', r"frames\.sync: expected bytes in hexadecimal, as in '20 4E', got 'hello'"),
-    ('sync = "20 4E"', "sync = 204", r"frames\.sync: expected a text, got 204"),
-    ('sync = "20 4E"', "", r"key 'frames\.sync' is missing"),
+    ("length = 16", "length = 17", r"length: expected 16 for these fields, got 17"),
+    ('sync = "20 4E"', 'sync = "hello"', r"sync: expected bytes in hexadecimal, as in '20 4E', got 'hello'"),
+    ('sync = "20 4E"', "sync = 204", r"sync: expected a text, got 204"),
+    ('sync = "20 4E"', "", r"sync' is missing"),
     (
         'checksum = "crc-16/modbus"',
         'checksum = "crc-99"',
-        r"frames\.checksum: expected one of none, sum-8.*, got 'crc-99'",
+        r"checksum: expected one of none, sum-8.*, got 'crc-99'",
     ),
     (
         'checksum = "crc-16/modbus"',
         'cheksum = "crc-16/modbus"',
-        r"unknown key 'frames\.cheksum'; known are sync, length",
+        r"cheksum'; known are sync, length",
     ),
-    ('type = "i16"', 'type = "i24"', r"frames\.fields\[1\]\.type: expected one of pad, u8.*, got 'i24'"),
+    ('type = "i16"', 'type = "i24"', r"fields\[1\]\.type: expected one of pad, u8.*, got 'i24'"),
     (
         'type = "i16"',
         'type = "i16", count = 2',
-        r"frames\.fields\[1\]\.count: expected 1, because only .* pad .*, got 2",
+        r"fields\[1\]\.count: expected 1, because only .* pad .*, got 2",
     ),
     (
         'type = "i16"',
         'type = "pad", count = 5000',
-        r"frames\.fields\[1\]\.count: expected a whole number from 1 to 4096",
+        r"fields\[1\]\.count: expected a whole number from 1 to 4096",
     ),
-    ('name = "Fy"', 'name = "Fx"', r"frames\.fields: expected names that differ, got \['Fx', 'Fx'"),
-    ('name = "Fy"', 'label = "Fy"', r"unknown key 'frames\.fields\[2\]\.label'"),
-    ('name = "Fy", ', "", r"key 'frames\.fields\[2\]\.name' is missing"),
-    ("scale = 0.01", "scale = 0", r"frames\.fields\[1\]\.scale: expected a finite number that is not 0, got 0"),
-    ("scale = 0.01", "scale = nan", r"frames\.fields\[1\]\.scale: expected a finite number that is not 0, got nan"),
+    ('name = "Fy"', 'name = "Fx"', r"fields: expected names that differ, got \['Fx', 'Fx'"),
+    ('name = "Fy"', 'label = "Fy"', r"fields\[2\]\.label'"),
+    ('name = "Fy", ', "", r"fields\[2\]\.name' is missing"),
+    ("scale = 0.01", "scale = 0", r"fields\[1\]\.scale: expected a finite number that is not 0, got 0"),
+    ("scale = 0.01", "scale = nan", r"fields\[1\]\.scale: expected a finite number that is not 0, got nan"),
     ("length = 16", 'length = 16\nbyte_order = "middle"', r"byte_order: expected one of little, big, got 'middle'"),
     (
         "length = 16",
@@ -70,17 +70,17 @@ WRONG = [
 
 @pytest.mark.parametrize(("good", "bad", "said"), WRONG)
 def test_wrong_descriptions(good, bad, said):
-    with pytest.raises(DeviceError, match=rf"^device\.toml: .*{said}"):
+    with pytest.raises(DeviceError, match=rf"^device\.toml: .*frames\.{said}"):
         layout(ROBOTIQ.replace(good, bad, 1))
 
 
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ("[]", r"frames\.fields: expected one or more that are channels, got \[\]"),
-        ('[{name = "seq", type = "u8"}]', r"frames\.fields: expected one or more that are channels, got \['seq'\]"),
-        ("3", r"frames\.fields: expected a list of tables, got 3"),
-        ("[3]", r"frames\.fields\[1\]: expected a table, got 3"),
+        ("[]", r"fields: expected one or more that are channels, got \[\]"),
+        ('[{name = "seq", type = "u8"}]', r"fields: expected one or more that are channels, got \['seq'\]"),
+        ("3", r"fields: expected a list of tables, got 3"),
+        ("[3]", r"fields\[1\]: expected a table, got 3"),
     ],
 )
 def test_fields_that_make_no_frame(fields, said):

@@ -1,14 +1,10 @@
-"""A record is one line of JSON that any parser takes, with the fields of the contract in their order; CSV and UDP."""
+"""A record is one line of JSON that any parser takes, with the fields of the contract in their order."""
 
-import csv
-import io
 import json
-import socket
 
 import pytest
 
-from isocharge.errors import InputError
-from isocharge.serve import PredictionRecord, UdpSink, csv_header, csv_line
+from isocharge.serve import PredictionRecord
 
 CONTRACT = [
     *("timestamp", "t_device_us", "seq", "x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit"),
@@ -54,54 +50,3 @@ def test_one_line_of_plain_values():
 def test_nan_never_leaves():
     with pytest.raises(ValueError, match="not JSON compliant"):
         record(misfit=float("nan")).to_json()
-
-
-ELECTRODES = ("A", "B")
-
-
-def test_csv_has_the_fields_of_a_record():
-    made = record(tare_pC={"A": 1.0, "B": -2.5}, contact=True, seq=7, flags=("gap", "outside"))
-    table = io.StringIO(csv_header(ELECTRODES) + "\n" + csv_line(made, ELECTRODES) + "\n")
-    (row,) = csv.DictReader(table)
-    flat = [name for name in CONTRACT if not name.endswith("_pC")]
-    assert [name for name in row if "." not in name] == flat
-    assert (row["seq"], row["x_mm"], row["y_mm"], row["contact"]) == ("7", "1.234568", "", "true")
-    assert (row["charge_pC.A"], row["charge_pC.B"]) == ("800.062500", "")
-    assert (row["tare_pC.A"], row["tare_pC.B"], row["charge_raw_pC.A"]) == ("1.000000", "-2.500000", "")
-    assert row["flags"] == "gap outside"
-
-
-def flattened(prefix, value):
-    """Series as PlotJuggler makes them: numbers and booleans by path, nulls and empty ones passed over."""
-    if isinstance(value, dict):
-        return {k: v for key, item in value.items() for k, v in flattened(f"{prefix}/{key}", item).items()}
-    if isinstance(value, list):
-        return {k: v for at, item in enumerate(value) for k, v in flattened(f"{prefix}[{at}]", item).items()}
-    return {prefix: float(value)} if isinstance(value, bool | int | float) else {}
-
-
-def test_datagrams_are_what_plotjuggler_reads():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.settimeout(5.0)
-        with UdpSink(f"127.0.0.1:{listener.getsockname()[1]}") as sink:
-            sink.send(record().to_json())
-        content = json.loads(listener.recv(65536))
-    assert isinstance(content["timestamp"], float)
-    series = flattened("", content)
-    assert (series["/charge_pC/A"], series["/x_mm"], series["/contact"]) == (800.0625, 1.234568, 1.0)
-    assert "/y_mm" not in series
-
-
-def test_nobody_listens():
-    with UdpSink("127.0.0.1:9") as sink:
-        for _ in range(3):
-            sink.send("{}")
-
-
-@pytest.mark.parametrize(
-    "address", ["127.0.0.1", "127.0.0.1:x", "127.0.0.1:70000", "no.such.host.invalid:1", f"{'a' * 70}.com:9"]
-)
-def test_addresses_that_are_none(address):
-    with pytest.raises(InputError, match="expected HOST:PORT, as in 127"):
-        UdpSink(address)

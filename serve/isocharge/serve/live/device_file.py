@@ -165,7 +165,7 @@ def _rule(file: Table, section: str, rule: type[Rule], default: Rule | None) -> 
 
 
 def _settings(table: Table, rule: type, *others: str) -> dict[str, Any]:
-    """The settings of a rule that a section has, checked by the types of their defaults; `others` are known keys, too."""
+    """The settings of a rule that a section has, checked by the types of their defaults; `others` are known, too."""
     defaults = {item.name: item.default for item in fields(rule) if isinstance(item.default, int | float)}
     table.only("on", *others, *defaults)
     return {key: _setting(table, key, default) for key, default in defaults.items() if key in table}

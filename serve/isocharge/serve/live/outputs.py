@@ -1,10 +1,13 @@
-"""Where records go: lines of JSON, CSV, and datagrams for PlotJuggler.
+"""Where records go: CSV, and datagrams for PlotJuggler; lines of JSON are `PredictionRecord.to_json`.
 
 PlotJuggler's UDP server with the JSON protocol takes one object per datagram, uses its number `timestamp`, makes a
 series of every number by the path to it, as in `charge_pC/A`, and passes over nulls: a prediction record as it stands.
 """
 
+import csv
+import io
 import socket
+from collections.abc import Iterable
 from types import TracebackType
 from typing import Any, Self
 
@@ -12,17 +15,16 @@ from isocharge.errors import InputError
 from isocharge.serve.prediction.record import FIELDS, PredictionRecord
 
 BY_ELECTRODE = ("charge_pC", "charge_raw_pC", "tare_pC")
+"""Fields of a record that have a value for each electrode."""
 
 
 def csv_header(electrodes: tuple[str, ...]) -> str:
     """The columns of `csv_line`: charges have one for each electrode, `charge_pC.A`."""
-    return ",".join(
-        column for name in FIELDS for column in (_columns(name, electrodes) if name in BY_ELECTRODE else (name,))
-    )
+    return _row(column for name in FIELDS for column in _columns(name, electrodes))
 
 
 def _columns(name: str, electrodes: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(f"{name}.{electrode}" for electrode in electrodes)
+    return tuple(f"{name}.{electrode}" for electrode in electrodes) if name in BY_ELECTRODE else (name,)
 
 
 def csv_line(record: PredictionRecord, electrodes: tuple[str, ...]) -> str:
@@ -34,7 +36,14 @@ def csv_line(record: PredictionRecord, electrodes: tuple[str, ...]) -> str:
             cells += [_cell(None if value is None else value[electrode]) for electrode in electrodes]
         else:
             cells.append(_cell(value))
-    return ",".join(cells)
+    return _row(cells)
+
+
+def _row(cells: Iterable[str]) -> str:
+    """Cells with commas between, quoted where they must be."""
+    line = io.StringIO()
+    csv.writer(line).writerow(cells)
+    return line.getvalue().removesuffix("\r\n")
 
 
 def _cell(value: Any) -> str:
@@ -48,26 +57,28 @@ def _cell(value: Any) -> str:
 
 
 class UdpSink:
-    """Sends lines as datagrams; whether anybody listens does not matter."""
+    """Sends lines as datagrams, whether anybody listens or not."""
 
     def __init__(self, address: str) -> None:
-        """Take an address `HOST:PORT`.
+        """Look up where to send.
+
+        Args:
+            address: `HOST:PORT`.
 
         Raises:
-            InputError: If it is none.
+            InputError: If it is of another form, or the host is unknown.
         """
         host, _, port = address.rpartition(":")
         try:
             if not 0 < int(port) < 1 << 16:
                 raise ValueError("no such port")
-            found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            self._family, _, _, _, self._address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except (OSError, ValueError) as error:  # ValueError: a part of the name is too long
             raise InputError(f"UDP address {address!r}: expected HOST:PORT, as in 127.0.0.1:9870 ({error})") from error
-        self._family, self._address = found[0], found[4]
         self._socket: socket.socket | None = None
 
     def __enter__(self) -> Self:
-        """Make the socket."""
+        """Open the socket."""
         self._socket = socket.socket(self._family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         return self

@@ -1,7 +1,7 @@
 """Charges from a CSV file; contacts to one, or to prediction records.
 
-The header of the charges names the electrodes, in any order. Each row is a touch charge in pC, so there is no tare and
-no looking for contact.
+The header of the charges names the electrodes, in any order. The rows are touch charges in pC: no tare is subtracted,
+and every row is a contact.
 """
 
 import csv
@@ -52,7 +52,7 @@ def _numbered_rows(lines: Iterable[str], where: str) -> Iterator[tuple[int, list
 
 
 def _columns(header: list[str], electrodes: tuple[str, ...], where: str) -> list[int]:
-    """Where each electrode's column is."""
+    """The column of each electrode."""
     unknown = [name for name in header if name not in electrodes]
     missing = [name for name in electrodes if name not in header]
     twice = sorted({name for name in header if header.count(name) > 1})
@@ -83,9 +83,9 @@ def _charge(cell: str, electrode: str, where: str) -> float:
 
 def write_contacts(contacts: Contacts, out: TextIO) -> None:
     """Write contacts as CSV, a row for each press, columns as in `Contact`, numbers to six decimals."""
-    out.write(",".join(Contacts._fields) + "\n")
-    for row in np.column_stack(contacts):
-        out.write(",".join(f"{value:.6f}" for value in row.tolist()) + "\n")
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(Contacts._fields)
+    writer.writerows([f"{value:.6f}" for value in row] for row in np.column_stack(contacts).tolist())
 
 
 def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
@@ -96,17 +96,17 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
     """
     metadata, contacts = predictor.metadata, predictor.predict_batch(charge_pC)
     flags = Domain.of(metadata).batch_flags(contacts)
-    for charges, felt, words in zip(charge_pC.tolist(), np.column_stack(contacts).tolist(), flags, strict=True):
+    for charges, contact, its_flags in zip(charge_pC.tolist(), np.column_stack(contacts).tolist(), flags, strict=True):
         yield PredictionRecord(
             timestamp=None,
             t_device_us=None,
             seq=None,
-            **dict(zip(Contacts._fields, felt, strict=True)),
+            **dict(zip(Contacts._fields, contact, strict=True)),
             contact=True,
             charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
             charge_raw_pC=None,
             tare_pC=None,
-            flags=words,
+            flags=its_flags,
             latency_us=None,
             model=metadata.label,
             frame_id=metadata.frame_id,

@@ -1,0 +1,107 @@
+"""Records as CSV that the csv module reads back, and as datagrams that PlotJuggler reads."""
+
+import csv
+import io
+import json
+import socket
+
+import pytest
+
+from isocharge.errors import InputError
+from isocharge.serve import PredictionRecord, UdpSink, csv_header, csv_line
+
+CONTRACT = [
+    *("timestamp", "t_device_us", "seq", "x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit"),
+    *("contact", "charge_pC", "charge_raw_pC", "tare_pC", "flags", "latency_us", "model", "frame_id"),
+]
+
+
+def record(**changes):
+    values = dict.fromkeys(CONTRACT) | {
+        "contact": True,
+        "flags": ("gap",),
+        "model": "linear/1",
+        "frame_id": "linear-film",
+        "x_mm": 1.23456789,
+        "charge_pC": {"A": 800.0625, "B": None},
+        "timestamp": 1763600000.1234567,
+    }
+    return PredictionRecord(**(values | changes))
+
+
+ELECTRODES = ("A", "B")
+
+
+def test_csv_has_the_fields_of_a_record():
+    row_of = record(tare_pC={"A": 1.0, "B": -2.5}, contact=True, seq=7, flags=("gap", "outside"))
+    table = io.StringIO(csv_header(ELECTRODES) + "\n" + csv_line(row_of, ELECTRODES) + "\n")
+    (row,) = csv.DictReader(table)
+    flat = [name for name in CONTRACT if not name.endswith("_pC")]
+    assert [name for name in row if "." not in name] == flat
+    assert (row["seq"], row["x_mm"], row["y_mm"], row["contact"]) == ("7", "1.234568", "", "true")
+    assert (row["charge_pC.A"], row["charge_pC.B"]) == ("800.062500", "")
+    assert (row["tare_pC.A"], row["tare_pC.B"], row["charge_raw_pC.A"]) == ("1.000000", "-2.500000", "")
+    assert row["flags"] == "gap outside"
+
+
+@pytest.mark.parametrize("name", ["mine, left hand", 'the "good" one', "two\nlines", "cr\rlf", " blank "])
+def test_csv_takes_any_name(name):
+    """Electrodes too may have any name."""
+    electrodes = ("A", name)
+    charges = {"A": 1.0, name: 2.0}
+    lines = csv_header(electrodes) + "\n" + csv_line(record(frame_id=name, charge_pC=charges), electrodes) + "\n"
+    (row,) = csv.DictReader(io.StringIO(lines, newline=""), strict=True)
+    assert (row["frame_id"], row[f"charge_pC.{name}"], row["model"]) == (name, "2.000000", "linear/1")
+    assert None not in row
+
+
+def test_an_ordinary_row_has_no_quotes():
+    assert csv_line(record(charge_pC={"A": 1.0, "B": 2.0}), ELECTRODES) == (
+        "1763600000.123457,,,1.234568,,,,,,,true,1.000000,2.000000,,,,,gap,,linear/1,linear-film"
+    )
+
+
+def flattened(prefix, value):
+    """Series as PlotJuggler makes them: numbers and booleans by path, nulls and empty ones passed over."""
+    if isinstance(value, dict):
+        return {k: v for key, item in value.items() for k, v in flattened(f"{prefix}/{key}", item).items()}
+    if isinstance(value, list):
+        return {k: v for at, item in enumerate(value) for k, v in flattened(f"{prefix}[{at}]", item).items()}
+    return {prefix: float(value)} if isinstance(value, bool | int | float) else {}
+
+
+def test_datagrams_are_what_plotjuggler_reads():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(5.0)
+        with UdpSink(f"127.0.0.1:{listener.getsockname()[1]}") as sink:
+            sink.send(record().to_json())
+        content = json.loads(listener.recv(65536))
+    assert isinstance(content["timestamp"], float)
+    series = flattened("", content)
+    assert (series["/charge_pC/A"], series["/x_mm"], series["/contact"]) == (800.0625, 1.234568, 1.0)
+    assert "/y_mm" not in series
+
+
+def test_nobody_listens():
+    """A refused datagram shows up as an error of the next one: it is dropped, and later ones arrive all the same."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        address = taken.getsockname()
+    with UdpSink(f"127.0.0.1:{address[1]}") as sink:
+        for _ in range(3):
+            sink.send("{}")
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+            listener.bind(address)
+            listener.settimeout(5.0)
+            sink.send("lost or not")
+            sink.send("heard")
+            assert set(iter(lambda: listener.recv(100), b"heard")) <= {b"lost or not"}
+
+
+@pytest.mark.parametrize(
+    "address", ["127.0.0.1", "127.0.0.1:x", "127.0.0.1:70000", "no.such.host.invalid:1", f"{'a' * 70}.com:9"]
+)
+def test_addresses_that_are_none(address):
+    with pytest.raises(InputError, match="expected HOST:PORT, as in 127"):
+        UdpSink(address)
