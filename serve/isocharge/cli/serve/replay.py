@@ -1,11 +1,9 @@
 """`isocharge serve replay`: the records of a recording, again."""
 
-import time
 from collections import deque
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -13,9 +11,6 @@ from isocharge.cli.serve.options import ModelsOption, Output, OutputOption
 from isocharge.cli.serve.record_output import LATENCIES, _closing_line, _pass_on, _writer
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import say
-
-if TYPE_CHECKING:
-    from isocharge.serve import PredictionRecord, RecordedClock, Recording, TouchStream
 
 
 def replay_command(
@@ -35,6 +30,7 @@ def replay_command(
     Example: isocharge serve replay touch.rec --real-time
     """
     from isocharge.serve import Policy, Predictor, RecordedClock, Recording, TouchStream, device_from_table
+    from isocharge.serve.live.recorded_stream import replay
 
     recording, clock = Recording(file), RecordedClock()
     predictor = Predictor(model or recording.model, models=models)
@@ -44,23 +40,5 @@ def replay_command(
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         write = _writer(stack, output, udp, predictor.metadata.electrodes)
-        _pass_on(_replayed(recording, path, clock, real_time), write, latencies)
+        _pass_on(replay(recording, path, clock, real_time=real_time), write, latencies)
     say(_closing_line(path, latencies))
-
-
-def _replayed(
-    recording: "Recording", path: "TouchStream", clock: "RecordedClock", real_time: bool
-) -> "Iterator[tuple[PredictionRecord, str]]":
-    """Records with their lines; as many for each chunk as there were."""
-    ahead_s: float | None = None
-    for event in recording.events():
-        clock.set(event)
-        if event.chunk is None:
-            path.tare()
-            continue
-        if real_time:
-            ahead_s = time.time() - event.chunk.timestamp if ahead_s is None else ahead_s
-            time.sleep(max(0.0, event.chunk.timestamp + ahead_s - time.time()))
-        for number, record in enumerate(path.feed(event.chunk)):
-            if number < len(event.latencies_us):
-                yield record, record.to_json()

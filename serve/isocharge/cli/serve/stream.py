@@ -4,7 +4,7 @@ import logging
 import signal
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
 from pathlib import Path
@@ -18,7 +18,8 @@ from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import say
 
 if TYPE_CHECKING:
-    from isocharge.serve import Chunk, Device, PredictionRecord, Recorder, TouchStream
+    from isocharge.serve import Device
+    from isocharge.serve.live.recorded_stream import RecordedStream
 
 
 def stream_command(
@@ -66,22 +67,23 @@ def stream_command(
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
     from isocharge.serve import Policy, Predictor, Recorder, TouchStream, open_source
+    from isocharge.serve.live.recorded_stream import RecordedStream
 
     predictor, board = Predictor(model, models=models), _board(device, offset_limit_pC)
     path = TouchStream(predictor, board, policy=Policy(policy.value))
     latencies: deque[float] = deque(maxlen=LATENCIES)
     recorder = Recorder(record, predictor.metadata.label, policy.value, board.table) if record else None
+    live = RecordedStream(path, recorder)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         stack.enter_context(_log_to_stderr())
         source = stack.enter_context(open_source(_awaited(port, wait), baud=baud, reconnect=reconnect))
-        wishes = stack.enter_context(_tare_on_signal())
+        stack.enter_context(_tare_on_signal(live))
         stack.enter_context(_alarm(seconds))
         write = _writer(stack, output, udp, predictor.metadata.electrodes)
         if recorder:
             stack.enter_context(recorder)
-        # Closed before the recorder is, so that what was begun is written.
-        records = stack.enter_context(closing(_follow(path, source, recorder, wishes)))
+        records = stack.enter_context(closing(live.follow(source)))  # closed before the recorder
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
             _pass_on(islice(records, count), write, latencies)
@@ -106,27 +108,6 @@ def _awaited(port: str, wait: float) -> str:
     return port
 
 
-def _follow(
-    path: "TouchStream", source: "Iterable[Chunk]", recorder: "Recorder | None", wishes: list[bool]
-) -> "Generator[tuple[PredictionRecord, str]]":
-    """Records with their lines of JSON; chunks and records go into the recording as they come."""
-    for chunk in source:
-        if wishes:
-            wishes.clear()
-            path.tare()
-            if recorder:
-                recorder.tare()
-        lines: list[str] = []
-        try:
-            for record in path.feed(chunk):
-                lines.append(record.to_json())
-                yield record, lines[-1]
-        finally:
-            if recorder:
-                recorder.chunk(chunk, lines)
-    path.finish()
-
-
 @contextmanager
 def _alarm(seconds: float | None) -> Iterator[None]:
     """As if Ctrl-C were pressed after some time, also where nothing comes from the port."""
@@ -143,12 +124,11 @@ def _alarm(seconds: float | None) -> Iterator[None]:
 
 
 @contextmanager
-def _tare_on_signal() -> Iterator[list[bool]]:
-    """A list that is not empty when somebody has asked for a new tare, by SIGUSR1."""
-    wishes: list[bool] = []
-    before = signal.signal(signal.SIGUSR1, lambda *_: wishes.append(True))
+def _tare_on_signal(live: "RecordedStream") -> Iterator[None]:
+    """SIGUSR1 asks for a new tare."""
+    before = signal.signal(signal.SIGUSR1, lambda *_: live.request_tare())
     try:
-        yield wishes
+        yield
     finally:
         signal.signal(signal.SIGUSR1, before)
 

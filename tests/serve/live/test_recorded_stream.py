@@ -1,0 +1,153 @@
+"""A recording gives the same records again, whatever happened while it was made."""
+
+import errno
+import json
+import os
+import time
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from isocharge.serve import (
+    Chunk,
+    Frame,
+    Policy,
+    Predictor,
+    RecordedClock,
+    Recorder,
+    Recording,
+    TouchStream,
+    device_from_table,
+    encode_frame,
+    find_model,
+    load_model,
+)
+from isocharge.serve.live.recorded_stream import RecordedStream, replay
+
+DEVICE = {"tare": {"frames": 10}, "leak": {"tau_s": 10.0}, "hum": {"frequency_Hz": 50.0}}
+
+
+def chunks(film, cuts=37, outage_at=40):
+    """Rest, a press, an outage, rest and a press, cut anyhow."""
+    rng = np.random.default_rng(3)
+    press = film.charge_pC([2.0], [1.0], [0.5])[0]
+    rows = [rng.normal(0, 1, 3) + (press if k % 40 > 20 else 0.0) for k in range(80)]
+    data = b"".join(encode_frame(Frame(k, 5000 * k, tuple(row))) for k, row in enumerate(rows))
+    pieces = [data[i : i + cuts] for i in range(0, len(data), cuts)]
+    return [
+        Chunk(piece, 1e9 + 0.0063 * k, time.perf_counter_ns(), 1.5 if k == outage_at else 0.0)
+        for k, piece in enumerate(pieces)
+    ]
+
+
+def following(path, chunks, predictor, table):
+    """Lines of JSON as they go out while recording, with a new tare before chunk 30."""
+    stream = TouchStream(predictor, device_from_table(table, "test"))
+    with Recorder(path, predictor.metadata.label, "every", table) as recorder:
+        live = RecordedStream(stream, recorder)
+
+        def asking():
+            for number, chunk in enumerate(chunks):
+                if number == 30:
+                    live.request_tare()
+                yield chunk
+
+        yield from (line for _, line in live.follow(asking()))
+
+
+def record(path, film, predictor):
+    return list(following(path, chunks(film), predictor, DEVICE))
+
+
+def played(path, predictor):
+    """Lines of a recording that is played again."""
+    recording, clock = Recording(path), RecordedClock()
+    stream = TouchStream(predictor, device_from_table(recording.device, "recording"), now_ns=clock)
+    return [line for _, line in replay(recording, stream, clock)]
+
+
+def test_replay_is_the_same_bit_for_bit(tmp_path, film, predictor):
+    path = tmp_path / "touch.rec"
+    lines = record(path, film, predictor)
+    assert len(lines) > 60
+    assert {flag for line in lines for flag in json.loads(line)["flags"]} >= {"tare", "reconnected"}
+    assert any(json.loads(line)["contact"] for line in lines)
+    assert all(json.loads(line)["latency_us"] > 0 for line in lines)
+    assert sum(event.chunk is None for event in Recording(path).events()) == 1
+    assert played(path, predictor) == lines
+
+
+@pytest.mark.parametrize("leak", [{}, {"leak": {"tau_s": 10.0}}])
+def test_replay_of_a_warming_film_is_the_same_bit_for_bit(tmp_path, leak):
+    """A released model of four electrodes; the common charge rises to 60 pC while one press is held."""
+    path, model = tmp_path / "touch.rec", load_model(find_model("four-25um-uniaxial"))
+    predictor, press = Predictor("four-25um-uniaxial"), model.golden.charge_pC[0].astype(float)
+    rows = [np.zeros(4)] * 200 + [press + 60.0 * k / 300 for k in range(300)]
+    data = [encode_frame(Frame(k, 5000 * k, tuple(row.tolist()))) for k, row in enumerate(rows)]
+    arrived = [Chunk(frame, 1e9 + 0.005 * k, time.perf_counter_ns()) for k, frame in enumerate(data)]
+    lines = list(following(path, arrived, predictor, {"tare": {"frames": 10}, "common_mode": {}} | leak))
+    assert "thermal" in json.loads(lines[-1])["flags"]
+    assert played(path, predictor) == lines
+
+
+def test_a_replay_ends_with_the_record_that_was_taken_last(tmp_path, film, predictor):
+    """Whoever takes ten records finds ten in the recording, although the chunk of the last one holds more frames."""
+    path = tmp_path / "touch.rec"
+    lines = list(islice(following(path, chunks(film, cuts=200), predictor, DEVICE), 10))
+    assert played(path, predictor) == lines
+
+
+@pytest.mark.parametrize("cut", [1, 10, 100, 500])
+def test_a_recording_that_was_cut_gives_the_records_before(tmp_path, film, predictor, cut):
+    path = tmp_path / "touch.rec"
+    lines = record(path, film, predictor)
+    path.write_bytes(path.read_bytes()[:-cut])
+    again = played(path, predictor)
+    assert again == lines[: len(again)]
+    assert len(again) > len(lines) - 6
+
+
+def test_a_full_disk_leaves_a_readable_file(tmp_path, film, predictor, monkeypatch, caplog):
+    """The disk takes half a line and then no more; the live path goes on."""
+    path, write, room = tmp_path / "touch.rec", os.write, [9000]
+
+    def write_until_full(descriptor, data):
+        if not room[0]:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        taken = write(descriptor, bytes(data)[: room[0]])
+        room[0] -= taken
+        return taken
+
+    monkeypatch.setattr("isocharge.serve.port.recording.os.write", write_until_full)
+    lines = record(path, film, predictor)
+    assert len(lines) > 60
+    assert path.stat().st_size < 9000
+    assert path.read_bytes().endswith(b"}\n")
+    assert [entry.levelname for entry in caplog.records] == ["ERROR"]
+    assert "recording stopped (No space left on device)" in caplog.text
+    again = played(path, predictor)
+    assert 3 < len(again) < len(lines)
+    assert again == lines[: len(again)]
+
+
+@pytest.mark.parametrize("real_time", [False, True])
+def test_real_time_waits_as_long_as_it_took(tmp_path, film, predictor, monkeypatch, real_time):
+    path, now = tmp_path / "touch.rec", [5e9]
+    record(path, film, predictor)
+    recording, clock = Recording(path), RecordedClock()
+    monkeypatch.setattr(time, "time", lambda: now[0])
+    monkeypatch.setattr(time, "sleep", lambda seconds: now.append(now.pop() + seconds))
+    stream = TouchStream(predictor, device_from_table(recording.device, "recording"), now_ns=clock)
+    assert sum(1 for _ in replay(recording, stream, clock, real_time=real_time)) > 60
+    count = sum(event.chunk is not None for event in recording.events())
+    assert now[0] - 5e9 == pytest.approx(0.0063 * (count - 1) if real_time else 0.0, abs=1e-5)
+
+
+def test_latest_gives_a_record_for_the_newest_frame_of_a_chunk(predictor):
+    stream = TouchStream(predictor, policy=Policy.latest)
+    data = b"".join(encode_frame(Frame(k, 5000 * k, (0.0, 0.0, 0.0))) for k in range(10))
+    assert [record.seq for record in stream.feed(Chunk(data, 0.0, 0))] == [9]
+    assert (stream.counts.records, stream.counts.skipped) == (1, 9)
+    every = TouchStream(predictor)
+    assert [record.seq for record in islice(every.feed(Chunk(data, 0.0, 0)), 20)] == list(range(10))
