@@ -1,7 +1,7 @@
-"""Finding out what a board sends: our binary frames or lines of text.
+"""Recognition of what a board sends: our binary frames or lines of text.
 
-Both parsers read along until one of them is sure: a binary frame whose checksum fits, or a text layout that came three
-times in a row. The bytes are cut where either of them could end a frame, so chunks do not matter.
+Both parsers read the bytes until one of them has a frame: a binary frame whose checksum fits, or a text layout that
+came three times in a row. The bytes are cut where either of them could end a frame, so chunks do not matter.
 """
 
 import re
@@ -14,37 +14,41 @@ _STEP = re.compile(rb"[^\0\n]*[\0\n]|[^\0\n]+")
 
 
 class AutoParser:
-    """Bytes in, frames out, once the format is recognised; the frames that it was recognised by come then."""
+    """Bytes in, frames out, from the frames on by which the format was recognised."""
 
     def __init__(self, columns: tuple[str, ...] = ()) -> None:
-        """Args: columns: Names for the columns of a CSV without header."""
+        """Set up both parsers.
+
+        Args:
+            columns: Names for the columns of a CSV without header.
+        """
         self._candidates: tuple[Parser, ...] = (BinaryParser(), TextParser(columns))
         self._chosen: Parser | None = None
         self._seen = 0
 
     @property
     def chosen(self) -> Parser | None:
-        """The parser of the format that was recognised, or None as long as there is none."""
+        """The parser of the recognised format; None before."""
         return self._chosen
 
     @property
     def counts(self) -> FrameCounts:
-        """Of the parser that was chosen; before, all bytes count as dropped."""
+        """The counters of the chosen parser; before, all bytes count as dropped."""
         return self._chosen.counts if self._chosen else FrameCounts(bytes_dropped=self._seen)
 
     @property
     def seq_modulus(self) -> int:
-        """Of the parser that was chosen."""
+        """The number at which a frame's `seq` wraps to 0, of the chosen parser."""
         return (self._chosen or self._candidates[0]).seq_modulus
 
     @property
     def t_us_modulus(self) -> int:
-        """Of the parser that was chosen."""
+        """The time at which a frame's `t_us` wraps to 0, of the chosen parser, us."""
         return (self._chosen or self._candidates[0]).t_us_modulus
 
     @property
     def format(self) -> str:
-        """The format that was recognised, in words."""
+        """The recognised format, for people."""
         return self._chosen.format if self._chosen else "nothing recognised yet"
 
     def feed(self, data: bytes) -> list[Frame]:

@@ -1,7 +1,7 @@
 """The binary frame: COBS of (version u8, seq u16, t_us u32, n u8, flags u8, n x f32 pC, CRC u16), then a zero byte.
 
 All little-endian. The CRC is CRC-16/CCITT-FALSE over everything before it. A zero occurs only as the end of a frame, so
-a parser that lost its way is back at the next zero: a damaged frame costs itself and nothing else.
+a parser that is out of step is back in step at the next zero: a damaged frame costs itself and nothing else.
 """
 
 import binascii
@@ -12,20 +12,25 @@ from isocharge.serve.frames.frame import T_US_MODULUS, Frame, FrameCounts, Split
 from isocharge.serve.frames.sequence import SEQ_MODULUS
 
 FRAME_VERSION = 1
+"""Version of the frame's layout, its first byte."""
 
 DELIMITER = b"\0"
+"""The byte that ends a frame."""
 
 HEAD = struct.Struct("<BHIBB")
+"""Version, number, clock in us, number of charges, flags."""
 
 CRC = struct.Struct("<H")
 
 LONGEST_PAYLOAD = HEAD.size + 255 * 4 + CRC.size
+"""Length of a frame with as many charges as a byte can count, bytes."""
 
 LONGEST_PIECE = LONGEST_PAYLOAD + 1 + LONGEST_PAYLOAD // 254
+"""Its length after byte stuffing, bytes."""
 
 
 def encode_frame(frame: Frame) -> bytes:
-    """The bytes of a frame, delimiter included; a number or time that the frame has not is sent as zero.
+    """The bytes of a frame with its delimiter; a missing number or time is sent as zero.
 
     Raises:
         struct.error: If a number does not fit its field.
@@ -46,7 +51,7 @@ class CrcError(ValueError):
 
 
 def decode_piece(piece: bytes) -> Frame:
-    """The frame that stands between two delimiters.
+    """The frame between two delimiters.
 
     Raises:
         CrcError: If its checksum does not fit.
@@ -76,7 +81,7 @@ class BinaryParser:
         self._pieces = Splitter(DELIMITER, LONGEST_PIECE, self.counts)
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end within `data`; what follows the last delimiter is kept for the next call."""
+        """The frames that end within `data`; the bytes after the last delimiter wait for the next call."""
         return [frame for piece in self._pieces.feed(data) if (frame := self._take(piece)) is not None]
 
     def forget(self) -> None:
@@ -84,7 +89,7 @@ class BinaryParser:
         self._pieces.forget()
 
     def _take(self, piece: bytes) -> Frame | None:
-        """The frame in a piece, or None, counted, if there is none; an empty piece is an idle line."""
+        """The frame in a piece, or None if it is damaged, which is counted, or empty, which is an idle line."""
         if not piece:
             return None
         try:

@@ -1,4 +1,4 @@
-"""What every frame format shares: the frame, the counters of a parser, what a parser is, and gaps in the numbering.
+"""What all frame formats share: the frame, the parser and its counters, and the cutting of bytes at a delimiter.
 
 Parsers know no port: bytes in, frames and counters out. However the bytes are cut into chunks, the frames and counters
 are the same, and memory is bounded whatever comes.
@@ -11,6 +11,7 @@ SATURATED_BIT = 0x01
 """In a frame's flags: an amplifier is at its limit. The other bits are reserved and sent as zero."""
 
 T_US_MODULUS = 1 << 32
+"""Time at which a clock of 32 bits wraps to 0, us."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,9 +21,9 @@ class Frame:
     Attributes:
         seq: Counter of frames, modulo the parser's `seq_modulus`; None if the format has none.
         t_us: The device's clock, us, modulo the parser's `t_us_modulus`; None if the format has none.
-        values: One for each channel, in the device's own unit; our binary frame has pC.
+        values: One value for each channel, in the device's unit; our binary frame has pC.
         flags: Bits; see `SATURATED_BIT`.
-        names: Of the channels; empty if the format does not name them.
+        names: Names of the channels; empty if the format has none.
     """
 
     seq: int | None
@@ -34,15 +35,15 @@ class Frame:
 
 @dataclass(slots=True)
 class FrameCounts:
-    """What a parser has seen so far.
+    """Counters of a parser.
 
     Attributes:
         frames: Intact frames.
         crc_errors: Pieces whose checksum did not fit.
         malformed: Pieces that were no frame for another reason: stuffing, length, version, not a number.
-        bytes_dropped: Bytes of those pieces, delimiters included.
-        resyncs: Times that a good frame was found again after something was dropped.
-        astray: Whether something was dropped since the last good frame.
+        bytes_dropped: Bytes of those pieces, with their delimiters.
+        resyncs: Intact frames that came right after dropped bytes.
+        astray: Whether bytes were dropped since the last intact frame.
     """
 
     frames: int = 0
@@ -59,13 +60,13 @@ class FrameCounts:
         self.astray = False
 
     def refuse(self, size: int, *, damaged: bool = False) -> None:
-        """Count a piece of `size` bytes that is dropped; damaged if its checksum did not fit."""
+        """Count a dropped piece of `size` bytes; `damaged` if its checksum did not fit."""
         self.crc_errors += damaged
         self.malformed += not damaged
         self.drop(size)
 
     def drop(self, size: int) -> None:
-        """Count bytes that are dropped."""
+        """Count dropped bytes."""
         self.bytes_dropped += size
         self.astray = True
 
@@ -75,29 +76,29 @@ class Parser(Protocol):
 
     @property
     def counts(self) -> FrameCounts:
-        """What was seen so far."""
+        """The counters so far."""
 
     @property
     def seq_modulus(self) -> int:
-        """The number at which a frame's `seq` begins again."""
+        """The number at which a frame's `seq` wraps to 0."""
 
     @property
     def t_us_modulus(self) -> int:
-        """The time at which a frame's `t_us` begins again, us."""
+        """The time at which a frame's `t_us` wraps to 0, us."""
 
     @property
     def format(self) -> str:
-        """The format, in words for people."""
+        """The format, for people."""
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end within `data`; what is left is kept for the next call."""
+        """The frames that end within `data`; the bytes after them wait for the next call."""
 
     def forget(self) -> None:
         """Drop what is unfinished: what comes next is from another connection."""
 
 
 class Splitter:
-    """Cuts bytes at a delimiter; what is longer than any frame is dropped and counted, so memory is bounded."""
+    """Cuts bytes at a delimiter; pieces longer than any frame are dropped and counted, so memory is bounded."""
 
     def __init__(self, delimiter: bytes, longest: int, counts: FrameCounts) -> None:
         self._delimiter, self._longest, self._counts = delimiter, longest, counts

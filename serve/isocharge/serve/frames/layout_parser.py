@@ -28,22 +28,22 @@ class DescribedParser:
         self._tail = b""
 
     def _unit(self) -> float:
-        """What one count of the clock is, us."""
+        """The time of one count of the clock, us."""
         clock = self.layout.fields[self._time] if self._time is not None else None
         return TIMES_US[clock.name] * clock.scale if clock else 1.0
 
     @property
     def seq_modulus(self) -> int:
-        """As many numbers as the field has."""
+        """The number at which the field `seq` wraps to 0."""
         return SEQ_MODULUS if self._seq is None else self.layout.fields[self._seq].modulus
 
     @property
     def t_us_modulus(self) -> int:
-        """As much time as the field can hold."""
+        """The time at which the clock's field wraps to 0, us."""
         return T_US_MODULUS if self._time is None else round(self.layout.fields[self._time].modulus * self._us)
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end within `data`; an unfinished one is kept for the next call."""
+        """The frames that end within `data`; an unfinished one waits for the next call."""
         data, at, frames, length = self._tail + data, 0, [], self.layout.length
         while (start := data.find(self.layout.sync, at)) >= 0 and start + length <= len(data):
             self._skip(start - at)
@@ -65,14 +65,14 @@ class DescribedParser:
             self.counts.drop(size)
 
     def _decode(self, data: bytes) -> Frame | None:
-        """The frame in exactly its bytes, or None, counted, if its checksum, number or clock is none."""
+        """The frame in exactly these bytes; None, which is counted, if its checksum, number or clock is wrong."""
         end = len(data) - self.layout.check.size
         if self.layout.checked(data[:end]) != data[end:]:
             self.counts.refuse(1, damaged=True)
             return None
         try:
             frame = self._frame(self.layout.body.unpack_from(data, len(self.layout.sync)))
-        except (OverflowError, ValueError):  # a number or clock in floating point that is no number
+        except (OverflowError, ValueError):  # a number or clock in floating point may be NaN or infinite
             self.counts.refuse(1)
             return None
         self.counts.accept()

@@ -3,15 +3,16 @@
 from isocharge.serve.flags import GAP, REPEAT, RESTART
 
 SEQ_MODULUS = 1 << 16
+"""Number at which a counter of 16 bits wraps to 0."""
 
 
 class SequenceGaps:
     """Follows the frame numbers.
 
     Attributes:
-        lost: Frames that are missing between those that came.
+        lost: Frames missing between those that came.
         repeated: Frames with the number of the one before.
-        restarts: Times the numbers went back, as after a reset of the device; nothing is known about frames lost there.
+        restarts: Times that the numbers went back, as after a reset of the device; frames lost then are not counted.
     """
 
     def __init__(self) -> None:
@@ -21,15 +22,15 @@ class SequenceGaps:
         self._last: int | None = None
 
     def forget(self) -> None:
-        """The next number is the first one of a new connection: whatever it is, it is no gap."""
+        """Start over: the next number is the first one of a new connection, and no gap."""
         self._last = None
 
     def update(self, seq: int | None, modulus: int = SEQ_MODULUS) -> tuple[str, ...]:
-        """Count the next frame; the flags that its number earns it (see `isocharge.serve.flags`).
+        """Count the next frame, and give its flags (see `isocharge.serve.flags`).
 
         Args:
             seq: Its number; None if the format has none.
-            modulus: The number at which counting begins again.
+            modulus: The number at which `seq` wraps to 0.
         """
         if seq is None:
             return ()

@@ -1,10 +1,10 @@
-"""Frames from lines of text, whose layout is recognised from the first good lines; and lines from frames.
+"""Frames from lines of text, whose layout is recognised from the first good lines.
 
 A layout is recognised when it has come three times in a row: three rows of the same width or names, or three times the
-same cycle of lines with one name each. A cycle is cut before the name that sorts first (number and clock before the
-rest), because a reader may come in the middle of one; for the same reason a first line of bare numbers is dropped.
-After that a line of another layout is dropped and counted. Text has no checksum: a damaged digit in a line that is
-otherwise whole cannot be noticed.
+same cycle of lines with one name each. A reader may start in the middle of a cycle, so a cycle begins with the name
+that sorts first, number and clock before channels; for the same reason a first line of bare numbers is dropped. After
+recognition a line of another layout is dropped and counted. Text has no checksum: a damaged digit in an otherwise whole
+line cannot be noticed.
 
 Some names mean something: `seq` counts frames; `t_us`, `t_ms` or `t_s` is the device's clock. All others are channels.
 """
@@ -18,26 +18,30 @@ from isocharge.serve.frames.sequence import SEQ_MODULUS
 from isocharge.serve.frames.text_lines import SEQ, TIMES_US, Line, Notation, parse_line
 
 LONGEST_LINE = 4096
+"""Longest line of a frame, bytes."""
 
 LONGEST_CYCLE = 64
+"""Largest number of lines that make a frame."""
 
 TIMES_TO_RECOGNISE = 3
+"""Number of times that a layout must come in a row to be recognised."""
 
 MOST_VALUES = 256
+"""Largest number of values in a line."""
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What a line, or a cycle of lines, holds.
+    """The layout of a row, or of a cycle of lines.
 
     Attributes:
         notation: How it is written.
-        names: Of all values; empty for CSV without header.
+        names: Names of all values; empty for CSV without header.
         width: Number of values.
-        lines: Lines in a cycle; 1 for rows.
-        channels: Places of the channels among the values.
-        seq, time: Places of number and clock, or None.
-        us: What one unit of the clock is, us.
+        lines: Number of lines in a cycle; 1 for rows.
+        channels: Positions of the channels among the values.
+        seq, time: Positions of number and clock; None without them.
+        us: Unit of the clock, us.
     """
 
     notation: Notation
@@ -80,7 +84,7 @@ def _whole(value: float) -> int:
 
 
 class TextParser:
-    """Bytes in, frames out; the layout is found out, or `columns` names those of a CSV without header."""
+    """Bytes in, frames out; the layout is recognised, and `columns` are the names of a CSV without header."""
 
     seq_modulus = SEQ_MODULUS
 
@@ -96,19 +100,19 @@ class TextParser:
 
     @property
     def t_us_modulus(self) -> int:
-        """Clocks of boards count in 32 bits, us or ms."""
+        """The time at which a clock of 32 bits in this unit wraps to 0, us."""
         return T_US_MODULUS * round(self.layout.us) if self.layout else T_US_MODULUS
 
     @property
     def format(self) -> str:
-        """The layout in words."""
+        """The layout, for people."""
         if self.layout is None:
             return "text of a layout that is not clear yet"
         names = ", ".join(self.layout.names) or f"{self.layout.width} columns without names"
         return f"text, {self.layout.notation}: {names}"
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end within `data`; an unfinished line is kept for the next call."""
+        """The frames that end within `data`; an unfinished line waits for the next call."""
         return [frame for line in self._lines.feed(data) for frame in self._take(line)]
 
     def forget(self) -> None:
@@ -135,14 +139,14 @@ class TextParser:
         return self._recognise(line, size) if self.layout is None else self._read(line, size)
 
     def _refuse(self, size: int) -> None:
-        """Count a bad line; what had been gathered towards a layout does not count any more."""
+        """Count a bad line, and drop the lines that were gathered to recognise a layout."""
         self.counts.refuse(size)
         for _, length in self._history:
             self.counts.refuse(length)
         self._history.clear()
 
     def _name_columns(self, header: Line, size: int) -> list[Frame]:
-        """A header names the columns, also when it comes again after a reset of the board."""
+        """Name the columns by a header; it comes again after a reset of the board."""
         if self.layout is not None and (self.layout.notation is not Notation.csv or self._columns):
             self.counts.refuse(size)
         elif self.layout is not None and self.layout.width == len(header.names):
@@ -152,18 +156,19 @@ class TextParser:
         return []
 
     def _recognise(self, line: Line, size: int) -> list[Frame]:
-        """Wait until lines repeat; then read those that were kept."""
+        """Gather lines until they repeat; then read the gathered ones."""
         self._history.append((line, size))
-        period = _period([kept for kept, _ in self._history])
+        period = _period([gathered for gathered, _ in self._history])
         if not period or len(line.values) > MOST_VALUES:
             while len(self._history) > TIMES_TO_RECOGNISE * LONGEST_CYCLE:
                 self.counts.refuse(self._history.pop(0)[1])
             return []
-        self.layout = self._layout([kept for kept, _ in self._history[-period:]])
-        kept, self._history = self._history, []
-        for _, length in kept[: -TIMES_TO_RECOGNISE * period]:
+        self.layout = self._layout([gathered for gathered, _ in self._history[-period:]])
+        history, self._history = self._history, []
+        before, repeating = history[: -TIMES_TO_RECOGNISE * period], history[-TIMES_TO_RECOGNISE * period :]
+        for _, length in before:
             self.counts.refuse(length)
-        return [frame for old, length in kept[-TIMES_TO_RECOGNISE * period :] for frame in self._read(old, length)]
+        return [frame for gathered, length in repeating for frame in self._read(gathered, length)]
 
     def _layout(self, lines: list[Line]) -> Layout:
         first, width = lines[0], len(lines[0].values)
@@ -187,7 +192,7 @@ class TextParser:
         return self._frame(layout, line.values, size)
 
     def _gather(self, layout: Layout, line: Line, size: int) -> list[Frame]:
-        """A line of a cycle: the frame, if it is the last one."""
+        """Take a line of a cycle; the last one completes a frame."""
         new = [name for name in line.names if name not in TIMES_US]
         if not set(line.names) <= set(layout.names) or not new:
             self.counts.refuse(size)
@@ -203,7 +208,7 @@ class TextParser:
         return self._frame(layout, values, size)
 
     def _drop_cycle(self) -> None:
-        """A cycle that was not finished is lost."""
+        """Count the lines of an unfinished cycle as dropped."""
         if self._cycle:
             self.counts.refuse(self._cycle_bytes)
         self._cycle, self._cycle_bytes = {}, 0
@@ -224,12 +229,12 @@ def _before(name: str) -> tuple[bool, str]:
 
 
 def _start(layout: Layout) -> str:
-    """The name that a cycle begins with: a clock that comes with every value is no beginning."""
+    """The name that begins a cycle; a clock may come with every value, so it is no beginning."""
     return next(name for name in layout.names if name not in TIMES_US)
 
 
 def _period(lines: list[Line]) -> int:
-    """Length of the cycle that has just come three times in a row, 0 if there is none; a long one needs names."""
+    """Number of lines in the cycle that has just come three times in a row, or 0; only named values make cycles."""
     signatures = [line.signature for line in lines]
     last = signatures[-1]
     back = signatures[-2::-1]

@@ -38,7 +38,7 @@ TEXT_FORMATS: dict[str, Callable[[Frame], str]] = {
     "teleplot": _teleplot_lines,
     "json": _json_line,
 }
-"""Notations by name, and what writes them. CSV has the channels alone and no header, as the simplest boards."""
+"""Notations by name, with their writers. CSV has only the channels and no header, as the simplest boards send it."""
 
 
 def encode_text(frame: Frame, notation: str) -> bytes:

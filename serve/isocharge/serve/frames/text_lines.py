@@ -4,10 +4,10 @@
 |---|---|
 | CSV, also with semicolons, tabs or blanks; header or not | `12, 801.2, 799.5, 803.3` |
 | name:value, several in a line or one | `A:801.2,B:799.5,C:803.3` |
-| Teleplot (github.com/nesnes/teleplot) | `>A:1627551892437:801.2§pC` (time in ms and unit as you like) |
+| Teleplot (github.com/nesnes/teleplot) | `>A:1627551892437:801.2§pC` (time in ms and unit are optional) |
 | JSON object or list | `{"seq": 12, "A": 801.2}` |
 
-Blank lines and lines that begin with # say nothing. Numbers are those that Python's `float` reads, without underscores.
+Blank lines and lines that begin with # hold no values. A number is what Python's `float` reads, without underscores.
 """
 
 import json
@@ -16,11 +16,13 @@ from enum import StrEnum
 from typing import Any, NamedTuple
 
 SEQ = "seq"
+"""Name under which a device sends the number of a frame."""
 
 TIMES_US = {"t_us": 1.0, "t_ms": 1e3, "t_s": 1e6}
-"""Names under which a device sends its clock, and what they are in us."""
+"""Names under which a device sends its clock, with their units, us."""
 
 TELEPLOT_TIME = "t_ms"
+"""Name of the clock in Teleplot's lines."""
 
 _CELL = re.compile(r"\s*[,;\t]\s*|\s+")
 
@@ -41,12 +43,12 @@ class Notation(StrEnum):
 
 
 class Line(NamedTuple):
-    """What a line says.
+    """The content of a line.
 
     Attributes:
         notation: How it is written.
-        names: Of the values; none for CSV; only names for a header.
-        values: Numbers.
+        names: Names of the values, or of the columns in a header; empty for CSV.
+        values: Numbers; empty for a header.
     """
 
     notation: Notation
@@ -55,7 +57,7 @@ class Line(NamedTuple):
 
     @property
     def signature(self) -> tuple[Notation, tuple[str, ...], int]:
-        """Equal for lines of one layout."""
+        """What lines of one layout have in common."""
         return self.notation, self.names, len(self.values)
 
 
@@ -106,7 +108,7 @@ def _pairs(text: str) -> Line:
 
 
 def _teleplot(text: str) -> Line:
-    """The latest of the values in a line; words and points of x-y plots are nothing that is measured over time."""
+    """The latest value of a line; texts and points of x-y plots are no readings."""
     content, _, flags = text[1:].partition("|")
     name, _, values = content.partition(":")
     if not name.strip() or not values:
@@ -127,17 +129,17 @@ def _json(text: str) -> Line:
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
     if isinstance(content, list) and content and all(map(_is_number, content)):
-        return Line(Notation.csv, (), tuple(map(float, content)))
+        return Line(Notation.csv, (), tuple(content))
     numbers = dict(_numbers("", content))
     if not numbers:
         raise ValueError(f"expected numbers, got {text!r}")
     return Line(Notation.json, tuple(numbers), tuple(numbers.values()))
 
 
-def _numbers(name: str, content: Any) -> "list[tuple[str, float]]":
+def _numbers(name: str, content: Any) -> list[tuple[str, float]]:
     """Every number of a JSON value by the path to it, `charge.A` or `charge.0`, at most two levels deep."""
     if _is_number(content):
-        return [(name, float(content))]
+        return [(name, content)]
     if name.count(".") >= 2 or not isinstance(content, dict | list):
         return []
     items = content.items() if isinstance(content, dict) else enumerate(content)
@@ -145,4 +147,5 @@ def _numbers(name: str, content: Any) -> "list[tuple[str, float]]":
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    """Whether a value of this JSON, whose integers were read as floats too, is a number."""
+    return isinstance(value, float)

@@ -11,19 +11,19 @@ from isocharge.serve.frames.frame import Frame
 
 
 class ChannelPicker:
-    """Picks an electrode's value out of each frame; how is found out once for each set of names.
+    """Picks the value of each electrode out of frames; the order is looked up again only when a frame's names change.
 
-    The device file's `[channels]` decides; without, channels named as the electrodes (`A`, `A_pC`, or `charge.A`), and
-    without names, or with others, the order, if there are as many as electrodes.
+    The device file's `[channels]` decides. Without it, channels are matched by the names of the electrodes (`A`, `A_pC`
+    or `charge.A`); without such names by their order, if their number is that of the electrodes.
     """
 
     def __init__(self, electrodes: tuple[str, ...], channels: Mapping[str, str], model: str) -> None:
-        """Take notice.
+        """Set up the look-up.
 
         Args:
-            electrodes: In the order of the model.
-            channels: Electrode to the channel's name; empty for nothing known.
-            model: For messages.
+            electrodes: Names of the electrodes, in the order of the model.
+            channels: Electrode to the channel's name; empty where nothing is known.
+            model: The model's label, for messages.
         """
         self._electrodes, self._channels, self._model = electrodes, channels, model
         self._names: tuple[str, ...] | None = None
@@ -34,20 +34,20 @@ class ChannelPicker:
         """Values in the order of the electrodes, shape (electrodes,), in the device's unit.
 
         Raises:
-            ChargeError: If an electrode's value is not there.
+            ChargeError: If a frame has no value for an electrode.
         """
         if frame.names != self._names or len(frame.values) != self._width:
-            self._order = self._find(frame)
+            self._order = self._look_up(frame)
             self._names, self._width = frame.names, len(frame.values)
         return np.array(itemgetter(*self._order)(frame.values), dtype=float).reshape(-1)
 
-    def _find(self, frame: Frame) -> tuple[int, ...]:
-        wanted = [self._channels.get(name, name) for name in self._electrodes]
-        if self._channels and set(wanted) <= set(frame.names):
-            return tuple(frame.names.index(name) for name in wanted)
-        known = {_bare(name): at for at, name in enumerate(frame.names)}
-        if not self._channels and set(self._electrodes) <= set(known):
-            return tuple(known[name] for name in self._electrodes)
+    def _look_up(self, frame: Frame) -> tuple[int, ...]:
+        names = [self._channels.get(name, name) for name in self._electrodes]
+        if self._channels and set(names) <= set(frame.names):
+            return tuple(frame.names.index(name) for name in names)
+        positions = {_electrode(name): position for position, name in enumerate(frame.names)}
+        if not self._channels and set(self._electrodes) <= set(positions):
+            return tuple(positions[name] for name in self._electrodes)
         if not self._channels and len(frame.values) == len(self._electrodes):
             return tuple(range(len(frame.values)))
         raise ChargeError(
@@ -57,6 +57,6 @@ class ChannelPicker:
         )
 
 
-def _bare(name: str) -> str:
+def _electrode(name: str) -> str:
     """`A` of `A`, `A_pC`, `charge.A` and `charge_raw_pC.A`."""
     return name.rpartition(".")[2].removesuffix("_pC")

@@ -1,13 +1,13 @@
-"""Recordings: what came through the port and what was made of it, one line of JSON each, as it happens.
+"""Recordings: the chunks of a port and the records that came of them, a line of JSON each, written as they come.
 
     {"isocharge_recording": 1, "model": "three/1", "policy": "every", "device": {...}}
     {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
     {"timestamp": ..., ...}                       the records of that chunk, as they went out
-    {"tare": true}                                somebody asked for a new tare here
+    {"tare": true}                                a request for a new tare
 
-A recording is played through the same path. Everything is computed anew except `latency_us`, which belongs to that run
-is taken from its record; so the same model gives the same records, bit for bit. Whole lines are written at once; a
-line that a full disk or a power cut left unfinished is ignored.
+Everything in a replay is recomputed except `latency_us`, which is copied from the recording because it belongs to the
+original run. So the same model gives the same records, bit for bit. Whole lines are written at once; a line that a full
+disk or a power cut left unfinished is ignored.
 """
 
 import base64
@@ -25,8 +25,10 @@ from isocharge.files import refuse_existing
 from isocharge.serve.port.serial_port import Chunk
 
 VERSION = 1
+"""Version of the file's format."""
 
 KIND = "isocharge_recording"
+"""Key of the version in the first line: what makes a file a recording."""
 
 log = logging.getLogger(__name__)
 
@@ -36,11 +38,18 @@ class Recorder:
 
     Attributes:
         path: The file.
-        failed: Whether writing had to stop: the disk is full. What was written until then is whole.
+        failed: Whether writing has stopped because the disk is full. What was written before is whole.
     """
 
     def __init__(self, path: Path, model: str, policy: str, device: Mapping[str, Any]) -> None:
-        """Describe a recording; the file is made on entering the context."""
+        """Describe a recording; the file is created on entering the context.
+
+        Args:
+            path: The file; it must not exist.
+            model: The model's label, `name/version`.
+            policy: Which frames get a record.
+            device: Content of the device file.
+        """
         self.path = path
         self.failed = False
         self._header = {KIND: VERSION, "model": model, "policy": policy, "device": dict(device)}
@@ -48,11 +57,11 @@ class Recorder:
         self._good = 0
 
     def __enter__(self) -> Self:
-        """Make the file.
+        """Create the file.
 
         Raises:
             OutputExists: If it is already there.
-            OutputError: If it cannot be made.
+            OutputError: If it cannot be created.
         """
         refuse_existing(self.path)
         try:
@@ -69,13 +78,13 @@ class Recorder:
         os.close(self._descriptor)
 
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
-        """Write a chunk and the records that were made of it."""
+        """Write a chunk and the lines of its records."""
         data = base64.b64encode(chunk.data).decode()
         head = json.dumps({"chunk": [chunk.timestamp, chunk.clock_ns, chunk.outage_s, data]})
         self._write("\n".join([head, *records]))
 
     def tare(self) -> None:
-        """Write that somebody asked for a new tare."""
+        """Write a request for a new tare."""
         self._write('{"tare": true}')
 
     def _write(self, lines: str) -> None:
@@ -84,9 +93,9 @@ class Recorder:
             return
         data = f"{lines}\n".encode()
         try:
-            for_now = memoryview(data)
-            while for_now:
-                for_now = for_now[os.write(self._descriptor, for_now) :]
+            unwritten = memoryview(data)
+            while unwritten:
+                unwritten = unwritten[os.write(self._descriptor, unwritten) :]
         except OSError as error:
             self.failed = True
             os.ftruncate(self._descriptor, self._good)
@@ -96,19 +105,19 @@ class Recorder:
 
 
 class Event(NamedTuple):
-    """What happened next: a chunk with the latencies of its records (us), or the wish for a new tare (no chunk)."""
+    """A chunk with the latencies of its records (us), or a request for a new tare (no chunk)."""
 
     chunk: Chunk | None
     latencies_us: tuple[float, ...] = ()
 
 
 class Recording:
-    """A recording that is read.
+    """A recording to read.
 
     Attributes:
         model: The model's label, `name/version`.
         policy: Which frames got a record.
-        device: The device file.
+        device: Content of the device file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -129,7 +138,7 @@ class Recording:
             raise RecordingError(f"{path}: recording version {version} is not supported (this version reads {VERSION})")
 
     def events(self) -> Iterator[Event]:
-        """What happened, in its order.
+        """Chunks and requests for a new tare, in their order.
 
         Raises:
             RecordingError: If a line other than the last one is damaged.
@@ -148,12 +157,12 @@ class Recording:
             yield Event(chunk, tuple(latencies_us))
 
     def _entries(self) -> Iterator[Chunk | float | None]:
-        """What each line says."""
+        """The content of each line, as `_entry` gives it."""
         with self._path.open(encoding="utf-8", errors="replace") as file:
             next(file)
             for number, line in enumerate(file, start=2):
                 if not line.endswith("\n"):
-                    return  # the power went while it was written
+                    return  # the power failed while it was written
                 try:
                     entry = _entry(json.loads(line))
                 except (ArithmeticError, KeyError, TypeError, ValueError) as error:
@@ -162,7 +171,7 @@ class Recording:
 
 
 def _entry(content: dict[str, Any]) -> Chunk | float | None:
-    """A chunk, the latency of a record (us), or None: the wish for a new tare.
+    """A chunk, the latency of a record (us), or None for a request for a new tare.
 
     Raises:
         ArithmeticError, KeyError, TypeError, ValueError: If it is none of these.
@@ -176,7 +185,7 @@ def _entry(content: dict[str, Any]) -> Chunk | float | None:
 
 
 class RecordedClock:
-    """The clock of a replay: it stands where it stood when each record was made."""
+    """The clock of a replay: for each record it shows the time at which that record was built."""
 
     def __init__(self) -> None:
         self._base_ns = 0
@@ -188,6 +197,6 @@ class RecordedClock:
         self._latencies_us = deque(event.latencies_us)
 
     def __call__(self) -> int:
-        """Nanoseconds, on the clock of `Chunk.clock_ns`; the arrival itself if there is no record."""
+        """Nanoseconds on the clock of `Chunk.clock_ns`: the arrival itself once the records of the chunk are over."""
         latency_us = self._latencies_us.popleft() if self._latencies_us else 0.0
         return self._base_ns + round(latency_us * 1e3)

@@ -1,8 +1,8 @@
 """A serial port as a context manager and an iterator of chunks, each with the host time of its arrival.
 
 Any URL that pyserial knows will do: `/dev/ttyACM0`, a pseudo-terminal, `socket://host:port`, `rfc2217://host:port`,
-`loop://`. Asked to, a port that goes away or falls silent is opened again for ever; the first chunk after an outage
-says how long it was.
+`loop://`. On request, a port that goes away or falls silent is opened again until it is back; the first chunk after an
+outage says how long it was.
 """
 
 import io
@@ -20,12 +20,13 @@ import serial
 from isocharge.errors import PortError, PortLost
 
 RETRY_S = 0.1
-"""First pause before opening again; each one is twice as long,"""
+"""First pause before a lost port is opened again, s; each pause is twice as long as the one before."""
 
 LONGEST_RETRY_S = 2.0
-"""up to this."""
+"""Longest pause, s."""
 
 MOST_BYTES = 65536
+"""Largest chunk, bytes."""
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +38,7 @@ class Chunk(NamedTuple):
         data: At least one byte.
         timestamp: Host time of arrival, unix seconds.
         clock_ns: The same moment on `time.perf_counter_ns`, for latencies.
-        outage_s: How long the port had been away just before, s; 0 if it had not.
+        outage_s: Length of the outage just before, s; 0 if there was none.
     """
 
     data: bytes
@@ -47,7 +48,7 @@ class Chunk(NamedTuple):
 
 
 class Port:
-    """An open port; iterate over it to get `Chunk`s, for ever.
+    """A port; iterate over it to get `Chunk`s without end.
 
     Attributes:
         url: Device path or pyserial URL.
@@ -64,9 +65,9 @@ class Port:
 
         Args:
             url: Device path or pyserial URL.
-            baud: Bits per second; without meaning for USB and pseudo-terminals.
+            baud: Bits per second; ignored by USB and pseudo-terminals.
             silence_s: Time without a byte after which the port counts as lost, s.
-            reconnect: Whether to open a lost port again, for ever, instead of raising.
+            reconnect: Whether to open a lost port again until it is back, instead of raising.
         """
         self.url = url
         self.outages = 0
@@ -77,14 +78,14 @@ class Port:
         self._descriptor: int | None = None
 
     def __enter__(self) -> Self:
-        """Open the port and forget what had piled up in it.
+        """Open the port and drop the bytes that it has buffered.
 
         Raises:
             PortError: If it cannot be opened.
         """
         try:
             self._serial = serial.serial_for_url(self.url, baudrate=self._baud, timeout=self._silence_s, exclusive=True)
-            self._serial.reset_input_buffer()  # a tty does so by itself, a socket does not
+            self._serial.reset_input_buffer()  # a tty drops them by itself, a socket does not
         except (OSError, ValueError, termios.error) as error:
             self._close()
             raise PortError(
@@ -126,7 +127,7 @@ class Port:
             outage_s = 0.0
 
     def _come_back(self, reason: PortLost) -> bytes:
-        """Open again and again until there is data: the first bytes."""
+        """Open the port again and again until bytes come: these bytes."""
         if not self._reconnect:
             raise reason
         log.warning("%s; trying again until it is back", reason)
@@ -142,7 +143,7 @@ class Port:
                 continue
 
     def _read(self) -> bytes:
-        """Wait for a byte and take all that came with it.
+        """Wait for a byte, and read all bytes that came with it.
 
         Raises:
             PortLost: If the port went away, or nothing came in time.
@@ -163,7 +164,7 @@ class Port:
         return data
 
     def _read_directly(self) -> bytes:
-        """Two system calls for all that is there: pyserial takes five, and one for every byte of a socket."""
+        """Read all bytes in two system calls: pyserial takes five, and one for every byte of a socket."""
         assert self._descriptor is not None
         if not select.select([self._descriptor], [], [], self._silence_s)[0]:
             return b""
@@ -179,7 +180,7 @@ class Port:
 
 
 def _ask_for_low_latency(port: serial.SerialBase) -> None:
-    """USB adapters collect bytes for 16 ms unless asked not to; other ports have no such mode, each says so its way."""
+    """Turn off the 16 ms for which USB adapters collect bytes; a port without that mode raises an error of its own."""
     try:
         port.set_low_latency_mode(True)
     except (AttributeError, NotImplementedError, OSError, ValueError):
@@ -187,7 +188,7 @@ def _ask_for_low_latency(port: serial.SerialBase) -> None:
 
 
 def _descriptor(port: serial.SerialBase) -> int | None:
-    """What the operating system reads from; None for ports that live inside pyserial."""
+    """The file descriptor; None for ports that exist only inside pyserial."""
     try:
         return int(port.fileno())
     except (AttributeError, io.UnsupportedOperation):

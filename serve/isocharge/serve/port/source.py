@@ -12,14 +12,16 @@ from isocharge.errors import InputError
 from isocharge.serve.port.serial_port import Chunk, Port
 
 STDIN = "-"
+"""Name of the standard input."""
 
 CHUNK_BYTES = 4096
+"""Largest chunk from a file, bytes."""
 
 Chunks = contextlib.AbstractContextManager["Port | FileSource"]
 
 
 class FileSource:
-    """The bytes of a file, a pipe or stdin, as they can be read, to the end."""
+    """Chunks of a file, a pipe or stdin, up to its end."""
 
     outages = 0
 
@@ -33,10 +35,11 @@ class FileSource:
 
 
 def open_source(url: str, *, baud: int = 115200, silence_s: float = 5.0, reconnect: bool = False) -> Chunks:
-    """What to read chunks from, as a context manager.
+    """The source of chunks behind a name, as a context manager.
 
     Args:
-        url: A device path or pyserial URL (see `Port` for the rest), the path of a file or named pipe, or - for stdin.
+        url: A device path or pyserial URL, the path of a file or named pipe, or - for stdin.
+        baud, silence_s, reconnect: As `Port` takes them; ignored for files.
 
     Raises:
         InputError: If the file cannot be read.
