@@ -109,7 +109,7 @@ def test_what_is_refused_at_the_start_is_said(film, start, tmp_path):
     assert ask(process.stdout.readline().strip())[0] == 200
     process.terminate()
     refused, serving = process.communicate(timeout=20)[1].splitlines()
-    assert re.match(r"refused: .*linear/2/golden.json: not there; a model travels with its golden.json", refused)
+    assert re.match(r"refused: .*linear/2/golden.json: missing; a model comes with its golden.json", refused)
     assert serving == "serving linear/1; Ctrl-C stops"
 
 

@@ -129,7 +129,7 @@ def spoilt(film):
     ("wrong", "error", "said"),
     [
         ("no graph", ModelError, "cannot read these 11 bytes"),
-        ("no metadata", ModelError, "no 'format_version'"),
+        ("no metadata", ModelError, "key 'format_version' is missing"),
         ("other metadata", ModelError, "disagree on 'probes'"),
         ("other output", ModelError, "expected the outputs"),
         ("golden too narrow", ChargeError, "'A', 'B', 'C'"),
@@ -201,7 +201,12 @@ def test_not_a_model_is_chained_from_its_cause(own_model, data):
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [(None, "not there"), ("{", "damaged .JSONDecodeError"), ("{}", "damaged .KeyError"), ("[]", "damaged .TypeError")],
+    [
+        (None, "missing; a model comes with"),
+        ("{", "damaged .JSONDecodeError"),
+        ("{}", "damaged .KeyError"),
+        ("[]", "damaged .TypeError"),
+    ],
 )
 def test_missing_or_damaged_golden(own_model, text, said):
     golden = own_model / "golden.json"

@@ -81,7 +81,7 @@ def test_missing_name_says_where_and_what(roots):
 
 
 def test_missing_path_says_what_was_expected(roots):
-    with pytest.raises(ModelError, match=r"nowhere/model.onnx: no model there; expected a model folder"):
+    with pytest.raises(ModelError, match=r"nowhere/model.onnx: no model; expected a model folder"):
         find_model("nowhere/model.onnx", roots["given"])
 
 

@@ -72,9 +72,10 @@ class UdpSink:
         try:
             if not 0 < int(port) < 1 << 16:
                 raise ValueError("no such port")
-            self._family, _, _, _, self._address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            family, _, _, _, socket_address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except (OSError, ValueError) as error:  # ValueError: a part of the name is too long
             raise InputError(f"UDP address {address!r}: expected HOST:PORT, as in 127.0.0.1:9870 ({error})") from error
+        self._family, self._address = family, socket_address
         self._socket: socket.socket | None = None
 
     def __enter__(self) -> Self:

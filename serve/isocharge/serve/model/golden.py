@@ -1,7 +1,7 @@
-"""Golden vectors: charges, and what a model answered to them on the day it was written.
+"""Golden vectors: charges, and a model's answers to them at the time of export.
 
-They say whether a file is still the one that was released (checksum), and whether another machine or another runtime
-computes what ours did: |a - b| <= 1e-5 max(|b|, floor).
+They show whether a file is still the one that was released (checksum), and whether another machine or runtime computes
+the same answers: |a - b| <= 1e-5 max(|b|, floor).
 """
 
 import json
@@ -18,13 +18,15 @@ from isocharge.files import sha256_of
 from isocharge.serve.model.session import INPUT, OUTPUTS, run
 
 RELATIVE = 1e-5
+"""Largest difference of two answers, relative to max(|answer|, floor), dimensionless."""
 
 FLOORS = {
     "contact": (1.0, 1.0, 0.1),  # mm, mm, N
     "contact_std": (1.0, 1.0, 0.1),
-    # Through sinh, from a length of numbers that cancel near zero: float32 agrees between runtimes to 1e-4.
+    # The sinh of a norm whose terms cancel near zero: float32 agrees between runtimes to 1e-4.
     "misfit": (20.0,),
 }
+"""Floor for each column of an output, in the unit of the column."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Golden:
 
 
 def make_golden(session: ort.InferenceSession, onnx_model: bytes, charge_pC: Singles) -> Golden:
-    """Run charges of shape (n, electrodes), pC, through a model and keep what it answers.
+    """Run charges of shape (n, electrodes), pC, through a model and keep its answers.
 
     Raises:
         ModelError: If an answer is not finite.
@@ -83,7 +85,7 @@ def read_golden(path: Path) -> Golden:
     try:
         return _from_json(json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError as error:
-        raise ModelError(f"{path}: not there; a model travels with its golden.json, copy the whole folder") from error
+        raise ModelError(f"{path}: missing; a model comes with its golden.json: copy the whole folder") from error
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise ModelError(
             f"{path}: damaged ({type(error).__name__}: {error}); copy or export the model again"
@@ -109,7 +111,7 @@ def check_answers(golden: Golden, answers: dict[str, Singles], where: str) -> No
         where: The model, for messages.
 
     Raises:
-        ModelError: If one is further away than the tolerance; the worst one is named.
+        ModelError: If an answer differs by more than the tolerance; the worst one is named.
     """
     for name, expected in golden.outputs.items():
         got = answers[name].astype(np.float64)

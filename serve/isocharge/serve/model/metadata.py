@@ -1,8 +1,8 @@
-"""What a model file says about itself: the `metadata_props` of its ONNX graph, one JSON value per key.
+"""The metadata of a model: the `metadata_props` of its ONNX graph, one JSON value per key.
 
-Whoever holds only `model.onnx` can read from it which sensor it was made for, in which order the charges go in, where
-it may be trusted and how well it did. The sensor travels whole but is opaque here, except for its name, which is the
-frame that x and y refer to.
+From `model.onnx` alone one can read for which sensor the model was trained, in which order it takes the charges, where
+it may be trusted and how large its errors are. The sensor is stored whole but only its name is read here: the frame
+that x and y refer to.
 """
 
 import json
@@ -14,6 +14,7 @@ from isocharge.errors import ModelError
 from isocharge.tables import Table, shown
 
 FORMAT_VERSION = 1
+"""Version of the metadata."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,17 +23,17 @@ class ModelMetadata:
 
     Attributes:
         name: Model name, equal to its folder's.
-        version: From 1; the name of the version folder.
+        version: Number from 1; the name of the version folder.
         sensor: The whole sensor as JSON; only its `name` is read here.
         electrodes: Electrode names in the order of the charges.
         working_area_mm: Polygon (x, y), mm, inside which the model was trained.
-        probes: Probe notations it was trained with.
-        force_range_N: Smallest and largest force it was trained with, N.
+        probes: Notations of the probes in the training.
+        force_range_N: Smallest and largest force in the training, N.
         noise: The noise model of the training, with its parameters.
         dataset_sha256: Checksum of the dataset.
         errors: Measured errors, by names that carry the unit.
         made_with: The command and the package versions.
-        format_version: Of this metadata.
+        format_version: Version of the metadata.
     """
 
     name: str
@@ -97,7 +98,7 @@ def _to_json(key: str, value: Any) -> str:
 
 
 def _table(props: Mapping[str, str], names: tuple[str, ...], where: str) -> Table:
-    """The values of these fields, as far as they are there."""
+    """The values of those of these fields that `props` has."""
     values: dict[str, Any] = {}
     for name in names:
         try:

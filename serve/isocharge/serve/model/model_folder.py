@@ -5,8 +5,8 @@
     <name>/<version>/golden.json   charges, answers, tolerances, and the checksum of model.onnx
     <name>/<version>/card.md       for people
 
-A version appears whole or not at all: it is written under a temporary name, read back as a user would read it, and
-only then renamed.
+A version appears whole or not at all: it is written under a temporary name, read back as a user reads it, and only then
+renamed.
 """
 
 import re
@@ -25,7 +25,7 @@ from isocharge.serve.model.session import check_interface, open_session, run
 from isocharge.serve.model.triton_config import triton_config
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-"""Model names: safe in paths, URLs and config.pbtxt."""
+"""Pattern of model names: safe in paths, URLs and config.pbtxt."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +82,10 @@ def _check_fits(golden: Golden, metadata: ModelMetadata, folder: Path) -> None:
 
 
 def check_golden(model: Model) -> None:
-    """Compute a model's golden vectors anew.
+    """Compare the answers of this machine with a model's golden vectors.
 
     Raises:
-        ModelError: If this machine gets other answers than golden.json has.
+        ModelError: If an answer differs from that in golden.json.
     """
     check_answers(model.golden, run(model.session, model.golden.charge_pC), str(model.folder / "model.onnx"))
 
@@ -96,20 +96,20 @@ def write_model(
     """Write a new version of a model.
 
     Args:
-        folder: The model's folder; it has the model's name and may exist already, with other versions.
+        folder: The model's folder; it has the model's name and may already hold other versions.
         onnx_model: The graph, with `metadata.to_props()` in its metadata_props.
         metadata: The same metadata.
-        golden_charge_pC: Charges to answer in golden.json, shape (n, electrodes), pC.
+        golden_charge_pC: Inputs of the golden vectors, shape (n, electrodes), pC.
         card: Text of the model card.
 
     Returns:
         The version folder.
 
     Raises:
-        OutputExists: If this version is there already, or a file has the folder's name.
+        OutputExists: If this version exists already, or a file has the folder's name.
         ChargeError: If the golden charges do not fit the electrodes.
         ModelError: If the graph cannot be loaded as a reader loads it, or disagrees with `metadata`. After any error
-            nothing is left behind.
+            no file of the version is left.
     """
     target = folder / str(metadata.version)
     check_target(folder, metadata.version, metadata.electrodes)
@@ -129,15 +129,15 @@ def write_model(
 
 
 def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> None:
-    """Refuse a place where a model version cannot be written; worth doing before the work, too.
+    """Refuse a folder in which a model version cannot be written; training checks it before it starts.
 
     Args:
         folder: The model's folder, named as the model.
         version: Number of the version to write.
-        electrodes: Of the model.
+        electrodes: Names of the model's electrodes.
 
     Raises:
-        OutputExists: If the version, or a file in the folder's place, is there already.
+        OutputExists: If the version exists already, or a file has the folder's name.
         ModelError: If the folder's name is no model name, or the folder holds a model with other electrodes.
     """
     refuse_existing(folder / str(version))
@@ -145,16 +145,16 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Non
         raise OutputExists(f"{folder}: expected a folder or nothing, got a file; choose another place")
     name = folder.resolve().name
     if not NAME.fullmatch(name):
-        raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; name the folder so")
-    config, wanted = folder / "config.pbtxt", triton_config(name, len(electrodes))
-    if config.exists() and config.read_text(encoding="utf-8") != wanted:
+        raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; rename the folder")
+    config, expected = folder / "config.pbtxt", triton_config(name, len(electrodes))
+    if config.exists() and config.read_text(encoding="utf-8") != expected:
         raise ModelError(
             f"{config}: describes a model other than one with the electrodes {electrodes}; use another model name"
         )
 
 
 def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
-    """Read a new version back as a user would."""
+    """Read a new version back as a user reads it."""
     model = load_model(draft)
     inside, given = model.metadata.to_props(), metadata.to_props()
     differing = [key for key in given if inside[key] != given[key]]

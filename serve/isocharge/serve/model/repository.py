@@ -1,7 +1,8 @@
-"""Finding a model by name, version or path.
+"""Search for a model by name, version or path.
 
-A model repository is a folder of models (`<name>/<version>/model.onnx`); whatever else lies in it is left alone. Names
-are looked up in the folder that was given, `$ISOCHARGE_MODELS`, `./models`, and the models that ship with isocharge.
+A model repository is a folder of models (`<name>/<version>/model.onnx`); other files in it are ignored. Names are
+looked up in the folder that was given, in `$ISOCHARGE_MODELS`, in `./models`, and in the models that ship with
+isocharge.
 """
 
 import os
@@ -23,7 +24,7 @@ def find_model(model: str | Path, models: Path | None = None) -> Path:
         models: Repository in which names are looked up first.
 
     Raises:
-        ModelError: If there is none; the message says where it was looked for and what is there.
+        ModelError: If there is no such model; the message names the folders that were searched and their models.
     """
     roots = repositories(models)
     is_path = isinstance(model, Path) or model.startswith((".", "/")) or model.endswith(".onnx")
@@ -36,13 +37,13 @@ def find_model(model: str | Path, models: Path | None = None) -> Path:
 
 
 def repositories(models: Path | None = None) -> list[Path]:
-    """The folders in which names are looked up, first come, first served.
+    """The folders in which names are looked up, in this order.
 
     Raises:
-        ModelError: If `models` is not there; the others need not be.
+        ModelError: If `models` is given and no folder; the other folders need not exist.
     """
     if models is not None and not models.is_dir():
-        raise ModelError(f"{models}: expected a folder of models, found none there; correct --models or leave it out")
+        raise ModelError(f"{models}: expected a folder of models, got no folder; correct --models or leave it out")
     variable = os.environ.get("ISOCHARGE_MODELS")
     given = [models] if models is not None else []
     return [*given, *([Path(variable)] if variable else []), Path("models"), _shipped()]
@@ -57,9 +58,9 @@ def model_names(root: Path) -> list[str]:
 
 def _shipped() -> Path:
     """Released models: inside the installed package, or at the top of a source checkout."""
-    here = Path(__file__).resolve()
-    packaged = here.parents[1] / "released"
-    return packaged if packaged.is_dir() else here.parents[4] / "models"
+    module = Path(__file__).resolve()
+    packaged = module.parents[1] / "released"
+    return packaged if packaged.is_dir() else module.parents[4] / "models"
 
 
 def _version_folder(path: Path) -> Path | None:
@@ -85,7 +86,7 @@ def _versions(folder: Path) -> list[int]:
 def _not_found(model: str | Path, roots: list[Path], is_path: bool) -> str:
     if is_path:
         return (
-            f"{model}: no model there; expected a model folder with numbered versions, a version folder with "
+            f"{model}: no model; expected a model folder with numbered versions, a version folder with "
             "model.onnx, or a model.onnx"
         )
     looked = "; ".join(f"{root} ({', '.join(model_names(root)) or 'no models'})" for root in roots)

@@ -1,7 +1,7 @@
-"""Opening an ONNX graph the way this package runs it: one thread, in order, no spinning; its interface checked.
+"""ONNX sessions as this package runs them: one thread, in order, no spinning, with a checked interface.
 
-A network of this size is done in microseconds. A second thread costs more than it brings, and onnxruntime's default of
-spinning between runs burns most of a core at 100 Hz.
+A network of this size takes microseconds. A second thread costs more than it saves, and onnxruntime's default, to spin
+between runs, burns most of a core at 100 Hz.
 """
 
 from collections.abc import Mapping
@@ -12,13 +12,14 @@ from isocharge.arrays import Singles
 from isocharge.errors import ModelError
 
 INPUT = "charge_pC"
+"""Name of the input."""
 
 OUTPUTS = {"contact": 3, "contact_std": 3, "misfit": 1}
-"""Output name to width: x_mm, y_mm, force_N; their standard deviations; the distance from the nearest contact."""
+"""Names and widths of the outputs: x_mm, y_mm, force_N; their standard deviations; the misfit."""
 
 
 def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
-    """A session for one thread; not yet checked for its interface.
+    """A session for one thread, whose interface is not checked yet.
 
     Raises:
         ModelError: If the bytes are not an ONNX graph that onnxruntime can run.
@@ -51,7 +52,7 @@ def check_interface(session: ort.InferenceSession, electrodes: int, where: str) 
     """Check names, number type and shapes of a model's input and outputs; the batch must be free.
 
     Raises:
-        ModelError: If they are not those of a model with this many electrodes.
+        ModelError: If they are not those of a model with this number of electrodes.
     """
     _check_tensors("input", session.get_inputs(), {INPUT: electrodes}, where)
     _check_tensors("outputs", session.get_outputs(), OUTPUTS, where)

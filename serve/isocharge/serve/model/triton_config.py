@@ -1,13 +1,13 @@
-"""`config.pbtxt`, with which Triton serves a model folder as it stands."""
+"""`config.pbtxt`: with it Triton serves a model folder without changes."""
 
 from isocharge.serve.model.session import INPUT, OUTPUTS
 
 MAX_BATCH = 4096
-"""Largest batch that Triton may form; the graph itself takes any."""
+"""Largest batch that Triton may form; the graph itself has no limit."""
 
 
 def triton_config(name: str, electrodes: int) -> str:
-    """The text of `config.pbtxt` for a model with this many electrodes; the batch dimension is Triton's to add."""
+    """The text of `config.pbtxt` for a model with this number of electrodes; Triton adds the batch dimension."""
     head = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
     return head + _tensors("input", {INPUT: electrodes}) + _tensors("output", OUTPUTS)
 

@@ -29,11 +29,11 @@ class BoundPress:
         self._answers: Any = answers.data
 
     def run_into(self, charge_pC: Singles, out: Singles) -> None:
-        """Compute from an array into an array; a memoryview compares number type and shape as it copies, for nothing.
+        """Compute from an array into an array; the copies through memoryviews check number type and shape at no cost.
 
         Raises:
-            AttributeError, NotImplementedError, TypeError, ValueError: If one of them is not what is bound; nothing is
-                written into `out` then.
+            AttributeError, NotImplementedError, TypeError, ValueError: If an array has not the number type and shape of
+                the bound memory; nothing is written into `out` then.
         """
         self._charges[:] = charge_pC
         self.run()

@@ -1,9 +1,9 @@
 """From charges to contacts in process.
 
-One press goes through buffers that are bound to the session once: writing three numbers, running, reading seven back
+A single press uses buffers that are bound to the session once: to write three numbers, run and read seven back
 allocates no array and is faster than a plain `session.run`. Batches go through `session.run`.
 
-A host program's loop uses `predict_into`, with two arrays of its own; people use `predict`, which checks and explains.
+The loop of a host program uses `predict_into` with its two arrays; people use `predict`, which checks and explains.
 """
 
 import math
@@ -60,7 +60,7 @@ class Contacts(NamedTuple):
 class Predictor:
     """A loaded model. Its buffers serve one press at a time: use one Predictor per thread.
 
-    `predict` and `predict_into` use them; `predict_batch` touches none and may be called from any thread.
+    `predict` and `predict_into` use the buffers; `predict_batch` does not and may be called from any thread.
 
     Example:
         >>> from isocharge.serve import Predictor
@@ -114,9 +114,9 @@ class Predictor:
         """The contact of one press, for the hot loop: from an array into an array, and nothing else.
 
         Args:
-            charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. Whether
-                they are finite is not looked at: NaN in, NaN out.
-            out: Filled with the numbers of a Contact in their order, shape (7,), float32.
+            charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. They
+                are not checked: NaN in, NaN out.
+            out: Receives the numbers of a Contact in their order, shape (7,), float32.
 
         Raises:
             ChargeError: If an array is not float32 or of another shape; nothing is written then.
@@ -147,7 +147,7 @@ class Predictor:
 
 
 def _kind(value: object) -> str:
-    """A few words on what somebody took for a float32 array."""
+    """What an argument is that is no float32 array of the right shape, for messages."""
     return f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
 
 

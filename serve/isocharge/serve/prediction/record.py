@@ -1,6 +1,6 @@
-"""The prediction record: one shape for every carrier - JSON lines today, and whatever else comes.
+"""The prediction record: the same fields for every source and output.
 
-A field that a carrier does not have is None (null): a CSV file has no device time, a film that nobody touches has no
+A field that is unknown is None (null): a CSV file of charges has no device time, a film that nobody touches has no
 position.
 """
 
@@ -11,7 +11,7 @@ from typing import Any
 from isocharge.serve.prediction.predictor import Contact
 
 DECIMALS = 6
-"""Of numbers in JSON: 1 nm, 1 uN, 1 aC, 1 us, all far below what a sensor resolves."""
+"""Decimals of numbers in JSON: 1 nm, 1 uN, 1 aC, 1 us, all far below what a sensor resolves."""
 
 Charges = dict[str, float | None]
 """Electrode name to charge, pC; None where the device sent no number."""
@@ -19,7 +19,7 @@ Charges = dict[str, float | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictionRecord:
-    """One reading of a sensor and what the model makes of it.
+    """One reading of a sensor and the model's answer.
 
     Attributes:
         timestamp: Host time of the reading, unix seconds: the device's clock fitted to the arrivals; the arrival itself
@@ -31,10 +31,10 @@ class PredictionRecord:
         x_std_mm, y_std_mm, force_std_N: Standard deviations; None out of contact.
         misfit: Distance from the nearest single contact the model knows, in standard deviations; None out of contact.
         contact: Whether something touches.
-        charge_pC: Touch charges, as the model got them.
-        charge_raw_pC: Charges as they came from the device, after its gain.
-        tare_pC: What was subtracted.
-        flags: Short words, see `isocharge.serve.flags`.
+        charge_pC: Touch charges, the model's input.
+        charge_raw_pC: Charges as the device sent them, after the gain.
+        tare_pC: The tare that was subtracted.
+        flags: Words, see `isocharge.serve.flags`.
         latency_us: From the arrival of the reading's last byte to this record, us.
         model: `name/version`.
         frame_id: Name of the sensor.
@@ -71,16 +71,16 @@ class PredictionRecord:
 FIELDS = tuple(field.name for field in fields(PredictionRecord))
 
 UNKNOWN: dict[str, Any] = dict.fromkeys(Contact._fields)
-"""What a record says of the contact when nothing was computed."""
+"""The fields of the contact where nothing was computed."""
 
 OUT_OF_CONTACT: dict[str, Any] = UNKNOWN | {"force_N": 0.0}
-"""What a record says of the contact when there is none."""
+"""The fields of the contact where nothing touches."""
 
 _ENCODE = json.JSONEncoder(allow_nan=False).encode
 
 
 def _plain(value: Any) -> Any:
-    """What JSON has a notation for. Classes are compared, not asked for: this runs 20 times for each record."""
+    """A value as JSON can write it. `is` on the class is the fastest test, and this runs 20 times for each record."""
     kind = value.__class__
     if kind is float:
         return round(value, DECIMALS)

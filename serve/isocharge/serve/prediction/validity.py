@@ -1,4 +1,4 @@
-"""Where a model may be trusted: the check of a contact against what the model was trained for."""
+"""The check of contacts against the domain that a model was trained for."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,17 +11,17 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.predictor import Contact, Contacts
 
 MISFIT_LIMIT = 5.0
-"""Standard deviations, for a model that does not say what misfit one good press in a thousand exceeds."""
+"""Smallest limit of the misfit, in standard deviations; a model may state a larger one, that of 0.1 % of presses."""
 
 
 @dataclass(frozen=True)
 class Domain:
-    """Where a model may be trusted.
+    """The domain in which a model may be trusted.
 
     Attributes:
-        corners_mm: Working area, a polygon of shape (n, 2), mm.
+        corners_mm: Corners of the working area, a polygon, shape (n, 2), mm.
         force_range_N: Smallest and largest force, N.
-        misfit_limit: In standard deviations.
+        misfit_limit: Largest misfit of a single contact, in standard deviations.
     """
 
     corners_mm: Array
@@ -36,7 +36,7 @@ class Domain:
 
     @cached_property
     def safe_mm2(self) -> float:
-        """Square of the radius about the origin that is inside the area for sure, mm^2; 0 if the origin is outside."""
+        """Squared radius of the largest disk about the origin inside the area, mm^2; 0 if the origin is outside."""
         zero = np.zeros(1)
         start, end = self.corners_mm, np.roll(self.corners_mm, -1, axis=0)
         along = end - start
@@ -45,15 +45,15 @@ class Domain:
         return float(nearest) if inside_polygon(zero, zero, self.corners_mm)[0] else 0.0
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
-        """The words that one contact earns."""
+        """The flags of one contact."""
         low, high = self.force_range_N
         inside = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm < self.safe_mm2
         if inside and low <= contact.force_N <= high and contact.misfit <= self.misfit_limit:
-            return ()  # nearly all contacts, and without an array
+            return ()  # nearly all contacts, without allocating an array
         return self.batch_flags(Contacts(*np.array(contact, dtype=np.float32)[:, np.newaxis]))[0]
 
     def batch_flags(self, contacts: Contacts) -> list[tuple[str, ...]]:
-        """The words that each of n contacts earns."""
+        """The flags of each of n contacts."""
         low, high = self.force_range_N
         outside = ~inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm)
         outside |= (contacts.force_N < low) | (contacts.force_N > high)

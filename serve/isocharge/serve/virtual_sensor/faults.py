@@ -1,4 +1,4 @@
-"""What goes wrong between board and reader, on demand: lost frames, damaged bytes, gaps, unplugging, clock drift."""
+"""Faults between board and reader, on request: lost frames, damaged bytes, gaps, unplugging, clock drift."""
 
 from dataclasses import dataclass
 
@@ -9,14 +9,14 @@ from isocharge.errors import SceneError
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """Faults of a virtual sensor; none by default.
+    """Faults of a virtual sensor; by default it has no fault.
 
     Attributes:
-        lose_share: Share of frames that are not sent.
-        corrupt_share: Share of bytes that are flipped, dropped or followed by a random one.
-        gap_every_s, gap_s: So often nothing is sent, for so long, s; 0 for never.
-        unplug_every_s, unplug_s: So often the port vanishes, for so long, s; 0 for never.
-        clock_ppm: How much faster the device's clock runs, parts per million.
+        lose_share: Share of frames that are not sent, dimensionless.
+        corrupt_share: Share of bytes that are flipped, dropped or followed by a random one, dimensionless.
+        gap_every_s, gap_s: Interval and length of the gaps in which nothing is sent, s; interval 0 for no gaps.
+        unplug_every_s, unplug_s: Interval and length of the outages of the port, s; interval 0 for no outages.
+        clock_ppm: Excess of the device's clock rate over the true one, parts per million.
     """
 
     lose_share: float = 0.0
@@ -34,22 +34,22 @@ class Faults:
             raise SceneError(f"faults: expected shares from 0 to 1 and times from 0, got {self}")
 
     def in_gap(self, t_s: float) -> bool:
-        """Whether nothing is sent at this time, s from the beginning; the first gap comes after one interval."""
+        """Whether nothing is sent at this time, s from the start; the first gap comes after one interval."""
         return self.gap_every_s > 0.0 and t_s >= self.gap_every_s and t_s % self.gap_every_s < self.gap_s
 
     def unplugged(self, t_s: float) -> bool:
-        """Whether the port is gone at this time, s from the beginning."""
+        """Whether the port is away at this time, s from the start."""
         return self.unplug_every_s > 0.0 and t_s >= self.unplug_every_s and t_s % self.unplug_every_s < self.unplug_s
 
 
 def corrupt(data: bytes, share: float, rng: np.random.Generator) -> bytes:
-    """Bytes of which a share is flipped in one bit, dropped, or followed by a random one, a third each."""
-    hit = np.flatnonzero(rng.random(len(data)) < share)
-    if not hit.size:
+    """Damage a share of bytes: a third each is flipped in one bit, dropped, or followed by a random byte."""
+    positions = np.flatnonzero(rng.random(len(data)) < share)
+    if not positions.size:
         return data
     damaged = [bytes([byte]) for byte in data]
-    for at in hit.tolist():
+    for position in positions.tolist():
         kind, extra = int(rng.integers(3)), int(rng.integers(256))
-        bit = bytes([data[at] ^ 1 << extra % 8])
-        damaged[at] = (bit, b"", bytes([data[at], extra]))[kind]
+        flipped = bytes([data[position] ^ 1 << extra % 8])
+        damaged[position] = (flipped, b"", bytes([data[position], extra]))[kind]
     return b"".join(damaged)

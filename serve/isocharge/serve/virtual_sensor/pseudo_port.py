@@ -1,4 +1,4 @@
-"""A pseudo-terminal that plays a serial port: one end for whoever writes here, a device path for whoever reads."""
+"""A pseudo-terminal as a serial port: this process writes to one end, a reader opens the device path of the other."""
 
 import array
 import contextlib
@@ -8,21 +8,21 @@ import termios
 import tty
 
 PORT_BUFFER = 3840
-"""Bytes that may wait for the reader. Linux holds 4095; beyond, a write could be cut in the middle of a frame."""
+"""Largest number of bytes that wait for the reader. Linux holds 4095: beyond, a write could be cut within a frame."""
 
 
 class PseudoPort:
     """An open pseudo-terminal in raw mode; `url` is the device path. Close it to make the port vanish."""
 
     def __init__(self) -> None:
-        # Our own hold on the reader's end lets readers come and go without the port hanging up.
+        # The reader's end stays open here, so the port does not hang up when a reader closes it.
         self._writer, self._reader = os.openpty()
         tty.setraw(self._reader)
         os.set_blocking(self._writer, False)
         self.url = os.ttyname(self._reader)
 
     def write_whole(self, data: bytes) -> bool:
-        """Write all of `data` or, where the reader is too far behind, nothing; never wait."""
+        """Write all of `data`, or nothing if the reader is too far behind, without waiting; whether it was written."""
         if self._waiting() + len(data) > PORT_BUFFER:
             return False
         with contextlib.suppress(BlockingIOError):
@@ -30,7 +30,7 @@ class PseudoPort:
         return False
 
     def _waiting(self) -> int:
-        """Bytes that the reader has not taken yet."""
+        """Number of bytes that the reader has not read yet."""
         count = array.array("i", [0])
         fcntl.ioctl(self._reader, termios.FIONREAD, count)
         return count[0]

@@ -1,4 +1,4 @@
-"""What is pressed, when: the scripts that a virtual sensor plays."""
+"""Scripts of a virtual sensor: position and force of the press in each frame."""
 
 import csv
 from collections.abc import Iterable
@@ -11,23 +11,24 @@ from isocharge.arrays import Array, Booleans
 from isocharge.errors import SceneError
 
 REST_S = 1.0
-"""Nothing touches for so long at the start: time to tare."""
+"""Rest at the start of a script, s: time for a tare."""
 
 PRESS_S = (1.0, 3.0)
+"""Shortest and longest press, s."""
 
 PAUSE_S = (0.6, 1.2)
-"""Long enough to tare in, for a reader that comes late."""
+"""Shortest and longest pause between presses, s: long enough for the tare of a reader that comes late."""
 
 RAMP_S = 0.15
-"""In which the force rises from the smallest to that of the press, and falls back."""
+"""Time in which the force rises from the smallest to that of the press, or falls back, s."""
 
 
 @dataclass(frozen=True)
 class Script:
-    """A press, or none, for each frame.
+    """Position and force for each frame.
 
     Attributes:
-        x_mm, y_mm: Position, shape (n,), mm; not a number where nothing touches.
+        x_mm, y_mm: Position, shape (n,), mm; NaN where nothing touches.
         force_N: Force, shape (n,), N; 0 where nothing touches.
         rate_Hz: Frames per second.
     """
@@ -54,9 +55,9 @@ class Script:
 
 
 def read_script(lines: Iterable[str], rate_Hz: float, where: str) -> Script:
-    """Presses from a CSV with the columns seconds, x_mm, y_mm, force_N; between rows all go along straight lines.
+    """A script from a CSV with the columns seconds, x_mm, y_mm, force_N; values between rows are interpolated linearly.
 
-    Nothing touches where the force is 0; a row's position counts where it or its neighbour has a force.
+    Nothing touches where the force is 0; the position of a row without force matters only next to a row with one.
 
     Args:
         lines: Lines of the file.
@@ -64,7 +65,7 @@ def read_script(lines: Iterable[str], rate_Hz: float, where: str) -> Script:
         where: The file, for messages.
 
     Raises:
-        SceneError: If a column is missing, a cell is no number, a force is negative or time does not go on.
+        SceneError: If a column is missing, a cell is no number, a force is negative or the seconds do not grow.
     """
     names = ("seconds", "x_mm", "y_mm", "force_N")
     try:
@@ -87,16 +88,16 @@ def wander(
     radius_mm: float = 8.0,
     force_range_N: tuple[float, float] = (0.05, 2.0),
 ) -> Script:
-    """Presses that wander over the film: a second of rest, then presses of 1 to 3 s with pauses between.
+    """A script of random presses that wander over the film: a second of rest, then presses of 1 to 3 s with pauses.
 
-    Position and the logarithm of the force vary smoothly within a press; a force never leaves its range, because what
-    lies below it is outside what a forward map knows.
+    Position and the logarithm of the force vary smoothly within a press. A force never leaves its range, because
+    forward maps hold in a range of forces only.
 
     Args:
-        seed: Of all random choices.
+        seed: Seed of all random choices.
         seconds: Length of the script, s.
         rate_Hz: Frames per second.
-        radius_mm: Presses stay inside this radius, mm.
+        radius_mm: Radius of the disk that holds all presses, mm.
         force_range_N: Smallest and largest force, N.
 
     Raises:
@@ -114,24 +115,24 @@ def wander(
     while start < seconds:
         end = start + rng.uniform(*PRESS_S)
         inside = (t >= start) & (t < end)
-        position[inside] = radius_mm * _wandering(rng, t[inside] - start)
-        force_N[inside] = low * (high / low) ** _pressing(rng, t[inside] - start, end - start)
+        position[inside] = radius_mm * _random_path(rng, t[inside] - start)
+        force_N[inside] = low * (high / low) ** _force_level(rng, t[inside] - start, end - start)
         start = end + rng.uniform(*PAUSE_S)
     return Script(position.real, position.imag, force_N, rate_Hz)
 
 
-def _wandering(rng: np.random.Generator, t: Array) -> NDArray[np.complex128]:
-    """A smooth path inside the unit disk from a random start, shape (n,), at times t from 0, s."""
+def _random_path(rng: np.random.Generator, t: Array) -> NDArray[np.complex128]:
+    """Points of a smooth random path inside the unit disk at times t from 0 on, s, shape (n,)."""
     start = np.sqrt(rng.uniform()) * np.exp(2j * np.pi * rng.uniform())
     turns_per_s = rng.uniform(-0.5, 0.5, size=(3, 1))
     sway = 0.25 * (np.exp(2j * np.pi * turns_per_s * t) - 1.0)
     path = start + (np.exp(2j * np.pi * rng.uniform(size=(3, 1))) * sway).sum(axis=0)
-    squashed: NDArray[np.complex128] = path / (1.0 + np.abs(path) ** 8) ** (1 / 8)  # hardly moves what is well inside
+    squashed: NDArray[np.complex128] = path / (1.0 + np.abs(path) ** 8) ** (1 / 8)  # points well inside hardly move
     return squashed
 
 
-def _pressing(rng: np.random.Generator, t: Array, duration: float) -> Array:
-    """How hard, from 0 (smallest force) to 1 (largest), shape (n,), at times t from 0 to the duration, s."""
+def _force_level(rng: np.random.Generator, t: Array, duration: float) -> Array:
+    """Level of the force, from 0 (smallest) to 1 (largest), at times t from 0 to the duration, s, shape (n,)."""
     level = rng.uniform() + 0.15 * np.sin(2.0 * np.pi * (rng.uniform(0.3, 1.0) * t + rng.uniform()))
     return np.clip(level, 0.0, 1.0) * _smooth_step(t / RAMP_S) * _smooth_step((duration - t) / RAMP_S)
 

@@ -1,9 +1,9 @@
 """A virtual sensor: a pseudo-terminal that sends frames like a board, from any forward map.
 
-The touch charges of the whole script are computed before it plays; the amplifier, which has a memory, takes them a
-block at a time. The writer keeps absolute deadlines, so the rate does not drift. It never waits for a reader: a frame
-that does not fit into the port's buffer is withheld whole, and counted, and its number is missing in what the reader
-sees. Faults on demand: `isocharge.serve.virtual_sensor.faults`.
+The touch charges of the whole script are computed before it plays; the amplifier, which has a memory, processes them
+block by block. Frames are written at absolute deadlines, so the rate does not drift. The writer never waits for a
+reader: a frame that does not fit into the port's buffer is withheld whole and counted, and the reader sees a gap in the
+frame numbers. Faults on request: `isocharge.serve.virtual_sensor.faults`.
 """
 
 import itertools
@@ -30,23 +30,23 @@ ForwardMap = Callable[[Array, Array, Array], Array]
 """`charge_pC(x_mm, y_mm, force_N)`: arrays of shape (n,) to touch charges of shape (n, electrodes), pC."""
 
 Noise = Callable[[Array, np.random.Generator], Array]
-"""`noise(charge_pC, rng)`: charges of shape (n, electrodes), pC, to what an amplifier makes of them.
+"""`noise(charge_pC, rng)`: charges to the output of an amplifier, both of shape (n, electrodes), pC.
 
 It is called block by block in the order of time, so it may have a memory.
 """
 
 Encode = Callable[[Frame], bytes]
-"""The bytes of a frame, or of several lines that make one."""
+"""A frame to its bytes."""
 
 BLOCK_S = 0.5
-"""The amplifier takes so much at a time, s."""
+"""Length of the blocks that the amplifier processes, s."""
 
 
 class Truth(NamedTuple):
-    """What was pressed in one frame.
+    """The press in one frame.
 
     Attributes:
-        x_mm, y_mm: Position, mm; not a number where nothing touches.
+        x_mm, y_mm: Position, mm; NaN where nothing touches.
         force_N: Force, N; 0 where nothing touches.
         charge_pC: Touch charges without noise and offset, shape (electrodes,), pC.
         sent_s: When the frame was written, on `time.perf_counter`, s.
@@ -62,11 +62,11 @@ class Truth(NamedTuple):
 class VirtualSensor:
     """Plays a script, over and over, from entering the context to leaving it.
 
-    Readers may come and go. The counters start anew with each playing.
+    Readers may come and go. Entering the context sets the counters to 0.
 
     Attributes:
         withheld: Frames that did not fit into the port, because nobody read.
-        lost: Frames that a fault swallowed.
+        lost: Frames that a fault lost.
         corrupted: Frames that a fault damaged.
         unplugged: Times that the port vanished and came back.
 
@@ -88,19 +88,19 @@ class VirtualSensor:
         faults: Faults | None = None,
         link: Path | None = None,
     ) -> None:
-        """Compute what will be played.
+        """Compute the charges of the script.
 
         Args:
             charge_pC: Forward map; called once, for the frames in which something touches.
-            script: What is pressed.
-            noise: Of the amplifier; None for clean charges.
-            offset_pC: Constant charge on each electrode, pC, for the reader to tare away; by default up to 20 pC
-                drawn at random.
-            seed: Of noise, offset and faults.
+            script: The presses.
+            noise: The amplifier; None for clean charges.
+            offset_pC: Constant charge on each electrode, pC, which the reader tares away; by default drawn at random
+                up to 20 pC.
+            seed: Seed of noise, offset and faults.
             encode: The frame format.
-            faults: What goes wrong.
-            link: A symbolic link to the port, kept while it plays; without, one is made if the port is to vanish, for
-                it comes back under another name.
+            faults: By default there are no faults.
+            link: Path of a symbolic link to the port while it plays. Without one, a sensor whose port vanishes makes
+                its own, because the port comes back under another name.
 
         Raises:
             SceneError: If the forward map gives charges of another shape, or not finite.
@@ -110,24 +110,24 @@ class VirtualSensor:
         self._faults, self._link = faults or Faults(), link
         self._clean_pC = _clean_charges(charge_pC, script)
         electrodes = self._clean_pC.shape[1]
-        drawn_pC = self._rng.uniform(-20.0, 20.0, electrodes)
-        self._offset_pC = drawn_pC if offset_pC is None else np.asarray(offset_pC)
+        random_pC = self._rng.uniform(-20.0, 20.0, electrodes)
+        self._offset_pC = random_pC if offset_pC is None else np.asarray(offset_pC)
         self._block = max(1, round(BLOCK_S * script.rate_Hz))
         self._sent_s = np.full(SEQ_MODULUS, np.nan)
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
         self._port: PseudoPort | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
-        self._start()
+        self._reset()
 
-    def _start(self) -> None:
+    def _reset(self) -> None:
         self._first_url = ""
         self._frames = self.withheld = self.lost = self.corrupted = self.unplugged = 0
         self._played_pC: list[tuple[float, ...]] = []
 
     @property
     def url(self) -> str:
-        """Path to read from.
+        """Path for the reader.
 
         Raises:
             PortError: Outside the context.
@@ -147,8 +147,8 @@ class VirtualSensor:
         return self._frames - self.withheld - self.lost
 
     def __enter__(self) -> Self:
-        """Open the port and begin to play."""
-        self._start()
+        """Open the port and start to play."""
+        self._reset()
         if self._link is None and self._faults.unplug_every_s > 0.0:
             self._folder = tempfile.TemporaryDirectory(prefix="isocharge-")
             self._link = Path(self._folder.name) / "film"
@@ -163,7 +163,7 @@ class VirtualSensor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop, and make the port vanish."""
+        """Stop playing and close the port."""
         self._stop.set()
         if self._writer is not None:
             self._writer.join()
@@ -192,10 +192,10 @@ class VirtualSensor:
         self._port = None
 
     def truth(self, seq: int) -> Truth:
-        """What was pressed in the latest frame with this number.
+        """The press in the latest frame with this number.
 
         Raises:
-            SceneError: If there was none yet.
+            SceneError: If no frame had it yet.
         """
         latest = self._frames - 1
         frame = latest - (latest - seq) % SEQ_MODULUS
@@ -216,7 +216,7 @@ class VirtualSensor:
             self._send(frame)
 
     def _measure(self, first: int) -> list[tuple[float, ...]]:
-        """What the amplifier makes of the next block."""
+        """The amplifier's output for the next block, one tuple for each frame."""
         clean_pC = self._clean_pC.take(range(first, first + self._block), axis=0, mode="wrap")
         played_pC = clean_pC if self._noise is None else self._noise(clean_pC, self._rng)
         return [tuple(row) for row in (played_pC + self._offset_pC).tolist()]
@@ -225,9 +225,9 @@ class VirtualSensor:
         t_s = frame / self._script.rate_Hz
         seq, t_us = frame % SEQ_MODULUS, round(t_s * (1e6 + self._faults.clock_ppm)) % T_US_MODULUS
         self._sent_s[seq] = time.perf_counter()
-        self._frames = frame + 1  # before writing: a quick reader asks for the truth at once
+        self._frames = frame + 1  # before writing: a quick reader may ask for the truth at once
         port = self._plugged(t_s)
-        if port is None or self._faults.in_gap(t_s) or self._hit(self._faults.lose_share):
+        if port is None or self._faults.in_gap(t_s) or self._chance(self._faults.lose_share):
             self.lost += 1
             return
         whole = self._encode(Frame(seq, t_us, self._played_pC[frame % self._block]))
@@ -236,11 +236,11 @@ class VirtualSensor:
         if not port.write_whole(data):
             self.withheld += 1
 
-    def _hit(self, share: float) -> bool:
+    def _chance(self, share: float) -> bool:
         return share > 0.0 and self._rng.random() < share
 
     def _plugged(self, t_s: float) -> PseudoPort | None:
-        """The port, if it is there at this time; it vanishes and comes back here."""
+        """The port, or None while it is away; opens and closes it as the faults say."""
         if self._faults.unplugged(t_s):
             self._unplug()
         elif self._port is None:
