@@ -158,8 +158,8 @@ def test_the_time_of_invalid_frames_counts_for_the_next():
     """A leak is undone over all the time since the last valid frame: exp(-0.5 s / 1 s) of the output is left."""
     chain = Chain(tare=None, touch=None, leak=LeakRule(np.ones(3), learn=False))
     state = ChainState.start(3)
-    for values, dt_s in ((np.zeros(3), 0.1), (np.zeros(3), 0.1), (np.full(3, 100.0), 0.1), (np.full(3, np.nan), 0.2)):
-        state, _ = advance(chain, state, values, 0.0, dt_s)
+    for charge_pC, dt_s in ((0.0, 0.1), (0.0, 0.1), (100.0, 0.1), (np.nan, 0.05), (np.inf, 0.15)):
+        state, _ = advance(chain, state, np.full(3, charge_pC), 0.0, dt_s)
     state, reading = advance(chain, state, 100.0 * np.exp(np.full(3, -0.5)), 0.0, 0.3)
     np.testing.assert_allclose(reading.charge_pC, 100.0)
     assert state.invalid_s == 0.0
