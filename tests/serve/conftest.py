@@ -155,10 +155,10 @@ def handler(shelf):
 
 @pytest.fixture(scope="session")
 def stopping():
-    """Servers that were told to stop; all of them must have done so in the end. Nobody waits for each."""
-    told = []
-    yield told
-    for server, thread in told:
+    """Servers that were stopped, with their threads; at the end of the session all threads must have ended."""
+    stopped = []
+    yield stopped
+    for server, thread in stopped:
         thread.join(timeout=30)
         server.close()
         assert not thread.is_alive()
@@ -166,7 +166,7 @@ def stopping():
 
 @pytest.fixture
 def start_http(stopping):
-    """Start servers on loopback, in threads, with ports of their own; they are told to stop when the test ends."""
+    """Start servers on loopback, in threads, each on a free port; they are stopped when the test ends."""
     started = []
 
     def start(handler, *, token=None, tls=None, uds=None):

@@ -14,7 +14,7 @@ def reference_noise(charge_pC, rng):
 
 def follow(film, predictor, n):
     """Records of the first n frames with what was pressed, and the counters."""
-    # Charges are proportional to the force here: below a twentieth of a press's peak the chain would see a release.
+    # Charges are proportional to the force: below a twentieth of a press's peak the chain would see a release.
     script = wander(seed=11, force_range_N=(0.2, 2.0))
     parser, gaps = BinaryParser(), SequenceGaps()
     with VirtualSensor(film.charge_pC, script, noise=reference_noise) as sensor, Port(sensor.url) as port:
@@ -30,7 +30,7 @@ def check_nothing_lost(pairs, counts, gaps, withheld):
     assert [record.seq for record, _ in pairs] == [(first + i) % 65536 for i in range(len(pairs))]
 
 
-def check_felt_as_pressed(pairs):
+def check_records_against_the_truth(pairs):
     tared = [(record, truth) for record, truth in pairs if record.tare_pC is not None]
     assert all(record.contact == (truth.force_N > 0.0) for record, truth in tared)
     errors = [np.hypot(r.x_mm - t.x_mm, r.y_mm - t.y_mm) * t.force_N for r, t in tared if r.contact]
@@ -38,15 +38,15 @@ def check_felt_as_pressed(pairs):
     assert np.median(errors) < 0.05  # mm N: the noise of 1 pC on a lever of 20 mm
 
 
-def test_three_seconds_at_200_Hz(film, predictor):
+def test_live_path_for_three_seconds_at_200_Hz(film, predictor):
     pairs, *counts = follow(film, predictor, 600)
     check_nothing_lost(pairs, *counts)
-    check_felt_as_pressed(pairs)
+    check_records_against_the_truth(pairs)
     assert [record.tare_pC is None for record, _ in pairs] == [True] * 100 + [False] * 500
 
 
 @pytest.mark.slow
-def test_sixty_seconds_at_200_Hz(film, predictor):
+def test_live_path_for_sixty_seconds_at_200_Hz(film, predictor):
     pairs, *counts = follow(film, predictor, 12_000)
     check_nothing_lost(pairs, *counts)
-    check_felt_as_pressed(pairs)
+    check_records_against_the_truth(pairs)

@@ -1,4 +1,4 @@
-"""What a board sends is found out from the bytes alone, however they are cut."""
+"""The format of a board is recognised from its bytes alone."""
 
 import pytest
 
@@ -14,7 +14,7 @@ def frames(n):
 
 @pytest.mark.parametrize("name", sorted(ENCODERS))
 @pytest.mark.parametrize("start", [0, 1, 7, 19])
-def test_each_format_is_recognised_from_anywhere(name, start):
+def test_format_is_recognised_from_anywhere(name, start):
     parser = AutoParser()
     got = parser.feed(b"".join(map(ENCODERS[name], frames(20)))[start:])
     assert len(got) >= 17
@@ -22,7 +22,7 @@ def test_each_format_is_recognised_from_anywhere(name, start):
     assert ("binary" if name == "binary" else "text") in parser.format
 
 
-def test_before_it_knows_all_bytes_count_as_dropped():
+def test_bytes_before_recognition_count_as_dropped():
     parser = AutoParser()
     parser.feed(b"\xf0\x9f" * 500)
     assert (parser.counts.frames, parser.counts.bytes_dropped, parser.chosen) == (0, 1000, None)

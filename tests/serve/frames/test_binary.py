@@ -68,7 +68,7 @@ def test_round_trip(frame):
     assert BinaryParser().feed(encode_frame(frame)) == [frame]
 
 
-def test_longest_frame():
+def test_longest_frame_fits():
     frame = Frame(1, 2, (1.5,) * 255)
     parser = BinaryParser()
     assert len(encode_frame(frame)) <= LONGEST_PIECE + 1
@@ -101,7 +101,7 @@ def payload(body):
         (encode_frame(Frame(1, 2, (3.0,)))[:-2] + b"\x77\0", "crc_errors"),
     ],
 )
-def test_what_is_no_frame_is_counted(data, counter):
+def test_piece_that_is_no_frame_is_counted(data, counter):
     parser = BinaryParser()
     assert parser.feed(data) == []
     assert getattr(parser.counts, counter) == 1

@@ -215,18 +215,18 @@ def loses_no_intact_frame(form, make):
 
 
 @every_format
-def test_no_intact_frame_is_lost(name):
+def test_intact_frames_are_never_lost(name):
     loses_no_intact_frame(FORMATS[name], FORMATS[name].parser)
 
 
 @every_format
-def test_a_parser_that_skips_something_intact_is_caught(name):
+def test_planted_fault_is_caught(name):
     with pytest.raises(AssertionError):
         loses_no_intact_frame(FORMATS[name], FORMATS[name].faulty)
 
 
 @every_format
-def test_an_unfinished_frame_is_forgotten_with_its_connection(name):
+def test_unfinished_frame_is_forgotten_with_its_connection(name):
     """The first half of one frame and the second half of another make no frame."""
     form, frame = FORMATS[name], Frame(1, 2, (100.0,) * channels(name))
     parser = form.parser()
@@ -251,7 +251,7 @@ def frames_of_three(n, seed):
 
 @pytest.mark.parametrize("name", ["binary", "described", "auto binary"])
 @pytest.mark.parametrize("seed", range(4))
-def test_one_percent_of_bytes_damaged(name, seed):
+def test_damage_of_one_percent_of_bytes(name, seed):
     """No wrong frame is taken, and none is lost that is intact between intact neighbours."""
     form = FORMATS[name]
     rng, sent = np.random.default_rng(seed), frames_of_three(2000, seed)
@@ -300,12 +300,12 @@ def check_fuzzed(name, size, seed=0):
 
 
 @pytest.mark.parametrize("name", FUZZED)
-def test_a_little_fuzz(name):
+def test_fuzz_of_some_bytes(name):
     check_fuzzed(name, 200_000)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", FUZZED)
-def test_ten_million_bytes(name):
+def test_fuzz_of_ten_million_bytes(name):
     check_fuzzed(name, 10_000_000, seed=1)

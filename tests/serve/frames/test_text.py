@@ -68,11 +68,11 @@ def feed(*lines, parser=None):
 
 
 @pytest.mark.parametrize("line", ['{"A": %s, "B": 1, "C": 2}', "[%s, 1, 2]", "A:%s,B:1,C:2", "%s,1,2"])
-def test_a_number_of_hundreds_of_digits_is_infinite_in_every_notation(line):
+def test_number_of_hundreds_of_digits_is_infinite_in_every_notation(line):
     assert parse_line((line % ("9" * 400)).encode()).values == (math.inf, 1.0, 2.0)
 
 
-def test_a_layout_is_recognised_from_the_first_good_lines():
+def test_layout_is_recognised_from_the_first_good_lines():
     parser = TextParser()
     assert feed("booting v1.2 ...", "3.3,801.2", "801.0,799.0,803.0", "801.1,799.1,803.1", parser=parser) == []
     frames = feed("801.2,799.2,803.2", "801.3,799.3,803.3", parser=parser)
@@ -81,23 +81,23 @@ def test_a_layout_is_recognised_from_the_first_good_lines():
     assert (parser.counts.frames, parser.counts.malformed, parser.counts.resyncs) == (4, 2, 1)
 
 
-def test_a_header_names_the_columns():
+def test_header_names_the_columns():
     frames = feed("seq,t_us,A,B,C", *(f"{k},{k * 1000},1,2,3" for k in range(4)))
     assert frames[0] == Frame(0, 0, (1.0, 2.0, 3.0), names=("A", "B", "C"))
     assert [(f.seq, f.t_us) for f in frames] == [(0, 0), (1, 1000), (2, 2000), (3, 3000)]
 
 
-def test_a_header_that_comes_again_after_a_reset():
+def test_header_that_comes_again_after_a_reset():
     frames = feed("A,B", "1,2", "3,4", "5,6", "A,B", "7,8")
     assert [frame.values for frame in frames] == [(1, 2), (3, 4), (5, 6), (7, 8)]
 
 
-def test_columns_from_outside():
+def test_columns_are_named_from_outside():
     frames = feed("7,12.5,801", "8,13.5,801", "9,14.5,801", parser=TextParser(("seq", "t_ms", "A")))
     assert frames[1] == Frame(8, 13500, (801.0,), names=("A",))
 
 
-def test_a_cycle_of_lines_joined_in_the_middle():
+def test_cycle_of_lines_joined_in_the_middle():
     """Whoever comes in the middle of A, B, C must not read B, C, A of two readings."""
     lines = [f">{name}:{1000 + k}:{100 * k + j}" for k in range(6) for j, name in enumerate("ABC")]
     frames = feed(*lines[1:])
@@ -106,7 +106,7 @@ def test_a_cycle_of_lines_joined_in_the_middle():
     assert all(frame.values[0] + 2 == frame.values[2] for frame in frames)
 
 
-def test_a_lost_line_of_a_cycle_costs_its_cycle_only():
+def test_lost_line_of_a_cycle_costs_its_cycle_only():
     parser = TextParser()
     lines = [f"{name}:{100 * k + j}" for k in range(6) for j, name in enumerate("ABC")]
     frames = feed(*lines[:12], *lines[13:], parser=parser)  # the fifth A is lost
@@ -114,7 +114,7 @@ def test_a_lost_line_of_a_cycle_costs_its_cycle_only():
     assert parser.counts.malformed == 1
 
 
-def test_a_line_of_another_layout_is_dropped_and_counted():
+def test_line_of_another_layout_is_dropped_and_counted():
     parser = TextParser()
     frames = feed("1,2,3", "1,2,3", "1,2,3", "1,2", "A:1", "1,2,3", parser=parser)
     assert (len(frames), parser.counts.malformed, parser.counts.resyncs) == (4, 2, 1)
@@ -151,7 +151,7 @@ def test_memory_is_bounded():
     assert feed("1,2,3", "1,2,3", "1,2,3", parser=parser)[-1].values == (1.0, 2.0, 3.0)
 
 
-def test_a_number_cut_by_joining_late_is_not_taken():
+def test_number_cut_by_joining_late_is_not_taken():
     parser = TextParser()
     frames = parser.feed(b"01.2,799,803\n801.2,799,803\n801.2,799,803\n801.2,799,803\n")
     assert [frame.values[0] for frame in frames] == [801.2] * 3

@@ -1,4 +1,4 @@
-"""Offset, noise, drift and hum of channels that are made of them."""
+"""Offset, noise, drift and hum of channels against the values that they were computed from."""
 
 import numpy as np
 import pytest

@@ -47,7 +47,7 @@ def device(tmp_path):
     return load
 
 
-def test_a_full_file(device):
+def test_device_file_with_all_sections(device):
     board = device(FULL)
     chain = board.chain(ELECTRODES)
     assert (board.name, board.channels["A"]) == ("bench board 3", "adc1")
@@ -58,7 +58,7 @@ def test_a_full_file(device):
     assert isinstance(board.parser(), TextParser)
 
 
-def test_without_a_file_only_tare_and_touch_are_on():
+def test_device_without_a_file_has_tare_and_touch():
     chain = ANY_BOARD.chain(ELECTRODES)
     assert (chain.gain_pC, chain.limit_pC, chain.hum, chain.leak) == (None, None, None, None)
     assert chain.tare is not None
@@ -67,7 +67,7 @@ def test_without_a_file_only_tare_and_touch_are_on():
 
 
 @pytest.mark.parametrize("stage", ["gain", "saturation", "hum", "tare", "leak", "touch"])
-def test_each_stage_can_be_switched_off(device, stage):
+def test_stage_can_be_switched_off(device, stage):
     chain = device(FULL.replace(f"[{stage}]", f"[{stage}]\non = false")).chain(ELECTRODES)
     attribute = {"gain": "gain_pC", "saturation": "limit_pC"}.get(stage, stage)
     assert getattr(chain, attribute) is None
@@ -75,13 +75,13 @@ def test_each_stage_can_be_switched_off(device, stage):
     assert all(getattr(chain, other) is not None for other in others)
 
 
-def test_one_number_for_all_channels(device):
+def test_setting_may_be_one_number_for_all_channels(device):
     chain = device("[gain]\npC_per_unit = 2.0\n[leak]\ntau_s = 1.0\n").chain(ELECTRODES)
     np.testing.assert_array_equal(chain.gain_pC, [2.0] * 3)
     np.testing.assert_array_equal(chain.leak.tau_s, [1.0] * 3)
 
 
-def test_formats(device):
+def test_format_decides_the_parser(device):
     assert isinstance(device('[frames]\nformat = "binary"').parser(), BinaryParser)
     described = '[frames]\nformat = "described"\nsync = "55"\nlength = 5\nfields = [{name = "A", type = "f32"}]'
     assert isinstance(device(described).parser(), DescribedParser)
@@ -118,17 +118,17 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("text", "said"), WRONG)
-def test_wrong_files(device, text, said):
+def test_device_file_that_is_refused(device, text, said):
     with pytest.raises(DeviceError, match=rf"device\.toml: .*{said}"):
         device(text)
 
 
-def test_a_stage_that_is_switched_off_is_checked_all_the_same(device):
+def test_stage_that_is_switched_off_is_checked_too(device):
     with pytest.raises(DeviceError, match=r"leak\.tau_s: expected a positive number"):
         device("[leak]\non = false\ntau_s = 0\n")
 
 
-def test_the_table_is_kept_as_it_came(device):
+def test_table_stays_as_it_came(device):
     """Recordings hold it; it makes the same device again."""
     board = device(FULL)
     again = device_from_table(board.table, board.where)
@@ -136,7 +136,7 @@ def test_the_table_is_kept_as_it_came(device):
     assert board.table["tare"] == {"frames": 50}
 
 
-def test_another_offset_limit_is_in_the_rule_and_in_the_table(device):
+def test_offset_limit_changes_in_the_rule_and_in_the_table(device):
     board = with_offset_limit(device(FULL), 250.0)
     assert (board.tare.frames, board.tare.offset_limit_pC) == (50, 250.0)
     assert board.table["tare"] == {"frames": 50, "offset_limit_pC": 250.0}
@@ -146,12 +146,12 @@ def test_another_offset_limit_is_in_the_rule_and_in_the_table(device):
         with_offset_limit(board, -1.0)
 
 
-def test_a_file_that_is_not_there(tmp_path):
+def test_device_file_that_does_not_exist(tmp_path):
     with pytest.raises(DeviceError, match=r"none\.toml: cannot be read"):
         load_device(tmp_path / "none.toml")
 
 
-def test_other_electrodes_than_the_model(device):
+def test_setting_for_other_electrodes_is_refused(device):
     board = device("[gain]\npC_per_unit = {A = 1.0, B = 1.0}\n")
     with pytest.raises(
         DeviceError, match=r"one for each of the electrodes \('A', 'B', 'C'\), got \{'A': 1.0, 'B': 1.0\}"
@@ -170,13 +170,13 @@ def test_other_electrodes_than_the_model(device):
         (("x", "y", "z"), {"A": "z", "B": "y", "C": "x"}, [3, 2, 1]),
     ],
 )
-def test_which_channel_is_which_electrode(names, channels, picked):
+def test_channel_of_each_electrode(names, channels, picked):
     picker = ChannelPicker(ELECTRODES, channels, "linear/1")
     assert picker.pick(Frame(0, 0, (1.0, 2.0, 3.0), names=names)).tolist() == picked
 
 
 @pytest.mark.parametrize(("names", "channels"), [(("x", "y"), {}), (("x", "y", "z"), {"A": "u", "B": "y", "C": "x"})])
-def test_an_electrode_without_a_channel(names, channels):
+def test_channel_that_is_missing(names, channels):
     picker = ChannelPicker(ELECTRODES, channels, "linear/1")
     with pytest.raises(ChargeError, match=r"\[channels\] A = "):
         picker.pick(Frame(0, 0, tuple(range(len(names))), names=names))

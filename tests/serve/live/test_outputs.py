@@ -55,7 +55,7 @@ def test_csv_takes_any_name(name):
     assert None not in row
 
 
-def test_an_ordinary_row_has_no_quotes():
+def test_csv_has_no_quotes_in_an_ordinary_row():
     assert csv_line(record(charge_pC={"A": 1.0, "B": 2.0}), ELECTRODES) == (
         "1763600000.123457,,,1.234568,,,,,,,true,1.000000,2.000000,,,,,gap,,linear/1,linear-film"
     )
@@ -83,7 +83,7 @@ def test_datagrams_are_what_plotjuggler_reads():
     assert "/y_mm" not in series
 
 
-def test_nobody_listens():
+def test_datagrams_to_nobody_are_dropped():
     """A refused datagram shows up as an error of the next one: it is dropped, and later ones arrive all the same."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
@@ -102,6 +102,6 @@ def test_nobody_listens():
 @pytest.mark.parametrize(
     "address", ["127.0.0.1", "127.0.0.1:x", "127.0.0.1:70000", "no.such.host.invalid:1", f"{'a' * 70}.com:9"]
 )
-def test_addresses_that_are_none(address):
+def test_datagrams_need_an_address(address):
     with pytest.raises(InputError, match="expected HOST:PORT, as in 127"):
         UdpSink(address)

@@ -1,4 +1,4 @@
-"""The doctor against boards whose illness is known."""
+"""The port check against boards whose faults are known."""
 
 import json
 import threading
@@ -25,7 +25,7 @@ def board(film, **options):
     return VirtualSensor(film.charge_pC, idle(), offset_pC=[5.0, -6.0, 7.0], **options)
 
 
-def test_a_healthy_board(film):
+def test_check_of_a_healthy_board(film):
     device = device_from_table({"leak": {"tau_s": 10.0}}, "test")
     noise = lambda charge_pC, rng: charge_pC + rng.normal(0, 0.3, charge_pC.shape)  # noqa: E731
     with board(film, noise=noise) as sensor:
@@ -36,7 +36,7 @@ def test_a_healthy_board(film):
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]
 
 
-def test_text_in_counts(film):
+def test_check_of_text_in_counts(film):
     device = device_from_table({"gain": {"pC_per_unit": {"A": 2.0, "B": -1.0, "C": 1.0}}}, "test")
     with board(film, encode=partial(encode_text, notation="pairs")) as sensor:
         report = examine(sensor.url, bauds=BAUD, seconds=0.6, device=device)
@@ -44,7 +44,7 @@ def test_text_in_counts(film):
     assert [(channel.name, round(channel.offset_pC)) for channel in report.channels] == [("A", 10), ("B", 6), ("C", 7)]
 
 
-def test_a_stage_that_is_switched_off_is_not_used(film):
+def test_check_uses_no_stage_that_is_switched_off(film):
     """A gain that is off multiplies nothing, and a leak that is off is missing."""
     off = {"gain": {"on": False, "pC_per_unit": 2.0}, "leak": {"on": False, "tau_s": 10.0}}
     with board(film) as sensor:
@@ -53,8 +53,8 @@ def test_a_stage_that_is_switched_off_is_not_used(film):
     assert "time constants ([leak] tau_s" in missing(report)
 
 
-def test_a_channel_without_a_number():
-    """A board prints `nan` where an amplifier is missing; the other channels are told as ever, in valid JSON too."""
+def test_check_of_a_channel_without_a_number():
+    """A board prints `nan` where an amplifier is missing; the others are reported as ever, in valid JSON too."""
     port = PseudoPort()
     stop = threading.Event()
 
@@ -79,7 +79,7 @@ def missing(report):
     return " / ".join(report.missing)
 
 
-def test_what_is_missing(film):
+def test_check_says_what_is_missing(film):
     hum = lambda q, rng: q + 9.0 * np.sin(2 * np.pi * 50 * np.arange(len(q))[:, None] / 200.0 + 0.5)  # noqa: E731, ARG005
     with board(film, noise=hum) as sensor:
         report = examine(sensor.url, bauds=BAUD, seconds=0.9, electrodes=("A", "B", "C", "D"))
@@ -88,7 +88,7 @@ def test_what_is_missing(film):
     assert "time constants ([leak] tau_s" in missing(report)
 
 
-def test_a_board_that_is_dead():
+def test_check_of_a_dead_board():
     silent = PseudoPort()
     report = examine(silent.url, seconds=0.5)
     silent.close()
@@ -96,7 +96,7 @@ def test_a_board_that_is_dead():
     assert "not one byte came" in missing(report)
 
 
-def test_another_baud_rate_looks_like_noise():
+def test_check_at_another_baud_rate():
     port, stop = PseudoPort(), threading.Event()
 
     def babble():
@@ -113,6 +113,6 @@ def test_another_baud_rate_looks_like_noise():
     assert "bytes come, but no frames: another baud rate" in missing(report)
 
 
-def test_no_port_at_all():
+def test_check_without_a_port():
     with pytest.raises(PortError, match="cannot be opened"):
         examine("/dev/ttyNone")

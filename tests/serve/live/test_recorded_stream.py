@@ -1,4 +1,4 @@
-"""A recording gives the same records again, whatever happened while it was made."""
+"""A recording gives the same records again, whatever happened meanwhile."""
 
 import errno
 import json
@@ -91,7 +91,7 @@ def test_replay_of_a_warming_film_is_the_same_bit_for_bit(tmp_path, leak):
     assert played(path, predictor) == lines
 
 
-def test_a_replay_ends_with_the_record_that_was_taken_last(tmp_path, film, predictor):
+def test_replay_ends_with_the_last_record_that_was_taken(tmp_path, film, predictor):
     """Whoever takes ten records finds ten in the recording, although the chunk of the last one holds more frames."""
     path = tmp_path / "touch.rec"
     lines = list(islice(following(path, chunks(film, cuts=200), predictor, DEVICE), 10))
@@ -99,7 +99,7 @@ def test_a_replay_ends_with_the_record_that_was_taken_last(tmp_path, film, predi
 
 
 @pytest.mark.parametrize("cut", [1, 10, 100, 500])
-def test_a_recording_that_was_cut_gives_the_records_before(tmp_path, film, predictor, cut):
+def test_replay_of_a_cut_recording_gives_the_records_before(tmp_path, film, predictor, cut):
     path = tmp_path / "touch.rec"
     lines = record(path, film, predictor)
     path.write_bytes(path.read_bytes()[:-cut])
@@ -108,7 +108,7 @@ def test_a_recording_that_was_cut_gives_the_records_before(tmp_path, film, predi
     assert len(again) > len(lines) - 6
 
 
-def test_a_full_disk_leaves_a_readable_file(tmp_path, film, predictor, monkeypatch, caplog):
+def test_recording_on_a_full_disk_stays_readable(tmp_path, film, predictor, monkeypatch, caplog):
     """The disk takes half a line and then no more; the live path goes on."""
     path, write, room = tmp_path / "touch.rec", os.write, [9000]
 
@@ -132,7 +132,7 @@ def test_a_full_disk_leaves_a_readable_file(tmp_path, film, predictor, monkeypat
 
 
 @pytest.mark.parametrize("real_time", [False, True])
-def test_real_time_waits_as_long_as_it_took(tmp_path, film, predictor, monkeypatch, real_time):
+def test_replay_in_real_time_waits_as_long_as_it_took(tmp_path, film, predictor, monkeypatch, real_time):
     path, now = tmp_path / "touch.rec", [5e9]
     record(path, film, predictor)
     recording, clock = Recording(path), RecordedClock()

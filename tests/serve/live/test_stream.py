@@ -48,7 +48,7 @@ def pressed(film, x_mm=2.0, y_mm=-3.0, force_N=0.5):
     return film.charge_pC(np.array([x_mm]), np.array([y_mm]), np.array([force_N]))[0]
 
 
-def test_a_press(film, play):
+def test_record_of_a_press(film, play):
     raw = pressed(film) + OFFSET
     (record,) = play(Frame(10, 50_000, tuple(raw.tolist())))
     assert (record.x_mm, record.y_mm, record.force_N) == pytest.approx((2.0, -3.0, 0.5), rel=1e-5)
@@ -61,14 +61,14 @@ def test_a_press(film, play):
     assert 0.0 < record.latency_us < 5e6
 
 
-def test_out_of_contact(play):
+def test_record_out_of_contact(play):
     (record,) = play(Frame(10, 50_000, tuple((OFFSET + 1.0).tolist())))
     assert (record.contact, record.force_N, record.flags) == (False, 0.0, ())
     assert {record.x_mm, record.y_mm, record.x_std_mm, record.y_std_mm, record.force_std_N, record.misfit} == {None}
     assert record.charge_pC == {"A": 1.0, "B": 1.0, "C": 1.0}
 
 
-def test_while_it_tares(predictor):
+def test_record_before_the_tare(predictor):
     records = list(stream([chunk(*frames(np.tile(OFFSET, (10, 1))))], predictor, CHAIN))
     assert {(r.flags, r.contact, r.force_N, r.charge_pC, r.tare_pC) for r in records} == {
         (("tare",), False, 0.0, None, None)
@@ -80,15 +80,15 @@ def test_while_it_tares(predictor):
     ("press", "flags"),
     [({"x_mm": 9.0}, ("outside",)), ({"force_N": 2.5}, ("outside",)), ({"force_N": 0.049}, ("outside",)), ({}, ())],
 )
-def test_outside_what_the_model_knows(film, play, press, flags):
+def test_press_outside_the_domain_is_flagged(film, play, press, flags):
     assert play(Frame(10, 0, tuple((pressed(film, **press) + OFFSET).tolist())))[0].flags == flags
 
 
-def test_charges_of_no_single_contact(play):
+def test_charges_of_no_single_contact_are_flagged(play):
     assert play(Frame(10, 0, (900.0, 900.0, -200.0)))[0].flags[-1] == "misfit"
 
 
-def test_flags_of_the_frame(film, play):
+def test_flags_of_the_frame_are_in_the_record(film, play):
     charges = tuple((pressed(film) + OFFSET).tolist())
     gaps = SequenceGaps()
     records = play(
@@ -99,7 +99,7 @@ def test_flags_of_the_frame(film, play):
     assert (gaps.lost, gaps.repeated, gaps.restarts) == (2, 1, 1)
 
 
-def test_a_charge_that_is_no_number(film, play):
+def test_charge_that_is_no_number_invalidates_its_frame(film, play):
     good = tuple((pressed(film) + OFFSET).tolist())
     records = play(Frame(10, 0, good), Frame(11, 0, (good[0], math.nan, good[2])), Frame(12, 0, good))
     assert [r.contact for r in records] == [True, False, True]
@@ -109,7 +109,7 @@ def test_a_charge_that_is_no_number(film, play):
 
 
 @pytest.mark.parametrize("damaged", [1.01e9, -1e38, 1e300, -1.7e308, math.inf])
-def test_a_number_that_no_film_sends_costs_its_frame_only(film, predictor, damaged):
+def test_absurd_number_costs_its_frame_only(film, predictor, damaged):
     """Text has no checksum: a digit more in the exponent must stop neither the stream nor the sums of the chain."""
     device = device_from_table(
         {"gain": {"pC_per_unit": 2.0}, "leak": {"tau_s": 1.0}, "hum": {"frequency_Hz": 50.0}}, ""
@@ -131,24 +131,24 @@ def test_a_number_that_no_film_sends_costs_its_frame_only(film, predictor, damag
 
 
 @pytest.mark.parametrize("data", [b"", b"hello, film\n"])
-def test_a_file_without_a_frame_is_said(predictor, data):
+def test_file_without_a_frame_is_refused(predictor, data):
     """However short it is: silence must not be taken for a film that is left alone."""
     with pytest.raises(PortError, match=f"no intact frame among the first {len(data)} bytes"):
         list(stream([Chunk(data, 1e9, 0)] if data else [], predictor))
 
 
-def test_another_number_of_charges(play):
+def test_other_number_of_charges_is_refused(play):
     with pytest.raises(ChargeError, match=r"model linear/1 expects 3 charges \('A', 'B', 'C'\), frame 10 has 4"):
         play(Frame(10, 0, (1.0, 2.0, 3.0, 4.0)))
 
 
-def test_film_that_is_not_left_alone(predictor):
+def test_film_that_is_touched_cannot_be_tared(predictor):
     rows = np.cumsum(np.ones((60, 3)), axis=0) * 20.0
     with pytest.raises(TareError):
         list(stream([chunk(f) for f in frames(rows)], predictor, Chain(tare=TareRule(frames=10, patience=50))))
 
 
-def test_bytes_that_are_no_frames(predictor):
+def test_bytes_that_are_no_frames_are_refused(predictor):
     noise = [Chunk(bytes(range(128, 256)) * 4, 0.0, 0)] * 50
     with pytest.raises(
         PortError, match=r"no intact frame among the first \d+ bytes .*nothing recognised yet: check baud"
@@ -182,7 +182,7 @@ def four(make_film, tmp_path):
     return film, Predictor("linear", models=tmp_path)
 
 
-def test_warming_is_looked_for_in_contact_only(four):
+def test_warming_is_estimated_in_contact_only(four):
     """This model's misfit says nothing about a common charge: the record says that it is blind."""
     film, predictor = four
     board = device_from_table({"tare": {"frames": 10}, "common_mode": {"every_s": 0.01}}, "test")
@@ -192,7 +192,7 @@ def test_warming_is_looked_for_in_contact_only(four):
     assert ["blind" in record.flags for record in records] == [False] * 16 + [True] * 14 + [False] * 5
 
 
-def test_warming_that_is_told_is_taken_out(four, monkeypatch):
+def test_warming_is_subtracted_where_the_misfit_shows_it(four, monkeypatch):
     """A misfit that knows the press: the common charge goes into the tare, and the record says so."""
     film, predictor = four
     press = film.charge_pC(np.array([2.0]), np.array([1.0]), np.array([0.5]))[0]

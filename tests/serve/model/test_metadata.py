@@ -1,4 +1,4 @@
-"""Metadata survive the way into an ONNX file and back, and wrong ones are refused with the reason."""
+"""Metadata are the same after a round trip through an ONNX file, and wrong ones are refused with the reason."""
 
 import json
 

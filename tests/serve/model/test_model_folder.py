@@ -124,7 +124,7 @@ def spoilt(film):
     }
 
 
-@pytest.mark.parametrize("beside", [False, True], ids=["new folder", "beside version 7"])
+@pytest.mark.parametrize("another_version", [False, True], ids=["new folder", "folder with version 7"])
 @pytest.mark.parametrize(
     ("wrong", "error", "said"),
     [
@@ -137,8 +137,8 @@ def spoilt(film):
         ("no golden", ModelError, "n > 0"),
     ],
 )
-def test_unusable_model_leaves_nothing_behind(film, tmp_path, wrong, error, said, beside):
-    if beside:
+def test_unusable_model_leaves_nothing_behind(film, tmp_path, wrong, error, said, another_version):
+    if another_version:
         film.write(tmp_path, version=7)
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(error, match=said):

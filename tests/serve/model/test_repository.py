@@ -1,4 +1,4 @@
-"""Models are found by name, version and path, in the order that is promised."""
+"""Models are found by name, version and path, in the documented order."""
 
 from pathlib import Path
 
@@ -12,13 +12,13 @@ from isocharge.serve.model.repository import model_names
 @pytest.fixture
 def roots(tmp_path, monkeypatch):
     """Three repositories - given, from the environment, of the working folder - and nothing shipped."""
-    given, variable, here = (tmp_path / name for name in ("given", "variable", "work/models"))
+    given, variable, current = (tmp_path / name for name in ("given", "variable", "work/models"))
     monkeypatch.setenv("ISOCHARGE_MODELS", str(variable))
-    here.mkdir(parents=True)
+    current.mkdir(parents=True)
     given.mkdir()
-    monkeypatch.chdir(here.parent)
+    monkeypatch.chdir(current.parent)
     monkeypatch.setattr("isocharge.serve.model.repository._shipped", lambda: tmp_path / "shipped")
-    return {"given": given, "variable": variable, "here": here, "shipped": tmp_path / "shipped"}
+    return {"given": given, "variable": variable, "current": current, "shipped": tmp_path / "shipped"}
 
 
 def put(root: Path, name: str = "m", version: str = "1") -> Path:
@@ -29,11 +29,11 @@ def put(root: Path, name: str = "m", version: str = "1") -> Path:
 
 
 def test_first_repository_wins(roots):
-    found = []
-    for name in ("shipped", "here", "variable", "given"):
+    first = []
+    for name in ("shipped", "current", "variable", "given"):
         put(roots[name])
-        found.append(find_model("m", roots["given"]).resolve().parents[1])
-    assert found == [roots[name].resolve() for name in ("shipped", "here", "variable", "given")]
+        first.append(find_model("m", roots["given"]).resolve().parents[1])
+    assert first == [roots[name].resolve() for name in ("shipped", "current", "variable", "given")]
 
 
 def test_highest_version_is_by_number(roots):
@@ -48,16 +48,16 @@ def test_version_by_name(roots):
     assert find_model("m/1", roots["given"]).name == "1"
 
 
-def test_every_kind_of_path(roots):
+def test_path_of_every_kind(roots):
     folder = put(roots["given"])
     for path in (folder.parent, folder, folder / "model.onnx"):
         assert find_model(path) == find_model(str(path)) == folder
 
 
 def test_path_beside_us_is_found_when_no_model_has_the_name(roots):
-    folder = put(roots["here"].parent, "mine")
+    folder = put(roots["current"].parent, "mine")
     assert find_model("mine").resolve() == folder
-    shadow = put(roots["here"], "mine")
+    shadow = put(roots["current"], "mine")
     assert find_model("mine").resolve() == shadow
     assert find_model("./mine").resolve() == folder
     assert find_model(Path("mine")).resolve() == folder
@@ -85,8 +85,8 @@ def test_missing_path_says_what_was_expected(roots):
         find_model("nowhere/model.onnx", roots["given"])
 
 
-def test_a_repository_that_was_named_must_be_there(roots):
-    put(roots["here"])
+def test_repository_that_was_named_must_be_there(roots):
+    put(roots["current"])
     with pytest.raises(ModelError, match="nope: expected a folder of models"):
         find_model("m", roots["given"] / "nope")
 

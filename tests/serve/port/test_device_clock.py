@@ -17,7 +17,7 @@ def follow(t_us, arrived_s, modulus=MODULUS):
     return clock, times
 
 
-def test_wraps_are_undone():
+def test_clock_unwraps():
     t_us = np.arange(2**32 - 50_000, 2**32 + 50_000, 1000)
     clock, times = follow(t_us, START_S + t_us * 1e-6)
     assert [time.device_us for time in times] == t_us.tolist()
@@ -26,7 +26,7 @@ def test_wraps_are_undone():
 
 
 @pytest.mark.parametrize("ppm", [0.0, 150.0, -2000.0])
-def test_the_fit_follows_the_rate_and_smooths_the_jitter(ppm):
+def test_fit_follows_the_rate_and_smooths_the_jitter(ppm):
     """Jitter of 1 ms; the fitted time has a fifth of it, and the rate is known to 20 ppm after two minutes."""
     t_s = np.arange(0.0, 120.0, 0.005)
     true_s = START_S + t_s * (1 + ppm * 1e-6)
@@ -39,7 +39,7 @@ def test_the_fit_follows_the_rate_and_smooths_the_jitter(ppm):
     assert (clock.rate - 1.0) * 1e6 == pytest.approx(ppm, abs=20.0)
 
 
-def test_a_device_that_begins_anew():
+def test_clock_of_a_device_that_restarts():
     t_us = np.concatenate([np.arange(1000) * 1000, np.arange(1000) * 1000])
     arrived_s = START_S + np.arange(2000) * 1e-3
     clock, times = follow(t_us, arrived_s)
@@ -48,7 +48,7 @@ def test_a_device_that_begins_anew():
     assert np.abs(np.array([time.host_s for time in times]) - arrived_s).max() < 1e-3
 
 
-def test_several_readings_in_a_chunk_are_spread_by_the_device_clock():
+def test_readings_of_one_chunk_are_spread_by_the_device_clock():
     clock, host_s = DeviceClock(), []
     for chunk in range(200):
         arrived_s = START_S + 0.016 * (chunk + 1)
@@ -58,7 +58,7 @@ def test_several_readings_in_a_chunk_are_spread_by_the_device_clock():
     np.testing.assert_allclose(steps, 1e-3, rtol=1e-3)
 
 
-def test_without_a_device_clock_arrivals_are_the_time():
+def test_time_without_a_device_clock_is_the_arrival():
     clock = DeviceClock()
     times = [clock.read(None, MODULUS, START_S + host) for host in (0.0, 0.01, 0.03)]
     assert [time.device_us for time in times] == [None] * 3

@@ -38,7 +38,7 @@ def test_clock_of_a_replay_stands_where_it_stood(recorded):
 
 
 @pytest.mark.parametrize("cut", [1, 10, 30])
-def test_a_line_that_was_not_finished_is_ignored(recorded, cut):
+def test_unfinished_line_is_ignored(recorded, cut):
     whole = list(Recording(recorded).events())
     recorded.write_bytes(recorded.read_bytes()[:-cut])
     *events, last = Recording(recorded).events()
@@ -46,7 +46,7 @@ def test_a_line_that_was_not_finished_is_ignored(recorded, cut):
     assert last == (CHUNKS[-1], whole[-1].latencies_us[:-1])
 
 
-def test_nothing_is_overwritten(tmp_path):
+def test_recorder_overwrites_nothing(tmp_path):
     path = tmp_path / "touch.rec"
     path.write_text("mine")
     with pytest.raises(OutputExists), Recorder(path, "m/1", "every", {}):
@@ -54,13 +54,13 @@ def test_nothing_is_overwritten(tmp_path):
     assert path.read_text() == "mine"
 
 
-def test_a_folder_that_is_not_there(tmp_path):
+def test_recorder_needs_its_folder(tmp_path):
     with pytest.raises(OutputError, match="cannot be written"), Recorder(tmp_path / "no" / "x", "m/1", "every", {}):
         pass
 
 
 @pytest.mark.parametrize("text", ["", "hello\n", "{}\n", "[1]\n", '{"isocharge_recording": 1}\n'])
-def test_what_is_no_recording(tmp_path, text):
+def test_recording_that_is_none(tmp_path, text):
     path = tmp_path / "touch.rec"
     path.write_text(text)
     with pytest.raises(RecordingError, match="expected a recording of `serve stream --record`"):
@@ -69,14 +69,14 @@ def test_what_is_no_recording(tmp_path, text):
         Recording(tmp_path / "none")
 
 
-def test_another_version(tmp_path):
+def test_recording_of_another_version(tmp_path):
     path = tmp_path / "touch.rec"
     path.write_text('{"isocharge_recording": 9, "model": "m/1", "policy": "every", "device": {}}\n')
     with pytest.raises(RecordingError, match=r"version 9 is not supported \(this version reads 1\)"):
         Recording(path)
 
 
-def test_a_damaged_line_in_the_middle_is_said(recorded):
+def test_damaged_line_in_the_middle_is_named(recorded):
     lines = recorded.read_text().split("\n")
     recorded.write_text("\n".join([*lines[:5], "garbage", *lines[5:]]))
     with pytest.raises(RecordingError, match="line 6: damaged"):
@@ -97,7 +97,7 @@ def test_a_damaged_line_in_the_middle_is_said(recorded):
         '{"chunk": [1.0, 1e999, 0.0, "AAAA"]}',
     ],
 )
-def test_a_line_of_json_that_is_none_of_ours_is_damaged_too(recorded, line):
+def test_line_of_foreign_json_is_damaged(recorded, line):
     first, *lines = recorded.read_text().split("\n")
     recorded.write_text("\n".join([first, line, *lines]))
     with pytest.raises(RecordingError, match="line 2: damaged"):

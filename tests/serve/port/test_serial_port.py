@@ -1,4 +1,4 @@
-"""Ports that are there, are not, fall silent and vanish."""
+"""Ports that exist, do not, fall silent and vanish."""
 
 import itertools
 import socket
@@ -21,7 +21,7 @@ def board():
     port.close()
 
 
-def test_bytes_and_time_of_arrival(board):
+def test_chunk_has_bytes_and_time_of_arrival(board):
     with Port(board.url) as port:
         sent = time.time()
         board.write_whole(b"hello")
@@ -65,7 +65,7 @@ def test_port_that_another_program_holds(board):
         pass
 
 
-def test_silence(board):
+def test_port_that_is_silent(board):
     with Port(board.url, silence_s=0.05) as port, pytest.raises(PortError, match=r"no data for 0.05 s; check that"):
         next(iter(port))
 
@@ -84,7 +84,7 @@ def test_port_that_vanishes():
 
 
 class _Vanishing:
-    """A device that vanishes between the first byte and the question how many more there are."""
+    """A device that vanishes between the first byte and the question how many more have come."""
 
     def read(self, size):
         return b"x" * size
@@ -159,12 +159,12 @@ def test_socket_that_comes_back(server, caplog):
     assert "went away while it was read" in caplog.text
 
 
-def send_one_by_one(server, words):
-    """A client for each word; it is sent away only after it has had the time to read it."""
-    for word in words:
+def send_one_by_one(server, messages):
+    """A client for each message; its connection is closed after it has had the time to read it."""
+    for message in messages:
         with server.accept()[0] as client:
             time.sleep(0.05)
-            client.sendall(word)
+            client.sendall(message)
             time.sleep(0.05)
 
 
@@ -220,7 +220,7 @@ def talk(board, word, heard):
         board.write_whole(word)
 
 
-def test_low_latency_is_asked_for_where_it_exists(monkeypatch):
+def test_low_latency_is_set_where_it_exists(monkeypatch):
     asked = []
     monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda _, on: asked.append(on))
     board = PseudoPort()

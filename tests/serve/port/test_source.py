@@ -9,7 +9,7 @@ from isocharge.errors import InputError
 from isocharge.serve import Port, open_source
 
 
-def test_a_file_is_read_to_its_end(tmp_path):
+def test_file_is_read_to_its_end(tmp_path):
     path = tmp_path / "frames.bin"
     path.write_bytes(bytes(range(256)) * 40)
     with open_source(str(path)) as source:
@@ -18,7 +18,7 @@ def test_a_file_is_read_to_its_end(tmp_path):
     assert {chunk.outage_s for chunk in chunks} == {0.0}
 
 
-def test_a_named_pipe_is_read_as_it_comes(tmp_path):
+def test_named_pipe_is_read_as_it_comes(tmp_path):
     path = tmp_path / "pipe"
     os.mkfifo(path)
     threading.Thread(target=path.write_bytes, args=(b"hello",)).start()
@@ -26,7 +26,7 @@ def test_a_named_pipe_is_read_as_it_comes(tmp_path):
         assert [chunk.data for chunk in source] == [b"hello"]
 
 
-def test_stdin(monkeypatch):
+def test_source_is_stdin(monkeypatch):
     reader, writer = os.pipe()
     os.write(writer, b"hello")
     os.close(writer)
@@ -37,11 +37,11 @@ def test_stdin(monkeypatch):
 
 
 @pytest.mark.parametrize("url", ["/dev/ttyNone", "socket://127.0.0.1:1", "loop://"])
-def test_everything_else_is_a_port(url):
+def test_source_of_any_other_name_is_a_port(url):
     assert isinstance(open_source(url, reconnect=True), Port)
 
 
-def test_a_file_that_may_not_be_read(tmp_path, monkeypatch):
+def test_file_that_may_not_be_read(tmp_path, monkeypatch):
     path = tmp_path / "frames.bin"
     path.write_bytes(b"x")
     monkeypatch.setattr("pathlib.Path.open", lambda *_, **__: (_ for _ in ()).throw(PermissionError(13, "not yours")))

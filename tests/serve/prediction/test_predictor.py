@@ -28,7 +28,7 @@ def bare_answer(session, charge_pC):
     return np.concatenate(session.run(None, {"charge_pC": np.atleast_2d(np.float32(charge_pC))}), axis=1)
 
 
-def test_feels_what_was_pressed(film, predictor):
+def test_predict_gives_back_the_press(film, predictor):
     contact = predictor.predict(film.charge_pC(np.array([3.0]), np.array([-4.0]), np.array([0.5]))[0])
     assert contact[:3] == pytest.approx((3.0, -4.0, 0.5), rel=1e-5)
     assert contact.x_std_mm == pytest.approx(50.0 / 1200.0)
@@ -43,9 +43,9 @@ def test_answers_equal_a_bare_session(bare, predictor, charge_pC):
 
 def test_answers_do_not_change_afterwards(predictor):
     first = predictor.predict([100.0, 200.0, 300.0])
-    kept = tuple(first)
+    before = tuple(first)
     predictor.predict([900.0, 800.0, 700.0])
-    assert tuple(first) == kept
+    assert tuple(first) == before
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_answers_do_not_change_afterwards(predictor):
         lambda q: np.float64(q + q)[::2],
     ],
 )
-def test_any_kind_of_numbers(predictor, kind):
+def test_predict_takes_any_kind_of_numbers(predictor, kind):
     assert predictor.predict(kind([100, 100, 100])) == predictor.predict([100.0, 100.0, 100.0])
 
 
@@ -98,7 +98,7 @@ def test_batches_of_any_size(predictor, n):
         ((q for q in (1.0, 2.0, math.nan)), "as numbers"),
     ],
 )
-def test_no_charges(predictor, charge_pC, said):
+def test_predict_refuses_what_is_no_charges(predictor, charge_pC, said):
     with pytest.raises(ChargeError, match=said):
         predictor.predict(charge_pC)
 
@@ -112,13 +112,13 @@ def test_no_charges(predictor, charge_pC, said):
         ([[1.0, 2.0, 3.0], [1.0, math.nan, math.inf]], r"in row 1 .* for electrode 'B' \(nan\), 'C' \(inf\)"),
     ],
 )
-def test_no_batch(predictor, charge_pC, said):
+def test_predict_batch_refuses_what_is_no_batch(predictor, charge_pC, said):
     with pytest.raises(ChargeError, match=said):
         predictor.predict_batch(charge_pC)
 
 
 @pytest.mark.parametrize("gap", [1, 2], ids=["together", "with gaps"])
-def test_from_an_array_into_an_array(film, predictor, bare, gap):
+def test_predict_into_fills_an_array(film, predictor, bare, gap):
     charges, out = np.zeros(3 * gap, np.float32)[::gap], np.full(7 * gap, -1.0, np.float32)[::gap]
     for row in film.golden_pC():
         charges[:] = row
@@ -140,13 +140,13 @@ def test_from_an_array_into_an_array(film, predictor, bare, gap):
         (np.ones(3, np.float32), np.broadcast_to(np.float32(0.0), 7), "read-only"),
     ],
 )
-def test_arrays_that_do_not_fit(predictor, charge_pC, out, said):
+def test_predict_into_refuses_arrays_that_do_not_fit(predictor, charge_pC, out, said):
     with pytest.raises(ChargeError, match=said):
         predictor.predict_into(charge_pC, out)
     assert not np.any(out)
 
 
-def test_into_an_array_allocates_no_array(predictor):
+def test_predict_into_allocates_no_array(predictor):
     charges, out = np.full(3, 100.0, np.float32), np.zeros(7, np.float32)
     predictor.predict_into(charges, out)
     tracemalloc.start()
@@ -156,10 +156,10 @@ def test_into_an_array_allocates_no_array(predictor):
     assert grown < 1000
 
 
-def test_what_threads_may_share(film, models, predictor):
+def test_predictor_in_threads(film, models, predictor):
     """One predictor for each thread, and one for all of them for batches, as the README says."""
     charges = np.tile(film.golden_pC(), (50, 1))
-    wanted = np.column_stack(predictor.predict_batch(charges))
+    expected = np.column_stack(predictor.predict_batch(charges))
 
     def alone(_):
         mine, rows = Predictor("linear", models=models), np.empty((len(charges), 7), np.float32)
@@ -170,17 +170,17 @@ def test_what_threads_may_share(film, models, predictor):
     with ThreadPoolExecutor(4) as threads:
         together = list(threads.map(lambda _: np.column_stack(predictor.predict_batch(charges)), range(20)))
         for got in [*together, *threads.map(alone, range(4))]:
-            np.testing.assert_allclose(got, wanted, rtol=1e-6, atol=1e-6)
+            np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
 
 
-def test_goes_on_after_an_error(predictor):
+def test_predictor_goes_on_after_an_error(predictor):
     before = predictor.predict([100.0, 200.0, 300.0])
     with pytest.raises(ChargeError):
         predictor.predict([1.0, math.nan, 3.0])
     assert predictor.predict([100.0, 200.0, 300.0]) == before
 
 
-def test_memory_that_is_not_shared_is_noticed(models, monkeypatch):
+def test_bound_memory_that_is_not_shared_is_noticed(models, monkeypatch):
     monkeypatch.setattr(BoundPress, "__init__", _unshared)
     with pytest.raises(ModelError, match=r"through bound memory and .* without"):
         Predictor("linear", models=models)

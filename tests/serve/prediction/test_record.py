@@ -32,11 +32,11 @@ def strictly(text):
     return json.loads(text, parse_constant=refuse)
 
 
-def test_fields_and_order():
+def test_record_has_the_fields_in_their_order():
     assert list(strictly(record().to_json())) == CONTRACT
 
 
-def test_one_line_of_plain_values():
+def test_record_is_one_line_of_plain_values():
     text = record().to_json()
     assert "\n" not in text
     got = strictly(text)
@@ -47,6 +47,6 @@ def test_one_line_of_plain_values():
     assert got["timestamp"] == 1763600000.123457
 
 
-def test_nan_never_leaves():
+def test_record_never_holds_nan():
     with pytest.raises(ValueError, match="not JSON compliant"):
         record(misfit=float("nan")).to_json()

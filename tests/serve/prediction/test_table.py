@@ -26,11 +26,11 @@ def read(text):
         '"A","B","C"\n"1",2,3\n4,5,6.5\n',
     ],
 )
-def test_every_dress_gives_the_same_charges(text):
+def test_charges_are_the_same_from_every_kind_of_csv(text):
     np.testing.assert_array_equal(read(text), [[1, 2, 3], [4, 5, 6.5]])
 
 
-def test_header_alone_is_no_presses():
+def test_charges_of_a_header_alone():
     assert read("A,B,C\n").shape == (0, 3)
 
 
@@ -52,12 +52,12 @@ def test_header_alone_is_no_presses():
         ("A,B,C\n1,2,3,4\n", "line 2: expected 3 cells as in the header, got 4"),
     ],
 )
-def test_what_is_no_table_of_charges(text, said):
+def test_charges_that_are_refused(text, said):
     with pytest.raises(ChargeError, match=said):
         read(text)
 
 
-def test_bytes_that_are_no_text():
+def test_charges_that_are_no_text():
     lines = io.TextIOWrapper(io.BytesIO(b"A,B,C\n1,2,\xff\xfe\n"), encoding="utf-8")
     with pytest.raises(ChargeError, match="not CSV text in UTF-8"):
         read_charges(lines, NAMES, "presses.csv")

@@ -9,7 +9,7 @@ from isocharge.serve.prediction.validity import MISFIT_LIMIT, inside_polygon
 GOOD = Contact(1.0, -2.0, 0.5, 0.1, 0.1, 0.01, 0.3)
 
 
-def test_inside_of_a_disk():
+def test_inside_polygon_of_a_disk():
     angle, rng = 2 * np.pi * np.arange(720) / 720, np.random.default_rng(1)
     x, y = rng.uniform(-2, 2, (2, 5000))
     r = np.hypot(x, y)
@@ -19,7 +19,7 @@ def test_inside_of_a_disk():
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_inside_of_a_notched_square(closed):
+def test_inside_polygon_of_a_notched_square(closed):
     corners = np.array([[0, 0], [4, 0], [4, 4], [2, 1], [0, 4]] + [[0, 0]] * closed, dtype=float)
     inside = inside_polygon(np.array([2.0, 2.0, 0.5, 3.5, -1.0]), np.array([0.5, 2.0, 2.0, 2.0, 0.0]), corners)
     assert inside.tolist() == [True, False, True, True, False]
@@ -36,7 +36,7 @@ def test_inside_of_a_notched_square(closed):
         ({"misfit": 99.0, "y_mm": -9.0}, ("outside", "misfit")),
     ],
 )
-def test_flags(film, changes, flags):
+def test_flags_of_a_contact(film, changes, flags):
     assert Domain.of(film.metadata()).flags(GOOD._replace(**changes)) == flags
 
 
@@ -47,7 +47,7 @@ def test_batch_flags_equal_one_by_one(film):
     assert domain.batch_flags(Contacts(*columns)) == one_by_one
 
 
-def test_one_contact_is_judged_as_in_a_batch():
+def test_flags_of_one_contact_equal_those_in_a_batch():
     """One contact takes a short cut where it is well inside; it must not show."""
     rng = np.random.default_rng(0)
     square = Domain(np.array([[-4.0, -3.0], [6.0, -3.0], [6.0, 5.0], [-4.0, 5.0]]), (0.05, 2.0))

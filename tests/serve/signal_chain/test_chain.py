@@ -70,7 +70,7 @@ def test_tare_gives_up_with_the_reason():
         run(rest(300, sigma=50.0), Chain(tare=TareRule(patience=250)))
 
 
-def test_a_new_tare_is_waited_for_for_ever():
+def test_second_tare_never_gives_up():
     """In the middle of a live run, a finger that rests on the film is no reason to stop."""
     chain, state = Chain(tare=TareRule(frames=20, patience=50)), ChainState.start(3)
     for k, raw in enumerate(rest(60)):
@@ -101,7 +101,7 @@ def test_hysteresis():
 
 
 @pytest.mark.parametrize("before", [[], [850.0], [850.0] * 5])
-def test_a_spike_is_no_peak(before):
+def test_spike_is_no_peak(before):
     """One absurd frame, at the first touch too, neither releases the press nor hides it."""
     assert touches([*before, 3e38, *[850.0] * 4])[-4:] == [True] * 4
 
@@ -110,16 +110,16 @@ def test_release_at_a_share_of_the_peak():
     assert touches([1000.0, 4000.0, 4000.0, 201.0, 199.0]) == [True, True, True, True, False]
 
 
-def test_a_drifted_base_releases_and_is_no_new_touch():
+def test_drifted_base_releases_and_is_no_new_touch():
     """An absolute release threshold under the drift of 60 pC never would release."""
     assert touches([2060.0, 2060.0, 60.0, 62.0, 58.0, 60.0, 75.0, 100.0]) == [True] * 2 + [False] * 5 + [True]
 
 
-def test_a_press_that_softens_to_the_smallest_force_is_held():
+def test_press_that_softens_to_the_smallest_force_is_held():
     assert all(touches([4040.0, 340.0]))
 
 
-def test_smallest_press_is_felt_at_once():
+def test_smallest_press_is_detected_at_once():
     frames = rest(400)
     frames[200:300] += 340.0 / 3.0
     contact = [r.contact for r in run(frames)]
@@ -137,13 +137,13 @@ def test_negative_charges_are_no_touch_and_are_flagged():
     assert [r.contact for r in inverted] == [False] * 150 + [True] * 50
 
 
-def test_no_false_touch_in_two_and_a_half_minutes_of_noise():
+def test_noise_of_two_and_a_half_minutes_gives_no_touch():
     assert not any(r.contact for r in run(rest(30_000, seed=3)))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.01e9, 1.7e308])
 @pytest.mark.parametrize("gain", [None, 0.5, 2.0])
-def test_an_invalid_frame_passes_no_stage(value, gain):
+def test_invalid_frame_passes_no_stage(value, gain):
     """The state after it is that before, but for the time that it took."""
     chain, state = Chain(gain_pC=None if gain is None else np.full(3, gain)), ChainState.start(3)
     for k, raw in enumerate(rest(150)):
@@ -154,7 +154,7 @@ def test_an_invalid_frame_passes_no_stage(value, gain):
     assert (reading.charge_pC, reading.tare, reading.contact, reading.flags) == (None, None, False, ("gap", "invalid"))
 
 
-def test_the_time_of_invalid_frames_counts_for_the_next():
+def test_time_of_invalid_frames_counts_for_the_next():
     """A leak is undone over all the time since the last valid frame: exp(-0.5 s / 1 s) of the output is left."""
     chain = Chain(tare=None, touch=None, leak=LeakRule(np.ones(3), learn=False))
     state = ChainState.start(3)
@@ -177,7 +177,7 @@ def test_advance_leaves_its_input_alone():
     assert (after.frames, len(after.waiting_pC)) == (1, 1)
 
 
-def test_a_base_that_relaxes_to_zero_is_no_touch():
+def test_base_that_relaxes_to_zero_is_no_touch():
     """A long press may leave the charge below zero; as it relaxes, so does the base that a touch is measured from."""
     totals, decay = -100.0 * np.exp(-np.arange(1000) / 200.0), float(np.exp(-1.0 / 200.0))
 

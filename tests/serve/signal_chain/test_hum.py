@@ -29,7 +29,7 @@ def test_hum_is_gone_after_two_seconds(rate_Hz, frequency_Hz):
     assert np.abs(left).max() < (0.1 if frequency_Hz == 50.0 else 1.0)
 
 
-def test_a_touch_passes_without_delay_and_without_ringing():
+def test_touch_passes_hum_removal_without_delay_and_ringing():
     rate_Hz, at = 1000.0, 3000
     step = np.where(np.arange(6000)[:, None] < at, 0.0, 850.0) * np.ones(3)
     out = clean(step + mains(6000, rate_Hz, 1.0), rate_Hz)
@@ -38,11 +38,11 @@ def test_a_touch_passes_without_delay_and_without_ringing():
     assert fixed_notch_rings_with > 10.0
 
 
-def test_noise_is_hardly_raised():
+def test_noise_is_hardly_raised_by_hum_removal():
     noise = np.random.default_rng(0).normal(0.0, 0.3, (20_000, 3))
     assert clean(noise, 1000.0)[2000:].std() < 1.05 * 0.3
 
 
-def test_where_the_hum_does_not_turn_between_frames_nothing_is_done():
+def test_hum_that_does_not_turn_between_frames_is_left():
     raw = np.random.default_rng(0).normal(0.0, 1.0, (100, 3))
     np.testing.assert_array_equal(clean(raw, 50.0), raw)

@@ -39,7 +39,7 @@ def undo(output_pC, rule=None, every=1):
     return np.array(charges), np.array(contact)
 
 
-def test_a_held_press_stays():
+def test_held_press_stays():
     charge = pressed((3.0, 8.0, 400.0))
     output = integrator(charge)
     assert output[2150] < 20.0  # what the amplifier still shows at the end of the press
@@ -51,7 +51,7 @@ def test_a_held_press_stays():
     np.testing.assert_allclose(got[2900:], 0.0, atol=0.05)
 
 
-def test_what_leaks_in_is_learned_out_of_contact():
+def test_inflow_is_learned_out_of_contact():
     """5 pC/s from the tare on; unlearned, they add 50 pC to each electrode in a press of 10 s."""
     charge = pressed((8.0, 10.0, 300.0), seconds=22.0)
     since_s = np.maximum(0.0, np.arange(charge.size) / RATE_HZ - 0.5)
@@ -76,7 +76,7 @@ def test_lost_frames_cost_little():
 
 
 @pytest.mark.parametrize("error", [0.005, 0.05])
-def test_an_error_of_tau_costs_as_much_as_theory_says(error):
+def test_error_of_tau_costs_as_much_as_theory_says(error):
     """q' = q (1 + (tau / tau' - 1)(1 - exp(-t / tau))) in the limit of small steps, for a step held for t."""
     charge = pressed((3.0, 8.0, 400.0))
     got, _ = undo(integrator(charge), LeakRule(np.full(3, TAU_S * (1 + error))))
@@ -84,7 +84,7 @@ def test_an_error_of_tau_costs_as_much_as_theory_says(error):
     assert got[2000, 0] == pytest.approx(expected, abs=1.0)
 
 
-def test_a_slow_common_warming_is_no_touch():
+def test_slow_common_warming_is_no_touch():
     output = integrator(3.0 * np.arange(4000) / RATE_HZ)  # 3 pC/s on each electrode
     got, contact = undo(output)
     assert not contact.any()
@@ -98,14 +98,14 @@ def leak_after(surplus_pC, noise_pC=1.0, **state):
     return undo_leak(rule, leak, np.full(3, surplus_pC), np.full(3, noise_pC), 0.005, contact=False)
 
 
-def test_a_spike_counts_up_to_a_limit():
+def test_spike_is_clipped_in_learning():
     """Four standard deviations of an innovation, sqrt(2) pC each, over 3 s of settling."""
     assert leak_after(1.0).inflow_pC_per_s == pytest.approx(np.full(3, 1.0 / 3.0))
     assert leak_after(1000.0).inflow_pC_per_s == pytest.approx(np.full(3, 4.0 * np.sqrt(2.0) / 3.0))
     assert leak_after(-1000.0, noise_pC=0.0).inflow_pC_per_s == pytest.approx(np.full(3, -0.1 / 3.0))
 
 
-def test_learning_holds_off_after_a_release():
+def test_learning_pauses_after_a_release():
     """A finger that leaves takes the last twentieth of its charge after the release."""
     rule = LeakRule(np.full(3, TAU_S))
     leak = Leak.start(np.zeros(3))._replace(learned_s=10.0)

@@ -36,7 +36,7 @@ def warmed(film, ramp_pC, seed=0):
     return np.array(estimates), state
 
 
-def test_a_step_of_half_a_kelvin_is_followed():
+def test_warming_of_half_a_kelvin_is_followed():
     ramp = np.concatenate([np.linspace(0, 135, 100), np.full(100, 135.0)])
     estimates, state = warmed(UNIAXIAL, ramp)
     assert np.abs(estimates - ramp).max() < 15.0
@@ -44,18 +44,18 @@ def test_a_step_of_half_a_kelvin_is_followed():
     assert not state.blind
 
 
-def test_where_it_cannot_be_told_nothing_is_taken():
+def test_warming_that_is_inseparable_from_force_is_not_subtracted():
     estimates, state = warmed(BIAXIAL, np.linspace(0, 135, 100))
     assert not estimates.any()
     assert state.blind
 
 
-def test_a_quiet_film_stays_quiet():
+def test_warming_of_a_quiet_film_stays_small():
     estimates, _ = warmed(UNIAXIAL, np.zeros(400))
     assert np.abs(estimates).max() < 5.0
 
 
-def test_the_model_is_asked_twenty_times_a_second():
+def test_misfit_is_evaluated_twenty_times_a_second():
     asked, state = [], NO_DRIFT
     for _ in range(1000):
         state = track_thermal_drift(ThermalRule(), state, np.ones(4), lambda q: asked.append(q) or np.ones(5), 0.001)
@@ -79,7 +79,7 @@ def step(state, common_pC, *, chain=None, limited=False):
     return advance(chain, state, values, 0.0, 0.005, misfit=misfit_of(UNIAXIAL), limited=limited)
 
 
-def test_the_reading_is_corrected_in_the_frame_of_the_estimate():
+def test_reading_is_corrected_in_the_frame_of_the_estimate():
     """Without a leak the tare takes it, so raw charge, tare and touch charge of one frame fit together."""
     after, reading = step(in_contact(), 15.0)
     assert after.drift.charge_pC == pytest.approx(15.0, abs=1.0)
@@ -90,7 +90,7 @@ def test_the_reading_is_corrected_in_the_frame_of_the_estimate():
     assert step(after, 15.0)[1].charge_pC == pytest.approx(reading.charge_pC)  # nor is it taken twice
 
 
-def test_with_a_leak_the_leak_takes_the_correction():
+def test_correction_goes_into_the_leak_if_there_is_one():
     output_pC = PRESS + 15.0
     state = in_contact(leak=Leak.start(output_pC)._replace(charge_pC=output_pC))
     after, reading = step(state, 15.0, chain=Chain(leak=LeakRule(np.full(4, 1e9)), thermal=ThermalRule()))
@@ -100,14 +100,14 @@ def test_with_a_leak_the_leak_takes_the_correction():
     assert after.drift.charge_pC == pytest.approx(15.0, abs=1.0)
 
 
-def test_a_clipped_charge_says_nothing_about_warming():
+def test_clipped_charge_changes_no_warming():
     after, reading = step(in_contact(), 15.0, limited=True)
     assert after.drift == in_contact().drift
     assert reading.flags == ("saturated",)
     np.testing.assert_array_equal(after.tare.charge_pC, TARE.charge_pC)
 
 
-def test_every_touch_begins_without_warming_and_the_correction_stays():
+def test_touch_begins_without_warming_and_the_correction_stays():
     after, _ = step(in_contact(), 15.0)
     released, reading = advance(
         Chain(thermal=ThermalRule()), after, after.tare.charge_pC, 0.0, 0.005, misfit=misfit_of(UNIAXIAL)
@@ -116,6 +116,6 @@ def test_every_touch_begins_without_warming_and_the_correction_stays():
     np.testing.assert_array_equal(reading.charge_pC, np.zeros(4))
 
 
-def test_the_stage_needs_a_model():
+def test_stage_needs_a_misfit():
     with pytest.raises(ValueError, match="needs the misfit of a model, got None"):
         advance(Chain(thermal=ThermalRule()), in_contact(), PRESS, 0.0, 0.005)

@@ -1,4 +1,4 @@
-"""What a virtual sensor is told to press stays where it is allowed, and is smooth."""
+"""Scripts stay in their area and their range of forces, and are smooth."""
 
 import numpy as np
 import pytest
@@ -18,12 +18,12 @@ def runs(touching):
     return edges.reshape(-1, 2)
 
 
-def test_begins_with_a_second_of_rest(script):
+def test_wander_begins_with_a_second_of_rest(script):
     assert not script.touching[:200].any()
     assert script.touching[200:210].any()
 
 
-def test_stays_inside_radius_and_forces(script):
+def test_wander_stays_inside_radius_and_forces(script):
     on = script.touching
     assert np.hypot(script.x_mm[on], script.y_mm[on]).max() < 8.0
     assert script.force_N[on].min() == pytest.approx(0.05)
@@ -32,7 +32,7 @@ def test_stays_inside_radius_and_forces(script):
     assert np.isnan(script.y_mm[~on]).all()
 
 
-def test_presses_and_pauses_last_as_promised(script):
+def test_wander_has_presses_and_pauses_of_the_documented_lengths(script):
     presses = runs(script.touching)
     assert len(presses) > 30
     lengths = np.diff(presses[:-1], axis=1) / 200.0
@@ -41,14 +41,14 @@ def test_presses_and_pauses_last_as_promised(script):
     assert (pauses.min(), pauses.max()) == (pytest.approx(0.6, abs=0.1), pytest.approx(1.2, abs=0.1))
 
 
-def test_moves_smoothly(script):
+def test_wander_moves_smoothly(script):
     for start, end in runs(script.touching):
         steps = np.hypot(np.diff(script.x_mm[start:end]), np.diff(script.y_mm[start:end]))
         assert steps.max() * 200.0 < 40.0  # mm/s
         assert np.abs(np.diff(np.log(script.force_N[start:end]))).max() < 0.25
 
 
-def test_covers_the_area_and_the_forces(script):
+def test_wander_covers_the_area_and_the_forces(script):
     on = script.touching
     assert np.hypot(script.x_mm[on], script.y_mm[on]).min() < 2.0
     assert (np.abs(script.x_mm[on]).max(), np.abs(script.y_mm[on]).max()) > (6.0, 6.0)
@@ -56,7 +56,7 @@ def test_covers_the_area_and_the_forces(script):
     assert low < 0.2 < middle < 0.7 < high
 
 
-def test_seed_decides():
+def test_wander_depends_on_the_seed_alone():
     one, same, other = (wander(seed=seed, seconds=5.0).force_N for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
     assert not np.array_equal(one, other)
@@ -72,7 +72,7 @@ def test_seed_decides():
         {"seconds": 0.0},
     ],
 )
-def test_impossible_scripts(wrong):
+def test_wander_refuses_impossible_scripts(wrong):
     with pytest.raises(SceneError, match="wander: expected 0 < smallest"):
         wander(seed=0, **wrong)
 
@@ -84,7 +84,7 @@ def test_script_arrays_agree():
         Script(np.zeros(2), np.zeros(2), np.zeros(2), 0.0)
 
 
-def test_a_script_from_a_file():
+def test_script_from_a_file():
     lines = ["seconds,x_mm,y_mm,force_N", "0,1,2,0", "1,1,2,0", "1.1,1,2,0.5", "2.1,3,2,0.5", "2.2,3,2,0"]
     script = read_script(lines, 100.0, "presses.csv")
     assert (len(script), script.rate_Hz) == (220, 100.0)

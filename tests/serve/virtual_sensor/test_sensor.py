@@ -46,7 +46,7 @@ def test_frames_carry_script_noise_and_offset(film):
         assert frame.t_us == frame.seq * 2000
 
 
-def test_keeps_its_rate_without_drift(film):
+def test_rate_does_not_drift(film):
     with VirtualSensor(film.charge_pC, steady(rate_Hz=1000.0)) as sensor:
         begin = time.perf_counter()
         frames, _ = read(sensor.url, 1000)
@@ -57,13 +57,13 @@ def test_keeps_its_rate_without_drift(film):
     assert begin - 0.1 < sent[0] < sent[-1] < end
 
 
-def test_default_offset_is_there_and_small(film):
+def test_default_offset_is_small_but_not_zero(film):
     with VirtualSensor(film.charge_pC, wander(seed=1, seconds=0.5)) as sensor:
         (frame, *_), _ = read(sensor.url, 1)
     assert 0.0 < np.abs(frame.values).max() <= 20.0
 
 
-def test_truth_says_what_was_pressed(film):
+def test_truth_is_the_press(film):
     script = wander(seed=3, seconds=2.0, rate_Hz=1000.0)
     with VirtualSensor(film.charge_pC, script) as sensor:
         frames, _ = read(sensor.url, 1200)
@@ -89,7 +89,7 @@ def test_truth_of_a_frame_to_come(film):
         sensor.truth(60_000)
 
 
-def test_nobody_reads_then_somebody_does(film):
+def test_frames_are_withheld_until_somebody_reads(film):
     """What does not fit is withheld whole: a late reader sees a gap at most, and no damaged frame."""
     with VirtualSensor(film.charge_pC, steady(rate_Hz=2000.0)) as sensor:
         time.sleep(0.3)
@@ -103,7 +103,7 @@ def test_nobody_reads_then_somebody_does(film):
         assert sensor.sent + sensor.withheld > 600
 
 
-def test_plays_again_after_leaving(film):
+def test_sensor_plays_again_after_leaving(film):
     sensor = VirtualSensor(film.charge_pC, steady())
     for _ in range(2):
         with sensor:
@@ -113,13 +113,13 @@ def test_plays_again_after_leaving(film):
 
 
 @pytest.mark.parametrize("charges", [np.zeros(3), np.zeros((2, 3)), np.full((10, 3), np.nan)])
-def test_forward_map_that_is_none(charges):
+def test_forward_map_that_is_refused(charges):
     with pytest.raises(SceneError, match=r"forward map: expected finite charges of shape \(10, electrodes\)"):
         VirtualSensor(lambda *_: charges, steady())
 
 
 @pytest.mark.parametrize("notation", ["csv", "pairs", "teleplot", "json"])
-def test_sends_text(film, notation):
+def test_sensor_sends_text(film, notation):
     encode = partial(encode_text, notation=notation)
     with VirtualSensor(film.charge_pC, steady(), encode=encode, offset_pC=[1.0, 2.0, 3.0]) as sensor:
         frames, parser = read(sensor.url, 20, AutoParser())
@@ -171,7 +171,7 @@ def test_clock_drift(film):
     assert frames[-1].t_us == round(frames[-1].seq * 1000.5)
 
 
-def test_unplugging_comes_back_under_the_same_name(film):
+def test_unplugged_port_comes_back_under_the_same_name(film):
     faults = Faults(unplug_every_s=0.8, unplug_s=0.3)
     with VirtualSensor(film.charge_pC, steady(rate_Hz=500.0), faults=faults) as sensor:
         outages_s = []
@@ -183,7 +183,7 @@ def test_unplugging_comes_back_under_the_same_name(film):
 
 
 @pytest.mark.parametrize("wrong", [{"lose_share": 1.1}, {"corrupt_share": -0.1}, {"gap_every_s": -1.0}])
-def test_impossible_faults(wrong):
+def test_faults_that_are_impossible(wrong):
     with pytest.raises(SceneError, match="expected shares from 0 to 1 and times from 0"):
         Faults(**wrong)
 
