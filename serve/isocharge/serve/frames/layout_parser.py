@@ -20,10 +20,10 @@ class DescribedParser:
         self.layout = layout
         self.format = f"described frames of {layout.length} bytes: {', '.join(field.name for field in layout.fields)}"
         self._names = tuple(field.name for field in layout.channels)
-        places = {field.name: at for at, field in enumerate(layout.fields)}
-        self._channels = [(places[field.name], field.scale) for field in layout.channels]
-        self._seq, self._flags = places.get(SEQ), places.get(FLAGS)
-        self._time = next((places[name] for name in TIMES_US if name in places), None)
+        positions = {field.name: position for position, field in enumerate(layout.fields)}
+        self._channels = [(positions[field.name], field.scale) for field in layout.channels]
+        self._seq, self._flags = positions.get(SEQ), positions.get(FLAGS)
+        self._time = next((positions[name] for name in TIMES_US if name in positions), None)
         self._us = self._unit()
         self._tail = b""
 
@@ -50,9 +50,9 @@ class DescribedParser:
             frame = self._decode(data[start : start + length])
             at = start + (1 if frame is None else length)
             frames += [] if frame is None else [frame]
-        keep = start if start >= 0 else max(at, len(data) - len(self.layout.sync) + 1)
-        self._skip(keep - at)
-        self._tail = data[keep:]
+        unfinished = start if start >= 0 else max(at, len(data) - len(self.layout.sync) + 1)
+        self._skip(unfinished - at)
+        self._tail = data[unfinished:]
         return frames
 
     def forget(self) -> None:
@@ -82,7 +82,7 @@ class DescribedParser:
         return Frame(
             None if self._seq is None else int(counts[self._seq]),
             None if self._time is None else round(counts[self._time] * self._us),
-            tuple(counts[at] * scale for at, scale in self._channels),
+            tuple(counts[position] * scale for position, scale in self._channels),
             0 if self._flags is None else int(counts[self._flags]),
             self._names,
         )

@@ -163,7 +163,9 @@ def advance(
     leak, charge_pC = _charge(chain, state, tare, output_pC, dt_s)
     touch = _touch(chain, state, charge_pC, tare, dt_s)
     saturated = limited or (state.saturated and touch.contact)
-    drift = _drift(chain.thermal, state.drift, charge_pC, misfit, dt_s, contact=touch.contact, saturated=saturated)
+    drift = NO_DRIFT
+    if chain.thermal is not None and touch.contact:
+        drift = _drift(chain.thermal, state.drift, charge_pC, misfit, dt_s, saturated=saturated)
     if touch.contact and drift.charge_pC != state.drift.charge_pC:
         change_pC = drift.charge_pC - state.drift.charge_pC
         charge_pC = charge_pC - change_pC
@@ -209,17 +211,8 @@ def _touch(chain: Chain, state: ChainState, charge_pC: Array, tare: Tare, dt_s: 
 
 
 def _drift(
-    rule: ThermalRule | None,
-    drift: ThermalDrift,
-    charge_pC: Array,
-    misfit: Misfit | None,
-    dt_s: float,
-    *,
-    contact: bool,
-    saturated: bool,
+    rule: ThermalRule, drift: ThermalDrift, charge_pC: Array, misfit: Misfit | None, dt_s: float, *, saturated: bool
 ) -> ThermalDrift:
-    if rule is None or not contact:
-        return NO_DRIFT
     if misfit is None:
         raise ValueError("the thermal stage needs the misfit of a model, got None")
     if saturated:  # a clipped charge fits no contact, whatever the temperature
