@@ -42,7 +42,7 @@ def states(shelf):
 
 DAMAGE = {
     "bytes": "the file is damaged or changed",
-    "half copied": "golden.json: not there",
+    "half copied": "golden.json: missing",
     "answers": r"contact\[0, 0\] is .*golden.json says",
     "not a graph": "cannot read these 8 bytes as a model",
 }
