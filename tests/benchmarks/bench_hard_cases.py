@@ -29,6 +29,7 @@ from isocharge.simulate import (
     Film,
     Polygon,
     Probe,
+    SolveSettings,
     Theory,
     load_sensor,
     press,
@@ -137,7 +138,7 @@ def refined_error(found: Equilibrium) -> float:
     )
     full = Theory(stretching=True, bending=True, pretensioned=film.pretension > 0.0)
     start = found if near else None
-    exact = press(film, found.probe, found.at, found.force, theory=full, resolution=finer, start=start)
+    exact = press(film, found.probe, found.at, found.force, SolveSettings(theory=full, resolution=finer), start=start)
     return max(
         float(np.abs(rough - fine).max() / np.abs(fine).max())
         for rough, fine in zip(charges(found), charges(exact), strict=True)

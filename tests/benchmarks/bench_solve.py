@@ -27,6 +27,7 @@ from isocharge.simulate import (
     Probe,
     Resolution,
     Sensor,
+    SolveSettings,
     Theory,
     built_in_sensors,
     load_sensor,
@@ -76,7 +77,9 @@ class Scene:
         start: Equilibrium | None = None,
         probe: Probe = PROBE,
     ) -> Equilibrium:
-        return press(FILM, probe, (self.x, self.y), self.force, theory=theory, resolution=resolution, start=start)
+        return press(
+            FILM, probe, (self.x, self.y), self.force, SolveSettings(theory=theory, resolution=resolution), start=start
+        )
 
     def neighbour(self) -> "Scene":
         return Scene(self.x + 0.3e-3, self.y - 0.4e-3, 1.1 * self.force)

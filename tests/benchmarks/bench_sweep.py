@@ -26,7 +26,9 @@ import scipy
 from isocharge.simulate import (
     Dataset,
     Resolution,
+    SolveSettings,
     Sweep,
+    SweepCallbacks,
     load_sensor,
     parse_probe,
     press,
@@ -83,9 +85,8 @@ def measure(sensor_name: str, samples: int, workers: int, checks: int, seed: int
                 sensor,
                 [parse_probe(text) for text in PROBES],
                 sweep,
-                executor=crew.executor,
-                ahead=crew.ahead,
-                sampled=lambda *_: solved_at.append(time.perf_counter()),
+                workers=crew,
+                callbacks=SweepCallbacks(sampled=lambda *_: solved_at.append(time.perf_counter())),
             )
         seconds = time.perf_counter() - began
         usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
@@ -136,7 +137,7 @@ def press_of(dataset: Dataset, row: int) -> tuple[str, float, float, float]:
 def solve(sensor, one: tuple[str, float, float, float]) -> np.ndarray:
     """Touch charges, pC."""
     probe, x, y, force = one
-    solved = press(sensor.film, parse_probe(probe), (1e-3 * x, 1e-3 * y), force, resolution=FINER)
+    solved = press(sensor.film, parse_probe(probe), (1e-3 * x, 1e-3 * y), force, SolveSettings(resolution=FINER))
     return 1e12 * touch_charge(sensor, solved)
 
 

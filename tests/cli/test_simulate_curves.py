@@ -28,7 +28,7 @@ def command(monkeypatch, capsys):
 @pytest.fixture(scope="module", autouse=True)
 def _quick():
     """One forward map for all commands: what it holds is tested elsewhere."""
-    from isocharge.simulate import ForwardMap, Resolution, Theory
+    from isocharge.simulate import ForwardMap, Resolution, SolveSettings, Theory
 
     build, made = ForwardMap.build.__func__, {}
 
@@ -36,7 +36,9 @@ def _quick():
         if not made:
             membrane = Theory(stretching=True, bending=False, pretensioned=False)
             resolution = Resolution(4, 8, 5)
-            made[None] = build(cls, sensor, probe, 14e-3, (1.0, 1.0), theory=membrane, resolution=resolution)
+            made[None] = build(
+                cls, sensor, probe, 14e-3, (1.0, 1.0), settings=SolveSettings(theory=membrane, resolution=resolution)
+            )
         assert radius <= 14e-3
         progress(1, 1)
         return made[None]

@@ -17,6 +17,7 @@ from isocharge.simulate import (
     Polygon,
     Probe,
     Resolution,
+    SolveSettings,
     Theory,
     load_sensor,
     press,
@@ -64,7 +65,9 @@ def plate_stiffness(film: Film) -> float:
 def test_schwerin_point_load(share):
     """w = k (1 - (r/a)^(2/3)), N_r = 3 F / (4 pi k) (r/a)^(-2/3), N_theta = N_r / 3, away from a small probe."""
     film, force = replace(SLACK, poisson=1.0 / 3.0), TINY
-    solved = press(film, Circle(2e-5), (0.0, 0.0), force, theory=MEMBRANE, resolution=Resolution(6, 8, 10))
+    solved = press(
+        film, Circle(2e-5), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=Resolution(6, 8, 10))
+    )
     k = np.cbrt(3.0 / np.pi * force * film.radius**2 / (film.young * film.thickness))
     points = ring(share * film.radius)
     np.testing.assert_allclose(solved.deflection(points), k * (1.0 - share ** (2 / 3)), rtol=2e-5)
@@ -135,7 +138,7 @@ def test_taut_membrane_under_a_disk(at, radius):
     """Green's function is harmonic, so a disk pulls like a point."""
     probe = Circle(radius)
     theory = MEMBRANE if at == PLACES[1] else Theory(False, False, True)
-    solved = press(TAUT, probe, at, TINY, theory=theory, accuracy=1e-5)
+    solved = press(TAUT, probe, at, TINY, SolveSettings(accuracy=1e-5, theory=theory))
     points, z = read_outside(TAUT, probe, at)
     expected = TINY / (TAUT.pretension * TAUT.thickness) * harmonic(z, complex(*at) / TAUT.radius)
     np.testing.assert_allclose(solved.deflection(points), expected, atol=1e-5 * expected.max())
@@ -144,7 +147,9 @@ def test_taut_membrane_under_a_disk(at, radius):
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
 def test_taut_membrane_under_a_centred_disk(share):
     """w(0) = F / (2 pi T) (ln(a / R) + 1/2)."""
-    solved = press(TAUT, Circle(share * TAUT.radius), (0.0, 0.0), TINY, theory=MEMBRANE, resolution=REFINED)
+    solved = press(
+        TAUT, Circle(share * TAUT.radius), (0.0, 0.0), TINY, SolveSettings(theory=MEMBRANE, resolution=REFINED)
+    )
     expected = TINY / (2.0 * np.pi * TAUT.pretension * TAUT.thickness) * (np.log(1.0 / share) + 0.5)
     assert solved.deflection(np.zeros((1, 2)))[0] == pytest.approx(expected, rel=1e-7)
 
@@ -155,7 +160,7 @@ POLYGONS = [Polygon.rectangle(4e-3, 2e-3, 0.5), Polygon.triangle(6e-3, 1.0)]
 @pytest.mark.parametrize("at", PLACES[1:])
 @pytest.mark.parametrize("probe", POLYGONS, ids=lambda probe: probe.name)
 def test_taut_membrane_under_a_polygon(at, probe):
-    solved = press(TAUT, probe, at, TINY, theory=Theory(False, False, True), accuracy=1e-5)
+    solved = press(TAUT, probe, at, TINY, SolveSettings(accuracy=1e-5, theory=Theory(False, False, True)))
     points, z = read_outside(TAUT, probe, at)
     mean = over_polygon(harmonic, z, (complex(*at) + probe.outline) / TAUT.radius)
     expected = TINY / (TAUT.pretension * TAUT.thickness) * mean
@@ -171,7 +176,7 @@ def test_plate_under_a_disk(at, radius):
     """Small: Michell's point load. Large: the same, corrected for its size."""
     probe = Circle(radius)
     theory = FULL if at == PLACES[1] else Theory(False, True, False)
-    solved = press(THICK, probe, at, TINY, theory=theory, accuracy=1e-4)
+    solved = press(THICK, probe, at, TINY, SolveSettings(accuracy=1e-4, theory=theory))
     points, z = read_outside(THICK, probe, at)
     c = complex(*at) / THICK.radius
     scale = TINY * THICK.radius**2 / plate_stiffness(THICK)
@@ -185,7 +190,9 @@ def test_plate_under_a_disk(at, radius):
 def test_plate_under_a_centred_disk(share):
     """w(0) = F (4 a^2 - 4 R^2 ln(a / R) - 3 R^2) / 64 pi D (Timoshenko and Woinowsky-Krieger 1959, art. 16)."""
     a, c = THICK.radius, share * THICK.radius
-    solved = press(THICK, Circle(c), (0.0, 0.0), TINY, theory=Theory(False, True, False), resolution=WITH_RIM)
+    solved = press(
+        THICK, Circle(c), (0.0, 0.0), TINY, SolveSettings(theory=Theory(False, True, False), resolution=WITH_RIM)
+    )
     expected = TINY * (4 * a**2 - 4 * c**2 * np.log(a / c) - 3 * c**2) / (64.0 * np.pi * plate_stiffness(THICK))
     assert solved.deflection(np.zeros((1, 2)))[0] == pytest.approx(expected, rel=1e-5)
 
@@ -193,7 +200,7 @@ def test_plate_under_a_centred_disk(share):
 @pytest.mark.parametrize("at", PLACES[1:])
 @pytest.mark.parametrize("probe", POLYGONS, ids=lambda probe: probe.name)
 def test_plate_under_a_polygon(at, probe):
-    solved = press(THICK, probe, at, TINY, theory=Theory(False, True, False), accuracy=1e-4)
+    solved = press(THICK, probe, at, TINY, SolveSettings(accuracy=1e-4, theory=Theory(False, True, False)))
     points, z = read_outside(THICK, probe, at)
     mean = over_polygon(michell, z, (complex(*at) + probe.outline) / THICK.radius)
     expected = TINY * THICK.radius**2 / plate_stiffness(THICK) * mean
@@ -228,7 +235,11 @@ def test_taut_plate_under_a_centred_disk(tension_MPa):
     scale = TINY / tension
     for theory in (Theory(False, True, True), Theory(True, True, True)):
         solved = press(
-            film, Circle(c * film.radius), (0.0, 0.0), TINY, theory=theory, resolution=Resolution(7, 8, 5, 2)
+            film,
+            Circle(c * film.radius),
+            (0.0, 0.0),
+            TINY,
+            SolveSettings(theory=theory, resolution=Resolution(7, 8, 5, 2)),
         )
         centre = solved.deflection(np.zeros((1, 2)))[0]
         assert centre == pytest.approx(scale * (weights[0] + weights[1] / iv(0, k * c)), rel=2e-5)
@@ -278,7 +289,7 @@ def test_stress_and_charge_that_a_uniform_load_induces(name, film, force):
     linear = theory_by_name(name, film)
     for theory in (linear, replace(linear, stretching=True)):
         resolution = Resolution(8, 8, 3, 2 if theory.bending else 0)
-        solved = press(film, probe, (0.0, 0.0), force, theory=theory, resolution=resolution, layer=0.02)
+        solved = press(film, probe, (0.0, 0.0), force, SolveSettings(theory=theory, resolution=resolution, layer=0.02))
         assert solved.deflection(np.zeros((1, 2)))[0] == pytest.approx(height * film.radius, rel=3e-5)
         for r in (0.01, 0.3, 0.8):
             radial, hoop, _ = radial_and_hoop(solved.touch_stress(ring(r * film.radius)), ring(r * film.radius))
@@ -310,7 +321,7 @@ def test_linear_theories_are_limits_of_the_nonlinear_ones(film, theory, probe):
     full = replace(theory, stretching=True)
     sensor = replace(load_sensor("three-25um-uniaxial"), film=film)
     solved = [
-        press(film, probe, (5e-3, 3e-3), 1e-5, theory=each, resolution=Resolution(5, 8, 5, 1))
+        press(film, probe, (5e-3, 3e-3), 1e-5, SolveSettings(theory=each, resolution=Resolution(5, 8, 5, 1)))
         for each in (theory, full)
     ]
     one, two = (touch_charge(sensor, each) for each in solved)
@@ -384,7 +395,9 @@ def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float
 def test_axisymmetric_membrane(share, force, poisson, tension):
     amplitude2 = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
     film = replace(SLACK, poisson=poisson, pretension=tension * SLACK.young * amplitude2)
-    solved = press(film, Circle(share * film.radius), (0.0, 0.0), force, theory=MEMBRANE, resolution=REFINED)
+    solved = press(
+        film, Circle(share * film.radius), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=REFINED)
+    )
     at = np.array([0.005, 0.015, 0.1, 0.4, 0.8, 0.97])
     expected = axisymmetric(share, amplitude2, poisson, tension, at)
     for i, r in enumerate(at):
@@ -401,7 +414,7 @@ def test_hencky():
     """A probe over the whole film is a uniform dead pressure q: N_r(0) = b0 / 4 (q^2 a^2 E h)^(1/3) with
     b0 = 1.7244 at Poisson 0.3 (Hencky 1915; digits of Fichter 1997)."""
     film, force, radius = replace(SLACK, poisson=0.3), 1e-6, 0.9999 * SLACK.radius
-    solved = press(film, Circle(radius), (0.0, 0.0), force, theory=MEMBRANE, resolution=REFINED)
+    solved = press(film, Circle(radius), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=REFINED))
     pressure = force / (np.pi * radius**2)
     expected = 1.7244 / 4.0 * np.cbrt(pressure**2 * film.radius**2 * film.young * film.thickness)
     centre = solved.touch_stress(np.zeros((1, 2)))[0] * film.thickness
@@ -412,7 +425,7 @@ def test_charge_of_a_centred_press_is_the_integral_of_the_boundary_value_problem
     """The output itself: electrode A integrated over from scipy's stresses, no code of ours but the solve."""
     sensor, force = load_sensor("four-25um-uniaxial"), 1.0
     amplitude2 = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
-    solved = press(sensor.film, Circle(1e-3), (0.0, 0.0), force, theory=MEMBRANE, resolution=REFINED)
+    solved = press(sensor.film, Circle(1e-3), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=REFINED))
     charge = touch_charge(sensor, solved)[0]
     x, y = np.meshgrid(np.linspace(8.5e-3, 11.5e-3, 41), np.linspace(-1.5e-3, 1.5e-3, 41))
     r, c2 = np.hypot(x, y), x**2 / (x**2 + y**2)

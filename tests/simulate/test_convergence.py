@@ -12,6 +12,7 @@ from isocharge.simulate import (
     Polygon,
     Probe,
     Resolution,
+    SolveSettings,
     Theory,
     load_sensor,
     press,
@@ -43,7 +44,7 @@ def solves(film, probe, request) -> list[Equilibrium]:
 
     def solve(order: int) -> Equilibrium:
         resolution = Resolution(order, 8, 5, 2 if theory.bending else 0)
-        return press(film, probe, (5e-3, 3e-3), 1.0, theory=theory, resolution=resolution)
+        return press(film, probe, (5e-3, 3e-3), 1.0, SolveSettings(theory=theory, resolution=resolution))
 
     return [solve(order) for order in (*ORDERS, 8)]
 
@@ -88,7 +89,7 @@ def test_charge_of_a_surface_converges(solves):
 
 def refined(film: Film, probe: Probe, theory: Theory, order: int, times: int) -> Equilibrium:
     resolution = Resolution(order, 8 * times, 3 * times)
-    return press(film, probe, (6e-3, 3e-3), 1.0, theory=theory, resolution=resolution, layer=0.1)
+    return press(film, probe, (6e-3, 3e-3), 1.0, SolveSettings(theory=theory, resolution=resolution, layer=0.1))
 
 
 SMALL = {"circle": Circle(1e-3), "rectangle": Polygon.rectangle(2e-3, 1e-3, 0.5)}
@@ -102,7 +103,9 @@ def test_charge_converges_with_the_order_of_the_elements(film, probe, order, nam
     theory = THEORIES[name][1]
     film = replace(film, thickness=300e-6) if theory.bending else film
     sensor = replace(load_sensor("four-25um-uniaxial"), film=film)
-    finest = press(film, probe, (6e-3, 3e-3), 1.0, theory=theory, resolution=Resolution(8, 8, 6), layer=0.1)
+    finest = press(
+        film, probe, (6e-3, 3e-3), 1.0, SolveSettings(theory=theory, resolution=Resolution(8, 8, 6), layer=0.1)
+    )
     reference = touch_charge(sensor, finest)
     coarse, fine = (
         np.abs(touch_charge(sensor, refined(film, probe, theory, order, k)) - reference).max() for k in (1, 2)
@@ -119,6 +122,8 @@ def test_energy_converges_with_twice_the_order_of_the_elements(film, order):
         geometry = Geometry.build(solved.mesh, solved.placement.element_points(solved.mesh))
         return ElasticFilm(geometry, solved.groups).energy(solved.field)
 
-    reference = energy(press(film, Circle(1e-3), (6e-3, 3e-3), 1.0, theory=theory, resolution=Resolution(8, 8, 6)))
+    reference = energy(
+        press(film, Circle(1e-3), (6e-3, 3e-3), 1.0, SolveSettings(theory=theory, resolution=Resolution(8, 8, 6)))
+    )
     coarse, fine = (abs(energy(refined(film, Circle(1e-3), theory, order, k)) - reference) for k in (1, 2))
     assert np.log2(coarse / fine) == pytest.approx(2 * order, abs=0.8)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from isocharge.errors import SceneError, SolveError
-from isocharge.simulate import Circle, Film, Polygon, Probe, load_sensor, press, touch_charge
+from isocharge.simulate import Circle, Film, Polygon, Probe, SolveSettings, load_sensor, press, touch_charge
 
 REASONS = (
     r"press at .* too near .*; press farther inside",
@@ -94,7 +94,9 @@ def test_none_is_silently_wrong():
         try:
             solved = press(film, probe, at, force)
             finer = replace(solved.resolution, order=solved.resolution.order + 2, rim=2 * solved.resolution.rim)
-            refined = press(film, probe, at, force, theory=solved.theory, resolution=finer, layer=solved.layer)
+            refined = press(
+                film, probe, at, force, SolveSettings(theory=solved.theory, resolution=finer, layer=solved.layer)
+            )
         except (SceneError, SolveError):
             continue
         sensor = replace(load_sensor("four-25um-uniaxial"), film=film)

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from isocharge.simulate import Equilibrium, Polygon, Theory, load_sensor, press, touch_charge
+from isocharge.simulate import Equilibrium, Polygon, SolveSettings, Theory, load_sensor, press, touch_charge
 
 NEAR = 4e-3
 """An electrode counts as near the probe if its edge is closer to the footprint's than this (m)."""
@@ -79,7 +79,7 @@ def test_second_library_live(skfem, film):
     corners = at + np.stack([probe.outline.real, probe.outline.imag], axis=1)
     other = skfem.solve(film.thickness, film.pretension, corners, force, 1.0)
     for theory in (None, Theory(stretching=True, bending=True, pretensioned=True)):
-        solved = press(film, probe, at, force, theory=theory)
+        solved = press(film, probe, at, force, SolveSettings(theory=theory))
         for readout in ("area", "edge"):
             charge = touch_charge(replace(sensor, readout=readout), solved)
             d31, d32 = sensor.piezo.d31, sensor.piezo.d32

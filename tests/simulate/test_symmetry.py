@@ -12,6 +12,7 @@ from isocharge.simulate import (
     Probe,
     Resolution,
     Sensor,
+    SolveSettings,
     Theory,
     load_sensor,
     press,
@@ -139,8 +140,8 @@ def test_polygon_of_many_corners_is_a_circle(film):
     reach = radius * np.sqrt(2.0 * np.pi / count / np.sin(2.0 * np.pi / count))
     polygon = Polygon.of(reach * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     at, theory = (8e-3, 1e-3), Theory(stretching=True, bending=False, pretensioned=sensor.film.pretension > 0.0)
-    one = press(sensor.film, polygon, at, 1.0, theory=theory, resolution=Resolution(4, 48, 4))
-    two = press(sensor.film, Circle(radius), at, 1.0, theory=theory, resolution=Resolution(7, 8, 6))
+    one = press(sensor.film, polygon, at, 1.0, SolveSettings(theory=theory, resolution=Resolution(4, 48, 4)))
+    two = press(sensor.film, Circle(radius), at, 1.0, SolveSettings(theory=theory, resolution=Resolution(7, 8, 6)))
     np.testing.assert_allclose(touch_charge(sensor, one), touch_charge(sensor, two), rtol=5e-4)
     points = np.array([at, (0.0, 0.0), (-20e-3, 5e-3)])
     np.testing.assert_allclose(one.deflection(points), two.deflection(points), rtol=1e-4)
@@ -194,8 +195,8 @@ def test_a_membrane_knows_only_force_over_thickness(film, share):
     """Without bending, twice the thickness under twice the force is the same film."""
     theory, sensor = Theory(stretching=True, bending=False, pretensioned=False), load_sensor("four-25um-uniaxial")
     other = replace(film, thickness=film.thickness * share)
-    one = press(film, RECTANGLE, AT, 1.0, theory=theory, layer=0.05)
-    two = press(other, RECTANGLE, AT, share, theory=theory, layer=0.05)
+    one = press(film, RECTANGLE, AT, 1.0, SolveSettings(theory=theory, layer=0.05))
+    two = press(other, RECTANGLE, AT, share, SolveSettings(theory=theory, layer=0.05))
     points = np.array([AT, (0.0, 0.0), (-20e-3, 10e-3)])
     np.testing.assert_allclose(two.deflection(points), one.deflection(points), rtol=1e-7)
     np.testing.assert_allclose(touch_charge(replace(sensor, film=other), two), touch_charge(sensor, one), rtol=1e-7)
@@ -206,7 +207,8 @@ def test_slack_film_follows_the_power_two_thirds(film):
     sensor, theory = load_sensor("three-25um-biaxial"), Theory(stretching=True, bending=False, pretensioned=False)
     ratio = np.array(
         [
-            touch_charge(sensor, press(film, Circle(1e-3), (3e-3, 1e-3), force, theory=theory)) / force ** (2 / 3)
+            touch_charge(sensor, press(film, Circle(1e-3), (3e-3, 1e-3), force, SolveSettings(theory=theory)))
+            / force ** (2 / 3)
             for force in (1e-4, 1e-2, 1.0, 5.0)
         ]
     )

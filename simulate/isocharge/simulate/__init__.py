@@ -15,6 +15,7 @@ with require("simulate"):
     from isocharge.simulate.contours.fix import Fix, Meeting
     from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTriangulation, draw_contour
     from isocharge.simulate.contours.triangulation import Triangulation
+    from isocharge.simulate.dataset.callbacks import SweepCallbacks
     from isocharge.simulate.dataset.sampling import Sweep
     from isocharge.simulate.dataset.shards import Dataset, Samples, read_dataset, write_dataset
     from isocharge.simulate.dataset.sweep import run_sweep, solve_maps, write_sweep
@@ -36,6 +37,7 @@ with require("simulate"):
     from isocharge.simulate.sensor.sensor_file import built_in_sensors, load_sensor, sensor_from_dict, sensor_to_dict
     from isocharge.simulate.solver.equilibrium import Equilibrium
     from isocharge.simulate.solver.press import press
+    from isocharge.simulate.solver.settings import SolveSettings
 
 __all__ = [
     "Amplifier",
@@ -65,7 +67,9 @@ __all__ = [
     "Resolution",
     "Samples",
     "Sensor",
+    "SolveSettings",
     "Sweep",
+    "SweepCallbacks",
     "Theory",
     "Triangulation",
     "WorkingArea",

@@ -10,6 +10,7 @@ from isocharge.simulate import (
     ForwardMap,
     Mapping,
     Resolution,
+    SolveSettings,
     Theory,
     load_sensor,
     press,
@@ -23,7 +24,9 @@ DEG = np.pi / 180.0
 
 @pytest.fixture(scope="module")
 def film() -> ForwardMap:
-    return ForwardMap.build(SENSOR, Circle(1e-3), 17e-3, (1.0, 1.0), theory=MEMBRANE, resolution=Resolution(5, 8, 5))
+    return ForwardMap.build(
+        SENSOR, Circle(1e-3), 17e-3, (1.0, 1.0), SolveSettings(theory=MEMBRANE, resolution=Resolution(5, 8, 5))
+    )
 
 
 def test_the_papers_scheme():
@@ -48,7 +51,7 @@ def test_curves_are_presses(film):
     curves = Curves.of(film, Mapping.lines(SENSOR, "A", (35 * DEG, 90 * DEG), length=16e-3), 1.0)
     for line, step in ((0, 0), (3, 1), (6, 3)):
         at = tuple(curves.mapping.points[line, step])
-        direct = touch_charge(SENSOR, press(SENSOR.film, Circle(1e-3), at, 1.0, theory=MEMBRANE))
+        direct = touch_charge(SENSOR, press(SENSOR.film, Circle(1e-3), at, 1.0, SolveSettings(theory=MEMBRANE)))
         np.testing.assert_allclose(curves.charge[line, step], direct, rtol=2e-3)
     np.testing.assert_array_equal(curves.own, curves.charge[..., 0])
 

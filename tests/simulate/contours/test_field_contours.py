@@ -8,11 +8,21 @@ import pytest
 from scipy.optimize import brentq
 
 from isocharge.errors import SceneError, SensorError
-from isocharge.simulate import Circle, ContourField, Electrode, ForwardMap, Resolution, Sensor, Theory, load_sensor
+from isocharge.simulate import (
+    Circle,
+    ContourField,
+    Electrode,
+    ForwardMap,
+    Resolution,
+    Sensor,
+    SolveSettings,
+    Theory,
+    load_sensor,
+)
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 
 SENSOR = load_sensor("three-25um-biaxial")
-QUICK = {"theory": Theory(stretching=True, bending=False, pretensioned=False), "resolution": Resolution(4, 8, 4)}
+QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
 RADIUS = 9e-3
 
 
@@ -42,7 +52,7 @@ def round_field() -> ContourField:
 
 @pytest.fixture(scope="module")
 def field() -> ContourField:
-    return ContourField.of(ForwardMap.build(SENSOR, Circle(1e-3), RADIUS, (1.0, 1.0), **QUICK), 1.0)
+    return ContourField.of(ForwardMap.build(SENSOR, Circle(1e-3), RADIUS, (1.0, 1.0), QUICK), 1.0)
 
 
 @pytest.mark.parametrize(("name", "distance_mm"), [("A", 6.0), ("B", 9.0), ("C", 13.0)])

@@ -14,6 +14,7 @@ from isocharge.simulate import (
     Meeting,
     Polygon,
     Resolution,
+    SolveSettings,
     Theory,
     Triangulation,
     load_sensor,
@@ -23,7 +24,7 @@ from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 
 RADIUS, FORCES = 8e-3, (0.2, 2.0)
-QUICK = {"theory": Theory(stretching=True, bending=False, pretensioned=False), "resolution": Resolution(4, 8, 4)}
+QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
 LAYOUTS = {name: load_sensor(f"{name}-25um-biaxial") for name in ("three", "four")}
 
 
@@ -137,7 +138,7 @@ def test_closest_to_meeting_is_scipys_least_squares():
 
 @pytest.fixture(scope="module")
 def triangle_map() -> ForwardMap:
-    return ForwardMap.build(LAYOUTS["three"], Polygon.triangle(4e-3), 8e-3, (1.0, 1.0), **QUICK)
+    return ForwardMap.build(LAYOUTS["three"], Polygon.triangle(4e-3), 8e-3, (1.0, 1.0), QUICK)
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +206,7 @@ def test_contours_that_meet_twice():
 def test_folded_map_says_that_there_are_two():
     """Three electrodes, uniaxial, force unknown: two contacts with the same charges, found from either."""
     uniaxial = load_sensor("three-25um-uniaxial")
-    made = ForwardMap.build(uniaxial, Circle(1e-3), 8e-3, FORCES, **QUICK)
+    made = ForwardMap.build(uniaxial, Circle(1e-3), 8e-3, FORCES, QUICK)
     triangulation = Triangulation.from_map(made, spacing=0.5e-3)
     x, y, force = draw(200, seed=8)
     fix = triangulation.locate_with_force(made.forward(x, y, force))

@@ -14,8 +14,8 @@ import pytest
 
 from isocharge.errors import OutputExists, SceneError, SolveError
 from isocharge.resumable_run import draft_of, resume_folder
-from isocharge.simulate import Circle, Resolution, Sweep, Theory, load_sensor, run_sweep
-from isocharge.simulate.solver.settings import SolveSettings
+from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, SweepCallbacks, Theory, load_sensor, run_sweep
+from isocharge.simulate.execution.workers import Workers
 
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
@@ -44,7 +44,7 @@ class Counting(Executor):
 
 
 def sweep_to(target: Path, **options) -> Path:
-    arguments = {"probes": (Circle(1e-3),), "sweep": SWEEP, "solver": QUICK, "shard": 10} | options
+    arguments = {"probes": (Circle(1e-3),), "sweep": SWEEP, "settings": QUICK, "shard": 10} | options
     return run_sweep(target, SENSOR, **arguments)
 
 
@@ -56,7 +56,7 @@ def files(folder: Path) -> dict[str, bytes]:
 def whole(tmp_path_factory) -> tuple[dict[str, bytes], int]:
     """The files of an uninterrupted run, and how many jobs it took."""
     executor = Counting()
-    return files(sweep_to(tmp_path_factory.mktemp("whole") / "presses", executor=executor)), executor.jobs
+    return files(sweep_to(tmp_path_factory.mktemp("whole") / "presses", workers=Workers(executor))), executor.jobs
 
 
 def stop_after(count: int):
@@ -73,18 +73,18 @@ def stop_after(count: int):
 def stopped(tmp_path) -> Path:
     """The target of a run that was stopped with all solves and two shards of ten done."""
     with pytest.raises(Stopped):
-        sweep_to(tmp_path / "presses", sampled=stop_after(20))
+        sweep_to(tmp_path / "presses", callbacks=SweepCallbacks(sampled=stop_after(20)))
     return tmp_path / "presses"
 
 
-@pytest.mark.parametrize("when", [{"progress": stop_after(1)}, {"progress": stop_after(3)}, {"sampled": stop_after(0)},
+@pytest.mark.parametrize("when", [{"solved": stop_after(1)}, {"solved": stop_after(3)}, {"sampled": stop_after(0)},
                                   {"sampled": stop_after(10)}, {"sampled": stop_after(60)}])  # fmt: skip
 def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, whole, when):
     target, first, second = tmp_path / "presses", Counting(), Counting()
     with pytest.raises(Stopped):
-        sweep_to(target, executor=first, ahead=1, **when)
+        sweep_to(target, workers=Workers(first, ahead=1), callbacks=SweepCallbacks(**when))
     assert [path.name for path in tmp_path.iterdir()] == ["presses.part"]
-    sweep_to(target, executor=second)
+    sweep_to(target, workers=Workers(second))
     expected, jobs = whole
     assert files(target) == expected
     assert first.jobs + second.jobs == jobs  # nothing twice
@@ -93,12 +93,12 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, whole, when):
 
 def test_a_resumed_run_tells_what_is_there(stopped):
     told = []
-    sweep_to(stopped, sampled=lambda done, total: told.append((done, total)))
+    sweep_to(stopped, callbacks=SweepCallbacks(sampled=lambda done, total: told.append((done, total))))
     assert told == [(20, 60), (30, 60), (40, 60), (50, 60), (60, 60)]
 
 
 def test_what_does_not_change_the_bytes_may_change(stopped, whole):
-    sweep_to(stopped, executor=Counting(), ahead=2)
+    sweep_to(stopped, workers=Workers(Counting(), ahead=2))
     assert files(stopped) == whole[0]
 
 
@@ -107,7 +107,7 @@ def test_what_does_not_change_the_bytes_may_change(stopped, whole):
     [
         ({"sweep": replace(SWEEP, samples=70)}, "sweep.samples is 60 there, 70 here"),
         ({"probes": (Circle(2e-3),)}, r"probes is \['circle:1.0@0'\] there, \['circle:2.0@0'\] here"),
-        ({"solver": SolveSettings()}, "solver.resolution is .*; solver.theory is"),
+        ({"settings": SolveSettings()}, "solver.resolution is .*; solver.theory is"),
         ({"shard": 20}, "shard is 10 there, 20 here"),
     ],
 )  # fmt: skip
@@ -123,7 +123,7 @@ def test_a_draft_of_another_sensor_or_version_is_left_alone(stopped):
     with pytest.raises(
         OutputExists, match=r"sensor\.electrodes\.D is None there, \[-?0\.0, -10\.0\] here; sensor.name is"
     ):
-        run_sweep(stopped, load_sensor("four-25um-biaxial"), (Circle(1e-3),), SWEEP, solver=QUICK, shard=10)
+        run_sweep(stopped, load_sensor("four-25um-biaxial"), (Circle(1e-3),), SWEEP, QUICK, shard=10)
     run = draft_of(stopped) / "run.json"
     run.write_text(run.read_text().replace('"made_by": "isocharge 0', '"made_by": "isocharge 9'))
     with pytest.raises(OutputExists, match=r"made_by is isocharge 9\..* there, isocharge 0\..* here; .*--fresh"):
@@ -132,7 +132,7 @@ def test_a_draft_of_another_sensor_or_version_is_left_alone(stopped):
 
 def test_fresh_throws_the_draft_away(stopped, whole):
     executor = Counting()
-    sweep_to(stopped, shard=20, fresh=True, executor=executor)
+    sweep_to(stopped, shard=20, fresh=True, workers=Workers(executor))
     assert executor.jobs == whole[1] - 3  # all of them, in half as many shards
     assert not draft_of(stopped).exists()
 
@@ -190,7 +190,7 @@ def test_two_runs_do_not_work_on_one_draft(tmp_path):
         raise Stopped
 
     with pytest.raises(Stopped):
-        sweep_to(tmp_path / "presses", progress=other_run)
+        sweep_to(tmp_path / "presses", callbacks=SweepCallbacks(other_run))
 
 
 def test_killed_between_name_and_tidying(stopped):
@@ -239,7 +239,6 @@ import os, sys
 from pathlib import Path
 sys.path[:0] = {path!r}
 from isocharge.simulate import *
-from isocharge.simulate.solver.settings import SolveSettings
 from isocharge.simulate.execution.workers import local_workers
 
 def killed(done, total):
@@ -253,13 +252,13 @@ if __name__ == "__main__":
     with local_workers({workers}) as workers:
         if workers.executor:
             print(workers.executor.submit(os.getpid).result(), flush=True)
-        run_sweep(Path(sys.argv[1]), load_sensor("three-25um-biaxial"), (Circle(1e-3),), sweep, solver=quick, shard=10,
-                  executor=workers.executor, ahead=workers.ahead, {phase}=killed)
+        run_sweep(Path(sys.argv[1]), load_sensor("three-25um-biaxial"), (Circle(1e-3),), sweep, quick, shard=10,
+                  workers=workers, callbacks=SweepCallbacks({phase}=killed))
 """
 
 
 @pytest.mark.parametrize(
-    ("phase", "count", "workers"), [("progress", 2, 2), ("sampled", 20, 2), ("sampled", 60, 1)]
+    ("phase", "count", "workers"), [("solved", 2, 2), ("sampled", 20, 2), ("sampled", 60, 1)]
 )  # fmt: skip
 def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path, whole, phase, count, workers):
     """SIGKILL in the middle of the solves, between two shards, and before the manifest; no worker outlives it."""
@@ -275,7 +274,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path, whole, phase, count, w
             time.sleep(0.02)
         assert not is_running(pid)
     executor = Counting()
-    sweep_to(tmp_path / "presses", executor=executor)
+    sweep_to(tmp_path / "presses", workers=Workers(executor))
     assert files(tmp_path / "presses") == whole[0]
     assert executor.jobs < whole[1]
 

@@ -14,7 +14,9 @@ from isocharge.simulate import (
     Polygon,
     Resolution,
     Sensor,
+    SolveSettings,
     Sweep,
+    SweepCallbacks,
     Theory,
     load_sensor,
     parse_probe,
@@ -25,7 +27,6 @@ from isocharge.simulate import (
     write_sweep,
 )
 from isocharge.simulate.dataset.sweep import SHARD, TASK
-from isocharge.simulate.solver.settings import SolveSettings
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
@@ -95,9 +96,13 @@ def test_same_seed_same_bytes(small_dataset, three_map, tmp_path):
 
 def test_a_run_writes_what_its_maps_write(tmp_path):
     """Whether or not a draft is kept on the way."""
-    maps = [ForwardMap.build(SENSOR, Circle(1e-3), 3e-3, (1.0, 1.0), theory=MEMBRANE, resolution=QUICK.resolution)]
+    maps = [
+        ForwardMap.build(
+            SENSOR, Circle(1e-3), 3e-3, (1.0, 1.0), SolveSettings(theory=MEMBRANE, resolution=QUICK.resolution)
+        )
+    ]
     plain = write_sweep(tmp_path / "a" / "presses", maps, small())
-    drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (Circle(1e-3),), small(), solver=QUICK)
+    drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (Circle(1e-3),), small(), QUICK)
     assert files(plain) == files(drafted)
     assert [path.name for path in drafted.parent.iterdir()] == ["presses"]
 
@@ -136,12 +141,12 @@ def test_shards_and_tasks_keep_the_order(tmp_path, probes):
 def test_probes_take_turns(tmp_path):
     """Each with its own charges; an odd number of samples, and a probe that gets none."""
     probes, sweep = (Circle(1e-3), Circle(2e-3)), small(5)
-    read = read_dataset(run_sweep(tmp_path / "two", SENSOR, probes, sweep, solver=QUICK))
+    read = read_dataset(run_sweep(tmp_path / "two", SENSOR, probes, sweep, QUICK))
     assert read.samples.probe.tolist() == ["circle:1.0", "circle:2.0", "circle:1.0", "circle:2.0", "circle:1.0"]
     assert read.manifest["probes"] == ["circle:1.0", "circle:2.0"]
     for i in (0, 3):
         at = (1e-3 * read.samples.x_mm[i], 1e-3 * read.samples.y_mm[i])
-        solved = press(SENSOR.film, probes[i % 2], at, read.samples.force_N[i], theory=MEMBRANE)
+        solved = press(SENSOR.film, probes[i % 2], at, read.samples.force_N[i], SolveSettings(theory=MEMBRANE))
         np.testing.assert_allclose(read.samples.charge_pC[i], 1e12 * touch_charge(SENSOR, solved), rtol=1e-3)
     one = read_dataset(write_sweep(tmp_path / "one", [Spy(probe) for probe in probes], small(1)))
     assert one.samples.probe.tolist() == ["circle:1.0"]
@@ -158,9 +163,11 @@ def test_a_grid_on_disk(tmp_path):
 def test_progress_of_both_phases_is_told(tmp_path):
     solved, sampled = [], []
     run_sweep(
-        tmp_path / "presses", SENSOR, (Circle(1e-3),), small(25), solver=QUICK, shard=10,
-        progress=lambda done, total: solved.append((done, total)),
-        sampled=lambda done, total: sampled.append((done, total)),
+        tmp_path / "presses", SENSOR, (Circle(1e-3),), small(25), QUICK, shard=10,
+        callbacks=SweepCallbacks(
+            solved=lambda done, total: solved.append((done, total)),
+            sampled=lambda done, total: sampled.append((done, total)),
+        ),
     )  # fmt: skip
     assert solved[-1] == (len(solved), len(solved))
     assert sampled == [(0, 25), (10, 25), (20, 25), (25, 25)]
@@ -177,7 +184,7 @@ def test_existing_folder_is_refused_before_any_work(tmp_path):
             SENSOR,
             (Circle(1e-3),),
             Sweep(),
-            progress=lambda done, total: pytest.fail(f"worked: {done} of {total}"),
+            callbacks=SweepCallbacks(lambda done, total: pytest.fail(f"worked: {done} of {total}")),
         )
     assert [path.name for path in tmp_path.iterdir()] == ["presses"]
 
@@ -209,7 +216,7 @@ def test_no_probes(tmp_path):
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OutputError, match="file/presses cannot be written: Not a directory; choose another output"):
-        run_sweep(tmp_path / "file" / "presses", SENSOR, (Circle(1e-3),), small(), solver=QUICK)
+        run_sweep(tmp_path / "file" / "presses", SENSOR, (Circle(1e-3),), small(), QUICK)
     assert (tmp_path / "file").read_text() == "mine"
 
 

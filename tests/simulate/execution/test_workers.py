@@ -12,20 +12,19 @@ from pathlib import Path
 import pytest
 
 from isocharge.errors import InputError, MissingExtra, WorkersLost
-from isocharge.simulate import Circle, Resolution, Sweep, Theory, load_sensor, run_sweep
+from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, SweepCallbacks, Theory, load_sensor, run_sweep
 from isocharge.simulate.execution import workers as module
 from isocharge.simulate.execution.workers import Workers, dask_workers, local_workers
-from isocharge.simulate.solver.settings import SolveSettings
 
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
 SWEEP = Sweep(radius=3e-3, force_range=(1.0, 1.0), samples=60, seed=7, orientation="random")
 
 
-def sweep_with(workers: Workers, target: Path, **options) -> dict[str, bytes]:
+def sweep_with(workers: Workers, target: Path, **called) -> dict[str, bytes]:
     """The files of a small sweep of two probes in shards of ten."""
     probes = (Circle(1e-3), Circle(2e-3))
-    run_sweep(target, SENSOR, probes, SWEEP, solver=QUICK, shard=10, executor=workers.executor, ahead=3, **options)
+    run_sweep(target, SENSOR, probes, SWEEP, QUICK, workers=workers, callbacks=SweepCallbacks(**called), shard=10)
     return {path.name: path.read_bytes() for path in target.iterdir()}
 
 
@@ -99,7 +98,7 @@ def waited(seconds: float) -> float:
 
 def test_a_worker_with_another_isocharge_is_refused(monkeypatch):
     """Its bytes might differ."""
-    function = module.Checked(waited)
+    function = module.SameCodeOnly(waited)
     monkeypatch.setattr(module, "code_fingerprint", lambda: "isocharge 9.9")
     with pytest.raises(WorkersLost, match=r"a worker runs isocharge 9\.9, expected isocharge 0\.1\.0 \([0-9a-f]{12}\)"):
         function(0.0)
@@ -127,7 +126,7 @@ def test_dask(cluster, tmp_path, expected):
         assert sweep_with(workers, tmp_path / "presses") == expected
 
 
-@pytest.mark.parametrize("phase", ["progress", "sampled"])
+@pytest.mark.parametrize("phase", ["solved", "sampled"])
 def test_a_dask_worker_killed_half_way_is_no_matter(cluster, tmp_path, expected, phase):
     """In the middle of the solves, and between two shards."""
     killed = []

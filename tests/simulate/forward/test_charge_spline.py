@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.errors import SceneError
-from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Resolution, Theory, load_sensor
+from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Resolution, SolveSettings, Theory, load_sensor
 from isocharge.simulate.numerics.disk import sunflower
 
 RADIUS, FORCES = 4e-3, (0.2, 1.0)
@@ -26,7 +26,7 @@ def near_electrodes(d33: float = 0.0):
 @pytest.fixture(scope="module")
 def film():
     return ForwardMap.build(
-        near_electrodes(), Circle(1e-3), RADIUS, FORCES, theory=MEMBRANE, resolution=Resolution(4, 8, 4)
+        near_electrodes(), Circle(1e-3), RADIUS, FORCES, SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
     )
 
 
@@ -111,8 +111,7 @@ def test_of_the_whole_working_area():
         Circle(1e-3),
         10e-3,
         (0.1, 1.0),
-        theory=MEMBRANE,
-        resolution=Resolution(5, 8, 5),
+        SolveSettings(theory=MEMBRANE, resolution=Resolution(5, 8, 5)),
     )
     rng, table = np.random.default_rng(1), ChargeSpline.of(made)
     at, edge = 10e-3 * np.sqrt(rng.random(800)), 10e-3 * np.ones(200)

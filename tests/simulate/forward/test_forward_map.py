@@ -13,6 +13,7 @@ from isocharge.simulate import (
     Probe,
     Resolution,
     Sensor,
+    SolveSettings,
     Theory,
     load_sensor,
     parse_probe,
@@ -23,7 +24,8 @@ from isocharge.simulate.forward.family import Family
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
-QUICK = {"radius": 4e-3, "force_range": (0.7, 1.0), "theory": MEMBRANE, "resolution": Resolution(5, 8, 4)}
+QUICK_SETTINGS = SolveSettings(theory=MEMBRANE, resolution=Resolution(5, 8, 4))
+QUICK = {"radius": 4e-3, "force_range": (0.7, 1.0), "settings": QUICK_SETTINGS}
 """A small family without bending: few and cheap solves."""
 PROBES = {
     "triangle": Polygon.triangle(2.5e-3),
@@ -57,10 +59,10 @@ def direct(
     made: ForwardMap, x: np.ndarray, y: np.ndarray, force: np.ndarray, turn: np.ndarray | float = 0.0
 ) -> np.ndarray:
     """The same presses solved one by one, on the map's mesh and with its theory."""
-    sensor, how = made.sensor, {"theory": made.theory, "resolution": made.resolution}
+    sensor, settings = made.sensor, made.settings
     presses = zip(x.tolist(), y.tolist(), force.tolist(), np.broadcast_to(turn, x.shape).tolist(), strict=True)
     return np.array(
-        [touch_charge(sensor, press(sensor.film, made.probe.turned(t), (a, b), f, **how)) for a, b, f, t in presses]
+        [touch_charge(sensor, press(sensor.film, made.probe.turned(t), (a, b), f, settings)) for a, b, f, t in presses]
     )
 
 
@@ -163,10 +165,14 @@ def test_contact_pressure(four_map, turned_map):
         assert extra.max() > 1e-12
 
 
+def with_theory(theory: Theory) -> dict[str, SolveSettings]:
+    return {"settings": replace(QUICK_SETTINGS, theory=theory)}
+
+
 FILMS = {
-    "pretension": ({"pretension": 0.5e6}, {"theory": Theory(stretching=True, bending=False, pretensioned=True)}),
-    "plate": ({"thickness": 1e-3}, {"theory": Theory(stretching=False, bending=True, pretensioned=False)}),
-    "110 um": ({"thickness": 110e-6}, {"theory": None, "resolution": None, "radius": 2e-3}),
+    "pretension": ({"pretension": 0.5e6}, with_theory(Theory(stretching=True, bending=False, pretensioned=True))),
+    "plate": ({"thickness": 1e-3}, with_theory(Theory(stretching=False, bending=True, pretensioned=False))),
+    "110 um": ({"thickness": 110e-6}, {"settings": SolveSettings(), "radius": 2e-3}),
 }
 
 
@@ -183,7 +189,7 @@ def test_surface():
     """Bending is in though nobody asked for it."""
     sensor = replace(load_sensor("four-25um-uniaxial"), surface="top")
     sensor = replace(sensor, film=replace(sensor.film, thickness=110e-6))
-    made = ForwardMap.build(sensor, Circle(1e-3), **{**QUICK, "theory": None, "resolution": None, "radius": 2e-3})
+    made = ForwardMap.build(sensor, Circle(1e-3), radius=2e-3, force_range=(0.7, 1.0))
     assert made.theory.bending
     x, y, force, _ = draw(made, 6, seed=8)
     assert np.quantile(errors(made, x, y, force), 0.9) < 2e-3
@@ -268,7 +274,9 @@ def test_a_map_that_interpolates_badly_is_refused(monkeypatch):
     monkeypatch.setattr("isocharge.simulate.forward.forward_map.INTERPOLATION_ERROR", 1e-13)
     with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to .* only, expected 1e-13"):
         ForwardMap.build(
-            load_sensor("three-25um-biaxial"), Circle(1e-3), **{**QUICK, "resolution": Resolution(3, 8, 2)}
+            load_sensor("three-25um-biaxial"),
+            Circle(1e-3),
+            **{**QUICK, "settings": replace(QUICK_SETTINGS, resolution=Resolution(3, 8, 2))},
         )
 
 

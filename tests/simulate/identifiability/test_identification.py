@@ -13,6 +13,7 @@ from isocharge.simulate import (
     Circle,
     ForwardMap,
     Resolution,
+    SolveSettings,
     Theory,
     load_sensor,
     noise_model,
@@ -33,7 +34,9 @@ MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
 @pytest.fixture(scope="module")
 def film():
     sensor = load_sensor("four-25um-uniaxial")
-    return ForwardMap.build(sensor, Circle(2e-3), 5e-3, (0.05, 2.0), theory=MEMBRANE, resolution=Resolution(4, 8, 4))
+    return ForwardMap.build(
+        sensor, Circle(2e-3), 5e-3, (0.05, 2.0), SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +126,9 @@ def test_taken_for_another_probe():
 def test_uniaxial_charges_tell_the_size_and_biaxial_ones_do_not(film):
     """Under a probe of 2 mm at 1 N; the maps are the same but for what the electrodes make of the stress."""
     sizes = [
-        ForwardMap.build(film.sensor, Circle(r), 4e-3, (0.8, 1.2), theory=MEMBRANE, resolution=film.resolution)
+        ForwardMap.build(
+            film.sensor, Circle(r), 4e-3, (0.8, 1.2), SolveSettings(theory=MEMBRANE, resolution=film.resolution)
+        )
         for r in (1.8e-3, 2e-3, 2.2e-3)
     ]
     limits = {}

@@ -8,7 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.errors import SceneError
-from isocharge.simulate import Circle, Film, Polygon, Theory, load_sensor, press, theory_for, touch_charge
+from isocharge.simulate import (
+    Circle,
+    Film,
+    Polygon,
+    SolveSettings,
+    Theory,
+    load_sensor,
+    press,
+    theory_for,
+    touch_charge,
+)
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared
 from isocharge.simulate.mechanics.theory import bending_length, choose_theory, modelling_error, theory_by_name
 
@@ -74,7 +84,9 @@ def test_unknown_name_is_shown(film):
 def test_choice(film, thickness_um, pretension_MPa, force, accuracy, name):
     film = thick(film, thickness_um, pretension_MPa)
     assert choose_theory(film, PROBE, force, accuracy).name == name
-    assert press(film, PROBE, AT, force, accuracy=max(accuracy, 1e-4)).theory.pretensioned == (pretension_MPa > 0.0)
+    assert press(film, PROBE, AT, force, SolveSettings(accuracy=max(accuracy, 1e-4))).theory.pretensioned == (
+        pretension_MPa > 0.0
+    )
 
 
 def test_taut_thin_film_under_a_feather_is_linear(film):
@@ -143,13 +155,16 @@ def test_theory_for_a_sensor_serves_all_forces_and_the_surface(film):
 def test_theory_can_be_overridden(film):
     """The wrong one too: it says how wrong."""
     film = thick(film, 1000.0)
-    membrane = press(film, PROBE, AT, 1.0, theory=theory_by_name("nonlinear membrane", film))
+    membrane = press(film, PROBE, AT, 1.0, SolveSettings(theory=theory_by_name("nonlinear membrane", film)))
     assert membrane.theory.name == "nonlinear membrane"
     assert membrane.estimated_error == np.inf
-    plate = press(film, PROBE, AT, 1.0, theory=theory_by_name("linear plate", film))
+    plate = press(film, PROBE, AT, 1.0, SolveSettings(theory=theory_by_name("linear plate", film)))
     assert 0.005 < plate.estimated_error < 0.5
     assert (
-        press(film, PROBE, AT, 1.0, theory=theory_by_name("nonlinear membrane + bending", film)).estimated_error < 1e-3
+        press(
+            film, PROBE, AT, 1.0, SolveSettings(theory=theory_by_name("nonlinear membrane + bending", film))
+        ).estimated_error
+        < 1e-3
     )
 
 
@@ -172,8 +187,8 @@ def difference(scene: tuple, accuracy: float) -> tuple[float, float, str]:
     film, probe, at, force = scene
     theory = choose_theory(film, probe, force, accuracy)
     sensor = replace(load_sensor("three-25um-uniaxial"), film=film)
-    full = press(film, probe, at, force, theory=Theory(True, True, film.pretension > 0.0))
-    simple = press(film, probe, at, force, theory=theory, resolution=full.resolution, layer=full.layer)
+    full = press(film, probe, at, force, SolveSettings(theory=Theory(True, True, film.pretension > 0.0)))
+    simple = press(film, probe, at, force, SolveSettings(theory=theory, resolution=full.resolution, layer=full.layer))
     exact, charge = touch_charge(sensor, full), touch_charge(sensor, simple)
     return (
         float(np.abs(charge - exact).max() / np.abs(exact).max()),

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from isocharge.errors import SceneError
-from isocharge.simulate import Circle, Film, Polygon, Resolution, Theory, load_sensor, press, touch_charge
+from isocharge.simulate import (
+    Circle,
+    Film,
+    Polygon,
+    Resolution,
+    SolveSettings,
+    Theory,
+    load_sensor,
+    press,
+    touch_charge,
+)
 from isocharge.simulate.mechanics.stress import stress, turn_stress
 from isocharge.simulate.solver.equilibrium import LINEAR_STRESS
 
@@ -36,7 +46,7 @@ def test_a_corner_over_the_rim_is_refused(film):
     long, at = Polygon.rectangle(10e-3, 1e-3), (39.9e-3, 5e-3)
     with pytest.raises(SceneError, match=r"probe off the film: centre \(39\.9, 5\) mm, farthest point of rectangle"):
         press(film, long, at, 1.0)
-    assert press(film, long.turned(0.5 * np.pi), at, 1e-3, accuracy=0.05).status == "converged"
+    assert press(film, long.turned(0.5 * np.pi), at, 1e-3, SolveSettings(accuracy=0.05)).status == "converged"
 
 
 @pytest.mark.parametrize("force", [0.0, -1.0, np.inf, np.nan])
@@ -119,7 +129,7 @@ def test_vertical_forces_balance_round_the_probe(film, at, probe):
     Independent of the solver's own residual: stress and deflection are read as a user reads them.
     """
     centre, radius, step = np.array(at), 5e-3, 1e-6
-    solved = press(film, probe, at, 1.0, theory=MEMBRANE, resolution=Resolution(7, 8, 6))
+    solved = press(film, probe, at, 1.0, SolveSettings(theory=MEMBRANE, resolution=Resolution(7, 8, 6)))
     angle = 2.0 * np.pi * np.arange(64) / 64
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = centre + radius * normal
@@ -135,7 +145,7 @@ def test_vertical_forces_balance_round_the_probe(film, at, probe):
 def test_tension_is_positive_up_to_half_the_radius_and_not_at_the_rim(film):
     """No wrinkles where the forward map works; near the rim the film is compressed, and says so."""
     for distance, taut in ((0.0, True), (0.5, True), (0.75, False)):
-        solved = press(film, Circle(1e-3), (distance * film.radius, 0.0), 1.0, theory=MEMBRANE)
+        solved = press(film, Circle(1e-3), (distance * film.radius, 0.0), 1.0, SolveSettings(theory=MEMBRANE))
         warned = [warning for warning in solved.warnings if "may wrinkle" in warning]
         assert (solved.principal_stress[0] > 0.0) == taut
         assert bool(warned) == (not taut)
@@ -199,7 +209,7 @@ def test_mesh_error_is_a_bound(film, seed):
     at, force = (float(z.real), float(z.imag)), float(np.exp(rng.uniform(np.log(0.01), np.log(2.0))))
     solved = press(film, probe, at, force)
     finer = replace(solved.resolution, order=solved.resolution.order + 2, rim=2 * solved.resolution.rim)
-    refined = press(film, probe, at, force, theory=solved.theory, resolution=finer, layer=solved.layer)
+    refined = press(film, probe, at, force, SolveSettings(theory=solved.theory, resolution=finer, layer=solved.layer))
     for name in ("three-25um-uniaxial", "four-25um-biaxial"):
         sensor = replace(load_sensor(name), film=film)
         exact = touch_charge(sensor, refined)
@@ -210,10 +220,12 @@ def test_mesh_error_is_a_bound(film, seed):
 def test_wanted_accuracy_is_reached(film):
     """And costs: a finer mesh for more digits."""
     sensor, probe, at = load_sensor("four-25um-uniaxial"), Circle(1e-3), (9e-3, 1e-3)
-    exact = touch_charge(sensor, press(film, probe, at, 1.0, theory=FULL, resolution=Resolution(10, 8, 8, 3)))
+    exact = touch_charge(
+        sensor, press(film, probe, at, 1.0, SolveSettings(theory=FULL, resolution=Resolution(10, 8, 8, 3)))
+    )
     sizes = []
     for accuracy in (1e-2, 1e-3, 1e-4):
-        solved = press(film, probe, at, 1.0, theory=FULL, accuracy=accuracy)
+        solved = press(film, probe, at, 1.0, SolveSettings(accuracy=accuracy, theory=FULL))
         assert np.abs(touch_charge(sensor, solved) / exact - 1.0).max() < accuracy
         sizes.append(solved.field.size)
     assert sizes == sorted(sizes)
@@ -223,11 +235,13 @@ def test_wanted_accuracy_is_reached(film):
 def test_mesh_error_of_a_smooth_field_is_a_number(film):
     """Where the highest modes hold nothing but round-off."""
     taut, theory = replace(film, pretension=1e7), Theory(stretching=False, bending=False, pretensioned=True)
-    solved = press(taut, Circle(0.9 * film.radius), (0.0, 0.0), 1e-3, theory=theory, resolution=Resolution(12, 8, 3))
+    solved = press(
+        taut, Circle(0.9 * film.radius), (0.0, 0.0), 1e-3, SolveSettings(theory=theory, resolution=Resolution(12, 8, 3))
+    )
     assert 0.0 <= solved.mesh_error < 1e-4
 
 
 def test_equilibrium_of_a_thick_film_admits_it(film: Film):
     """The membrane is wrong by factors there, so no number is given."""
     thick = replace(film, thickness=1e-3)
-    assert press(thick, Circle(1e-3), (0.0, 0.0), 1.0, theory=MEMBRANE).estimated_error == np.inf
+    assert press(thick, Circle(1e-3), (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE)).estimated_error == np.inf

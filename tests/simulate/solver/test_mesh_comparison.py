@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.errors import SolveError
-from isocharge.simulate import Circle, Film, Polygon, Probe, Theory, load_sensor, press, touch_charge
+from isocharge.simulate import Circle, Film, Polygon, Probe, SolveSettings, Theory, load_sensor, press, touch_charge
 from isocharge.simulate.mesh.placement import template_for
 from isocharge.simulate.solver.mesh_comparison import needs_second_mesh, relative_difference
 
@@ -55,7 +55,9 @@ def test_the_estimate_holds(scene):
     solved = press(film, probe, at, force)
     mesh = solved.resolution
     finer = replace(mesh, order=mesh.order + 2, rings=mesh.rings + 1, rim=mesh.rim and mesh.rim + 1)
-    refined = press(film, probe, at, force, theory=solved.theory, resolution=finer, layer=solved.layer, start=solved)
+    refined = press(
+        film, probe, at, force, SolveSettings(theory=solved.theory, resolution=finer, layer=solved.layer), start=solved
+    )
     assert worst_error(film, solved, refined) <= solved.mesh_error < 0.01
 
 
@@ -75,8 +77,8 @@ def test_apart_is_the_relative_difference():
     """Of charges, which go with the force where the theory is linear; nothing between a press and itself."""
     theory = Theory(stretching=False, bending=True, pretensioned=True)
     film = replace(FILM, pretension=5e6)
-    one = press(film, Circle(1e-3), (9e-3, 0.0), 1e-5, theory=theory)
-    more = press(film, Circle(1e-3), (9e-3, 0.0), 1.01e-5, theory=theory)
+    one = press(film, Circle(1e-3), (9e-3, 0.0), 1e-5, SolveSettings(theory=theory))
+    more = press(film, Circle(1e-3), (9e-3, 0.0), 1.01e-5, SolveSettings(theory=theory))
     assert relative_difference(one, one) == 0.0
     assert relative_difference(one, more) == pytest.approx(1.0 - 1.0 / 1.01**2, rel=1e-3)
 

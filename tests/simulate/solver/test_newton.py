@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from isocharge.errors import SceneError, SolveError
-from isocharge.simulate import Circle, Polygon, Resolution, Theory, load_sensor, press, touch_charge
+from isocharge.simulate import Circle, Polygon, Resolution, SolveSettings, Theory, load_sensor, press, touch_charge
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.solver import newton
 from isocharge.simulate.solver.assembly import Assembly, Factor
@@ -17,7 +17,7 @@ FORCES = (1e-5, 1e-3, 0.1, 1.0, 10.0)
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
 FULL = Theory(stretching=True, bending=True, pretensioned=False)
 PROBES = {"circle": Circle(1e-3), "rectangle": Polygon.rectangle(4e-3, 2e-3, 0.4)}
-FAILING = {"resolution": Resolution(4, 8, 3), "theory": MEMBRANE, "tolerance": 1e-30}
+FAILING = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 3), tolerance=1e-30)
 
 
 @pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES.keys())
@@ -26,7 +26,9 @@ FAILING = {"resolution": Resolution(4, 8, 3), "theory": MEMBRANE, "tolerance": 1
 def test_every_force_converges_from_flat(film, thickness_um, probe, theory):
     """No help from the user: no force steps, no tension, no start."""
     for force in FORCES:
-        solved = press(replace(film, thickness=thickness_um * 1e-6), probe, (5e-3, 3e-3), force, theory=theory)
+        solved = press(
+            replace(film, thickness=thickness_um * 1e-6), probe, (5e-3, 3e-3), force, SolveSettings(theory=theory)
+        )
         assert solved.status == "converged"
         assert solved.residual <= 1e-7 or "round-off" in solved.message
         assert solved.iterations <= 20
@@ -49,20 +51,24 @@ def test_large_probes_converge(film, share):
 def test_every_pretension_converges(film, pretension):
     """From hardly any to one that makes the film linear."""
     for force in FORCES:
-        solved = press(replace(film, pretension=pretension), Circle(1e-3), (5e-3, 2e-3), force, theory=FULL)
+        solved = press(
+            replace(film, pretension=pretension), Circle(1e-3), (5e-3, 2e-3), force, SolveSettings(theory=FULL)
+        )
         assert solved.iterations <= 20
 
 
 @pytest.mark.parametrize("resolution", [Resolution(2, 8, 3), Resolution(6, 8, 6, 1), Resolution(5, 16, 8)], ids=str)
 def test_every_mesh_converges(film, resolution):
-    assert press(film, Circle(1e-3), (8e-3, 0.0), 1.0, resolution=resolution, theory=FULL).iterations <= 12
+    assert (
+        press(film, Circle(1e-3), (8e-3, 0.0), 1.0, SolveSettings(theory=FULL, resolution=resolution)).iterations <= 12
+    )
 
 
 @pytest.mark.parametrize("theory", [MEMBRANE, FULL], ids=["membrane", "full"])
 def test_end_of_newton_is_quadratic(film, theory):
     """The last step nearly squares the residual: the tangent is the true one at the end."""
     residuals = [
-        press(film, Circle(1e-3), (3e-3, 0.0), 1.0, tolerance=tolerance, theory=theory).residual
+        press(film, Circle(1e-3), (3e-3, 0.0), 1.0, SolveSettings(theory=theory, tolerance=tolerance)).residual
         for tolerance in (1e-1, 1e-2, 1e-4)
     ]
     assert residuals[2] < 10.0 * residuals[1] ** 1.5
@@ -71,26 +77,28 @@ def test_end_of_newton_is_quadratic(film, theory):
 @pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES.keys())
 def test_neighbour_is_a_better_start(film, probe):
     first = press(film, probe, (5e-3, 0.0), 1.0)
-    same = {"resolution": first.resolution, "layer": first.layer}
-    near = press(film, probe, (5.2e-3, 1e-3), 1.1, start=first, **same)
-    cold = press(film, probe, (5.2e-3, 1e-3), 1.1, **same)
+    same = SolveSettings(resolution=first.resolution, layer=first.layer)
+    near = press(film, probe, (5.2e-3, 1e-3), 1.1, same, start=first)
+    cold = press(film, probe, (5.2e-3, 1e-3), 1.1, same)
     assert near.iterations <= 2 < cold.iterations
     sensor = load_sensor("three-25um-uniaxial")
     np.testing.assert_allclose(touch_charge(sensor, near), touch_charge(sensor, cold), rtol=1e-6)
 
 
 def test_start_of_another_mesh_is_not_used(film):
-    coarse = press(film, Circle(1e-3), (5e-3, 0.0), 1.0, resolution=Resolution(3, 8, 4))
+    coarse = press(film, Circle(1e-3), (5e-3, 0.0), 1.0, SolveSettings(resolution=Resolution(3, 8, 4)))
     other = press(film, PROBES["rectangle"], (5e-3, 0.0), 1.0)
     cold = press(film, Circle(1e-3), (5e-3, 0.0), 1.0)
     for start in (coarse, other):
-        solved = press(film, Circle(1e-3), (5e-3, 0.0), 1.0, start=start, resolution=cold.resolution)
+        solved = press(
+            film, Circle(1e-3), (5e-3, 0.0), 1.0, start=start, settings=SolveSettings(resolution=cold.resolution)
+        )
         np.testing.assert_array_equal(solved.field, cold.field)
 
 
 def test_start_of_a_much_thicker_film_still_converges(film):
-    thick = press(replace(film, thickness=1e-3), Circle(1e-3), (5e-3, 0.0), 1.0, theory=FULL)
-    solved = press(film, Circle(1e-3), (5e-3, 0.0), 1e-3, theory=FULL, start=thick)
+    thick = press(replace(film, thickness=1e-3), Circle(1e-3), (5e-3, 0.0), 1.0, SolveSettings(theory=FULL))
+    solved = press(film, Circle(1e-3), (5e-3, 0.0), 1e-3, SolveSettings(theory=FULL), start=thick)
     assert solved.status == "converged"
 
 
@@ -99,12 +107,12 @@ def test_failure_raises_a_full_sentence(film):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("isocharge.simulate.solver.newton.ROUND_OFF", 0.0)
         with pytest.raises(SolveError, match=message):
-            press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, **FAILING)
+            press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, FAILING)
 
 
 def test_failure_is_told_if_asked_not_to_raise(film, monkeypatch):
     monkeypatch.setattr("isocharge.simulate.solver.newton.ROUND_OFF", 0.0)
-    failed = press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, throw=False, **FAILING)
+    failed = press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, FAILING, throw=False)
     assert failed.status == "failed"
     assert 0.0 < failed.residual < 1e-9
     assert failed.iterations < 60
@@ -112,7 +120,7 @@ def test_failure_is_told_if_asked_not_to_raise(film, monkeypatch):
 
 def test_round_off_is_not_a_failure(film):
     """A tolerance that no arithmetic reaches: as good as it gets, and said so."""
-    solved = press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, **FAILING)
+    solved = press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, FAILING)
     assert solved.status == "converged"
     assert solved.message == f"converged to round-off in {solved.iterations} steps"
 
@@ -140,11 +148,11 @@ WRINKLES = r"no equilibrium at .* N, position \(.*\) mm: .* it wrinkles, which h
 def test_a_film_that_wrinkles_is_told(film, monkeypatch):
     """Stopped early, beside the rim, where it is compressed: the message says so. In the middle it does not."""
     monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 3)
-    mesh = {"theory": FULL, "resolution": Resolution(5, 8, 6, 1)}
+    mesh = SolveSettings(theory=FULL, resolution=Resolution(5, 8, 6, 1))
     with pytest.raises(SolveError, match=WRINKLES):
-        press(film, Circle(1e-3), (0.0, 42e-3), 5.0, **mesh)
+        press(film, Circle(1e-3), (0.0, 42e-3), 5.0, mesh)
     with pytest.raises(SolveError, match=r"after 6 steps$"):
-        press(film, Circle(1e-3), (0.0, 0.0), 5.0, **mesh)
+        press(film, Circle(1e-3), (0.0, 0.0), 5.0, mesh)
 
 
 @pytest.mark.slow
@@ -167,7 +175,7 @@ def test_too_near_the_rim_is_told(film):
 def test_start_has_about_the_right_height(film, pretension, thickness):
     """Within a factor of two of the solution in slack, taut and thick films alike; flat on the rim."""
     film = replace(film, pretension=pretension, thickness=thickness)
-    solved = press(film, Circle(1e-3), (0.0, 0.0), 0.1, theory=FULL)
+    solved = press(film, Circle(1e-3), (0.0, 0.0), 0.1, SolveSettings(theory=FULL))
     z = solved.placement.to_template(solved.placement.element_points(solved.mesh).ravel()[solved.mesh.first_seen])
     start = schwerin_start(z, float(solved.placement.rho), DimensionlessGroups.of(film, 0.1, bending=True))
     assert 0.5 < start[:, 2].max() / solved.field[:, 2].max() < 2.0
@@ -205,12 +213,14 @@ def test_a_tangent_is_used_again_while_that_pays(film, monkeypatch, bending):
         return factor(self, matrix)
 
     monkeypatch.setattr(Assembly, "factor", counted)
-    start = press(film, Circle(1e-3), (5e-3, 1e-3), 1.0, theory=theory)
+    start = press(film, Circle(1e-3), (5e-3, 1e-3), 1.0, SolveSettings(theory=theory))
     found, needed = {}, {}
     for limit in (0.0, newton.CHORD_FROM):
         monkeypatch.setattr(newton, "CHORD_FROM", limit)
         tangents.clear()
-        found[limit] = press(film, Circle(1e-3), (5.5e-3, 1e-3), 1.1, theory=theory, start=start, tolerance=1e-10)
+        found[limit] = press(
+            film, Circle(1e-3), (5.5e-3, 1e-3), 1.1, SolveSettings(theory=theory, tolerance=1e-10), start=start
+        )
         needed[limit] = len(tangents)
         assert found[limit].residual <= 1e-10
     first, again = found.values()

@@ -11,6 +11,7 @@ from isocharge.simulate import (
     Electrode,
     Polygon,
     Resolution,
+    SolveSettings,
     Theory,
     load_sensor,
     press,
@@ -52,7 +53,7 @@ def surface_stress(solved, surface: str, points: np.ndarray) -> np.ndarray:
 def test_bending_stress_outside_the_footprint(thick, share):
     """Radial and hoop stress of a clamped plate on the touched side, to the rim."""
     c = share * thick.radius
-    solved = press(thick, Circle(c), (0.0, 0.0), FORCE, theory=PLATE, resolution=FINE)
+    solved = press(thick, Circle(c), (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
     for r in (1.5 * c, 0.6 * thick.radius, 0.99 * thick.radius):
         points = np.array([(r, 0.0), (0.0, r), (-r, 0.0)])
         found = surface_stress(solved, "top", points)
@@ -68,7 +69,7 @@ def test_bending_stress_outside_the_footprint(thick, share):
 def test_bending_stress_under_the_middle(thick, share):
     """M = F (1 + nu) / 4 pi (ln(a / c) + c^2 / 4 a^2) compresses the touched side (Timoshenko, art. 19), 6 M / h^2."""
     c = share * thick.radius
-    solved = press(thick, Circle(c), (0.0, 0.0), FORCE, theory=PLATE, resolution=FINE)
+    solved = press(thick, Circle(c), (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
     moment = FORCE * (1.0 + thick.poisson) / (4.0 * np.pi) * (np.log(1.0 / share) + 0.25 * share**2)
     found = surface_stress(solved, "top", np.array([(1e-9, 0.0)]))[0]
     np.testing.assert_allclose(found[:2], -6.0 * moment / thick.thickness**2, rtol=1e-3)
@@ -110,7 +111,7 @@ def test_charge_of_a_surface_is_the_integral_of_its_stress(thick):
     probe, corner = Circle(2e-3), np.array([(12e-3, 0.0), (12.1e-3, 0.0), (12.1e-3, 0.1e-3), (12e-3, 0.1e-3)])
     sensor = replace(load_sensor("four-25um-uniaxial"), film=thick)
     sensor = replace(sensor, electrodes=(Electrode("A", tuple((float(x), float(y)) for x, y in corner)),))
-    solved = press(thick, probe, (0.0, 0.0), FORCE, theory=PLATE, resolution=FINE)
+    solved = press(thick, probe, (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
     for surface, sign in (("top", 1.0), ("bottom", -1.0)):
         charge = touch_charge(replace(sensor, surface=surface), solved) - touch_charge(sensor, solved)
         radial, hoop = outer(thick, FORCE, 2e-3, 12.05e-3)
@@ -120,12 +121,14 @@ def test_charge_of_a_surface_is_the_integral_of_its_stress(thick):
 @pytest.mark.parametrize("surface", ["top", "bottom"])
 def test_surface_needs_bending(film, surface):
     sensor = replace(load_sensor("three-25um-biaxial"), surface=surface)
-    solved = press(film, Circle(1e-3), (0.0, 0.0), 1.0, theory=MEMBRANE)
+    solved = press(film, Circle(1e-3), (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE))
     message = (
         rf"surface '{surface}' needs bending, but the film was solved as a nonlinear membrane; solve it with theory="
     )
     with pytest.raises(SensorError, match=message):
         touch_charge(sensor, solved)
-    bent = press(film, Circle(1e-3), (0.0, 0.0), 1.0, theory=theory_for(sensor, Circle(1e-3), (1.0, 1.0)))
+    bent = press(
+        film, Circle(1e-3), (0.0, 0.0), 1.0, SolveSettings(theory=theory_for(sensor, Circle(1e-3), (1.0, 1.0)))
+    )
     middle = touch_charge(replace(sensor, surface="middle"), bent)
     assert np.abs(touch_charge(sensor, bent) / middle - 1.0).max() > 1e-5

@@ -36,7 +36,15 @@ def point_command(
 
     Example: isocharge simulate point three-25um-biaxial --probe triangle:4.0@30 --at 3,-2 --force 1.0
     """
-    from isocharge.simulate import load_sensor, parse_probe, press, theory_for, thermal_charge, touch_charge
+    from isocharge.simulate import (
+        SolveSettings,
+        load_sensor,
+        parse_probe,
+        press,
+        theory_for,
+        thermal_charge,
+        touch_charge,
+    )
     from isocharge.simulate.mechanics.theory import theory_by_name
 
     if not 1e-8 <= accuracy <= 1.0:
@@ -44,7 +52,7 @@ def point_command(
     film_sensor, pressing = load_sensor(sensor), parse_probe(probe)
     terms = theory_by_name(theory, film_sensor.film) if theory != "auto" else None
     terms = terms or theory_for(film_sensor, pressing, (force, force), accuracy)
-    equilibrium = press(film_sensor.film, pressing, position(at), force, theory=terms, accuracy=accuracy)
+    equilibrium = press(film_sensor.film, pressing, position(at), force, SolveSettings(accuracy=accuracy, theory=terms))
     charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
     report = _report(film_sensor, equilibrium, charge)
     typer.echo(json_module.dumps(report) if json else _table(report))

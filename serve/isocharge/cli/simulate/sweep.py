@@ -77,7 +77,7 @@ def sweep_command(
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
     from isocharge.resumable_run import refuse_finished
-    from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
+    from isocharge.simulate import Sweep, SweepCallbacks, load_sensor, parse_probe, run_sweep
 
     if workers and cluster:
         raise InputError("expected either --workers or --cluster, got both")
@@ -92,12 +92,9 @@ def sweep_command(
                 film_sensor,
                 probes,
                 sweep,
-                executor=crew.executor,
-                ahead=crew.ahead,
+                workers=crew,
+                callbacks=SweepCallbacks(solving, sampled, say),
                 fresh=fresh,
-                progress=solving,
-                sampled=sampled,
-                warn=say,
             )
     except KeyboardInterrupt:
         if (part := output.with_name(f"{output.name}.part")).exists():

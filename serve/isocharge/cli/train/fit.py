@@ -93,13 +93,15 @@ def _simulate(sensor: str, probes: list[str], radius: str) -> "Dataset":
     """A sweep with its defaults, kept only as long as it is needed; a few seconds, so in this process."""
     from tempfile import TemporaryDirectory
 
-    from isocharge.simulate import Sweep, load_sensor, parse_probe, read_dataset, run_sweep
+    from isocharge.simulate import Sweep, SweepCallbacks, load_sensor, parse_probe, read_dataset, run_sweep
 
     film_sensor, pressing, forces = load_sensor(sensor), [parse_probe(text) for text in probes], Sweep().force_range
     reach = auto_radius(film_sensor, pressing, forces) if radius == "auto" else 1e-3 * number_mm(radius)
     with TemporaryDirectory() as folder, progress("solving the film") as advance:
         sweep = Sweep(reach, samples=SAMPLES)
-        return read_dataset(run_sweep(Path(folder) / "presses", film_sensor, pressing, sweep, progress=advance))
+        return read_dataset(
+            run_sweep(Path(folder) / "presses", film_sensor, pressing, sweep, callbacks=SweepCallbacks(advance))
+        )
 
 
 def _summary(release: "Release") -> str:

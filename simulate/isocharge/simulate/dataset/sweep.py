@@ -4,7 +4,6 @@ A forward map is solved for every probe and evaluated for every press. Both are 
 workers, so neither do the bytes. What is finished is kept in a draft beside the dataset: a run that was killed goes on.
 """
 
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict
@@ -16,8 +15,9 @@ import numpy as np
 
 from isocharge.arrays import Array, Integers
 from isocharge.errors import SceneError
-from isocharge.progress import Progress, Warn
+from isocharge.progress import Progress
 from isocharge.resumable_run import ResumableRun, output_errors, refuse_finished, resume_folder
+from isocharge.simulate.dataset.callbacks import SweepCallbacks
 from isocharge.simulate.dataset.sampling import Sweep as Sweep
 from isocharge.simulate.dataset.sampling import SweepPresses
 from isocharge.simulate.dataset.shards import (
@@ -31,7 +31,7 @@ from isocharge.simulate.dataset.shards import (
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.execution.checkpointed_map import CheckpointedExecutor
 from isocharge.simulate.execution.code_version import code_fingerprint
-from isocharge.simulate.execution.workers import AHEAD, Workers
+from isocharge.simulate.execution.workers import Workers
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.sensor.probe import Probe
@@ -57,15 +57,12 @@ def run_sweep(
     sensor: Sensor,
     probes: Sequence[Probe],
     sweep: Sweep,
+    settings: SolveSettings = SolveSettings(),
     *,
-    solver: SolveSettings = SolveSettings(),
-    executor: Executor | None = None,
-    ahead: int = AHEAD,
+    workers: Workers = Workers(),
+    callbacks: SweepCallbacks = SweepCallbacks(),
     shard: int = SHARD,
     fresh: bool = False,
-    progress: Progress | None = None,
-    sampled: Progress | None = None,
-    warn: Warn = warnings.warn,
 ) -> Path:
     """Simulate a sweep and write it as a dataset. Killed and called again with the same arguments, it goes on.
 
@@ -74,14 +71,11 @@ def run_sweep(
         sensor: The sensor.
         probes: The objects that press; they take turns.
         sweep: What to sample.
-        solver: How the film is solved.
-        executor: Where the work is done; here and now if absent. The bytes written do not depend on it.
-        ahead: Tasks to hand out before the first is back; twice the number of workers keeps all of them busy.
+        settings: How the film is solved.
+        workers: Who does the work, this process by default. The bytes written do not depend on it.
+        callbacks: What to call with progress and warnings.
         shard: Samples per shard.
         fresh: Throw away what an earlier run left.
-        progress: Told how many distances and orientations of a probe are solved.
-        sampled: Told how many samples are made.
-        warn: Told if a part of an earlier run is damaged; it is made again.
 
     Returns:
         The folder.
@@ -95,14 +89,16 @@ def run_sweep(
     folder, probes = Path(folder), tuple(probes)
     refuse_finished(folder)
     presses = sweep.over(probes)  # before anything is written: scipy's Sobol tables swallow an interrupt
-    workers = Workers(executor, ahead)
-    identity = _identity(sensor, probes, sweep, solver, shard)
-    with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh, warn=warn) as draft:
-        maps = tuple(
-            _build(sensor, probe, sweep, solver, CheckpointedExecutor(draft, f"solve-{number:02d}", executor), progress)
-            for number, probe in enumerate(probes)
+    identity = _identity(sensor, probes, sweep, settings, shard)
+    with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh, warn=callbacks.warn) as draft:
+        checkpointed = (
+            CheckpointedExecutor(draft, f"solve-{number:02d}", workers.executor) for number in range(len(probes))
         )
-        entries = _draft_shards(draft, maps, presses, workers, shard, sampled)
+        maps = tuple(
+            _build(sensor, probe, sweep, settings, executor, callbacks.solved)
+            for probe, executor in zip(probes, checkpointed, strict=True)
+        )
+        entries = _draft_shards(draft, maps, presses, workers, shard, callbacks.sampled)
         with output_errors(folder):
             write_manifest(draft.data, folder.name, sensor, entries, _about(maps, sweep))
     return folder
@@ -112,15 +108,15 @@ def solve_maps(
     sensor: Sensor,
     probes: Sequence[Probe],
     sweep: Sweep,
+    settings: SolveSettings = SolveSettings(),
     *,
-    solver: SolveSettings = SolveSettings(),
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> tuple[ForwardMap, ...]:
     """A forward map for each probe, over the sweep's ranges."""
     if not probes:
         raise SceneError("probes: expected at least one, got none")
-    return tuple(_build(sensor, probe, sweep, solver, executor, progress) for probe in probes)
+    return tuple(_build(sensor, probe, sweep, settings, executor, progress) for probe in probes)
 
 
 def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
@@ -133,25 +129,17 @@ def _build(
     sensor: Sensor,
     probe: Probe,
     sweep: Sweep,
-    solver: SolveSettings,
+    settings: SolveSettings,
     executor: Executor | None,
     progress: Progress | None,
 ) -> ForwardMap:
     return ForwardMap.build(
-        sensor,
-        probe,
-        sweep.radius,
-        sweep.force_range,
-        theory=solver.theory,
-        accuracy=solver.accuracy,
-        resolution=solver.resolution,
-        executor=executor,
-        progress=progress,
+        sensor, probe, sweep.radius, sweep.force_range, settings, executor=executor, progress=progress
     )
 
 
 def _identity(
-    sensor: Sensor, probes: Sequence[Probe], sweep: Sweep, solver: SolveSettings, shard: int
+    sensor: Sensor, probes: Sequence[Probe], sweep: Sweep, settings: SolveSettings, shard: int
 ) -> dict[str, Any]:
     """All that decides about the bytes."""
     return {
@@ -159,7 +147,7 @@ def _identity(
         "sensor": sensor_to_dict(sensor),
         "probes": [f"{probe.notation}@{np.rad2deg(probe.angle):.12g}" for probe in probes],
         "sweep": asdict(sweep),
-        "solver": asdict(solver),
+        "solver": asdict(settings),
         "shard": shard,
     }
 

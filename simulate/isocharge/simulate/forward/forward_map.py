@@ -9,7 +9,7 @@ built.
 """
 
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,7 +23,7 @@ from isocharge.simulate.forward.readout import COARSE, FINE, NEAR, ReadoutPoints
 from isocharge.simulate.forward.solve_family import check_family, solve_family
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.stress import turn_stress
-from isocharge.simulate.mechanics.theory import ACCURACY, Theory, theory_for
+from isocharge.simulate.mechanics.theory import Theory, theory_for
 from isocharge.simulate.mesh.placement import Placement, template_for
 from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.numerics.interpolation import tensor_values
@@ -31,6 +31,7 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.mesh_choice import layer_for
 from isocharge.simulate.solver.press import press
+from isocharge.simulate.solver.settings import SolveSettings
 
 CHUNK = 256
 """Presses evaluated at once: keeps the working arrays within some 100 MB."""
@@ -77,10 +78,8 @@ class ForwardMap:
         probe: Probe,
         radius: float = 8e-3,
         force_range: tuple[float, float] = (0.05, 2.0),
+        settings: SolveSettings = SolveSettings(),
         *,
-        theory: Theory | None = None,
-        accuracy: float = ACCURACY,
-        resolution: Resolution | None = None,
         executor: Executor | None = None,
         progress: Progress | None = None,
     ) -> "ForwardMap":
@@ -91,9 +90,8 @@ class ForwardMap:
             probe: The footprint.
             radius: Largest distance of a press from the centre, m.
             force_range: Smallest and largest force, N.
-            theory: Which terms to model; the fewest that the accuracy allows over the forces if absent.
-            accuracy: Relative error of a charge that is wanted.
-            resolution: Mesh; the coarsest that carries the outermost press well if absent.
+            settings: Accuracy, theory and mesh. What is None is chosen for all presses: the fewest terms that the
+                accuracy allows over the forces, the mesh of the outermost press, thin rings for the middle force.
             executor: Where the solves run; here and now if absent. The result does not depend on it.
             progress: Told how many solves are done.
 
@@ -103,16 +101,17 @@ class ForwardMap:
         """
         film = sensor.film
         check_family(film, probe, radius, force_range)
-        theory = theory or theory_for(sensor, probe, force_range, accuracy)
+        theory = settings.theory or theory_for(sensor, probe, force_range, settings.accuracy)
         middle = float(np.sqrt(force_range[0] * force_range[1]))
-        layer = layer_for(film, middle)
-        if resolution is None:
-            outermost = press(film, probe, (radius, 0.0), middle, theory=theory, accuracy=accuracy, layer=layer)
-            resolution = outermost.resolution
+        layer = settings.layer or layer_for(film, middle)
+        settings = replace(settings, theory=theory, layer=layer)
+        resolution = settings.resolution or press(film, probe, (radius, 0.0), middle, settings).resolution
+        settings = replace(settings, resolution=resolution)
         error = np.inf
         for count, turns in (((5, 3), TURNS), ((8, 5), 2 * TURNS), ((13, 8), 3 * TURNS)):
             family = Family.spread(radius, force_range, count, probe.period, turns)
-            table = solve_family(film, probe, sensor.surface, family, theory, resolution, layer, executor, progress)
+            solved = solve_family(sensor, probe, family, settings, executor, progress)
+            table = family.unfold(solved, template_for(probe, resolution))
             made = cls(sensor, probe, family, theory, resolution, layer, table, error)
             error = _check_against_solves(made)
             if error <= INTERPOLATION_ERROR:
@@ -131,6 +130,11 @@ class ForwardMap:
     def force_range(self) -> tuple[float, float]:
         """Smallest and largest force covered, N."""
         return self.family.force_range
+
+    @property
+    def settings(self) -> SolveSettings:
+        """Theory and mesh of the solves, for single presses or another map; the thin rings suit each press."""
+        return SolveSettings(theory=self.theory, resolution=self.resolution)
 
     @property
     def solves(self) -> int:
@@ -243,9 +247,7 @@ def _check_against_solves(made: ForwardMap) -> float:
     errors = []
     for distance, angle, force, turn in made.family.probes_between(CHECKS):
         x, y = distance * np.cos(angle), distance * np.sin(angle)
-        solved = press(
-            made.sensor.film, made.probe.turned(turn), (x, y), force, theory=made.theory, resolution=made.resolution
-        )
+        solved = press(made.sensor.film, made.probe.turned(turn), (x, y), force, made.settings)
         direct = touch_charge(made.sensor, solved)
         mapped = made.forward(np.array([x]), np.array([y]), np.array([force]), turn)[0]
         scale = np.maximum(np.abs(direct), SMALL * np.abs(direct).max())

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,13 +11,33 @@ from isocharge.errors import SceneError
 from isocharge.progress import Progress
 from isocharge.simulate.forward.family import Family
 from isocharge.simulate.mechanics.stress import turn_stress
-from isocharge.simulate.mechanics.theory import Theory
-from isocharge.simulate.mesh.placement import template_for
-from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium
 from isocharge.simulate.solver.press import check_scene, press
+from isocharge.simulate.solver.settings import SolveSettings
+
+
+@dataclass(frozen=True)
+class _Chain:
+    """Presses of one distance and orientation.
+
+    Attributes:
+        film: The film.
+        probe: The footprint, turned as it presses.
+        surface: Where in the thickness the stress is read.
+        distance: Of the presses from the film's centre, m.
+        forces: N, shape (n_force,), in the order in which they are solved.
+        settings: Theory and mesh.
+    """
+
+    film: Film
+    probe: Probe
+    surface: Surface
+    distance: float
+    forces: Array
+    settings: SolveSettings
 
 
 def check_family(film: Film, probe: Probe, radius: float, force_range: tuple[float, float]) -> None:
@@ -34,26 +55,25 @@ def check_family(film: Film, probe: Probe, radius: float, force_range: tuple[flo
 
 
 def solve_family(
-    film: Film,
+    sensor: Sensor,
     probe: Probe,
-    surface: Surface,
     family: Family,
-    theory: Theory,
-    resolution: Resolution,
-    layer: float,
+    settings: SolveSettings,
     executor: Executor | None,
     progress: Progress | None,
 ) -> Array:
-    """Scaled nodal stress of every member, shape (n_distance * n_force * n_turn, n_element * n_local * 3)."""
-    jobs = [
-        (film, probe.turned(float(turn)), surface, float(distance), family.force, theory, resolution, layer)
+    """Scaled stress at the nodes, as `Family.unfold` takes it: (n_distance, n_solved_turn, n_force, ...).
+
+    The settings give theory, mesh and width of the thin rings, the same for all members.
+    """
+    chains = [
+        _Chain(sensor.film, probe.turned(float(turn)), sensor.surface, float(distance), family.force, settings)
         for distance in family.distance
         for turn in family.solved_turns
     ]
-    results: Iterable[Array] = executor.map(_solve_chain, jobs) if executor else map(_solve_chain, jobs)
-    solved = np.stack(list(_report(results, len(jobs), progress)))
-    shape = (family.distance.size, family.solved_turns.size, family.force.size, -1)
-    return family.unfold(solved.reshape(shape), template_for(probe, resolution))
+    results: Iterable[Array] = executor.map(_solve_chain, chains) if executor else map(_solve_chain, chains)
+    stress = np.stack(list(_report(results, len(chains), progress)))
+    return stress.reshape(family.distance.size, family.solved_turns.size, family.force.size, -1)
 
 
 def _report(results: Iterable[Array], total: int, progress: Progress | None) -> Iterator[Array]:
@@ -63,14 +83,11 @@ def _report(results: Iterable[Array], total: int, progress: Progress | None) -> 
         yield result
 
 
-def _solve_chain(job: tuple[Film, Probe, Surface, float, Array, Theory, Resolution, float]) -> Array:
-    """One distance and orientation, all forces, each started from the one before; shape (n_force, ...)."""
-    film, probe, surface, distance, forces, theory, resolution, layer = job
+def _solve_chain(chain: _Chain) -> Array:
+    """Scaled stress at the nodes for each force, solved from the one before; shape (n_force, ...)."""
     start: Equilibrium | None = None
     rows = []
-    for force in forces:
-        start = press(
-            film, probe, (distance, 0.0), float(force), theory=theory, resolution=resolution, layer=layer, start=start
-        )
-        rows.append(turn_stress(start.nodal_stress(surface), -probe.angle).ravel())
+    for force in chain.forces:
+        start = press(chain.film, chain.probe, (chain.distance, 0.0), float(force), chain.settings, start=start)
+        rows.append(turn_stress(start.nodal_stress(chain.surface), -chain.probe.angle).ravel())
     return np.stack(rows)

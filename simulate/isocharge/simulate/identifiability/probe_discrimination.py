@@ -176,8 +176,7 @@ def _of_radius(forward_map: ForwardMap, radius: float, progress: Progress | None
         Circle(radius),
         made.radius,
         made.force_range,
-        theory=made.theory,
-        resolution=made.resolution,
+        made.settings,
         progress=progress,
     )
 

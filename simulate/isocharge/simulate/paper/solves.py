@@ -25,6 +25,7 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium
 from isocharge.simulate.solver.press import press
+from isocharge.simulate.solver.settings import SolveSettings
 
 FORCE = 1.0
 """The paper's, N."""
@@ -65,7 +66,7 @@ def solve_presses(job: SolveJob) -> Array:
     start: Equilibrium | None = None
     charge = []
     for at, force in zip(job.at, job.force, strict=True):
-        start = press(job.sensors[0].film, job.probe, at, force, accuracy=job.accuracy, start=start)
+        start = press(job.sensors[0].film, job.probe, at, force, SolveSettings(accuracy=job.accuracy), start=start)
         charge.append([touch_charge(sensor, start) for sensor in job.sensors])
     return np.moveaxis(np.array(charge), 1, 0)
 
@@ -98,7 +99,9 @@ def solve_mesh(job: MeshJob) -> tuple[Array, int, float]:
     """Charges, unknowns and CPU seconds; NaN charges where the mesh gives no equilibrium."""
     began, theory = process_time(), Theory(stretching=True, bending=True, pretensioned=False)
     try:
-        solved = press(job.sensor.film, job.probe, job.at, FORCE, theory=theory, resolution=Resolution(*job.mesh))
+        solved = press(
+            job.sensor.film, job.probe, job.at, FORCE, SolveSettings(theory=theory, resolution=Resolution(*job.mesh))
+        )
     except SolveError:
         return np.full(len(job.sensor.electrodes), np.nan), 0, process_time() - began
     charge = touch_charge(job.sensor, solved)

@@ -10,7 +10,7 @@ from isocharge.errors import SceneError, SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared
-from isocharge.simulate.mechanics.theory import ACCURACY, Theory, choose_theory
+from isocharge.simulate.mechanics.theory import Theory, choose_theory
 from isocharge.simulate.mesh.elements import Geometry
 from isocharge.simulate.mesh.placement import Placement, place, template_for
 from isocharge.simulate.mesh.resolution import Resolution
@@ -23,6 +23,7 @@ from isocharge.simulate.solver.error_estimate import shape_error
 from isocharge.simulate.solver.mesh_choice import layer_for, resolution_for, too_near_the_rim
 from isocharge.simulate.solver.mesh_comparison import ANOTHER, MOST_ORDERS, needs_second_mesh, relative_difference
 from isocharge.simulate.solver.newton import GUARD_BELOW, NewtonResult, schwerin_start, solve_linear, solve_newton
+from isocharge.simulate.solver.settings import SolveSettings
 
 LAYER_REUSE = (0.75, 2.0)
 """Width of a neighbour's thin rings over one's own, between which it is taken over, so that its field still fits."""
@@ -71,13 +72,9 @@ def press(
     probe: Probe,
     at: tuple[float, float],
     force: float,
+    settings: SolveSettings = SolveSettings(),
     *,
-    theory: Theory | None = None,
-    accuracy: float = ACCURACY,
-    resolution: Resolution | None = None,
-    layer: float | None = None,
     start: Equilibrium | None = None,
-    tolerance: float = 1e-7,
     throw: bool = True,
 ) -> Equilibrium:
     """Solve the film under a press.
@@ -87,13 +84,8 @@ def press(
         probe: The footprint, pressing uniformly, dead load.
         at: Centroid of the footprint (x, y), m.
         force: N, positive pushes.
-        theory: Which terms to model; the fewest that the accuracy allows if absent.
-        accuracy: Relative error of a charge that is wanted.
-        resolution: Mesh of the template.
-        layer: Width of the thin rings at the rim over the film's radius; six bending lengths if absent, or what the
-            start has if that is near.
+        settings: Accuracy, theory and mesh.
         start: A neighbouring equilibrium of the same mesh to start from: another force, another position.
-        tolerance: Out-of-balance force over load.
         throw: Whether a failure raises; if not, look at `status`.
 
     Returns:
@@ -104,17 +96,18 @@ def press(
         SolveError: If no equilibrium was found and `throw` is set.
     """
     check_scene(film, probe, at, force)
-    theory = theory or choose_theory(film, probe, force, accuracy)
+    theory = settings.theory or choose_theory(film, probe, force, settings.accuracy)
     began = process_time()
-    scene = _Scene(film, probe, at, force, theory, layer or _layer(film, force, probe, resolution, start), tolerance)
+    layer = settings.layer or _layer(film, force, probe, settings.resolution, start)
+    scene = _Scene(film, probe, at, force, theory, layer, settings.tolerance)
     with single_threaded_blas():
-        if resolution is None and needs_second_mesh(film, probe, at, accuracy):
-            solved = _solve_until_meshes_agree(scene, accuracy, start)
+        if settings.resolution is None and needs_second_mesh(film, probe, at, settings.accuracy):
+            solved = _solve_until_meshes_agree(scene, settings.accuracy, start)
         else:
-            solved = scene.solve(resolution or scene.resolution(accuracy), start)
+            solved = scene.solve(settings.resolution or scene.resolution(settings.accuracy), start)
     solved = replace(solved, seconds=process_time() - began)
     if throw and solved.status != "converged":
-        raise SolveError(_failure_reason(solved, tolerance))
+        raise SolveError(_failure_reason(solved, settings.tolerance))
     return solved
 
 

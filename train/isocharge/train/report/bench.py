@@ -9,10 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.errors import DatasetError
-from isocharge.simulate import Dataset, ForwardMap, Probe, Samples, Sensor, Sweep, noise_model, parse_probe, solve_maps
+from isocharge.simulate import (
+    Dataset,
+    ForwardMap,
+    Probe,
+    Samples,
+    Sensor,
+    SolveSettings,
+    Sweep,
+    noise_model,
+    parse_probe,
+    solve_maps,
+)
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.mechanics.theory import ACCURACY
-from isocharge.simulate.solver.settings import SolveSettings
 from isocharge.train.data.domain import ContactDomain
 from isocharge.train.data.presses import LabelledPresses, domain_of
 
@@ -69,12 +78,10 @@ class EvaluationScene:
         sensor: Sensor | None = None,
         probes: tuple[Probe, ...] | None = None,
         further: float = FURTHER,
-        accuracy: float = ACCURACY,
+        settings: SolveSettings = SolveSettings(),
     ) -> tuple[ForwardMap, ...]:
         """Forward maps of the sensor under its probes, or of another sensor, other probes, another reach."""
-        return solve_maps(
-            sensor or self.sensor, probes or self.probes, self.sweep(further), solver=SolveSettings(accuracy=accuracy)
-        )
+        return solve_maps(sensor or self.sensor, probes or self.probes, self.sweep(further), settings)
 
 
 def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:

@@ -13,7 +13,7 @@ from isocharge.errors import ModelError
 from isocharge.files import new_folder, write_whole
 from isocharge.progress import StageProgress
 from isocharge.serve import ModelMetadata
-from isocharge.simulate import Dataset, Samples, sensor_to_dict
+from isocharge.simulate import Dataset, Samples, SolveSettings, sensor_to_dict
 from isocharge.train.baselines import Fitted, FittingTask, ReleasedModel
 from isocharge.train.data.presses import domain_of
 from isocharge.train.report import effects, maps, pictures
@@ -140,7 +140,7 @@ class _Subject:
         """Everything about this dataset: its section of the record, its pictures written."""
         settings, bench = self.settings, self.bench
         steps("solving the film for limits and contours")
-        films = bench.films(further=1.0, accuracy=settings.accuracy)
+        films = bench.films(further=1.0, settings=SolveSettings(accuracy=settings.accuracy))
         steps("solving the film for the test presses")
         test = EvaluationPresses.of(bench, press_on(films if settings.quick else bench.films(), bench.sweep()))
         steps("integrating the Bayes limit")

@@ -9,7 +9,7 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.errors import IsochargeError
 from isocharge.progress import Announce
-from isocharge.simulate import Sensor, parse_probe
+from isocharge.simulate import Sensor, SolveSettings, parse_probe
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.baselines import Fitted, FittingTask, GaussNewton, PolynomialRidge, ReleasedModel
 from isocharge.train.data.presses import LabelledPresses, noisy_charges
@@ -75,11 +75,12 @@ def cases(bench: EvaluationScene, clean: LabelledPresses, settings: Settings, pr
         yield Case("noise", f"x {level:g}", clean, _noisy(clean, bench, level))
     for notation in settings.shapes:
         progress(f"solving the film under {notation}")
-        presses = press_on(bench.films(probes=(parse_probe(notation),), accuracy=max(ROUGH, settings.accuracy)), sweep)
+        rough = SolveSettings(accuracy=max(ROUGH, settings.accuracy))
+        presses = press_on(bench.films(probes=(parse_probe(notation),), settings=rough), sweep)
         yield Case("probe", notation, presses, noisy(presses))
     if settings.worlds:
         progress("solving a film with more pretension")
-        presses = press_on(bench.films(sensor=_tauter(bench.sensor), accuracy=ROUGH), sweep)
+        presses = press_on(bench.films(sensor=_tauter(bench.sensor), settings=SolveSettings(accuracy=ROUGH)), sweep)
         yield Case("pretension", f"+{1e-6 * PRETENSION_OFF:g} MPa", presses, noisy(presses))
     yield from _wrong_gains(bench, clean, noisy(clean))
     if settings.worlds:
@@ -115,7 +116,7 @@ def _wrong_gains(bench: EvaluationScene, clean: LabelledPresses, noisy: Array) -
 def _outside(bench: EvaluationScene, noisy: Callable[[LabelledPresses], Array]) -> Iterator[Case]:
     """Presses beyond the working area, where the film is large enough."""
     try:
-        films = bench.films(further=OUTSIDE, accuracy=ROUGH)
+        films = bench.films(further=OUTSIDE, settings=SolveSettings(accuracy=ROUGH))
     except IsochargeError:
         return
     low, high = bench.domain.force_range_N
