@@ -35,7 +35,7 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.forward.readout import ReadoutPoints
-from isocharge.simulate.mesh.placement import template_for
+from isocharge.simulate.mesh.template import template_for
 
 SENSORS = tuple(load_sensor(name) for name in built_in_sensors())
 FILM, PROBE = SENSORS[0].film, Circle(1e-3)

@@ -29,7 +29,8 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.elements import Geometry
-from isocharge.simulate.mesh.placement import Placement, place, template_for
+from isocharge.simulate.mesh.placed_mesh import place
+from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template
 
 DATA = Path(__file__).parents[1] / "data"
@@ -153,11 +154,9 @@ class Mesh:
 
 
 def _mesh(probe: Probe, at: tuple[float, float], resolution: Resolution) -> Mesh:
-    template = template_for(probe, resolution)
-    placement = place(Film(1.0, 1e-3, 1.0, 0.3), probe, at, resolution, 0.05)
-    z = placement.element_points(template)
-    points = z.ravel()[template.first_seen]
-    return Mesh(template, placement, Geometry.build(template, z), np.stack([points.real, points.imag], axis=1))
+    mesh = place(Film(1.0, 1e-3, 1.0, 0.3), probe, at, resolution, 0.05)
+    points = np.stack([mesh.node_points.real, mesh.node_points.imag], axis=1)
+    return Mesh(mesh.template, mesh.placement, mesh.geometry, points)
 
 
 @pytest.fixture(scope="session")
@@ -200,12 +199,21 @@ def made_up() -> Callable[..., Equilibrium]:
     ) -> Equilibrium:
         of = of or load_sensor("three-25um-biaxial").film
         resolution = Resolution(order, 8, 5, 1)
-        template = template_for(probe, resolution)
-        z = place(of, probe, at, resolution, 0.05).element_points(template).ravel()[template.first_seen]
-        values = field(np.stack([z.real, z.imag], axis=1))
-        groups = DimensionlessGroups(amplitude2, 1.0, 0.0, 0.0, of.poisson)
+        mesh = place(of, probe, at, resolution, 0.05)
         return Equilibrium(
-            of, probe, at, 1.0, theory, resolution, 0.05, values, groups, "converged", "made up", 0, 0.0, 0.0
+            film=of,
+            probe=probe,
+            at=at,
+            force=1.0,
+            theory=theory,
+            placed_mesh=mesh,
+            field=field(np.stack([mesh.node_points.real, mesh.node_points.imag], axis=1)),
+            groups=DimensionlessGroups(amplitude2, 1.0, 0.0, 0.0, of.poisson),
+            status="converged",
+            message="made up",
+            iterations=0,
+            residual=0.0,
+            seconds=0.0,
         )
 
     return make

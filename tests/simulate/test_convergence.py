@@ -19,7 +19,6 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mesh.elements import Geometry
 
 ORDERS = (3, 4, 5, 6)
 PROBES = {"circle": Circle(1e-3), "rectangle": Polygon.rectangle(4e-3, 2e-3, 0.5)}
@@ -119,8 +118,7 @@ def test_energy_converges_with_twice_the_order_of_the_elements(film, order):
     theory = THEORIES["membrane"][1]
 
     def energy(solved: Equilibrium) -> float:
-        geometry = Geometry.build(solved.mesh, solved.placement.element_points(solved.mesh))
-        return ElasticFilm(geometry, solved.groups).energy(solved.field)
+        return ElasticFilm(solved.placed_mesh.geometry, solved.groups).energy(solved.field)
 
     reference = energy(
         press(film, Circle(1e-3), (6e-3, 3e-3), 1.0, SolveSettings(theory=theory, resolution=Resolution(8, 8, 6)))

@@ -224,8 +224,8 @@ def test_a_folder_that_cannot_be_written(tmp_path):
 def _spied(monkeypatch):
     """Sweeps solve nothing: a build is four jobs whose results do not matter."""
 
-    def build(_sensor, probe, *_ranges, executor, **_options):
-        assert [float(result.sum()) for result in executor.map(np.full, range(1, 5), range(1, 5))] == [1, 4, 9, 16]
+    def build(_sensor, probe, *_ranges, map_jobs, **_options):
+        assert [float(result.sum()) for result in map_jobs(lambda n: np.full(n, n), range(1, 5))] == [1, 4, 9, 16]
         return Spy(probe)
 
     monkeypatch.setattr(ForwardMap, "build", build)

@@ -302,7 +302,7 @@ def test_the_issues_ranges(probe):
 def test_result_does_not_depend_on_the_executor(two_processes, probe: Probe):
     sensor, family = load_sensor("three-25um-biaxial"), {**QUICK, "force_range": (0.9, 1.0), "radius": 1e-3}
     here = ForwardMap.build(sensor, probe, **family)
-    there = ForwardMap.build(sensor, probe, **family, executor=two_processes)
+    there = ForwardMap.build(sensor, probe, **family, map_jobs=two_processes.map)
     assert here.table.tobytes() == there.table.tobytes()
     assert here.error == there.error
 

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from isocharge.errors import SceneError
 from isocharge.simulate import Circle, Film, Polygon, Probe, Resolution, Theory
-from isocharge.simulate.mesh.elements import Geometry
-from isocharge.simulate.mesh.placement import Placement, place, template_for
-from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.mesh.placed_mesh import place
+from isocharge.simulate.mesh.placement import Placement
+from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.sensor.probe import farthest
-from isocharge.simulate.solver.mesh_choice import resolution_for
+from isocharge.simulate.solver.mesh_choice import choose_mesh
 
 FILM = Film(1.0, 1e-3, 1.0, 0.3)
 FULL = Theory(stretching=True, bending=True, pretensioned=False)
@@ -44,7 +44,7 @@ def presses(draw) -> tuple[Probe, tuple[float, float], Resolution, float]:
     distance = share * (1.0 - probe.reach)
     at = (distance * np.cos(angle), distance * np.sin(angle))
     try:
-        resolution = resolution_for(FILM, probe, at, FULL, 1e-3, layer)
+        resolution = choose_mesh(FILM, probe, at, FULL, 1e-3, layer).resolution
     except SceneError:
         assume(False)
     return probe, at, resolution, layer
@@ -75,7 +75,7 @@ def accuracy(film: np.ndarray, placement: Placement) -> np.ndarray:
 def test_locate_inverts_element_points(scene, seed):
     """Points inside of every element are found in that element, at their local coordinates."""
     probe, at, resolution, layer = scene
-    placement, mesh = place(FILM, probe, at, resolution, layer), template_for(probe, resolution)
+    placement, mesh = place(FILM, probe, at, resolution, layer).placement, template_for(probe, resolution)
     xi, eta = np.random.default_rng(seed).uniform(-0.98, 0.98, (2, 4))
     film = exact_points(placement, mesh, xi, eta).ravel()
     element, found_xi, found_eta = (found[0] for found in placement.batch().locate(mesh, film[None]))
@@ -89,7 +89,7 @@ def test_locate_inverts_element_points(scene, seed):
 def test_any_point_is_found_where_it_was(scene, seed):
     """All over the film, on the rim, and on every seam: the nodes, the hub, the footprint's edge."""
     probe, at, resolution, layer = scene
-    placement, mesh = place(FILM, probe, at, resolution, layer), template_for(probe, resolution)
+    placement, mesh = place(FILM, probe, at, resolution, layer).placement, template_for(probe, resolution)
     rng = np.random.default_rng(seed)
     disk = np.sqrt(rng.random(120)) * np.exp(2j * np.pi * rng.random(120))
     near = placement.corners.mean() + 3.0 * probe.reach * disk[:100]
@@ -106,7 +106,7 @@ def test_accepted_presses_have_no_folded_elements(scene):
     """Jacobians positive at every integration point and node; the film's area is there."""
     probe, at, resolution, layer = scene
     mesh = template_for(probe, resolution)
-    geometry = Geometry.build(mesh, place(FILM, probe, at, resolution, layer).element_points(mesh))
+    geometry = place(FILM, probe, at, resolution, layer).geometry
     assert geometry.weights.min() > 0.0
     assert geometry.mass.min() > 0.0
     assert mesh.copies * geometry.weights.sum() == pytest.approx(np.pi, rel=3e-3)
@@ -118,14 +118,13 @@ def test_footprint_is_the_probes(scene):
     """Its area, centroid and share of the load: exact for polygons, to the mesh's accuracy for circles."""
     probe, at, resolution, layer = scene
     mesh, distance = template_for(probe, resolution), float(np.hypot(*at))
-    points = place(FILM, probe, at, resolution, layer).element_points(mesh)
-    geometry = Geometry.build(mesh, points)
+    placed = place(FILM, probe, at, resolution, layer)
+    geometry = placed.geometry
     exact = 1e-9 if isinstance(probe, Polygon) else 1e-4
     inner = geometry.weights[mesh.footprint]
     assert mesh.copies * inner.sum() == pytest.approx(probe.area, rel=exact)
     assert mesh.copies * geometry.load.sum() == pytest.approx(1.0, rel=1e-12)
-    z = points.ravel()[mesh.first_seen]
-    mean = mesh.copies * geometry.load @ z
+    mean = mesh.copies * geometry.load @ placed.node_points
     assert mean.real == pytest.approx(distance, abs=exact * probe.reach)
     if not mesh.half:
         assert mean.imag == pytest.approx(0.0, abs=exact * probe.reach)
@@ -141,8 +140,8 @@ def test_load_is_uniform_over_a_polygon(probe, distance):
     """Second moments about the centroid, from the corners' closed formula, to round-off: no staircase of elements."""
     resolution = Resolution(4, 8, 3)
     mesh = template_for(probe, resolution)
-    points = place(FILM, probe, (distance, 0.0), resolution, 0.05).element_points(mesh)
-    load, about = Geometry.build(mesh, points).load, points.ravel()[mesh.first_seen] - distance
+    placed = place(FILM, probe, (distance, 0.0), resolution, 0.05)
+    load, about = placed.geometry.load, placed.node_points - distance
     (x, y), (u, v) = (np.stack([z.real, z.imag]) for z in (probe.outline, np.roll(probe.outline, -1)))
     cross = (x * v - u * y) / (12.0 * probe.area)
     assert load @ about.real**2 == pytest.approx(np.sum(cross * (x * x + x * u + u * u)), rel=1e-11)
@@ -156,9 +155,8 @@ def test_load_is_uniform_over_a_polygon(probe, distance):
 def test_load_is_uniform_over_a_disk(distance, radius):
     """1, the centre, R^2/4 along each axis."""
     resolution = Resolution(8, 8, 4)
-    mesh = template_for(Circle(radius), resolution)
-    points = place(FILM, Circle(radius), (distance, 0.0), resolution, 0.05).element_points(mesh)
-    load, about = 2.0 * Geometry.build(mesh, points).load, points.ravel()[mesh.first_seen] - distance
+    placed = place(FILM, Circle(radius), (distance, 0.0), resolution, 0.05)
+    load, about = 2.0 * placed.geometry.load, placed.node_points - distance
     assert load.sum() == pytest.approx(1.0, rel=1e-13)
     assert abs(load @ about.real) < 1e-8 * radius
     assert load @ about.real**2 == pytest.approx(0.25 * radius**2, rel=1e-7)
@@ -168,7 +166,7 @@ def test_load_is_uniform_over_a_disk(distance, radius):
 @pytest.mark.parametrize(("distance", "radius"), [(0.0, 0.02), (0.5, 0.002), (0.3, 0.5), (0.9, 0.05), (0.96, 0.03)])
 def test_footprint_edge_is_the_right_circle(distance, radius):
     """The template's ring |z| = rho lands on the circle with the footprint's radius and centre, the rim on the rim."""
-    placement = place(FILM, Circle(radius), (distance, 0.0), Resolution(), 0.05)
+    placement = place(FILM, Circle(radius), (distance, 0.0), Resolution(), 0.05).placement
     turn = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 50))
     np.testing.assert_allclose(np.abs(placement.to_film(placement.rho * turn) - distance), radius, atol=1e-13)
     np.testing.assert_allclose(np.abs(placement.to_film(turn)), 1.0, atol=1e-13)
@@ -180,7 +178,7 @@ def test_footprint_edge_is_the_right_circle(distance, radius):
 @settings(derandomize=True, deadline=None, max_examples=30)
 def test_circle_round_a_polygon_is_on_the_film_and_holds_it(scene):
     probe, at, resolution, layer = scene
-    placement = place(FILM, probe, at, resolution, layer)
+    placement = place(FILM, probe, at, resolution, layer).placement
     ring = placement.to_film(placement.rho * np.exp(2j * np.pi * np.arange(400) / 400))
     assert np.abs(ring).max() < 1.0
     assert np.abs(placement.corners).max() == pytest.approx(farthest(probe, at), abs=0.8 * probe.reach)
@@ -190,9 +188,8 @@ def test_circle_round_a_polygon_is_on_the_film_and_holds_it(scene):
 def test_area_converges_exponentially_with_the_order():
     error = []
     for order in (2, 4, 6):
-        mesh = template_for(Circle(0.11), Resolution(order, 8, 4))
-        points = place(FILM, Circle(0.11), (0.4, 0.0), Resolution(order, 8, 4), 0.05).element_points(mesh)
-        error.append(abs(2.0 * Geometry.build(mesh, points).weights.sum() - np.pi))
+        mesh = place(FILM, Circle(0.11), (0.4, 0.0), Resolution(order, 8, 4), 0.05)
+        error.append(abs(2.0 * mesh.geometry.weights.sum() - np.pi))
     assert error[1] < error[0] / 50.0
     assert error[2] < error[1] / 50.0
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import Resolution
-from isocharge.simulate.mesh.placement import template
-from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.mesh.template import Template, template
 
 RESOLUTIONS = (Resolution(2, 8, 1), Resolution(3, 8, 4), Resolution(4, 16, 3, 2), Resolution(5, 24, 2, 1))
 CORNERS = (0, 3, 4, 5, 7)

@@ -6,8 +6,7 @@ import pytest
 from isocharge.simulate import Resolution
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.mesh.placement import template
-from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.mesh.template import Template, template
 from isocharge.simulate.solver.assembly import Assembly, assembly
 
 SMALL = ((Resolution(2, 8, 1), 0), (Resolution(3, 8, 2, 1), 0), (Resolution(3, 8, 1), 3), (Resolution(2, 8, 1, 2), 4))

@@ -7,7 +7,8 @@ import pytest
 
 from isocharge.errors import SolveError
 from isocharge.simulate import Circle, Film, Polygon, Probe, SolveSettings, Theory, load_sensor, press, touch_charge
-from isocharge.simulate.mesh.placement import template_for
+from isocharge.simulate.mesh.placed_mesh import place
+from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.solver.mesh_comparison import needs_second_mesh, relative_difference
 
 FILM = Film(45e-3, 25e-6, 3e9, 0.34)
@@ -66,7 +67,8 @@ def test_a_field_is_the_same_on_another_order(probe: Probe):
     """Up: the same polynomials, to round-off; and down again."""
     solved = press(FILM, probe, (6e-3, 1e-3), 1.0)
     finer = replace(solved.resolution, order=solved.resolution.order + 3)
-    raised = replace(solved, resolution=finer, field=solved.field_of_order(finer.order))
+    placed = place(FILM, probe, solved.at, finer, solved.layer)
+    raised = replace(solved, placed_mesh=placed, field=solved.field_of_order(finer.order))
     points = 1e-3 * np.random.default_rng(0).uniform(-20.0, 20.0, (200, 2))
     np.testing.assert_allclose(raised.deflection(points), solved.deflection(points), atol=1e-12 * FILM.radius)
     np.testing.assert_allclose(raised.field_of_order(solved.resolution.order), solved.field, atol=1e-12)
@@ -112,8 +114,8 @@ def test_what_a_finer_mesh_cannot_hold_is_said():
 def test_different_equilibria_are_no_answer(monkeypatch):
     """Meshes that differ by a tenth are not two views of one film; by less, the difference is the estimate."""
     scene = FILM, Circle(1e-3), (32e-3, 0.0), 1.0
-    monkeypatch.setattr("isocharge.simulate.solver.press.apart", lambda *_: 0.09)
+    monkeypatch.setattr("isocharge.simulate.solver.press.relative_difference", lambda *_: 0.09)
     assert press(*scene).estimated_error == pytest.approx(0.09)
-    monkeypatch.setattr("isocharge.simulate.solver.press.apart", lambda *_: 0.11)
+    monkeypatch.setattr("isocharge.simulate.solver.press.relative_difference", lambda *_: 0.11)
     with pytest.raises(SolveError, match=r"order \d+ and one of order \d+ find charges that differ by 11%"):
         press(*scene)

@@ -5,7 +5,6 @@ workers, so neither do the bytes. What is finished is kept in a draft beside the
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Executor
 from dataclasses import asdict
 from itertools import tee
 from pathlib import Path
@@ -29,7 +28,7 @@ from isocharge.simulate.dataset.shards import (
     write_manifest,
 )
 from isocharge.simulate.execution.blas import single_threaded_blas
-from isocharge.simulate.execution.checkpointed_map import CheckpointedExecutor
+from isocharge.simulate.execution.checkpointed_map import CheckpointedMap, JobMap
 from isocharge.simulate.execution.code_version import code_fingerprint
 from isocharge.simulate.execution.workers import Workers
 from isocharge.simulate.forward.forward_map import ForwardMap
@@ -91,12 +90,9 @@ def run_sweep(
     presses = sweep.over(probes)  # before anything is written: scipy's Sobol tables swallow an interrupt
     identity = _identity(sensor, probes, sweep, settings, shard)
     with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh, warn=callbacks.warn) as draft:
-        checkpointed = (
-            CheckpointedExecutor(draft, f"solve-{number:02d}", workers.executor) for number in range(len(probes))
-        )
         maps = tuple(
-            _build(sensor, probe, sweep, settings, executor, callbacks.solved)
-            for probe, executor in zip(probes, checkpointed, strict=True)
+            _build(sensor, probe, sweep, settings, map_jobs, callbacks.solved)
+            for probe, map_jobs in _checkpointed_maps(draft, probes, workers)
         )
         entries = _draft_shards(draft, maps, presses, workers, shard, callbacks.sampled)
         with output_errors(folder):
@@ -110,13 +106,13 @@ def solve_maps(
     sweep: Sweep,
     settings: SolveSettings = SolveSettings(),
     *,
-    executor: Executor | None = None,
+    workers: Workers = Workers(),
     progress: Progress | None = None,
 ) -> tuple[ForwardMap, ...]:
     """A forward map for each probe, over the sweep's ranges."""
     if not probes:
         raise SceneError("probes: expected at least one, got none")
-    return tuple(_build(sensor, probe, sweep, settings, executor, progress) for probe in probes)
+    return tuple(_build(sensor, probe, sweep, settings, workers.in_order, progress) for probe in probes)
 
 
 def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
@@ -130,12 +126,20 @@ def _build(
     probe: Probe,
     sweep: Sweep,
     settings: SolveSettings,
-    executor: Executor | None,
+    map_jobs: JobMap,
     progress: Progress | None,
 ) -> ForwardMap:
     return ForwardMap.build(
-        sensor, probe, sweep.radius, sweep.force_range, settings, executor=executor, progress=progress
+        sensor, probe, sweep.radius, sweep.force_range, settings, map_jobs=map_jobs, progress=progress
     )
+
+
+def _checkpointed_maps(
+    draft: ResumableRun, probes: Sequence[Probe], workers: Workers
+) -> Iterator[tuple[Probe, CheckpointedMap]]:
+    """Each probe with the map function whose results the run keeps under its number."""
+    for number, probe in enumerate(probes):
+        yield probe, CheckpointedMap(draft, f"solve-{number:02d}", workers.in_order)
 
 
 def _identity(

@@ -1,66 +1,46 @@
-"""An executor whose results are kept in a resumable run, so that a killed run does not solve twice."""
+"""A map function whose results are kept in a resumable run, so that a killed run does not solve twice."""
 
 import io
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor
 from typing import Any
 
 import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.resumable_run import ResumableRun
-from isocharge.simulate.execution.workers import SameCodeOnly
+
+JobMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""Applies a function to jobs and gives the results in their order: `map`, an executor's `map`, `Workers.in_order`."""
 
 
-class CheckpointedExecutor(Executor):
-    """An executor whose `map` keeps its results, if they are arrays, in a draft, and does not work for them again.
+class CheckpointedMap:
+    """A `JobMap` that keeps its results, which are arrays, in a resumable run, and loads those that are there.
 
-    The results of a call are named by their place in it and by the call's place among the others: both depend on the
-    run alone.
+    A result's file name is (number of the map call, index of the job), so the same run finds its results again.
     """
 
-    def __init__(self, draft: ResumableRun, name: str, inner: Executor | None) -> None:
-        self._draft, self._name, self._inner, self._calls = draft, name, inner, 0
+    def __init__(self, run: ResumableRun, name: str, map_jobs: JobMap) -> None:
+        self._run, self._name, self._map_jobs, self._calls = run, name, map_jobs, 0
 
-    def map(self, fn: Callable[..., Any], *iterables: Iterable[Any], **_options: Any) -> Iterator[Any]:
-        """As of any executor; finished results are saved as they are taken."""
-        jobs = list(zip(*iterables, strict=False))
+    def __call__(self, function: Callable[[Any], Array], jobs: Iterable[Any]) -> Iterator[Array]:
+        """The results of all jobs, in their order; new ones are saved as they are taken."""
+        jobs = list(jobs)
         names = [f"{self._name}-{self._calls:02d}-{number:04d}.npy" for number in range(len(jobs))]
         self._calls += 1
-        kept = [self._load(name) for name in names]
-        left = [job for job, result in zip(jobs, kept, strict=True) if result is None]
-        made = self._inner.map(SameCodeOnly(Spread(fn)), left) if self._inner and left else map(Spread(fn), left)
-        return self._merged(names, kept, iter(made))
+        saved = [self._load(name) for name in names]
+        missing = [job for job, result in zip(jobs, saved, strict=True) if result is None]
+        return self._merged(names, saved, iter(self._map_jobs(function, missing)))
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
-        """Not remembered."""
-        if self._inner is None:
-            raise RuntimeError("expected an executor to submit to, got none: without one there is only map")
-        return self._inner.submit(fn, *args, **kwargs)
-
-    def _merged(self, names: list[str], kept: list[Array | None], made: Iterator[Any]) -> Iterator[Any]:
-        for name, result in zip(names, kept, strict=True):
-            if result is not None:
-                yield result
-                continue
-            fresh = next(made)
-            if isinstance(fresh, np.ndarray):
-                self._draft.save(name, _npy(fresh))
-            yield fresh
+    def _merged(self, names: list[str], saved: list[Array | None], computed: Iterator[Array]) -> Iterator[Array]:
+        for name, result in zip(names, saved, strict=True):
+            if result is None:
+                result = next(computed)
+                self._run.save(name, _npy(result))
+            yield result
 
     def _load(self, name: str) -> Array | None:
-        data = self._draft.load(name)
+        data = self._run.load(name)
         return None if data is None else np.load(io.BytesIO(data), allow_pickle=False)
-
-
-class Spread:
-    """A function of several arguments as one of their tuple."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
-
-    def __call__(self, arguments: tuple[Any, ...]) -> Any:
-        return self._function(*arguments)
 
 
 def _npy(array: Array) -> bytes:

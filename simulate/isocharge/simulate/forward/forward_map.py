@@ -8,7 +8,6 @@ place of the electrode, with the probe on it included. How well it does is measu
 built.
 """
 
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,19 +17,21 @@ from isocharge.arrays import Array, Complexes, Integers
 from isocharge.errors import SceneError, SolveError
 from isocharge.progress import Progress
 from isocharge.simulate.execution.blas import single_threaded_blas
+from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.family import TURNS, Family
 from isocharge.simulate.forward.readout import COARSE, FINE, NEAR, ReadoutPoints, contact_charge, touch_charge
 from isocharge.simulate.forward.solve_family import check_family, solve_family
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.stress import turn_stress
 from isocharge.simulate.mechanics.theory import Theory, theory_for
-from isocharge.simulate.mesh.placement import Placement, template_for
+from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.resolution import Resolution
+from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.mesh_choice import layer_for
-from isocharge.simulate.solver.press import press
+from isocharge.simulate.solver.press import needed_resolution, press
 from isocharge.simulate.solver.settings import SolveSettings
 
 CHUNK = 256
@@ -80,7 +81,7 @@ class ForwardMap:
         force_range: tuple[float, float] = (0.05, 2.0),
         settings: SolveSettings = SolveSettings(),
         *,
-        executor: Executor | None = None,
+        map_jobs: JobMap = map,
         progress: Progress | None = None,
     ) -> "ForwardMap":
         """Solve a family and check it.
@@ -92,7 +93,8 @@ class ForwardMap:
             force_range: Smallest and largest force, N.
             settings: Accuracy, theory and mesh. What is None is chosen for all presses: the fewest terms that the
                 accuracy allows over the forces, the mesh of the outermost press, thin rings for the middle force.
-            executor: Where the solves run; here and now if absent. The result does not depend on it.
+            map_jobs: Runs the solves, in this process by default; `executor.map` or `Workers.in_order`. The result does
+                not depend on it.
             progress: Told how many solves are done.
 
         Raises:
@@ -105,12 +107,12 @@ class ForwardMap:
         middle = float(np.sqrt(force_range[0] * force_range[1]))
         layer = settings.layer or layer_for(film, middle)
         settings = replace(settings, theory=theory, layer=layer)
-        resolution = settings.resolution or press(film, probe, (radius, 0.0), middle, settings).resolution
+        resolution = settings.resolution or needed_resolution(film, probe, (radius, 0.0), middle, settings)
         settings = replace(settings, resolution=resolution)
         error = np.inf
         for count, turns in (((5, 3), TURNS), ((8, 5), 2 * TURNS), ((13, 8), 3 * TURNS)):
             family = Family.spread(radius, force_range, count, probe.period, turns)
-            solved = solve_family(sensor, probe, family, settings, executor, progress)
+            solved = solve_family(sensor, probe, family, settings, map_jobs, progress)
             table = family.unfold(solved, template_for(probe, resolution))
             made = cls(sensor, probe, family, theory, resolution, layer, table, error)
             error = _check_against_solves(made)
@@ -230,8 +232,7 @@ class ForwardMap:
         mesh, angle = template_for(self.probe, self.resolution), np.angle(at[press_index])
         points = readout.points[electrode] @ np.array([1.0, 1j]) / self.sensor.film.radius
         film = points * np.exp(-1j * angle)[:, None]
-        mirrored = (film.imag < 0.0) & mesh.half
-        film = np.where(mesh.half, film.real + 1j * np.abs(film.imag), film)
+        film, mirrored = mesh.into_meshed_half(film)
         element, xi, eta = placement[press_index].locate(mesh, film)
         values = tensor_values(self.resolution.order, xi.ravel(), eta.ravel())
         nodal = field.reshape(len(field), mesh.n_element, -1, 3)[press_index[:, None], element]

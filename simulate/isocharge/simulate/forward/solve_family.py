@@ -1,7 +1,6 @@
 """The solves of a family of presses, on all workers."""
 
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,13 +8,15 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.errors import SceneError
 from isocharge.progress import Progress
+from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.family import Family
 from isocharge.simulate.mechanics.stress import turn_stress
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium
-from isocharge.simulate.solver.press import check_scene, press
+from isocharge.simulate.solver.press import press
+from isocharge.simulate.solver.scene import check_scene
 from isocharge.simulate.solver.settings import SolveSettings
 
 
@@ -59,7 +60,7 @@ def solve_family(
     probe: Probe,
     family: Family,
     settings: SolveSettings,
-    executor: Executor | None,
+    map_jobs: JobMap,
     progress: Progress | None,
 ) -> Array:
     """Scaled stress at the nodes, as `Family.unfold` takes it: (n_distance, n_solved_turn, n_force, ...).
@@ -71,8 +72,7 @@ def solve_family(
         for distance in family.distance
         for turn in family.solved_turns
     ]
-    results: Iterable[Array] = executor.map(_solve_chain, chains) if executor else map(_solve_chain, chains)
-    stress = np.stack(list(_report(results, len(chains), progress)))
+    stress = np.stack(list(_report(map_jobs(_solve_chain, chains), len(chains), progress)))
     return stress.reshape(family.distance.size, family.solved_turns.size, family.force.size, -1)
 
 

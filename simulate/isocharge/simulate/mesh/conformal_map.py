@@ -3,8 +3,8 @@
 import numpy as np
 
 from isocharge.arrays import Array, Complexes
+from isocharge.simulate.mesh.blocks import Blocks
 from isocharge.simulate.mesh.resolution import Resolution
-from isocharge.simulate.mesh.template import Template
 
 CLEARANCE = 0.4
 """Room between a polygon's farthest corner and the circle round it, in units of that corner's distance."""
@@ -47,21 +47,21 @@ def enclosing_circle(corners: Complexes, at: Array) -> tuple[Array, Array]:
     return centre, radius(centre)
 
 
-def sector_angles(mesh: Template, corners: Complexes, centre: Array, radius: Array, pull: Array) -> Array:
+def sector_angles(blocks: Blocks, corners: Complexes, centre: Array, radius: Array, pull: Array) -> Array:
     """Angles on the template's circle, where rays from the polygon's hub meet it.
 
     Their directions lie between those of the polygon's corners and an even spread where there is room between polygon
     and circle, else nearer to the polygon, lest elements fold. `pull` is c rho.
     """
     hub = corners[..., -1:]
-    stops = corners @ mesh.boundary[:: mesh.split].T
+    stops = corners @ blocks.boundary[:: blocks.split].T
     angle = np.unwrap(np.angle(stops - hub), axis=-1)
-    even = np.linspace(0.0, 2.0 * np.pi / mesh.copies, angle.shape[-1])
+    even = np.linspace(0.0, 2.0 * np.pi / blocks.copies, angle.shape[-1])
     even = even + np.mean(angle[..., :-1] - even[:-1], axis=-1)[..., None]
     reach = np.abs(corners - centre[..., None]).max(axis=-1)
     evenness = 0.5 * np.minimum((radius / reach - 1.0) / CLEARANCE, 1.0)[..., None]
     mixed = angle + LARGEST_TURN * np.tanh(evenness * (even - angle) / LARGEST_TURN)
-    share = np.arange(mesh.split) / mesh.split
+    share = np.arange(blocks.split) / blocks.split
     steps = (mixed[..., :-1, None] + share * np.diff(mixed, axis=-1)[..., None]).reshape(*mixed.shape[:-1], -1)
     ray = np.exp(1j * np.concatenate([steps, mixed[..., -1:]], axis=-1))
     away = hub - centre[..., None]

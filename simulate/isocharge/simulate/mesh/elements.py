@@ -8,6 +8,7 @@ import numpy as np
 from isocharge.arrays import Array, Complexes, Integers
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import lobatto_nodes, lobatto_quadrature, tensor_basis
+from isocharge.simulate.numerics.quadrature import gauss_reference_square
 
 
 @dataclass(frozen=True)
@@ -52,13 +53,12 @@ def _quadrature(order: int) -> tuple[Array, Array, Array, Array, Array]:
 
     And for the nodes themselves: local derivatives (2, n_local, n_local), Gauss-Lobatto weights (n_local,).
     """
-    line, weight = np.polynomial.legendre.leggauss(order + 1)
-    xi, eta = np.meshgrid(line, line)
+    xi, eta, weights = gauss_reference_square(order + 1)
     nodes, node_weight = lobatto_nodes(order), lobatto_quadrature(order)
     node_xi, node_eta = np.meshgrid(nodes, nodes)
     return (
-        *tensor_basis(order, xi.ravel(), eta.ravel()),
-        np.outer(weight, weight).ravel(),
+        *tensor_basis(order, xi, eta),
+        weights,
         tensor_basis(order, node_xi.ravel(), node_eta.ravel())[1],
         np.outer(node_weight, node_weight).ravel(),
     )

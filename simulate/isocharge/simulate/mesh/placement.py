@@ -16,12 +16,12 @@ of the film are found in the mesh by closed formulas and, inside the circle, a f
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
 
 from isocharge.arrays import Array, Complexes, Integers
+from isocharge.simulate.mesh.blocks import Blocks
 from isocharge.simulate.mesh.conformal_map import (
     automorphism_onto,
     enclosing_circle,
@@ -29,10 +29,7 @@ from isocharge.simulate.mesh.conformal_map import (
     ring_edges,
     sector_angles,
 )
-from isocharge.simulate.mesh.resolution import Resolution
-from isocharge.simulate.mesh.template import Template
-from isocharge.simulate.sensor.film import Film
-from isocharge.simulate.sensor.probe import Circle, Polygon, Probe
+from isocharge.simulate.sensor.probe import Circle, Probe
 
 CORE = 0.45
 """Half side of the virtual square in a circular footprint over its radius: corners at 0.64 of it."""
@@ -70,12 +67,12 @@ class Placement:
 
     @classmethod
     def of(
-        cls, mesh: Template, probe: Probe, distance: Array, film_radius: float, layer: float, turn: Array | float = 0.0
+        cls, blocks: Blocks, probe: Probe, distance: Array, film_radius: float, layer: float, turn: Array | float = 0.0
     ) -> Self:
         """Place a template under a press on the positive x axis.
 
         Args:
-            mesh: The template; its number of corners must be the probe's.
+            blocks: The blocks; their number of corners must be the probe's.
             probe: The footprint, turned as it is when the press lies on the x axis.
             distance: Distance of the footprint's centroid from the film's centre, m, any shape.
             film_radius: m.
@@ -92,8 +89,8 @@ class Placement:
             centre, radius = enclosing_circle(corners, at)
         corners = np.concatenate([corners, at[..., None]], axis=-1)
         c, rho = automorphism_onto(centre, radius)
-        start = sector_angles(mesh, corners, centre, radius, c * rho)
-        depth = ring_edges(mesh.resolution, rho, layer * (1.0 + c) / (1.0 - c))
+        start = sector_angles(blocks, corners, centre, radius, c * rho)
+        depth = ring_edges(blocks.resolution, rho, layer * (1.0 + c) / (1.0 - c))
         return cls(c, rho, corners, start, rim_angles(start, c, rho), depth)
 
     def __getitem__(self, which: Integers) -> "Placement":
@@ -119,40 +116,40 @@ class Placement:
         z: Complexes = (film - c) / (1.0 - c * film)
         return z
 
-    def element_points(self, mesh: Template) -> Complexes:
+    def element_points(self, blocks: Blocks) -> Complexes:
         """Film points of every element's nodes for one placement, shape (n_element, (order + 1)^2), unit radius."""
-        v, t = 0.5 * (mesh.xi + 1.0), 0.5 * (mesh.eta + 1.0)
-        a, b, c, d = (mesh.straight @ self.corners).T[:, :, None]
+        v, t = 0.5 * (blocks.xi + 1.0), 0.5 * (blocks.eta + 1.0)
+        a, b, c, d = (blocks.straight @ self.corners).T[:, :, None]
         inner = (1.0 - v) * (a + t * (b - a)) + v * (c + t * (d - c))
-        sector = np.arange(mesh.n_sector)[:, None]
+        sector = np.arange(blocks.n_sector)[:, None]
         low, high = self.start[sector], self.start[sector + 1]
         arc = self.to_film(self.rho * np.exp(1j * (low + t * (high - low))))
-        inner[mesh.n_quad :] += v * arc
+        inner[blocks.n_quad :] += v * arc
         depth = self.depth[:-1, None] + v * np.diff(self.depth)[:, None]
         swept = depth[:, None]
         angles = (1.0 - swept) * (low + t * (high - low)) + swept * (self.end[sector] + t * np.diff(self.end)[:, None])
         outside = self.to_film(np.exp((1.0 - swept) * np.log(self.rho) + 1j * angles))
         return np.concatenate([inner, outside.reshape(-1, v.size)])
 
-    def locate(self, mesh: Template, film: Complexes) -> tuple[Integers, Array, Array]:
-        """Find film points in the mesh, so many for each placement.
+    def locate(self, blocks: Blocks, film: Complexes) -> tuple[Integers, Array, Array]:
+        """Find film points in the blocks, so many for each placement.
 
         Args:
-            mesh: The template.
+            blocks: The blocks.
             film: Points (unit radius), shape (k, n) where the attributes have one leading axis of length k; in the
-                upper half for a half template.
+                upper half where only that is meshed.
 
         Returns:
             Element, xi and eta, each of shape (k, n).
         """
         z = self.to_template(film)
-        element, v, t = self._locate_rings(mesh, z)
+        element, v, t = self._locate_rings(blocks, z)
         inside = np.nonzero(np.abs(z) <= self.rho[:, None])
         if inside[0].size:
-            element[inside], v[inside], t[inside] = self[inside[0]]._locate_inner(mesh, film[inside])
+            element[inside], v[inside], t[inside] = self[inside[0]]._locate_inner(blocks, film[inside])
         return element, 2.0 * v - 1.0, 2.0 * t - 1.0
 
-    def _locate_rings(self, mesh: Template, z: Complexes) -> tuple[Integers, Array, Array]:
+    def _locate_rings(self, blocks: Blocks, z: Complexes) -> tuple[Integers, Array, Array]:
         with np.errstate(divide="ignore"):
             depth = np.clip(1.0 - np.log(np.abs(z)) / np.log(self.rho)[:, None], 0.0, 1.0)
         ring = np.sum(self.depth[:, None, 1:-1] <= depth[..., None], axis=-1)
@@ -164,36 +161,36 @@ class Placement:
             return at
 
         angle = np.angle(z)
-        if not mesh.half:
+        if not blocks.half:
             first = edge(np.zeros_like(ring))
             angle = first + np.mod(angle - first, 2.0 * np.pi)
         turn = (self.end - self.start)[:, None, 1:-1]
         sector = np.sum(self.start[:, None, 1:-1] + depth[..., None] * turn <= angle[..., None], axis=-1)
         before, after = edge(sector), edge(sector + 1)
         return (
-            mesh.n_inner + ring * mesh.n_sector + sector,
+            blocks.n_inner + ring * blocks.n_sector + sector,
             (depth - low) / (high - low),
             (angle - before) / (after - before),
         )
 
-    def _locate_inner(self, mesh: Template, film: Complexes) -> tuple[Integers, Array, Array]:
+    def _locate_inner(self, blocks: Blocks, film: Complexes) -> tuple[Integers, Array, Array]:
         """Points inside the circle, one for each placement; all of shape (n,)."""
-        a, b, c, d = np.moveaxis(np.einsum("ekn,pn->pek", mesh.straight, self.corners), -1, 0)
+        a, b, c, d = np.moveaxis(np.einsum("ekn,pn->pek", blocks.straight, self.corners), -1, 0)
         circle = self.to_film(self.rho[:, None] * np.exp(1j * self.start))
-        c[:, mesh.n_quad :], d[:, mesh.n_quad :] = circle[:, :-1], circle[:, 1:]
+        c[:, blocks.n_quad :], d[:, blocks.n_quad :] = circle[:, :-1], circle[:, 1:]
         at = film[:, None]
         sides = [_left(a, c, at), _left(d, b, at), _left(b, a, at), _left(c, d, at)]
-        sides[3][:, mesh.n_quad :] = np.inf
+        sides[3][:, blocks.n_quad :] = np.inf
         element = np.argmax(np.min(sides, axis=0), axis=1)
         pick = np.arange(film.size), element
-        return element, *self._invert(mesh, film, element, *(corner[pick] for corner in (a, b, c, d)))
+        return element, *self._invert(blocks, film, element, *(corner[pick] for corner in (a, b, c, d)))
 
     def _invert(
-        self, mesh: Template, film: Complexes, element: Integers, a: Complexes, b: Complexes, c: Complexes, d: Complexes
+        self, blocks: Blocks, film: Complexes, element: Integers, a: Complexes, b: Complexes, c: Complexes, d: Complexes
     ) -> tuple[Array, Array]:
         """(v, t) of points in given elements inside the circle: Newton on two equations, to round-off in a few."""
-        arc = element >= mesh.n_quad
-        sector = np.where(arc, element - mesh.n_quad, 0)
+        arc = element >= blocks.n_quad
+        sector = np.where(arc, element - blocks.n_quad, 0)
         v, t = np.full(film.shape, 0.5), np.full(film.shape, 0.5)
         low, high = (np.take_along_axis(self.start, (sector + i)[:, None], axis=1)[:, 0] for i in (0, 1))
         for _ in range(NEWTON_STEPS):
@@ -215,24 +212,3 @@ def _left(start: Complexes, end: Complexes, at: Complexes) -> Array:
     way = end - start
     left: Array = ((at - start) * np.conj(way)).imag / np.maximum(np.abs(way), 1e-300)
     return left
-
-
-@lru_cache(maxsize=16)
-def template(resolution: Resolution, corners: int) -> Template:
-    """The template of a resolution for a polygon of so many corners, 0 for a circle; made once."""
-    mesh = Template(resolution, corners)
-    turn = np.linspace(0.0, 2.0 * np.pi, max(corners, 3), endpoint=False)
-    sample: Probe = Polygon.of(0.1 * np.stack([np.cos(turn), np.sin(turn)], axis=1)) if corners else Circle(0.1)
-    mesh.number(Placement.of(mesh, sample, np.array(0.1), 1.0, 0.05).element_points(mesh))
-    return mesh
-
-
-def template_for(probe: Probe, resolution: Resolution) -> Template:
-    """The template that follows a probe's outline."""
-    return template(resolution, len(probe.corners) if isinstance(probe, Polygon) else 0)
-
-
-def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> Placement:
-    """Where the template lies, the press turned onto the positive x axis; `layer` over the film's radius."""
-    turned = probe.turned(-float(np.arctan2(at[1], at[0])))
-    return Placement.of(template_for(probe, resolution), turned, np.array(np.hypot(*at)), film.radius, layer)

@@ -1,130 +1,61 @@
-"""The mesh's topology: one template for all positions, thicknesses and forces.
+"""The mesh as a template: its blocks, and one number for each node."""
 
-Seen from the probe, the mesh is a footprint's worth of blocks inside a circle and rings from that circle to the rim:
-
-    a polygon of n corners  is split into n quadrilaterals about its hub,
-    2 n blocks              lie between the polygon's half edges and the circle,
-    rings of 2 n sectors    carry on to the rim, the last ones thin where bending needs it.
-
-A circular footprint is the same with a virtual square as its polygon and the circle as its edge; since it is
-symmetric about the line through the film's centre, only the upper half is meshed. Each block may be subdivided.
-`Placement` says where a template lies.
-"""
-
-from functools import cached_property
-from itertools import pairwise
+from functools import lru_cache
 
 import numpy as np
 
-from isocharge.arrays import Array, Integers
+from isocharge.arrays import Complexes, Integers
+from isocharge.simulate.mesh.blocks import Blocks
+from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.resolution import Resolution
-from isocharge.simulate.numerics.interpolation import lobatto_nodes
+from isocharge.simulate.sensor.probe import Circle, Polygon, Probe
 
-SQUARE = 4
-"""Corners of the virtual polygon inside a circular footprint."""
+SAMPLE_REACH, SAMPLE_DISTANCE, SAMPLE_LAYER = 0.1, 0.1, 0.05
+"""A press that shows which nodes coincide, in film radii: any on which no elements fold would do."""
 
 
-class Template:
-    """Elements, nodes and their numbering; nothing in it depends on where the probe is.
-
-    Element e has (order + 1)^2 nodes in tensor order (xi fast, outwards; eta anticlockwise); local coordinates lie in
-    [-1, 1]^2. Elements come as quadrilaterals of the polygon, blocks up to the circle, rings from the inside out.
+class Template(Blocks):
+    """Blocks whose nodes are numbered: elements that touch share the nodes between them.
 
     Attributes:
-        resolution: How fine.
-        corners: Corners of the probe's polygon, or 0 for a circle.
-        half: Whether only the upper half is meshed.
         nodes: Node number of each element's nodes, shape (n_element, (order + 1)^2).
         n_node: Number of nodes.
+        first_seen: Place of each node among all elements' nodes where it comes first, shape (n_node,).
         on_rim: Whether a node lies on the rim, shape (n_node,).
         on_axis: Whether a node lies on the line of symmetry of a half template, shape (n_node,).
     """
 
     def __init__(self, resolution: Resolution, corners: int) -> None:
-        self.resolution = resolution
-        self.corners = corners
-        self.half = corners == 0
-        self.n_corner = corners or SQUARE
-        self.split = max(1, round(resolution.around / (2 * self.n_corner)))
-        self.n_meshed = self.n_corner // 2 if self.half else self.n_corner
-        self.n_sector = 2 * self.n_meshed * self.split
-        self.n_quad = self.n_meshed * self.split**2
-        self.n_inner = self.n_quad + self.n_sector
-        self.n_ring = resolution.rings + resolution.rim
-        self.n_element = self.n_inner + self.n_sector * self.n_ring
-        line = lobatto_nodes(resolution.order)
-        xi, eta = np.meshgrid(line, line, indexing="xy")
-        self.xi, self.eta = xi.ravel(), eta.ravel()
-
-    @property
-    def footprint(self) -> slice:
-        """The elements that fill the footprint."""
-        return slice(0, self.n_inner if self.half else self.n_quad)
-
-    @property
-    def copies(self) -> int:
-        """How many copies of the template make up the film."""
-        return 2 if self.half else 1
-
-    @cached_property
-    def boundary(self) -> Array:
-        """Points along the polygon's boundary as weights of its corners and hub, shape (n_sector + 1, n_corner + 1).
-
-        From the middle of the edge before the first corner, anticlockwise.
-        """
-        unit = np.eye(self.n_corner + 1)[:-1]
-        middle = 0.5 * (unit + np.roll(unit, -1, axis=0))
-        stops = [middle[-1]]
-        for i in range(self.n_meshed):
-            stops += [unit[i], middle[i]]
-        share = np.arange(self.split)[:, None] / self.split
-        parts = [a + share * (b - a) for a, b in pairwise(stops)]
-        return np.concatenate([*parts, stops[-1][None]])
-
-    @cached_property
-    def straight(self) -> Array:
-        """Corners (a, b, c, d) of the elements inside the circle as weights of the polygon's corners and its hub.
-
-        The element is (1 - v) (a + t (b - a)) + v (c + t (d - c)); blocks up to the circle have their outer side on it
-        and their c and d here are void. Shape (n_inner, 4, n_corner + 1).
-        """
-        k, hub = self.split, np.eye(self.n_corner + 1)[-1]
-        parts = []
-        for i in range(self.n_meshed):
-            before, corner, after = (
-                self.boundary[2 * k * i],
-                self.boundary[2 * k * i + k],
-                self.boundary[2 * k * (i + 1)],
-            )
-            grid = np.array(
-                [[_bilinear(hub, after, before, corner, v / k, t / k) for t in range(k + 1)] for v in range(k + 1)]
-            )
-            parts += [
-                [grid[v, t], grid[v, t + 1], grid[v + 1, t], grid[v + 1, t + 1]] for v in range(k) for t in range(k)
-            ]
-        void = np.zeros(self.n_corner + 1)
-        parts += [[a, b, void, void] for a, b in pairwise(self.boundary)]
-        return np.array(parts)
-
-    def turned(self, fold: int, folds: int) -> Integers:
-        """For each element the one that takes its place when the probe is turned by fold / folds of a full turn."""
-        shift = fold * self.n_corner // folds
-        quads = np.arange(self.n_quad).reshape(self.n_meshed, -1)
-        sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)
-        return np.concatenate(
-            [np.roll(quads, -shift, axis=0).ravel(), np.roll(sectors, -2 * self.split * shift, axis=1).ravel()]
-        )
-
-    def number(self, points: np.ndarray) -> None:
-        """Give coincident nodes one number, from the film points (n_element, n_local) of any one placement."""
+        super().__init__(resolution, corners)
+        points = _sample_points(self)
         z = points.ravel()
-        _, first, number = np.unique(np.round(z, 9), return_index=True, return_inverse=True)
+        _, self.first_seen, number = np.unique(np.round(z, 9), return_index=True, return_inverse=True)
         self.nodes: Integers = number.reshape(points.shape)
-        self.n_node = first.size
-        self.first_seen = first
-        self.on_rim = np.abs(z[first]) > 1.0 - 1e-9
-        self.on_axis = (np.abs(z[first].imag) < 1e-9) & self.half
+        self.n_node = self.first_seen.size
+        self.on_rim = np.abs(z[self.first_seen]) > 1.0 - 1e-9
+        self.on_axis = (np.abs(z[self.first_seen].imag) < 1e-9) & self.half
 
 
-def _bilinear(a: Array, b: Array, c: Array, d: Array, v: float, t: float) -> Array:
-    return (1.0 - v) * (a + t * (b - a)) + v * (c + t * (d - c))
+def _sample_points(blocks: Blocks) -> Complexes:
+    """Film points of every element's nodes under one press, shape (n_element, (order + 1)^2)."""
+    turn = np.linspace(0.0, 2.0 * np.pi, max(blocks.corners, 3), endpoint=False)
+    outline = SAMPLE_REACH * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    probe: Probe = Polygon.of(outline) if blocks.corners else Circle(SAMPLE_REACH)
+    placement = Placement.of(blocks, probe, np.array(SAMPLE_DISTANCE), 1.0, SAMPLE_LAYER)
+    return placement.element_points(blocks)
+
+
+def corners_of(probe: Probe) -> int:
+    """Corners of a probe's outline, 0 for a circle: all that a template has to know of the probe."""
+    return len(probe.corners) if isinstance(probe, Polygon) else 0
+
+
+@lru_cache(maxsize=16)
+def template(resolution: Resolution, corners: int) -> Template:
+    """The template of a resolution for a polygon with this number of corners, 0 for a circle; built once."""
+    return Template(resolution, corners)
+
+
+def template_for(probe: Probe, resolution: Resolution) -> Template:
+    """The template that follows a probe's outline."""
+    return template(resolution, corners_of(probe))

@@ -15,9 +15,8 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
 from isocharge.arrays import Array, Integers
-from isocharge.simulate.mesh.placement import template
 from isocharge.simulate.mesh.resolution import Resolution
-from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.mesh.template import Template, template
 
 
 class Assembly:

@@ -15,10 +15,11 @@ from isocharge.errors import SceneError
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mechanics.stress import principal_stresses, strain, stress, turn_stress
 from isocharge.simulate.mechanics.theory import Theory, bending_length, modelling_error
-from isocharge.simulate.mesh.elements import Geometry, film_gradient
-from isocharge.simulate.mesh.placement import Placement, place, template_for
+from isocharge.simulate.mesh.elements import film_gradient
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh
+from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.resolution import Resolution
-from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.numerics.interpolation import tensor_basis, tensor_values
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.probe import Probe
@@ -31,7 +32,7 @@ WRINKLE_SHARE = 1e-3
 """Compression over the largest stress that is worth a warning."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Equilibrium:
     """The film at rest under a press.
 
@@ -41,8 +42,7 @@ class Equilibrium:
         at: Centroid of the footprint (x, y), m.
         force: N.
         theory: Which terms were in.
-        resolution: Mesh.
-        layer: Width of its thin rings at the rim over the film's radius.
+        placed_mesh: Mesh, where it lies under the press turned onto the x axis.
         field: Nodal (U1, U2, W), dimensionless, of the press turned onto the x axis; shape (n_node, 3).
         groups: Dimensionless groups of the scene.
         status: "converged" or "failed".
@@ -59,8 +59,7 @@ class Equilibrium:
     at: tuple[float, float]
     force: float
     theory: Theory
-    resolution: Resolution
-    layer: float
+    placed_mesh: PlacedMesh
     field: Array
     groups: DimensionlessGroups
     status: Literal["converged", "failed"]
@@ -88,8 +87,7 @@ class Equilibrium:
         """Relative error of a charge to expect from the mesh."""
         if self.proven_error is not None:
             return max(LEAST_ERROR, self.proven_error)
-        geometry = Geometry.build(self.mesh, self._nodes)
-        return mesh_error(self.mesh, geometry, self._node_slope[..., 2])
+        return mesh_error(self.placed_mesh, self._node_slope[..., 2])
 
     @cached_property
     def principal_stress(self) -> tuple[float, float]:
@@ -124,12 +122,22 @@ class Equilibrium:
     @property
     def mesh(self) -> Template:
         """The template."""
-        return template_for(self.probe, self.resolution)
+        return self.placed_mesh.template
 
-    @cached_property
+    @property
+    def resolution(self) -> Resolution:
+        """How fine the mesh is."""
+        return self.placed_mesh.resolution
+
+    @property
+    def layer(self) -> float:
+        """Width of the mesh's thin rings at the rim over the film's radius."""
+        return self.placed_mesh.layer
+
+    @property
     def placement(self) -> Placement:
         """Where the template lies, the press turned onto the x axis."""
-        return place(self.film, self.probe, self.at, self.resolution, self.layer)
+        return self.placed_mesh.placement
 
     def field_of_order(self, order: int) -> Array:
         """The field on the nodes of the same mesh with elements of another order, shape (n_node, 3)."""
@@ -197,17 +205,13 @@ class Equilibrium:
     def _gradient(self, element: Integers, xi: Array, eta: Array) -> Array:
         """d(basis)/d(X1, X2) at points of elements, shape (n, 2, n_local)."""
         _, by_local = tensor_basis(self.resolution.order, xi, eta)
-        return film_gradient(by_local[:, :, None, :], self._nodes[element])[0][:, 0]
-
-    @cached_property
-    def _nodes(self) -> Complexes:
-        return self.placement.element_points(self.mesh)
+        return film_gradient(by_local[:, :, None, :], self.placed_mesh.points[element])[0][:, 0]
 
     @cached_property
     def _node_gradient(self) -> Array:
         """d(basis)/d(X1, X2) at the nodes of every element, shape (n_element, n_local, 2, n_local)."""
         _, by_local = tensor_basis(self.resolution.order, self.mesh.xi, self.mesh.eta)
-        return film_gradient(by_local[:, None], self._nodes)[0]
+        return film_gradient(by_local[:, None], self.placed_mesh.points)[0]
 
     @property
     def _node_hessian(self) -> Array:
@@ -231,8 +235,7 @@ class Equilibrium:
             x, y = 1e3 * points[np.argmax(off)]
             raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {self.film.radius * 1e3:.4g} mm")
         film = _on_axis(points, self.at) / self.film.radius
-        mirrored = (film.imag < 0.0) & self.mesh.half
-        film = np.where(self.mesh.half, film.real + 1j * np.abs(film.imag), film)
+        film, mirrored = self.mesh.into_meshed_half(film)
         element, xi, eta = self.placement.batch().locate(self.mesh, film[None])
         return element[0], xi[0], eta[0], mirrored
 

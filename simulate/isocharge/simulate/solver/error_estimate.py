@@ -3,37 +3,39 @@
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.mesh.elements import Geometry
-from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import modal_matrix
 
 SAFETY = 2.0
-"""Over the error that shape and decay foretell, in the inner 0.6 of the film's radius; beside the rim too little."""
+"""Safety factor on the error predicted from element shape and modal decay, dimensionless.
+
+Valid within 0.6 film radii; near the rim it is too small (see `mesh_comparison`).
+"""
 
 LEAST_ERROR = 5e-5
-"""What thin rings at the rim and the electrodes' integration points leave, however smooth the rest is."""
+"""Smallest relative error of a charge that is claimed: thin rings and the electrodes' integration points leave it."""
 
 DECAY_WEIGHT = 0.1
-"""Relative error of a charge over the share of the slopes that the elements' highest modes carry."""
+"""Relative error of a charge per share of the slopes that the elements' highest modes carry, dimensionless."""
 
 
-def shape_error(mesh: Template, geometry: Geometry) -> float:
-    """Relative error of a charge that the elements' shapes foretell, infinite where one is turned inside out.
+def shape_error(mesh: PlacedMesh) -> float:
+    """Relative error of a charge as predicted from the elements' shapes, infinite where an element is inside out.
 
     The elements carry the conformal map as a polynomial. How well they do shows in the film's own area: the worst
     charge's error is about a third of the square root of the area's (`tests/benchmarks/bench_hard_cases.py`).
     """
+    geometry = mesh.geometry
     if geometry.weights.min() <= 0.0 or geometry.mass.min() <= 0.0:
         return np.inf
-    return float(np.sqrt(abs(mesh.copies * geometry.weights.sum() / np.pi - 1.0)))
+    return float(np.sqrt(abs(mesh.template.copies * geometry.weights.sum() / np.pi - 1.0)))
 
 
-def decay(mesh: Template, geometry: Geometry, slope: Array) -> float:
+def decay(mesh: PlacedMesh, slope: Array) -> float:
     """Share of the deflection's slopes that the highest polynomial modes of the elements carry.
 
     Args:
-        mesh: The template.
-        geometry: Where it lies.
+        mesh: The mesh of the press.
         slope: grad W at the nodes of every element, shape (n_element, n_local, 2).
 
     Returns:
@@ -46,10 +48,10 @@ def decay(mesh: Template, geometry: Geometry, slope: Array) -> float:
     power = ((modal @ square @ modal.T) ** 2 * np.outer(weight, weight)).sum(axis=1)
     total = power.sum(axis=(1, 2))
     top = total - power[:, :-1, :-1].sum(axis=(1, 2))
-    area = geometry.weights.sum(axis=1)
+    area = mesh.geometry.weights.sum(axis=1)
     return float(np.sum(area * np.sqrt(np.maximum(top, 0.0) * total)) / max(np.sum(area * total), 1e-300))
 
 
-def mesh_error(mesh: Template, geometry: Geometry, slope: Array) -> float:
+def mesh_error(mesh: PlacedMesh, slope: Array) -> float:
     """Relative error of a charge to expect from the mesh, from the elements' shapes and from the solution itself."""
-    return max(LEAST_ERROR, SAFETY * shape_error(mesh, geometry), SAFETY * DECAY_WEIGHT * decay(mesh, geometry, slope))
+    return max(LEAST_ERROR, SAFETY * shape_error(mesh), SAFETY * DECAY_WEIGHT * decay(mesh, slope))

@@ -11,6 +11,7 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.simulate.mechanics.theory import ACCURACY
+from isocharge.simulate.numerics.quadrature import gauss_reference_square
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Polygon, Probe, farthest
 from isocharge.simulate.solver.equilibrium import Equilibrium
@@ -73,6 +74,5 @@ def _centres(solved: Equilibrium) -> np.ndarray:
 
 def _patch(side: float) -> tuple[np.ndarray, Array]:
     """Gauss points of a square about zero as complex numbers, shape (1, n), and their weights, which add up to one."""
-    line, weight = np.polynomial.legendre.leggauss(PER_SIDE)
-    x, y = np.meshgrid(0.5 * side * line, 0.5 * side * line)
-    return (x + 1j * y).ravel()[None], 0.25 * np.outer(weight, weight).ravel()
+    xi, eta, weights = gauss_reference_square(PER_SIDE)
+    return (0.5 * side * xi + 1j * (0.5 * side * eta))[None], 0.25 * weights
