@@ -248,6 +248,14 @@ def test_press_outside_is_shown(three_map, x, force, shown):
         three_map.forward(np.array([0.0, x]), np.zeros(2), np.array([1.0, force]))
 
 
+def test_press_outside_is_counted_among_all_presses(three_map):
+    """Untouched ones, whose place does not matter, are counted too."""
+    x, force = np.array([0.0, 0.05, 1e-3, 8.1e-3]), np.array([0.0, 0.0, 1.0, 1.0])
+    assert not three_map.forward(x[:2], np.zeros(2), force[:2]).any()
+    with pytest.raises(SceneError, match=r"press 3 at \(8\.1, 0\) mm"):
+        three_map.forward(x, np.zeros(4), force)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

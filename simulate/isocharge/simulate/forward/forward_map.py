@@ -161,8 +161,8 @@ class ForwardMap:
         x, y, force, orientation = np.broadcast_arrays(
             *(np.asarray(value, dtype=float) for value in (x, y, force, orientation))
         )
+        self._check_inside(x, y, force)
         touched = np.flatnonzero(force != 0.0)
-        self._check_inside(x[touched], y[touched], force[touched])
         charge = np.zeros((x.size, len(self.sensor.electrodes)))
         with single_threaded_blas():
             for start in range(0, touched.size, CHUNK):
@@ -171,11 +171,13 @@ class ForwardMap:
         return charge
 
     def _check_inside(self, x: Array, y: Array, force: Array) -> None:
+        """SceneError if a press is outside the covered radius or forces; without a force there is no press."""
         distance, slack = np.hypot(x, y), 1.0 + 1e-9
         low, high = self.force_range
-        wrong = ~((distance <= self.radius * slack) & (force >= low / slack) & (force <= high * slack))
-        if wrong.any():
-            i = int(np.argmax(wrong))
+        inside = (distance <= self.radius * slack) & (force >= low / slack) & (force <= high * slack)
+        outside = ~inside & (force != 0.0)
+        if outside.any():
+            i = int(np.argmax(outside))
             raise SceneError(
                 f"press {i} at ({x[i] * 1e3:.4g}, {y[i] * 1e3:.4g}) mm with {force[i]:.4g} N is outside the forward "
                 f"map: expected at most {self.radius * 1e3:g} mm from the centre and {low:g} to {high:g} N"
