@@ -1,4 +1,4 @@
 """Datasets of presses and charges: sampling plans, sweeps, and the file format.
 
-May import: forward, solver, mesh, sensor, execution, numerics.
+May import: forward, solver, sensor, execution, numerics.
 """

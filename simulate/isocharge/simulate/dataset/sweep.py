@@ -32,7 +32,6 @@ from isocharge.simulate.execution.checkpointed_map import CheckpointedMap, JobMa
 from isocharge.simulate.execution.code_version import code_fingerprint
 from isocharge.simulate.execution.workers import Workers
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
@@ -170,15 +169,11 @@ def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
         "noise": "clean",
         "solver": {
             "theory": maps[0].theory.name,
-            "mesh": {made.probe.notation: _mesh_words(made.resolution) for made in maps},
+            "mesh": {made.probe.notation: made.resolution.description for made in maps},
             "solves": sum(made.solves for made in maps),
             "interpolation_error": max(made.error for made in maps),
         },
     }
-
-
-def _mesh_words(resolution: Resolution) -> str:
-    return ", ".join(f"{name} {value}" for name, value in asdict(resolution).items())
 
 
 def _draft_shards(

@@ -1,6 +1,6 @@
 """How fine a mesh is."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 
 @dataclass(frozen=True)
@@ -9,7 +9,7 @@ class Resolution:
 
     Attributes:
         order: Polynomial order of the elements.
-        around: Elements round the circle; a polygon of n corners takes the next multiple of 2 n.
+        around: Elements round the circle; a polygon of n corners takes the nearest multiple of 2 n.
         rings: Rings between the circle and the rim, in equal steps of the logarithm.
         rim: Thin rings at the rim, for bending's boundary layer.
     """
@@ -18,6 +18,11 @@ class Resolution:
     around: int = 8
     rings: int = 5
     rim: int = 0
+
+    @property
+    def description(self) -> str:
+        """The four numbers as a dataset's manifest names them: "order 4, around 8, rings 5, rim 0"."""
+        return ", ".join(f"{name} {value}" for name, value in asdict(self).items())
 
     def __post_init__(self) -> None:
         if self.order < 2 or self.around < 4 or self.rings < 1 or self.rim < 0:

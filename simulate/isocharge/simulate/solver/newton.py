@@ -6,10 +6,12 @@ so that the step stays a descent direction and the quadratic end is untouched.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.arrays import Array, Booleans
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.solver.assembly import Assembly, Factor
@@ -18,32 +20,34 @@ GUARD_TENSION = 0.4
 """Tension added to the tangent at a relative residual of one, over a slack film's own (5 MPa at 25 um and 1 N)."""
 
 GUARD_BELOW = 1e-2
-"""Relative residual below which the tangent is left as it is."""
+"""Relative residual, dimensionless, below which no tension is added to the tangent."""
 
 MAX_ITERATIONS = 60
-"""Limit of Newton steps; ordinary scenes take five to ten."""
+"""Limit of Newton steps; ordinary presses take five to ten."""
 
 PATIENCE = 8
-"""Steps in which their size must halve, after the first as many."""
+"""Number of steps. Newton stops as stalled if, after the first PATIENCE steps, the smallest step of the last PATIENCE
+is not below half of the smallest before."""
 
 REFINEMENTS, REFINED = 5, 1e-5
-"""Corrections of a linear solve, and their size in the energy norm from which on no other is needed."""
+"""Largest number of corrections of a linear solve, and size of a correction in the energy norm that ends them."""
 
 CHORD_FROM, CHORD_KEEPS = 0.15, 0.3
-"""Share of the residual that a step leaves, below which its tangent is used again; the share each use must beat."""
+"""Reuse the factorised tangent if the last step reduced the residual below CHORD_FROM of its value, and as long as each
+reuse reduces it below CHORD_KEEPS."""
 
 ROUND_OFF = 1e-9
-"""Size of a Newton step in the energy norm, relative to the load's work, from which on only round-off is left."""
+"""Size of a Newton step in the energy norm, relative to the load's work, below which only round-off is left."""
 
 
 @dataclass(frozen=True)
 class NewtonResult:
-    """What came out.
+    """Outcome of a solve.
 
     Attributes:
         field: Nodal (U1, U2, W), shape (n_node, 3).
         converged: Whether the residual is below the tolerance or as low as round-off lets it.
-        iterations: Newton steps, of a linear theory solves.
+        iterations: Newton steps; of a linear theory, solves.
         residual: Out-of-balance force: the larger of transverse over load and in-plane over in-plane force. Of a linear
             theory the size of the correction that it asked for, in the energy norm.
         message: One sentence for people.
@@ -78,11 +82,11 @@ def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Ar
 
 
 def solve_linear(film: ElasticFilm, assembly: Assembly) -> NewtonResult:
-    """The linear theories: W from load, tension and bending alone, then the in-plane displacement that W asks for.
+    """The linear theories: W from load, tension and bending alone, then the in-plane displacement U that W causes.
 
     The stress that the deflection induces does not act back on it. The flat film's tangent does not couple W and U, so
-    one solve serves both U and the correction that W needs (iterative refinement: each leaves about the square of the
-    error), whose size in the energy norm tells how well W was solved.
+    one solve gives both U and a correction of W (iterative refinement: each squares the error, roughly). The size of
+    the correction in the energy norm shows how well W was solved.
     """
     flat = np.zeros((assembly.free.shape[0], 3))
     factor = assembly.factor(film.tangent(flat))
@@ -108,7 +112,7 @@ def _linear_residual(film: ElasticFilm, deflection: Array) -> Array:
 
 
 def solve_newton(
-    film: ElasticFilm, assembly: Assembly, start: Array, tolerance: float, near: float = GUARD_BELOW
+    film: ElasticFilm, assembly: Assembly, start: Array, tolerance: float, local_below: float = GUARD_BELOW
 ) -> NewtonResult:
     """Find the equilibrium from a start.
 
@@ -117,46 +121,77 @@ def solve_newton(
         assembly: Solver for its template.
         start: First field, shape (n_node, 3), zero where fixed.
         tolerance: Relative residual to reach.
-        near: Relative residual below which Newton's own step is taken if it halves the residual, uphill or down.
+        local_below: Relative residual below which a full Newton step that halves the residual is taken even if it
+            raises the energy.
 
     Returns:
         The result, converged or not; the caller decides what a failure means.
     """
-    field, residual = start, film.residual(start)
-    free = assembly.free[:, :3]
+    iterate = _Iterate.at(film, assembly.free[:, :3], start)
     sizes: list[float] = []
     for iteration in range(MAX_ITERATIONS + 1):
-        relative = _relative(film, field, residual * free)
+        relative = iterate.relative
         if not np.isfinite(relative):
-            return NewtonResult(field, False, iteration, relative, "the residual is not a finite number")
+            return iterate.result(False, iteration, "the residual is not a finite number")
         if relative <= tolerance:
-            return NewtonResult(field, True, iteration, relative, f"converged in {iteration} steps")
+            return iterate.result(True, iteration, f"converged in {iteration} steps")
         if iteration == MAX_ITERATIONS or _stalled(sizes):
-            return NewtonResult(field, False, iteration, relative, f"no progress any more after {iteration} steps")
-        factor = assembly.factor(film.tangent(field, _guard(film, relative)))
-        step = factor.solve(-residual)
-        sizes.append(_energy_norm(film, field, step, residual))
+            return iterate.result(False, iteration, f"no progress any more after {iteration} steps")
+        factor = assembly.factor(film.tangent(iterate.field, _regularisation(film, relative)))
+        step = factor.solve(-iterate.residual)
+        sizes.append(_energy_norm(film, iterate.field, step, iterate.residual))
         if sizes[-1] <= ROUND_OFF:
-            return NewtonResult(field, True, iteration, relative, f"converged to round-off in {iteration} steps")
-        taken = _local_step(film, field, step, relative, free) if relative <= near else None
-        if taken is None:
-            step = _downhill(film, assembly, field, residual, step)
-            taken = _line_search(film, field, step, residual, free)
-        if taken is None:
-            return NewtonResult(field, False, iteration, relative, "no step lowers the energy any more")
-        field, residual = _again(film, factor, *taken, relative, tolerance, free)
+            return iterate.result(True, iteration, f"converged to round-off in {iteration} steps")
+        following = _local_step(iterate, step) if relative <= local_below else None
+        if following is None:
+            following = _line_search(iterate, _descent_step(iterate, assembly, step))
+        if following is None:
+            return iterate.result(False, iteration, "no step lowers the energy any more")
+        iterate = _chord_steps(following, factor, relative, tolerance)
     raise AssertionError("the loop returns")
+
+
+@dataclass(frozen=True)
+class _Iterate:
+    """A field on the way to the equilibrium.
+
+    Attributes:
+        film: The discrete problem.
+        free: Which components of the nodes are not fixed, shape (n_node, 3).
+        field: Nodal (U1, U2, W), shape (n_node, 3).
+        residual: Out-of-balance force at the nodes, shape (n_node, 3).
+    """
+
+    film: ElasticFilm
+    free: Booleans
+    field: Array
+    residual: Array
+
+    @classmethod
+    def at(cls, film: ElasticFilm, free: Booleans, field: Array) -> Self:
+        """A field with its residual."""
+        return cls(film, free, field, film.residual(field))
+
+    def moved(self, step: Array) -> Self:
+        """The field after a step."""
+        return type(self).at(self.film, self.free, self.field + step)
+
+    @cached_property
+    def relative(self) -> float:
+        """Relative residual: the larger of transverse over load and in-plane over in-plane force."""
+        residual = self.residual * self.free
+        across = np.linalg.norm(residual[:, 2]) / (self.film.groups.load * np.linalg.norm(self.film.geometry.load))
+        along = np.linalg.norm(residual[:, :2]) / max(self.film.in_plane_scale(self.field), 1e-300)
+        return float(max(across, along))
+
+    def result(self, converged: bool, iterations: int, message: str) -> NewtonResult:
+        """This field as the outcome."""
+        return NewtonResult(self.field, converged, iterations, self.relative, message)
 
 
 def _stalled(sizes: list[float]) -> bool:
     """Whether the steps have stopped shrinking: the film runs away along a direction without stiffness."""
     return len(sizes) > 2 * PATIENCE and min(sizes[-PATIENCE:]) > 0.5 * min(sizes[:-PATIENCE])
-
-
-def _relative(film: ElasticFilm, field: Array, residual: Array) -> float:
-    across = np.linalg.norm(residual[:, 2]) / (film.groups.load * np.linalg.norm(film.geometry.load))
-    along = np.linalg.norm(residual[:, :2]) / max(film.in_plane_scale(field), 1e-300)
-    return float(max(across, along))
 
 
 def _energy_norm(film: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
@@ -165,77 +200,64 @@ def _energy_norm(film: ElasticFilm, field: Array, step: Array, residual: Array) 
     return float(np.sqrt(abs(float(np.sum(step * residual))) / max(work, 1e-300)))
 
 
-def _guard(film: ElasticFilm, relative: float) -> float:
-    """Tension to add to the tangent: none near the end."""
+def _regularisation(film: ElasticFilm, relative: float) -> float:
+    """Tension to add to the tangent: in proportion to the residual, none near the equilibrium."""
     slack = GUARD_TENSION * float(np.cbrt(film.groups.load)) ** 2
     return slack * min(1.0, relative) if relative > GUARD_BELOW else 0.0
 
 
-def _local_step(
-    film: ElasticFilm, field: Array, step: Array, relative: float, free: np.ndarray
-) -> tuple[Array, Array] | None:
-    """Newton's own step near the end, if it halves the residual at least, uphill or down.
+def _local_step(iterate: _Iterate, step: Array) -> _Iterate | None:
+    """The full Newton step if it at least halves the residual.
 
-    A compressed film can have a flat equilibrium that a wrinkle would lower by a hair: it is found, not fled from.
+    Accept a full Newton step that raises the energy: a compressed film may have an unwrinkled equilibrium whose energy
+    is slightly above the wrinkled one.
     """
     if not np.isfinite(step).all():
         return None
-    trial = field + step
-    residual = film.residual(trial)
-    return (trial, residual) if _relative(film, trial, residual * free) < 0.5 * relative else None
+    trial = iterate.moved(step)
+    return trial if trial.relative < 0.5 * iterate.relative else None
 
 
-def _again(
-    film: ElasticFilm,
-    factor: Factor,
-    field: Array,
-    residual: Array,
-    before: float,
-    tolerance: float,
-    free: np.ndarray,
-) -> tuple[Array, Array]:
-    """Further steps with the same tangent while they pay, which cost a seventh of one with its own (chord method).
+def _chord_steps(iterate: _Iterate, factor: Factor, before: float, tolerance: float) -> _Iterate:
+    """Further steps with the same tangent while they pay (chord method): each costs a seventh of a Newton step.
 
-    A step that left the share s of the residual says that the next with its tangent will leave about 2 s (Kelley 1995).
+    A step that left the share s of the residual suggests that the next with its tangent leaves about 2 s (Kelley 1995).
     """
-    relative = _relative(film, field, residual * free)
-    if relative > CHORD_FROM * before:
-        return field, residual
-    while relative > tolerance:
-        trial = field + factor.solve(-residual)
-        trial_residual = film.residual(trial)
-        left = _relative(film, trial, trial_residual * free)
-        if not left < CHORD_KEEPS * relative:
+    if iterate.relative > CHORD_FROM * before:
+        return iterate
+    while iterate.relative > tolerance:
+        trial = iterate.moved(factor.solve(-iterate.residual))
+        if not trial.relative < CHORD_KEEPS * iterate.relative:
             break
-        field, residual, relative = trial, trial_residual, left
-    return field, residual
+        iterate = trial
+    return iterate
 
 
-def _downhill(film: ElasticFilm, assembly: Assembly, field: Array, residual: Array, step: Array) -> Array:
-    """A step that goes downhill: the given one, or with more and more tension in the tangent."""
+def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
+    """A step that lowers the energy: the given one, or one with more and more tension in the tangent."""
+    film = iterate.film
     tension = 0.05 * GUARD_TENSION * float(np.cbrt(film.groups.load)) ** 2
     for _ in range(12):
-        if np.isfinite(step).all() and float(np.sum(step * residual)) < 0.0:
+        if np.isfinite(step).all() and float(np.sum(step * iterate.residual)) < 0.0:
             break
-        step = assembly.factor(film.tangent(field, tension)).solve(-residual)
+        step = assembly.factor(film.tangent(iterate.field, tension)).solve(-iterate.residual)
         tension *= 2.0
     return step
 
 
-def _line_search(
-    film: ElasticFilm, field: Array, step: Array, residual: Array, free: np.ndarray
-) -> tuple[Array, Array] | None:
-    """Halve the step until the energy falls enough (Armijo), or, where the energy's digits end, the residual does."""
-    energy, slope = film.energy(field), float(np.sum(step * residual))
-    norm = np.linalg.norm(residual[free])
+def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
+    """Halve the step until the energy falls enough (Armijo) or, where its digits end, until the residual falls."""
+    film, residual = iterate.film, iterate.residual
+    energy, slope = film.energy(iterate.field), float(np.sum(step * residual))
+    norm = np.linalg.norm(residual[iterate.free])
     share = 1.0
     for _ in range(30):
-        trial = field + share * step
-        change = film.energy(trial) - energy
+        field = iterate.field + share * step
+        change = film.energy(field) - energy
         lower = change <= 1e-4 * share * slope
         if lower or abs(change) <= 1e-12 * abs(energy):
-            trial_residual = film.residual(trial)
-            if lower or np.linalg.norm(trial_residual[free]) < norm:
-                return trial, trial_residual
+            trial = _Iterate.at(film, iterate.free, field)
+            if lower or np.linalg.norm(trial.residual[iterate.free]) < norm:
+                return trial
         share *= 0.5
     return None
