@@ -1,4 +1,4 @@
-"""Files and folders that are there whole or not at all."""
+"""Files and folders that exist whole or not at all."""
 
 import hashlib
 import os
@@ -37,16 +37,16 @@ def write_whole(path: Path, data: bytes) -> None:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Fill a folder out of sight and give it its name when the block ends well; on an error nothing is left.
+    """Fill a folder out of sight and give it its name when the block ends well; on an error nothing remains.
 
     Args:
-        path: The folder to make; its parents are made too.
+        path: The folder to create, with its parents.
 
     Yields:
         A temporary sibling to write into.
 
     Raises:
-        OutputExists: If `path` is already there, or another process makes it meanwhile.
+        OutputExists: If `path` is already there, or another process creates it meanwhile.
         OutputError: If the file system refuses.
     """
     refuse_existing(path)
@@ -85,7 +85,7 @@ def _remove_empty(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames in a folder survive a power cut."""
+    """Make sure that renames in a folder survive a power cut."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,12 +1,12 @@
-"""A run that can be killed and go on: its finished parts, kept beside the folder that it will make.
+"""A run that can be killed and go on: its finished parts are kept next to the folder that it will write.
 
     presses.part/
-        run.json           what the run is: another run does not touch it
+        run.json           identity of the run: another run does not touch the folder
         lock               held by the process at work; released by the system if that is killed
         parts/<name>       finished work, and <name>.sha256
         data/<name>        what becomes the folder in the end; its checksums are in parts/
 
-A part counts only once its checksum is there and fits; whatever else is found is made again.
+A part counts only if its checksum exists and matches; all other parts are computed again.
 """
 
 import fcntl
@@ -24,12 +24,12 @@ from isocharge.progress import Warn
 
 
 class ResumableRun:
-    """Finished parts of a run; `resume_folder` makes one.
+    """Finished parts of a run; see `resume_folder`.
 
     Attributes:
-        target: The folder that the run makes.
-        folder: The draft itself.
-        data: Becomes the target.
+        target: The folder that the run writes.
+        folder: The draft: the folder that holds the parts until the run is done.
+        data: The folder in the draft that becomes the target.
     """
 
     def __init__(self, target: Path, warn: Warn = warnings.warn) -> None:
@@ -47,7 +47,7 @@ class ResumableRun:
             write_whole(self._parts / f"{name}.sha256", sha256_of(data).encode())
 
     def load(self, name: str, *, final: bool = False) -> bytes | None:
-        """A part that was finished, or None if it has to be made; a damaged one is told of and counts as unmade."""
+        """A finished part, or None if it must be computed; a damaged part gives a warning and None."""
         try:
             checksum = (self._parts / f"{name}.sha256").read_text()
         except (FileNotFoundError, UnicodeDecodeError):
@@ -56,18 +56,20 @@ class ResumableRun:
         data = path.read_bytes() if path.is_file() else b""
         if sha256_of(data) == checksum:
             return data
-        self._warn(f"{path} is damaged: expected sha256 {checksum[:12]}..., got {sha256_of(data)[:12]}...; made again")
+        self._warn(
+            f"{path} is damaged: expected sha256 {checksum[:12]}..., got {sha256_of(data)[:12]}...; computed again"
+        )
         return None
 
     def is_empty(self) -> bool:
-        """Whether nothing is finished yet."""
+        """Whether no part is finished yet."""
         return not any(self._parts.glob("*.sha256"))
 
     def _place(self, name: str, final: bool) -> Path:
         return (self.data if final else self._parts) / name
 
-    def tidy(self) -> None:
-        """Make the folders, and remove what a killed process was just writing."""
+    def prepare(self) -> None:
+        """Create the folders, and remove files that a killed process had not finished writing."""
         with output_errors(self.target):
             for folder in (self._parts, self.data):
                 folder.mkdir(exist_ok=True)
@@ -85,12 +87,12 @@ class ResumableRun:
         self.remove()
 
     def remove(self) -> None:
-        """Throw it away."""
+        """Remove the draft with all its parts."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def draft_of(target: Path) -> Path:
-    """Where the draft of a target lies."""
+    """Folder of a target's draft."""
     return target.with_name(f"{target.name}.part")
 
 
@@ -109,14 +111,14 @@ def resume_folder(
     """Begin a run, or go on with one that was stopped; the target appears when the block ends well.
 
     Args:
-        target: The folder to make.
-        identity: All that decides about the result, as JSON can hold it.
+        target: The folder to write.
+        identity: Everything that the result depends on, as JSON.
         fresh: Throw an earlier draft away.
-        warn: Told of damaged parts.
+        warn: Called with a sentence for each damaged part.
 
     Yields:
-        The draft; fill `data`. If the block fails the draft stays, unless nothing is finished or the error is one that
-        would come again.
+        The draft; fill `data`. If the block fails, the draft stays, unless nothing is finished or the same error would
+        come again.
 
     Raises:
         OutputExists: If the target is already there, or the draft is another run's or in use.
@@ -131,14 +133,14 @@ def resume_folder(
 def resume_parts(
     target: Path, identity: Mapping[str, Any], *, fresh: bool = False, warn: Warn = warnings.warn
 ) -> Iterator[ResumableRun]:
-    """As `resume_folder`, but the block makes the target itself; the draft is gone when it ends well."""
+    """Like `resume_folder`, but the block writes the target itself; the draft is removed when the block ends well."""
     refuse_finished(target)
     draft = ResumableRun(target, warn)
     parents = [parent for parent in target.parents if not parent.exists()]
     try:
         with _claim(draft, json.loads(json.dumps(identity)), fresh):
             try:
-                draft.tidy()
+                draft.prepare()
                 yield draft
                 draft.remove()
             except BaseException as error:
@@ -153,15 +155,15 @@ def resume_parts(
 
 @contextmanager
 def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterator[None]:
-    """Hold the draft of this run, made if there is none."""
+    """Hold the draft of this run; create it if necessary."""
     folder = draft.folder
     if fresh and (folder / "run.json").is_file():
         with _lock(folder):
             draft.remove()
     if not folder.exists():
-        with output_errors(draft.target), new_folder(folder) as made:
-            (made / "lock").touch()
-            write_whole(made / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
+        with output_errors(draft.target), new_folder(folder) as new:
+            (new / "lock").touch()
+            write_whole(new / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
     with _lock(folder):
         _check_same_run(folder, identity)
         yield
@@ -169,15 +171,15 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
 
 @contextmanager
 def output_errors(target: Path) -> Iterator[None]:
-    """Say it in our words if the file system refuses."""
+    """Turn OSError into OutputError."""
     try:
         yield
     except OSError as error:
         if isinstance(error, OutputExists):
             raise
         cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
-        kept = f"what is done is kept in {draft_of(target)}; the same command goes on"
-        hint = "choose another output" if ResumableRun(target).is_empty() else kept
+        resume = f"what is done is kept in {draft_of(target)}; the same command goes on"
+        hint = "choose another output" if ResumableRun(target).is_empty() else resume
         raise OutputError(f"{target} cannot be written: {cause.strerror or cause}; {hint}") from error
 
 
@@ -196,23 +198,23 @@ def _lock(folder: Path) -> Iterator[None]:
 
 def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
     try:
-        there = json.loads((folder / "run.json").read_text())
+        saved = json.loads((folder / "run.json").read_text())
     except (FileNotFoundError, ValueError) as error:
         raise OutputExists(
             f"{folder} is in the way: it holds no run.json that can be read; choose another output or remove it"
         ) from error
-    if json.dumps(there, sort_keys=True) != json.dumps(identity, sort_keys=True):
-        differences = "; ".join(_differences(there, identity))
+    if json.dumps(saved, sort_keys=True) != json.dumps(identity, sort_keys=True):
+        differences = "; ".join(_differences(saved, identity))
         raise OutputExists(
             f"{folder} holds the unfinished run of other settings: {differences}; finish that with its own command, "
-            "choose another output, or start anew (--fresh, which throws it away)"
+            "choose another output, or begin again (--fresh, which throws it away)"
         )
 
 
-def _differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
-    if isinstance(there, dict) and isinstance(here, dict):
-        for key in sorted(there.keys() | here.keys()):
-            if there.get(key) != here.get(key):
-                yield from _differences(there.get(key), here.get(key), f"{name}.{key}" if name else key)
+def _differences(saved: Any, current: Any, name: str = "") -> Iterator[str]:
+    if isinstance(saved, dict) and isinstance(current, dict):
+        for key in sorted(saved.keys() | current.keys()):
+            if saved.get(key) != current.get(key):
+                yield from _differences(saved.get(key), current.get(key), f"{name}.{key}" if name else key)
     else:
-        yield f"{name or 'run.json'} is {there} there, {here} here"
+        yield f"{name or 'run.json'} is {saved} there, {current} here"

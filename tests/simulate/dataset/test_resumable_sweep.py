@@ -164,7 +164,7 @@ def test_a_damaged_part_is_told_of_and_made_again(stopped, whole, damage, name):
         path.unlink()
     else:
         path.write_bytes(bytes(data) if damage == "flipped" else bytes(data)[:-9])
-    with pytest.warns(UserWarning, match=rf"{path.name} is damaged: expected sha256 .*\.\.\.; made again"):
+    with pytest.warns(UserWarning, match=rf"{path.name} is damaged: expected sha256 .*\.\.\.; computed again"):
         sweep_to(stopped)
     assert files(stopped) == whole[0]
 

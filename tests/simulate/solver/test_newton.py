@@ -103,7 +103,7 @@ def test_start_of_a_much_thicker_film_still_converges(film):
 
 
 def test_failure_raises_a_full_sentence(film):
-    message = r"no equilibrium at 1\.5 N, position \(2, -3\) mm: .*; residual .* \(1e-30 asked for\) after \d+ steps"
+    message = r"no equilibrium at 1\.5 N, position \(2, -3\) mm: .*; residual .* \(expected 1e-30\) after \d+ steps"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("isocharge.simulate.solver.newton.ROUND_OFF", 0.0)
         with pytest.raises(SolveError, match=message):

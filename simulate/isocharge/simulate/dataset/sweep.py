@@ -1,7 +1,8 @@
 """A sweep: many presses spread over the working area and the forces, and their charges.
 
 A forward map is solved for every probe and evaluated for every press. Both are cut into tasks that do not depend on the
-workers, so neither do the bytes. What is finished is kept in a draft beside the dataset: a run that was killed goes on.
+workers, so neither do the bytes. Finished parts are kept in a folder next to the dataset, so
+a run that was killed goes on.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -41,7 +42,7 @@ SHARD = 16384
 """Samples per shard."""
 
 TASK = 8192
-"""Presses per task: long enough (a second) that sending the map along (12 MB) does not show."""
+"""Presses per task: a second of work, long compared with sending the map to the worker (12 MB)."""
 
 SAMPLING = {
     "sobol": "scrambled Sobol, uniform over the disk, log-uniform in force",
@@ -65,22 +66,22 @@ def run_sweep(
     """Simulate a sweep and write it as a dataset. Killed and called again with the same arguments, it goes on.
 
     Args:
-        folder: Where; must not exist yet.
+        folder: Folder to write; must not exist yet.
         sensor: The sensor.
-        probes: The objects that press; they take turns.
-        sweep: What to sample.
+        probes: The objects that press, in turn.
+        sweep: Which presses to sample.
         settings: How the film is solved.
         workers: Who does the work, this process by default. The bytes written do not depend on it.
         callbacks: What to call with progress and warnings.
         shard: Samples per shard.
-        fresh: Throw away what an earlier run left.
+        fresh: Throw away the parts of an earlier run.
 
     Returns:
         The folder.
 
     Raises:
         SceneError: If a press cannot exist.
-        OutputExists: If the folder is already there, or an unfinished run of other settings; said before the work
+        OutputExists: If the folder is already there, or an unfinished run of other settings; raised before the work
             begins.
         OutputError: If the file system refuses; the finished work is kept.
     """
@@ -88,14 +89,14 @@ def run_sweep(
     refuse_finished(folder)
     presses = sweep.over(probes)  # before anything is written: scipy's Sobol tables swallow an interrupt
     identity = _identity(sensor, probes, sweep, settings, shard)
-    with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh, warn=callbacks.warn) as draft:
+    with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh, warn=callbacks.warn) as run:
         maps = tuple(
             _build(sensor, probe, sweep, settings, map_jobs, callbacks.solved)
-            for probe, map_jobs in _checkpointed_maps(draft, probes, workers)
+            for probe, map_jobs in _checkpointed_maps(run, probes, workers)
         )
-        entries = _draft_shards(draft, maps, presses, workers, shard, callbacks.sampled)
+        entries = _finish_shards(run, maps, presses, workers, shard, callbacks.sampled)
         with output_errors(folder):
-            write_manifest(draft.data, folder.name, sensor, entries, _about(maps, sweep))
+            write_manifest(run.data, folder.name, sensor, entries, _about(maps, sweep))
     return folder
 
 
@@ -115,8 +116,8 @@ def solve_maps(
 
 
 def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
-    """Write a sweep's presses and charges, given the solved maps, here and now; see `run_sweep`."""
-    presses = sweep.over([made.probe for made in maps])
+    """Write a sweep's presses and charges, given the solved maps, in this process; see `run_sweep`."""
+    presses = sweep.over([forward_map.probe for forward_map in maps])
     return write_dataset(folder, maps[0].sensor, _samples(maps, _cut(presses, SHARD), Workers()), _about(maps, sweep))
 
 
@@ -134,17 +135,17 @@ def _build(
 
 
 def _checkpointed_maps(
-    draft: ResumableRun, probes: Sequence[Probe], workers: Workers
+    run: ResumableRun, probes: Sequence[Probe], workers: Workers
 ) -> Iterator[tuple[Probe, CheckpointedMap]]:
     """Each probe with the map function whose results the run keeps under its number."""
     for number, probe in enumerate(probes):
-        yield probe, CheckpointedMap(draft, f"solve-{number:02d}", workers.in_order)
+        yield probe, CheckpointedMap(run, f"solve-{number:02d}", workers.in_order)
 
 
 def _identity(
     sensor: Sensor, probes: Sequence[Probe], sweep: Sweep, settings: SolveSettings, shard: int
 ) -> dict[str, Any]:
-    """All that decides about the bytes."""
+    """Everything that the bytes of the dataset depend on."""
     return {
         "made_by": code_fingerprint(),
         "sensor": sensor_to_dict(sensor),
@@ -156,9 +157,9 @@ def _identity(
 
 
 def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
-    """What the manifest says of the sweep."""
+    """The manifest's entries about the sweep."""
     return {
-        "probes": list(dict.fromkeys(made.probe.notation for made in maps)),
+        "probes": list(dict.fromkeys(forward_map.probe.notation for forward_map in maps)),
         "ranges": {
             "radius_mm": float(f"{sweep.radius * 1e3:.12g}"),
             "force_N": list(sweep.force_range),
@@ -169,35 +170,35 @@ def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
         "noise": "clean",
         "solver": {
             "theory": maps[0].theory.name,
-            "mesh": {made.probe.notation: made.resolution.description for made in maps},
-            "solves": sum(made.solves for made in maps),
-            "interpolation_error": max(made.error for made in maps),
+            "mesh": {forward_map.probe.notation: forward_map.resolution.description for forward_map in maps},
+            "solves": sum(forward_map.solves for forward_map in maps),
+            "interpolation_error": max(forward_map.error for forward_map in maps),
         },
     }
 
 
-def _draft_shards(
-    draft: ResumableRun,
+def _finish_shards(
+    run: ResumableRun,
     maps: Sequence[ForwardMap],
     presses: SweepPresses,
     workers: Workers,
     shard: int,
     sampled: Progress | None,
 ) -> list[dict[str, Any]]:
-    """Make the shards that the draft has not got; what the manifest says of each, in order."""
+    """Write the shards that the run does not have yet; the manifest's entry of each shard, in order."""
     parts = dict(enumerate(_cut(presses, shard)))
     entries: dict[int, dict[str, Any]] = {}
     for number, part in parts.items():
-        if (data := draft.load(shard_name(number), final=True)) is not None:
+        if (data := run.load(shard_name(number), final=True)) is not None:
             entries[number] = shard_entry(shard_name(number), len(part), data)
     done = sum(entry["samples"] for entry in entries.values())
     missing = [number for number in parts if number not in entries]
     if sampled:
         sampled(done, len(presses))
-    made = _samples(maps, (parts[number] for number in missing), workers)
-    for number, samples in zip(missing, made, strict=True):
+    computed = _samples(maps, (parts[number] for number in missing), workers)
+    for number, samples in zip(missing, computed, strict=True):
         name, data = pack_shard(number, samples, maps[0].sensor)
-        draft.save(name, data, final=True)
+        run.save(name, data, final=True)
         entries[number] = shard_entry(name, len(samples), data)
         done += len(samples)
         if sampled:
@@ -215,8 +216,8 @@ def _samples(maps: Sequence[ForwardMap], shards: Iterable[SweepPresses], workers
     shards, coming = tee(shards)
     tasks = ((maps[number], part[rows]) for part in coming for number, rows in _tasks(part, len(maps)))
     charges = workers.in_order(_charges, tasks)
-    notation = np.array([made.probe.notation for made in maps])
-    angle = np.array([made.probe.angle for made in maps])
+    notation = np.array([forward_map.probe.notation for forward_map in maps])
+    angle = np.array([forward_map.probe.angle for forward_map in maps])
     for part in shards:
         charge = np.empty((len(part), len(maps[0].sensor.electrodes)))
         for _, rows in _tasks(part, len(maps)):
@@ -233,7 +234,7 @@ def _samples(maps: Sequence[ForwardMap], shards: Iterable[SweepPresses], workers
 
 
 def _tasks(part: SweepPresses, probes: int) -> Iterator[tuple[int, Integers]]:
-    """How a shard is cut into tasks: number of the probe and rows of the shard."""
+    """Tasks of a shard: number of the probe and rows of the shard."""
     for number in range(probes):
         rows = np.flatnonzero(part.probe == number)
         for start in range(0, rows.size, TASK):
@@ -242,5 +243,5 @@ def _tasks(part: SweepPresses, probes: int) -> Iterator[tuple[int, Integers]]:
 
 def _charges(task: tuple[ForwardMap, SweepPresses]) -> Array:
     """Touch charges of a task's presses, shape (n, n_electrode), C."""
-    made, presses = task
-    return made.forward(presses.x, presses.y, presses.force, presses.turn)
+    forward_map, presses = task
+    return forward_map.forward(presses.x, presses.y, presses.force, presses.turn)

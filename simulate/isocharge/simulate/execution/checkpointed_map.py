@@ -14,7 +14,7 @@ JobMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 class CheckpointedMap:
-    """A `JobMap` that keeps its results, which are arrays, in a resumable run, and loads those that are there.
+    """A `JobMap` that keeps its results, which are arrays, in a resumable run, and loads those that it already has.
 
     A result's file name is (number of the map call, index of the job), so the same run finds its results again.
     """

@@ -1,4 +1,4 @@
-"""Where the work of a sweep is done: here, in processes on this machine, or on a Dask cluster.
+"""Where the work of a sweep is done: in this process, in processes on this machine, or on a Dask cluster.
 
 All of them are one `concurrent.futures.Executor`. What they compute does not depend on which, on how many, or on who
 is first: tasks are cut beforehand and their results are taken in order.
@@ -26,10 +26,10 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 AHEAD = 16
-"""Tasks handed out before the first is back."""
+"""Tasks handed out before the first result is back."""
 
 CONNECT_S = 10.0
-"""How long a cluster may take to answer."""
+"""Longest wait for a cluster to answer, s."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Workers:
     """Who does the work.
 
     Attributes:
-        executor: Takes the tasks; None does them here and now.
-        ahead: Tasks to hand out before the first is back: enough for all to be busy, few enough to hold in memory.
+        executor: Runs the tasks; None runs them in this process.
+        ahead: Tasks to hand out before the first result is back: enough to keep workers busy, few enough for memory.
     """
 
     executor: Executor | None = None
@@ -63,15 +63,15 @@ class Workers:
 
 
 class SameCodeOnly(Generic[Job, Result]):
-    """A function that a worker runs only if its isocharge is the one of who sent it: else its bytes would differ."""
+    """A function that a worker runs only if it has the same isocharge as the sender: else its bytes would differ."""
 
     def __init__(self, function: Callable[[Job], Result]) -> None:
-        self._function, self._made_by = function, code_fingerprint()
+        self._function, self._fingerprint = function, code_fingerprint()
 
     def __call__(self, job: Job) -> Result:
-        if code_fingerprint() != self._made_by:
+        if code_fingerprint() != self._fingerprint:
             raise WorkersLost(
-                f"a worker runs {code_fingerprint()}, expected {self._made_by}; install the same on all of them"
+                f"a worker runs {code_fingerprint()}, expected {self._fingerprint}; install the same on all of them"
             )
         return self._function(job)
 
@@ -127,7 +127,7 @@ def dask_workers(address: str) -> Iterator[Workers]:
     A worker that is killed is no matter as long as others are left: Dask gives its tasks to them.
 
     Raises:
-        InputError: If the address is none.
+        InputError: If this is no address.
         WorkersLost: If the cluster does not answer, or is lost.
         MissingExtra: If the extra `cluster` is not installed.
     """

@@ -3,9 +3,8 @@
 Presses of one probe form a family in distance from the centre, force and, unless the probe is round, orientation; the
 angle of the position is a turn. Seen from the probe, the stress at the nodes of the template is a smooth function of
 all of them. It is solved on Chebyshev nodes in distance and the force's logarithm and on evenly spread orientations,
-interpolated as a field, and the charge is integrated from the interpolated field for every press anew: exact about the
-place of the electrode, with the probe on it included. How well it does is measured against direct solves when it is
-built.
+interpolated as a field, and the charge is integrated from the interpolated field again for every press: exact for the
+position of the electrode, also with the probe on it. Building a map compares it with direct solves.
 """
 
 from dataclasses import dataclass, replace
@@ -41,10 +40,10 @@ INTERPOLATION_ERROR = 5e-4
 """Largest relative error of any charge against direct solves that a forward map may have."""
 
 SMALL = 0.1
-"""Share of a press's largest charge below which an error counts as if the charge were that large."""
+"""Floor for the charge that an error is relative to, as a share of the press's largest charge, dimensionless."""
 
 CHECKS = 10
-"""Direct solves that a forward map is compared with."""
+"""Number of direct solves that a forward map is compared with."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +53,8 @@ class ForwardMap:
     Attributes:
         sensor: The sensor.
         probe: The footprint.
-        family: Where it was solved: distances, forces, orientations.
-        theory: Which terms were in.
+        family: Distances, forces and orientations of the solves.
+        theory: Which terms are modelled.
         resolution: Mesh of the solves.
         layer: Width of its thin rings at the rim over the film's radius.
         table: Scaled stress C : E' at the nodes of every element, in a frame that turns with the probe; shape
@@ -95,11 +94,11 @@ class ForwardMap:
                 accuracy allows over the forces, the mesh of the outermost press, thin rings for the middle force.
             map_jobs: Runs the solves, in this process by default; `executor.map` or `Workers.in_order`. The result does
                 not depend on it.
-            progress: Told how many solves are done.
+            progress: Called with (done, total) distances and orientations.
 
         Raises:
             SceneError: If some presses cannot exist.
-            SolveError: If an equilibrium or the wanted interpolation error was not reached.
+            SolveError: If an equilibrium or the interpolation error is not reached.
         """
         film = sensor.film
         check_family(film, probe, radius, force_range)
@@ -114,10 +113,10 @@ class ForwardMap:
             family = Family.spread(radius, force_range, count, probe.period, turns)
             solved = solve_family(sensor, probe, family, settings, map_jobs, progress)
             table = family.unfold(solved, template_for(probe, resolution))
-            made = cls(sensor, probe, family, theory, resolution, layer, table, error)
-            error = _check_against_solves(made)
+            forward_map = cls(sensor, probe, family, theory, resolution, layer, table, error)
+            error = _check_against_solves(forward_map)
             if error <= INTERPOLATION_ERROR:
-                return cls(sensor, probe, family, theory, resolution, layer, table, error)
+                return replace(forward_map, error=error)
         raise SolveError(
             f"the forward map of {sensor.name} up to {radius * 1e3:g} mm and {force_range[1]:g} N interpolates to "
             f"{error:.2g} only, expected {INTERPOLATION_ERROR:g}; ask for a smaller radius or range of forces"
@@ -140,7 +139,7 @@ class ForwardMap:
 
     @property
     def solves(self) -> int:
-        """How many equilibria the map was made from."""
+        """Number of equilibria that were solved for the map."""
         return self.family.distance.size * self.family.force.size * self.family.solved_turns.size
 
     def forward(self, x: Array, y: Array, force: Array, orientation: Array | float = 0.0) -> Array:
@@ -150,7 +149,7 @@ class ForwardMap:
             x: Positions, shape (n,), m.
             y: Positions, shape (n,), m.
             force: Forces, shape (n,), N; where zero the film is untouched and the charges are zero.
-            orientation: How far the probe is turned further, shape (n,) or a number, rad, anticlockwise.
+            orientation: Further turn of the probe, shape (n,) or a number, rad, anticlockwise.
 
         Returns:
             Shape (n, n_electrode), C.
@@ -233,26 +232,25 @@ class ForwardMap:
         """
         mesh, angle = template_for(self.probe, self.resolution), np.angle(at[press_index])
         points = readout.points[electrode] @ np.array([1.0, 1j]) / self.sensor.film.radius
-        film = points * np.exp(-1j * angle)[:, None]
-        film, mirrored = mesh.into_meshed_half(film)
-        element, xi, eta = placement[press_index].locate(mesh, film)
+        position, mirrored = mesh.into_meshed_half(points * np.exp(-1j * angle)[:, None])
+        element, xi, eta = placement[press_index].locate(mesh, position)
         values = tensor_values(self.resolution.order, xi.ravel(), eta.ravel())
         nodal = field.reshape(len(field), mesh.n_element, -1, 3)[press_index[:, None], element]
-        local = np.matmul(values[:, None, :], nodal.reshape(*values.shape, 3)).reshape(*film.shape, 3)
+        local = np.matmul(values[:, None, :], nodal.reshape(*values.shape, 3)).reshape(*position.shape, 3)
         local[mirrored, 2] *= -1.0
         stress = turn_stress(local, (angle if mesh.half else angle + frame[press_index])[:, None])
         charge: Array = np.einsum("kpc,kpc->k", stress, readout.weights[electrode])
         return charge
 
 
-def _check_against_solves(made: ForwardMap) -> float:
+def _check_against_solves(forward_map: ForwardMap) -> float:
     """Largest relative error of a charge over presses between the nodes and at the edge of the family."""
     errors = []
-    for distance, angle, force, turn in made.family.probes_between(CHECKS):
+    for distance, angle, force, turn in forward_map.family.probes_between(CHECKS):
         x, y = distance * np.cos(angle), distance * np.sin(angle)
-        solved = press(made.sensor.film, made.probe.turned(turn), (x, y), force, made.settings)
-        direct = touch_charge(made.sensor, solved)
-        mapped = made.forward(np.array([x]), np.array([y]), np.array([force]), turn)[0]
+        solved = press(forward_map.sensor.film, forward_map.probe.turned(turn), (x, y), force, forward_map.settings)
+        direct = touch_charge(forward_map.sensor, solved)
+        mapped = forward_map.forward(np.array([x]), np.array([y]), np.array([force]), turn)[0]
         scale = np.maximum(np.abs(direct), SMALL * np.abs(direct).max())
         errors.append((np.abs(mapped - direct) / scale).max())
     return float(np.max(errors))

@@ -28,7 +28,7 @@ class _Chain:
         film: The film.
         probe: The footprint, turned as it presses.
         surface: Where in the thickness the stress is read.
-        distance: Of the presses from the film's centre, m.
+        distance: Distance of the presses from the film's centre, m.
         forces: N, shape (n_force,), in the order in which they are solved.
         settings: Theory and mesh.
     """

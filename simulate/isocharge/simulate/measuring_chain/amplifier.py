@@ -21,7 +21,7 @@ from isocharge.errors import InputError
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 PVDF_PYRO = 30e-6 * 9e-6
-"""C/K on an electrode of 9 mm^2: 30 uC/(m^2 K)."""
+"""Pyroelectric charge per temperature of a PVDF electrode of 9 mm^2, C/K: 30 uC/(m^2 K)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,12 +37,12 @@ class Amplifier:
         offset: Standard deviation of a channel's constant output, C.
         bias: Current that every channel integrates, A; its sign differs.
         pyro: Charge per temperature, C/K, on every electrode.
-        temperature_rms: Of the film's slow wandering, K.
-        temperature_time: In which it wanders, s: twice a first-order lag, so smooth, as a film with a mass is.
+        temperature_rms: Root mean square of the film's slow temperature drift, K.
+        temperature_time: Time constant of that drift, s: two first-order lags in series, as of a film with mass.
         step: Temperature step, K.
-        step_at, step_time: When it begins and how long it takes, s.
+        step_at, step_time: Start and duration of the temperature step, s.
         limit: Largest charge that can be read, C; infinite for any.
-        bits: Of the converter between both limits; 0 for none.
+        bits: Resolution of the converter between both limits; 0 for no converter.
     """
 
     noise: NoiseModel
@@ -66,16 +66,16 @@ class Amplifier:
         if self.bits and not math.isfinite(self.limit):
             raise InputError(
                 f"bits: a converter of {self.bits} bits needs the largest charge that it reads, got a limit of "
-                f"{self.limit} C; give limit_pC beside bits, or bits = 0 for no converter"
+                f"{self.limit} C; give limit_pC with bits, or bits = 0 for no converter"
             )
 
     def start(self, electrodes: int, rate: float, rng: np.random.Generator) -> "Measurement":
-        """Switch it on: mismatches are drawn, and it has settled.
+        """Switch the amplifier on: draw its mismatches and let it settle.
 
         Args:
             electrodes: Number of channels.
             rate: Readings per second, Hz.
-            rng: Of this and of everything that follows.
+            rng: Random numbers of the mismatches and of all readings.
         """
         tau = self.tau * (1.0 + self.tau_mismatch * rng.standard_normal(electrodes))
         gain = 1.0 + self.gain_mismatch * rng.standard_normal(electrodes)
@@ -87,11 +87,11 @@ class Amplifier:
 
 @dataclass
 class Measurement:
-    """An amplifier at work: call it with the charges block by block. The drawn channels are there to be looked at.
+    """A running amplifier: call it with the charges block by block.
 
     Attributes:
-        amplifier, rate, rng: As started.
-        tau, gain, bias, offset, phase: Of each channel, shape (electrodes,), SI units.
+        amplifier, rate, rng: As given to `Amplifier.start`.
+        tau, gain, bias, offset, phase: Values drawn for each channel, shape (electrodes,), SI units.
     """
 
     amplifier: Amplifier
@@ -127,7 +127,7 @@ class Measurement:
         return self._convert(noisy)
 
     def _temperature(self, time: Array) -> Array:
-        """Above the mean, shape (n,), K."""
+        """Temperature above its mean, shape (n,), K."""
         part = self.amplifier
         keep = math.exp(-1.0 / (self.rate * part.temperature_time))
         kicks = math.sqrt(2.0 * (1.0 - keep * keep)) * part.temperature_rms * self.rng.standard_normal(time.size)
@@ -143,13 +143,13 @@ class Measurement:
         self._charge = film[-1]
         keep = np.exp(-1.0 / (self.rate * self.tau))
         output = np.empty_like(steps)
-        for k, kept in enumerate(keep):
-            output[:, k] = lfilter([1.0], [1.0, -kept], steps[:, k], zi=[kept * self._output[k]])[0]
+        for k, share in enumerate(keep):
+            output[:, k] = lfilter([1.0], [1.0, -share], steps[:, k], zi=[share * self._output[k]])[0]
         self._output = output[-1]
         return output
 
     def _convert(self, output: Array) -> Array:
-        """Clipped, and in the converter's steps."""
+        """The output clipped, and rounded to the converter's steps."""
         limit, bits = self.amplifier.limit, self.amplifier.bits
         clipped = np.clip(output, -limit, limit)
         if not bits:

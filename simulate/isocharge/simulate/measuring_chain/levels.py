@@ -11,7 +11,7 @@ NOISE_LEVELS = {
     "bench": NoiseModel("bench", 0.3e-12, 0.0),
     "surgery": NoiseModel("surgery", 1e-12, 0.0),
 }
-"""By name; of `bench` and `surgery` the memoryless part, the rest is in `measuring_chain.amplifier`."""
+"""Noise levels by name. For `bench` and `surgery` this is the memoryless part of their amplifiers below."""
 
 BENCH = Amplifier(
     noise=NOISE_LEVELS["bench"],

@@ -21,7 +21,7 @@ class NoiseModel:
     """Independent Gaussian noise of each reading.
 
     Attributes:
-        name: Level.
+        name: Name of the level.
         white: Standard deviation that every reading has, C.
         gain: Standard deviation in proportion to the charge, dimensionless.
     """
@@ -46,7 +46,7 @@ class NoiseModel:
         return variance
 
     def information(self, charge: Array) -> Array:
-        """What a reading tells about its true charge, 1/C^2: one over the variance of the best unbiased estimate.
+        """Fisher information of a reading, 1/C^2: one over the variance of the best unbiased estimate of its charge.
 
         Of a Gaussian whose mean and standard deviation both depend on the charge (Kay 1993, eq. 3.31),
         (1 + 2 (d sigma / dQ)^2) / sigma^2.

@@ -42,13 +42,13 @@ OTHER_KEYS = ("like", "white_pC", "proportional", "bits")
 def load_amplifier(level: str) -> Amplifier:
     """An amplifier by the name of its level, or from a TOML file.
 
-        like = "bench"       # optional: what is not said is as there
+        like = "bench"       # optional: the level that missing keys are taken from
         white_pC = 0.5
         tau_s = 1.0          # inf for no leak
 
     Raises:
-        InputError: If there is no such level or file, a key is unknown or no number in its range, or the converter has
-            bits and no limit.
+        InputError: If there is no such level or file, a key is unknown or not a number in its range, or the converter
+            has bits and no limit.
     """
     if level in AMPLIFIER_LEVELS:
         return AMPLIFIER_LEVELS[level]
@@ -77,14 +77,14 @@ def _amplifier(values: Mapping[str, Any], where: str) -> Amplifier:
 def noise_model(level: str) -> NoiseModel:
     """Noise by the name of its level, or from a TOML file, for all that takes charges one by one.
 
-        like = "reference"      # optional: what is not said is as there, otherwise as in "clean"
+        like = "reference"      # optional: the level that missing keys are taken from, by default "clean"
         white_pC = 0.5
         proportional = 0.001    # standard deviation over charge
 
-    The file may describe a whole measuring chain (`load_amplifier`); what has a memory plays no part here.
+    The file may describe a whole measuring chain (`load_amplifier`); only its memoryless part counts here.
 
     Raises:
-        InputError: If there is no such level or file, or a key is unknown or no number in its range.
+        InputError: If there is no such level or file, or a key is unknown or not a number in its range.
     """
     if level in NOISE_LEVELS:
         return NOISE_LEVELS[level]

@@ -29,7 +29,7 @@ from isocharge.arrays import Array
 from isocharge.simulate.mesh.elements import Geometry
 
 SHIFT = 5.0
-"""s above."""
+"""Shift s of the linear solves, dimensionless: between 0 and 11.56, twice the lowest eigenvalue of the film."""
 
 
 class Bending:

@@ -1,4 +1,4 @@
-"""The film's energy under a load: stretching, bending where the scene needs it, and the probe's work.
+"""The film's energy under a load: stretching, bending where the press needs it, and the probe's work.
 
     Pi = stretching + bending - load * mean of W over the footprint
 

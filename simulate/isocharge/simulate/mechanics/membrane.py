@@ -9,7 +9,8 @@ Kirchhoff, plane stress, S = E_young A^2 (C : E' + tau I). The energy in units o
 
     integral( E' : C : E' / 2 + tau (tr E' - div U) ).
 
-The integral of div U over a clamped film is zero; left in, a strong pretension would drown the rest in round-off.
+The integral of div U over a clamped film is zero; left in, with a strong pretension its
+round-off would drown the others.
 (Strain and stress: Bonet and Wood 2008, ch. 3 and 6; scaling: Schwerin 1929.)
 
 Field values are (U1, U2, W) per node, shape (n_node, 3). F_ia = d_ia + A^2 U_i,a for i = 1, 2 and W,a for i = 3, so

@@ -55,13 +55,13 @@ class DimensionlessGroups:
 
     @property
     def height(self) -> float:
-        """Deflection of the middle over a A, roughly: one, where the groups are what `of` makes them."""
+        """Approximate deflection of the middle in units of a A: one for groups from `of`."""
         linear = MEMBRANE_STIFFNESS * self.tension + PLATE_STIFFNESS * self.bending
         return float(_root(linear, self.load))
 
     @property
     def induced(self) -> float:
-        """Roughly, the share of the load that the stress induced by the deflection carries: 0 linear, 1 slack."""
+        """Approximate share of the load that the stress induced by the deflection carries: 0 linear, 1 slack."""
         return self.height**3 / self.load
 
     def stiffened(self, tension: float) -> "DimensionlessGroups":

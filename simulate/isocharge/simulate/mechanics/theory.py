@@ -1,4 +1,4 @@
-"""Which terms a scene needs: the choice between the film's theories, and what the rest would have changed.
+"""Which terms a press needs: the choice between the film's theories, and the error of leaving terms out.
 
 One formulation, two switches. *Bending* matters within l = sqrt(D / N) of the rim, the probe and any readout at the
 film's surface, N the tension force between them; where pretension and induced tension are small it carries the load.
@@ -23,30 +23,30 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 ACCURACY = 1e-3
-"""Relative error of a charge that is good enough where nothing else is asked for."""
+"""Default target for the relative error of a charge, dimensionless."""
 
 LINEAR_WEIGHT = 4.0
-"""Relative error of a charge of the linear theories over the share of the load that induced stress carries."""
+"""Relative charge error of the linear theories per unit of the share of the load that induced stress carries."""
 
 LOCAL_WEIGHT = 0.4
-"""The same over the strain that a taut film's slope induces at the footprint, by that of the pretension."""
+"""Relative charge error per unit of (strain induced at the footprint / pretension strain), for a taut film."""
 
 BENDING_WEIGHT = 1.5
-"""Worst relative error of a charge without bending over the bending length: 1.41 in the solutions of tests/data."""
+"""Largest relative charge error without bending per unit of bending length over film radius: 1.41 in tests/data."""
 
 MOSTLY_BENT = 0.3
-"""Bending length over film radius above which a membrane says nothing about a film; its error is then infinite."""
+"""Bending length over film radius above which a membrane is no model of a film; its error is then infinite."""
 
 PROBE_WEIGHT = 4.0
-"""Relative error of a taut film's charge without bending over the squared bending length at the probe by its reach."""
+"""Relative charge error of a taut film without bending per unit of (bending length at the probe / probe reach)^2."""
 
 INDUCED_STRAIN = 0.44
-"""Radial strain that a slack membrane's rim is stretched by, over A^2."""
+"""Radial strain at the rim of a slack membrane, in units of A^2."""
 
 
 @dataclass(frozen=True)
 class Theory:
-    """What is modelled.
+    """The terms that are modelled.
 
     Attributes:
         stretching: Whether the stress that the deflection induces acts back on it.
@@ -60,7 +60,7 @@ class Theory:
 
     @property
     def name(self) -> str:
-        """What an engineer calls it."""
+        """Name in engineering terms, such as "nonlinear membrane + bending"."""
         if self.stretching:
             return "nonlinear membrane + bending" if self.bending else "nonlinear membrane"
         kind = "linear plate" if self.bending else "linear membrane"
@@ -68,18 +68,18 @@ class Theory:
 
 
 def bending_length(film: Film, force: float) -> float:
-    """l / a: how far a clamped edge bends the film, over the film's radius."""
+    """l / a: length over which a clamped edge bends the film, in units of the film's radius."""
     groups = DimensionlessGroups.of(film, force, bending=True)
     tension = groups.tension + INDUCED_STRAIN * groups.height**2
     return float(np.sqrt(groups.bending / tension))
 
 
 def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
-    """Relative change of a charge by bending at the footprint, where pretension and no induced tension holds the film.
+    """Relative change of a charge by bending at the footprint, for a film held by pretension.
 
-    It goes with the square of the bending length over the footprint's reach. The tension at the footprint is the
-    pretension and what a slack membrane under this load has there, S = E W'^2 / 2 with S W' in balance with the load,
-    W'^3 = F / (pi R h E); where the latter rules, the deflection gives way and charges hardly change.
+    It is proportional to the square of the bending length over the footprint's reach. The tension at the footprint is
+    the pretension plus that of a slack membrane under this load, S = E W'^2 / 2 with S W' in balance with the load, so
+    W'^3 = F / (pi R h E). Where the induced tension is the larger one, charges hardly change.
     """
     slope2 = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young)) ** 2
     pretension = film.pretension / film.young
@@ -101,7 +101,7 @@ def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
 
 
 def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
-    """Relative error of a charge to expect from what a theory leaves out; infinite where it has no meaning."""
+    """Expected relative error of a charge from the terms that a theory leaves out; infinite where it has no meaning."""
     error = 0.0
     if not theory.stretching:
         if not theory.bending and film.pretension == 0.0:
@@ -116,7 +116,7 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
 
 
 def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
-    """The cheapest theory whose error stays within the wanted accuracy, the full one if none does."""
+    """The cheapest theory whose error stays within half of the accuracy; the full one if no theory does."""
     tense = film.pretension > 0.0
     cheap_first = (
         Theory(stretching=False, bending=False, pretensioned=tense),
@@ -130,7 +130,7 @@ def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Th
 
 
 def theory_for(sensor: Sensor, probe: Probe, force_range: tuple[float, float], accuracy: float = ACCURACY) -> Theory:
-    """The fewest terms that serve every force (N) of a range and the surface that a sensor reads."""
+    """The fewest terms that suffice for every force (N) of a range and for the surface that a sensor reads."""
     ends = [choose_theory(sensor.film, probe, force, accuracy) for force in force_range]
     return Theory(
         stretching=any(end.stretching for end in ends),
@@ -143,13 +143,13 @@ def theory_by_name(name: str, film: Film) -> Theory:
     """The theory of this name, "linear plate", "linear membrane", "nonlinear membrane" or with " + bending".
 
     Raises:
-        SceneError: If there is no such theory, or it cannot hold this film.
+        SceneError: If no theory has this name, or it has no stiffness for this film.
     """
     tense = film.pretension > 0.0
     options = [Theory(stretching, bending, tense) for stretching in (False, True) for bending in (False, True)]
-    found = [theory for theory in options if name in (theory.name, theory.name.removeprefix("pre-tensioned "))]
-    if not found:
+    matching = [theory for theory in options if name in (theory.name, theory.name.removeprefix("pre-tensioned "))]
+    if not matching:
         raise SceneError(f"theory: expected one of {[theory.name for theory in options]}, got {name!r}")
-    if found[0].name == "linear membrane":
+    if matching[0].name == "linear membrane":
         raise SceneError("theory 'linear membrane': a film without pretension has no stiffness in it; set a pretension")
-    return found[0]
+    return matching[0]

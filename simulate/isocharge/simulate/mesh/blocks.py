@@ -92,7 +92,7 @@ class Blocks:
         """Corners (a, b, c, d) of the elements inside the circle as weights of the polygon's corners and its hub.
 
         The element is (1 - v) (a + t (b - a)) + v (c + t (d - c)); blocks up to the circle have their outer side on it
-        and their c and d here are void. Shape (n_inner, 4, n_corner + 1).
+        and no c and d of their own: zeros stand for them. Shape (n_inner, 4, n_corner + 1).
         """
         k, hub = self.split, np.eye(self.n_corner + 1)[-1]
         parts = []
@@ -113,7 +113,7 @@ class Blocks:
         return np.array(parts)
 
     def turned(self, fold: int, folds: int) -> Integers:
-        """For each element the one that takes its place when the probe is turned by fold / folds of a full turn."""
+        """For each element, the one that takes its place when the probe is turned by fold / folds of a full turn."""
         shift = fold * self.n_corner // folds
         quads = np.arange(self.n_quad).reshape(self.n_meshed, -1)
         sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)

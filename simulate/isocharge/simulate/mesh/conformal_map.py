@@ -7,16 +7,17 @@ from isocharge.simulate.mesh.blocks import Blocks
 from isocharge.simulate.mesh.resolution import Resolution
 
 CLEARANCE = 0.4
-"""Room between a polygon's farthest corner and the circle round it, in units of that corner's distance."""
+"""Gap between a polygon's farthest corner and the circle round it, in units of that corner's distance."""
 
 LARGEST_TURN = 0.2
-"""How far (rad) a sector's side is turned at most from the ray through its corner: clustered corners would fold it."""
+"""Largest angle, rad, between a sector's side and the ray through its corner: clustered corners would fold more."""
 
 INNER_SHARE, OUTER_SHARE = 0.25, 0.35
-"""Beside the rim: that room, and the room between circle and rim, over that between polygon and rim."""
+"""Next to the rim: the gap between polygon and circle, and that between circle and rim, over that between polygon and
+rim, dimensionless."""
 
 GRADING = 0.65
-"""How much of the map's stretching round the rim the sectors take up there: none 0, all 1."""
+"""Share of the map's stretching round the rim that the sectors take up there: 0 none, 1 all."""
 
 
 def automorphism_onto(at: Array, radius: Array) -> tuple[Array, Array]:
@@ -26,7 +27,7 @@ def automorphism_onto(at: Array, radius: Array) -> tuple[Array, Array]:
 
 
 def enclosing_circle(corners: Complexes, at: Array) -> tuple[Array, Array]:
-    """Centre and radius of a circle inside the film round each polygon: about the centroid where there is room."""
+    """Centre and radius of a circle inside the film round each polygon: about the centroid if it fits."""
     gap = 1.0 - np.abs(corners).max(axis=-1)
 
     def radius(centre: Array) -> Array:
@@ -50,8 +51,8 @@ def enclosing_circle(corners: Complexes, at: Array) -> tuple[Array, Array]:
 def sector_angles(blocks: Blocks, corners: Complexes, centre: Array, radius: Array, pull: Array) -> Array:
     """Angles on the template's circle, where rays from the polygon's hub meet it.
 
-    Their directions lie between those of the polygon's corners and an even spread where there is room between polygon
-    and circle, else nearer to the polygon, lest elements fold. `pull` is c rho.
+    Their directions lie between those of the polygon's corners and an even spread. The narrower the gap between polygon
+    and circle, the nearer they are to the corners: else elements would fold. `pull` is c rho.
     """
     hub = corners[..., -1:]
     stops = corners @ blocks.boundary[:: blocks.split].T
@@ -75,7 +76,7 @@ def sector_angles(blocks: Blocks, corners: Complexes, centre: Array, radius: Arr
 def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
     """Angles on the rim, from those on the circle: moved towards pi, where the map compresses the far side of the film.
 
-    Even spacing on the circle of the film has done some of it.
+    Even spacing on the circle already does some of it.
     """
     stretch = ((1.0 + c) / (1.0 - c)) ** GRADING * (1.0 - c * rho) / (1.0 + c * rho)
     return stretch_angles(angle, np.maximum(stretch, 1.0))

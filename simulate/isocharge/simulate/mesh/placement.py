@@ -32,16 +32,16 @@ from isocharge.simulate.mesh.conformal_map import (
 from isocharge.simulate.sensor.probe import Circle, Probe
 
 CORE = 0.45
-"""Half side of the virtual square in a circular footprint over its radius: corners at 0.64 of it."""
+"""Half side of the virtual square in a circular footprint, in units of its radius: the corners lie at 0.64 of it."""
 
 DIAGONALS = np.array([0.25, 0.75, 1.25, 1.75])
-"""Directions of its corners, in units of pi."""
+"""Directions of the corners of that square, in units of pi."""
 
 NEWTON_STEPS = 20
-"""For finding a point inside the circle; six do where blocks are well shaped."""
+"""Steps of Newton to find a point inside the circle; six are enough where blocks are well shaped."""
 
 OVERSHOOT = 0.1
-"""How far outside of its element a point may be sought."""
+"""Largest distance outside its element at which Newton looks for a point, in local coordinates from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Placement:
             distance: Distance of the footprint's centroid from the film's centre, m, any shape.
             film_radius: m.
             layer: Width of the thin rings at the rim over the film's radius.
-            turn: How far the footprint is turned further, rad, the shape of `distance` or a number.
+            turn: Further turn of the footprint, rad, the shape of `distance` or a number.
         """
         at = np.asarray(distance, dtype=float) / film_radius
         if isinstance(probe, Circle):
@@ -107,13 +107,13 @@ class Placement:
     def to_film(self, z: Complexes) -> Complexes:
         """Template points, shape (..., n), to film points (unit radius)."""
         c = self.c[..., None]
-        film: Complexes = (z + c) / (1.0 + c * z)
-        return film
+        points: Complexes = (z + c) / (1.0 + c * z)
+        return points
 
-    def to_template(self, film: Complexes) -> Complexes:
+    def to_template(self, points: Complexes) -> Complexes:
         """Film points (unit radius), shape (..., n), to template points."""
         c = self.c[..., None]
-        z: Complexes = (film - c) / (1.0 - c * film)
+        z: Complexes = (points - c) / (1.0 - c * points)
         return z
 
     def element_points(self, blocks: Blocks) -> Complexes:
@@ -131,22 +131,22 @@ class Placement:
         outside = self.to_film(np.exp((1.0 - swept) * np.log(self.rho) + 1j * angles))
         return np.concatenate([inner, outside.reshape(-1, v.size)])
 
-    def locate(self, blocks: Blocks, film: Complexes) -> tuple[Integers, Array, Array]:
-        """Find film points in the blocks, so many for each placement.
+    def locate(self, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
+        """Find film points in the blocks, n points for each placement.
 
         Args:
             blocks: The blocks.
-            film: Points (unit radius), shape (k, n) where the attributes have one leading axis of length k; in the
-                upper half where only that is meshed.
+            points: Film points (unit radius), shape (k, n) where the attributes have one leading axis of length k; in
+                the upper half where only that is meshed.
 
         Returns:
             Element, xi and eta, each of shape (k, n).
         """
-        z = self.to_template(film)
+        z = self.to_template(points)
         element, v, t = self._locate_rings(blocks, z)
         inside = np.nonzero(np.abs(z) <= self.rho[:, None])
         if inside[0].size:
-            element[inside], v[inside], t[inside] = self[inside[0]]._locate_inner(blocks, film[inside])
+            element[inside], v[inside], t[inside] = self[inside[0]]._locate_inner(blocks, points[inside])
         return element, 2.0 * v - 1.0, 2.0 * t - 1.0
 
     def _locate_rings(self, blocks: Blocks, z: Complexes) -> tuple[Integers, Array, Array]:
@@ -173,25 +173,29 @@ class Placement:
             (angle - before) / (after - before),
         )
 
-    def _locate_inner(self, blocks: Blocks, film: Complexes) -> tuple[Integers, Array, Array]:
+    def _locate_inner(self, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
         """Points inside the circle, one for each placement; all of shape (n,)."""
         a, b, c, d = np.moveaxis(np.einsum("ekn,pn->pek", blocks.straight, self.corners), -1, 0)
         circle = self.to_film(self.rho[:, None] * np.exp(1j * self.start))
         c[:, blocks.n_quad :], d[:, blocks.n_quad :] = circle[:, :-1], circle[:, 1:]
-        at = film[:, None]
+        at = points[:, None]
         sides = [_left(a, c, at), _left(d, b, at), _left(b, a, at), _left(c, d, at)]
         sides[3][:, blocks.n_quad :] = np.inf
         element = np.argmax(np.min(sides, axis=0), axis=1)
-        pick = np.arange(film.size), element
-        return element, *self._invert(blocks, film, element, *(corner[pick] for corner in (a, b, c, d)))
+        pick = np.arange(points.size), element
+        return element, *self._invert(blocks, points, element, tuple(corner[pick] for corner in (a, b, c, d)))
 
     def _invert(
-        self, blocks: Blocks, film: Complexes, element: Integers, a: Complexes, b: Complexes, c: Complexes, d: Complexes
+        self, blocks: Blocks, points: Complexes, element: Integers, corners: tuple[Complexes, ...]
     ) -> tuple[Array, Array]:
-        """(v, t) of points in given elements inside the circle: Newton on two equations, to round-off in a few."""
+        """(v, t) of points in given elements inside the circle, whose corners are (a, b, c, d), each of shape (n,).
+
+        Newton on two equations, to round-off in a few steps.
+        """
+        a, b, c, d = corners
         arc = element >= blocks.n_quad
         sector = np.where(arc, element - blocks.n_quad, 0)
-        v, t = np.full(film.shape, 0.5), np.full(film.shape, 0.5)
+        v, t = np.full(points.shape, 0.5), np.full(points.shape, 0.5)
         low, high = (np.take_along_axis(self.start, (sector + i)[:, None], axis=1)[:, 0] for i in (0, 1))
         for _ in range(NEWTON_STEPS):
             z = self.rho * np.exp(1j * (low + t * (high - low)))
@@ -200,7 +204,7 @@ class Placement:
             by_t = (1.0 - v) * (b - a) + v * np.where(arc, turned, d - c)
             inner = a + t * (b - a)
             by_v = outer - inner
-            miss = inner + v * by_v - film
+            miss = inner + v * by_v - points
             determinant = (np.conj(by_v) * by_t).imag
             v = np.clip(v - (np.conj(miss) * by_t).imag / determinant, -OVERSHOOT, 1.0 + OVERSHOOT)
             t = np.clip(t - (np.conj(by_v) * miss).imag / determinant, -OVERSHOOT, 1.0 + OVERSHOOT)
@@ -209,6 +213,6 @@ class Placement:
 
 def _left(start: Complexes, end: Complexes, at: Complexes) -> Array:
     """Distance of points to the left of directed lines."""
-    way = end - start
-    left: Array = ((at - start) * np.conj(way)).imag / np.maximum(np.abs(way), 1e-300)
+    direction = end - start
+    left: Array = ((at - start) * np.conj(direction)).imag / np.maximum(np.abs(direction), 1e-300)
     return left

@@ -43,7 +43,7 @@ class Rings:
 
 
 def lattice(most: int) -> np.ndarray:
-    """Points x + iy of the largest square lattice with at most so many in the unit disk.
+    """Points x + iy of the largest square lattice with at most `most` points in the unit disk.
 
     The centre is one of them and the outermost lie on the circle; from the inside out, shape (n,).
     """
@@ -59,7 +59,7 @@ def lattice(most: int) -> np.ndarray:
 
 
 def sunflower(count: int) -> Complexes:
-    """So many points x + iy evenly over the unit disk, from the inside out (Vogel 1979)."""
+    """`count` points x + iy spread evenly over the unit disk, from the inside out (Vogel 1979)."""
     number = np.arange(count)
     points: Complexes = np.sqrt((number + 0.5) / count) * np.exp(1j * np.pi * (3.0 - np.sqrt(5.0)) * number)
     return points

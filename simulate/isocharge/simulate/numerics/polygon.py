@@ -26,8 +26,8 @@ def is_convex(corners: Array) -> bool:
     """Whether a polygon turns left at every corner and no corner lies to the right of any edge (a star's do)."""
     edge = np.roll(corners, -1, axis=0) - corners
     turn = edge[:, 0] * np.roll(edge[:, 1], -1) - edge[:, 1] * np.roll(edge[:, 0], -1)
-    way = corners[None, :] - corners[:, None]
-    left = edge[:, None, 0] * way[..., 1] - edge[:, None, 1] * way[..., 0]
+    offset = corners[None, :] - corners[:, None]
+    left = edge[:, None, 0] * offset[..., 1] - edge[:, None, 1] * offset[..., 0]
     return bool(np.all(turn > 0.0) and left.min() >= -1e-9 * left.max())
 
 
@@ -54,13 +54,13 @@ def shared_area(first: Complexes, second: Complexes) -> float:
 
 def _left_of(corners: Complexes, side: Array) -> Complexes:
     """The part of a polygon where `side`, given at its corners and linear along its edges, is positive."""
-    kept = []
-    for at, following, here, there in zip(corners, np.roll(corners, -1), side, np.roll(side, -1), strict=True):
-        if here >= 0.0:
-            kept.append(at)
-        if here * there < 0.0:
-            kept.append(at + (following - at) * here / (here - there))
-    return np.array(kept, dtype=complex)
+    clipped = []
+    for at, following, value, next_value in zip(corners, np.roll(corners, -1), side, np.roll(side, -1), strict=True):
+        if value >= 0.0:
+            clipped.append(at)
+        if value * next_value < 0.0:
+            clipped.append(at + (following - at) * value / (value - next_value))
+    return np.array(clipped, dtype=complex)
 
 
 def area_in_disk(corners: Complexes, centre: complex, radius: float) -> float:

@@ -1,4 +1,4 @@
-"""Electrodes, and where calibration found them on a real film."""
+"""Electrodes, and the calibration of their positions and gains on a real film."""
 
 from dataclasses import dataclass, field
 
@@ -17,7 +17,7 @@ class Electrode:
     Attributes:
         name: As in the sensor file.
         corners: Corners of a convex polygon, anticlockwise, m.
-        square: Whether it was made by `of_square`; only squares have the edges that the edge readout averages over.
+        square: Whether it comes from `of_square`; only squares have the edges that the edge readout averages over.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Electrode:
 
     @property
     def area(self) -> float:
-        """m^2."""
+        """Area, m^2."""
         return area_of(np.array(self.corners))
 
     @property
@@ -45,12 +45,12 @@ class Electrode:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What calibration found on a real film.
+    """Gains and positions measured on a real film.
 
     Attributes:
         gain: Charge read over charge collected, by electrode name; missing names count as 1.
-        shift: How far the electrodes sit from where the layout says, m.
-        rotation: How far they are turned about the film's centre before the shift, rad, anticlockwise.
+        shift: Displacement of the electrodes from the layout, m.
+        rotation: Angle by which they are turned about the film's centre before the shift, rad, anticlockwise.
     """
 
     gain: dict[str, float] = field(default_factory=dict)
@@ -86,13 +86,15 @@ def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration)
     if not np.linalg.norm(placed, axis=1).max() < film.radius:
         x, y = 1e3 * placed.mean(axis=0)
         reach = 1e3 * np.linalg.norm(placed - placed.mean(axis=0), axis=1).max()
-        size = f"half side {_mm(500.0 * side)} mm" if electrode.square else f"corners up to {_mm(reach)} mm from it"
+        size = (
+            f"half side {_short(500.0 * side)} mm" if electrode.square else f"corners up to {_short(reach)} mm from it"
+        )
         raise SensorError(
-            f"electrode {electrode.name!r} lies outside the film: centre ({_mm(x)}, {_mm(y)}) mm, {size}, "
-            f"film radius {_mm(1e3 * film.radius)} mm"
+            f"electrode {electrode.name!r} lies outside the film: centre ({_short(x)}, {_short(y)}) mm, {size}, "
+            f"film radius {_short(1e3 * film.radius)} mm"
         )
 
 
-def _mm(value: float) -> str:
-    """For messages, the value already in mm."""
+def _short(value: float) -> str:
+    """A number with six digits, for messages."""
     return str(float(f"{value:.6g}"))

@@ -27,7 +27,7 @@ NOTATION = re.compile(
 )
 
 MOST_CORNERS = 64
-"""Corners of a polygon above which a mesh that follows them is not worth its unknowns: use a circle."""
+"""Largest number of corners of a polygon: beyond it a circle gives the same charges with fewer unknowns."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Circle:
     @property
     def notation(self) -> str:
         """As on the command line, the radius in mm."""
-        return f"circle:{_mm(self.radius)}"
+        return f"circle:{_in_millimetres(self.radius)}"
 
     @property
     def area(self) -> float:
-        """m^2."""
+        """Area, m^2."""
         return float(np.pi * self.radius**2)
 
     @property
@@ -57,7 +57,7 @@ class Circle:
 
     @property
     def angle(self) -> float:
-        """How far the footprint is turned: nothing for a circle."""
+        """Turn of the footprint, rad: zero for a circle."""
         return 0.0
 
     @property
@@ -76,8 +76,8 @@ class Polygon:
 
     Attributes:
         corners: (x, y) relative to the centroid, anticlockwise, m, before turning.
-        angle: How far it is turned about the centroid, anticlockwise, rad.
-        name: What to call it, "rectangle", "triangle" or "polygon".
+        angle: Turn about the centroid, anticlockwise, rad.
+        name: Kind of footprint: "rectangle", "triangle" or "polygon".
     """
 
     corners: tuple[tuple[float, float], ...]
@@ -126,14 +126,14 @@ class Polygon:
         """As on the command line, lengths in mm, without the angle."""
         at = np.array(self.corners)
         if self.name == "rectangle":
-            return f"rectangle:{_mm(2.0 * at[0, 0])}x{_mm(2.0 * at[0, 1])}"
+            return f"rectangle:{_in_millimetres(2.0 * at[0, 0])}x{_in_millimetres(2.0 * at[0, 1])}"
         if self.name == "triangle":
-            return f"triangle:{_mm(float(np.linalg.norm(at[1] - at[0])))}"
-        return "polygon:" + ";".join(f"{_mm(x)},{_mm(y)}" for x, y in at)
+            return f"triangle:{_in_millimetres(float(np.linalg.norm(at[1] - at[0])))}"
+        return "polygon:" + ";".join(f"{_in_millimetres(x)},{_in_millimetres(y)}" for x, y in at)
 
     @property
     def area(self) -> float:
-        """m^2."""
+        """Area, m^2."""
         return area_of(np.array(self.corners))
 
     @property
@@ -194,7 +194,7 @@ def _check_positive(**sizes: float) -> None:
             raise SceneError(f"probe {name}: expected a positive number, got {value} m")
 
 
-def _mm(metres: float) -> float:
+def _in_millimetres(metres: float) -> float:
     return float(f"{metres * 1e3:.12g}")
 
 

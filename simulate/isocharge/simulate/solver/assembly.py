@@ -127,5 +127,5 @@ def _free(mesh: Template, components: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def assembly(resolution: Resolution, corners: int, components: int) -> Assembly:
-    """The assembly of a template, made once."""
+    """The assembly of a template, built once."""
     return Assembly(template(resolution, corners), components)

@@ -26,10 +26,10 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.solver.error_estimate import LEAST_ERROR, mesh_error
 
 LINEAR_STRESS = 40e6
-"""Stress (Pa) up to which PVDF is taken to be linear."""
+"""Largest stress, Pa, at which PVDF counts as linear."""
 
 WRINKLE_SHARE = 1e-3
-"""Compression over the largest stress that is worth a warning."""
+"""Compression over the largest stress, dimensionless, above which a warning is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,15 +41,15 @@ class Equilibrium:
         probe: The footprint.
         at: Centroid of the footprint (x, y), m.
         force: N.
-        theory: Which terms were in.
+        theory: Which terms were modelled.
         placed_mesh: Mesh, where it lies under the press turned onto the x axis.
         field: Nodal (U1, U2, W), dimensionless, of the press turned onto the x axis; shape (n_node, 3).
         groups: Dimensionless groups of the scene.
         status: "converged" or "failed".
         message: One sentence.
-        iterations: Newton steps, that is tangents; of a linear theory solves with its one.
-        residual: Out-of-balance force over load; of a linear theory the size of the correction that it asked
-            for, in the energy norm.
+        iterations: Newton steps, each with its tangent; of a linear theory, solves with its only tangent.
+        residual: Out-of-balance force over load; of a linear theory, the size of the last correction in the
+            energy norm.
         seconds: Process CPU time of mesh and solve.
         proven_error: Difference of the charges from those on a mesh of one order less, if that was solved too.
     """
@@ -71,20 +71,20 @@ class Equilibrium:
 
     @property
     def estimated_error(self) -> float:
-        """Relative error of a charge to expect from what the theory leaves out and from the mesh.
+        """Expected relative error of a charge, from the terms that the theory leaves out and from the mesh.
 
-        Infinite where the theory says nothing about this film.
+        Infinite where the theory has no meaning for this film.
         """
         return self.mesh_error + modelling_error(self.film, self.probe, self.force, self.theory)
 
     @property
     def bending_length(self) -> float:
-        """How far a clamped edge bends the film, over the film's radius."""
+        """Length over which a clamped edge bends the film, over the film's radius."""
         return bending_length(self.film, self.force)
 
     @cached_property
     def mesh_error(self) -> float:
-        """Relative error of a charge to expect from the mesh."""
+        """Expected relative error of a charge from the mesh."""
         if self.proven_error is not None:
             return max(LEAST_ERROR, self.proven_error)
         return mesh_error(self.placed_mesh, self._node_slope[..., 2])
@@ -106,18 +106,18 @@ class Equilibrium:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a real film would do that the theory does not know, one sentence each."""
+        """Effects in a real film that the theory does not model, one sentence each."""
         smallest, largest = self.principal_stress
-        found = []
+        sentences = []
         if largest > LINEAR_STRESS:
-            found.append(
+            sentences.append(
                 f"the film is stressed to {largest * 1e-6:.3g} MPa; PVDF is linear up to {LINEAR_STRESS * 1e-6:g} MPa"
             )
         if smallest < -WRINKLE_SHARE * largest:
-            found.append(
+            sentences.append(
                 f"the film is compressed to {smallest * 1e-6:.3g} MPa somewhere; a thin film may wrinkle there"
             )
-        return tuple(found)
+        return tuple(sentences)
 
     @property
     def mesh(self) -> Template:
@@ -156,7 +156,7 @@ class Equilibrium:
         Returns:
             Shape (n,), m, positive the way the probe pushes.
         """
-        element, xi, eta, _ = self._find(points)
+        element, xi, eta, _ = self._locate(points)
         values = tensor_values(self.resolution.order, xi, eta)
         scaled = np.einsum("pn,pn->p", values, self.field[self.mesh.nodes[element], 2])
         deflection: Array = self.film.radius * np.sqrt(self.groups.amplitude2) * scaled
@@ -168,12 +168,12 @@ class Equilibrium:
         Args:
             points: (x, y), shape (n, 2), m, on the film.
             surface: Where in the thickness: "top" is the side that the probe touches. The stress of bending is linear
-                through the thickness and is there whether or not the theory lets the film resist it.
+                through the thickness and exists whether or not the theory lets the film resist it.
 
         Returns:
             (s11, s22, s12) in the film's axes, shape (n, 3), Pa, tension positive.
         """
-        element, xi, eta, mirrored = self._find(points)
+        element, xi, eta, mirrored = self._locate(points)
         gradient = self._gradient(element, xi, eta)
         strained = strain(gradient @ self.field[self.mesh.nodes[element]], self.groups.amplitude2)
         if surface != "middle":
@@ -227,16 +227,15 @@ class Equilibrium:
         flat = gradient.reshape(len(gradient), -1, gradient.shape[-1])
         return (flat @ self.field[self.mesh.nodes]).reshape(*gradient.shape[:3], 3)
 
-    def _find(self, points: Array) -> tuple[Integers, Array, Array, np.ndarray]:
+    def _locate(self, points: Array) -> tuple[Integers, Array, Array, np.ndarray]:
         """Element, xi, eta of each point and whether it was mirrored into a half template; SceneError off the film."""
         points = np.asarray(points, dtype=float)
         off = ~(np.hypot(points[:, 0], points[:, 1]) <= self.film.radius * (1.0 + 1e-9))
         if off.any():
             x, y = 1e3 * points[np.argmax(off)]
             raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {self.film.radius * 1e3:.4g} mm")
-        film = _on_axis(points, self.at) / self.film.radius
-        film, mirrored = self.mesh.into_meshed_half(film)
-        element, xi, eta = self.placement.batch().locate(self.mesh, film[None])
+        position, mirrored = self.mesh.into_meshed_half(_on_axis(points, self.at) / self.film.radius)
+        element, xi, eta = self.placement.batch().locate(self.mesh, position[None])
         return element[0], xi[0], eta[0], mirrored
 
 

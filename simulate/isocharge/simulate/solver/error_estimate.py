@@ -53,5 +53,5 @@ def decay(mesh: PlacedMesh, slope: Array) -> float:
 
 
 def mesh_error(mesh: PlacedMesh, slope: Array) -> float:
-    """Relative error of a charge to expect from the mesh, from the elements' shapes and from the solution itself."""
+    """Expected relative error of a charge from the mesh, by the elements' shapes and from the solution itself."""
     return max(LEAST_ERROR, SAFETY * shape_error(mesh), SAFETY * DECAY_WEIGHT * decay(mesh, slope))

@@ -1,10 +1,10 @@
-"""How wrong a solved press is, seen from the same press on a mesh of one order more.
+"""The error of a press, measured against the same press on a mesh of one order more.
 
-In the inner part of the film the elements' shapes and the decay of their modes tell how wrong a charge is (see
-`meshing.py`). Beside the rim, and round polygons that are large on the film, they do not: what is coarse there may lie
-far from what is stressed. There, and where more digits than usual are asked for, a press is solved again one order
-higher, from its own field, until two meshes agree. Each order divides the error by three to ten: the difference bounds
-the error of the finer one.
+In the inner part of the film the elements' shapes and the decay of their modes predict the error of a charge (see
+`error_estimate`). Near the rim, and around polygons that are large on the film, they do not: the coarse elements may be
+far from the stressed ones. There, and for accuracies below the default, a press is solved again one order higher, from
+its own field, until two meshes agree. Each order divides the error by three to ten, so the difference of two meshes
+bounds the error of the finer one.
 """
 
 import numpy as np
@@ -17,29 +17,30 @@ from isocharge.simulate.sensor.probe import Polygon, Probe, farthest
 from isocharge.simulate.solver.equilibrium import Equilibrium
 
 INNER = 0.6
-"""Share of the film's radius within which the shapes of the elements tell enough."""
+"""Share of the film's radius within which the element shapes predict the error."""
 
 LARGE = 0.08
-"""Reach of a polygon over the film's radius from which on they do not."""
+"""Polygons with a larger reach (relative to the film's radius) need a second mesh: the element shapes no longer predict
+the error."""
 
 MOST_ORDERS = 3
-"""How many orders are tried beyond the first mesh."""
+"""Largest number of orders that are tried beyond the first mesh."""
 
 ANOTHER = 0.1
-"""Difference above which two meshes have found different equilibria, of which a film that wrinkles has many."""
+"""Relative difference above which two meshes have different equilibria: a film that wrinkles has many."""
 
 RINGS, AROUND = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8), 12
-"""Where charges are compared: places on rings about the film's centre, in film radii, and how many on each."""
+"""Radii of rings about the film's centre, in film radii, and number of patches on each, where charges are compared."""
 
 SIDE = 1.0 / 15.0
-"""Side of the patches that are compared, in film radii: 3 mm of 45."""
+"""Side of the patches, in film radii: 3 mm of 45."""
 
 PER_SIDE = 6
 """Gauss points along a patch's side."""
 
 
 def needs_second_mesh(film: Film, probe: Probe, at: tuple[float, float], accuracy: float) -> bool:
-    """Whether a press must be solved on two meshes to know how wrong it is."""
+    """Whether a press must be solved on two meshes to know its error."""
     large = isinstance(probe, Polygon) and probe.reach > LARGE * film.radius
     return large or farthest(probe, at) > INNER * film.radius or accuracy < ACCURACY
 
@@ -52,17 +53,17 @@ def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     centres = _centres(one)
     offset, weight = _patch(SIDE * one.film.radius)
     points = (centres[:, :, None, None] + offset).ravel()
-    place = np.stack([points.real, points.imag], axis=1)
+    position = np.stack([points.real, points.imag], axis=1)
     inside = np.abs(points) < one.film.radius
     charge = [np.zeros((points.size, 3)), np.zeros((points.size, 3))]
     for values, solved in zip(charge, (one, other), strict=True):
-        values[inside] = solved.touch_stress(place[inside])
+        values[inside] = solved.touch_stress(position[inside])
     means = [np.einsum("rapc,p->rac", values.reshape(*centres.shape, -1, 3), weight) for values in charge]
     read = [np.stack([mean[..., 0] + mean[..., 1], 10.0 * mean[..., 0] + mean[..., 1]], axis=-1) for mean in means]
     largest = np.maximum(np.abs(read[1]).max(axis=1, keepdims=True), 1e-300)
-    here = np.array([one.at])
-    depth = float(other.deflection(here)[0])
-    return max(float((np.abs(read[0] - read[1]) / largest).max()), abs(float(one.deflection(here)[0]) / depth - 1.0))
+    middle = np.array([one.at])
+    depth = float(other.deflection(middle)[0])
+    return max(float((np.abs(read[0] - read[1]) / largest).max()), abs(float(one.deflection(middle)[0]) / depth - 1.0))
 
 
 def _centres(solved: Equilibrium) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Newton's method for a film that may be flat and slack at the start, and the linear theories as its first step.
 
-A flat film without pretension has no transverse stiffness and plain Newton fails in many ways. What holds up: a start
+A flat film without pretension has no transverse stiffness, and plain Newton fails in many ways. What works: a start
 of Schwerin's shape, an energy line search, and some tension added to the tangent only, in proportion to the residual,
-so that the step stays a descent direction and the quadratic end is untouched.
+so that the step stays a descent direction and the convergence near the equilibrium stays quadratic.
 """
 
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ class NewtonResult:
 
 
 def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Array:
-    """A first field: Schwerin's point-load shape in the template's coordinate, no in-plane displacement.
+    """The first field: Schwerin's point-load shape in the template's coordinate, no in-plane displacement.
 
     W = (3 / pi)^(1/3) (1 - r^(2/3)) solves a point load on a slack membrane exactly at Poisson 1/3 (Schwerin 1929).
     Tension and bending lower it.
@@ -69,7 +69,7 @@ def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Ar
     Args:
         z: Template coordinates of the nodes, shape (n_node,).
         rho: Footprint radius in the template.
-        groups: The scene.
+        groups: Dimensionless groups of the press.
 
     Returns:
         Field of shape (n_node, 3).
@@ -81,7 +81,7 @@ def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Ar
     return field
 
 
-def solve_linear(film: ElasticFilm, assembly: Assembly) -> NewtonResult:
+def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
     """The linear theories: W from load, tension and bending alone, then the in-plane displacement U that W causes.
 
     The stress that the deflection induces does not act back on it. The flat film's tangent does not couple W and U, so
@@ -89,13 +89,13 @@ def solve_linear(film: ElasticFilm, assembly: Assembly) -> NewtonResult:
     the correction in the energy norm shows how well W was solved.
     """
     flat = np.zeros((assembly.free.shape[0], 3))
-    factor = assembly.factor(film.tangent(flat))
-    field, size = factor.solve(-film.residual(flat)), np.inf
+    factor = assembly.factor(elastic.tangent(flat))
+    field, size = factor.solve(-elastic.residual(flat)), np.inf
     for solves in range(2, 2 + REFINEMENTS):
-        balance = film.residual(field)
-        balance[:, 2] = _linear_residual(film, field)[:, 2]
+        balance = elastic.residual(field)
+        balance[:, 2] = _linear_residual(elastic, field)[:, 2]
         step = factor.solve(-balance)
-        size = _energy_norm(film, field, step[:, 2], balance[:, 2])
+        size = _energy_norm(elastic, field, step[:, 2], balance[:, 2])
         field = field + step
         if size <= REFINED:
             return NewtonResult(
@@ -104,20 +104,20 @@ def solve_linear(film: ElasticFilm, assembly: Assembly) -> NewtonResult:
     return NewtonResult(field, False, solves, size, "the linear system is too near to singular")
 
 
-def _linear_residual(film: ElasticFilm, deflection: Array) -> Array:
-    """The residual without the induced stress, whose force goes with the cube of W: two scales tell them apart."""
-    flat, small = film.residual(np.zeros_like(deflection)), 0.01
-    once, twice = (film.residual(scale * small * deflection) - flat for scale in (1.0, 2.0))
+def _linear_residual(elastic: ElasticFilm, deflection: Array) -> Array:
+    """The residual without the induced stress, whose force goes with W^3: two amplitudes separate it."""
+    flat, small = elastic.residual(np.zeros_like(deflection)), 0.01
+    once, twice = (elastic.residual(scale * small * deflection) - flat for scale in (1.0, 2.0))
     return flat + (8.0 * once - twice) / (6.0 * small)
 
 
 def solve_newton(
-    film: ElasticFilm, assembly: Assembly, start: Array, tolerance: float, local_below: float = GUARD_BELOW
+    elastic: ElasticFilm, assembly: Assembly, start: Array, tolerance: float, local_below: float = GUARD_BELOW
 ) -> NewtonResult:
     """Find the equilibrium from a start.
 
     Args:
-        film: The discrete problem.
+        elastic: The discrete problem.
         assembly: Solver for its template.
         start: First field, shape (n_node, 3), zero where fixed.
         tolerance: Relative residual to reach.
@@ -127,7 +127,7 @@ def solve_newton(
     Returns:
         The result, converged or not; the caller decides what a failure means.
     """
-    iterate = _Iterate.at(film, assembly.free[:, :3], start)
+    iterate = _Iterate.at(elastic, assembly.free[:, :3], start)
     sizes: list[float] = []
     for iteration in range(MAX_ITERATIONS + 1):
         relative = iterate.relative
@@ -137,9 +137,9 @@ def solve_newton(
             return iterate.result(True, iteration, f"converged in {iteration} steps")
         if iteration == MAX_ITERATIONS or _stalled(sizes):
             return iterate.result(False, iteration, f"no progress any more after {iteration} steps")
-        factor = assembly.factor(film.tangent(iterate.field, _regularisation(film, relative)))
+        factor = assembly.factor(elastic.tangent(iterate.field, _regularisation(elastic, relative)))
         step = factor.solve(-iterate.residual)
-        sizes.append(_energy_norm(film, iterate.field, step, iterate.residual))
+        sizes.append(_energy_norm(elastic, iterate.field, step, iterate.residual))
         if sizes[-1] <= ROUND_OFF:
             return iterate.result(True, iteration, f"converged to round-off in {iteration} steps")
         following = _local_step(iterate, step) if relative <= local_below else None
@@ -156,32 +156,34 @@ class _Iterate:
     """A field on the way to the equilibrium.
 
     Attributes:
-        film: The discrete problem.
+        elastic: The discrete problem.
         free: Which components of the nodes are not fixed, shape (n_node, 3).
         field: Nodal (U1, U2, W), shape (n_node, 3).
         residual: Out-of-balance force at the nodes, shape (n_node, 3).
     """
 
-    film: ElasticFilm
+    elastic: ElasticFilm
     free: Booleans
     field: Array
     residual: Array
 
     @classmethod
-    def at(cls, film: ElasticFilm, free: Booleans, field: Array) -> Self:
+    def at(cls, elastic: ElasticFilm, free: Booleans, field: Array) -> Self:
         """A field with its residual."""
-        return cls(film, free, field, film.residual(field))
+        return cls(elastic, free, field, elastic.residual(field))
 
     def moved(self, step: Array) -> Self:
         """The field after a step."""
-        return type(self).at(self.film, self.free, self.field + step)
+        return type(self).at(self.elastic, self.free, self.field + step)
 
     @cached_property
     def relative(self) -> float:
         """Relative residual: the larger of transverse over load and in-plane over in-plane force."""
         residual = self.residual * self.free
-        across = np.linalg.norm(residual[:, 2]) / (self.film.groups.load * np.linalg.norm(self.film.geometry.load))
-        along = np.linalg.norm(residual[:, :2]) / max(self.film.in_plane_scale(self.field), 1e-300)
+        across = np.linalg.norm(residual[:, 2]) / (
+            self.elastic.groups.load * np.linalg.norm(self.elastic.geometry.load)
+        )
+        along = np.linalg.norm(residual[:, :2]) / max(self.elastic.in_plane_scale(self.field), 1e-300)
         return float(max(across, along))
 
     def result(self, converged: bool, iterations: int, message: str) -> NewtonResult:
@@ -194,15 +196,15 @@ def _stalled(sizes: list[float]) -> bool:
     return len(sizes) > 2 * PATIENCE and min(sizes[-PATIENCE:]) > 0.5 * min(sizes[:-PATIENCE])
 
 
-def _energy_norm(film: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
+def _energy_norm(elastic: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
     """Square root of the energy a step would gain over the load's work."""
-    work = film.groups.load * abs(float(film.geometry.load @ field[:, 2]))
+    work = elastic.groups.load * abs(float(elastic.geometry.load @ field[:, 2]))
     return float(np.sqrt(abs(float(np.sum(step * residual))) / max(work, 1e-300)))
 
 
-def _regularisation(film: ElasticFilm, relative: float) -> float:
+def _regularisation(elastic: ElasticFilm, relative: float) -> float:
     """Tension to add to the tangent: in proportion to the residual, none near the equilibrium."""
-    slack = GUARD_TENSION * float(np.cbrt(film.groups.load)) ** 2
+    slack = GUARD_TENSION * float(np.cbrt(elastic.groups.load)) ** 2
     return slack * min(1.0, relative) if relative > GUARD_BELOW else 0.0
 
 
@@ -235,28 +237,28 @@ def _chord_steps(iterate: _Iterate, factor: Factor, before: float, tolerance: fl
 
 def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
     """A step that lowers the energy: the given one, or one with more and more tension in the tangent."""
-    film = iterate.film
-    tension = 0.05 * GUARD_TENSION * float(np.cbrt(film.groups.load)) ** 2
+    elastic = iterate.elastic
+    tension = 0.05 * GUARD_TENSION * float(np.cbrt(elastic.groups.load)) ** 2
     for _ in range(12):
         if np.isfinite(step).all() and float(np.sum(step * iterate.residual)) < 0.0:
             break
-        step = assembly.factor(film.tangent(iterate.field, tension)).solve(-iterate.residual)
+        step = assembly.factor(elastic.tangent(iterate.field, tension)).solve(-iterate.residual)
         tension *= 2.0
     return step
 
 
 def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
     """Halve the step until the energy falls enough (Armijo) or, where its digits end, until the residual falls."""
-    film, residual = iterate.film, iterate.residual
-    energy, slope = film.energy(iterate.field), float(np.sum(step * residual))
+    elastic, residual = iterate.elastic, iterate.residual
+    energy, slope = elastic.energy(iterate.field), float(np.sum(step * residual))
     norm = np.linalg.norm(residual[iterate.free])
     share = 1.0
     for _ in range(30):
         field = iterate.field + share * step
-        change = film.energy(field) - energy
+        change = elastic.energy(field) - energy
         lower = change <= 1e-4 * share * slope
         if lower or abs(change) <= 1e-12 * abs(energy):
-            trial = _Iterate.at(film, iterate.free, field)
+            trial = _Iterate.at(elastic, iterate.free, field)
             if lower or np.linalg.norm(trial.residual[iterate.free]) < norm:
                 return trial
         share *= 0.5

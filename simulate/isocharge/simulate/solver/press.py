@@ -39,7 +39,7 @@ def press(
 
     Raises:
         SceneError: If the press cannot exist, or not on this mesh.
-        SolveError: If no equilibrium was found and `throw` is set.
+        SolveError: If no equilibrium is reached and `throw` is set.
     """
     check_scene(film, probe, at, force)
     scene = Scene.of(film, probe, at, force, settings, start)
@@ -61,8 +61,8 @@ def needed_resolution(
     """The mesh that `press` would choose; the film is solved only where two meshes must be compared.
 
     Raises:
-        SceneError: If the press cannot exist, or no mesh carries it.
-        SolveError: If two meshes must be compared and no equilibrium was found.
+        SceneError: If the press cannot exist, or every mesh for it is too distorted.
+        SolveError: If two meshes must be compared and no equilibrium is reached.
     """
     check_scene(film, probe, at, force)
     if settings.resolution:
@@ -100,7 +100,7 @@ def _solve_until_meshes_agree(scene: Scene, start: Equilibrium | None) -> Equili
 
 
 def _failure_reason(solved: Equilibrium, tolerance: float) -> str:
-    """Why there is no answer."""
+    """Why the solve failed, for the error message."""
     (x, y), smallest = solved.at, solved.principal_stress[0]
     wrinkles = (
         f"; the film is compressed to {smallest * 1e-6:.3g} MPa on the way: it wrinkles, which has many solutions; "
@@ -108,6 +108,6 @@ def _failure_reason(solved: Equilibrium, tolerance: float) -> str:
     )
     return (
         f"no equilibrium at {solved.force:.4g} N, position ({x * 1e3:.4g}, {y * 1e3:.4g}) mm: {solved.message}; "
-        f"residual {solved.residual:.2g} ({tolerance:.2g} asked for) after {solved.iterations} steps"
+        f"residual {solved.residual:.2g} (expected {tolerance:.2g}) after {solved.iterations} steps"
         + (wrinkles if smallest < 0.0 else "")
     )
