@@ -21,7 +21,7 @@ def fingerprint() -> str:
 
 
 @pytest.mark.usefixtures("package")
-def test_a_copy_has_the_same_fingerprint():
+def test_fingerprint_of_a_copy_is_the_same():
     assert fingerprint() == code_version.code_fingerprint()
 
 
@@ -29,14 +29,14 @@ def test_a_copy_has_the_same_fingerprint():
     "name",
     ["solver/newton.py", "mesh/template.py", "paper/page.py", "sensors/three-25um-biaxial.toml", "__init__.py"],
 )
-def test_a_change_anywhere_is_another_fingerprint(package, name):
+def test_fingerprint_changes_with_any_file(package, name):
     before = fingerprint()
     path = package / name
     path.write_text(path.read_text("utf-8") + "\n# changed\n", "utf-8")
     assert fingerprint() != before
 
 
-def test_a_module_that_moves_is_another_fingerprint(package):
+def test_fingerprint_changes_when_a_module_moves(package):
     before = fingerprint()
     (package / "solver/newton.py").rename(package / "mesh/newton.py")
     assert fingerprint() != before

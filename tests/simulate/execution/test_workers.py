@@ -36,18 +36,18 @@ def expected(tmp_path_factory) -> dict[str, bytes]:
         return sweep_with(workers, tmp_path_factory.mktemp("one") / "presses")
 
 
-def test_two_processes(tmp_path, expected):
+def test_bytes_from_two_processes_are_the_same(tmp_path, expected):
     with local_workers(2) as workers:
         assert sweep_with(workers, tmp_path / "presses") == expected
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_threads(tmp_path, expected, count):
+def test_bytes_from_threads_are_the_same(tmp_path, expected, count):
     with ThreadPoolExecutor(count) as pool:
         assert sweep_with(Workers(pool), tmp_path / "presses") == expected
 
 
-def test_a_worker_process_that_dies_is_told_of_and_the_run_can_go_on(tmp_path, expected):
+def test_worker_process_that_dies_is_an_error_and_the_run_can_go_on(tmp_path, expected):
     def kill(_done, _total, killed=[]):  # noqa: B006
         if not killed:
             killed.append(workers.executor.submit(os.getpid).result())
@@ -96,7 +96,7 @@ def waited(seconds: float) -> float:
     return seconds
 
 
-def test_a_worker_with_another_isocharge_is_refused(monkeypatch):
+def test_worker_with_another_isocharge_is_refused(monkeypatch):
     """Its bytes might differ."""
     function = module.SameCodeOnly(waited)
     monkeypatch.setattr(module, "code_fingerprint", lambda: "isocharge 9.9")
@@ -121,13 +121,13 @@ def pids(cluster) -> list[int]:
     return [nanny.pid for nanny in cluster.workers.values() if nanny.pid]
 
 
-def test_dask(cluster, tmp_path, expected):
+def test_bytes_from_dask_are_the_same(cluster, tmp_path, expected):
     with dask_workers(cluster.scheduler_address) as workers:
         assert sweep_with(workers, tmp_path / "presses") == expected
 
 
 @pytest.mark.parametrize("phase", ["solved", "sampled"])
-def test_a_dask_worker_killed_half_way_is_no_matter(cluster, tmp_path, expected, phase):
+def test_dask_worker_killed_half_way_is_replaced(cluster, tmp_path, expected, phase):
     """In the middle of the solves, and between two shards."""
     killed = []
 
@@ -142,7 +142,7 @@ def test_a_dask_worker_killed_half_way_is_no_matter(cluster, tmp_path, expected,
     assert killed[0] not in pids(cluster)
 
 
-def test_a_cluster_that_does_not_answer(monkeypatch):
+def test_cluster_that_does_not_answer_is_an_error(monkeypatch):
     monkeypatch.setattr(module, "CONNECT_S", 0.3)
     with pytest.raises(WorkersLost, match="no Dask scheduler answers at tcp://127"):
         dask_workers("tcp://127.0.0.1:9").__enter__()
@@ -150,7 +150,7 @@ def test_a_cluster_that_does_not_answer(monkeypatch):
         dask_workers("carrier-pigeon://1").__enter__()
 
 
-def test_the_extra_is_named(monkeypatch):
+def test_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingExtra, match=re.escape("pip install 'isocharge[cluster]'")):
         dask_workers("tcp://127.0.0.1:9").__enter__()

@@ -24,19 +24,19 @@ def step(n=2000, at=200, height=400e-12, electrodes=3):
 
 
 @pytest.mark.parametrize("tau", [1.0, 10.0])
-def test_a_held_step_decays_by_the_closed_form(tau):
+def test_held_step_decays_by_the_closed_form(tau):
     readings, _ = measure(Amplifier(noise=CLEAN, tau=tau), step())
     t = np.arange(1800) / RATE
     np.testing.assert_allclose(readings[200:, 0], 400e-12 * np.exp(-t / tau), rtol=1e-9)
     np.testing.assert_array_equal(readings[:200], 0.0)
 
 
-def test_a_step_held_for_five_seconds_keeps_61_percent():
+def test_step_held_for_five_seconds_keeps_61_percent():
     readings, _ = measure(Amplifier(noise=CLEAN, tau=10.0), step())
     assert readings[200 + 1000, 0] / 400e-12 == pytest.approx(0.6065, abs=1e-4)
 
 
-def test_a_bias_current_settles_at_current_times_tau():
+def test_bias_current_settles_at_current_times_tau():
     readings, process = measure(Amplifier(noise=CLEAN, tau=2.0, bias=0.5e-12), np.zeros((1000, 3)))
     np.testing.assert_allclose(readings, np.broadcast_to(process.bias * 2.0, readings.shape), rtol=2e-3)
 
@@ -75,7 +75,7 @@ def test_film_warms_smoothly_and_alike_on_all_electrodes():
     assert rate_of_change.std() == pytest.approx(0.05 * 270e-12 / 20.0, rel=0.1)  # rms / time: a lag behind a lag
 
 
-def test_a_temperature_step():
+def test_temperature_step_gives_its_pyroelectric_charge():
     part = Amplifier(noise=CLEAN, step=0.5, step_at=2.0, step_time=5.0)
     readings, _ = measure(part, np.zeros((2000, 3)))
     assert readings[400 - 1, 0] == 0.0
@@ -106,7 +106,7 @@ def test_surgery_is_bench_but_worse():
     assert replace(surgery, noise=bench.noise, hum=bench.hum, step=0.0) == bench
 
 
-def test_a_file_says_what_differs(tmp_path):
+def test_file_changes_what_it_says(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('like = "bench"\nwhite_pC = 0.5\ntau_s = 1\ngain_mismatch = 0.002\nbits = 12\n')
     part = load_amplifier(str(path))
@@ -131,7 +131,7 @@ def test_a_file_says_what_differs(tmp_path):
         ("tau_s", "not a TOML file"),
     ],
 )
-def test_wrong_files(tmp_path, text, said):
+def test_wrong_file_is_refused(tmp_path, text, said):
     path = tmp_path / "mine.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=said):
@@ -147,7 +147,7 @@ def test_infinity_is_no_leak_and_no_limit(tmp_path):
     assert readings[-1].min() > 4.5e-9
 
 
-def test_unknown_level():
+def test_unknown_level_is_refused():
     with pytest.raises(
         InputError, match=r"expected one of clean, reference, bench, surgery, or a TOML file, got 'lab'"
     ):

@@ -61,7 +61,7 @@ def test_unknown_level_names_the_known_ones():
 
 
 @pytest.mark.parametrize("level", AMPLIFIER_LEVELS)
-def test_a_level_is_the_same_noise_for_all(level):
+def test_level_is_the_same_noise_for_all(level):
     """Training and limits take charges one by one, the virtual sensor in time: from one level the same noise."""
     assert noise_model(level) == load_amplifier(level).noise
 
@@ -80,7 +80,7 @@ def test_noise_from_a_file(tmp_path):
     ("text", "words"),
     [("white = 1.0", "unknown key 'white'"), ("white_pC = -1.0", "white_pC"), ('like = "loud"', "like"), ("x", "TOML")],
 )
-def test_a_wrong_file_is_refused(tmp_path, text, words):
+def test_wrong_noise_file_is_refused(tmp_path, text, words):
     path = tmp_path / "mine.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=words):

@@ -130,7 +130,7 @@ def test_elastic_energy_does_not_see_a_rigid_motion_on_top(mesh, motion):
 
 
 @pytest.mark.parametrize("tension", [0.0, 0.5])
-def test_patch(mesh, tension):
+def test_patch_of_uniform_strain_is_exact(mesh, tension):
     """A linear field: energy as Hooke says, no out-of-balance force inside, only on the boundary of what is meshed."""
     gradient, scene = np.array([[0.3, -0.1, 0.4], [0.2, 0.1, -0.6]]), groups(0.2, tension)
     membrane, field = Membrane(mesh.geometry, scene), mesh.points @ gradient

@@ -42,13 +42,13 @@ NAMES = {
 
 
 @pytest.mark.parametrize(("terms", "name"), NAMES.items(), ids=str)
-def test_names(terms, name):
+def test_theory_has_the_name_of_its_terms(terms, name):
     assert Theory(*terms).name == name
 
 
 @pytest.mark.parametrize("tense", [False, True])
 @pytest.mark.parametrize("name", sorted(set(NAMES.values())))
-def test_named_gives_what_was_named(film, name, tense):
+def test_theory_by_name_gives_the_theory_of_that_name(film, name, tense):
     film = thick(film, 25.0, 1.0 if tense else 0.0)
     if name == "linear membrane" and not tense:
         with pytest.raises(SceneError, match="'linear membrane': a film without pretension has no stiffness in it"):
@@ -81,7 +81,7 @@ def test_unknown_name_is_shown(film):
         (110.0, 0.0, 1e-1, 1e-12, "nonlinear membrane + bending"),
     ],
 )
-def test_choice(film, thickness_um, pretension_MPa, force, accuracy, name):
+def test_choose_theory_gives_the_fewest_terms(film, thickness_um, pretension_MPa, force, accuracy, name):
     film = thick(film, thickness_um, pretension_MPa)
     assert choose_theory(film, PROBE, force, accuracy).name == name
     assert press(film, PROBE, AT, force, SolveSettings(accuracy=max(accuracy, 1e-4))).theory.pretensioned == (
@@ -208,7 +208,7 @@ def scenes(seed: int, count: int, accuracy: float) -> list[tuple]:
 
 
 @pytest.mark.parametrize("accuracy", [1e-3, 1e-2])
-def test_left_out_bounds_the_real_difference(accuracy):
+def test_modelling_error_bounds_the_real_difference(accuracy):
     """A hundredth of the accuracy is for the digits of Newton's method, where next to nothing is left out."""
     for scene in scenes(5, 16, accuracy):
         error, bound, name = difference(scene, accuracy)
@@ -218,7 +218,7 @@ def test_left_out_bounds_the_real_difference(accuracy):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("accuracy", [1e-3, 1e-2, 0.1])
-def test_left_out_bounds_the_real_difference_in_many_scenes(accuracy):
+def test_modelling_error_bounds_the_real_difference_in_many_scenes(accuracy):
     for scene in scenes(6, 150, accuracy):
         error, bound, name = difference(scene, accuracy)
         assert error <= bound + 0.01 * accuracy, (name, error, bound, scene)

@@ -86,7 +86,7 @@ def test_locate_inverts_element_points(scene, seed):
 
 @given(scene=presses(), seed=st.integers(0, 2**32 - 1))
 @COMMON
-def test_any_point_is_found_where_it_was(scene, seed):
+def test_locate_finds_any_point_where_it_was(scene, seed):
     """All over the film, on the rim, and on every seam: the nodes, the hub, the footprint's edge."""
     probe, at, resolution, layer = scene
     placement, mesh = place(FILM, probe, at, resolution, layer).placement, template_for(probe, resolution)

@@ -26,6 +26,10 @@ def test_impossible_resolution_is_refused(wrong):
         Resolution(*wrong)
 
 
+def test_resolution_is_described_as_in_a_manifest():
+    assert Resolution(5, 8, 6, 1).description == "order 5, around 8, rings 6, rim 1"
+
+
 def edges_of(mesh: Template) -> list[frozenset]:
     n = mesh.resolution.order
     corner = mesh.nodes[:, [0, n, (n + 1) ** 2 - 1, n * (n + 1)]]
@@ -39,7 +43,7 @@ def test_euler_characteristic_of_a_disk(built):
     assert len(vertices) - len(edges) + built.n_element == 1
 
 
-def test_no_edge_has_more_than_two_elements(built):
+def test_edges_have_at_most_two_elements(built):
     """Those that have one are the rim and, for a half disk, the line of symmetry."""
     edges = edges_of(built)
     count = {edge: edges.count(edge) for edge in set(edges)}
@@ -61,13 +65,13 @@ def test_number_of_nodes_follows_from_vertices_edges_and_faces(built):
     assert built.on_rim.sum() == rim
 
 
-def test_half_a_disk_for_circles_only(built):
+def test_template_is_half_a_disk_for_circles_only(built):
     assert built.half == (built.corners == 0)
     assert built.copies == (2 if built.half else 1)
     assert built.on_axis.any() == built.half
 
 
-def test_a_turn_of_the_probe_permutes_the_elements(built):
+def test_elements_are_permuted_by_a_turn_of_the_probe(built):
     """Going round by one corner as often as there are corners is the identity; neighbours stay neighbours."""
     if built.half:
         return
@@ -93,6 +97,13 @@ def _neighbours(mesh: Template) -> list[tuple[int, int]]:
     return pairs
 
 
-def test_template_is_made_once(resolution):
+def test_template_is_built_once(resolution):
     assert template(resolution, 4) is template(resolution, 4)
     assert template(resolution, 4) is not template(resolution, 0)
+
+
+def test_template_needs_no_set_up(resolution):
+    """What is built is what the cache gives, numbers of nodes included."""
+    alone, cached = Template(resolution, 4), template(resolution, 4)
+    np.testing.assert_array_equal(alone.nodes, cached.nodes)
+    np.testing.assert_array_equal(alone.on_rim, cached.on_rim)

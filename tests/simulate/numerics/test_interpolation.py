@@ -92,7 +92,7 @@ def test_interpolation_on_chebyshev_nodes_is_scipys(count):
     np.testing.assert_allclose(ours, BarycentricInterpolator(nodes, values)(at), rtol=1e-9, atol=1e-9)
 
 
-def test_one_node_is_a_constant():
+def test_interpolation_on_one_node_is_a_constant():
     nodes = chebyshev_nodes(1, 2.0, 5.0)
     np.testing.assert_array_equal(nodes, [3.5])
     np.testing.assert_array_equal(
@@ -100,7 +100,7 @@ def test_one_node_is_a_constant():
     )
 
 
-def test_what_is_cached_cannot_be_changed():
+def test_cached_arrays_cannot_be_changed():
     for array in (lobatto_nodes(4), lobatto_weights(4), derivative_matrix(4)):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 5.0

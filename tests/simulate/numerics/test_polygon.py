@@ -46,7 +46,7 @@ def test_area_and_centroid_add_up(z):
     assert not is_convex(whole[::-1])
 
 
-def test_a_dent_and_a_star_are_not_convex():
+def test_convexity_excludes_a_dent_and_a_star():
     assert not is_convex(np.array([(0.0, 0.0), (2.0, 0.0), (0.5, 0.5), (0.0, 2.0)]))
     star = np.exp(2j * np.pi * np.arange(5) * 2 / 5)
     assert not is_convex(corners_of(star))
@@ -85,11 +85,11 @@ def test_area_in_a_disk_is_bounded_and_additive_and_a_polygons_limit(a, x, y, ra
     ("shift", "expected"),
     [(0.0, 1.0), (0.5, 0.5), (0.5 + 0.25j, 0.375), (1.0, 0.0), (2.0, 0.0), (-0.25 - 0.25j, 0.5625)],
 )
-def test_two_squares(shift, expected):
+def test_shared_area_of_two_squares(shift, expected):
     assert shared_area(SQUARE, SQUARE + shift) == pytest.approx(expected, abs=1e-15)
 
 
-def test_square_and_diamond():
+def test_shared_area_of_square_and_diamond():
     """The unit square cut by |x| + |y| <= c about its centre: an octagon."""
     diamond = 0.5 + 0.5j + 0.75 * np.array([1.0, 1.0j, -1.0, -1.0j])
     assert shared_area(SQUARE, diamond) == pytest.approx(1.0 - 4 * 0.5 * 0.25**2, rel=1e-14)
@@ -107,12 +107,12 @@ def test_square_and_diamond():
         (0.5 + 0.5j, 0.6, 0.36 * (np.pi - 4 * (np.arccos(5 / 6) - 5 / 6 * np.sqrt(11) / 6))),  # four segments cut off
     ],
 )
-def test_square_and_disk(centre, radius, expected):
+def test_area_in_disk_of_a_square(centre, radius, expected):
     assert area_in_disk(SQUARE, centre, radius) == pytest.approx(expected, abs=1e-14)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_against_darts(seed):
+def test_areas_are_those_of_random_points(seed):
     """Monte Carlo: 200,000 darts, five standard deviations."""
     rng = np.random.default_rng(seed)
     a = np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, 6))) + 0.2

@@ -79,7 +79,7 @@ def test_electrodes_need_three_corners(three, corners):
         replace(three, electrodes=(Electrode("A", corners),))
 
 
-def test_what_is_called_a_square_is_one(three):
+def test_square_that_is_none_is_refused(three):
     triangle = ((0.0, 0.0), (4e-3, 0.0), (0.0, 3e-3))
     with pytest.raises(SensorError, match="electrode 'A': expected the corners of a square along the axes"):
         replace(three, electrodes=(Electrode("A", triangle, square=True),))
@@ -151,12 +151,12 @@ def test_gains_are_positive(three, gain):
         replace(three, calibration=Calibration(gain={"A": gain}))
 
 
-def test_a_film_without_any_effect():
+def test_film_without_any_effect_is_refused():
     with pytest.raises(SensorError, match="piezo d31 and d32 are both 0: such a film gives no charge"):
         Piezo(d31=0.0, d32=0.0, d33=-30e-12)
 
 
-def test_a_sensor_has_electrodes(three):
+def test_sensor_without_electrodes_is_refused(three):
     with pytest.raises(SensorError, match="electrodes: expected at least one, got none"):
         replace(three, electrodes=())
 

@@ -250,7 +250,7 @@ def test_squares_of_two_sizes_survive_as_polygons():
 
 @given(path=st.sampled_from(CLOSED), key=st.text(min_size=1, max_size=12))
 @settings(derandomize=True, max_examples=200)
-def test_any_unknown_key_is_named(path, key):
+def test_unknown_key_is_named(path, key):
     table = whole()
     if key in at(table, path):
         return
@@ -354,6 +354,6 @@ def test_file_that_is_not_text(tmp_path):
 
 
 @pytest.mark.parametrize("table", [None, [], "film", 3])
-def test_something_that_is_no_table(table):
+def test_value_that_is_no_table_is_refused(table):
     with pytest.raises(SensorError, match=r"^sensor: expected a table, got "):
         sensor_from_dict(table)

@@ -64,7 +64,7 @@ def test_tangent_of_a_film_is_solved_like_the_dense_one(mesh, bending):
     np.testing.assert_allclose(solution, expected, atol=1e-8 * np.abs(expected).max())
 
 
-def test_one_factor_serves_many_right_hand_sides(mesh):
+def test_factor_serves_many_right_hand_sides(mesh):
     matrix, rights = random_matrices(mesh.template, 3, 5), [mesh.random_field(seed) for seed in range(3)]
     factor = Assembly(mesh.template, 3).factor(matrix)
     for right in rights:
@@ -86,6 +86,6 @@ def test_fixed_values_of_the_right_hand_side_are_ignored(mesh):
     np.testing.assert_array_equal(factor.solve(right), first)
 
 
-def test_assembly_is_made_once():
+def test_assembly_is_built_once():
     assert assembly(Resolution(3, 8, 2), 4, 3) is assembly(Resolution(3, 8, 2), 4, 3)
     assert assembly(Resolution(3, 8, 2), 4, 3) is not assembly(Resolution(3, 8, 2), 4, 4)

@@ -41,7 +41,7 @@ def test_impossible_places_are_refused(film, at_mm, radius_mm, message):
         press(film, Circle(radius_mm * 1e-3), (at_mm[0] * 1e-3, at_mm[1] * 1e-3), 1.0)
 
 
-def test_a_corner_over_the_rim_is_refused(film):
+def test_corner_over_the_rim_is_refused(film):
     """A turned rectangle fits where an unturned one does not."""
     long, at = Polygon.rectangle(10e-3, 1e-3), (39.9e-3, 5e-3)
     with pytest.raises(SceneError, match=r"probe off the film: centre \(39\.9, 5\) mm, farthest point of rectangle"):
@@ -99,7 +99,7 @@ def test_deflection_of_a_linear_field_is_linear(made_up):
 
 
 @pytest.mark.parametrize("surface", ["middle", "top"])
-def test_a_rigid_turn_has_no_stress_and_no_charge(film, made_up, surface):
+def test_rigid_turn_has_no_stress_and_no_charge(film, made_up, surface):
     """Out of plane by 50 degrees, then by 20 in the plane."""
     a, b, amplitude2 = np.deg2rad(50.0), np.deg2rad(20.0), 0.1
     tilt = np.array([[np.cos(a), 0.0], [0.0, 1.0], [np.sin(a), 0.0]])
@@ -217,7 +217,7 @@ def test_mesh_error_is_a_bound(film, seed):
         assert error <= solved.mesh_error
 
 
-def test_wanted_accuracy_is_reached(film):
+def test_accuracy_is_reached(film):
     """And costs: a finer mesh for more digits."""
     sensor, probe, at = load_sensor("four-25um-uniaxial"), Circle(1e-3), (9e-3, 1e-3)
     exact = touch_charge(
@@ -241,7 +241,7 @@ def test_mesh_error_of_a_smooth_field_is_a_number(film):
     assert 0.0 <= solved.mesh_error < 1e-4
 
 
-def test_equilibrium_of_a_thick_film_admits_it(film: Film):
+def test_estimated_error_of_a_thick_film_as_a_membrane_is_infinite(film: Film):
     """The membrane is wrong by factors there, so no number is given."""
     thick = replace(film, thickness=1e-3)
     assert press(thick, Circle(1e-3), (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE)).estimated_error == np.inf

@@ -48,7 +48,7 @@ def worst_error(film: Film, rough, fine) -> float:
         for i, (name, scene) in enumerate((INSIDE | BESIDE_THE_RIM).items())
     ],
 )
-def test_the_estimate_holds(scene):
+def test_mesh_error_bounds_the_difference_from_a_finer_mesh(scene):
     """Against a mesh two orders higher with more rings, evenly and at the rim."""
     thickness, pretension, poisson, probe, distance, force = scene
     film = Film(45e-3, thickness, 3e9, poisson, pretension)
@@ -63,7 +63,7 @@ def test_the_estimate_holds(scene):
 
 
 @pytest.mark.parametrize("probe", [Circle(1e-3), Polygon.rectangle(4e-3, 2e-3, 0.3)])
-def test_a_field_is_the_same_on_another_order(probe: Probe):
+def test_field_of_order_is_the_same_field(probe: Probe):
     """Up: the same polynomials, to round-off; and down again."""
     solved = press(FILM, probe, (6e-3, 1e-3), 1.0)
     finer = replace(solved.resolution, order=solved.resolution.order + 3)
@@ -75,7 +75,7 @@ def test_a_field_is_the_same_on_another_order(probe: Probe):
     assert raised.field.shape == (template_for(probe, finer).n_node, 3)
 
 
-def test_apart_is_the_relative_difference():
+def test_relative_difference_is_that_of_charges():
     """Of charges, which go with the force where the theory is linear; nothing between a press and itself."""
     theory = Theory(stretching=False, bending=True, pretensioned=True)
     film = replace(FILM, pretension=5e6)
@@ -85,7 +85,7 @@ def test_apart_is_the_relative_difference():
     assert relative_difference(one, more) == pytest.approx(1.0 - 1.0 / 1.01**2, rel=1e-3)
 
 
-def test_where_proof_is_needed():
+def test_second_mesh_is_needed_near_the_rim_for_large_polygons_and_for_more_digits():
     inside, rim = (9e-3, 0.0), (26.5e-3, 0.0)
     assert not needs_second_mesh(FILM, Circle(0.4e-3), rim, 1e-3)
     assert needs_second_mesh(FILM, Circle(0.6e-3), rim, 1e-3)
@@ -95,7 +95,7 @@ def test_where_proof_is_needed():
     assert needs_second_mesh(FILM, Circle(1e-3), inside, 5e-4)
 
 
-def test_a_proven_press_starts_its_neighbour():
+def test_press_on_two_meshes_starts_its_neighbour():
     """Although its mesh is of a higher order than the neighbour's first."""
     first = press(FILM, Circle(1e-3), (36e-3, 0.0), 1.0)
     cold, warm = (press(FILM, Circle(1e-3), (36e-3, 0.0), 1.05, start=start) for start in (None, first))
@@ -105,13 +105,13 @@ def test_a_proven_press_starts_its_neighbour():
     assert worst_error(FILM, warm, cold) < 1e-5
 
 
-def test_what_a_finer_mesh_cannot_hold_is_said():
+def test_wrinkling_on_a_finer_mesh_is_an_error():
     """A film of 7 um under 9 N beside the rim wrinkles."""
     with pytest.raises(SolveError, match="wrinkles"):
         press(Film(45e-3, 7e-6, 3e9, 0.3), Polygon.triangle(2.6e-3, 0.3), (39.2e-3, 0.0), 8.9)
 
 
-def test_different_equilibria_are_no_answer(monkeypatch):
+def test_meshes_with_different_equilibria_are_an_error(monkeypatch):
     """Meshes that differ by a tenth are not two views of one film; by less, the difference is the estimate."""
     scene = FILM, Circle(1e-3), (32e-3, 0.0), 1.0
     monkeypatch.setattr("isocharge.simulate.solver.press.relative_difference", lambda *_: 0.09)

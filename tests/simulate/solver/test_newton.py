@@ -35,7 +35,7 @@ def test_every_force_converges_from_flat(film, thickness_um, probe, theory):
 
 
 @pytest.mark.parametrize(("distance_mm", "force"), [(30.0, 5.0), (38.0, 1e-3), (42.0, 1e-3)])
-def test_near_the_rim(film, distance_mm, force):
+def test_presses_near_the_rim_converge(film, distance_mm, force):
     solved = press(film, Circle(1e-3), (0.0, distance_mm * 1e-3), force)
     assert solved.status == "converged"
     assert solved.iterations <= 20
@@ -65,7 +65,7 @@ def test_every_mesh_converges(film, resolution):
 
 
 @pytest.mark.parametrize("theory", [MEMBRANE, FULL], ids=["membrane", "full"])
-def test_end_of_newton_is_quadratic(film, theory):
+def test_newton_ends_quadratically(film, theory):
     """The last step nearly squares the residual: the tangent is the true one at the end."""
     residuals = [
         press(film, Circle(1e-3), (3e-3, 0.0), 1.0, SolveSettings(theory=theory, tolerance=tolerance)).residual
@@ -75,7 +75,7 @@ def test_end_of_newton_is_quadratic(film, theory):
 
 
 @pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES.keys())
-def test_neighbour_is_a_better_start(film, probe):
+def test_start_from_a_neighbour_saves_steps(film, probe):
     first = press(film, probe, (5e-3, 0.0), 1.0)
     same = SolveSettings(resolution=first.resolution, layer=first.layer)
     near = press(film, probe, (5.2e-3, 1e-3), 1.1, same, start=first)
@@ -110,7 +110,7 @@ def test_failure_raises_a_full_sentence(film):
             press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, FAILING)
 
 
-def test_failure_is_told_if_asked_not_to_raise(film, monkeypatch):
+def test_failure_is_a_status_with_throw_off(film, monkeypatch):
     monkeypatch.setattr("isocharge.simulate.solver.newton.ROUND_OFF", 0.0)
     failed = press(film, Circle(1e-3), (2e-3, -3e-3), 1.5, FAILING, throw=False)
     assert failed.status == "failed"
@@ -132,7 +132,7 @@ def test_steps_are_limited(film, monkeypatch):
     assert failed.iterations == 4  # two at once, two with the load in parts
 
 
-def test_a_start_that_is_not_finite_is_not_trusted(film):
+def test_start_that_is_not_finite_fails(film):
     """The press is solved from a small force up instead, and is none the worse."""
     good = press(film, Circle(1e-3), (0.0, 0.0), 1.0)
     bad = press(film, Circle(1e-3), (0.0, 0.0), 1.0)
@@ -145,7 +145,7 @@ def test_a_start_that_is_not_finite_is_not_trusted(film):
 WRINKLES = r"no equilibrium at .* N, position \(.*\) mm: .* it wrinkles, which has many solutions; press farther"
 
 
-def test_a_film_that_wrinkles_is_told(film, monkeypatch):
+def test_wrinkling_film_is_an_error(film, monkeypatch):
     """Stopped early, beside the rim, where it is compressed: the message says so. In the middle it does not."""
     monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 3)
     mesh = SolveSettings(theory=FULL, resolution=Resolution(5, 8, 6, 1))
@@ -156,14 +156,14 @@ def test_a_film_that_wrinkles_is_told(film, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_thinner_film_that_wrinkles_is_told_in_time(film):
+def test_wrinkling_of_a_thinner_film_is_an_error_before_the_limit_of_steps(film):
     began = time.process_time()
     with pytest.raises(SolveError, match=WRINKLES):
         press(replace(film, thickness=7e-6), Polygon.rectangle(0.4e-3, 0.12e-3), (44.3e-3, 0.0), 3.5)
     assert time.process_time() - began < 60.0
 
 
-def test_too_near_the_rim_is_told(film):
+def test_press_too_near_the_rim_is_refused(film):
     with pytest.raises(
         SceneError, match=r"press at \(44, 0\) mm comes within 0\.0001 mm of the rim, too near for a mesh"
     ):
@@ -190,7 +190,7 @@ def test_linear_theories_need_one_matrix(film):
 
 
 @pytest.mark.parametrize(("factor", "converges"), [(1.001, True), (3.0, False)])
-def test_a_linear_solve_is_corrected_and_told(film, monkeypatch, factor, converges):
+def test_linear_solve_is_corrected_and_says_so(film, monkeypatch, factor, converges):
     """By its residual, which the solver has no part in: what is a little off is mended, what is far off no answer."""
     scene = replace(film, thickness=2e-3, pretension=1e6), Circle(1e-3), (5e-3, 0.0), 1e-3
     exact, solve = press(*scene), Factor.solve
@@ -203,7 +203,7 @@ def test_a_linear_solve_is_corrected_and_told(film, monkeypatch, factor, converg
 
 
 @pytest.mark.parametrize("bending", [False, True])
-def test_a_tangent_is_used_again_while_that_pays(film, monkeypatch, bending):
+def test_tangent_is_used_again_while_that_pays(film, monkeypatch, bending):
     """The same equilibrium as with a tangent for every step, from half as many of them."""
     theory = Theory(stretching=True, bending=bending, pretensioned=False)
     tangents, factor = [], Assembly.factor
