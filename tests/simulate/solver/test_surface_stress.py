@@ -123,7 +123,8 @@ def test_surface_needs_bending(film, surface):
     sensor = replace(load_sensor("three-25um-biaxial"), surface=surface)
     solved = press(film, Circle(1e-3), (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE))
     message = (
-        rf"surface '{surface}' needs bending, but the film was solved as a nonlinear membrane; solve it with theory="
+        rf"surface '{surface}' needs bending, but the film was solved as a nonlinear membrane; solve it with "
+        r"SolveSettings\(theory="
     )
     with pytest.raises(SensorError, match=message):
         touch_charge(sensor, solved)

@@ -83,7 +83,7 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
     if sensor.surface != "middle" and not equilibrium.theory.bending:
         raise SensorError(
             f"surface {sensor.surface!r} needs bending, but the film was solved as a {equilibrium.theory.name}; solve "
-            "it with theory=theory_for(sensor, probe, (force, force))"
+            "it with SolveSettings(theory=theory_for(sensor, probe, (force, force)))"
         )
     readout = ReadoutPoints.of(sensor, DIRECT)
     stress = equilibrium.touch_stress(readout.points.reshape(-1, 2), sensor.surface)
