@@ -1,8 +1,11 @@
 """What tests of several stages share."""
 
+import io
 import os
+import re
 import subprocess
 import sys
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -57,5 +60,33 @@ def shell():
         )
         assert done.returncode == 0, done.stderr
         return done.stdout
+
+    return run
+
+
+@pytest.fixture
+def run_example():
+    """Run a Python example of a page: each print prints what the comment on its line says, to the letter."""
+
+    def run(example, page):
+        with redirect_stdout(io.StringIO()) as printed:
+            exec(compile(example, page, "exec"), {"__name__": "example"})
+        prints = [line for line in example.splitlines() if line.lstrip().startswith("print(")]
+        expected = [line.rpartition(")  # ")[2] for line in prints]
+        assert expected
+        assert printed.getvalue().splitlines() == expected
+
+    return run
+
+
+@pytest.fixture
+def run_commands(shell):
+    """Run a shell example of a page in a folder; what it starts in the background ends with it, outputs are there."""
+
+    def run(example, folder, timeout=280):
+        printed = shell(f"trap 'kill $(jobs -p) || true; wait' EXIT\n{example}", cwd=folder, timeout=timeout)
+        for output in re.findall(r" (?:-o|--record|>) ([\w./-]+)", example):
+            assert (folder / output).exists(), output
+        return printed
 
     return run

@@ -1,11 +1,10 @@
-"""What simulate/README.md and the docstring of the package show is true: examples, measured tables, list of files."""
+"""What the pages of simulate and the docstring of the package show is true: measured tables, files, names."""
 
 import re
 import tomllib
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 import isocharge.simulate
 from isocharge.simulate import (
@@ -18,20 +17,9 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.dataset.card import COLUMNS
 
-SIMULATE = Path(__file__).parents[2] / "simulate"
-README = (SIMULATE / "README.md").read_text("utf-8")
-TABLES = re.findall(r"```toml\n(.*?)```", README, re.DOTALL)
-EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-
-
-NAMES = ["one press", "many presses", "a dataset", "triangulation", "working area"]
-
-
-@pytest.mark.parametrize("example", EXAMPLES, ids=NAMES)
-def test_example_runs(example, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    exec(compile(example, "simulate/README.md", "exec"), {})
-    assert capsys.readouterr().out
+DOCS = Path(__file__).parents[2] / "simulate" / "docs"
+ACCURACY, DATASETS, FILES = ((DOCS / f"{name}.md").read_text("utf-8") for name in ("accuracy", "datasets", "files"))
+TABLES = re.findall(r"```toml\n(.*?)```", FILES, re.DOTALL)
 
 
 def test_example_of_the_package():
@@ -60,7 +48,7 @@ def errors(case) -> tuple[float, float]:
 def test_accuracy_table(reference_cases, further_cases):
     """Every figure is what the solver gives now, to a digit: figures this small differ between libraries."""
     sources = {"collocation, dolfinx": reference_cases, "scikit-fem": further_cases}
-    rows = re.findall(r"^\| (.+) \| (\d+) um \| (\d+) \| ([\d.]+) % \| ([\d.]+) % \|$", README, re.MULTILINE)
+    rows = re.findall(r"^\| (.+) \| (\d+) um \| (\d+) \| ([\d.]+) % \| ([\d.]+) % \|$", ACCURACY, re.MULTILINE)
     assert len(rows) == 8
     for source, thickness, count, *shown in rows:
         cases = sources[source](float(thickness))
@@ -81,9 +69,9 @@ def test_sensor_file_can_be_read():
 
 def test_names_are_complete():
     for name in built_in_sensors():
-        assert f"`{name}`" in README
+        assert f"`{name}`" in FILES
     for column in COLUMNS:
-        assert f"`{column}`" in README
+        assert f"`{column}`" in DATASETS
 
 
 def test_noise_file_can_be_read(tmp_path):

@@ -1,0 +1,110 @@
+"""What the pages of serve show is true: their examples run, the frame is a frame, tables are complete."""
+
+import json
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from isocharge.serve import Frame, TextParser, encode_frame, flags, load_device
+from isocharge.serve.frames.cobs import cobs_decode
+from isocharge.serve.network.limits import ServerLimits
+from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.protocol import Handler
+
+SERVE = Path(__file__).parents[2] / "serve"
+PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
+
+SLOW = {"recordings.md", "virtual_sensor.md"}
+"""Pages whose commands simulate a film each time; those of the README, which do the same, run always."""
+
+
+def examples(language):
+    """Every example of a language, with its page as id."""
+    for page, text in PAGES.items():
+        for number, block in enumerate(re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)):
+            slow = [pytest.mark.slow] if page in SLOW and language == "sh" else []
+            yield pytest.param(block, id=f"{page}-{number}", marks=slow)
+
+
+def test_frame_example():
+    before, after = (
+        bytes.fromhex(line) for line in re.search(r"```text\n(.*?)\n```", PAGES["frames.md"], re.DOTALL)[1].split("\n")
+    )
+    assert encode_frame(Frame(1, 5000, (850.0, 840.5, 846.25))) == after
+    assert cobs_decode(after[:-1]) == before
+
+
+@pytest.mark.parametrize("example", [*examples("python")])
+def test_python_example_prints_what_it_says(example, start_http, run_example):
+    if "127.0.0.1:8000" in example:
+        example = example.replace("127.0.0.1:8000", start_http(Handler(open_model_store())).url.removeprefix("http://"))
+    run_example(example, "serve")
+
+
+@pytest.mark.parametrize("example", [*examples("sh")])
+def test_commands_run_line_by_line(example, tmp_path, run_commands):
+    if "curl" in example and shutil.which("curl") is None:
+        pytest.skip("the example uses curl")
+    (tmp_path / "presses.csv").write_text("A,B,C\n850,840,846\n")
+    printed = run_commands(on_free_ports(example), tmp_path, timeout=60)
+    if "curl" in example:
+        outputs = json.loads(printed[printed.index("{") :])["outputs"]
+        assert outputs[0]["data"] == pytest.approx([3.0, -2.0, 1.0], abs=0.02)
+    if "doctor" in example:
+        assert "binary frames of isocharge" in printed
+        assert (tmp_path / "again.jsonl").read_text() == (tmp_path / "touch.jsonl").read_text()
+        assert len((tmp_path / "touch.jsonl").read_text().splitlines()) > 300
+
+
+def on_free_ports(example):
+    """The example with ports that nobody uses."""
+    with ExitStack() as stack:
+        for port in ("8000", "8001"):
+            free = stack.enter_context(socket.socket())
+            free.bind(("127.0.0.1", 0))
+            example = example.replace(port, str(free.getsockname()[1]))
+    return example
+
+
+def test_every_option_and_bound_is_the_command_s():
+    """The table of bounds says what `--help` and the limits say."""
+    text = subprocess.run(
+        [sys.executable, "-m", "isocharge.cli", "serve", "http", "--help"], capture_output=True, text=True, check=True
+    ).stdout
+    section = PAGES["http.md"].partition("## Speed")[0]
+    assert all(option in text for option in re.findall(r"`(--[a-z-]+)`", section))
+    limits = ServerLimits()
+    assert f"| {limits.batch} |" in section
+    assert (limits.header_seconds, limits.body_seconds, limits.idle_seconds) == (10.0, 30.0, 75.0)
+    assert (limits.body_bytes, limits.header_bytes, limits.connections) == (1 << 20, 16 << 10, 1024)
+
+
+def test_every_flag_is_explained():
+    words = {value for name, value in vars(flags).items() if name.isupper()}
+    table = PAGES["predictions.md"].partition("| flag |")[2]
+    assert words <= set(re.findall(r"`(\w+)`", table))
+
+
+def test_the_device_file_is_one(tmp_path):
+    path = tmp_path / "device.toml"
+    path.write_text(re.search(r"```toml\n(.*?)```", PAGES["device_file.md"], re.DOTALL)[1])
+    board = load_device(path)
+    chain = board.chain(("A", "B", "C"))
+    assert board.parser().layout.length == 18
+    stages = (chain.gain_pC, chain.limit_pC, chain.hum, chain.tare, chain.leak, chain.touch)
+    assert not any(stage is None for stage in stages)
+
+
+@pytest.mark.parametrize("row", re.findall(r"^\| .*? \| `(.*)` \|$", PAGES["frames.md"], re.MULTILINE))
+def test_lines_of_text_are_read(row):
+    line = row.encode() + b"\n"
+    lines = line if ">" not in row else line + line.replace(b">A", b">B") + line.replace(b">A", b">C")
+    (frame, *_) = TextParser().feed(b"\n" + lines * 3)
+    assert frame.values[0] == 801.2
+    assert len(frame.values) == 3
