@@ -3,7 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all bench soak release report proto clean
+.PHONY: demo test test-all docs bench soak release report proto clean
+
+# Tests without ports and clocks; all others of serve run one at a time.
+FREE := $(addprefix tests/serve/,frames model prediction signal_chain network network/protocol)
+ALONE := $(filter-out $(FREE) %/conftest.py %/__pycache__,$(wildcard tests/serve/* tests/serve/network/*)) tests/test_live.py
 
 demo: $(VENV)/installed
 	$(BIN)/isocharge demo
@@ -13,11 +17,15 @@ test: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest --ignore tests/serve --ignore tests/test_live.py -n 2 --dist loadfile # arithmetic: both cores
-	$(BIN)/python -m pytest tests/serve tests/test_live.py # ports and clocks: one at a time
+	$(BIN)/python -m pytest $(addprefix --ignore=,$(ALONE)) -n 2 --dist loadfile # arithmetic: both cores
+	$(BIN)/python -m pytest $(ALONE) # ports and clocks: one at a time
 
-test-all: $(VENV)/installed
+test-all: docs
 	$(BIN)/python -m pytest -m "slow or not slow"
+
+# The reference of all modules, from their docstrings: build/docs/index.html. A warning is an error.
+docs: $(VENV)/installed
+	$(BIN)/python -W error .ci/docs.py build/docs
 
 bench: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_solve.py
@@ -31,7 +39,7 @@ bench: $(VENV)/installed
 soak: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_soak.py
 
-# The released models, made anew; fails at one that is there already.
+# The released models, trained again; fails if one is already there.
 release: $(VENV)/installed
 	$(BIN)/isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
 	$(BIN)/isocharge train fit --sensor four-25um-biaxial --radius auto -o models/four-25um-biaxial

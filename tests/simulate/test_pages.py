@@ -3,6 +3,7 @@
 import re
 import tomllib
 from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 
@@ -24,7 +25,7 @@ TABLES = re.findall(r"```toml\n(.*?)```", FILES, re.DOTALL)
 
 def test_example_of_the_package():
     """The docstring's five lines give three charges of some hundred pC."""
-    lines = isocharge.simulate.__doc__.split("\n\n", 1)[1]
+    lines = dedent(isocharge.simulate.__doc__.split("\n\n", 1)[1])
     scope = {}
     exec(compile(lines, "isocharge.simulate", "exec"), scope)
     assert scope["charge"].shape == (3,)

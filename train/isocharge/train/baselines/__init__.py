@@ -2,10 +2,10 @@
 
 May import: release, training, data.
 
-from isocharge.train.baselines import PolynomialRidge, FittingTask
+    from isocharge.train.baselines import PolynomialRidge, FittingTask
 
-library, plain = PolynomialRidge().fit(task)   # the same polynomial, by scikit-learn and by NumPy
-contact = plain.predict(charge_pC)             # (n, n_electrode) to (n, 3): x_mm, y_mm, force_N
+    library, plain = PolynomialRidge().fit(task)   # the same polynomial, by scikit-learn and by NumPy
+    contact = plain.predict(charge_pC)             # (n, n_electrode) to (n, 3): x_mm, y_mm, force_N
 """
 
 from isocharge.train.baselines.boosting import GradientBoosting

@@ -1,0 +1,104 @@
+"""The recipes of CONTRIBUTING.md work: each is followed in a copy of the project, to its last line."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+RECIPES = dict(re.findall(r"^## (Add .*?)\n(.*?)(?=^## |\Z)", TEXT, re.DOTALL | re.MULTILINE))
+ENOUGH = ("simulate", "train", "serve", "tests", "models", "pyproject.toml")
+
+
+@pytest.fixture
+def project(tmp_path):
+    """A copy of the project."""
+    for name in ENOUGH:
+        source, target = ROOT / name, tmp_path / name
+        if source.is_dir():
+            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", "pictures", "benchmarks"))
+        else:
+            shutil.copy(source, target)
+    return tmp_path
+
+
+def blocks(recipe, language):
+    """File and text of each block of a language, whose first line names the file."""
+    return re.findall(rf"^```{language}\n# (\S+)\n(.*?)^```", recipe, re.DOTALL | re.MULTILINE)
+
+
+def hunks(lines):
+    """(old, new) texts of a difference: lines to find, one after the other, then lines to add."""
+    old, new = [], []
+    for line in lines:
+        if not line.startswith("+") and any(added not in old for added in new):
+            yield "\n".join(old), "\n".join(new)
+            old, new = [], []
+        old += [line[1:]] * (not line.startswith("+"))
+        new += [line[1:]] * (not line.startswith("-"))
+    yield "\n".join(old), "\n".join(new)
+
+
+def follow(recipe, project):
+    """Write the new files and change the others."""
+    for name, text in blocks(recipe, "python"):
+        assert not (project / name).exists(), name
+        (project / name).write_text(text, "utf-8")
+    for name, text in blocks(recipe, "diff"):
+        content = (project / name).read_text("utf-8")
+        for old, new in hunks(text.splitlines()):
+            assert f"\n{content}".count(f"\n{old}\n") == 1, f"{name} has not this once:\n{old}"
+            content = f"\n{content}".replace(f"\n{old}\n", f"\n{new}\n")[1:]
+        (project / name).write_text(content, "utf-8")
+
+
+def run(commands, project):
+    """The commands of a recipe on the copy: the packages of the copy come first, then this environment's."""
+    folders = [str(project / name) for name in ("simulate", "train", "serve")]
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    environment = os.environ | {"PYTHONPATH": ":".join(folders), "PATH": path}
+    return subprocess.run(
+        ["bash", "-ec", commands.replace("isocharge ", "python -m isocharge.cli ")],
+        cwd=project,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=250,
+        check=False,
+    )
+
+
+def test_there_are_recipes():
+    assert len(RECIPES) == 4
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_recipe_works(name, project):
+    follow(RECIPES[name], project)
+    (commands,) = re.findall(r"^```sh\n(.*?)^```", RECIPES[name], re.DOTALL | re.MULTILINE)
+    done = run(commands, project)
+    assert done.returncode == 0, done.stdout + done.stderr
+    tests = re.search(r"(\d+) passed", done.stdout)
+    assert tests
+    assert int(tests[1]) > 0
+
+
+def test_the_hooks_see_only_what_was_added(project):
+    """Without its steps the first recipe ends with no test at all."""
+    (name,) = (name for name in RECIPES if "frame format" in name)
+    (commands,) = re.findall(r"^```sh\n(.*?)^```", RECIPES[name], re.DOTALL | re.MULTILINE)
+    assert run(commands, project).returncode == pytest.ExitCode.NO_TESTS_COLLECTED
+
+
+def test_the_map_is_complete():
+    """Every module of the shared ground, and every folder."""
+    (picture,) = re.findall(r"^## The map\n+```text\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+    ground = {path.stem for path in (ROOT / "serve" / "isocharge").glob("*.py")}
+    assert ground <= set(picture.split())
+    for folder in re.findall(r"^([\w/]+/)", picture, re.MULTILINE):
+        assert (ROOT / folder).is_dir(), folder

@@ -1,0 +1,41 @@
+"""The Makefile: all tests run once, and what runs before a commit is what `make test` runs."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def commands():
+    """What `make test` would run."""
+    if shutil.which("make") is None:
+        pytest.skip("there is no make")
+    done = subprocess.run(["make", "--dry-run", "test"], cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()
+
+
+def test_hooks_before_a_commit_are_commands_of_make_test(commands):
+    text = (ROOT / ".pre-commit-config.yaml").read_text("utf-8")
+    entries = re.findall(r"entry: (.+)", text)
+    assert len(entries) == 3
+    assert set(entries) <= set(commands)
+
+
+def test_both_parts_of_make_test_are_all_tests(commands):
+    """What the first part leaves out is what the second runs, and every part of it exists."""
+    first, second = (line.partition(" # ")[0] for line in commands if " -m pytest " in line)
+    left_out = set(re.findall(r"--ignore=(\S+)", first))
+    assert left_out == set(re.findall(r"tests/\S+", second))
+    assert all((ROOT / name).exists() for name in left_out)
+
+
+def test_tests_with_ports_and_clocks_run_one_at_a_time(commands):
+    (second,) = (line for line in commands if " -m pytest tests/" in line)
+    assert " -n " not in second
+    for name in ("cli", "live", "port", "virtual_sensor", "network/http", "network/grpc", "test_end_to_end.py"):
+        assert f" tests/serve/{name} " in second
