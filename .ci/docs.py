@@ -26,13 +26,15 @@ def modules() -> list[str]:
     return [name for name in names if "._" not in name]
 
 
-def check_references(names: list[str]) -> None:
-    """Every dotted name in backticks in a docstring is a module, or an attribute of one.
+def check_docstrings(names: list[str]) -> None:
+    """Every dotted name in backticks is a module, or an attribute of one, and an example is indented, so it is code.
 
     Raises:
         SystemExit: If one is not.
     """
     for name in names:
+        if re.search(r"^(from \w+ import|>>>|\w+ = \w+\()", import_module(name).__doc__ or "", re.MULTILINE):
+            sys.exit(f"{name}: expected the example in the docstring indented, under a line that ends with no colon")
         for dotted in DOTTED.findall(Path(str(import_module(name).__file__)).read_text("utf-8")):
             home, _, attribute = dotted.rpartition(".")
             if dotted not in names and not (home in names and hasattr(import_module(home), attribute)):
@@ -42,7 +44,7 @@ def check_references(names: list[str]) -> None:
 def main(folder: Path) -> None:
     """Write a page for each module, the index and what its search reads."""
     names = modules()
-    check_references(names)
+    check_docstrings(names)
     render.configure(docformat="google", math=True, template_directory=ROOT / ".ci" / "docs")
     pages = {name: Module(import_module(name)) for name in names}
     for name, module in pages.items():

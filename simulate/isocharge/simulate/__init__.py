@@ -1,10 +1,12 @@
 """The simulator: from a press on a clamped piezoelectric film to the charges of its electrodes.
 
-from isocharge.simulate import Circle, load_sensor, press, touch_charge
+Five lines give the charges of one press.
 
-sensor = load_sensor("three-25um-biaxial")
-equilibrium = press(sensor.film, Circle(radius=1e-3), at=(2e-3, 3e-3), force=1.0)
-charge = touch_charge(sensor, equilibrium)  # C, in the order of sensor.electrode_names
+    from isocharge.simulate import Circle, load_sensor, press, touch_charge
+
+    sensor = load_sensor("three-25um-biaxial")
+    equilibrium = press(sensor.film, Circle(radius=1e-3), at=(2e-3, 3e-3), force=1.0)
+    charge = touch_charge(sensor, equilibrium)  # C, in the order of sensor.electrode_names
 """
 
 from isocharge.extras import require

@@ -1,10 +1,12 @@
 """Training: a dataset in, a small network that gives contacts from charges out, as an ONNX model with its card.
 
-from isocharge.simulate import read_dataset
-from isocharge.train import train_model
+A few lines make a model from a dataset.
 
-release = train_model(read_dataset(Path("presses")), Path("models/mine"))
-print(release.metadata.errors)
+    from isocharge.simulate import read_dataset
+    from isocharge.train import train_model
+
+    release = train_model(read_dataset(Path("presses")), Path("models/mine"))
+    print(release.metadata.errors)
 """
 
 from isocharge.extras import require

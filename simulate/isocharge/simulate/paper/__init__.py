@@ -3,10 +3,10 @@
 May import: plots, contours, identifiability, forward, solver, mechanics, mesh, sensor, measuring_chain, execution,
 numerics.
 
-from pathlib import Path
-from isocharge.simulate.paper import write_paper
+    from pathlib import Path
+    from isocharge.simulate.paper import write_paper
 
-write_paper(Path("paper"))
+    write_paper(Path("paper"))
 """
 
 from isocharge.simulate.paper.build import write_paper

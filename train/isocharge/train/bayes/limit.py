@@ -1,7 +1,7 @@
 """The Bayes limit: the errors of the posterior mean, which no estimator of x, y, F can beat on average.
 
-scene = Scene(load_sensor("three-25um-biaxial"), Circle(1e-3), radius_mm=8.0, force_range_N=(0.05, 2.0))
-print(bayes_limit(scene).position_rms_mm)
+    scene = Scene(load_sensor("three-25um-biaxial"), Circle(1e-3), radius_mm=8.0, force_range_N=(0.05, 2.0))
+    print(bayes_limit(scene).position_rms_mm)
 
 Both functions keep their results in the cache folder (`isocharge.train.bayes.cache`).
 """
