@@ -1,6 +1,7 @@
 """A fresh machine: the base install into an empty environment serves a released model, without torch or scipy."""
 
 import json
+import re
 import subprocess
 import venv
 from pathlib import Path
@@ -42,12 +43,19 @@ def test_predict_works_from_any_folder(fresh, tmp_path):
     assert record["model"] == "three-25um-biaxial/1"
 
 
-def test_python_works_from_any_folder(fresh, tmp_path):
+@pytest.mark.parametrize(("page", "number"), [("README.md", 0), ("serve/README.md", 0), ("serve/README.md", 1)])
+def test_examples_of_the_base_install_work_from_any_folder(fresh, tmp_path, page, number):
+    """They print what their comments say with nothing but the base install."""
+    example = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)[number]
+    done = run(fresh, "python", "-c", example, cwd=tmp_path)
+    assert done.stdout.splitlines() == re.findall(r"^print\(.*\)  # (.+)$", example, re.MULTILINE), done.stderr
+
+
+def test_licence_and_readme_came_along(fresh, tmp_path):
     code = (
-        "from isocharge.serve import Predictor; print(Predictor('three-25um-biaxial').predict([848, 848, 848]).force_N)"
+        "import importlib.metadata as m; d = m.metadata('isocharge'); print(d['License-Expression'], d['License-File'])"
     )
-    done = run(fresh, "python", "-c", code, cwd=tmp_path)
-    assert float(done.stdout) == pytest.approx(1.0, abs=0.02)
+    assert run(fresh, "python", "-c", code, cwd=tmp_path).stdout.split() == ["BSD-3-Clause", "LICENSE"]
 
 
 @pytest.mark.parametrize("stage", ["simulate", "train"])

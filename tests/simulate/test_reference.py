@@ -4,13 +4,17 @@
 `film_cases_skfem.json`: scikit-fem P3, what neither of them has: off-centre polygons, the rim, thick films (3e-5).
 """
 
+import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from isocharge.simulate import Equilibrium, Polygon, SolveSettings, Theory, load_sensor, press, touch_charge
+
+ACCURACY = (Path(__file__).parents[2] / "simulate" / "docs" / "accuracy.md").read_text("utf-8")
 
 NEAR = 4e-3
 """An electrode counts as near the probe if its edge is closer to the footprint's than this (m)."""
@@ -93,3 +97,25 @@ def test_second_library_live(skfem, film):
         points = np.array([at, (0.0, 0.0), (20e-3, 10e-3), (-30e-3, 5e-3)])
         expected = [other.deflection(point) for point in points]
         np.testing.assert_allclose(solved.deflection(points), expected, rtol=5e-4)
+
+
+def worst_errors(case) -> tuple[float, float]:
+    """Error of a press's charges relative to the largest, and of its deflection."""
+    solved = solve(case.film, case.probe, case.at, case.force)
+    charges = [
+        np.abs(touch_charge(case.sensor(k), solved) - q).max() / np.abs(q).max() for k, q in case.charges.items()
+    ]
+    return max(charges), float(abs(solved.deflection([case.at])[0] / case.deflection - 1.0))
+
+
+def test_accuracy_table_is_what_the_solver_gives(reference_cases, further_cases):
+    """Every figure of simulate/docs/accuracy.md, to a digit: figures this small differ between libraries."""
+    sources = {"collocation, dolfinx": reference_cases, "scikit-fem": further_cases}
+    rows = re.findall(r"^\| (.+) \| (\d+) um \| (\d+) \| ([\d.]+) % \| ([\d.]+) % \|$", ACCURACY, re.MULTILINE)
+    assert len(rows) == 8
+    for source, thickness, count, *shown in rows:
+        cases = sources[source](float(thickness))
+        assert len(cases) == int(count)
+        np.testing.assert_allclose(
+            np.max([worst_errors(case) for case in cases], axis=0), 0.01 * np.array(shown, dtype=float), atol=2e-5
+        )
