@@ -1,5 +1,7 @@
 """Charge curves against direct presses and numpy's polynomials; the scheme against the paper's numbers."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -54,6 +56,20 @@ def test_curves_are_presses(film):
         direct = touch_charge(SENSOR, press(SENSOR.film, Circle(1e-3), at, 1.0, SolveSettings(theory=MEMBRANE)))
         np.testing.assert_allclose(curves.charge[line, step], direct, rtol=2e-3)
     np.testing.assert_array_equal(curves.own, curves.charge[..., 0])
+
+
+def test_curves_as_json_are_in_mm_and_pC(film):
+    curves = Curves.of(film, Mapping.lines(SENSOR, "B", (200 * DEG, 220 * DEG), length=8e-3), 1.0)
+    report = json.loads(json.dumps(curves.to_dict()))
+    assert list(report) == ["electrode", "probe", "force_N", "lines"]
+    assert (report["electrode"], report["probe"], report["force_N"]) == ("B", "circle:1.0", 1.0)
+    assert [line["angle_deg"] for line in report["lines"]] == pytest.approx([200.0, 210.0, 220.0])
+    for number, line in enumerate(report["lines"]):
+        assert list(line) == ["angle_deg", "distance_mm", "x_mm", "y_mm", "charge_pC"]
+        assert line["distance_mm"] == pytest.approx([4.0, 8.0])
+        np.testing.assert_allclose(np.transpose([line["x_mm"], line["y_mm"]]), 1e3 * curves.mapping.points[number])
+        np.testing.assert_allclose(list(line["charge_pC"].values()), 1e12 * curves.charge[number].T)
+        assert list(line["charge_pC"]) == ["A", "B", "C"]
 
 
 def test_charge_falls_with_the_distance(film):

@@ -1,5 +1,6 @@
 """Contours from the field: on them the charge is constant, and of a round field they are circles."""
 
+import json
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -130,3 +131,22 @@ def test_wrong_input_is_shown(field):
         ContourField.of(field.forward_map, 2.0)
     with pytest.raises(SceneError, match="up to the forward map's 9 mm, got 10 mm"):
         ContourField.of(field.forward_map, 1.0, 10e-3)
+
+
+def test_contours_as_json_are_in_mm_and_pC(field):
+    low, high = field.reach("A")
+    charges = {"A": (float(np.sqrt(low * high)), 2.0 * high), "C": (field.reach("C")[0] * 1.1,)}
+    contours = {name: [field.contours(name, charge) for charge in charges[name]] for name in charges}
+    report = json.loads(json.dumps(field.to_dict(charges, contours)))
+    assert list(report) == ["probe", "force_N", "radius_mm", "reached_pC", "contours"]
+    assert (report["probe"], report["force_N"], report["radius_mm"]) == ("circle:1.0", 1.0, pytest.approx(9.0))
+    assert report["reached_pC"]["A"] == pytest.approx([1e12 * low, 1e12 * high])
+    assert list(report["reached_pC"]) == ["A", "B", "C"]
+    rows = report["contours"]
+    assert [row["electrode"] for row in rows] == ["A", "A", "C"]
+    assert [row["charge_pC"] for row in rows] == pytest.approx([1e12 * q for name in charges for q in charges[name]])
+    assert rows[1]["pieces_mm"] == rows[1]["closed"] == []
+    for row, pieces in ((rows[0], contours["A"][0]), (rows[2], contours["C"][0])):
+        assert row["closed"] == [piece.closed for piece in pieces]
+        for points_mm, piece in zip(row["pieces_mm"], pieces, strict=True):
+            np.testing.assert_allclose(points_mm, 1e3 * piece.points)

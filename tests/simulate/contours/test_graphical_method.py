@@ -15,6 +15,7 @@ from isocharge.simulate import (
     draw_contour,
     load_sensor,
 )
+from isocharge.simulate.contours.graphical_method import drawn_to_dicts
 
 LAYOUTS = {name: load_sensor(f"{name}-25um-biaxial") for name in ("three", "four")}
 
@@ -60,6 +61,16 @@ def test_a_polynomial_of_too_low_degree_misses():
 
 def test_lines_that_do_not_reach_the_charge_give_no_contour():
     assert draw_contour(curves_of(LAYOUTS["three"], "A"), 5e-9) is None
+
+
+def test_drawn_contours_as_json_are_in_mm_and_pC():
+    curves = curves_of(LAYOUTS["three"], "A")
+    charges = {"A": (float(charge_at(np.array(9e-3))), 5e-9)}
+    contours = {"A": [draw_contour(curves, charge) for charge in charges["A"]]}
+    first, second = drawn_to_dicts(charges, contours)
+    assert (first["electrode"], first["charge_pC"]) == ("A", pytest.approx(1e12 * charges["A"][0]))
+    np.testing.assert_allclose(first["points_mm"], 1e3 * contours["A"][0].knots)
+    assert second == {"electrode": "A", "charge_pC": pytest.approx(5000.0), "points_mm": None}
 
 
 def test_crossings_are_those_of_the_splines():

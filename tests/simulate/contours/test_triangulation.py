@@ -243,3 +243,17 @@ def test_radius_beyond_the_map_is_refused(triangle_map):
 def test_no_presses_give_no_fixes(on_film):
     assert on_film.locate(np.zeros((0, 3)), 1.0).x.shape == (0,)
     assert on_film.locate_with_force(np.zeros((0, 3))).force.shape == (0,)
+
+
+def test_a_fix_as_json_has_a_position_in_mm_or_none():
+    table, forward, _, _ = round_table(LAYOUTS["three"])
+    charge = forward(np.array([2e-3, 2e-3]), np.array([1e-3, 1e-3]), np.array([1.0, 1.0]))
+    charge[1] *= [1.0, 1.0, 9.0]
+    fix = Triangulation(table).locate(charge, 1.0)
+    assert fix.to_dict(0) == {
+        "status": "met",
+        "words": "the contours meet",
+        "at_mm": pytest.approx([2.0, 1.0], abs=1e-3),
+    }
+    assert fix.to_dict(1)["status"] == "no_contour"
+    assert fix.to_dict(1)["at_mm"] is None

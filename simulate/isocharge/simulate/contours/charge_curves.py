@@ -6,6 +6,7 @@ to the charge along each line; see `drawn` for what it makes of them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -139,6 +140,25 @@ class Curves:
         """Charge of the electrode that the lines leave from, shape (n_line, n_step), C."""
         own: Array = self.charge[..., self.electrodes.index(self.mapping.electrode)]
         return own
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, in degrees, mm, pC and N."""
+        lines = zip(self.mapping.angle, self.mapping.points, self.charge, strict=True)
+        return {
+            "electrode": self.mapping.electrode,
+            "probe": self.probe.notation,
+            "force_N": self.force,
+            "lines": [
+                {
+                    "angle_deg": float(np.rad2deg(angle)),
+                    "distance_mm": (1e3 * self.mapping.distance).tolist(),
+                    "x_mm": (1e3 * points[:, 0]).tolist(),
+                    "y_mm": (1e3 * points[:, 1]).tolist(),
+                    "charge_pC": dict(zip(self.electrodes, (1e12 * charge.T).tolist(), strict=True)),
+                }
+                for angle, points, charge in lines
+            ],
+        }
 
     def polynomials(self, degree: int) -> Sequence[Polynomial]:
         """The paper's fit: charge (C) of the own electrode as a polynomial of the distance (m), one for each line.

@@ -4,9 +4,10 @@ Traced on the tabled charges by marching squares, then every point is moved alon
 gives the wanted charge there: within ON_CONTOUR. `drawn` makes the same contours the way the paper does.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from contourpy import LineType, contour_generator
@@ -100,6 +101,33 @@ class ContourField:
         low, high = self.reach(electrode)
         spread = np.geomspace if low * high > 0.0 else np.linspace
         return [float(charge) for charge in spread(low, high, count + 2)[1:-1]]
+
+    def to_dict(
+        self, charges: Mapping[str, Sequence[float]], contours: Mapping[str, Sequence[tuple[Contour, ...]]]
+    ) -> dict[str, Any]:
+        """For JSON, in mm, pC and N.
+
+        Args:
+            charges: Charges of each electrode, C.
+            contours: The pieces of the contour of each of these charges, from `contours`; none if no press gives it.
+        """
+        names = self.forward_map.electrode_names
+        return {
+            "probe": self.forward_map.probe.notation,
+            "force_N": self.force,
+            "radius_mm": 1e3 * self.table.radius,
+            "reached_pC": {name: [1e12 * charge for charge in self.reach(name)] for name in names},
+            "contours": [
+                {
+                    "electrode": name,
+                    "charge_pC": 1e12 * charge,
+                    "pieces_mm": [(1e3 * piece.points).tolist() for piece in pieces],
+                    "closed": [piece.closed for piece in pieces],
+                }
+                for name in charges
+                for charge, pieces in zip(charges[name], contours[name], strict=True)
+            ],
+        }
 
     @cached_property
     def _squares(self) -> tuple[Array, Array, Array]:

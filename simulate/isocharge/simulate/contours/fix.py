@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -62,3 +63,9 @@ class Fix:
         """Which presses have a position, shape (n,)."""
         found: np.ndarray = self.status == Meeting.met
         return found
+
+    def to_dict(self, press: int) -> dict[str, Any]:
+        """The fix of one press, for JSON; without a position `at_mm` is None."""
+        status = Meeting(int(self.status[press]))
+        position = [1e3 * float(self.x[press]), 1e3 * float(self.y[press])] if status is Meeting.met else None
+        return {"status": status.name, "words": status.words, "at_mm": position}

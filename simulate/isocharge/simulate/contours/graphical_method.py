@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -103,6 +104,26 @@ def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnCo
     knots = np.array(mapping.origin) + np.array(roots)[:, None] * direction
     knots = knots[np.isfinite(roots)]
     return DrawnContour(mapping.electrode, charge, knots) if len(knots) > 1 else None
+
+
+def drawn_to_dicts(
+    charges: Map[str, Sequence[float]], contours: Map[str, Sequence[DrawnContour | None]]
+) -> list[dict[str, Any]]:
+    """Drawn contours for JSON, in mm and pC; `points_mm` is None where no contour could be drawn.
+
+    Args:
+        charges: Charges of each electrode, C.
+        contours: The contour of each of these charges, from `draw_contour`.
+    """
+    return [
+        {
+            "electrode": name,
+            "charge_pC": 1e12 * charge,
+            "points_mm": None if contour is None else (1e3 * contour.knots).tolist(),
+        }
+        for name in charges
+        for charge, contour in zip(charges[name], contours[name], strict=True)
+    ]
 
 
 def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) -> float:

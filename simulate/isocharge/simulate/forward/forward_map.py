@@ -138,6 +138,11 @@ class ForwardMap:
         return SolveSettings(theory=self.theory, resolution=self.resolution)
 
     @property
+    def electrode_names(self) -> tuple[str, ...]:
+        """Names of the sensor's electrodes, in the order of the charges."""
+        return self.sensor.electrode_names
+
+    @property
     def solves(self) -> int:
         """Number of equilibria that were solved for the map."""
         return self.family.distance.size * self.family.force.size * self.family.solved_turns.size
