@@ -7,6 +7,7 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import SolveError
+from isocharge.json_values import finite_or_none
 from isocharge.progress import Progress
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
@@ -100,8 +101,8 @@ class Identification:
             "working_area": {
                 "radius_mm": 1e3 * area.radius,
                 "why": area.why,
-                "fold_radius_mm": _finite(1e3 * area.fold_radius),
-                "twin_radius_mm": _finite(1e3 * area.twin_radius),
+                "fold_radius_mm": finite_or_none(1e3 * area.fold_radius),
+                "twin_radius_mm": finite_or_none(1e3 * area.twin_radius),
                 "error_radius_mm": 1e3 * area.error_radius,
                 "unfolded_radius_mm": 1e3 * area.unfolded,
                 "error_mm": 1e3 * area.error,
@@ -174,10 +175,6 @@ def _quantile(values: Array, weights: Array, share: float) -> float:
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(total, share * total[-1])])
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _twin_rows(area: WorkingArea, most: int = 20) -> list[dict[str, Any]]:

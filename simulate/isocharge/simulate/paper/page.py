@@ -3,8 +3,7 @@
 import json
 from collections.abc import Sequence
 
-import numpy as np
-
+from isocharge.json_values import plain_values
 from isocharge.simulate.paper.choices import Choices
 from isocharge.simulate.paper.entry import Entry
 
@@ -63,16 +62,4 @@ def numbers(entries: Sequence[Entry]) -> dict[str, object]:
 
 def as_json(entries: Sequence[Entry]) -> str:
     """The numbers as JSON; NaN becomes null."""
-    return json.dumps(_plain(numbers(entries)), indent=1, allow_nan=False) + "\n"
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return value
+    return json.dumps(plain_values(numbers(entries)), indent=1, allow_nan=False) + "\n"
