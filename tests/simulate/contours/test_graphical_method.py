@@ -120,9 +120,9 @@ def test_what_has_no_answer_is_said(layout):
 
 def test_wrong_input_is_refused(layout):
     _, curves = layout
-    with pytest.raises(ChargeError, match=rf"numbers of shape \(n, {len(curves)}\), got shape \(1, 2\)"):
+    with pytest.raises(ChargeError, match=rf"charges of shape \(n, {len(curves)}\) for \(.+\), got shape \(1, 2\)"):
         DrawnTriangulation(curves).locate(np.ones((1, 2)))
-    with pytest.raises(ChargeError):
+    with pytest.raises(ChargeError, match="charge of 'A' in press 0: expected a finite number, got nan"):
         DrawnTriangulation(curves).locate(np.full((1, len(curves)), np.nan))
     with pytest.raises(SensorError, match="at least three electrodes"):
         DrawnTriangulation(curves[:2])

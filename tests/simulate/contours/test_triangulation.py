@@ -219,7 +219,12 @@ def test_folded_map_says_that_there_are_two():
     ("charge", "force", "error", "message"),
     [
         (np.ones((1, 2)), 1.0, ChargeError, r"shape \(n, 3\) for \('A', 'B', 'C'\), got shape \(1, 2\)"),
-        (np.array([[1.0, np.nan, 1.0]]), 1.0, ChargeError, "charge of 'B' in press 0: expected a number, got nan"),
+        (
+            np.array([[1.0, np.nan, 1.0]]),
+            1.0,
+            ChargeError,
+            "charge of 'B' in press 0: .* finite number, got nan",
+        ),
         (np.ones((2, 3)), 2.5, SceneError, "force of press 0: expected 1 to 1 N, which the table covers, got 2.5 N"),
         (np.ones((2, 3)), np.array([1.0, np.nan]), SceneError, "force of press 1: .* got nan N"),
     ],

@@ -131,7 +131,7 @@ def test_impossible_radius_is_refused(film, radius):
 
 @pytest.mark.parametrize("contact", [[4.1e-3, 0.0, 0.5], [0.0, 0.0, 1.1], [0.0, 0.0, 0.1], [np.nan, 0.0, 0.5]])
 def test_outside_is_refused(made, contact):
-    with pytest.raises(SceneError, match=r"outside the table: expected at most 4 mm and 0\.2 to 1 N"):
+    with pytest.raises(SceneError, match=r"outside the table: expected at most 4 mm from the centre and 0\.2 to 1 N"):
         made.charge(np.array([contact]))
     with pytest.raises(SceneError, match="outside the table"):
         made.jacobian(np.array([contact]))

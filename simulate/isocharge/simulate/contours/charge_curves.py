@@ -133,7 +133,7 @@ class Curves:
         points = mapping.points
         x, y = points.reshape(-1, 2).T
         charge = forward_map.forward(x, y, np.full(x.size, force)).reshape(*points.shape[:2], -1)
-        return cls(mapping, forward_map.sensor.electrode_names, forward_map.probe, force, charge)
+        return cls(mapping, forward_map.electrode_names, forward_map.probe, force, charge)
 
     @property
     def own(self) -> Array:

@@ -15,6 +15,7 @@ from contourpy import LineType, contour_generator
 from isocharge.arrays import Array
 from isocharge.errors import SceneError
 from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.checks import check_forces
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.numerics.disk import onto_disk
 from isocharge.simulate.sensor.sensor import electrode_index
@@ -69,9 +70,7 @@ class ContourField:
         Raises:
             SceneError: If the map does not cover the force or the radius.
         """
-        low, high = forward_map.force_range
-        if not low * (1.0 - 1e-9) <= force <= high * (1.0 + 1e-9):
-            raise SceneError(f"force: expected {low:g} to {high:g} N, which the forward map covers, got {force:g} N")
+        check_forces(force, forward_map.force_range, "forward map")
         return cls(forward_map, ChargeSpline.of(forward_map, radius, spacing), force)
 
     def contours(self, electrode: str, charge: float) -> tuple[Contour, ...]:

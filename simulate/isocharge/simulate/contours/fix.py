@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.arrays import Array, Integers
+from isocharge.errors import SensorError
 
 TOLERANCE = 1e-3
 """Distance (m) of crossings from their mean up to which contours meet there."""
@@ -69,3 +70,13 @@ class Fix:
         status = Meeting(int(self.status[press]))
         position = [1e3 * float(self.x[press]), 1e3 * float(self.y[press])] if status is Meeting.met else None
         return {"status": status.name, "words": status.words, "at_mm": position}
+
+
+def check_electrodes(electrode_names: tuple[str, ...]) -> None:
+    """Refuse fewer than three electrodes: two contours cross wherever they cross, nothing tells which crossing it is.
+
+    Raises:
+        SensorError: If there are fewer than three.
+    """
+    if len(electrode_names) < 3:
+        raise SensorError(f"triangulation needs at least three electrodes, got {electrode_names}")

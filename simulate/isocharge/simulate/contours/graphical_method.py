@@ -17,9 +17,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from isocharge.arrays import Array
-from isocharge.errors import ChargeError, SensorError
 from isocharge.simulate.contours.charge_curves import Curves
-from isocharge.simulate.contours.fix import AMBIGUOUS, APART, TOLERANCE, Fix, Meeting
+from isocharge.simulate.contours.fix import AMBIGUOUS, APART, TOLERANCE, Fix, Meeting, check_electrodes
+from isocharge.simulate.forward.checks import as_charges
 
 DEGREE = 4
 """Of the polynomial along a line; the paper does not say its own. Lower ones miss the charge near the electrode."""
@@ -152,9 +152,12 @@ class DrawnTriangulation:
     tolerance: float = TOLERANCE
 
     def __post_init__(self) -> None:
-        names = tuple(curves.mapping.electrode for curves in self.curves)
-        if len(names) < 3:
-            raise SensorError(f"triangulation needs at least three electrodes, got {names}")
+        check_electrodes(self.electrode_names)
+
+    @property
+    def electrode_names(self) -> tuple[str, ...]:
+        """In the order of the charges."""
+        return tuple(curves.mapping.electrode for curves in self.curves)
 
     def contours(self, charge: Array) -> tuple[DrawnContour | None, ...]:
         """The contour of each charge, shape (n_electrode,), C."""
@@ -167,11 +170,9 @@ class DrawnTriangulation:
             charge: Touch charges, shape (n, n_electrode), C.
 
         Raises:
-            ChargeError: If the charges are not one for each electrode.
+            ChargeError: If the charges are not finite or not one for each electrode.
         """
-        charge = np.asarray(charge, dtype=float)
-        if charge.ndim != 2 or charge.shape[1] != len(self.curves) or not np.isfinite(charge).all():
-            raise ChargeError(f"expected numbers of shape (n, {len(self.curves)}), got shape {charge.shape}")
+        charge = as_charges(charge, self.electrode_names)
         found = [self._locate_one(row) for row in charge]
         x, y, spread, status, triples = (np.array(column) for column in zip(*found, strict=True))
         force = np.full(len(charge), self.curves[0].force)

@@ -17,10 +17,11 @@ from itertools import combinations
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.errors import ChargeError, SceneError, SensorError
+from isocharge.errors import SceneError
 from isocharge.simulate.contours.candidates import FLAT, Candidates, SeedGrid, gauss_newton_step
-from isocharge.simulate.contours.fix import AMBIGUOUS, APART, RESOLVED, TOLERANCE, Fix, Meeting
+from isocharge.simulate.contours.fix import AMBIGUOUS, APART, RESOLVED, TOLERANCE, Fix, Meeting, check_electrodes
 from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.checks import as_charges, check_forces
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.numerics.disk import onto_disk
 
@@ -50,11 +51,7 @@ class Triangulation:
     tolerance: float = TOLERANCE
 
     def __post_init__(self) -> None:
-        if self.table.electrodes < 3:
-            raise SensorError(
-                f"triangulation needs at least three electrodes, got {self.table.electrodes}: "
-                f"{self.table.electrode_names}"
-            )
+        check_electrodes(self.table.electrode_names)
         if not (np.isfinite(self.tolerance) and self.tolerance > 0.0):
             raise SceneError(f"tolerance: expected a positive length, got {self.tolerance * 1e3} mm")
 
@@ -79,10 +76,7 @@ class Triangulation:
             SensorError: If there are fewer than three electrodes.
             SceneError: If the radius reaches beyond the map.
         """
-        if len(forward_map.sensor.electrodes) < 3:
-            raise SensorError(
-                f"triangulation needs at least three electrodes, got {forward_map.sensor.electrode_names}"
-            )
+        check_electrodes(forward_map.electrode_names)
         return cls(ChargeSpline.of(forward_map, radius, spacing), tolerance)
 
     def locate(self, charge: Array, force: Array | float) -> Fix:
@@ -99,8 +93,9 @@ class Triangulation:
             ChargeError: If the charges are not finite or not one for each electrode.
             SceneError: If a force lies outside the table.
         """
-        charge = self._checked(charge)
-        force = self._checked_force(force, len(charge))
+        charge = as_charges(charge, self.table.electrode_names)
+        force = np.broadcast_to(np.asarray(force, dtype=float), len(charge))
+        check_forces(force, self.table.force_range, "table")
         return self._in_chunks(charge, force)
 
     def locate_with_force(self, charge: Array) -> Fix:
@@ -115,29 +110,7 @@ class Triangulation:
         Raises:
             ChargeError: If the charges are not finite or not one for each electrode.
         """
-        return self._in_chunks(self._checked(charge), None)
-
-    def _checked(self, charge: Array) -> Array:
-        charge, names = np.asarray(charge, dtype=float), self.table.electrode_names
-        if charge.ndim != 2 or charge.shape[1] != len(names):
-            raise ChargeError(f"expected charges of shape (n, {len(names)}) for {names}, got shape {charge.shape}")
-        if not np.isfinite(charge).all():
-            row, column = np.argwhere(~np.isfinite(charge))[0]
-            raise ChargeError(
-                f"charge of {names[column]!r} in press {row}: expected a number, got {charge[row, column]}"
-            )
-        return charge
-
-    def _checked_force(self, force: Array | float, count: int) -> Array:
-        force = np.broadcast_to(np.asarray(force, dtype=float), count)
-        (low, high), slack = self.table.force_range, 1.0 + 1e-9
-        wrong = ~((force >= low / slack) & (force <= high * slack))
-        if wrong.any():
-            i = int(np.argmax(wrong))
-            raise SceneError(
-                f"force of press {i}: expected {low:g} to {high:g} N, which the table covers, got {force[i]:g} N"
-            )
-        return force
+        return self._in_chunks(as_charges(charge, self.table.electrode_names), None)
 
     def _in_chunks(self, charge: Array, force: Array | None) -> Fix:
         if len(charge) == 0:

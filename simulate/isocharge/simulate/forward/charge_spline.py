@@ -16,7 +16,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
 from isocharge.arrays import Array
-from isocharge.errors import SceneError
+from isocharge.simulate.forward.checks import check_presses, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.numerics.disk import lattice, onto_disk, sunflower
@@ -83,10 +83,7 @@ class ChargeSpline:
             SceneError: If the radius is not positive or reaches beyond the map.
         """
         radius = forward_map.radius if radius is None else radius
-        if not 0.0 < radius <= forward_map.radius * (1.0 + 1e-9):
-            raise SceneError(
-                f"radius: expected up to the forward map's {forward_map.radius * 1e3:g} mm, got {radius * 1e3:g} mm"
-            )
+        check_radius(radius, forward_map.radius, "forward map")
         spacing = spacing or min(SPACING, SHARE * forward_map.probe.reach)
         sensor, force = forward_map.sensor, _force_nodes(forward_map)
         return cls.fit(
@@ -174,15 +171,7 @@ class ChargeSpline:
         return np.stack([self.table(position, nu=nu) for nu in ((1, 0), (0, 1))], axis=-1)
 
     def _check_inside(self, contact: Array) -> None:
-        low, high = self.force_range
-        distance, force, slack = np.hypot(contact[:, 0], contact[:, 1]), contact[:, 2], 1.0 + 1e-9
-        wrong = ~((distance <= self.radius * slack) & (force >= low / slack) & (force <= high * slack))
-        if wrong.any():
-            i = int(np.argmax(wrong))
-            raise SceneError(
-                f"contact {i}, {1e3 * distance[i]:.4g} mm from the centre with {force[i]:.4g} N, is outside the table: "
-                f"expected at most {self.radius * 1e3:g} mm and {low:g} to {high:g} N"
-            )
+        check_presses(*contact.T, radius=self.radius, force_range=self.force_range, source="table")
 
 
 def _force_nodes(forward_map: ForwardMap) -> Array:

@@ -1,0 +1,90 @@
+"""Checks of what a charge map is asked: presses within its disk and forces, charges of its electrodes."""
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.errors import ChargeError, SceneError
+
+SLACK = 1.0 + 1e-9
+"""Factor by which a radius or force may lie outside a limit, dimensionless: a limit that was converted from mm and back
+still counts as inside."""
+
+
+def check_presses(
+    x: Array, y: Array, force: Array, *, radius: float, force_range: tuple[float, float], source: str
+) -> None:
+    """Refuse presses outside a disk and a range of forces.
+
+    Args:
+        x: Positions, shape (n,), m.
+        y: Positions, shape (n,), m.
+        force: Forces, shape (n,), N.
+        radius: Largest distance from the centre, m.
+        force_range: Smallest and largest force, N.
+        source: What has these limits, for the message: "table".
+
+    Raises:
+        SceneError: If a press lies outside.
+    """
+    low, high = force_range
+    outside = ~((np.hypot(x, y) <= radius * SLACK) & _within(force, force_range))
+    if outside.any():
+        i = int(np.argmax(outside))
+        raise SceneError(
+            f"press {i} at ({x[i] * 1e3:.4g}, {y[i] * 1e3:.4g}) mm with {force[i]:.4g} N is outside the {source}: "
+            f"expected at most {radius * 1e3:g} mm from the centre and {low:g} to {high:g} N"
+        )
+
+
+def check_forces(force: Array | float, force_range: tuple[float, float], source: str) -> None:
+    """Refuse forces outside a range (N); `source` says what has it.
+
+    Raises:
+        SceneError: If a force lies outside.
+    """
+    forces = np.asarray(force)
+    outside = np.flatnonzero(~_within(forces, force_range))
+    if outside.size:
+        i, (low, high) = outside[0], force_range
+        which = f"force of press {i}" if forces.ndim else "force"
+        raise SceneError(
+            f"{which}: expected {low:g} to {high:g} N, which the {source} covers, got {forces.flat[i]:g} N"
+        )
+
+
+def check_radius(radius: float, largest: float, source: str) -> None:
+    """Refuse a radius (m) that is not positive or larger than `largest` (m); `source` says what has that limit.
+
+    Raises:
+        SceneError: If the radius lies outside.
+    """
+    if not 0.0 < radius <= largest * SLACK:
+        raise SceneError(f"radius: expected up to the {source}'s {largest * 1e3:g} mm, got {radius * 1e3:g} mm")
+
+
+def as_charges(charge: Array, electrode_names: tuple[str, ...]) -> Array:
+    """Charges of presses as float64, one for each electrode.
+
+    Args:
+        charge: Charges, shape (n, n_electrode), C.
+        electrode_names: In the order of the charges.
+
+    Raises:
+        ChargeError: If the charges are not finite or not one for each electrode.
+    """
+    charge = np.asarray(charge, dtype=float)
+    count = len(electrode_names)
+    if charge.ndim != 2 or charge.shape[1] != count:
+        raise ChargeError(f"expected charges of shape (n, {count}) for {electrode_names}, got shape {charge.shape}")
+    if not np.isfinite(charge).all():
+        row, column = np.argwhere(~np.isfinite(charge))[0]
+        raise ChargeError(
+            f"charge of {electrode_names[column]!r} in press {row}: expected a finite number, got {charge[row, column]}"
+        )
+    return charge
+
+
+def _within(force: Array, force_range: tuple[float, float]) -> np.ndarray:
+    """Which forces lie in a range; NaN does not."""
+    low, high = force_range
+    return np.asarray((force >= low / SLACK) & (force <= high * SLACK))
