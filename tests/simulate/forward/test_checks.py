@@ -10,11 +10,9 @@ FORCES = (0.1, 2.0)
 
 
 def test_limits_are_inside_also_when_rounded():
-    one = np.ones(1)
+    edge = np.array([[3e-3], [4e-3], [2.0]])
     for wiggle in (1.0 - 1e-12, 1.0, 1.0 + 1e-12):
-        check_presses(
-            3e-3 * wiggle * one, 4e-3 * wiggle * one, 2.0 * one, radius=5e-3, force_range=FORCES, source="map"
-        )
+        check_presses(*(wiggle * edge), radius=5e-3, force_range=FORCES, source="map")
         check_forces(np.array(FORCES) * wiggle, FORCES, "map")
         check_radius(5e-3 * wiggle, 5e-3, "map")
 

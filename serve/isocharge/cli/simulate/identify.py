@@ -9,6 +9,7 @@ import typer
 
 from isocharge.cli.shared.options import PROBE_HELP, SensorArgument
 from isocharge.cli.shared.terminal import progress, say
+from isocharge.default_scene import DEFAULT_FORCE_RANGE
 from isocharge.errors import InputError
 from isocharge.files import new_folder, refuse_existing, write_whole
 
@@ -30,7 +31,7 @@ def identify_command(
     ] = None,
     force: Annotated[
         tuple[float, float], typer.Option("--force", metavar="MIN MAX", help="Smallest and largest force, N.")
-    ] = (0.05, 2.0),
+    ] = DEFAULT_FORCE_RANGE,
     noise: Annotated[str, typer.Option("--noise", metavar="LEVEL|FILE.toml", help=NOISE_HELP)] = "reference",
     error: Annotated[
         float, typer.Option("--error", metavar="MM", help="Position error allowed in the working area at any force.")

@@ -10,6 +10,7 @@ import typer
 
 from isocharge.cli.shared.options import SensorArgument, auto_radius, number_mm
 from isocharge.cli.shared.terminal import progress_rows, say
+from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,10 +48,10 @@ def sweep_command(
         typer.Option(
             "--radius", metavar="MM|auto", help="Largest distance from the centre, mm, or auto: the working area's."
         ),
-    ] = "8.0",
+    ] = f"{1e3 * DEFAULT_RADIUS}",
     force: Annotated[
         tuple[float, float], typer.Option("--force", metavar="MIN MAX", help="Smallest and largest force, N.")
-    ] = (0.05, 2.0),
+    ] = DEFAULT_FORCE_RANGE,
     samples: Annotated[int, typer.Option("--samples", help="How many presses.")] = 20_000,
     orientation: Annotated[
         Orientation, typer.Option("--orientation", help="Turn the probe further in each press.")

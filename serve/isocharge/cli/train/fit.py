@@ -8,6 +8,7 @@ import typer
 
 from isocharge.cli.shared.options import PROBE_HELP, auto_radius, number_mm
 from isocharge.cli.shared.terminal import progress, say, this_command
+from isocharge.default_scene import DEFAULT_RADIUS
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing
 
@@ -40,7 +41,7 @@ def fit_command(
             metavar="MM|auto",
             help="With --sensor: largest distance from the centre, mm, or auto.",
         ),
-    ] = "8.0",
+    ] = f"{1e3 * DEFAULT_RADIUS}",
     config: Annotated[
         Path | None, typer.Option("--config", metavar="FILE", help="Training configuration, TOML. (default: built in)")
     ] = None,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isocharge.arrays import Array, Booleans
+from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import SceneError
 
 REST_S = 1.0
@@ -85,8 +86,8 @@ def wander(
     seed: int,
     seconds: float = 60.0,
     rate_Hz: float = 200.0,
-    radius_mm: float = 8.0,
-    force_range_N: tuple[float, float] = (0.05, 2.0),
+    radius_mm: float = 1e3 * DEFAULT_RADIUS,
+    force_range_N: tuple[float, float] = DEFAULT_FORCE_RANGE,
 ) -> Script:
     """A script of random presses that wander over the film: a second of rest, then presses of 1 to 3 s with pauses.
 

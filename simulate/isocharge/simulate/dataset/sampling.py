@@ -15,6 +15,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from isocharge.arrays import Array, Integers
+from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import SceneError
 from isocharge.simulate.numerics.disk import lattice
 from isocharge.simulate.sensor.probe import Probe
@@ -68,8 +69,8 @@ class Sweep:
         sampling: "sobol", "random" or "grid".
     """
 
-    radius: float = 8e-3
-    force_range: tuple[float, float] = (0.05, 2.0)
+    radius: float = DEFAULT_RADIUS
+    force_range: tuple[float, float] = DEFAULT_FORCE_RANGE
     samples: int = 20_000
     seed: int = 0
     orientation: Orientation = "fixed"

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.arrays import Array, Complexes, Integers
+from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import SceneError, SolveError
 from isocharge.progress import Progress
 from isocharge.simulate.execution.blas import single_threaded_blas
@@ -76,8 +77,8 @@ class ForwardMap:
         cls,
         sensor: Sensor,
         probe: Probe,
-        radius: float = 8e-3,
-        force_range: tuple[float, float] = (0.05, 2.0),
+        radius: float = DEFAULT_RADIUS,
+        force_range: tuple[float, float] = DEFAULT_FORCE_RANGE,
         settings: SolveSettings = SolveSettings(),
         *,
         map_jobs: JobMap = map,

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.arrays import Array
+from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import ChargeError, InputError
 from isocharge.files import sha256_of
 from isocharge.progress import Progress
@@ -48,8 +49,8 @@ class Scene:
 
     sensor: Sensor
     probe: Probe
-    radius_mm: float = 8.0
-    force_range_N: tuple[float, float] = (0.05, 2.0)
+    radius_mm: float = 1e3 * DEFAULT_RADIUS
+    force_range_N: tuple[float, float] = DEFAULT_FORCE_RANGE
     noise: NoiseModel = field(default_factory=lambda: noise_model("reference"))
 
     def forward_map(self) -> ForwardMap:
