@@ -4,12 +4,13 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from isocharge.arrays import Array
 from isocharge.simulate.contours.field_contours import ContourField
-from isocharge.simulate.contours.fix import Meeting
+from isocharge.simulate.contours.fix import Fix, Meeting
 from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTriangulation
-from isocharge.simulate.paper.choices import PAPER
+from isocharge.simulate.paper.choices import PAPER, Choices
 from isocharge.simulate.paper.entry import Entry, Row
 from isocharge.simulate.paper.solves import FORCE, Solves
 from isocharge.simulate.paper.triangulation_errors import BEYOND, Accuracy
@@ -24,13 +25,13 @@ LEVELS, AREA = 8, 11.5e-3
 def fig_9(study: Solves, accuracy: Accuracy) -> Entry:
     """Contours from the field, under a triangle."""
     sensor = study.choices.sensor("three")
-    film, at = study.film("triangle", sensor), study.choices.shown
-    charge = film.forward(np.array([at[0]]), np.array([at[1]]), np.array([FORCE]))[0]
-    field = ContourField.of(film, FORCE, BEYOND * study.choices.radius, study.choices.spacing)
+    forward_map, at = study.film("triangle", sensor), study.choices.shown
+    charges = study.charges("triangle", sensor, np.array([at]))[0]
+    field = ContourField.of(forward_map, FORCE, BEYOND * study.choices.radius, study.choices.spacing)
     figure = new_figure(6.6, 7.0)
     axes = figure.subplots()
-    for name, q, colour in zip(sensor.electrode_names, charge, COLOURS, strict=False):
-        draw_contours(axes, field.contours(name, float(q)), colour, f"{name}, {1e12 * q:.0f} pC")
+    for name, charge, colour in zip(sensor.electrode_names, charges, COLOURS, strict=False):
+        draw_contours(axes, field.contours(name, float(charge)), colour, f"{name}, {1e12 * charge:.0f} pC")
     draw_electrodes(axes, sensor)
     draw_probe(axes, study.choices.triangle, at, "probe")
     draw_working_area(axes, study.choices.radius, "working area")
@@ -58,68 +59,76 @@ def fig_9(study: Solves, accuracy: Accuracy) -> Entry:
 
 
 def fig_10(study: Solves, accuracy: Accuracy) -> Entry:
-    """The paper's own way, and how its 0.122 mm compares."""
+    """The paper's graphical method, and how its 0.122 mm compares."""
     sensor, at = study.choices.sensor("three"), study.choices.shown
-    contours = DrawnTriangulation(study.scheme("triangle", sensor), study.choices.degree)
-    charge = study.film("triangle", sensor).forward(np.array([at[0]]), np.array([at[1]]), np.array([FORCE]))
-    drawn, fix = [c for c in contours.contours(charge[0]) if c is not None], contours.locate(charge)
+    triangulation = DrawnTriangulation(study.scheme("triangle", sensor), study.choices.degree)
+    charge = study.charges("triangle", sensor, np.array([at]))
+    contours, fix = [c for c in triangulation.contours(charge[0]) if c is not None], triangulation.locate(charge)
+    error_mm = 1e3 * float(np.hypot(fix.x[0] - at[0], fix.y[0] - at[1]))
     figure = new_figure(16.5, 5.6)
-    whole, near, share = figure.subplots(1, 3)
+    whole, near, distribution = figure.subplots(1, 3)
     for axes in (whole, near):
-        for contour, colour in zip(drawn, COLOURS, strict=False):
-            axes.plot(
-                *1e3 * contour.points.T,
-                color=colour,
-                lw=1.3,
-                label=f"{contour.electrode}, {1e12 * contour.charge:.0f} pC",
-            )
-            axes.plot(*1e3 * contour.knots.T, ".", color=colour, ms=5)
+        _draw_graphical_contours(axes, contours)
     draw_probe(whole, study.choices.triangle, at)
     draw_electrodes(whole, sensor)
     frame_film(whole, sensor, BEYOND * study.choices.radius, "Fig. 10: contours as the paper draws them")
     whole.legend(fontsize=8)
-    error = 1e3 * float(np.hypot(fix.x[0] - at[0], fix.y[0] - at[1]))
-    _zoom(near, drawn, at, (float(fix.x[0]), float(fix.y[0])))
-    _distributions(share, accuracy, study.choices.degree)
-    here = accuracy.drawn["three", study.choices.degree]
-    others = ", ".join(
-        f"degree {degree}: median {accuracy.drawn['three', degree].percentile(50):.2f} mm, 0.122 mm at "
-        f"{accuracy.drawn['three', degree].share_below(PAPER.error_mm):.0f} %"
-        for degree in sorted(
-            {degree for layout, degree in accuracy.drawn if layout == "three"} - {study.choices.degree}
-        )
-    )
+    _zoom(near, contours, at, (float(fix.x[0]), float(fix.y[0])))
+    _distributions(distribution, accuracy, study.choices.degree)
     return Entry(
         "Fig. 10",
         "Contours from a polynomial on each line and a spline through its roots; the crossings and their mean; the "
         "errors over the working area.",
         figure,
-        [
-            Row(
-                "are the three contours concurrent?",
-                "no",
-                f"no: {1e3 * fix.spread[0]:.3f} mm from the mean" if fix.found[0] else "no",
-                "error of polynomial and spline",
-            ),
-            Row(
-                "the shown press, distance from the mean of the crossings",
-                "0.122 mm (place not given)",
-                f"{error:.3f} mm" if fix.found[0] else Meeting(int(fix.status[0])).words,
-                "the place of the paper's press is not given",
-            ),
-            Row(
-                "percentile of 0.122 mm over the working area",
-                "0.122 mm",
-                f"{here.share_below(PAPER.error_mm):.0f} %; median {here.percentile(50):.3f}, "
-                f"95 % {here.percentile(95):.3f} mm; "
-                f"contours met for {here.fix.found.sum()} of {len(here.at)} presses",
-                f"polynomials of degree {study.choices.degree}, our choice; {others}",
-            ),
-        ],
+        [*_rows_of_shown_press(fix, error_mm), _row_of_percentile(accuracy, study.choices.degree)],
         {
-            "shown_error_mm": error,
-            **{f"{layout}_degree_{degree}": e.numbers() for (layout, degree), e in accuracy.drawn.items()},
+            "shown_error_mm": error_mm,
+            **{f"{layout}_degree_{degree}": errors.numbers() for (layout, degree), errors in accuracy.drawn.items()},
         },
+    )
+
+
+def _draw_graphical_contours(axes: Any, contours: list[DrawnContour]) -> None:
+    """Splines, and the roots on the lines that they join."""
+    for contour, colour in zip(contours, COLOURS, strict=False):
+        label = f"{contour.electrode}, {1e12 * contour.charge:.0f} pC"
+        axes.plot(*1e3 * contour.points.T, color=colour, lw=1.3, label=label)
+        axes.plot(*1e3 * contour.knots.T, ".", color=colour, ms=5)
+
+
+def _rows_of_shown_press(fix: Fix, error_mm: float) -> list[Row]:
+    """Whether the contours of the shown press meet in one point, and how far from it."""
+    return [
+        Row(
+            "are the three contours concurrent?",
+            "no",
+            f"no: {1e3 * fix.spread[0]:.3f} mm from the mean" if fix.found[0] else "no",
+            "error of polynomial and spline",
+        ),
+        Row(
+            "the shown press, distance from the mean of the crossings",
+            "0.122 mm (place not given)",
+            f"{error_mm:.3f} mm" if fix.found[0] else Meeting(int(fix.status[0])).words,
+            "the place of the paper's press is not given",
+        ),
+    ]
+
+
+def _row_of_percentile(accuracy: Accuracy, degree: int) -> Row:
+    """Where the paper's error lies among those over the working area, for our degree and for others."""
+    errors = accuracy.drawn["three", degree]
+    others = ", ".join(
+        f"degree {other}: median {accuracy.drawn['three', other].percentile(50):.2f} mm, 0.122 mm at "
+        f"{accuracy.drawn['three', other].share_below(PAPER.error_mm):.0f} %"
+        for other in sorted({other for layout, other in accuracy.drawn if layout == "three"} - {degree})
+    )
+    return Row(
+        "percentile of 0.122 mm over the working area",
+        "0.122 mm",
+        f"{errors.share_below(PAPER.error_mm):.0f} %; median {errors.percentile(50):.3f}, "
+        f"95 % {errors.percentile(95):.3f} mm; "
+        f"contours met for {errors.fix.found.sum()} of {len(errors.at)} presses",
+        f"polynomials of degree {degree}, our choice; {others}",
     )
 
 
@@ -168,61 +177,70 @@ def _distributions(axes: Any, accuracy: Accuracy, degree: int) -> None:
 def fig_11(study: Solves) -> Entry:
     """Contours of all four electrodes under a circle."""
     sensor = study.choices.sensor("four")
-    film = study.film("circle", sensor)
-    field = ContourField.of(film, FORCE, AREA, study.choices.spacing)
-    figure = new_figure(12.6, 6.6)
-    left, right = figure.subplots(1, 2)
-    reached = {}
-    for name, colour in zip(sensor.electrode_names, COLOURS, strict=False):
-        levels = field.even_charges(name, LEVELS)
-        pieces = [piece for q in levels for piece in field.contours(name, q)]
-        draw_contours(left, pieces, colour, f"{name}, {1e12 * min(levels):.0f} to {1e12 * max(levels):.0f} pC", 0.9)
-        reached[name] = [1e12 * q for q in field.reach(name)]
-        if name == sensor.electrode_names[0]:
-            _one_electrode(right, field, name, colour)
-    for axes, title in ((left, "Fig. 11: all four electrodes, circle of 1 mm, 1 N"), (right, "electrode A alone, pC")):
-        draw_electrodes(axes, sensor)
-        draw_working_area(axes, study.choices.radius, "working area")
-        draw_probe(axes, study.choices.circle, (0.0, 0.0), "probe")
-        frame_film(axes, sensor, AREA, title)
-    handles, labels = left.get_legend_handles_labels()
-    figure.legend(handles, labels, fontsize=8, loc="outside lower center", ncols=6)
-    apart = _apart_from_triangle(study)
+    field = ContourField.of(study.film("circle", sensor), FORCE, AREA, study.choices.spacing)
+    reached_pC = {name: [1e12 * charge for charge in field.reach(name)] for name in sensor.electrode_names}
+    median, worst = _change_from_circle_to_triangle(study)
     return Entry(
         "Fig. 11",
         "Isocharge contours of all four electrodes; on the right those of A with their charges.",
-        figure,
+        _draw_fig_11(study.choices, field),
         [
             Row(
                 "charges met in the central area",
                 "in the figure",
-                f"{reached['A'][0]:.0f} to {reached['A'][1]:.0f} pC on A, within {1e3 * AREA:g} mm",
+                f"{reached_pC['A'][0]:.0f} to {reached_pC['A'][1]:.0f} pC on A, within {1e3 * AREA:g} mm",
                 "E, d31, d32 are our choice; largest with the probe on the electrode",
             ),
             Row(
                 "contours change with the probe's shape",
                 "they may",
-                f"triangle of 4 mm against circle of 1 mm: a charge changes by {100 * apart[0]:.1f} % at the median, "
-                f"{100 * apart[1]:.0f} % at most",
+                f"triangle of 4 mm against circle of 1 mm: a charge changes by {100 * median:.1f} % at the median, "
+                f"{100 * worst:.0f} % at most",
                 "shape matters beside an electrode only",
             ),
         ],
-        {"reached_pC": reached, "triangle_against_circle_median": apart[0], "triangle_against_circle_worst": apart[1]},
+        {"reached_pC": reached_pC, "triangle_against_circle_median": median, "triangle_against_circle_worst": worst},
     )
 
 
+def _draw_fig_11(choices: Choices, field: ContourField) -> Figure:
+    """On the left the contours of all electrodes, on the right those of the first with their charges."""
+    sensor = field.forward_map.sensor
+    figure = new_figure(12.6, 6.6)
+    left, right = figure.subplots(1, 2)
+    for name, colour in zip(sensor.electrode_names, COLOURS, strict=False):
+        levels = field.even_charges(name, LEVELS)
+        pieces = [piece for charge in levels for piece in field.contours(name, charge)]
+        draw_contours(left, pieces, colour, f"{name}, {1e12 * min(levels):.0f} to {1e12 * max(levels):.0f} pC", 0.9)
+    _one_electrode(right, field, sensor.electrode_names[0], COLOURS[0])
+    for axes, title in ((left, "Fig. 11: all four electrodes, circle of 1 mm, 1 N"), (right, "electrode A alone, pC")):
+        draw_electrodes(axes, sensor)
+        draw_working_area(axes, choices.radius, "working area")
+        draw_probe(axes, choices.circle, (0.0, 0.0), "probe")
+        frame_film(axes, sensor, AREA, title)
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=8, loc="outside lower center", ncols=6)
+    return figure
+
+
 def _one_electrode(axes: Any, field: ContourField, name: str, colour: str) -> None:
-    for q in field.even_charges(name, LEVELS):
-        pieces = field.contours(name, q)
+    for charge in field.even_charges(name, LEVELS):
+        pieces = field.contours(name, charge)
         draw_contours(axes, pieces, colour)
         for piece in pieces[:1]:
             end = piece.points[-1 if piece.points[-1, 1] > piece.points[0, 1] else 0]
-            out = 9.0 * end / np.linalg.norm(end)
-            label = {"xytext": tuple(out), "textcoords": "offset points", "fontsize": 7, "ha": "center", "va": "center"}
-            axes.annotate(f"{1e12 * q:.0f}", 1e3 * end, **label)
+            outward = 9.0 * end / np.linalg.norm(end)
+            label = {
+                "xytext": tuple(outward),
+                "textcoords": "offset points",
+                "fontsize": 7,
+                "ha": "center",
+                "va": "center",
+            }
+            axes.annotate(f"{1e12 * charge:.0f}", 1e3 * end, **label)
 
 
-def _apart_from_triangle(study: Solves) -> tuple[float, float]:
+def _change_from_circle_to_triangle(study: Solves) -> tuple[float, float]:
     """Relative change of a charge from the circle to the triangle over the working area: median and largest."""
     sensor, places = study.choices.sensor("four"), study.places
     circle, triangle = (study.charges(probe, sensor, places) for probe in ("circle", "triangle"))

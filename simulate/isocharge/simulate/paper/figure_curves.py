@@ -1,8 +1,11 @@
 """Fig. 6, 8 and 12: charge against distance."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from isocharge.arrays import Array
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
@@ -22,6 +25,9 @@ FINE = 97
 RATIOS = np.linspace(0.0, 2.0, 41)
 """d32 over d31 that are tried for the order of Fig. 8."""
 
+Extreme = Callable[..., Any]
+"""`np.argmax` or `np.argmin`."""
+
 
 def curves_of(
     study: Solves, probe: str, sensor: Sensor, name: str, degrees: tuple[float, float], length: float | None = None
@@ -33,7 +39,7 @@ def curves_of(
     return Curves.of(film, mapping, FORCE), Curves.of(film, mapping.finer(FINE), FORCE)
 
 
-def numbers(curves: Curves) -> dict[str, object]:
+def curve_numbers(curves: Curves) -> dict[str, object]:
     """A set of curves for programs."""
     return {
         "angle_deg": np.rad2deg(curves.mapping.angle).tolist(),
@@ -72,8 +78,8 @@ def fig_6(study: Solves) -> Entry:
         ),
     ]
     found = {
-        **numbers(at),
-        "four_electrodes": numbers(four),
+        **curve_numbers(at),
+        "four_electrodes": curve_numbers(four),
         "distance_of_650_pC_mm": distance,
         "spread_of_lines": 0.01 * apart,
     }
@@ -107,75 +113,85 @@ def _spread(curves: Curves) -> Array:
 
 
 def fig_8(study: Solves) -> Entry:
-    """Rectangle, biaxial, from B; and who is uppermost."""
+    """Rectangle, biaxial, from B; which line is uppermost."""
     sensor = study.choices.sensor("three")
-    at, smooth = curves_of(study, "rectangle", sensor, "B", PAPER.fig_8_deg)
+    curves, smooth = curves_of(study, "rectangle", sensor, "B", PAPER.fig_8_deg)
+    circle, _ = curves_of(study, "circle", sensor, "B", PAPER.fig_8_deg)
+    printed_length = study.choices.printed_length
+    printed, _ = curves_of(study, "rectangle", study.choices.as_printed(), "B", PAPER.fig_8_deg, printed_length)
+    ratio, share = _best_ratio(study)
+    numbers = {
+        **curve_numbers(curves),
+        "uppermost_deg": _angles(curves, np.argmax),
+        "lowermost_deg": _angles(curves, np.argmin),
+        "uppermost_as_printed_deg": _angles(printed, np.argmax),
+        "lowermost_as_printed_deg": _angles(printed, np.argmin),
+        "best_d32_over_d31": ratio,
+        "share_of_distances_in_order": share,
+    }
+    caption = "Charge of B under a rectangle of 4 x 2 mm; on the right each line against the mean of all."
+    rows = [*_rows_of_order(curves, circle, printed), _row_of_ratio(ratio, share)]
+    return Entry("Fig. 8", caption, _draw_fig_8(curves, smooth), rows, numbers)
+
+
+def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
+    """The curves, and each over the mean of all."""
     figure = new_figure(12.0, 5.2)
     left, right = figure.subplots(1, 2)
-    draw_curves(left, at, smooth)
+    draw_curves(left, curves, smooth)
     left.set_title("Fig. 8: rectangular probe, biaxial film, 1 N")
     mean = smooth.own.mean(axis=0)
-    for angle, own in zip(np.rad2deg(at.mapping.angle), smooth.own, strict=True):
-        colour, width, label = _marked(float(angle))
-        right.plot(1e3 * smooth.mapping.distance, 100.0 * (own / mean - 1.0), lw=width, color=colour, label=label)
+    for angle, charge in zip(np.rad2deg(curves.mapping.angle), smooth.own, strict=True):
+        colour, width, label = _line_style(float(angle))
+        right.plot(1e3 * smooth.mapping.distance, 100.0 * (charge / mean - 1.0), lw=width, color=colour, label=label)
     right.set(xlabel="distance from the centre of B, mm", ylabel="charge over the mean of the lines, %")
     right.set_title("the same, against the mean of the lines")
     right.grid(alpha=0.3)
     right.legend()
-    printed, _ = curves_of(
-        study, "rectangle", study.choices.as_printed(), "B", PAPER.fig_8_deg, study.choices.printed_length
-    )
-    ratio, share = _best_ratio(study)
-    under_circle, _ = curves_of(study, "circle", sensor, "B", PAPER.fig_8_deg)
+    return figure
+
+
+def _rows_of_order(curves: Curves, circle: Curves, printed: Curves) -> list[Row]:
+    """Which line is uppermost and lowermost: under the rectangle, under a circle, and with B where the text has it."""
     why = (
         "from our B 210° leads to the film's centre and 140° farthest from it; nearer the rim a press stretches the "
         "electrode less. Beside the electrode the rectangle's long side, along x, counts more"
     )
-    return Entry(
-        "Fig. 8",
-        "Charge of B under a rectangle of 4 x 2 mm; on the right each line against the mean of all.",
-        figure,
-        [
-            Row("uppermost line at 4, 8, ... mm", "140° throughout", _extreme(at, np.argmax), why),
-            Row(
-                "lowermost line at 4, 8, ... mm",
-                "240° throughout",
-                _extreme(at, np.argmin),
-                "the reverse of the claim, farther out",
-            ),
-            Row(
-                "under a circle",
-                "not given",
-                f"uppermost {_extreme(under_circle, np.argmax)}; lowermost {_extreme(under_circle, np.argmin)}",
-                "no corners: what is left is the place of the rim",
-            ),
-            Row(
-                "with B at 60° from the centre, as printed",
-                "140° uppermost, 240° lowermost",
-                f"uppermost {_extreme(printed, np.argmax)}; lowermost {_extreme(printed, np.argmin)}",
-                "the layout's angles do not explain it",
-            ),
-            Row(
-                "with another d32 over d31",
-                "not given",
-                f"140° uppermost and 240° lowermost at {100 * share:.0f} % of the distances"
-                + (f", with d32/d31 = {ratio:.2f}" if share else ""),
-                f"{'explains it' if share == 1.0 else 'does not explain it'}; tried {RATIOS[0]:g} to {RATIOS[-1]:g}",
-            ),
-        ],
-        {
-            **numbers(at),
-            "uppermost_deg": _angles(at, np.argmax),
-            "lowermost_deg": _angles(at, np.argmin),
-            "uppermost_as_printed_deg": _angles(printed, np.argmax),
-            "lowermost_as_printed_deg": _angles(printed, np.argmin),
-            "best_d32_over_d31": ratio,
-            "share_of_distances_in_order": share,
-        },
+    return [
+        Row("uppermost line at 4, 8, ... mm", "140° throughout", _extreme(curves, np.argmax), why),
+        Row(
+            "lowermost line at 4, 8, ... mm",
+            "240° throughout",
+            _extreme(curves, np.argmin),
+            "the reverse of the claim, farther out",
+        ),
+        Row(
+            "under a circle",
+            "not given",
+            _both_extremes(circle),
+            "no corners: what is left is the place of the rim",
+        ),
+        Row(
+            "with B at 60° from the centre, as printed",
+            "140° uppermost, 240° lowermost",
+            _both_extremes(printed),
+            "the layout's angles do not explain it",
+        ),
+    ]
+
+
+def _row_of_ratio(ratio: float, share: float) -> Row:
+    """Whether another d32 over d31 explains the order."""
+    return Row(
+        "with another d32 over d31",
+        "not given",
+        f"140° uppermost and 240° lowermost at {100 * share:.0f} % of the distances"
+        + (f", with d32/d31 = {ratio:.2f}" if share else ""),
+        f"{'explains it' if share == 1.0 else 'does not explain it'}; tried {RATIOS[0]:g} to {RATIOS[-1]:g}",
     )
 
 
-def _marked(angle: float) -> tuple[str, float, str | None]:
+def _line_style(angle: float) -> tuple[str, float, str | None]:
     """Colour, width and label of a line: the two that the paper names stand out."""
     for named, colour in zip(PAPER.fig_8_deg, COLOURS, strict=False):
         if np.isclose(angle, named):
@@ -183,13 +199,18 @@ def _marked(angle: float) -> tuple[str, float, str | None]:
     return PRESSED, 0.7, "the others" if np.isclose(angle, 190.0) else None
 
 
-def _angles(curves: Curves, extreme: object) -> list[float]:
-    index = extreme(curves.own, axis=0)  # type: ignore[operator]
+def _angles(curves: Curves, extreme: Extreme) -> list[float]:
+    """Angle of the line with the largest or smallest charge at each distance, degrees."""
+    index = extreme(curves.own, axis=0)
     return [round(float(angle), 6) for angle in np.rad2deg(curves.mapping.angle[index])]
 
 
-def _extreme(curves: Curves, extreme: object) -> str:
+def _extreme(curves: Curves, extreme: Extreme) -> str:
     return ", ".join(f"{angle:.0f}°" for angle in _angles(curves, extreme))
+
+
+def _both_extremes(curves: Curves) -> str:
+    return f"uppermost {_extreme(curves, np.argmax)}; lowermost {_extreme(curves, np.argmin)}"
 
 
 def _best_ratio(study: Solves) -> tuple[float, float]:
@@ -228,7 +249,7 @@ def fig_12(study: Solves) -> Entry:
             )
         )
         found[layout] = {
-            **numbers(uniaxial),
+            **curve_numbers(uniaxial),
             "spread": (0.01 * apart[1]).tolist(),
             "spread_biaxial": (0.01 * apart[0]).tolist(),
         }

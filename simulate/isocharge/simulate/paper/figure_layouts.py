@@ -17,6 +17,7 @@ from isocharge.simulate.plots.curves import draw_mapping
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.solver.equilibrium import Equilibrium
 
 FIG_4_DEG, FIG_7_DEG = (35.0, 145.0), PAPER.fig_8_deg
 """Lines from A, the half that Fig. 6 shows and its mirror image; lines from B."""
@@ -185,44 +186,21 @@ def fig_7(study: Solves) -> Entry:
 
 def fig_5(study: Solves) -> Entry:
     """The mesh, and what its fineness is worth."""
-    shown = study.shown
+    unknowns, error, seconds = mesh_errors(study)
     figure = new_figure(15.0, 5.0)
     whole, near, errors = figure.subplots(1, 3)
     for axes, reach, title in ((whole, 46.0, "Fig. 5: mesh, whole film"), (near, 8.0, "at the probe")):
         _draw_mesh(axes, study)
-        x, y = (0.0, 0.0) if axes is whole else (1e3 * shown.at[0], 1e3 * shown.at[1])
+        x, y = (0.0, 0.0) if axes is whole else (1e3 * study.shown.at[0], 1e3 * study.shown.at[1])
         draw_electrodes(axes, study.choices.sensor("three"), names=axes is near, ink="#2e6f9e")
         axes.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", title=title)
         axes.set(xlabel="x, mm", ylabel="y, mm")
-    unknowns, error, seconds = mesh_errors(study)
-    errors.loglog(unknowns, 100.0 * error, "o-", color=FELT, label="ours, the shown press")
-    errors.axhline(0.1, color=INK, lw=0.8, ls=":", label="0.1 %")
-    errors.set_xticks(unknowns, [f"{n:,}" for n in unknowns])
-    errors.minorticks_off()
-    errors.set(xlabel="unknowns", ylabel="worst charge against the finest mesh, %", title="error against mesh")
-    errors.grid(alpha=0.3, which="both")
-    errors.legend(fontsize=8)
-    enough = int(np.argmax(error < 1e-3))
-    order, count = shown.resolution.order, shown.mesh.nodes.shape[0]
-    ours = f"{count} quadrilaterals of order {order}, {3 * shown.mesh.n_node} unknowns"
-    why = "high order on a mesh that follows the probe; the solution is smooth outside of it"
-    fixed = (
-        "README, Speed against error: 13,000 quadratic triangles of dolfinx 0.08 % in 13 s, 13,000 linear ones of "
-        "CalculiX 3 %: too many for a good element, and not enough for one like SHELL63"
-    )
+    _draw_mesh_errors(errors, unknowns, error)
     return Entry(
         "Fig. 5",
         "Elements under a triangular probe: the whole film, at the probe, and the error against the unknowns.",
         figure,
-        [
-            Row("elements", f"{PAPER.elements[0]:,} to {PAPER.elements[1]:,} triangles", ours, why),
-            Row(
-                "fine enough?",
-                "captures the entire geometry well enough",
-                f"0.1 % of a charge takes {unknowns[enough]:,} unknowns and {seconds[enough]:.2f} s",
-                fixed,
-            ),
-        ],
+        _rows_of_mesh(study.shown, unknowns, error, seconds),
         {
             "unknowns": unknowns.tolist(),
             "worst_relative_error": error.tolist(),
@@ -231,6 +209,38 @@ def fig_5(study: Solves) -> Entry:
             "finest": FINEST,
         },
     )
+
+
+def _draw_mesh_errors(axes: Any, unknowns: Array, error: Array) -> None:
+    """Error of a charge against the size of the mesh."""
+    axes.loglog(unknowns, 100.0 * error, "o-", color=FELT, label="ours, the shown press")
+    axes.axhline(0.1, color=INK, lw=0.8, ls=":", label="0.1 %")
+    axes.set_xticks(unknowns, [f"{n:,}" for n in unknowns])
+    axes.minorticks_off()
+    axes.set(xlabel="unknowns", ylabel="worst charge against the finest mesh, %", title="error against mesh")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize=8)
+
+
+def _rows_of_mesh(shown: Equilibrium, unknowns: Array, error: Array, seconds: Array) -> list[Row]:
+    """How many elements, and whether they are enough."""
+    enough = int(np.argmax(error < 1e-3))
+    order, count = shown.resolution.order, shown.mesh.nodes.shape[0]
+    return [
+        Row(
+            "elements",
+            f"{PAPER.elements[0]:,} to {PAPER.elements[1]:,} triangles",
+            f"{count} quadrilaterals of order {order}, {3 * shown.mesh.n_node} unknowns",
+            "high order on a mesh that follows the probe; the solution is smooth outside of it",
+        ),
+        Row(
+            "fine enough?",
+            "captures the entire geometry well enough",
+            f"0.1 % of a charge takes {unknowns[enough]:,} unknowns and {seconds[enough]:.2f} s",
+            "README, Speed against error: 13,000 quadratic triangles of dolfinx 0.08 % in 13 s, 13,000 linear ones of "
+            "CalculiX 3 %: too many for a good element, and not enough for one like SHELL63",
+        ),
+    ]
 
 
 def mesh_errors(study: Solves) -> tuple[Array, Array, Array]:
