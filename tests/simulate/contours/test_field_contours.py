@@ -125,7 +125,7 @@ def test_a_charge_that_is_not_reached_has_no_contour(field):
 def test_wrong_input_is_shown(field):
     with pytest.raises(SensorError, match="no electrode 'Q'"):
         field.contours("Q", 1e-9)
-    with pytest.raises(SceneError, match="charge of 'A': expected a number, got nan pC"):
+    with pytest.raises(SceneError, match="charge of 'A': expected a finite number, got nan pC"):
         field.contours("A", np.nan)
     with pytest.raises(SceneError, match="expected 1 to 1 N, which the forward map covers, got 2 N"):
         ContourField.of(field.forward_map, 2.0)

@@ -197,7 +197,7 @@ def test_another_sensor_where_one_is_expected(dataset):
 
 def test_missing_shard(dataset):
     (dataset / "shard-00001.npz").unlink()
-    with pytest.raises(DatasetError, match=r"shard-00001\.npz: the manifest lists this shard, but it is not there"):
+    with pytest.raises(DatasetError, match=r"shard-00001\.npz: the manifest lists this shard, but the file is missing"):
         read_dataset(dataset)
 
 
@@ -222,7 +222,7 @@ def test_shard_outside_the_folder_is_not_read(dataset, tmp_path):
     """A manifest cannot point elsewhere."""
     shutil.move(dataset / "shard-00000.npz", tmp_path / "shard-00000.npz")
     edit(dataset, lambda manifest: manifest["shards"][0].update(file="../shard-00000.npz"))
-    with pytest.raises(DatasetError, match="it is not there"):
+    with pytest.raises(DatasetError, match="the file is missing"):
         read_dataset(dataset)
 
 

@@ -122,7 +122,7 @@ def test_the_allowed_error_bounds_it_earlier():
 def test_where_nothing_ends_it_the_search_does():
     found = working_area(creased(radius=1e-3), REFERENCE, error=1.0)
     assert (found.radius, found.why) == (1e-3, "searched")
-    assert "no farther than 1 mm" in found.words
+    assert "search ended at 1 mm" in found.words
 
 
 def test_where_nothing_is_known_there_is_none():

@@ -1,6 +1,6 @@
-"""Where contours may meet: nodes to begin at, candidates on the way, the step between.
+"""Candidates for the meeting of contours: a grid of starting points, their bookkeeping, and the Gauss-Newton step.
 
-The bookkeeping of `triangulation`: many presses at once, several candidates for each.
+`triangulation` follows several candidates for each of many presses at once.
 """
 
 from dataclasses import dataclass
@@ -14,16 +14,17 @@ from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.numerics.disk import onto_disk
 
 NODE_SPACING = 0.6e-3
-"""Distance of the nodes that are tried, m: contours bend little on this scale."""
+"""Distance of the grid's nodes, m: contours bend little on this scale."""
 
 FORCES = 24
-"""Forces at which the nodes' total charges are tabled, evenly in the logarithm."""
+"""Number of forces at which the total charge of each node is tabulated, evenly spaced in ln F."""
 
 FLAT = 0.02
-"""Share of an electrode's median slope that slopes count as at least: on a hilltop a contour is not infinitely far."""
+"""Lower bound for the slope of a charge, relative to the electrode's median slope, dimensionless: where the charge map
+is flat, distance = misfit / slope would be infinite."""
 
 LARGEST_STEP, DAMPING = 1e-3, 1e-10
-"""Of a Newton step: its length at most (m), and what keeps it finite where contours touch."""
+"""Largest length of a Gauss-Newton step, m; damping that keeps it finite where contours touch, dimensionless."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,11 @@ class Candidates:
     """Possible positions, any number for each press.
 
     Attributes:
-        press: Whose, shape (n,).
-        at: (x, y), shape (n, 2), m.
-        force: Shape (n,), N.
-        spread: How far from a meeting, shape (n,), m.
-        triples: How many triples of electrodes it is the average of, shape (n,).
+        press: Number of the press, shape (n,).
+        at: Position (x, y), shape (n, 2), m.
+        force: Force, shape (n,), N.
+        spread: Distance from a meeting of the contours, shape (n,), m.
+        triples: Number of triples of electrodes that the position is the average of, shape (n,).
     """
 
     press: Integers
@@ -49,15 +50,15 @@ class Candidates:
 
     @classmethod
     def begin(cls, press: Integers, at: Array, force: Array) -> "Candidates":
-        """Infinitely far from a meeting as yet."""
+        """Candidates to start from: their distance from a meeting counts as infinite."""
         return cls(press, at, force, np.full(press.size, np.inf), np.zeros(press.size, dtype=np.intp))
 
     def joined(self, others: "Candidates") -> "Candidates":
-        """These and others."""
+        """These candidates and others."""
         return Candidates(*(np.concatenate([getattr(self, n), getattr(others, n)]) for n in self.__dataclass_fields__))
 
     def improved(self, at: Array, force: Array, spread: Array) -> "Candidates":
-        """These, moved where that brings them nearer to a meeting."""
+        """These candidates, moved where the new position is nearer to a meeting."""
         nearer = spread < self.spread
         return Candidates(
             self.press,
@@ -68,31 +69,31 @@ class Candidates:
         )
 
     def within(self, tolerance: float) -> "Candidates":
-        """Those no farther than this from a meeting."""
+        """Candidates at most `tolerance` (m) from a meeting."""
         return self[np.flatnonzero(self.spread <= tolerance)]
 
     def distinct(self, tolerance: float) -> "Candidates":
-        """Sorted by press and spread, without those that lie within `tolerance` (m) of a better one of their press."""
+        """Candidates sorted by press and spread, without those within `tolerance` (m) of a better one."""
         ordered = self[np.lexsort((self.spread, self.press))]
         rank = np.arange(ordered.press.size) - np.searchsorted(ordered.press, ordered.press)
         keep = np.ones(rank.size, dtype=bool)
         for worse in range(1, int(rank.max(initial=0)) + 1):
-            here = np.flatnonzero(rank == worse)
-            for better in here - 1 - np.arange(worse)[:, None]:
-                near = np.linalg.norm(ordered.at[here] - ordered.at[better], axis=1) <= tolerance
-                keep[here] &= ~(near & keep[better])
+            row = np.flatnonzero(rank == worse)
+            for better in row - 1 - np.arange(worse)[:, None]:
+                near = np.linalg.norm(ordered.at[row] - ordered.at[better], axis=1) <= tolerance
+                keep[row] &= ~(near & keep[better])
         return ordered[np.flatnonzero(keep)]
 
 
 @dataclass(frozen=True)
 class SeedGrid:
-    """A square grid over the disk with the charges there.
+    """Charges on the nodes of a square grid over the disk, where the search for a meeting starts.
 
     Attributes:
         table: The charges.
-        at: Nodes on the disk, shape (n_node, 2), m.
+        at: Positions of the nodes on the disk, shape (n_node, 2), m.
         place: Their index in the grid, shape (n_node,).
-        side: Nodes along the grid's side.
+        side: Number of nodes along the grid's side.
     """
 
     table: ChargeSpline
@@ -102,7 +103,7 @@ class SeedGrid:
 
     @classmethod
     def of(cls, table: ChargeSpline) -> "SeedGrid":
-        """Over a table's disk, edge included."""
+        """Grid over a table's disk, edge included."""
         side = 2 * max(4, int(np.ceil(table.radius / NODE_SPACING))) + 1
         line = np.linspace(-1.0, 1.0, side) * table.radius
         grid = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -117,14 +118,14 @@ class SeedGrid:
 
     @cached_property
     def gauge(self) -> Array:
-        """Length of the slopes at the middle force, over `table.scale`, shape (n_node, n_electrode), 1/m."""
+        """Length of the slopes at the middle force over `table.scale`, bounded by FLAT; (n_node, n_electrode), 1/m."""
         middle = np.sqrt(np.prod(self.table.force_range))
         _, slope, _ = self.table.first_order(self.at, middle)
         gauge: Array = np.linalg.norm(slope, axis=2) / self.table.scale(middle)
         return np.maximum(gauge, FLAT * np.median(gauge, axis=0))
 
     def charge(self, force: Array) -> Array:
-        """Charges at all nodes, forces of shape (n, 1) or (n, n_node), N; (n, n_node, n_electrode), C."""
+        """Charges at all nodes for forces of shape (n, 1) or (n, n_node), N: shape (n, n_node, n_electrode), C."""
         n_force, n_node, n_electrode = self.nodal.shape
         weights = self.table.by_force(np.log(force))
         if force.shape[1] == 1:
@@ -133,13 +134,13 @@ class SeedGrid:
         return charge
 
     def matching_force(self, charge: Array) -> Array:
-        """Force at which each node has the total of the charges, as far as the table goes; (n, n_node), N."""
+        """Force within the table at which each node has the total of the charges, shape (n, n_node), N."""
         low, high = np.log(self.table.force_range)
         logs = np.linspace(low, high, FORCES)
-        totals, wanted = self.charge(np.exp(logs)[:, None]).sum(axis=2), charge.sum(axis=1)
-        sign = np.sign(totals.sum())  # a film of negative coefficients gives ever more negative charges
-        found = [np.interp(sign * wanted, sign * totals[:, node], logs) for node in range(len(self.at))]
-        force: Array = np.exp(np.stack(found, axis=1))
+        totals, total = self.charge(np.exp(logs)[:, None]).sum(axis=2), charge.sum(axis=1)
+        sign = np.sign(totals.sum())  # with negative coefficients the charges fall with the force
+        matching = [np.interp(sign * total, sign * totals[:, node], logs) for node in range(len(self.at))]
+        force: Array = np.exp(np.stack(matching, axis=1))
         return force
 
     def distance(self, charge: Array, force: Array) -> Array:
@@ -150,7 +151,7 @@ class SeedGrid:
         return distance
 
     def lowest(self, distance: Array, most: int) -> tuple[Integers, Integers]:
-        """Nodes that lie lower than their neighbours, at most so many for each press: (press, node), each (n,)."""
+        """Nodes with a smaller distance than their neighbours, at most `most` per press: (press, node), each (n,)."""
         grid = np.full((len(distance), self.side**2), np.inf)
         grid[:, self.place] = distance
         square = grid.reshape(-1, self.side, self.side)
@@ -167,14 +168,14 @@ class SeedGrid:
 
 
 def gauss_newton_step(slope: Array, away: Array) -> Array:
-    """The step that brings distances `away` to zero, or their squares to the least.
+    """The step of Gauss and Newton towards the least sum of squared distances.
 
     Args:
-        slope: Their derivatives by the unknowns, shape (n, n_distance, n_unknown), of order one.
-        away: Shape (n, n_distance), m.
+        slope: Derivatives of the distances by the unknowns, shape (n, n_distance, n_unknown), of order one.
+        away: Distances, shape (n, n_distance), m.
 
     Returns:
-        Shape (n, n_unknown), m, no longer than LARGEST_STEP.
+        Step, shape (n, n_unknown), m, no longer than LARGEST_STEP.
     """
     square = np.einsum("nij,nik->njk", slope, slope) + DAMPING * np.eye(slope.shape[2])
     step: Array = -np.linalg.solve(square, np.einsum("nij,ni->nj", slope, away)[..., None])[..., 0]

@@ -1,7 +1,7 @@
 """Charge against distance on lines from an electrode: the mapping scheme of Mirbagheri et al. (2007, Fig. 2, 4 and 7).
 
 Lines leave the centre of an electrode at even angles and carry a press at even distances. The paper fits a polynomial
-to the charge along each line; see `drawn` for what it makes of them.
+to the charge along each line; `graphical_method` draws contours through their roots.
 """
 
 from collections.abc import Sequence
@@ -18,21 +18,22 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor, electrode_index
 
 STEP, LENGTH, ANGLE_STEP, HALF_ANGLE = 4e-3, 20e-3, np.deg2rad(10.0), np.deg2rad(70.0)
-"""The paper's step (m) and angle between lines (rad); ours: how long they are, how far to both sides of the centre."""
+"""Distance between presses on a line, m; length of the lines, m; angle between lines, rad; largest angle to both
+sides of the film's centre, rad. Step and angle are the paper's, the others our choice."""
 
 MOST_PRESSES = 100_000
-"""Presses on a scheme's lines: more are a slip of the units."""
+"""Largest number of presses of a scheme: more point to a mistake in the units."""
 
 
 @dataclass(frozen=True)
 class Mapping:
-    """Where a scheme presses.
+    """A mapping scheme: presses at even distances on lines from an electrode.
 
     Attributes:
-        electrode: The one that the lines leave from.
+        electrode: Name of the electrode that the lines leave from.
         origin: Its centre (x, y), m.
-        angle: Of each line from the drawn direction, anticlockwise, shape (n_line,), rad.
-        distance: From the origin, the same on each line, rising, shape (n_step,), m.
+        angle: Angle of each line from the drawn direction, anticlockwise, shape (n_line,), rad.
+        distance: Distances of the presses from the origin, ascending, the same on each line, shape (n_step,), m.
     """
 
     electrode: str
@@ -50,19 +51,19 @@ class Mapping:
         step: float = STEP,
         length: float = LENGTH,
     ) -> "Mapping":
-        """Lines at even angles, the last one included whether or not it falls on the step.
+        """Lines at even angles; the last angle always has a line, even between two steps.
 
         Args:
-            sensor: Its calibration moves the electrodes.
-            electrode: Where the lines leave from.
+            sensor: The sensor, whose calibration moves the electrodes.
+            electrode: Name of the electrode that the lines leave from.
             angles: First and last angle, rad; HALF_ANGLE to both sides of the film's centre if absent.
-            angle_step: Between lines, rad.
-            step: Between presses on a line, and to the first, m.
-            length: Of the lines, m.
+            angle_step: Angle between lines, rad.
+            step: Distance between presses on a line, and of the first from the electrode's centre, m.
+            length: Length of the lines, m.
 
         Raises:
             SensorError: If there is no such electrode.
-            SceneError: If angles, steps or length give no press, or far too many.
+            SceneError: If angles, steps or length give no press, or more than MOST_PRESSES.
         """
         centre = sensor.electrodes[electrode_index(sensor, electrode)].centre
         x, y = sensor.calibration.place(np.array(centre))
@@ -75,14 +76,14 @@ class Mapping:
 
     @property
     def points(self) -> Array:
-        """Every press (x, y), shape (n_line, n_step, 2), m."""
+        """Positions (x, y) of the presses, shape (n_line, n_step, 2), m."""
         direction = np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
         points: Array = np.array(self.origin) + self.distance[None, :, None] * direction[:, None]
         return points
 
     @property
     def reach(self) -> float:
-        """Distance of the farthest press from the film's centre, m: what a forward map must cover."""
+        """Distance of the farthest press from the film's centre, m; a forward map must cover it."""
         return float(np.linalg.norm(self.points, axis=-1).max())
 
     def finer(self, count: int) -> "Mapping":
@@ -110,10 +111,10 @@ class Curves:
     """Charges along the lines of a mapping.
 
     Attributes:
-        mapping: Where was pressed.
+        mapping: Where the presses are.
         electrodes: Names, in the order of the charges.
         probe: The footprint.
-        force: N.
+        force: Force of each press, N.
         charge: Touch charges, shape (n_line, n_step, n_electrode), C.
     """
 
@@ -125,7 +126,7 @@ class Curves:
 
     @classmethod
     def of(cls, forward_map: ForwardMap, mapping: Mapping, force: float) -> "Curves":
-        """Evaluate a forward map on the lines.
+        """Charges of a forward map on the lines.
 
         Raises:
             SceneError: If the map does not cover a press or the force.
@@ -138,8 +139,8 @@ class Curves:
     @property
     def own(self) -> Array:
         """Charge of the electrode that the lines leave from, shape (n_line, n_step), C."""
-        own: Array = self.charge[..., self.electrodes.index(self.mapping.electrode)]
-        return own
+        charge: Array = self.charge[..., self.electrodes.index(self.mapping.electrode)]
+        return charge
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON, in degrees, mm, pC and N."""
@@ -161,7 +162,7 @@ class Curves:
         }
 
     def polynomials(self, degree: int) -> Sequence[Polynomial]:
-        """The paper's fit: charge (C) of the own electrode as a polynomial of the distance (m), one for each line.
+        """The paper's fit: charge (C) of the mapping's electrode as a polynomial of the distance (m) on each line.
 
         Raises:
             SceneError: If a line has fewer presses than the polynomial has coefficients.

@@ -1,7 +1,8 @@
-"""Isocharge contours: where a press gives an electrode a wanted charge, for one probe and force.
+"""Isocharge contours: where presses give an electrode the same charge, for one probe and force.
 
-Traced on the tabled charges by marching squares, then every point is moved along the slope until the forward map itself
-gives the wanted charge there: within ON_CONTOUR. `drawn` makes the same contours the way the paper does.
+Contours are traced on the tabulated charges by marching squares; then each point is moved along the slope until the
+forward map itself gives the charge there, within ON_CONTOUR. `graphical_method` draws the same contours as the paper
+does.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,10 +22,10 @@ from isocharge.simulate.numerics.disk import onto_disk
 from isocharge.simulate.sensor.sensor import electrode_index
 
 GRID = 0.2e-3
-"""Spacing of the squares that are marched, m."""
+"""Side of the squares of the trace, m: contours bend little within one."""
 
 ON_CONTOUR, STEPS = 2e-8, 12
-"""Distance (m) from the contour at which a point is on it, and how many steps it may take there."""
+"""Distance from the contour at which a point counts as on it, m, and the largest number of Newton steps to it."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,9 @@ class Contour:
     """One connected piece of a contour.
 
     Attributes:
-        electrode: Whose charge.
-        charge: C.
-        points: (x, y) in order along it, shape (n, 2), m; the first again at the end if it is closed.
+        electrode: Name of the electrode.
+        charge: Its charge on the contour, C.
+        points: (x, y) in order along the contour, shape (n, 2), m; the first again at the end if it is closed.
     """
 
     electrode: str
@@ -43,7 +44,7 @@ class Contour:
 
     @property
     def closed(self) -> bool:
-        """Whether it ends where it began."""
+        """Whether the contour ends where it begins."""
         return bool(np.array_equal(self.points[0], self.points[-1]))
 
 
@@ -52,9 +53,9 @@ class ContourField:
     """Contours of a sensor under one probe and force, from the field.
 
     Attributes:
-        forward_map: Gives the charges.
-        table: The same as splines, for slopes and for a first trace.
-        force: N.
+        forward_map: Charges of the sensor under the probe.
+        table: The same charges as splines, for slopes and for the first trace.
+        force: Force of the presses, N.
     """
 
     forward_map: ForwardMap
@@ -65,7 +66,7 @@ class ContourField:
     def of(
         cls, forward_map: ForwardMap, force: float, radius: float | None = None, spacing: float | None = None
     ) -> "ContourField":
-        """Of presses within `radius` (m) of the centre, as far as the map reaches if absent; see `ChargeSpline.of`.
+        """Contours of presses within `radius` (m) of the centre, by default that of the map; see `ChargeSpline.of`.
 
         Raises:
             SceneError: If the map does not cover the force or the radius.
@@ -74,15 +75,15 @@ class ContourField:
         return cls(forward_map, ChargeSpline.of(forward_map, radius, spacing), force)
 
     def contours(self, electrode: str, charge: float) -> tuple[Contour, ...]:
-        """The pieces of an electrode's contour of a charge (C); none where no press gives it.
+        """The pieces of an electrode's contour of a charge (C); an empty tuple if no press gives it.
 
         Raises:
             SensorError: If there is no such electrode.
-            SceneError: If the charge is no number.
+            SceneError: If the charge is not finite.
         """
         index = electrode_index(self.forward_map.sensor, electrode)
         if not np.isfinite(charge):
-            raise SceneError(f"charge of {electrode!r}: expected a number, got {charge * 1e12:g} pC")
+            raise SceneError(f"charge of {electrode!r}: expected a finite number, got {charge * 1e12:g} pC")
         x, y, values = self._squares
         unit = np.abs(values[..., index]).max()
         traced = contour_generator(x, y, values[..., index] / unit, line_type=LineType.Separate).lines(charge / unit)
@@ -91,15 +92,15 @@ class ContourField:
         return tuple(Contour(electrode, charge, points) for points in refined if len(points) > 1)
 
     def reach(self, electrode: str) -> tuple[float, float]:
-        """Smallest and largest charge of an electrode that is met on the squares, C."""
+        """Smallest and largest charge of an electrode on the corners of the squares, C."""
         values = self._squares[2][..., electrode_index(self.forward_map.sensor, electrode)]
         return float(np.min(values)), float(np.max(values))
 
     def even_charges(self, electrode: str, count: int) -> Sequence[float]:
-        """So many charges between the smallest and the largest, C: in even ratios, or steps if the sign changes."""
+        """`count` charges between the smallest and the largest, C: in even ratios, or steps if the sign changes."""
         low, high = self.reach(electrode)
-        spread = np.geomspace if low * high > 0.0 else np.linspace
-        return [float(charge) for charge in spread(low, high, count + 2)[1:-1]]
+        even = np.geomspace if low * high > 0.0 else np.linspace
+        return [float(charge) for charge in even(low, high, count + 2)[1:-1]]
 
     def to_dict(
         self, charges: Mapping[str, Sequence[float]], contours: Mapping[str, Sequence[tuple[Contour, ...]]]
@@ -132,7 +133,7 @@ class ContourField:
     def _squares(self) -> tuple[Array, Array, Array]:
         """Corners x and y of the squares, shape (n,), m, and charges there, shape (n, n, n_electrode), C.
 
-        Beyond the disk's edge the charges are those of the edge, so that the squares there are whole.
+        Outside the disk the charges are those of its edge, so that the squares on the edge are complete.
         """
         radius = self.table.radius
         line = np.linspace(-radius, radius, 2 * int(np.ceil(radius / GRID)) + 1)
@@ -145,7 +146,7 @@ class ContourField:
         inside = np.hypot(line[:, 0], line[:, 1]) <= radius
         if inside.all():
             return [line]
-        starts, ends = (np.flatnonzero(np.diff(np.pad(inside, 1).astype(int)) == way) for way in (1, -1))
+        starts, ends = (np.flatnonzero(np.diff(np.pad(inside, 1).astype(int)) == change) for change in (1, -1))
         parts = []
         for start, end in zip(starts, ends, strict=True):
             before = [_onto_edge(line[start], line[start - 1], radius)] if start > 0 else []
@@ -176,14 +177,14 @@ class ContourField:
             )
         if np.array_equal(points[0], points[-1]):
             at[-1] = at[0]
-        kept: Array = at[np.abs(away) <= ON_CONTOUR]
-        return kept
+        on_contour: Array = at[np.abs(away) <= ON_CONTOUR]
+        return on_contour
 
 
 def _onto_edge(inner: Array, outer: Array, radius: float) -> Array:
     """Where the segment from a point inside to one outside leaves the disk."""
-    way = outer - inner
-    a, b, c = way @ way, inner @ way, inner @ inner - radius**2
+    segment = outer - inner
+    a, b, c = segment @ segment, inner @ segment, inner @ inner - radius**2
     share = (-b + np.sqrt(b * b - a * c)) / a
-    edge: Array = inner + share * way * (1.0 - 1e-12)
+    edge: Array = inner + share * segment * (1.0 - 1e-12)
     return edge

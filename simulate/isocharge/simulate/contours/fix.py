@@ -1,4 +1,4 @@
-"""A position fix: what triangulation gives, and why there may be none."""
+"""The result of triangulation: positions, or the reason why a press has none."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -10,17 +10,18 @@ from isocharge.arrays import Array, Integers
 from isocharge.errors import SensorError
 
 TOLERANCE = 1e-3
-"""Distance (m) of crossings from their mean up to which contours meet there."""
+"""Largest distance of three crossings from their mean at which the contours count as meeting there, m."""
 
 APART = 0.2e-3
-"""Distance (m) from which two places where contours meet are two."""
+"""Smallest distance between two meetings, m: nearer ones count as one."""
 
 AMBIGUOUS, RESOLVED = 2.0, 1e-5
-"""A second meeting counts if its spread is up to so many times the first one's, or below this length (m)."""
+"""A second meeting makes a fix ambiguous if its spread is at most AMBIGUOUS times that of the first (dimensionless), or
+below RESOLVED, m."""
 
 
 class Meeting(IntEnum):
-    """How contours met."""
+    """Whether contours meet in one point."""
 
     met = 0
     no_contour = 1
@@ -40,12 +41,12 @@ class Meeting(IntEnum):
 
 @dataclass(frozen=True)
 class Fix:
-    """Positions found; those that were not are NaN, and `status` says why.
+    """Positions of presses; NaN for those without one, and `status` says why.
 
     Attributes:
         x: Shape (n,), m.
         y: Shape (n,), m.
-        force: Given or found, shape (n,), N.
+        force: Known or estimated, shape (n,), N.
         spread: Largest distance of a crossing from the mean of its triple, or, with the force unknown, root mean square
             distance of the contours from the position; shape (n,), m.
         status: A `Meeting` for each press, shape (n,).
@@ -61,7 +62,7 @@ class Fix:
 
     @property
     def found(self) -> np.ndarray:
-        """Which presses have a position, shape (n,)."""
+        """Whether each press has a position, shape (n,)."""
         found: np.ndarray = self.status == Meeting.met
         return found
 

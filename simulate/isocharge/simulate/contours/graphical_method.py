@@ -3,7 +3,7 @@
 A polynomial is fitted to the charge along each line of a mapping scheme, its root is one point of the contour, and the
 points are joined by a spline (AutoCAD's SPLINE: cubic, through its points, parameter the length of the chords, free
 ends). Two contours are intersected as splines; the three crossings that lie together most closely are averaged.
-`contours` and `triangulation` do the same from the field, without the error of the drawing.
+`field_contours` and `triangulation` do the same from the field, without the error of the drawing.
 """
 
 from collections.abc import Mapping as Map
@@ -22,19 +22,19 @@ from isocharge.simulate.contours.fix import AMBIGUOUS, APART, TOLERANCE, Fix, Me
 from isocharge.simulate.forward.checks import as_charges
 
 DEGREE = 4
-"""Of the polynomial along a line; the paper does not say its own. Lower ones miss the charge near the electrode."""
+"""Degree of the polynomial along a line: our choice, since lower degrees miss the charge near the electrode."""
 
 PER_SPAN = 8
-"""Chords that a span of the spline is cut into before its crossings are refined."""
+"""Number of chords of each span of the spline, on which crossings are located before they are refined."""
 
 
 @dataclass(frozen=True)
 class DrawnContour:
-    """A contour drawn by hand.
+    """A contour by the graphical method: a spline through the roots on the lines.
 
     Attributes:
-        electrode: Whose charge.
-        charge: C.
+        electrode: Name of the electrode.
+        charge: Its charge on the contour, C.
         knots: Roots on the lines, in the order of their angle, shape (n, 2), m; n >= 2.
     """
 
@@ -44,7 +44,7 @@ class DrawnContour:
 
     @property
     def points(self) -> Array:
-        """Along the spline, shape (n, 2), m."""
+        """Points along the spline, shape (n, 2), m."""
         points: Array = self._spline(self._parameters)
         return points
 
@@ -61,18 +61,18 @@ class DrawnContour:
         return parameters
 
     def crossings(self, other: "DrawnContour") -> Array:
-        """Where two contours cross, shape (n, 2), m."""
+        """Positions where two contours cross, shape (n, 2), m."""
         starts = _chord_crossings(self.points, other.points)
         mine, theirs = self._parameters, other._parameters
-        found = []
+        crossings = []
         for i, s, j, t in starts:
             at = np.array([mine[i] + s * (mine[i + 1] - mine[i]), theirs[j] + t * (theirs[j + 1] - theirs[j])])
-            for _ in range(4):  # Newton on the splines: the chords are within some um already
+            for _ in range(4):  # Newton's method on the splines; the chords are within a few um
                 gap = self._spline(at[0]) - other._spline(at[1])
                 matrix = np.stack([self._spline(at[0], 1), -other._spline(at[1], 1)], axis=1)
                 at = at - np.linalg.lstsq(matrix, gap, rcond=None)[0]
-            found.append(self._spline(at[0]))
-        return np.array(found).reshape(-1, 2)
+            crossings.append(self._spline(at[0]))
+        return np.array(crossings).reshape(-1, 2)
 
 
 def _chord_crossings(first: Array, second: Array) -> list[tuple[int, float, int, float]]:
@@ -88,12 +88,12 @@ def _chord_crossings(first: Array, second: Array) -> list[tuple[int, float, int,
 
 
 def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnContour | None:
-    """The contour of the electrode that the curves belong to, or None if fewer than two lines reach the charge.
+    """The contour of the mapping's electrode, or None if fewer than two lines reach the charge.
 
     Args:
         curves: Charges along the lines of a mapping.
-        charge: C.
-        degree: Of the polynomial along each line.
+        charge: Charge on the contour, C.
+        degree: Degree of the polynomial along each line.
 
     Raises:
         SceneError: If a line has too few presses for the degree.
@@ -127,9 +127,9 @@ def drawn_to_dicts(
 
 
 def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) -> float:
-    """Where a line's polynomial has the charge, m: the nearest such place to the electrode, NaN if there is none.
+    """Smallest distance at which a line's polynomial has the charge, m; NaN if it has it nowhere.
 
-    Half a step before the first press still counts.
+    Distances from half of the first press's count.
     """
     roots = (polynomial - charge).roots()
     real = roots.real[np.abs(roots.imag) < 1e-9 * np.abs(distance[-1])]
@@ -139,12 +139,12 @@ def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) 
 
 @dataclass(frozen=True)
 class DrawnTriangulation:
-    """Triangulation with drawn contours.
+    """Triangulation with contours of the graphical method.
 
     Attributes:
         curves: One set for each electrode, each from that electrode, in the order of the charges.
-        degree: Of the polynomials.
-        tolerance: Distance (m) of crossings from their mean up to which contours meet.
+        degree: Degree of the polynomials.
+        tolerance: Largest distance of three crossings from their mean at which contours meet, m.
     """
 
     curves: Sequence[Curves]
@@ -156,7 +156,7 @@ class DrawnTriangulation:
 
     @property
     def electrode_names(self) -> tuple[str, ...]:
-        """In the order of the charges."""
+        """Names of the electrodes, in the order of the charges."""
         return tuple(curves.mapping.electrode for curves in self.curves)
 
     def contours(self, charge: Array) -> tuple[DrawnContour | None, ...]:
@@ -164,7 +164,7 @@ class DrawnTriangulation:
         return tuple(draw_contour(c, float(q), self.degree) for c, q in zip(self.curves, charge, strict=True))
 
     def locate(self, charge: Array) -> Fix:
-        """Positions of presses of the force that the curves were made with.
+        """Positions of presses; their force must be that of the curves.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), C.
@@ -173,8 +173,8 @@ class DrawnTriangulation:
             ChargeError: If the charges are not finite or not one for each electrode.
         """
         charge = as_charges(charge, self.electrode_names)
-        found = [self._locate_one(row) for row in charge]
-        x, y, spread, status, triples = (np.array(column) for column in zip(*found, strict=True))
+        fixes = [self._locate_one(row) for row in charge]
+        x, y, spread, status, triples = (np.array(column) for column in zip(*fixes, strict=True))
         force = np.full(len(charge), self.curves[0].force)
         return Fix(x, y, force, spread, status.astype(np.intp), triples.astype(np.intp))
 

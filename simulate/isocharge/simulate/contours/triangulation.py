@@ -2,9 +2,8 @@
 
 Each charge confines the press to a contour. Two contours cross in points; the paper takes the three crossings of three
 electrodes' contours that lie together and calls their mean the position, and with four electrodes averages over the
-four triples. So does `Triangulation.locate`: it looks for places that all contours pass by, follows each pair of
-contours to its crossing there by Newton's method, and says in `Fix.status` where there is no such place or more than
-one.
+four triples. So does `Triangulation.locate`: it searches for positions near all contours, follows each pair of contours
+to its crossing by Newton's method, and says in `Fix.status` if there is no such position, or more than one.
 
 With the force unknown the contours move with it, and the press is where, over all forces, they come closest to meeting:
 the point and the force with the least mean square distance to the contours (`Triangulation.locate_with_force`).
@@ -25,17 +24,17 @@ from isocharge.simulate.forward.checks import as_charges, check_forces
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.numerics.disk import onto_disk
 
-BESIDE = 2.0
-"""How many tolerances beside a meeting a second one is looked for."""
+SECOND_SEARCH = 2.0
+"""Distance from a meeting at which the search for a second one starts, in tolerances."""
 
 SEEDS = 4
-"""Places looked at for each press, the most promising first."""
+"""Largest number of starting points for each press, those nearest to all contours first."""
 
 STEPS, CONVERGED = 25, 1e-8
-"""Newton steps, and the distance (m) from a contour at which a point is on it."""
+"""Number of Newton steps, and the distance from a contour at which a point counts as on it, m."""
 
 CHUNK = 512
-"""Presses looked at together: keeps the working arrays within some 100 MB."""
+"""Number of presses located together: keeps the working arrays within some 100 MB."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class Triangulation:
 
     Attributes:
         table: The charges.
-        tolerance: Distance (m) of crossings from their mean up to which contours meet.
+        tolerance: Largest distance of three crossings from their mean at which contours meet, m.
     """
 
     table: ChargeSpline
@@ -68,8 +67,8 @@ class Triangulation:
 
         Args:
             forward_map: Charges of the sensor under the probe.
-            radius: Look within this distance from the centre only, m; as far as the map reaches if absent.
-            spacing: Distance of the knots that the charges are tabled with, m; that of `ChargeSpline.of` if absent.
+            radius: Largest distance of a position from the centre, m; that of the map if absent.
+            spacing: Distance of the knots of the tabulated charges, m; that of `ChargeSpline.of` if absent.
             tolerance: See the class.
 
         Raises:
@@ -114,8 +113,8 @@ class Triangulation:
 
     def _in_chunks(self, charge: Array, force: Array | None) -> Fix:
         if len(charge) == 0:
-            none = np.zeros(0)
-            return Fix(none, none, none, none, none.astype(np.intp), none.astype(np.intp))
+            empty = np.zeros(0)
+            return Fix(empty, empty, empty, empty, empty.astype(np.intp), empty.astype(np.intp))
         parts = []
         for start in range(0, len(charge), CHUNK):
             rows = slice(start, start + CHUNK)
@@ -128,40 +127,40 @@ class Triangulation:
         seeds = self._seeds(charge, force)
         closest = self._approach(charge, seeds, fixed=force is not None)
         closest = closest.within(self.tolerance).distinct(APART)
-        beside = self._approach(charge, self._beside(closest, fixed=force is not None), fixed=force is not None)
-        closest = closest.joined(beside.within(self.tolerance)).distinct(APART)
+        second = self._approach(charge, self._second_seeds(closest, fixed=force is not None), fixed=force is not None)
+        closest = closest.joined(second.within(self.tolerance)).distinct(APART)
         return closest if force is None else self._cross(charge, closest)
 
-    def _choose(self, charge: Array, force: Array | None, found: Candidates) -> Fix:
-        """One of the candidates of each press, or none."""
+    def _choose(self, charge: Array, force: Array | None, candidates: Candidates) -> Fix:
+        """The best candidate of each press, if it has one and it is not ambiguous."""
         count = len(charge)
-        order = np.lexsort((found.spread, found.press))
-        press, spread = found.press[order], found.spread[order]
+        order = np.lexsort((candidates.spread, candidates.press))
+        press, spread = candidates.press[order], candidates.spread[order]
         first = np.searchsorted(press, np.arange(count))
-        here = np.bincount(press, minlength=count)
+        matches = np.bincount(press, minlength=count)
         best = np.full(count, np.nan)
-        best[here > 0] = spread[first[here > 0]]
-        rival = np.full(count, np.inf)
-        rival[here > 1] = spread[first[here > 1] + 1]
-        status = np.where(here > 0, int(Meeting.met), int(Meeting.apart))
-        status[(here == 0) & self._out_of_reach(charge, force)] = Meeting.no_contour
-        status[rival <= np.maximum(AMBIGUOUS * best, RESOLVED)] = Meeting.twice
+        best[matches > 0] = spread[first[matches > 0]]
+        second = np.full(count, np.inf)
+        second[matches > 1] = spread[first[matches > 1] + 1]
+        status = np.where(matches > 0, int(Meeting.met), int(Meeting.apart))
+        status[(matches == 0) & self._out_of_reach(charge, force)] = Meeting.no_contour
+        status[second <= np.maximum(AMBIGUOUS * best, RESOLVED)] = Meeting.twice
         met = np.flatnonzero(status == Meeting.met)
         chosen = order[first[met]]
         columns = np.full((3, count), np.nan)
-        columns[:, met] = np.stack([*found.at[chosen].T, found.force[chosen]])
+        columns[:, met] = np.stack([*candidates.at[chosen].T, candidates.force[chosen]])
         triples = np.zeros(count, dtype=np.intp)
-        triples[met] = found.triples[chosen]
+        triples[met] = candidates.triples[chosen]
         return Fix(columns[0], columns[1], columns[2] if force is None else force, best, status, triples)
 
-    # Where to begin
+    # Starting points
 
     @cached_property
     def _nodes(self) -> SeedGrid:
         return SeedGrid.of(self.table)
 
     def _seeds(self, charge: Array, force: Array | None) -> Candidates:
-        """Nodes that all contours pass by more closely than by their neighbours."""
+        """Nodes that are nearer to all contours than their neighbours are."""
         nodes = self._nodes
         forces = nodes.matching_force(charge) if force is None else force[:, None]
         distance = nodes.distance(charge, forces)
@@ -170,22 +169,22 @@ class Triangulation:
         return Candidates.begin(press, nodes.at[node], chosen)
 
     def _out_of_reach(self, charge: Array, force: Array | None) -> np.ndarray:
-        """Which presses have a charge that no contour reaches, shape (n,)."""
+        """Whether each press has a charge that no node of the grid has, shape (n,)."""
         low, high = self._nodes.reach(force if force is not None else np.array(self.table.force_range))
         if force is None:
             low, high = low.min(axis=0), high.max(axis=0)
         slack = 0.02 * (high - low)
         return np.asarray(((charge < low - slack) | (charge > high + slack)).any(axis=1))
 
-    # From there to the meeting
+    # From the starting points to the meeting
 
-    def _beside(self, closest: Candidates, *, fixed: bool) -> Candidates:
-        """Where a second meeting would be if the map folds between: to both sides where the contours part least."""
+    def _second_seeds(self, closest: Candidates, *, fixed: bool) -> Candidates:
+        """Starting points for a second meeting across a fold: on both sides, in the direction of least change."""
         _, slope, by_force = self.table.first_order(closest.at, closest.force)
         free = self._unit_slopes(slope, by_force, closest.force, fixed=fixed)
         softest = np.linalg.svd(free)[2][:, -1]
         sides = []
-        for aside in (-BESIDE * self.tolerance, BESIDE * self.tolerance):
+        for aside in (-SECOND_SEARCH * self.tolerance, SECOND_SEARCH * self.tolerance):
             force = closest.force * (1.0 if fixed else np.exp(aside * softest[:, -1] / self.table.radius))
             sides.append(Candidates.begin(closest.press, closest.at + aside * softest[:, :2], force))
         return sides[0].joined(sides[1])
@@ -219,36 +218,36 @@ class Triangulation:
         for triple in combinations(range(count), 3):
             corners = crossing[:, [pairs.index(pair) for pair in combinations(triple, 2)]]
             mean = corners.mean(axis=1)
-            apart = np.linalg.norm(corners - mean[:, None], axis=2).max(axis=1)
-            good = apart <= self.tolerance  # not so for the NaN of a pair that does not cross
+            distance = np.linalg.norm(corners - mean[:, None], axis=2).max(axis=1)
+            good = distance <= self.tolerance  # False for the NaN of a pair that does not cross
             total[good] += mean[good]
-            spread[good] = np.maximum(spread[good], apart[good])
+            spread[good] = np.maximum(spread[good], distance[good])
             met += good
         some = met > 0
-        made = Candidates(near.press[some], total[some] / met[some, None], near.force[some], spread[some], met[some])
-        return made.distinct(APART)
+        means = Candidates(near.press[some], total[some] / met[some, None], near.force[some], spread[some], met[some])
+        return means.distinct(APART)
 
     def _crossing(self, charge: Array, near: Candidates, pair: tuple[int, int]) -> Array:
-        """Where two contours cross, by Newton's method from the candidates; shape (n, 2), NaN where they do not."""
-        at, wanted = near.at.copy(), charge[near.press][:, pair]
-        found = np.full_like(at, np.nan)
+        """Crossing of two contours, by Newton's method from each candidate; shape (n, 2), NaN if they do not cross."""
+        at, charges = near.at.copy(), charge[near.press][:, pair]
+        crossing = np.full_like(at, np.nan)
         active = np.arange(len(at))
         for _ in range(STEPS):
             force = near.force[active]
             value, slope, _ = self.table.first_order(at[active], force)
             gauge = self._gauge(slope, force)[:, pair]
-            away = (value[:, pair] - wanted[active]) / gauge
-            going = np.abs(away).max(axis=1) >= CONVERGED
-            found[active[~going]] = at[active[~going]]
-            active = active[going]
+            away = (value[:, pair] - charges[active]) / gauge
+            moving = np.abs(away).max(axis=1) >= CONVERGED
+            crossing[active[~moving]] = at[active[~moving]]
+            active = active[moving]
             if active.size == 0:
                 break
-            step = gauss_newton_step((slope[:, pair] / gauge[..., None])[going], away[going])
+            step = gauss_newton_step((slope[:, pair] / gauge[..., None])[moving], away[moving])
             at[active] = onto_disk(at[active] + step, self.table.radius)
-        return found
+        return crossing
 
     def _gauge(self, slope: Array, force: Array) -> Array:
-        """Length of the slopes, at least a share of what is usual; shape (n, n_electrode), C/m."""
+        """Length of the slopes, at least FLAT of the electrode's median; shape (n, n_electrode), C/m."""
         usual = np.median(self._nodes.gauge, axis=0) * self.table.scale(force)[:, None]
         gauge: Array = np.maximum(np.linalg.norm(slope, axis=2), FLAT * usual)
         return gauge

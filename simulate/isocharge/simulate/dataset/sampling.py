@@ -2,7 +2,7 @@
 
 sobol   scrambled Sobol points: fewer gaps and clumps than independent draws (Owen 1998); each probe has its own
 random  independent draws
-grid    every force at every orientation at every place of a square lattice: at most as many presses as asked for
+grid    every force at every orientation at every place of a square lattice: no more presses than asked for
 
 Sobol and random presses are uniform over the disk and in the logarithm of the force; the probes take turns.
 """
@@ -62,8 +62,8 @@ class Sweep:
     Attributes:
         radius: Largest distance of a press from the centre, m.
         force_range: Smallest and largest force, N.
-        samples: How many, shared equally among the probes; a grid takes the nearest number that is not above.
-        seed: Of the sequence; a grid has none.
+        samples: Number of presses, shared equally among the probes; a grid may have fewer, see `sampling`.
+        seed: Seed of the sequence; a grid uses none.
         orientation: "fixed" (as the probe is given) or "random": spread over a full turn, or, in a grid, evenly over
             the turn after which the probe looks the same.
         sampling: "sobol", "random" or "grid".
@@ -123,13 +123,13 @@ class Sweep:
         return unit
 
     def _force(self, share: Array) -> Array:
-        """Forces at these shares of the range's logarithm, N."""
+        """Forces (N) at shares of the range in ln F."""
         low, high = np.log(self.force_range)
         force: Array = np.clip(np.exp(low + (high - low) * share), *self.force_range)
         return force
 
     def _grid(self, most: int, period: float) -> tuple[Array, Array, Array, Array]:
-        """At most so many presses: about as many steps in each direction, then as many forces as still fit."""
+        """At most `most` presses: equal numbers of steps in each direction, then all forces that still fit."""
         forces, turns = self.force_range[0] < self.force_range[1], self.orientation == "random" and period > 0.0
         side = max(1, round(most ** (1.0 / (2 + forces + turns))))
         n_turn = side if turns else 1

@@ -81,7 +81,7 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
         folder: Where; must not exist yet.
         sensor: The sensor.
         shards: Samples, a shard at a time; consumed as they are written.
-        about: What made them, for the manifest: probes, ranges, seed, solver.
+        about: Origin of the samples, for the manifest: probes, ranges, seed, solver.
 
     Returns:
         The folder.
@@ -195,11 +195,11 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
 
 
 def _differs(sensor: Sensor, expected: Sensor) -> str:
-    """Its name, or what is not as expected under the same name."""
+    """Name of a sensor that is not the expected one; under the same name, what differs."""
     if sensor.name != expected.name:
         return repr(sensor.name)
-    here, there = sensor_to_dict(sensor), sensor_to_dict(expected)
-    keys = sorted(key for key in here.keys() | there.keys() if here.get(key) != there.get(key))
+    actual, target = sensor_to_dict(sensor), sensor_to_dict(expected)
+    keys = sorted(key for key in actual.keys() | target.keys() if actual.get(key) != target.get(key))
     return f"one of that name with another {', '.join(keys)}"
 
 
@@ -226,7 +226,7 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
 def _read_shard(folder: Path, entry: dict[str, Any], sensor: Sensor) -> Samples:
     path = folder / Path(entry["file"]).name
     if not path.is_file():
-        raise DatasetError(f"{path}: the manifest lists this shard, but it is not there; make the dataset again")
+        raise DatasetError(f"{path}: the manifest lists this shard, but the file is missing; make the dataset again")
     data = path.read_bytes()
     checksum = sha256_of(data)
     if checksum != entry["sha256"]:

@@ -1,4 +1,4 @@
-"""What identifiability needs of a charge map: charges and their derivatives by the contact."""
+"""Charges and their derivatives by the contact: all that identifiability needs to know of a sensor."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,28 +9,28 @@ import numpy as np
 from isocharge.arrays import Array
 
 STEPS = (5e-5, 5e-5, 1e-3)
-"""Steps in x and y (m) and in ln F by which charges without derivatives are differentiated."""
+"""Steps of the central differences in x and y (m) and in ln F (dimensionless)."""
 
 
 class ChargeModel(Protocol):
     """Charges as a function of the contact (x, y, F), m and N, within a disk and a range of forces.
 
-    `ChargeSpline` is one; `ChargeFunction` makes one of any function.
+    `ChargeSpline` is one; `ChargeFunction` turns any function into one.
     """
 
     @property
     def radius(self) -> float:
-        """Of the disk, m."""
+        """Radius of the disk, m."""
 
     @property
     def force_range(self) -> tuple[float, float]:
-        """N."""
+        """Smallest and largest force, N."""
 
     def charge(self, contact: Array) -> Array:
-        """(n, 3) to (n, n_electrode), C."""
+        """Charges, shape (n, n_electrode), C, of contacts (x, y, F), shape (n, 3), m and N."""
 
     def jacobian(self, contact: Array) -> Array:
-        """d(Q)/d(x, y, ln F): (n, 3) to (n, n_electrode, 3), C/m, C/m and C."""
+        """Derivatives d(Q)/d(x, y, ln F) of contacts, shape (n, 3): (n, n_electrode, 3), C/m, C/m and C."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ class ChargeFunction:
 
     Attributes:
         function: Contacts (x, y, F), shape (n, 3), m and N, to charges (n, n_electrode), C.
-        radius: Where it holds, m.
-        force_range: Where it holds, N.
-        steps: Of the differences in x, y (m) and ln F. On the edge of the domain they reach out of it by so much,
-            unless `radius` and `force_range` are given a little smaller than where the function holds.
+        radius: Largest distance from the centre at which the function holds, m.
+        force_range: Smallest and largest force at which it holds, N.
+        steps: Steps of the differences in x, y (m) and ln F. At the edge of the domain the function is called this far
+            outside; give a slightly smaller `radius` and `force_range` if it does not hold there.
     """
 
     function: Callable[[Array], Array]

@@ -2,8 +2,8 @@
 
 Charges over the amplitude's square, which takes most of the force out of them (`mechanics.scaling`), are
 tabulated at a few forces, each a cubic spline in (x, y) that is fitted by least squares to presses on the disk, so that
-no place is singular; between the forces go Lagrange's polynomials in the logarithm. A forward map interpolates its
-fields between forces in the same way, so there its own nodes lose nothing.
+no place is singular. Between the forces Lagrange polynomials in ln F interpolate. A forward map interpolates its fields
+between forces in the same way, so at its force nodes nothing is lost.
 """
 
 from collections.abc import Callable
@@ -24,25 +24,27 @@ from isocharge.simulate.numerics.interpolation import barycentric_weights, cheby
 from isocharge.simulate.sensor.film import Film
 
 SPACING, SHARE = 0.3e-3, 1.0 / 6.0
-"""Distance of knots: at most this, m, and this share of the probe's reach."""
+"""Distance of the knots: at most SPACING, m, and at most SHARE of the probe's reach, on which the charges vary."""
 
 CELLS = (8, 400)
 """Fewest and most cells of the spline across the disk."""
 
 OVERSAMPLING, ON_EDGE = 1.6, 2.0
-"""Presses for each cell of the disk, and for each of its edge's: there the spline has them on one side only."""
+"""Presses to fit per cell of the disk, and per cell along its edge, where the spline has presses on one side only."""
 
 STIFFNESS = 5e-3
-"""Weight of the coefficients' third differences in the fit: holds those at the disk's edge, which few presses reach."""
+"""Weight of the third differences of the coefficients in the fit, dimensionless: it determines the coefficients at the
+disk's edge, which few presses reach."""
 
 MORE_FORCES = 2
-"""Further force nodes where d33 counts, whose charges go with the force itself: up to 1e-4 of them is missed."""
+"""Additional force nodes with d33: its charges are proportional to the force, not to the squared amplitude. The error
+is then at most 1e-4 of them."""
 
 CHECKS = 400
-"""Presses at which the table is compared with what it was made from."""
+"""Presses at which the table is compared with the function it tabulates."""
 
 STRIDE = 1e-4
-"""Relative step in force of its derivative."""
+"""Step in ln F of the derivative by ln F, dimensionless."""
 
 Forward = Callable[[Array, Array, Array], Array]
 """(x, y, force) of shape (n,), SI, to charges of shape (n, n_electrode)."""
@@ -50,7 +52,7 @@ Forward = Callable[[Array, Array, Array], Array]
 
 @dataclass(frozen=True)
 class ChargeSpline:
-    """Touch charges as a function of (x, y, F), for one probe as it is turned.
+    """Touch charges as a function of (x, y, F), for one probe in one orientation.
 
     Attributes:
         electrode_names: In the order of the charges.
@@ -59,7 +61,7 @@ class ChargeSpline:
         force_range: Smallest and largest force, N.
         force: Forces of the table, shape (n_term,), N.
         table: Scaled charge over x and y, values of shape (n_term, n_electrode).
-        error: Largest error against what it was made from, relative to a press's largest charge.
+        error: Largest error against the tabulated function, relative to a press's largest charge.
     """
 
     electrode_names: tuple[str, ...]
@@ -106,12 +108,12 @@ class ChargeSpline:
         at = radius * _samples(cells)
         columns = [forward(at[:, 0], at[:, 1], np.full(len(at), f)) / amplitude_squared(film, float(f)) for f in force]
         table = _least_squares(at, np.stack(columns, axis=1), radius, cells)
-        made = cls(electrode_names, film, radius, force_range, force, table, np.nan)
-        return replace(made, error=_difference(made, forward))
+        spline = cls(electrode_names, film, radius, force_range, force, table, np.nan)
+        return replace(spline, error=_largest_error(spline, forward))
 
     @property
     def electrodes(self) -> int:
-        """How many charges a press gives."""
+        """Number of electrodes."""
         return len(self.electrode_names)
 
     def charge(self, contact: Array) -> Array:
@@ -151,7 +153,7 @@ class ChargeSpline:
         return np.einsum("nk,nke->ne", weights, terms), slope, np.einsum("nk,nke->ne", change, terms)
 
     def scale(self, force: Array | float) -> Any:
-        """What charges go with, near enough for a polynomial in ln F to do the rest; of the shape of `force` (N)."""
+        """Approximate dependence of the charges on the force (N), dimensionless; a polynomial in ln F corrects it."""
         return amplitude_squared(self.film, force)
 
     def by_force(self, logs: Array) -> Array:
@@ -167,7 +169,7 @@ class ChargeSpline:
         return terms
 
     def slopes(self, position: Array) -> Array:
-        """Their derivatives by x and y, shape (n, n_term, n_electrode, 2), 1/m."""
+        """Derivatives of `terms` by x and y, shape (n, n_term, n_electrode, 2), 1/m."""
         return np.stack([self.table(position, nu=nu) for nu in ((1, 0), (0, 1))], axis=-1)
 
     def _check_inside(self, contact: Array) -> None:
@@ -175,7 +177,7 @@ class ChargeSpline:
 
 
 def _force_nodes(forward_map: ForwardMap) -> Array:
-    """The map's own, between which it is a polynomial; more where the contact pressure (d33) goes another way."""
+    """Force nodes of the forward map, between which it is a polynomial; more of them with d33."""
     low, high = np.log(forward_map.force_range)
     if forward_map.sensor.piezo.d33 == 0.0 or low == high:
         return forward_map.family.force
@@ -192,11 +194,11 @@ def _samples(cells: int) -> Array:
 
 
 def _least_squares(at: Array, values: Array, radius: float, cells: int) -> NdBSpline:
-    """Spline of values, shape (n, ...), at (n, 2): normal equations, with third differences held small."""
+    """Cubic spline through values, shape (n, ...), at positions (n, 2): least squares with small third differences."""
     knots = np.concatenate([[-radius] * 3, np.linspace(-radius, radius, cells + 1), [radius] * 3])
     count = knots.size - 4
-    found = NdBSpline.design_matrix(at, (knots, knots), 3)  # as wide as its last entry
-    design = csr_array((found.data, found.indices, found.indptr), shape=(len(at), count**2))
+    entries = NdBSpline.design_matrix(at, (knots, knots), 3)  # only as wide as its last entry
+    design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(at), count**2))
     third = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
     smooth = STIFFNESS * vstack([kron(third, eye_array(count)), kron(eye_array(count), third)])
     normal = (design.T @ design + smooth.T @ smooth).tocsc()
@@ -206,11 +208,11 @@ def _least_squares(at: Array, values: Array, radius: float, cells: int) -> NdBSp
     return NdBSpline((knots, knots), solved.reshape(count, count, *values.shape[1:]), 3)
 
 
-def _difference(made: ChargeSpline, forward: Forward) -> float:
+def _largest_error(spline: ChargeSpline, forward: Forward) -> float:
     """Largest error at presses that are spread evenly but off the lattice."""
-    at, number = made.radius * sunflower(CHECKS), np.arange(CHECKS)
-    low, high = made.force_range
+    at, number = spline.radius * sunflower(CHECKS), np.arange(CHECKS)
+    low, high = spline.force_range
     force = np.clip(low * (high / low) ** (number * 0.618 % 1.0), low, high)
     truth = forward(at.real, at.imag, force)
-    apart = made.charge(np.stack([at.real, at.imag, force], axis=1)) - truth
-    return float((np.abs(apart).max(axis=1) / np.abs(truth).max(axis=1)).max())
+    error = spline.charge(np.stack([at.real, at.imag, force], axis=1)) - truth
+    return float((np.abs(error).max(axis=1) / np.abs(truth).max(axis=1)).max())

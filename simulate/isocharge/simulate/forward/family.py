@@ -1,4 +1,4 @@
-"""A family of presses of one probe: where it is solved, and how a member between is interpolated."""
+"""A family of presses of one probe: where it is solved, and how presses between are interpolated."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 TURNS = 7
-"""Orientations at least: the film's rim, far from the probe, is felt by its first few harmonics only."""
+"""Smallest number of orientations: only the first harmonics of the rim, far from the probe, reach the probe."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """Where a family is solved.
+    """Nodes at which a family of presses is solved.
 
     Attributes:
         radius: Largest distance from the centre, m.
@@ -24,7 +24,7 @@ class Family:
         distance: Distances from the centre, Chebyshev nodes, shape (n_distance,), m.
         force: Forces, Chebyshev nodes in the logarithm, shape (n_force,), N.
         turn: Orientations against the direction of the press, evenly spread over a full turn, shape (n_turn,), rad.
-        folds: How many of them look alike: the probe maps onto itself that often in a full turn.
+        folds: Order of the probe's rotational symmetry: how often it maps onto itself in a full turn.
     """
 
     radius: float
@@ -43,7 +43,15 @@ class Family:
         period: float,
         turns: int = TURNS,
     ) -> "Family":
-        """So many distances and forces; orientations for a probe that looks the same after `period` (rad, 0 round)."""
+        """Nodes for a probe.
+
+        Args:
+            radius: Largest distance from the centre, m.
+            force_range: Smallest and largest force, N.
+            count: Number of distances and of forces.
+            period: Angle after which the probe looks the same, rad; 0 for a round one.
+            turns: Smallest number of orientations.
+        """
         low, high = np.log(force_range)
         force = np.exp(chebyshev_nodes(count[1], low, high)) if high > low else np.array([force_range[0]])
         folds = round(2.0 * np.pi / period) if period > 0.0 else 1
@@ -53,7 +61,7 @@ class Family:
 
     @property
     def solved_turns(self) -> Array:
-        """The orientations that look different."""
+        """Orientations that must be solved: one period of the probe."""
         return self.turn[: self.turn.size // self.folds]
 
     def weights(self, distance: Array, force: Array, turn: Array) -> Array:
@@ -76,7 +84,7 @@ class Family:
         return by_turn
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
-        """From fields of the orientations that look different to all, each node in its turned place.
+        """Fields of all orientations from those that were solved, each node in its turned place.
 
         Args:
             solved: Shape (n_distance, n_solved_turn, n_force, n_element * n_local * 3), in the probe's frame.
@@ -91,13 +99,14 @@ class Family:
             turn_stress(field[..., mesh.turned(fold, self.folds), :, :], -2.0 * np.pi * fold / self.folds)
             for fold in range(self.folds)
         ]
-        every: Array = np.concatenate(parts, axis=2).reshape(-1, solved.shape[-1])
-        return every
+        unfolded: Array = np.concatenate(parts, axis=2).reshape(-1, solved.shape[-1])
+        return unfolded
 
     def probes_between(self, count: int) -> Iterator[tuple[float, float, float, float]]:
-        """Presses to check an interpolation with: between the nodes and, last, at the edge of the family.
+        """Presses to check the interpolation with: between the nodes and, last, at the edge of the family.
 
-        (distance m, angle rad, force N, turn rad).
+        Yields:
+            Distance (m), angle (rad), force (N) and orientation (rad).
         """
         shares = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
         low, high = np.log(self.force_range)

@@ -30,7 +30,7 @@ The stress has a kink on the footprint's edge; where that crosses an electrode 2
 """
 
 NEAR = 3e-3
-"""Distance (m) between an electrode's nearest corner and the probe's edge below which the fine rule is used."""
+"""Distance from the probe's edge to an electrode below which the fine rule is used, m."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class ReadoutPoints:
 
 
 def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
-    """Touch charge of every electrode.
+    """Touch charge of each electrode.
 
     Args:
         sensor: Its electrodes, coefficients and readout are used; its film must be the one that was solved.
@@ -100,8 +100,8 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     if sensor.piezo.d33 == 0.0:
         return np.zeros(len(sensor.electrodes))
     covered = [_covered(sensor.calibration.place(np.array(e.corners)), probe, complex(*at)) for e in sensor.electrodes]
-    pressed: Array = -sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered)
-    return pressed
+    charge: Array = -sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered)
+    return charge
 
 
 def _covered(corners: Array, probe: Probe, at: complex) -> float:
@@ -113,7 +113,7 @@ def _covered(corners: Array, probe: Probe, at: complex) -> float:
 
 
 def pretension_charge(sensor: Sensor) -> Array:
-    """Reading without load, from the uniform pretension: what a touch charge is counted from; (n_electrode,), C."""
+    """Reading without load, from the uniform pretension, shape (n_electrode,), C; touch charges are counted from it."""
     per_area = (sensor.piezo.d31 + sensor.piezo.d32) * sensor.film.pretension
     return _per_area(sensor, per_area)
 
@@ -147,6 +147,6 @@ def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
         np.array(start) + at[:, None] * (np.array(end) - np.array(start))
         for start, end in zip(electrode.corners, electrode.corners[1:] + electrode.corners[:1], strict=True)
     )
-    half, none = 0.5 * share, np.zeros_like(share)
-    first, second = np.stack([half, none, none], axis=1), np.stack([none, half, none], axis=1)
+    half, zero = 0.5 * share, np.zeros_like(share)
+    first, second = np.stack([half, zero, zero], axis=1), np.stack([zero, half, zero], axis=1)
     return np.concatenate([left, right, lower, upper]), np.concatenate([first, first, second, second])

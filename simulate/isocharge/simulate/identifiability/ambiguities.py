@@ -1,7 +1,7 @@
 """Contacts far apart with the same charges, and the contact that explains charges best.
 
-A map without folds may still bring two distant contacts to the same charges, as a sheet may come to lie on itself
-without a crease. Twins are looked for over the whole film at once.
+A map without folds may still give two distant contacts the same charges, as a sheet may lie on itself without a crease.
+The search for such pairs covers the whole film at once.
 """
 
 from dataclasses import dataclass
@@ -18,19 +18,21 @@ from isocharge.simulate.numerics.disk import lattice
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 INDISTINGUISHABLE_SIGMAS = 3.0
-"""Distance of the charges, in standard deviations, up to which two contacts count as alike."""
+"""Largest difference of the charges at which two contacts count as the same, standard deviations of the noise."""
 
 APART, WIDTHS = 1e-3, 6.0
-"""Twins are farther from each other than this (m), and than so many standard deviations of the position."""
+"""Smallest distance of an ambiguous pair: APART, m, and WIDTHS standard deviations of the position. Nearer contacts are
+one uncertain contact."""
 
 FORCES = 8
-"""Forces at which a twin's charges are tabulated."""
+"""Number of forces at which the charges of the second contact are tabulated."""
 
 POLISH, DAMPING = 8, 1e-3
 """Levenberg and Marquardt's steps for a twin, and their damping."""
 
 EXPONENT = 2.0 / 3.0
-"""Of the charge over the force, roughly: what is tabulated is what remains."""
+"""Exponent of the force in the charge of a slack membrane, dimensionless; the ratio of the charge to this power of the
+force is tabulated, because it varies little."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,8 @@ class AmbiguousPairs:
 
     Attributes:
         first: (x, y, F), shape (n, 3), m and N.
-        second: The same for its twin.
-        distance: Between their charges, in standard deviations, shape (n,).
+        second: The other contact of each pair, likewise.
+        distance: Difference of their charges, standard deviations of the noise, shape (n,).
     """
 
     first: Array
@@ -57,22 +59,22 @@ class AmbiguousPairs:
 
     @property
     def reach(self) -> Array:
-        """How far from the centre the outer one of each pair is, shape (n,), m."""
+        """Distance of the outer contact of each pair from the centre, shape (n,), m."""
         reach: Array = np.maximum(np.hypot(*self.first[:, :2].T), np.hypot(*self.second[:, :2].T))
         return reach
 
 
 def find_ambiguous_pairs(model: ChargeModel, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
-    """Contacts far apart whose charges are alike within the noise.
+    """Pairs of contacts far apart whose charges differ by less than the noise.
 
-    For each place of a square lattice, pressed with `force`, every other place is tried with the force that fits best
-    there; the best two are improved by least squares.
+    For each position of a square lattice, pressed with `force`, every other position is tried with the force that fits
+    best; the best two are improved by least squares.
 
     Args:
         model: The charges.
-        noise: Of the readings.
-        force: Of the first of each pair, N; the twin may have any.
-        places: Of the lattice: 1,000 take some 3 s with splines.
+        noise: Noise of the readings.
+        force: Force of the first contact of each pair, N; the second may have any.
+        places: Number of positions of the lattice: 1,000 take some 3 s with splines.
     """
     unit = lattice(places)
     position = model.radius * (1.0 - 1e-9) * np.stack([unit.real, unit.imag], axis=1)
@@ -82,25 +84,25 @@ def find_ambiguous_pairs(model: ChargeModel, noise: NoiseModel, force: float, pl
     pairs, start = _candidates(model, noise, position, charge, apart)
     second, distance = nearest_contact(model, noise, charge[pairs], start)
     far = np.hypot(*(second - first[pairs])[:, :2].T) > apart[pairs]
-    kept = np.flatnonzero(far & (distance < INDISTINGUISHABLE_SIGMAS))
-    found = AmbiguousPairs(first[pairs[kept]], second[kept], distance[kept])
-    order = np.argsort(found.reach, kind="stable")
-    return AmbiguousPairs(found.first[order], found.second[order], found.distance[order])
+    ambiguous = np.flatnonzero(far & (distance < INDISTINGUISHABLE_SIGMAS))
+    unordered = AmbiguousPairs(first[pairs[ambiguous]], second[ambiguous], distance[ambiguous])
+    order = np.argsort(unordered.reach, kind="stable")
+    return AmbiguousPairs(unordered.first[order], unordered.second[order], unordered.distance[order])
 
 
 def _candidates(
     model: ChargeModel, noise: NoiseModel, position: Array, charge: Array, apart: Array
 ) -> tuple[Integers, Array]:
-    """Numbers of places and contacts (x, y, F) elsewhere that may be their twins."""
+    """Numbers of first contacts, and for each a contact (x, y, F) far away that may have the same charges."""
     curve, terms = _tabulate(model, position)
     near = cKDTree(position)
     neighbours = near.query(position, min(9, len(position)))[1]
     numbers, contacts = [], []
-    for i, own in enumerate(charge):
-        both = np.broadcast_to(own, charge.shape)
-        logs = curve.best(terms, both, noise)
+    for i, row in enumerate(charge):
+        observed = np.broadcast_to(row, charge.shape)
+        logs = curve.best(terms, observed, noise)
         known = curve.charge(logs, terms)
-        chi2 = ((both - known) ** 2 / noise.variance(known)).sum(axis=1)
+        chi2 = ((observed - known) ** 2 / noise.variance(known)).sum(axis=1)
         lowest = chi2 <= chi2[neighbours].min(axis=1)
         elsewhere = np.flatnonzero(lowest & (np.hypot(*(position - position[i]).T) > apart[i]))
         best = elsewhere[np.argsort(chi2[elsewhere])[:2]]
@@ -110,7 +112,7 @@ def _candidates(
 
 
 def _tabulate(model: ChargeModel, position: Array) -> tuple[ForceProfile, Array]:
-    """Charges at every place as a function of the force."""
+    """Charges at every position as a function of the force."""
     low, high = np.log(model.force_range)
     nodes = chebyshev_nodes(FORCES, low, high) if high > low else np.array([low])
     rows = [

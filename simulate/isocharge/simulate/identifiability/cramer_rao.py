@@ -1,4 +1,4 @@
-"""The Cramer-Rao limit: how well an unbiased estimator can tell a contact from noisy charges, at best.
+"""The Cramer-Rao limit: the smallest errors of an unbiased estimator of a contact from noisy charges.
 
 With J = d(Q)/d(x, y, ln F, ...) the Fisher information is J' diag(i) J, i what one reading tells about its charge
 (`NoiseModel.information`), and the covariance of an unbiased estimate is at least its inverse (Kay 1993, ch. 3).
@@ -14,19 +14,19 @@ from isocharge.simulate.forward.charge_model import ChargeModel
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 SMALLEST = 1e-14
-"""Smallest eigenvalue of a scaled information that counts as more than rounding; limits stop there, some 1e7 times
-above the others, instead of becoming infinite."""
+"""Lower bound for the eigenvalues of the scaled Fisher information, dimensionless: smaller ones are rounding errors.
+Limits become some 1e7 times larger than the others instead of infinite."""
 
 NOTHING = 1e-60
-"""Information (1/m^2, or without unit) below which a parameter is not told at all."""
+"""Fisher information below which a parameter counts as unobservable: 1/m^2 for x and y, dimensionless for ln F."""
 
 
 @dataclass(frozen=True)
 class CramerRao:
-    """Limits of some contacts.
+    """Cramer-Rao limits of contacts.
 
     Attributes:
-        covariance: Of (x, y, ln F, ...), shape (n, p, p): m, m, and without unit.
+        covariance: Smallest covariance of (x, y, ln F, ...), shape (n, p, p); x and y in m, ln F dimensionless.
     """
 
     covariance: Array
@@ -52,9 +52,9 @@ def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel) -> CramerRao:
     """Limits from charges and their derivatives.
 
     Args:
-        charge: Shape (n, n_electrode), C.
-        jacobian: d(Q)/d(parameters), shape (n, n_electrode, p); the first three are x, y, ln F.
-        noise: Of the readings, not clean.
+        charge: Charges, shape (n, n_electrode), C.
+        jacobian: d(Q)/d(parameters), shape (n, n_electrode, p); the first three parameters are x, y, ln F.
+        noise: Noise of the readings, with white noise above zero.
     """
     return CramerRao(_invert(np.einsum("nei,ne,nej->nij", jacobian, noise.information(charge), jacobian)))
 
@@ -65,7 +65,7 @@ def limits_at(model: ChargeModel, contact: Array, noise: NoiseModel) -> CramerRa
 
 
 def _invert(information: Array) -> Array:
-    """Of symmetric matrices, shape (n, p, p), of any scale in each parameter, hardly singular or wholly so."""
+    """Inverse of symmetric matrices, shape (n, p, p), with parameters of any scale; singular ones are regularised."""
     size = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), NOTHING))
     both = size[:, :, None] * size[:, None, :]
     values, vectors = np.linalg.eigh(information / both)

@@ -1,13 +1,14 @@
-"""Where a charge map folds.
+"""Folds of a charge map.
 
-Charges tell a contact only where the map from (x, y, ln F) to the charges is one to one. It stops being so across a
-fold, where J = d(Q)/d(x, y, ln F) loses rank and turns over. With three electrodes det J changes sign there. With more,
-J spans a space of its own at each contact; between neighbours the map has turned over where
-det(J(a)' W J(b)) < 0, W = 1 / sigma^2. For three electrodes that is the sign of det J(a) det J(b), so one rule does for
-all. Electrodes on one circle fold a biaxial film near this circle, however many they are: what they collect hardly
-changes if the press moves to its mirror image in the circle.
+Charges determine a contact only where the map from (x, y, ln F) to the charges is one to one. Across a fold it is not:
+J = d(Q)/d(x, y, ln F) loses rank and the map turns over. With three electrodes det J changes sign across the fold.
+With more, J is not square; the map turns over between neighbours a and b if det(J(a)' W J(b)) < 0, W = 1 / sigma^2. For
+three electrodes this is the sign of det J(a) det J(b), so one rule serves all.
 
-Without any fold two contacts may still be alike, see `isocharge.simulate.identifiability.ambiguities`.
+Electrodes on one circle fold a biaxial film near this circle, however many they are: their charges hardly change if the
+press moves to its mirror image in the circle.
+
+Even without folds two contacts may have the same charges, see `ambiguities`.
 """
 
 import numpy as np
@@ -26,7 +27,7 @@ def turned_over(first: Array, second: Array) -> Booleans:
 
 
 def _unit_columns(jacobian: Array) -> Array:
-    """Scaled so that the sign of a determinant is not lost in rounding."""
+    """Columns of unit length: the sign of a determinant is then not lost in rounding."""
     unit: Array = jacobian / np.maximum(np.linalg.norm(jacobian, axis=-2, keepdims=True), np.finfo(float).tiny)
     return unit
 
@@ -38,7 +39,7 @@ def scaled_jacobian(model: ChargeModel, contact: Array, noise: NoiseModel) -> Ar
 
 
 def singular_values(scaled: Array) -> Array:
-    """Of J / sigma in the plane of positions, the force being unknown: (n, n_electrode, 3) to (n, 2), 1/m.
+    """Singular values of J / sigma for the position with unknown force: (n, n_electrode, 3) to (n, 2), 1/m.
 
     One over them are the smallest and the largest standard deviation of the position by direction; at a fold the second
     is zero.

@@ -9,21 +9,21 @@ from isocharge.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 STEPS = 4
-"""Steps towards the best force; each is right to second order in what the exponent leaves out."""
+"""Number of steps to the best force: the error of each is of second order in the error of the exponent."""
 
 FAR = 30.0
-"""Largest change of the charges' logarithm in one step."""
+"""Largest change of ln Q in one step, dimensionless."""
 
 
 @dataclass(frozen=True)
 class ForceProfile:
-    """How the charges at a place depend on the force: weights(ln F) @ terms.
+    """Charges at a position as a function of the force: weights(ln F) @ terms.
 
     Attributes:
-        weights: From logarithms of forces, shape (n,), to (n, n_term).
-        ends: Smallest and largest logarithm.
-        logs: Logarithms at which the exponent is tabulated, ascending.
-        exponent: d ln Q / d ln F of the weights' sum, which stands for every charge.
+        weights: Function from ln F, shape (n,), to weights, shape (n, n_term).
+        ends: Smallest and largest ln F.
+        logs: ln F at which the exponent is tabulated, ascending.
+        exponent: d ln Q / d ln F of the sum of the weights, taken for every charge.
     """
 
     weights: Callable[[Array], Array]

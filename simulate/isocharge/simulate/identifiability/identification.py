@@ -1,4 +1,4 @@
-"""What the charges of a sensor can tell about a contact: limits over the film, folds, working area, in numbers."""
+"""How well the charges of a sensor determine a contact: limits over the film, folds and the working area."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,10 +20,10 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 CLEAR = 0.75
-"""Share of the film's radius up to which is looked at most: nearer to the rim presses cost ever more."""
+"""Largest search radius over the film's radius, dimensionless: presses nearer to the rim take ever longer to solve."""
 
 RETREAT, RETREATS = 0.9, 3
-"""Factor by which to look less far where the charges cannot be interpolated, and how often at most."""
+"""Factor on the search radius if the charges cannot be interpolated that far, and the largest number of reductions."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class LimitMap:
     """Cramer-Rao limits under one force on rings about the centre.
 
     Attributes:
-        force: N.
-        rings: The positions.
+        force: Force, N.
+        rings: Positions.
         position: Position error, root mean square, shape (n_ring, n_angle), m.
         relative_force: Error of the force over the force, shape (n_ring, n_angle).
         condition: Largest over smallest standard deviation of the position by direction, shape (n_ring, n_angle).
@@ -46,7 +46,7 @@ class LimitMap:
 
     @classmethod
     def of(cls, charges: ChargeSpline, noise: NoiseModel, force: float, rings: Rings) -> "LimitMap":
-        """At every position of the rings."""
+        """Limits at every position of the rings."""
         contact = rings.contacts(force)
         limits = limits_at(charges, contact, noise)
         largest, smallest = singular_values(scaled_jacobian(charges, contact, noise)).T
@@ -54,7 +54,7 @@ class LimitMap:
         return cls(force, rings, *(rings.per_ring(value) for value in values))
 
     def summary(self, radius: float) -> dict[str, float]:
-        """Over the disk, each position with its area."""
+        """Errors within a radius (m), each position weighted with its area."""
         inside = self.rings.distance <= radius * (1.0 + 1e-9)
         area = np.repeat(self.rings.distance[inside], self.position.shape[1])
         position, force = 1e3 * self.position[inside].ravel(), 1e2 * self.relative_force[inside].ravel()
@@ -72,15 +72,15 @@ class LimitMap:
 
 @dataclass(frozen=True)
 class Identification:
-    """What the charges can tell.
+    """How well the charges determine a contact.
 
     Attributes:
         sensor: The sensor.
         probe: The footprint.
-        noise: Of the readings.
-        charges: Its charges as splines.
-        area: The working area, with folds and twins.
-        maps: Limits under the least force, 1 N if that is in the range, and the greatest.
+        noise: Noise of the readings.
+        charges: Charges of the sensor as splines.
+        area: The working area, with folds and ambiguous pairs.
+        maps: Limits under the smallest force, 1 N if that is in the range, and the largest.
     """
 
     sensor: Sensor
@@ -91,7 +91,7 @@ class Identification:
     maps: tuple[LimitMap, ...] = field(repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON; what is infinite is None."""
+        """For JSON; infinite radii are None."""
         area, rings = self.area, self.maps[0].rings
         return {
             "sensor": self.sensor.name,
@@ -109,30 +109,30 @@ class Identification:
                 "searched_mm": 1e3 * area.searched,
                 "words": area.words,
             },
-            "limits_in_working_area": [made.summary(area.radius) for made in self.maps] if area.radius else [],
+            "limits_in_working_area": [limits.summary(area.radius) for limits in self.maps] if area.radius else [],
             "by_distance": {
                 "distance_mm": (1e3 * rings.distance).tolist(),
                 **{
-                    f"{name}_position_mm_at_{made.force:g}_N": (1e3 * of(made.position, axis=1)).tolist()
-                    for made in self.maps
-                    for name, of in (("median", np.median), ("worst", np.max))
+                    f"{name}_position_mm_at_{limits.force:g}_N": (1e3 * statistic(limits.position, axis=1)).tolist()
+                    for limits in self.maps
+                    for name, statistic in (("median", np.median), ("worst", np.max))
                 },
             },
             "folds_mm": (1e3 * area.folds).round(3).tolist(),
-            "twins": _twin_rows(area),
+            "twins": _pair_rows(area),
         }
 
 
 def identify(
     forward_map: ForwardMap, noise: NoiseModel, *, error: float = ERROR, charges: ChargeSpline | None = None
 ) -> Identification:
-    """Find out what the charges can tell within the radius and the forces of a forward map: some 10 s.
+    """How well the charges determine contacts within the radius and the forces of a forward map: some 10 s.
 
     Args:
-        forward_map: The charges.
-        noise: Of the readings, not clean.
+        forward_map: Charges of the sensor under the probe.
+        noise: Noise of the readings, with white noise above zero.
         error: Largest Cramer-Rao position error allowed in the working area, m.
-        charges: The map as splines, if they are there already.
+        charges: The forward map as splines; tabulated if absent.
     """
     charges = charges or ChargeSpline.of(forward_map)
     low, high = forward_map.force_range
@@ -144,9 +144,9 @@ def identify(
 
 
 def search_radius(sensor: Sensor, probe: Probe) -> float:
-    """How far from the centre to look for the working area, m: to the outermost corner of an electrode.
+    """Radius of the search for the working area, m: to the outermost corner of an electrode.
 
-    Electrodes that surround the working area bound it, mostly by a fold through themselves.
+    Electrodes that surround the working area bound it, mostly by a fold that runs through them.
     """
     corners = np.concatenate([sensor.calibration.place(np.array(e.corners)) for e in sensor.electrodes])
     return min(float(np.hypot(*corners.T).max()), CLEAR * sensor.film.radius - probe.reach)
@@ -155,12 +155,11 @@ def search_radius(sensor: Sensor, probe: Probe) -> float:
 def map_to_search(
     sensor: Sensor, probe: Probe, force_range: tuple[float, float], progress: Progress | None = None
 ) -> ForwardMap:
-    """A forward map that reaches as far as the working area is looked for, or nearly: where the charges are too rough
-    to interpolate so far out, less far.
+    """A forward map over the search radius, or a smaller one if the charges cannot be interpolated so far out.
 
     Raises:
         SceneError: If some presses cannot exist.
-        SolveError: If an equilibrium or the wanted interpolation error was not reached.
+        SolveError: If an equilibrium or the target of the interpolation error was not reached.
     """
     radius = search_radius(sensor, probe)
     for _ in range(RETREATS):
@@ -177,7 +176,7 @@ def _quantile(values: Array, weights: Array, share: float) -> float:
     return float(values[order][np.searchsorted(total, share * total[-1])])
 
 
-def _twin_rows(area: WorkingArea, most: int = 20) -> list[dict[str, Any]]:
+def _pair_rows(area: WorkingArea, most: int = 20) -> list[dict[str, Any]]:
     def contact(row: Array) -> dict[str, float]:
         return {"x_mm": 1e3 * float(row[0]), "y_mm": 1e3 * float(row[1]), "force_N": float(row[2])}
 

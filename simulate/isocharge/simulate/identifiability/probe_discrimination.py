@@ -1,9 +1,9 @@
-"""Whether the charges tell what presses: its size, or its shape.
+"""Whether the charges determine the size or the shape of the probe.
 
-The charges of a contact under one probe are explained as well as they can be by a contact under another. What remains,
-in standard deviations of the noise, is all that tells the two apart; how far the explaining contact lies from the true
-one is the error of taking the one for the other. For the radius of a circle the same is asked of small changes: it
-is a fourth unknown of the Cramer-Rao limit. Three charges have nothing left for it.
+The charges of a contact under one probe are explained by the best contact under another. The remaining difference, in
+standard deviations of the noise, is all that distinguishes the two probes; the distance between the true and the
+explaining contact is the error of taking one probe for the other. For small changes of a circle's radius, the radius is
+a fourth unknown of the Cramer-Rao limit, which needs four charges.
 """
 
 from collections.abc import Sequence
@@ -25,13 +25,14 @@ from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.probe import Circle
 
 DISTINGUISHABLE_SIGMAS = 3.0
-"""Standard deviations by which charges must differ to tell two probes apart from one press."""
+"""Smallest difference of the charges at which one press distinguishes two probes, standard deviations of the noise."""
 
 INSIDE = 1.3
-"""Factor by which forces keep off the ends of the range: the explaining contact's may differ."""
+"""Ratio between the ends of the force range and the compared forces, dimensionless: the explaining contact may need
+another force."""
 
 RADIUS_STEP = 0.1
-"""Relative step in the probe's radius of its derivative."""
+"""Step of the derivative by the probe's radius, relative to the radius."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,9 @@ class ProbeConfusion:
 
     Attributes:
         contact: True (x, y, F), shape (n, 3), m and N.
-        sigmas: By how many standard deviations of the noise the charges still differ, shape (n,).
+        sigmas: Remaining difference of the charges, standard deviations of the noise, shape (n,).
         shift: Distance between the true and the explaining position, shape (n,), m.
-        force: Explaining over true force, shape (n,).
+        force: Explaining over true force, dimensionless, shape (n,).
     """
 
     contact: Array
@@ -81,8 +82,8 @@ def size_limit(
     Args:
         smaller: Charges under a circle whose radius is smaller by `RADIUS_STEP`.
         middle: Charges under the circle.
-        larger: Under one that is larger by `RADIUS_STEP`.
-        noise: Of the readings.
+        larger: Charges under a circle whose radius is larger by `RADIUS_STEP`.
+        noise: Noise of the readings.
         contact: (x, y, F), shape (n, 3), m and N.
 
     Returns:
@@ -99,7 +100,7 @@ def size_limit(
 
 
 def inner_forces(force_range: tuple[float, float]) -> list[float]:
-    """Forces to compare probes under: near both ends of the range, and 1 N or what is nearest to it, N."""
+    """Forces at which probes are compared, N: near both ends of the range, and the force nearest to 1 N."""
     low, high = INSIDE * force_range[0], force_range[1] / INSIDE
     return sorted({low, float(np.clip(1.0, low, high)), high}) if low < high else [float(np.sqrt(low * high))]
 
@@ -112,7 +113,7 @@ def spread_contacts(radius: float, force: float, count: int = 1000) -> Array:
 
 @dataclass(frozen=True)
 class RadiusLimit:
-    """How well the charges tell a circle's radius under one force.
+    """Limits of the estimated radius of a circle under one force.
 
     Attributes:
         contact: (x, y, F), shape (n, 3), m and N.
@@ -142,15 +143,15 @@ def radius_limits(
     reach: float,
     progress: Progress | None = None,
 ) -> list[RadiusLimit]:
-    """How well the charges tell the radius of a circle within a disk: 10 s, for two more forward maps.
+    """Limits of the radius of a circle over contacts in a disk: 10 s, for two more forward maps.
 
     Args:
-        forward_map: Of the circle.
-        charges: The same as a charge model.
-        noise: Of the readings.
-        forces: N.
+        forward_map: Charges under the circle.
+        charges: The same charges as a charge model.
+        noise: Noise of the readings.
+        forces: Forces of the contacts, N.
         reach: Radius of the disk, m.
-        progress: Told how many solves of a map are done.
+        progress: Called with the number of solves of a map that are done, and all.
 
     Raises:
         SceneError: If the probe is not a circle, or there are fewer than four electrodes.
@@ -169,14 +170,14 @@ def radius_limits(
 
 
 def _of_radius(forward_map: ForwardMap, radius: float, progress: Progress | None) -> ForwardMap:
-    """On the same mesh and with the same theory, so that what differs is the radius alone."""
-    made = forward_map
+    """Forward map of another radius with the same mesh and theory, so that only the radius differs."""
+    settings = forward_map.settings
     return ForwardMap.build(
-        made.sensor,
+        forward_map.sensor,
         Circle(radius),
-        made.radius,
-        made.force_range,
-        made.settings,
+        forward_map.radius,
+        forward_map.force_range,
+        settings,
         progress=progress,
     )
 

@@ -1,4 +1,4 @@
-"""The working area: the disk within which charges tell the contact, and how well."""
+"""The working area: the disk within which the charges determine the contact."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -16,27 +16,27 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings
 
 ERROR = 1e-3
-"""Largest Cramer-Rao position error that a working area has by default, m: a probe's radius, under the least force."""
+"""Default of the largest Cramer-Rao position error in a working area, m: the radius of the usual probe."""
 
 GRID = 1e-4
-"""Working radii are rounded down to this, m."""
+"""Step to which radii of working areas are rounded down, m."""
 
 Why = Literal["fold", "twins", "error", "searched"]
 
 
 @dataclass(frozen=True)
 class WorkingArea:
-    """The largest disk about the film's centre within which the charges tell the contact.
+    """The largest disk about the film's centre within which the charges determine the contact.
 
     Attributes:
-        radius: Of the disk, m, rounded down to 0.1 mm; 0 if there is none.
-        why: What ends it: "fold", "twins", "error", or "searched" if none of them does within what was searched. Near
-            a fold the error grows without bounds, so "error" comes before "fold" where an error is asked for.
+        radius: Radius of the disk, m, rounded down to 0.1 mm; 0 if there is none.
+        why: What bounds it: "fold", "twins" (an ambiguous pair), "error", or "searched" if none of these lies within
+            the search radius. Near a fold the error grows without bounds, so "error" comes before "fold".
         fold_radius: Distance from the centre of the nearest fold, m; infinite if there is none.
         twin_radius: Radius of the smallest disk that holds two contacts with the same charges, m; infinite if none.
-        error_radius: Within it the position error keeps to `error` at every force, m.
+        error_radius: Radius within which the position error is at most `error` at every force, m.
         error: Allowed Cramer-Rao position error (root mean square), m.
-        searched: How far from the centre it was looked, m.
+        searched: Radius of the search, m.
         force_range: Smallest and largest force, N.
         folds: Positions on fold lines, shape (n, 2), m.
         twins: Pairs of contacts with the same charges.
@@ -55,25 +55,25 @@ class WorkingArea:
 
     @property
     def unfolded(self) -> float:
-        """Radius of the largest disk without folds and twins, whatever the error, m, rounded down to 0.1 mm."""
+        """Radius of the largest disk without folds and ambiguous pairs, whatever the error, m, to 0.1 mm."""
         return _round_down(min(self.fold_radius, self.twin_radius, self.searched))
 
     @property
     def words(self) -> str:
-        """In a few sentences."""
+        """The working area in a few sentences."""
         low, high = self.force_range
-        parts = [f"Working area: up to {_mm(self.radius)} from the centre, {low:g} to {high:g} N."]
+        parts = [f"Working area: up to {_in_millimetres(self.radius)} from the centre, {low:g} to {high:g} N."]
         if self.error_radius < min(self.searched, self.fold_radius, self.twin_radius):
-            parts.append(f"Farther out the position error exceeds {_mm(self.error)} at {low:g} N.")
+            parts.append(f"Farther out the position error exceeds {_in_millimetres(self.error)} at {low:g} N.")
         if np.isfinite(self.fold_radius):
             parts.append(
                 f"The map folds {1e3 * self.fold_radius:.1f} mm from the centre: contacts on both sides of the fold "
                 "give the same charges, and no method can tell them apart."
             )
         if len(self.twins):
-            parts.append(_twin_words(self.twins))
+            parts.append(_pair_sentence(self.twins))
         if self.why == "searched":
-            parts.append(f"It was looked no farther than {_mm(self.searched)}.")
+            parts.append(f"The search ended at {_in_millimetres(self.searched)}.")
         return " ".join(parts)
 
 
@@ -86,14 +86,14 @@ def working_area(
 ) -> WorkingArea:
     """Find the working area within the radius and the forces that the charges cover.
 
-    It costs some 10 s from a forward map (4 s making splines, 1 s for folds and errors, 3 s for twins); from a charge
-    model, such as a fit to measured charges, what 400,000 of its evaluations cost, or 130,000 without the twins.
+    From a forward map it takes some 10 s (4 s for the splines, 1 s for folds and errors, 3 s for ambiguous pairs); from
+    a charge model, such as a fit to measured charges, 400,000 evaluations, or 130,000 without ambiguous pairs.
 
     Args:
         charges: A forward map, or any `ChargeModel`, such as `ChargeFunction(fitted, radius, force_range)`.
-        noise: Of the readings, not clean.
+        noise: Noise of the readings, with white noise above zero.
         error: Allowed Cramer-Rao position error, m, at every force.
-        twins: Whether to look for contacts far apart with the same charges, too.
+        twins: Whether to search for contacts far apart with the same charges, too.
     """
     model = ChargeSpline.of(charges) if isinstance(charges, ForwardMap) else charges
     rings = Rings.spread(model.radius)
@@ -126,7 +126,7 @@ def working_area(
 
 
 def _within(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel, error: float) -> float:
-    """Distance at which the position error, between rings taken as a power, first exceeds the allowed one, m."""
+    """Distance at which the position error first exceeds the allowed one, m; between rings ln(error) is linear."""
     worst = rings.per_ring(limits_at(model, rings.contacts(force), noise).position).max(axis=1)
     over = np.flatnonzero(~(worst <= error))
     if not over.size:
@@ -138,11 +138,11 @@ def _within(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel, e
     return float(np.interp(np.log(error), logs, rings.distance[first - 1 : first + 1]))
 
 
-def _twin_words(twins: AmbiguousPairs) -> str:
+def _pair_sentence(twins: AmbiguousPairs) -> str:
     (x, y, force), (other_x, other_y, other_force) = twins.first[0], twins.second[0]
     return (
-        f"Contacts far apart may be alike, too: {force:.3g} N at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm and "
-        f"{other_force:.3g} N at ({1e3 * other_x:.1f}, {1e3 * other_y:.1f}) mm give the same charges within "
+        f"Contacts far apart can have the same charges: {force:.3g} N at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm and "
+        f"{other_force:.3g} N at ({1e3 * other_x:.1f}, {1e3 * other_y:.1f}) mm are alike within "
         f"{twins.distance[0]:.1f} standard deviations."
     )
 
@@ -151,5 +151,5 @@ def _round_down(radius: float) -> float:
     return float(f"{np.floor(radius / GRID * (1.0 + 1e-9)) * GRID:.12g}")
 
 
-def _mm(metres: float) -> str:
+def _in_millimetres(metres: float) -> str:
     return f"{1e3 * metres:.3g} mm"

@@ -20,7 +20,7 @@ from isocharge.simulate.paper.triangulation_errors import Accuracy
 from isocharge.simulate.plots.figure import save_picture
 
 FIGURES = 15
-"""Entries of the page."""
+"""Number of entries of the page."""
 
 
 def write_paper(
@@ -37,24 +37,24 @@ def write_paper(
     Args:
         output: The folder to make.
         choices: What the paper leaves open.
-        workers: Who does the work; here and now if absent. The result does not depend on it.
-        solved: Told how many tasks are solved.
-        triangulated: Told how many ways of triangulating are done.
-        drawn: Told how many figures are drawn.
+        workers: Worker processes; this process if absent. The result does not depend on them.
+        solved: Called with the number of solved jobs, and all.
+        triangulated: Called with the number of finished triangulation methods, and all.
+        drawn: Called with the number of drawn figures, and all.
 
     Returns:
         The entries of the page.
 
     Raises:
-        OutputExists: If the folder is there.
+        OutputExists: If the folder exists.
     """
     began = time.perf_counter()
     choices, workers = choices or Choices(), workers or Workers()
     with new_folder(output) as draft:
-        study = solve_all(choices, workers, solved)
-        accuracy = Accuracy.of(study, workers, triangulated)
+        solves = solve_all(choices, workers, solved)
+        accuracy = Accuracy.of(solves, workers, triangulated)
         entries = []
-        for entry in make_entries(study, accuracy):
+        for entry in make_entries(solves, accuracy):
             if entry.figure is not None:
                 save_picture(entry.figure, draft / f"{entry.slug}.png")
                 entry.figure.set_layout_engine("none")  # as it was laid out, which takes as long as drawing it
@@ -68,14 +68,14 @@ def write_paper(
     return tuple(entries)
 
 
-def make_entries(study: Solves, accuracy: Accuracy) -> Iterator[Entry]:
+def make_entries(solves: Solves, accuracy: Accuracy) -> Iterator[Entry]:
     """Every figure in the paper's order, then eq. 4, the claims and our choices."""
     for make in (fig_1, fig_2, fig_3, fig_4, fig_5, fig_6, fig_7, fig_8):
-        yield make(study)
-    yield fig_9(study, accuracy)
-    yield fig_10(study, accuracy)
-    yield fig_11(study)
-    yield fig_12(study)
-    yield eq_4(study)
-    yield claims(study, accuracy)
-    yield what_choices_change(study, accuracy)
+        yield make(solves)
+    yield fig_9(solves, accuracy)
+    yield fig_10(solves, accuracy)
+    yield fig_11(solves)
+    yield fig_12(solves)
+    yield eq_4(solves)
+    yield claims(solves, accuracy)
+    yield what_choices_change(solves, accuracy)

@@ -17,24 +17,24 @@ D33, PYRO, KELVIN = -30e-12, 30e-6, 0.1
 """Of PVDF, C/N and C/(m^2 K), and a temperature step (K) that a finger makes easily."""
 
 
-def claims(study: Solves, accuracy: Accuracy) -> Entry:
+def claims(solves: Solves, accuracy: Accuracy) -> Entry:
     """What the text says without a figure."""
     rows, numbers = [], {}
     for make in (_edges, _d33, _pyro, _stress):
-        row, found = make(study)
+        row, values = make(solves)
         rows.append(row)
-        numbers.update(found)
-    rows += [_fourth(accuracy, study.choices.degree), _known(accuracy)]
+        numbers.update(values)
+    rows += [_fourth(accuracy, solves.choices.degree), _known(accuracy)]
     numbers["from_the_field_with_reference_noise"] = {name: e.numbers() for name, e in accuracy.noisy.items()}
     numbers["drawn_with_reference_noise"] = {name: e.numbers() for name, e in accuracy.drawn_noisy.items()}
     return Entry("Claims", "What the text says, in numbers.", None, rows, numbers)
 
 
-def _edges(study: Solves) -> tuple[Row, dict[str, object]]:
+def _edges(solves: Solves) -> tuple[Row, dict[str, object]]:
     """Edge averages against the whole electrode."""
-    places = study.places
+    places = solves.places
     edge, area = (
-        study.charges("triangle", study.choices.sensor("three", readout=readout), places)
+        solves.charges("triangle", solves.choices.sensor("three", readout=readout), places)
         for readout in ("edge", "area")
     )
     change = 100.0 * np.abs(edge / area - 1.0)
@@ -43,19 +43,19 @@ def _edges(study: Solves) -> tuple[Row, dict[str, object]]:
         "edge averages (eq. 3) give the charge",
         "\"precise\"",
         f"off the whole electrode's charge by {middle:.2f} % at the median, {most:.1f} % at 95 %, {worst:.1f} % most, "
-        f"within {1e3 * study.choices.radius:g} mm",
+        f"within {1e3 * solves.choices.radius:g} mm",
         "an electrode collects from all of its area; edges are a quadrature that misses the stress beside the probe",
     )  # fmt: skip
     return row, {"edge_against_area_percent": {"median": middle, "p95": most, "worst": worst}}
 
 
-def _d33(study: Solves) -> tuple[Row, dict[str, object]]:
+def _d33(solves: Solves) -> tuple[Row, dict[str, object]]:
     """The contact pressure where the probe covers part of B."""
-    sensor = study.choices.sensor("three")
+    sensor = solves.choices.sensor("three")
     taking = replace(sensor, piezo=replace(sensor.piezo, d33=D33))
-    points = Mapping.lines(sensor, "A", length=study.choices.length).points.reshape(-1, 2)
-    extra = np.array([contact_charge(taking, study.choices.triangle, (x, y), FORCE) for x, y in points])
-    charge = study.charges("triangle", sensor, points)
+    points = Mapping.lines(sensor, "A", length=solves.choices.length).points.reshape(-1, 2)
+    extra = np.array([contact_charge(taking, solves.choices.triangle, (x, y), FORCE) for x, y in points])
+    charge = solves.charges("triangle", sensor, points)
     share = extra / charge
     over = extra > TOUCHED * -D33 * FORCE
     whole = -D33 * FORCE
@@ -71,8 +71,8 @@ def _d33(study: Solves) -> tuple[Row, dict[str, object]]:
     return row, {"d33_pC": {"largest": 1e12 * extra.max(), "largest_share": share.max()}}
 
 
-def _pyro(study: Solves) -> tuple[Row, dict[str, object]]:
-    sensor = study.choices.sensor("three")
+def _pyro(solves: Solves) -> tuple[Row, dict[str, object]]:
+    sensor = solves.choices.sensor("three")
     warm = thermal_charge(replace(sensor, piezo=replace(sensor.piezo, pyro=PYRO)), KELVIN)[0]
     row = Row(
         "pyroelectric charge",
@@ -83,8 +83,8 @@ def _pyro(study: Solves) -> tuple[Row, dict[str, object]]:
     return row, {"pyro_pC_per_0.1_K": 1e12 * warm}
 
 
-def _stress(study: Solves) -> tuple[Row, dict[str, object]]:
-    largest = study.shown.principal_stress[1]
+def _stress(solves: Solves) -> tuple[Row, dict[str, object]]:
+    largest = solves.shown.principal_stress[1]
     row = Row(
         "the material stays linear",
         f"up to {PAPER.linear_MPa:g} MPa",
@@ -121,7 +121,7 @@ def _fourth(accuracy: Accuracy, degree: int) -> Row:
 
 def _known(accuracy: Accuracy) -> Row:
     """The probe and the film must be known."""
-    words = [
+    errors_by_name = [
         f"{name}: {errors.percentile(50):.2f} mm, {100 * errors.share_found:.0f} % found"
         for name, errors in accuracy.mistaken.items()
         if name.startswith(("probe", "pretension"))
@@ -129,26 +129,26 @@ def _known(accuracy: Accuracy) -> Row:
     return Row(
         "shape and size of the object must be known",
         "must be known",
-        "taken for a triangle of 4 mm on a slack film, median error: " + "; ".join(words),
+        "taken for a triangle of 4 mm on a slack film, median error: " + "; ".join(errors_by_name),
         "known force; a film that is a little taut costs more than the wrong probe",
     )
 
 
-def what_choices_change(study: Solves, accuracy: Accuracy) -> Entry:
+def what_choices_change(solves: Solves, accuracy: Accuracy) -> Entry:
     """Sizes that the paper does not give."""
     rows = []
-    film, piezo = study.choices.sensor("three").film, study.choices.sensor("three").piezo
+    film, piezo = solves.choices.sensor("three").film, solves.choices.sensor("three").piezo
     ours = {
         "E": f"{film.young * 1e-9:g} GPa",
         "nu": f"{film.poisson:g}",
-        "probe": f"{study.choices.triangle.notation} (side, mm)",
+        "probe": f"{solves.choices.triangle.notation} (side, mm)",
         "pretension": "0 MPa",
     }
-    for name in study.variants:
+    for name in solves.variants:
         kind, _, value = name.partition(" ")
         errors = accuracy.mistaken[name]
         position = f"{errors.percentile(50):.3f} mm" if errors.found_mm.size else "no contours met"
-        change = f"charges by {_signed(study, name)}, at most {100 * largest_change(study, name):.1f} %"
+        change = f"charges by {_signed(solves, name)}, at most {100 * largest_change(solves, name):.1f} %"
         rows.append(
             Row(
                 f"{kind}: {value}",
@@ -162,15 +162,15 @@ def what_choices_change(study: Solves, accuracy: Accuracy) -> Entry:
             "d31, d32",
             "not given",
             f"charges are linear in them; biaxial {1e12 * piezo.d31:g} and {1e12 * piezo.d32:g} pC/N",
-            f"eq. 4 agrees with d31 = {1e12 * piezo.d31 / study.eq_4[1]:.1f} pC/N, all else as ours",
+            f"eq. 4 agrees with d31 = {1e12 * piezo.d31 / solves.eq_4[1]:.1f} pC/N, all else as ours",
         )
     )
-    found = {name: {"largest_change": largest_change(study, name)} for name in study.variants}
-    return Entry("What the paper does not give", "Our choices, and what others would change.", None, rows, found)
+    numbers = {name: {"largest_change": largest_change(solves, name)} for name in solves.variants}
+    return Entry("What the paper does not give", "Our choices, and what others would change.", None, rows, numbers)
 
 
-def _signed(study: Solves, name: str) -> str:
+def _signed(solves: Solves, name: str) -> str:
     """Median relative change of a charge, with its sign."""
-    at: Array = np.array(sample(study.choices))
-    charge = study.charges("triangle", study.choices.sensor("three"), at)
-    return f"{100 * float(np.median(study.variants[name][0] / charge - 1.0)):+.1f} % at the median"
+    at: Array = np.array(sample(solves.choices))
+    charge = solves.charges("triangle", solves.choices.sensor("three"), at)
+    return f"{100 * float(np.median(solves.variants[name][0] / charge - 1.0)):+.1f} % at the median"

@@ -19,11 +19,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Entry:
-    """A figure of ours with what there is to say.
+    """One figure or section of the page.
 
     Attributes:
         heading: "Fig. 6", "Eq. 4", ...
-        caption: What is seen.
+        caption: What the figure shows.
         figure: The picture.
         rows: Numbers and claims.
         numbers: For programs, units in the keys.

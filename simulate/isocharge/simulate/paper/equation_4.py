@@ -13,16 +13,17 @@ from isocharge.simulate.paper.solves import Solves
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
 
 RANGE, BAND = (0.25, 2.0), 0.02
-"""Forces (N) over which eq. 4 is compared, and how near a normalised charge is called the same."""
+"""Range of forces of the comparison with eq. 4, N; largest difference of normalised charges that count as the same,
+dimensionless."""
 
 FINE = np.linspace(0.05, 2.0, 391)
-"""Forces (N) that the solved ones are interpolated to."""
+"""Forces at which the solved charges are interpolated, N."""
 
 SHOWN_N = (0.1, 0.5, 1.0, 2.0)
-"""Forces at which the local exponent is told."""
+"""Forces at which the page gives the local exponent, N."""
 
 LINEAR = 0.05
-"""Largest distance from a straight line, over the charge at the end, that is called linear."""
+"""Largest distance from a straight line that counts as linear, over the charge at the end, dimensionless."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,9 @@ class ChargeForce:
 
     def bent(self, force: float) -> float:
         """Distance from the best straight line through zero up to a force, over the charge there."""
-        here = FINE[force + 1e-9 >= FINE]
-        charge = self.charge(here)
-        line = here * (charge @ here) / (here @ here)
+        forces = FINE[force + 1e-9 >= FINE]
+        charge = self.charge(forces)
+        line = forces * (charge @ forces) / (forces @ forces)
         return float(np.abs(charge - line).max() / charge[-1])
 
     @property
@@ -74,22 +75,22 @@ class ChargeForce:
         return fitted
 
 
-def films_of(study: Solves) -> list[list[ChargeForce]]:
+def films_of(solves: Solves) -> list[list[ChargeForce]]:
     """Of every thickness, every pretension."""
-    choices = study.choices
+    choices = solves.choices
     logs = np.log(np.array(choices.force))
     return [
         [
-            ChargeForce(h, t, CubicSpline(logs, np.log(study.chains[i, k, :, 0])))
+            ChargeForce(h, t, CubicSpline(logs, np.log(solves.chains[i, k, :, 0])))
             for k, t in enumerate(choices.pretension)
         ]
         for i, h in enumerate(choices.thickness)
     ]
 
 
-def eq_4(study: Solves) -> Entry:
+def eq_4(solves: Solves) -> Entry:
     """The cubic, which film has it, and where charge is linear."""
-    films = films_of(study)
+    films = films_of(solves)
     figure = new_figure(15.5, 9.6)
     (curve, exponent), (misfit, bent) = figure.subplots(2, 2)
     _draw_curves(curve, films)
@@ -102,19 +103,19 @@ def eq_4(study: Solves) -> Entry:
         lambda film: 100 * film.bent(PAPER.linear_N),
         "{:.1f}",
     )
-    rows = [*_rows_of_press(study, films), *_rows_of_cubic(films), *_rows_of_line(films)]
+    rows = [*_rows_of_press(solves, films), *_rows_of_cubic(films), *_rows_of_line(films)]
     return Entry(
         "Eq. 4",
         "Charge of A against force at the place of eq. 4's press, films of several thicknesses and pretensions.",
         figure,
         rows,
-        _numbers(study, films),
+        _numbers(solves, films),
     )
 
 
-def _rows_of_press(study: Solves, films: list[list[ChargeForce]]) -> list[Row]:
+def _rows_of_press(solves: Solves, films: list[list[ChargeForce]]) -> list[Row]:
     """Where eq. 4's press was, and how large its charges are."""
-    (x, y), factor = study.eq_4
+    (x, y), factor = solves.eq_4
     pC, thick = [sum(cubic) for cubic in PAPER.cubics], films[-1]
     thick_pC, most = 1e12 * thick[0].at_1_N, 1e12 * max(film.at_1_N for film in thick)
     angle, away = np.rad2deg(np.arctan2(y + 10e-3, x)), 1e3 * np.hypot(x, y + 10e-3)
@@ -180,7 +181,7 @@ def _rows_of_line(films: list[list[ChargeForce]]) -> list[Row]:
         Row(
             f"linear up to {PAPER.linear_N:g} N",
             "yes (25 um)",
-            f"{_um(thin)}, slack: {100 * thin.bent(PAPER.linear_N):.0f} % off a line; " + _linear_words(films),
+            f"{_um(thin)}, slack: {100 * thin.bent(PAPER.linear_N):.0f} % off a line; " + _linear_films(films),
             "F^(2/3) where stretching carries the load, F^2 where pretension or bending does; linear on the way",
         ),
         Row(
@@ -214,29 +215,29 @@ def _poly(coefficients: Array) -> str:
     return "(" + ", ".join(f"{c:.4f}" for c in coefficients) + ")"
 
 
-def _linear_words(films: list[list[ChargeForce]]) -> str:
+def _linear_films(films: list[list[ChargeForce]]) -> str:
     """Which films are linear up to 0.5 N."""
     linear = [film for row in films for film in row if film.bent(PAPER.linear_N) <= LINEAR]
     if not linear:
         return f"none within {100 * LINEAR:g} %"
     first = min(linear, key=lambda film: (film.thickness, film.pretension))
-    words = ", ".join(f"{_name(film)} ({100 * film.bent(PAPER.linear_N):.1f} %)" for film in linear[:6])
+    names = ", ".join(f"{_name(film)} ({100 * film.bent(PAPER.linear_N):.1f} %)" for film in linear[:6])
     more = f" and {len(linear) - 6} more" if len(linear) > 6 else ""
     bends = f"; {_name(first)} then bends over, exponent {first.exponent(2.0):.2f} at 2 N"
-    return f"within {100 * LINEAR:g} %: {words}{more}{bends}"
+    return f"within {100 * LINEAR:g} %: {names}{more}{bends}"
 
 
-def _numbers(study: Solves, films: list[list[ChargeForce]]) -> dict[str, Any]:
-    (x, y), factor = study.eq_4
+def _numbers(solves: Solves, films: list[list[ChargeForce]]) -> dict[str, Any]:
+    (x, y), factor = solves.eq_4
     return {
         "press_of_eq_4_mm": [1e3 * x, 1e3 * y],
         "our_charges_over_the_papers": factor,
-        "force_N": list(study.choices.force),
+        "force_N": list(solves.choices.force),
         "films": [
             {
                 "thickness_um": 1e6 * film.thickness,
                 "pretension_MPa": 1e-6 * film.pretension,
-                "charge_pC": (1e12 * study.chains[i, k]).tolist(),
+                "charge_pC": (1e12 * solves.chains[i, k]).tolist(),
                 "misfit": film.misfit,
                 "off_a_line_to_0.5_N": film.bent(PAPER.linear_N),
                 "cubic": film.cubic.tolist(),
@@ -250,8 +251,8 @@ def _numbers(study: Solves, films: list[list[ChargeForce]]) -> dict[str, Any]:
 
 def _chosen(films: list[list[ChargeForce]]) -> list[ChargeForce]:
     """25 um, 110 um and 1 mm, as far as they were solved, without pretension."""
-    wanted = (25e-6, 110e-6, 1000e-6)
-    return [row[0] for row in films if any(np.isclose(row[0].thickness, h) for h in wanted)]
+    thicknesses = (25e-6, 110e-6, 1000e-6)
+    return [row[0] for row in films if any(np.isclose(row[0].thickness, h) for h in thicknesses)]
 
 
 def _draw_curves(axes: Any, films: list[list[ChargeForce]]) -> None:

@@ -19,24 +19,25 @@ from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 
 LEVELS, AREA = 8, 11.5e-3
-"""Contours of each electrode in Fig. 11, and how far from the centre they are followed, m: to the electrodes' end."""
+"""Number of contours of each electrode in Fig. 11, and their largest distance from the centre, m: the far side of the
+electrodes."""
 
 
-def fig_9(study: Solves, accuracy: Accuracy) -> Entry:
+def fig_9(solves: Solves, accuracy: Accuracy) -> Entry:
     """Contours from the field, under a triangle."""
-    sensor = study.choices.sensor("three")
-    forward_map, at = study.film("triangle", sensor), study.choices.shown
-    charges = study.charges("triangle", sensor, np.array([at]))[0]
-    field = ContourField.of(forward_map, FORCE, BEYOND * study.choices.radius, study.choices.spacing)
+    sensor = solves.choices.sensor("three")
+    forward_map, at = solves.forward_map("triangle", sensor), solves.choices.shown
+    charges = solves.charges("triangle", sensor, np.array([at]))[0]
+    field = ContourField.of(forward_map, FORCE, BEYOND * solves.choices.radius, solves.choices.spacing)
     figure = new_figure(6.6, 7.0)
     axes = figure.subplots()
     for name, charge, colour in zip(sensor.electrode_names, charges, COLOURS, strict=False):
         draw_contours(axes, field.contours(name, float(charge)), colour, f"{name}, {1e12 * charge:.0f} pC")
     draw_electrodes(axes, sensor)
-    draw_probe(axes, study.choices.triangle, at, "probe")
-    draw_working_area(axes, study.choices.radius, "working area")
+    draw_probe(axes, solves.choices.triangle, at, "probe")
+    draw_working_area(axes, solves.choices.radius, "working area")
     frame_film(
-        axes, sensor, BEYOND * study.choices.radius, "Fig. 9: triangulation with a triangular probe, from the field"
+        axes, sensor, BEYOND * solves.choices.radius, "Fig. 9: triangulation with a triangular probe, from the field"
     )
     figure.legend(fontsize=8, loc="outside lower center", ncols=5)
     errors = accuracy.field["three"]
@@ -58,29 +59,29 @@ def fig_9(study: Solves, accuracy: Accuracy) -> Entry:
     )
 
 
-def fig_10(study: Solves, accuracy: Accuracy) -> Entry:
+def fig_10(solves: Solves, accuracy: Accuracy) -> Entry:
     """The paper's graphical method, and how its 0.122 mm compares."""
-    sensor, at = study.choices.sensor("three"), study.choices.shown
-    triangulation = DrawnTriangulation(study.scheme("triangle", sensor), study.choices.degree)
-    charge = study.charges("triangle", sensor, np.array([at]))
+    sensor, at = solves.choices.sensor("three"), solves.choices.shown
+    triangulation = DrawnTriangulation(solves.scheme("triangle", sensor), solves.choices.degree)
+    charge = solves.charges("triangle", sensor, np.array([at]))
     contours, fix = [c for c in triangulation.contours(charge[0]) if c is not None], triangulation.locate(charge)
     error_mm = 1e3 * float(np.hypot(fix.x[0] - at[0], fix.y[0] - at[1]))
     figure = new_figure(16.5, 5.6)
     whole, near, distribution = figure.subplots(1, 3)
     for axes in (whole, near):
         _draw_graphical_contours(axes, contours)
-    draw_probe(whole, study.choices.triangle, at)
+    draw_probe(whole, solves.choices.triangle, at)
     draw_electrodes(whole, sensor)
-    frame_film(whole, sensor, BEYOND * study.choices.radius, "Fig. 10: contours as the paper draws them")
+    frame_film(whole, sensor, BEYOND * solves.choices.radius, "Fig. 10: contours as the paper draws them")
     whole.legend(fontsize=8)
     _zoom(near, contours, at, (float(fix.x[0]), float(fix.y[0])))
-    _distributions(distribution, accuracy, study.choices.degree)
+    _distributions(distribution, accuracy, solves.choices.degree)
     return Entry(
         "Fig. 10",
         "Contours from a polynomial on each line and a spline through its roots; the crossings and their mean; the "
         "errors over the working area.",
         figure,
-        [*_rows_of_shown_press(fix, error_mm), _row_of_percentile(accuracy, study.choices.degree)],
+        [*_rows_of_shown_press(fix, error_mm), _row_of_percentile(accuracy, solves.choices.degree)],
         {
             "shown_error_mm": error_mm,
             **{f"{layout}_degree_{degree}": errors.numbers() for (layout, degree), errors in accuracy.drawn.items()},
@@ -174,16 +175,16 @@ def _distributions(axes: Any, accuracy: Accuracy, degree: int) -> None:
     axes.legend(fontsize=8)
 
 
-def fig_11(study: Solves) -> Entry:
+def fig_11(solves: Solves) -> Entry:
     """Contours of all four electrodes under a circle."""
-    sensor = study.choices.sensor("four")
-    field = ContourField.of(study.film("circle", sensor), FORCE, AREA, study.choices.spacing)
+    sensor = solves.choices.sensor("four")
+    field = ContourField.of(solves.forward_map("circle", sensor), FORCE, AREA, solves.choices.spacing)
     reached_pC = {name: [1e12 * charge for charge in field.reach(name)] for name in sensor.electrode_names}
-    median, worst = _change_from_circle_to_triangle(study)
+    median, worst = _change_from_circle_to_triangle(solves)
     return Entry(
         "Fig. 11",
         "Isocharge contours of all four electrodes; on the right those of A with their charges.",
-        _draw_fig_11(study.choices, field),
+        _draw_fig_11(solves.choices, field),
         [
             Row(
                 "charges met in the central area",
@@ -240,9 +241,9 @@ def _one_electrode(axes: Any, field: ContourField, name: str, colour: str) -> No
             axes.annotate(f"{1e12 * charge:.0f}", 1e3 * end, **label)
 
 
-def _change_from_circle_to_triangle(study: Solves) -> tuple[float, float]:
+def _change_from_circle_to_triangle(solves: Solves) -> tuple[float, float]:
     """Relative change of a charge from the circle to the triangle over the working area: median and largest."""
-    sensor, places = study.choices.sensor("four"), study.places
-    circle, triangle = (study.charges(probe, sensor, places) for probe in ("circle", "triangle"))
+    sensor, places = solves.choices.sensor("four"), solves.places
+    circle, triangle = (solves.charges(probe, sensor, places) for probe in ("circle", "triangle"))
     change = np.abs(triangle / circle - 1.0)
     return float(np.median(change)), float(change.max())

@@ -20,27 +20,27 @@ from isocharge.simulate.sensor.sensor import Sensor
 
 FIG_6_DEG, FOUR_DEG = (35.0, 90.0), (110.0, 250.0)
 FINE = 97
-"""Presses on a line that is drawn smooth."""
+"""Number of presses on a line that is drawn as a smooth curve."""
 
 RATIOS = np.linspace(0.0, 2.0, 41)
-"""d32 over d31 that are tried for the order of Fig. 8."""
+"""Ratios d32 over d31 that are tried for the order of Fig. 8, dimensionless."""
 
 Extreme = Callable[..., Any]
 """`np.argmax` or `np.argmin`."""
 
 
 def curves_of(
-    study: Solves, probe: str, sensor: Sensor, name: str, degrees: tuple[float, float], length: float | None = None
+    solves: Solves, probe: str, sensor: Sensor, name: str, degrees: tuple[float, float], length: float | None = None
 ) -> tuple[Curves, Curves]:
     """Curves at the scheme's presses, and finely along the same lines."""
     ends = (np.deg2rad(degrees[0]), np.deg2rad(degrees[1]))
-    mapping = Mapping.lines(sensor, name, ends, length=length or study.choices.length)
-    film = study.film(probe, sensor)
-    return Curves.of(film, mapping, FORCE), Curves.of(film, mapping.finer(FINE), FORCE)
+    mapping = Mapping.lines(sensor, name, ends, length=length or solves.choices.length)
+    forward_map = solves.forward_map(probe, sensor)
+    return Curves.of(forward_map, mapping, FORCE), Curves.of(forward_map, mapping.finer(FINE), FORCE)
 
 
 def curve_numbers(curves: Curves) -> dict[str, object]:
-    """A set of curves for programs."""
+    """A set of curves for JSON."""
     return {
         "angle_deg": np.rad2deg(curves.mapping.angle).tolist(),
         "distance_mm": (1e3 * curves.mapping.distance).tolist(),
@@ -48,19 +48,19 @@ def curve_numbers(curves: Curves) -> dict[str, object]:
     }
 
 
-def fig_6(study: Solves) -> Entry:
+def fig_6(solves: Solves) -> Entry:
     """Triangle, biaxial, from A; three electrodes as in the paper, and four."""
     figure = new_figure(12.6, 5.2)
     left, right = figure.subplots(1, 2)
-    at, smooth = curves_of(study, "triangle", study.choices.sensor("three"), "A", FIG_6_DEG)
-    four, four_smooth = curves_of(study, "triangle", study.choices.sensor("four"), "A", FOUR_DEG)
+    at, smooth = curves_of(solves, "triangle", solves.choices.sensor("three"), "A", FIG_6_DEG)
+    four, four_smooth = curves_of(solves, "triangle", solves.choices.sensor("four"), "A", FOUR_DEG)
     for axes, curves, line, layout in ((left, at, smooth, "three"), (right, four, four_smooth, "four")):
         draw_curves(axes, curves, line)
         axes.axhline(PAPER.contour_pC, color="k", lw=0.8, ls=":")
         axes.annotate(f"{PAPER.contour_pC:g} pC", (4, PAPER.contour_pC), fontsize=8, va="bottom")
         axes.set_title(f"Fig. 6: triangular probe, biaxial film, {layout} electrodes, 1 N")
-    area = curves_of(study, "triangle", study.choices.sensor("three", readout="area"), "A", FIG_6_DEG)[0]
-    contour_row, distance = _example(study, at, smooth)
+    area = curves_of(solves, "triangle", solves.choices.sensor("three", readout="area"), "A", FIG_6_DEG)[0]
+    contour_row, distance = _example(solves, at, smooth)
     apart, change = 100.0 * _spread(at), 100.0 * np.abs(at.own / area.own - 1.0).max(axis=0)
     rows = [
         contour_row,
@@ -77,19 +77,19 @@ def fig_6(study: Solves) -> Entry:
             "the stress is not linear across an electrode near the probe",
         ),
     ]
-    found = {
+    numbers = {
         **curve_numbers(at),
         "four_electrodes": curve_numbers(four),
         "distance_of_650_pC_mm": distance,
         "spread_of_lines": 0.01 * apart,
     }
     caption = f"Charge of A under a triangle; the dotted line is the paper's example of {PAPER.contour_pC:g} pC."
-    return Entry("Fig. 6", caption, figure, rows, found)
+    return Entry("Fig. 6", caption, figure, rows, numbers)
 
 
-def _example(study: Solves, at: Curves, smooth: Curves) -> tuple[Row, Array]:
+def _example(solves: Solves, at: Curves, smooth: Curves) -> tuple[Row, Array]:
     """The paper's example of a contour: distances (mm) at which the lines have 650 pC."""
-    contour = draw_contour(at, 1e-12 * PAPER.contour_pC, study.choices.degree)
+    contour = draw_contour(at, 1e-12 * PAPER.contour_pC, solves.choices.degree)
     knots = np.empty((0, 2)) if contour is None else contour.knots
     distance = 1e3 * np.linalg.norm(knots - at.mapping.origin, axis=1)
     exact = 1e3 * np.array([np.interp(-1e-12 * PAPER.contour_pC, -q, smooth.mapping.distance) for q in smooth.own])
@@ -112,14 +112,14 @@ def _spread(curves: Curves) -> Array:
     return spread
 
 
-def fig_8(study: Solves) -> Entry:
+def fig_8(solves: Solves) -> Entry:
     """Rectangle, biaxial, from B; which line is uppermost."""
-    sensor = study.choices.sensor("three")
-    curves, smooth = curves_of(study, "rectangle", sensor, "B", PAPER.fig_8_deg)
-    circle, _ = curves_of(study, "circle", sensor, "B", PAPER.fig_8_deg)
-    printed_length = study.choices.printed_length
-    printed, _ = curves_of(study, "rectangle", study.choices.as_printed(), "B", PAPER.fig_8_deg, printed_length)
-    ratio, share = _best_ratio(study)
+    sensor = solves.choices.sensor("three")
+    curves, smooth = curves_of(solves, "rectangle", sensor, "B", PAPER.fig_8_deg)
+    circle, _ = curves_of(solves, "circle", sensor, "B", PAPER.fig_8_deg)
+    printed_length = solves.choices.printed_length
+    printed, _ = curves_of(solves, "rectangle", solves.choices.as_printed(), "B", PAPER.fig_8_deg, printed_length)
+    ratio, share = _best_ratio(solves)
     numbers = {
         **curve_numbers(curves),
         "uppermost_deg": _angles(curves, np.argmax),
@@ -213,29 +213,29 @@ def _both_extremes(curves: Curves) -> str:
     return f"uppermost {_extreme(curves, np.argmax)}; lowermost {_extreme(curves, np.argmin)}"
 
 
-def _best_ratio(study: Solves) -> tuple[float, float]:
+def _best_ratio(solves: Solves) -> tuple[float, float]:
     """d32 over d31 with which the order of Fig. 8 holds at most distances, and the share of them."""
-    sensor = study.choices.sensor("three")
+    sensor = solves.choices.sensor("three")
     directions = (Piezo(d31=1e-12, d32=0.0), Piezo(d31=0.0, d32=1e-12))
     sensors = [replace(sensor, piezo=piezo) for piezo in directions]
-    parts = [curves_of(study, "rectangle", taking, "B", PAPER.fig_8_deg)[0].own for taking in sensors]
+    parts = [curves_of(solves, "rectangle", taking, "B", PAPER.fig_8_deg)[0].own for taking in sensors]
     best = (0.0, 0.0)
     for ratio in RATIOS:
-        own = parts[0] + ratio * parts[1]
-        share = float(np.mean((own.argmax(axis=0) == 0) & (own.argmin(axis=0) == len(own) - 1)))
+        charge = parts[0] + ratio * parts[1]
+        share = float(np.mean((charge.argmax(axis=0) == 0) & (charge.argmin(axis=0) == len(charge) - 1)))
         best = max(best, (share, float(ratio)))
     return best[1], best[0]
 
 
-def fig_12(study: Solves) -> Entry:
+def fig_12(solves: Solves) -> Entry:
     """Triangle, uniaxial, from A, beside biaxial."""
     figure = new_figure(12.0, 5.2)
-    found, rows = {}, []
+    numbers, rows = {}, []
     for axes, layout in zip(figure.subplots(1, 2), ("three", "four"), strict=True):
         name = "A"
         degrees = FIG_6_DEG if layout == "three" else FOUR_DEG
-        uniaxial, smooth = curves_of(study, "triangle", study.choices.sensor(layout, "uniaxial"), name, degrees)
-        biaxial, _ = curves_of(study, "triangle", study.choices.sensor(layout), name, degrees)
+        uniaxial, smooth = curves_of(solves, "triangle", solves.choices.sensor(layout, "uniaxial"), name, degrees)
+        biaxial, _ = curves_of(solves, "triangle", solves.choices.sensor(layout), name, degrees)
         draw_curves(axes, uniaxial, smooth)
         axes.set_title(f"Fig. 12: triangular probe, uniaxial, {layout} electrodes, 1 N")
         apart = [100.0 * _spread(curves) for curves in (biaxial, uniaxial)]
@@ -248,7 +248,7 @@ def fig_12(study: Solves) -> Entry:
                 "d31 : d32 = 20 : 2 pC/N, our choice, weighs the radial against the hoop stress by the angle",
             )
         )
-        found[layout] = {
+        numbers[layout] = {
             **curve_numbers(uniaxial),
             "spread": (0.01 * apart[1]).tolist(),
             "spread_biaxial": (0.01 * apart[0]).tolist(),
@@ -258,5 +258,5 @@ def fig_12(study: Solves) -> Entry:
         "Charge of A on a uniaxial film under a triangle of 4 mm, with three and with four electrodes.",
         figure,
         rows,
-        found,
+        numbers,
     )

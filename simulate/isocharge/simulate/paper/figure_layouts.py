@@ -23,12 +23,12 @@ FIG_4_DEG, FIG_7_DEG = (35.0, 145.0), PAPER.fig_8_deg
 """Lines from A, the half that Fig. 6 shows and its mirror image; lines from B."""
 
 
-def fig_1(study: Solves) -> Entry:
+def fig_1(solves: Solves) -> Entry:
     """The principle: three distances."""
-    sensor = study.choices.sensor("three")
-    centres, at = np.array([e.centre for e in sensor.electrodes]), np.array(study.choices.shown)
+    sensor = solves.choices.sensor("three")
+    centres, at = np.array([e.centre for e in sensor.electrodes]), np.array(solves.choices.shown)
     distance = np.linalg.norm(centres - at, axis=1)
-    found, second = trilaterate(centres, distance), _mirrored(centres[0], centres[1], at)
+    meeting, second = trilaterate(centres, distance), _mirrored(centres[0], centres[1], at)
     figure = new_figure(6.4, 6.0)
     axes = figure.subplots()
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
@@ -37,11 +37,11 @@ def fig_1(study: Solves) -> Entry:
         axes.annotate(name, centre, xytext=(6, 6), textcoords="offset points", color=colour)
         circle = centre[:, None] + r * np.array([np.cos(angle), np.sin(angle)])
         axes.plot(*circle, color=colour, lw=1.0, label=f"{r:.2f} mm from {name}")
-    axes.plot(*1e3 * found, "o", color=INK, label="all three meet")
+    axes.plot(*1e3 * meeting, "o", color=INK, label="all three meet")
     axes.plot(*1e3 * second, "x", color=INK, label="a and b meet again")
     axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="Fig. 1: position from three distances")
     axes.legend(fontsize=8)
-    error = 1e3 * float(np.linalg.norm(found - at))
+    error = 1e3 * float(np.linalg.norm(meeting - at))
     again = f"twice, {1e3 * float(np.linalg.norm(second - at)):.2f} mm apart"
     return Entry(
         "Fig. 1",
@@ -59,8 +59,8 @@ def trilaterate(centres: Array, distance: Array) -> Array:
     """Eq. 1 for three circles, shape (2,): each difference of two of them is linear in the position."""
     matrix = 2.0 * (centres[1:] - centres[0])
     right = distance[0] ** 2 - distance[1:] ** 2 + np.sum(centres[1:] ** 2, axis=1) - np.sum(centres[0] ** 2)
-    found: Array = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    return found
+    position: Array = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    return position
 
 
 def _mirrored(first: Array, second: Array, at: Array) -> Array:
@@ -70,10 +70,10 @@ def _mirrored(first: Array, second: Array, at: Array) -> Array:
     return mirrored
 
 
-def fig_2(study: Solves) -> Entry:
+def fig_2(solves: Solves) -> Entry:
     """The mapping scheme about one electrode."""
-    sensor = study.choices.sensor("three")
-    mapping = Mapping.lines(sensor, "A", (0.0, 2.0 * np.pi - np.deg2rad(10.0)), length=study.choices.length)
+    sensor = solves.choices.sensor("three")
+    mapping = Mapping.lines(sensor, "A", (0.0, 2.0 * np.pi - np.deg2rad(10.0)), length=solves.choices.length)
     figure = new_figure(6.4, 6.2)
     axes = figure.subplots()
     draw_mapping(axes, mapping)
@@ -93,9 +93,9 @@ def fig_2(study: Solves) -> Entry:
     )
 
 
-def fig_3(study: Solves) -> Entry:
+def fig_3(solves: Solves) -> Entry:
     """The layout with three sensing elements, and as the text has it."""
-    sensor, printed = study.choices.sensor("three"), study.choices.as_printed()
+    sensor, printed = solves.choices.sensor("three"), solves.choices.as_printed()
     figure = new_figure(11.0, 5.6)
     left, right = figure.subplots(1, 2)
     for axes, shown, title in ((left, sensor, "Fig. 3: layout, equilateral"), (right, printed, "as the text has it")):
@@ -136,26 +136,28 @@ def _lengths(sides: list[float]) -> str:
     return ", ".join(f"{side:.2f}" for side in sides) + " mm"
 
 
-def _scheme(study: Solves, heading: str, electrode: str, angles: tuple[float, float]) -> Entry:
-    sensor = study.choices.sensor("three")
+def _scheme(solves: Solves, heading: str, electrode: str, angles: tuple[float, float]) -> Entry:
+    sensor = solves.choices.sensor("three")
     ends = (np.deg2rad(angles[0]), np.deg2rad(angles[1]))
-    mapping = Mapping.lines(sensor, electrode, ends, length=study.choices.length)
+    mapping = Mapping.lines(sensor, electrode, ends, length=solves.choices.length)
     figure = new_figure(6.8, 6.8)
     axes = figure.subplots()
     draw_mapping(axes, mapping)
     draw_electrodes(axes, sensor, highlight=electrode)
-    draw_working_area(axes, study.choices.radius, f"working area, {1e3 * study.choices.radius:g} mm")
-    draw_probe(axes, study.choices.triangle, (float(mapping.points[3, 1, 0]), float(mapping.points[3, 1, 1])), "probe")
+    draw_working_area(axes, solves.choices.radius, f"working area, {1e3 * solves.choices.radius:g} mm")
+    draw_probe(axes, solves.choices.triangle, (float(mapping.points[3, 1, 0]), float(mapping.points[3, 1, 1])), "probe")
     frame_film(axes, sensor, mapping.reach, f"{heading}: lines from {electrode}")
     figure.legend(fontsize=8, loc="outside lower center", ncols=4)
-    over = touching(study, sensor, mapping)
+    over = touching(solves, sensor, mapping)
     overlap = dict(zip(sensor.electrode_names, over.sum(axis=0).tolist(), strict=True))
-    words = f"{over.any(axis=1).sum()} of {len(over)} presses: " + ", ".join(f"{n} on {e}" for e, n in overlap.items())
+    overlaps = f"{over.any(axis=1).sum()} of {len(over)} presses: " + ", ".join(
+        f"{n} on {e}" for e, n in overlap.items()
+    )
     return Entry(
         heading,
         f"Lines from electrode {electrode} at {angles[0]:g}° to {angles[1]:g}° from the drawn direction.",
         figure,
-        [Row("probe over an electrode", "a small overlap with B in some", words, "triangle of 4 mm, our choice")],
+        [Row("probe over an electrode", "a small overlap with B in some", overlaps, "triangle of 4 mm, our choice")],
         {"presses_over_an_electrode": overlap},
     )
 
@@ -164,35 +166,35 @@ TOUCHED = 1e-3
 """Share of the probe that must lie on an electrode to count: less is the round-off of areas."""
 
 
-def touching(study: Solves, sensor: Sensor, mapping: Mapping) -> np.ndarray:
+def touching(solves: Solves, sensor: Sensor, mapping: Mapping) -> np.ndarray:
     """Which presses of a scheme overlap which electrode under the triangle, shape (n, n_electrode)."""
     pressed = replace(
         sensor, piezo=replace(sensor.piezo, d33=-1.0)
     )  # so that the contact's charge is the share covered
     points = mapping.points.reshape(-1, 2)
-    covered = [contact_charge(pressed, study.choices.triangle, (x, y), FORCE) for x, y in points]
+    covered = [contact_charge(pressed, solves.choices.triangle, (x, y), FORCE) for x, y in points]
     return np.asarray(np.array(covered) > TOUCHED)
 
 
-def fig_4(study: Solves) -> Entry:
+def fig_4(solves: Solves) -> Entry:
     """The scheme from A."""
-    return _scheme(study, "Fig. 4", "A", FIG_4_DEG)
+    return _scheme(solves, "Fig. 4", "A", FIG_4_DEG)
 
 
-def fig_7(study: Solves) -> Entry:
+def fig_7(solves: Solves) -> Entry:
     """The scheme from B."""
-    return _scheme(study, "Fig. 7", "B", FIG_7_DEG)
+    return _scheme(solves, "Fig. 7", "B", FIG_7_DEG)
 
 
-def fig_5(study: Solves) -> Entry:
+def fig_5(solves: Solves) -> Entry:
     """The mesh, and what its fineness is worth."""
-    unknowns, error, seconds = mesh_errors(study)
+    unknowns, error, seconds = mesh_errors(solves)
     figure = new_figure(15.0, 5.0)
     whole, near, errors = figure.subplots(1, 3)
     for axes, reach, title in ((whole, 46.0, "Fig. 5: mesh, whole film"), (near, 8.0, "at the probe")):
-        _draw_mesh(axes, study)
-        x, y = (0.0, 0.0) if axes is whole else (1e3 * study.shown.at[0], 1e3 * study.shown.at[1])
-        draw_electrodes(axes, study.choices.sensor("three"), names=axes is near, ink="#2e6f9e")
+        _draw_mesh(axes, solves)
+        x, y = (0.0, 0.0) if axes is whole else (1e3 * solves.shown.at[0], 1e3 * solves.shown.at[1])
+        draw_electrodes(axes, solves.choices.sensor("three"), names=axes is near, ink="#2e6f9e")
         axes.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", title=title)
         axes.set(xlabel="x, mm", ylabel="y, mm")
     _draw_mesh_errors(errors, unknowns, error)
@@ -200,7 +202,7 @@ def fig_5(study: Solves) -> Entry:
         "Fig. 5",
         "Elements under a triangular probe: the whole film, at the probe, and the error against the unknowns.",
         figure,
-        _rows_of_mesh(study.shown, unknowns, error, seconds),
+        _rows_of_mesh(solves.shown, unknowns, error, seconds),
         {
             "unknowns": unknowns.tolist(),
             "worst_relative_error": error.tolist(),
@@ -243,15 +245,15 @@ def _rows_of_mesh(shown: Equilibrium, unknowns: Array, error: Array, seconds: Ar
     ]
 
 
-def mesh_errors(study: Solves) -> tuple[Array, Array, Array]:
+def mesh_errors(solves: Solves) -> tuple[Array, Array, Array]:
     """Unknowns, worst relative error of a charge against the finest mesh, CPU seconds of every mesh but that."""
-    charges, unknowns, seconds = zip(*study.meshes, strict=True)
+    charges, unknowns, seconds = zip(*solves.meshes, strict=True)
     error = np.abs(np.array(charges[:-1]) / charges[-1] - 1.0).max(axis=1)
     return np.array(unknowns[:-1]), error, np.array(seconds[:-1])
 
 
-def _draw_mesh(axes: Any, study: Solves) -> None:
-    shown = study.shown
+def _draw_mesh(axes: Any, solves: Solves) -> None:
+    shown = solves.shown
     along, one = np.linspace(-1.0, 1.0, 13), np.ones(13)
     xi, eta = np.concatenate([along, one, -along, -one]), np.concatenate([-one, along, one, -along])
     turn = 1e3 * shown.film.radius * np.exp(1j * np.angle(complex(*shown.at)))

@@ -22,13 +22,13 @@ def page(entries: Sequence[Entry], choices: Choices, seconds: float) -> str:
     """The whole page as Markdown."""
     film = choices.sensor("three").film
     probes = ", ".join(probe.notation for probe in (choices.triangle, choices.rectangle, choices.circle))
-    made = (
+    settings = (
         f"Film: radius {1e3 * film.radius:g} mm, {1e6 * film.thickness:g} um, E {1e-9 * film.young:g} GPa, nu "
         f"{film.poisson:g}, no pretension. Probes, mm: {probes}. Readout: {choices.readout} (eq. 3). Force 1 N. "
         f"Working area: {1e3 * choices.radius:g} mm, up to {choices.presses} presses spread over it. Computed in "
         f"{seconds:.0f} s."
     )
-    parts = [INTRODUCTION, made, "\n## Table\n", _table(entries)]
+    parts = [INTRODUCTION, settings, "\n## Table\n", _table(entries)]
     for entry in entries:
         parts.append(f"\n## {entry.heading}\n\n{entry.caption}")
         if entry.figure is not None:

@@ -28,18 +28,18 @@ from isocharge.simulate.solver.press import press
 from isocharge.simulate.solver.settings import SolveSettings
 
 FORCE = 1.0
-"""The paper's, N."""
+"""Force of the paper's presses, N."""
 
 SLACK = 1.0 + 1e-6
-"""So that the outermost press of a scheme lies inside its map."""
+"""Factor on the reach of a scheme, dimensionless: its outermost press then lies inside the forward map."""
 
 MESHES = ((2, 6, 3, 1), (3, 8, 4, 1), (4, 8, 5, 1), (5, 8, 5, 1), (6, 8, 6, 1))
 
 FINEST = (8, 12, 7, 2)
-"""Order, around, rings, rim of the meshes that are compared, and of what with."""
+"""Order, around, rings and rim of the mesh that MESHES, whose entries have the same meaning, are compared with."""
 
 CHAIN_ACCURACY = 2e-3
-"""Of the presses of the thickness study, where some tenths of a percent cannot be seen."""
+"""Relative error of a charge in the comparison of thicknesses, where some tenths of a percent cannot be seen."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SolveJob:
         probe: The footprint.
         at: (x, y) of each, m.
         force: Of each, N; each is started from the one before.
-        accuracy: Relative error of a charge that is wanted.
+        accuracy: Target for the relative error of a charge.
     """
 
     sensors: tuple[Sensor, ...]
@@ -109,20 +109,20 @@ def solve_mesh(job: MeshJob) -> tuple[Array, int, float]:
 
 
 def run(job: tuple[Callable[[Any], Any], Any]) -> Any:
-    """A task as a worker gets it."""
+    """Run a job: a function and its argument, which a worker process can receive."""
     function, argument = job
     return function(argument)
 
 
 @dataclass(frozen=True)
 class Solves:
-    """What was solved.
+    """All that was solved for the page.
 
     Attributes:
         choices: What the paper leaves open.
         maps: Forward maps at 1 N by probe ("triangle", "rectangle", "circle"); any layout, film direction and readout
             shares them, since they hold the film's stress.
-        eq_4: Where the press of eq. 4 must have been, and how much larger our charges are there: (x, y) in m, factor.
+        eq_4: Position (x, y) of eq. 4's press, m, and the ratio of our charges to the paper's at this position.
         chains: Charges of the films of `choices`, shape (n_thickness, n_pretension, n_force, 3), C.
         meshes: Of MESHES and FINEST: charges, unknowns, CPU seconds.
         variants: Charges of named variations, see `_variants`.
@@ -137,19 +137,19 @@ class Solves:
     variants: dict[str, Array]
     shown: Equilibrium
 
-    def film(self, probe: str, sensor: Sensor) -> ForwardMap:
-        """The map of a probe, read by a sensor with the same film."""
+    def forward_map(self, probe: str, sensor: Sensor) -> ForwardMap:
+        """The forward map of a probe for any sensor with the same film."""
         return replace(self.maps[probe], sensor=sensor)
 
     def scheme(self, probe: str, sensor: Sensor) -> tuple[Curves, ...]:
         """Charge curves from every electrode, as far to both sides of the centre as contours need."""
-        film = self.film(probe, sensor)
+        forward_map = self.forward_map(probe, sensor)
         names, length = sensor.electrode_names, self.choices.length
-        return tuple(Curves.of(film, Mapping.lines(sensor, name, length=length), FORCE) for name in names)
+        return tuple(Curves.of(forward_map, Mapping.lines(sensor, name, length=length), FORCE) for name in names)
 
     def charges(self, probe: str, sensor: Sensor, at: Array) -> Array:
         """Touch charges of presses of 1 N at (x, y), shape (n, 2), m; (n, n_electrode), C."""
-        return self.film(probe, sensor).forward(at[:, 0], at[:, 1], np.full(len(at), FORCE))
+        return self.forward_map(probe, sensor).forward(at[:, 0], at[:, 1], np.full(len(at), FORCE))
 
     @property
     def places(self) -> Array:
@@ -159,28 +159,30 @@ class Solves:
 
 
 def solve_all(choices: Choices, workers: Workers, progress: Progress | None = None) -> Solves:
-    """Solve everything. `progress` is told how many tasks are done."""
+    """Solve everything; `progress` counts the finished jobs."""
     sensor = choices.sensor("three")
     first = _map_jobs(choices)
     variants = _variants(choices)
     meshes = [(solve_mesh, MeshJob(sensor, choices.triangle, choices.shown, mesh)) for mesh in (*MESHES, FINEST)]
     chains = len(choices.thickness) * len(choices.pretension)
     bar = _Counter(len(first) + len(variants) + len(meshes) + chains, progress)
-    early = bar.over(
+    results = bar.over(
         workers,
         [*((build_map, job) for job in first.values()), *((solve_presses, j) for j in variants.values()), *meshes],
     )
-    maps = dict(zip(first, early, strict=False))
-    read = dict(zip(variants, early[len(first) :], strict=False))
+    maps = dict(zip(first, results, strict=False))
+    varied = dict(zip(variants, results[len(first) :], strict=False))
     eq_4 = find_eq_4(replace(maps["triangle"], sensor=sensor), choices)
-    late = bar.over(workers, [(solve_presses, job) for job in _chain_jobs(choices, eq_4[0])])
-    charges = np.array(late)[:, 0].reshape(len(choices.thickness), len(choices.pretension), len(choices.force), -1)
+    chain_results = bar.over(workers, [(solve_presses, job) for job in _chain_jobs(choices, eq_4[0])])
+    charges = np.array(chain_results)[:, 0].reshape(
+        len(choices.thickness), len(choices.pretension), len(choices.force), -1
+    )
     shown = press(sensor.film, choices.triangle, choices.shown, FORCE)
-    return Solves(choices, maps, eq_4, charges, tuple(early[len(first) + len(variants) :]), read, shown)
+    return Solves(choices, maps, eq_4, charges, tuple(results[len(first) + len(variants) :]), varied, shown)
 
 
 class _Counter:
-    """Runs tasks and says how many are done."""
+    """Runs jobs and counts those that are done."""
 
     def __init__(self, total: int, progress: Progress | None) -> None:
         self._done, self._total, self._progress = 0, total, progress
@@ -223,14 +225,14 @@ def _chain_jobs(choices: Choices, at: tuple[float, float]) -> list[SolveJob]:
 
 
 TAUT = 0.5e6
-"""Pretension of a film that is not known to be taut, Pa."""
+"""Pretension of the film that the contours assume to be slack, Pa."""
 
 UNSUSPECTED = 24
-"""Presses with a probe or a film other than the one that the contours were made for."""
+"""Number of presses with each probe or film that the contours do not assume."""
 
 
 def sample(choices: Choices) -> tuple[tuple[float, float], ...]:
-    """Presses of the variations, m."""
+    """Positions (x, y) of the presses of the variations, m."""
     places = 0.9 * choices.radius * lattice(min(UNSUSPECTED, choices.presses)) * np.exp(0.1j)
     return tuple((float(z.real), float(z.imag)) for z in places)
 
@@ -242,25 +244,25 @@ def _variants(choices: Choices) -> dict[str, SolveJob]:
     def presses(film: Film, probe: Probe) -> SolveJob:
         return SolveJob((replace(sensor, film=film),), probe, at, (FORCE,) * len(at))
 
-    found = {f"probe {probe.notation}": presses(sensor.film, probe) for probe in choices.probes}
-    found[f"pretension {TAUT * 1e-6:g} MPa"] = presses(replace(sensor.film, pretension=TAUT), choices.triangle)
+    jobs = {f"probe {probe.notation}": presses(sensor.film, probe) for probe in choices.probes}
+    jobs[f"pretension {TAUT * 1e-6:g} MPa"] = presses(replace(sensor.film, pretension=TAUT), choices.triangle)
     for young in choices.young:
-        found[f"E {young * 1e-9:g} GPa"] = presses(replace(sensor.film, young=young), choices.triangle)
+        jobs[f"E {young * 1e-9:g} GPa"] = presses(replace(sensor.film, young=young), choices.triangle)
     for poisson in choices.poisson:
-        found[f"nu {poisson:g}"] = presses(replace(sensor.film, poisson=poisson), choices.triangle)
-    return found
+        jobs[f"nu {poisson:g}"] = presses(replace(sensor.film, poisson=poisson), choices.triangle)
+    return jobs
 
 
-def find_eq_4(film: ForwardMap, choices: Choices) -> tuple[tuple[float, float], float]:
-    """Where the ratios of eq. 4's charges at 1 N put the press: (x, y) in m, and our charges there over the paper's."""
-    table = ChargeSpline.of(film, 1.2 * choices.radius, choices.spacing)
-    wanted = np.array([sum(cubic) for cubic in PAPER.cubics]) * 1e-12
+def find_eq_4(forward_map: ForwardMap, choices: Choices) -> tuple[tuple[float, float], float]:
+    """Position (x, y) of eq. 4's press, m, from the ratios of its charges at 1 N; our charges over the paper's."""
+    table = ChargeSpline.of(forward_map, 1.2 * choices.radius, choices.spacing)
+    papers = np.array([sum(cubic) for cubic in PAPER.cubics]) * 1e-12
 
-    def miss(at_mm: Array) -> Array:
+    def log_ratio_misfit(at_mm: Array) -> Array:
         charge = table.first_order(1e-3 * at_mm[None], FORCE)[0][0]
-        away: Array = np.log(charge[1:] / charge[0]) - np.log(wanted[1:] / wanted[0])
-        return away
+        misfit: Array = np.log(charge[1:] / charge[0]) - np.log(papers[1:] / papers[0])
+        return misfit
 
-    found = least_squares(miss, np.array([0.0, -4.0])).x * 1e-3
-    factor = table.first_order(found[None], FORCE)[0][0] / wanted
-    return (float(found[0]), float(found[1])), float(np.mean(factor))
+    position = least_squares(log_ratio_misfit, np.array([0.0, -4.0])).x * 1e-3
+    factor = table.first_order(position[None], FORCE)[0][0] / papers
+    return (float(position[0]), float(position[1])), float(np.mean(factor))

@@ -1,4 +1,4 @@
-"""How well triangulation finds presses spread over the working area: the paper's way and from the field."""
+"""Position errors of triangulation over the working area: by the graphical method and from the field."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,18 +20,19 @@ LAYOUTS = ("three", "four")
 DEGREES = (2, 3, 4)
 
 BEYOND = 1.15
-"""Radius over the working area's within which contours are followed: presses at its edge meet there too."""
+"""Radius within which contours are followed over that of the working area, dimensionless: contours of a press on its
+edge meet too."""
 
 SEED = 0
 
 
 @dataclass(frozen=True)
 class Errors:
-    """What triangulation made of presses.
+    """Errors of triangulated presses.
 
     Attributes:
-        fix: Positions.
-        at: Where was pressed, shape (n, 2), m.
+        fix: Triangulated positions.
+        at: True positions, shape (n, 2), m.
     """
 
     fix: Fix
@@ -39,7 +40,7 @@ class Errors:
 
     @property
     def found_mm(self) -> Array:
-        """Position errors of those that were found, rising, mm."""
+        """Position errors of the presses with a position, ascending, mm."""
         errors = 1e3 * np.hypot(self.fix.x - self.at[:, 0], self.fix.y - self.at[:, 1])
         return np.sort(errors[self.fix.found])
 
@@ -49,11 +50,11 @@ class Errors:
         return float(self.fix.found.mean())
 
     def percentile(self, share: float) -> float:
-        """Error below which so many percent of those found lie, mm."""
+        """Percentile of the position errors, mm; `share` in percent."""
         return float(np.percentile(self.found_mm, share)) if self.found_mm.size else float("nan")
 
     def share_below(self, error_mm: float) -> float:
-        """Percent of those found whose error is at most this."""
+        """Percentage of the presses with a position whose error is at most `error_mm`."""
         return float(100.0 * np.mean(self.found_mm <= error_mm)) if self.found_mm.size else float("nan")
 
     def numbers(self) -> dict[str, object]:
@@ -73,11 +74,11 @@ class Accuracy:
     """Errors over the working area, 1 N, triangular probe, the force known.
 
     Attributes:
-        drawn: The paper's way without noise, by layout and degree of the polynomials.
+        drawn: Graphical method without noise, by layout and degree of the polynomials.
         field: From the field without noise, by layout.
         noisy: From the field with the reference noise, by layout.
-        drawn_noisy: The paper's way with the reference noise, by layout.
-        mistaken: From the field, presses of a variation of probe or film with the contours of our choice.
+        drawn_noisy: Graphical method with the reference noise, by layout.
+        mistaken: From the field, presses with another probe or film than the contours assume, by variation.
     """
 
     drawn: Mapping[tuple[str, int], Errors]
@@ -87,54 +88,56 @@ class Accuracy:
     mistaken: Mapping[str, Errors]
 
     @classmethod
-    def of(cls, study: Solves, workers: Workers, progress: Progress | None = None) -> "Accuracy":
-        """Triangulate; `progress` is told how many of the methods are done."""
-        degrees = [degree for degree in DEGREES if degree <= study.choices.degree]
-        jobs = [(study, layout, degree, False) for layout in LAYOUTS for degree in degrees]
-        jobs += [(study, layout, study.choices.degree, True) for layout in LAYOUTS]
-        found = []
-        for errors in workers.in_order(_draw, [_light(*job) for job in jobs]):
-            found.append(errors)
+    def of(cls, solves: Solves, workers: Workers, progress: Progress | None = None) -> "Accuracy":
+        """Triangulate; `progress` counts the finished methods."""
+        degrees = [degree for degree in DEGREES if degree <= solves.choices.degree]
+        jobs = [(solves, layout, degree, False) for layout in LAYOUTS for degree in degrees]
+        jobs += [(solves, layout, solves.choices.degree, True) for layout in LAYOUTS]
+        results = []
+        for errors in workers.in_order(_locate, [_graphical_job(*job) for job in jobs]):
+            results.append(errors)
             if progress:
-                progress(len(found), len(jobs) + len(LAYOUTS))
-        drawn = {(layout, degree): errors for (_, layout, degree, _), errors in zip(jobs[:-2], found, strict=False)}
+                progress(len(results), len(jobs) + len(LAYOUTS))
+        drawn = {(layout, degree): errors for (_, layout, degree, _), errors in zip(jobs[:-2], results, strict=False)}
         field, noisy, mistaken = {}, {}, {}
         for layout in LAYOUTS:
-            film = study.film("triangle", study.choices.sensor(layout))
-            contours = Triangulation.from_map(film, radius=BEYOND * study.choices.radius, spacing=study.choices.spacing)
-            charge = study.charges("triangle", film.sensor, study.places)
-            field[layout] = Errors(contours.locate(charge, FORCE), study.places)
-            noisy[layout] = Errors(contours.locate(_noisy(charge), FORCE), study.places)
+            forward_map = solves.forward_map("triangle", solves.choices.sensor(layout))
+            contours = Triangulation.from_map(
+                forward_map, radius=BEYOND * solves.choices.radius, spacing=solves.choices.spacing
+            )
+            charge = solves.charges("triangle", forward_map.sensor, solves.places)
+            field[layout] = Errors(contours.locate(charge, FORCE), solves.places)
+            noisy[layout] = Errors(contours.locate(_noisy(charge), FORCE), solves.places)
             if layout == "three":
-                at = np.array(sample(study.choices))
-                mistaken = {name: Errors(contours.locate(q[0], FORCE), at) for name, q in study.variants.items()}
+                at = np.array(sample(solves.choices))
+                mistaken = {name: Errors(contours.locate(q[0], FORCE), at) for name, q in solves.variants.items()}
             if progress:
                 progress(len(jobs) + len(field), len(jobs) + len(LAYOUTS))
-        return cls(drawn, field, noisy, dict(zip(LAYOUTS, found[-2:], strict=True)), mistaken)
+        return cls(drawn, field, noisy, dict(zip(LAYOUTS, results[-2:], strict=True)), mistaken)
 
 
 def _noisy(charge: Array) -> Array:
     return noise_model("reference").add(charge, np.random.default_rng(SEED))
 
 
-def _light(study: Solves, layout: str, degree: int, noise: bool) -> tuple[DrawnTriangulation, Array, Array]:
-    """A task that carries curves and charges, not the maps."""
-    sensor = study.choices.sensor(layout)
-    charge = study.charges("triangle", sensor, study.places)
+def _graphical_job(solves: Solves, layout: str, degree: int, noise: bool) -> tuple[DrawnTriangulation, Array, Array]:
+    """A job for a worker process: curves and charges, without the large forward maps."""
+    sensor = solves.choices.sensor(layout)
+    charge = solves.charges("triangle", sensor, solves.places)
     return (
-        DrawnTriangulation(study.scheme("triangle", sensor), degree),
-        study.places,
+        DrawnTriangulation(solves.scheme("triangle", sensor), degree),
+        solves.places,
         _noisy(charge) if noise else charge,
     )
 
 
-def _draw(job: tuple[DrawnTriangulation, Array, Array]) -> Errors:
+def _locate(job: tuple[DrawnTriangulation, Array, Array]) -> Errors:
     contours, at, charge = job
     return Errors(contours.locate(charge), at)
 
 
-def largest_change(study: Solves, name: str) -> float:
+def largest_change(solves: Solves, name: str) -> float:
     """Largest relative change of a charge that a variation makes, over the presses of the variations."""
-    at = np.array(sample(study.choices))
-    charge = study.charges("triangle", study.choices.sensor("three"), at)
-    return float(np.abs(study.variants[name][0] / charge - 1.0).max())
+    at = np.array(sample(solves.choices))
+    charge = solves.charges("triangle", solves.choices.sensor("three"), at)
+    return float(np.abs(solves.variants[name][0] / charge - 1.0).max())
