@@ -44,11 +44,11 @@ class RoundMap:
 
 @pytest.fixture(scope="module")
 def round_field() -> ContourField:
-    made = RoundMap(SENSOR)
+    forward_map = RoundMap(SENSOR)
     table = ChargeSpline.fit(
-        made.forward, SENSOR.electrode_names, SENSOR.film, RADIUS, np.array([1.0]), (1.0, 1.0), 0.6e-3
+        forward_map.forward, SENSOR.electrode_names, SENSOR.film, RADIUS, np.array([1.0]), (1.0, 1.0), 0.6e-3
     )
-    return ContourField(made, table, 1.0)
+    return ContourField(forward_map, table, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +68,9 @@ def test_contours_of_a_round_field_are_circles(round_field, name, distance_mm):
 
 def test_a_contour_inside_is_closed():
     sensor = Sensor("one", SENSOR.film, SENSOR.piezo, (Electrode.of_square("A", (1e-3, 2e-3), 3e-3),))
-    made = RoundMap(sensor)
-    table = ChargeSpline.fit(made.forward, ("A",), sensor.film, RADIUS, np.array([1.0]), (1.0, 1.0), 0.6e-3)
-    (contour,) = ContourField(made, table, 1.0).contours("A", 1e-9 / (1.0 + 0.4**2))
+    forward_map = RoundMap(sensor)
+    table = ChargeSpline.fit(forward_map.forward, ("A",), sensor.film, RADIUS, np.array([1.0]), (1.0, 1.0), 0.6e-3)
+    (contour,) = ContourField(forward_map, table, 1.0).contours("A", 1e-9 / (1.0 + 0.4**2))
     assert contour.closed
     assert len(np.unique(np.round(contour.points, 12), axis=0)) > 50
 
@@ -80,15 +80,15 @@ def test_the_charge_is_constant_on_a_contour(field):
     for charge in (700e-12, 1200e-12):
         (contour,) = field.contours("B", charge)
         x, y = contour.points.T
-        found = field.forward_map.forward(x, y, np.ones(x.size))[:, 1]
+        charges = field.forward_map.forward(x, y, np.ones(x.size))[:, 1]
         slope = np.linalg.norm(field.table.first_order(contour.points, 1.0)[1][:, 1], axis=1)
-        assert np.abs((found - charge) / slope).max() < 1e-7
+        assert np.abs((charges - charge) / slope).max() < 1e-7
         for i in (5, len(x) // 2, -6):
             uphill = field.table.first_order(contour.points[[i]], 1.0)[1][0, 1]
             across = uphill / np.linalg.norm(uphill)
 
-            def miss(step, here=contour.points[i], across=across, charge=charge):
-                x, y = here + step * across
+            def miss(step, point=contour.points[i], across=across, charge=charge):
+                x, y = point + step * across
                 return field.forward_map.forward(np.array([x]), np.array([y]), np.array([1.0]))[0, 1] - charge
 
             assert abs(brentq(miss, -0.2e-3, 0.2e-3)) < 1e-7
@@ -102,9 +102,9 @@ def test_neighbours_on_a_contour_are_close(field):
 def test_threefold_symmetry(field):
     contours = [field.contours(name, 900e-12)[0].points for name in "ABC"]
     turn = np.exp(2j * np.pi / 3.0)
-    for here, there in pairwise(contours):
-        turned = (here[:, 0] + 1j * here[:, 1]) * turn
-        away = np.abs(turned[:, None] - (there[:, 0] + 1j * there[:, 1])).min(axis=1)
+    for first, second in pairwise(contours):
+        turned = (first[:, 0] + 1j * first[:, 1]) * turn
+        away = np.abs(turned[:, None] - (second[:, 0] + 1j * second[:, 1])).min(axis=1)
         assert away.max() < 0.2e-3  # points lie elsewhere along the same curve
 
 

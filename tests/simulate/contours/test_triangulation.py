@@ -127,8 +127,8 @@ def test_closest_to_meeting_is_scipys_least_squares():
     fix = Triangulation(table).locate_with_force(charge)
 
     def away(contact):
-        here, force = contact[None, :2] * 1e-3, np.exp(contact[2:])
-        value, slope, _ = table.first_order(here, force)
+        position, force = contact[None, :2] * 1e-3, np.exp(contact[2:])
+        value, slope, _ = table.first_order(position, force)
         return 1e3 * ((value - charge) / np.linalg.norm(slope, axis=2))[0]
 
     best = least_squares(away, [2.0, -1.0, np.log(0.8)], xtol=1e-12, ftol=1e-12)
@@ -206,10 +206,10 @@ def test_contours_that_meet_twice():
 def test_folded_map_says_that_there_are_two():
     """Three electrodes, uniaxial, force unknown: two contacts with the same charges, found from either."""
     uniaxial = load_sensor("three-25um-uniaxial")
-    made = ForwardMap.build(uniaxial, Circle(1e-3), 8e-3, FORCES, QUICK)
-    triangulation = Triangulation.from_map(made, spacing=0.5e-3)
+    forward_map = ForwardMap.build(uniaxial, Circle(1e-3), 8e-3, FORCES, QUICK)
+    triangulation = Triangulation.from_map(forward_map, spacing=0.5e-3)
     x, y, force = draw(200, seed=8)
-    fix = triangulation.locate_with_force(made.forward(x, y, force))
+    fix = triangulation.locate_with_force(forward_map.forward(x, y, force))
     assert (fix.status == Meeting.twice).sum() > 10
     error = np.hypot(fix.x - x, fix.y - y)[fix.found]
     assert np.quantile(error, 0.95) < 0.05e-3

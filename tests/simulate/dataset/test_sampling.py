@@ -73,8 +73,8 @@ def test_forces_are_uniform_in_the_logarithm(sampling):
 
 def test_force_place_and_turn_are_independent():
     x, y, force, turn = Sweep(samples=4000, seed=3, orientation="random").presses()
-    found = np.corrcoef([x, y, np.hypot(x, y), np.log(force), turn])
-    assert np.abs(np.triu(found, 1)[:, 3:]).max() < 0.05
+    correlation = np.corrcoef([x, y, np.hypot(x, y), np.log(force), turn])
+    assert np.abs(np.triu(correlation, 1)[:, 3:]).max() < 0.05
 
 
 @pytest.mark.parametrize("probes", [1, 2, 3])
@@ -141,9 +141,9 @@ def test_a_round_probe_is_not_turned_in_a_grid():
 
 
 def test_a_lattice_has_one_spacing_and_as_many_points_as_fit():
-    found = [lattice(most).size for most in range(1, 30)]
+    sizes = [lattice(most).size for most in range(1, 30)]
     expected = [1] * 4 + [5] * 4 + [9] * 4 + [13] * 8 + [21] * 4 + [25] * 4 + [29]
-    assert found == expected
+    assert sizes == expected
     points = lattice(500)
     apart = np.abs(points[:, None] - points[None]) + np.eye(points.size)
     np.testing.assert_allclose(apart.min(axis=0), apart.min())

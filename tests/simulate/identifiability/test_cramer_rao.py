@@ -81,10 +81,10 @@ def test_an_efficient_estimator_scatters_as_much():
 
         start = np.append(contact[:2], np.log(contact[2])) / scale
         readings = reference.add(np.repeat(charge, 1000, axis=0), rng)
-        found = np.array([least_squares(miss, start, args=(reading,), method="lm").x for reading in readings]) * scale
-        position = np.sqrt(np.sum(found[:, :2].var(axis=0)))
+        estimates = np.array([least_squares(miss, start, args=(row,), method="lm").x for row in readings]) * scale
+        position = np.sqrt(np.sum(estimates[:, :2].var(axis=0)))
         assert position == pytest.approx(limits.position[number], rel=0.06)
-        assert found[:, 2].std() == pytest.approx(limits.force[number], rel=0.08)
+        assert estimates[:, 2].std() == pytest.approx(limits.force[number], rel=0.08)
 
 
 def test_more_noise_less_known():

@@ -97,32 +97,32 @@ def test_no_twins_where_the_sides_are_told_apart():
 def test_the_nearest_contact_is_the_right_one():
     model = creased(300.0)
     truth = np.array([[1e-3, -2e-3, 0.7], [-3e-3, 1e-3, 0.1]])
-    found, distance = nearest_contact(model, REFERENCE, model.charge(truth), np.array([[0.0, 0.0, 0.3]] * 2))
-    np.testing.assert_allclose(found, truth, rtol=1e-4)
+    contact, distance = nearest_contact(model, REFERENCE, model.charge(truth), np.array([[0.0, 0.0, 0.3]] * 2))
+    np.testing.assert_allclose(contact, truth, rtol=1e-4)
     assert distance == pytest.approx(0.0, abs=0.01)
 
 
 def test_the_crease_bounds_the_working_area():
-    found = working_area(creased(), REFERENCE, error=np.inf)
-    assert found.fold_radius == pytest.approx(CREASE, abs=6e-5)
-    assert found.why == "fold"
-    assert found.radius == found.unfolded == pytest.approx(2.9e-3, abs=1.1e-4)
-    assert "folds 3" in found.words
+    working = working_area(creased(), REFERENCE, error=np.inf)
+    assert working.fold_radius == pytest.approx(CREASE, abs=6e-5)
+    assert working.why == "fold"
+    assert working.radius == working.unfolded == pytest.approx(2.9e-3, abs=1.1e-4)
+    assert "folds 3" in working.words
 
 
 def test_the_allowed_error_bounds_it_earlier():
-    found = working_area(creased(), REFERENCE, error=0.2e-3, twins=False)
-    assert found.why == "error"
-    ring = found.error_radius * np.exp(2j * np.pi * np.arange(360) / 360)
+    working = working_area(creased(), REFERENCE, error=0.2e-3, twins=False)
+    assert working.why == "error"
+    ring = working.error_radius * np.exp(2j * np.pi * np.arange(360) / 360)
     contact = np.stack([ring.real, ring.imag, np.full(360, 0.05)], axis=1)
     assert limits_at(creased(), contact, REFERENCE).position.max() == pytest.approx(0.2e-3, rel=0.01)
-    assert "exceeds 0.2 mm at 0.05 N" in found.words
+    assert "exceeds 0.2 mm at 0.05 N" in working.words
 
 
 def test_where_nothing_ends_it_the_search_does():
-    found = working_area(creased(radius=1e-3), REFERENCE, error=1.0)
-    assert (found.radius, found.why) == (1e-3, "searched")
-    assert "search ended at 1 mm" in found.words
+    working = working_area(creased(radius=1e-3), REFERENCE, error=1.0)
+    assert (working.radius, working.why) == (1e-3, "searched")
+    assert "search ended at 1 mm" in working.words
 
 
 def test_where_nothing_is_known_there_is_none():

@@ -40,7 +40,7 @@ def film():
 
 
 @pytest.fixture(scope="module")
-def found(film):
+def identification(film):
     return identify(film, REFERENCE)
 
 
@@ -56,8 +56,8 @@ def sized(radius: float, tells: float = 0.1) -> ChargeFunction:
     return ChargeFunction(charge, 5e-3, (0.05, 2.0))
 
 
-def test_numbers_are_ready_for_json(found):
-    numbers = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+def test_numbers_are_ready_for_json(identification):
+    numbers = json.loads(json.dumps(identification.to_dict(), allow_nan=False))
     assert numbers["probe"] == "circle:2.0"
     assert numbers["noise"] == {"name": "reference", "white_pC": 1.0, "gain": 0.002}
     assert numbers["working_area"]["radius_mm"] == 5.0
@@ -67,8 +67,8 @@ def test_numbers_are_ready_for_json(found):
     assert len(numbers["by_distance"]["distance_mm"]) == len(numbers["by_distance"]["worst_position_mm_at_1_N"])
 
 
-def test_summaries_are_ordered_and_fall_with_the_force(found):
-    rows = found.to_dict()["limits_in_working_area"]
+def test_summaries_are_ordered_and_fall_with_the_force(identification):
+    rows = identification.to_dict()["limits_in_working_area"]
     for row in rows:
         assert 0.0 < row["position_median_mm"] <= row["position_rms_mm"] <= row["position_worst_mm"] < 1.0
         assert row["condition_worst"] >= 1.0
@@ -139,10 +139,10 @@ def test_uniaxial_charges_tell_the_size_and_biaxial_ones_do_not(film):
     assert limits["four-25um-biaxial"].min() > 1.0
 
 
-def test_size_needs_a_circle_and_four_charges(film, found):
+def test_size_needs_a_circle_and_four_charges(film, identification):
     three = replace(film, sensor=load_sensor("three-25um-biaxial"))
     with pytest.raises(SceneError, match="at least four charges for x, y, F and the radius, got 3"):
-        radius_limits(three, found.charges, REFERENCE, [1.0], 4e-3)
+        radius_limits(three, identification.charges, REFERENCE, [1.0], 4e-3)
 
 
 def test_forces_keep_off_the_ends():
