@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import ChargeFunction, ChargeSpline, Circle, ForwardMap, load_sensor, noise_model, working_area
-from isocharge.simulate.identifiability.ambiguities import find_ambiguous_pairs, nearest_contact
+from isocharge.simulate.identifiability.ambiguities import find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import fold_points, scaled_jacobian, singular_values, turned_over
+from isocharge.simulate.identifiability.nearest_contact import nearest_contact
 from isocharge.simulate.numerics.disk import Rings
 
 REFERENCE = noise_model("reference")
@@ -98,6 +99,14 @@ def test_the_nearest_contact_is_the_right_one():
     model = creased(300.0)
     truth = np.array([[1e-3, -2e-3, 0.7], [-3e-3, 1e-3, 0.1]])
     contact, distance = nearest_contact(model, REFERENCE, model.charge(truth), np.array([[0.0, 0.0, 0.3]] * 2))
+    np.testing.assert_allclose(contact, truth, rtol=1e-4)
+    assert distance == pytest.approx(0.0, abs=0.01)
+
+
+def test_the_nearest_contact_of_a_model_with_one_force_has_that_force():
+    model = replace(creased(300.0), force_range=(0.5, 0.5))
+    truth = np.array([[1e-3, -2e-3, 0.5]])
+    contact, distance = nearest_contact(model, REFERENCE, model.charge(truth), np.array([[0.0, 0.0, 0.5]]))
     np.testing.assert_allclose(contact, truth, rtol=1e-4)
     assert distance == pytest.approx(0.0, abs=0.01)
 

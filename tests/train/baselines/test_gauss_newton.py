@@ -5,7 +5,6 @@ import pytest
 from scipy.optimize import approx_fprime
 
 from isocharge.train.baselines import GaussNewton
-from isocharge.train.baselines.problem import damped_step
 from isocharge.train.data.presses import noisy_charges
 
 
@@ -63,13 +62,6 @@ def test_no_contact_of_a_dense_grid_fits_better(fits, task, known):
         costs = (plain.problem.residuals(around, row, sigma)[0] ** 2).sum(axis=1)
         best = (plain.problem.residuals(found[number], row, sigma)[0] ** 2).sum()
         assert best <= costs.min() + 1e-6
-
-
-def test_a_step_without_damping_solves_the_linear_problem():
-    rng = np.random.default_rng(0)
-    slopes, target = rng.normal(size=(6, 3, 5)), rng.uniform(-0.5, 0.5, size=(6, 3))
-    residual = -np.einsum("nke,nk->ne", slopes, target)
-    np.testing.assert_allclose(damped_step(np.zeros((6, 3)), residual, slopes, np.zeros(6)), target, rtol=1e-9)
 
 
 def test_answers_stay_in_the_domain(fits, known):

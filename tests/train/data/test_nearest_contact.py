@@ -5,7 +5,8 @@ import pytest
 from scipy.optimize import minimize
 
 from isocharge.simulate import noise_model
-from isocharge.train.data.nearest_contact import into_domain, nearest_contact, search
+from isocharge.simulate.numerics.disk_least_squares import into_domain
+from isocharge.train.data.nearest_contact import nearest_in_field, search_field
 
 NOISE = noise_model("reference")
 FAULTS = {
@@ -34,7 +35,7 @@ def by_scipy(field, charge, start):
 def test_nobody_finds_a_nearer_one(fit, fault):
     rng = np.random.default_rng(1)
     charge = FAULTS[fault](fit.held.charge_pC[:12], rng)
-    unit, miss = search(fit.field, charge, NOISE, starts=3)
+    unit, miss = search_field(fit.field, charge, NOISE, starts=3)
     found = np.linalg.norm(miss, axis=1)
     for row in range(len(charge)):
         starts = [unit[row], *into_domain(rng.uniform(-0.7, 0.7, (3, 3)))]
@@ -44,7 +45,7 @@ def test_nobody_finds_a_nearer_one(fit, fault):
 
 def test_the_miss_is_that_of_the_contact(fit):
     charge = 1.1 * fit.held.charge_pC[:50]
-    unit, miss = search(fit.field, charge, NOISE)
+    unit, miss = search_field(fit.field, charge, NOISE)
     known = np.exp(fit.field.log_charge(unit)[:, 0])
     assert np.allclose(miss, (charge - known) / np.hypot(1.0, 0.002 * charge), rtol=1e-9, atol=1e-9)
     assert np.all(np.hypot(unit[:, 0], unit[:, 1]) <= 1.0 + 1e-12)
@@ -55,7 +56,7 @@ def test_a_clean_press_is_found_where_it_was(fit):
     start = fit.network.domain.to_unit(fit.held.contact)
     charge = np.exp(fit.field.log_charge(start)[:, 0])
     moved = start + np.random.default_rng(0).uniform(-0.1, 0.1, start.shape)
-    unit, miss = nearest_contact(fit.field, charge, NOISE, moved)
+    unit, miss = nearest_in_field(fit.field, charge, NOISE, moved)
     assert np.abs(unit - start).max() < 1e-3
     assert np.abs(miss).max() < 0.01
 
@@ -65,13 +66,4 @@ def test_a_shift_makes_a_press_its_own_nearest(fit):
     start = fit.network.domain.to_unit(fit.held.contact[:40])
     shift = np.full((40, 3), 0.02) * [1.0, -1.0, 1.0]
     charge = np.exp(fit.field.log_charge(start)[:, 0] + shift)
-    assert np.abs(nearest_contact(fit.field, charge, NOISE, start, shift)[1]).max() < 1e-9
-
-
-def test_into_domain_ends_there_and_leaves_it_alone():
-    unit = np.random.default_rng(0).normal(size=(500, 3))
-    inside = into_domain(unit)
-    assert np.hypot(inside[:, 0], inside[:, 1]).max() <= 1.0 + 1e-12
-    assert np.abs(inside[:, 2]).max() <= 1.0
-    already = unit[(np.hypot(unit[:, 0], unit[:, 1]) < 1.0) & (np.abs(unit[:, 2]) < 1.0)]
-    assert np.array_equal(into_domain(already), already)
+    assert np.abs(nearest_in_field(fit.field, charge, NOISE, start, shift)[1]).max() < 1e-9

@@ -1,4 +1,4 @@
-"""Contacts far apart with the same charges, and the contact that explains charges best.
+"""Contacts far apart with the same charges.
 
 A map without folds may still give two distant contacts the same charges, as a sheet may lie on itself without a crease.
 The search for such pairs covers the whole film at once.
@@ -13,6 +13,7 @@ from isocharge.arrays import Array, Integers
 from isocharge.simulate.forward.charge_model import ChargeModel
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.force_profile import ForceProfile
+from isocharge.simulate.identifiability.nearest_contact import nearest_contact
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import lattice
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
@@ -26,9 +27,6 @@ one uncertain contact."""
 
 FORCES = 8
 """Number of forces at which the charges of the second contact are tabulated."""
-
-POLISH, DAMPING = 8, 1e-3
-"""Levenberg and Marquardt's steps for a twin, and their damping."""
 
 EXPONENT = 2.0 / 3.0
 """Exponent of the force in the charge of a slack membrane, dimensionless; the ratio of the charge to this power of the
@@ -126,48 +124,3 @@ def _tabulate(model: ChargeModel, position: Array) -> tuple[ForceProfile, Array]
         return by_force
 
     return ForceProfile.of(weights, model.force_range), terms
-
-
-def nearest_contact(model: ChargeModel, noise: NoiseModel, charge: Array, start: Array) -> tuple[Array, Array]:
-    """Contacts that explain charges best, by least squares from a start.
-
-    Args:
-        model: The charges of contacts.
-        noise: Of the readings.
-        charge: To be explained, shape (n, n_electrode), C.
-        start: Contacts (x, y, F) to start from, shape (n, 3), m and N.
-
-    Returns:
-        Contacts within the model's domain, shape (n, 3), and how far their charges are from those given, in standard
-        deviations, shape (n,).
-    """
-    contact, chi2 = start, _chi2(model, noise, charge, start)
-    damping = np.full(len(start), DAMPING)
-    for _ in range(POLISH):
-        known = model.charge(contact)
-        weighted = model.jacobian(contact) / noise.sigma(known)[..., None]
-        normal = np.einsum("nei,nej->nij", weighted, weighted)
-        diagonal = np.einsum("nii->ni", normal)
-        pull = np.einsum("nei,ne->ni", weighted, (charge - known) / noise.sigma(known))
-        held = normal + (damping[:, None] * diagonal)[:, :, None] * np.eye(3)
-        step = np.linalg.solve(held, pull[..., None])[..., 0]
-        tried = _inside(model, contact, step)
-        fresh = _chi2(model, noise, charge, tried)
-        better = fresh < chi2
-        contact, chi2 = np.where(better[:, None], tried, contact), np.where(better, fresh, chi2)
-        damping = np.where(better, 0.1 * damping, 10.0 * damping)
-    return contact, np.sqrt(chi2)
-
-
-def _chi2(model: ChargeModel, noise: NoiseModel, charge: Array, contact: Array) -> Array:
-    known = model.charge(contact)
-    chi2: Array = ((charge - known) ** 2 / noise.variance(known)).sum(axis=1)
-    return chi2
-
-
-def _inside(model: ChargeModel, contact: Array, step: Array) -> Array:
-    """Contacts moved by steps in (x, y, ln F) and brought back onto the disk and into the range of forces."""
-    position = contact[:, :2] + step[:, :2]
-    shrink = np.minimum(1.0, model.radius * (1.0 - 1e-9) / np.maximum(np.hypot(*position.T), 1e-300))
-    force = np.clip(contact[:, 2] * np.exp(np.clip(step[:, 2], -1.0, 1.0)), *model.force_range)
-    return np.concatenate([position * shrink[:, None], force[:, None]], axis=1)

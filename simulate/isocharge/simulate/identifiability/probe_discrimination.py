@@ -18,8 +18,8 @@ from isocharge.progress import Progress
 from isocharge.simulate.forward.charge_model import ChargeModel
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.identifiability.ambiguities import nearest_contact
 from isocharge.simulate.identifiability.cramer_rao import cramer_rao
+from isocharge.simulate.identifiability.nearest_contact import nearest_contact
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.probe import Circle

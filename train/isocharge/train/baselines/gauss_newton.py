@@ -19,9 +19,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from isocharge.arrays import Array
+from isocharge.simulate.numerics.disk_least_squares import minimise, minimise_one
 from isocharge.train.baselines.estimator import Fitted, FittingTask
 from isocharge.train.baselines.features import LogFeatures
-from isocharge.train.baselines.problem import Problem, damped_step
+from isocharge.train.baselines.problem import Problem
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import ContactDomain
 
@@ -32,12 +33,6 @@ STARTS = 600
 
 TOLERANCE = 1e-5
 """Step in unit coordinates at which a press is done: 0.1 um or 1e-5 of the force."""
-
-ROUNDING = 1e-9
-"""A sum of squares that grows by less has not grown."""
-
-MOST_STEPS = 30
-"""Steps after which a press is done anyway."""
 
 DOUBTFUL = 12.0
 """Sum of squared residuals from which another start is tried: noise alone, with a charge or none to spare, hardly
@@ -170,22 +165,8 @@ class NumpyGaussNewton(_GaussNewton):
     def _descend(self, charge: Array, unit: Array) -> tuple[Array, Array]:
         """Contacts (n, 3) and sums of squared residuals (n,) from a start."""
         sigma = self.problem.sigma(charge)
-        residual, slopes = self.problem.residuals(unit, charge, sigma)
-        cost, damping, todo = (residual**2).sum(axis=1), np.full(len(unit), 1e-3), np.arange(len(unit))
-        for _ in range(MOST_STEPS):
-            trial = damped_step(unit[todo], residual[todo], slopes[todo], damping[todo])
-            new_residual, new_slopes = self.problem.residuals(trial, charge[todo], sigma[todo])
-            new_cost, far = (new_residual**2).sum(axis=1), np.abs(trial - unit[todo]).max(axis=1) > TOLERANCE
-            better = new_cost <= cost[todo]
-            going = far | (new_cost - cost[todo] > ROUNDING)
-            taken = todo[better]
-            unit[taken], residual[taken], slopes[taken] = trial[better], new_residual[better], new_slopes[better]
-            cost[taken] = new_cost[better]
-            damping[todo] *= np.where(better, 0.1, 10.0)
-            todo = todo[going]
-            if not todo.size:
-                break
-        return unit, cost
+        unit, residual = minimise(lambda rows, at: self.problem.residuals(at, charge[rows], sigma[rows]), unit)
+        return unit, (residual**2).sum(axis=1)
 
     def one(self, charge_pC: Array) -> Callable[[], object]:
         """See `Fitted.one`."""
@@ -194,27 +175,15 @@ class NumpyGaussNewton(_GaussNewton):
 
     def single(self, charge_pC: Array) -> Array:
         """The contact of one press, shape (n_electrode,) to (3,)."""
-        unit, cost = self._descend_one(charge_pC, self.start(charge_pC, 0))
-        for attempt in range(1, ATTEMPTS):
-            if cost <= DOUBTFUL:
-                break
-            other, other_cost = self._descend_one(charge_pC, self.start(charge_pC, attempt))
-            unit, cost = (other, other_cost) if other_cost < cost else (unit, cost)
-        return self.domain.to_contact(unit)
+        sigma = self.problem.sigma(charge_pC)
 
-    def _descend_one(self, charge: Array, unit: Array) -> tuple[Array, float]:
-        """As `_descend`, without a batch's bookkeeping."""
-        sigma, damping = self.problem.sigma(charge), np.array(1e-3)
-        residual, slopes = self.problem.residuals(unit, charge, sigma)
-        cost = float(residual @ residual)
-        for _ in range(MOST_STEPS):
-            trial = damped_step(unit, residual, slopes, damping)
-            new_residual, new_slopes = self.problem.residuals(trial, charge, sigma)
-            new_cost, far = float(new_residual @ new_residual), np.abs(trial - unit).max() > TOLERANCE
-            better, going = new_cost <= cost, far or new_cost - cost > ROUNDING
-            if better:
-                unit, residual, slopes, cost = trial, new_residual, new_slopes, new_cost
-            damping = damping * (0.1 if better else 10.0)
-            if not going:
+        def residuals(unit: Array) -> tuple[Array, Array]:
+            return self.problem.residuals(unit, charge_pC, sigma)
+
+        unit, square = minimise_one(residuals, self.start(charge_pC, 0))
+        for attempt in range(1, ATTEMPTS):
+            if square <= DOUBTFUL:
                 break
-        return unit, cost
+            other, other_square = minimise_one(residuals, self.start(charge_pC, attempt))
+            unit, square = (other, other_square) if other_square < square else (unit, square)
+        return self.domain.to_contact(unit)

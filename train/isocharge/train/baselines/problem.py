@@ -1,5 +1,4 @@
-"""The least-squares problem of Gauss-Newton: residuals of a contact, their derivatives, and one damped step within the
-prior's disk and forces."""
+"""The least-squares problem of Gauss-Newton: residuals of a contact and their derivatives."""
 
 from dataclasses import dataclass
 
@@ -8,9 +7,6 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.charge_field import ChargeField
-
-STIFF = 1e6
-"""Weight of the edge's tangent over that of the charges."""
 
 
 @dataclass(frozen=True)
@@ -69,46 +65,3 @@ class Problem:
         """Residuals, shape (..., n_electrode), and their derivatives, shape (..., 3, n_electrode)."""
         known, slopes = self.known(unit)
         return (known - charge_pC) / sigma_pC, slopes / sigma_pC[..., None, :]
-
-
-def within(unit: Array) -> Array:
-    """The nearest contacts in the domain."""
-    held = unit.copy()
-    radius = np.sqrt(unit[..., 0] ** 2 + unit[..., 1] ** 2)
-    held[..., :2] /= np.maximum(radius, 1.0)[..., None]
-    held[..., 2] = np.minimum(np.maximum(unit[..., 2], -1.0), 1.0)
-    return held
-
-
-def damped_step(unit: Array, residual: Array, slopes: Array, damping: Array) -> Array:
-    """Where a Levenberg-Marquardt step (Marquardt 1963) ends, kept in the domain.
-
-    Args:
-        unit: Where it begins, shape (..., 3).
-        residual: There, shape (..., n_electrode).
-        slopes: Derivatives, shape (..., 3, n_electrode).
-        damping: Relative to the diagonal, shape (...).
-    """
-    normal: Array = slopes @ slopes.swapaxes(-1, -2)
-    normal = normal * (1.0 + damping[..., None, None] * np.eye(3))
-    gradient = slopes @ residual[..., None]
-    end: Array = unit + np.linalg.solve(normal, -gradient)[..., 0]
-    outside = (end[..., 0] ** 2 + end[..., 1] ** 2 > 1.0) | (np.abs(end[..., 2]) > 1.0)
-    if not outside.any():
-        return end
-    tangents, gap = _tangents(end, unit)
-    stiff = STIFF / 3.0 * np.trace(normal, axis1=-2, axis2=-1)[..., None, None]
-    normal = normal + stiff * (tangents.swapaxes(-1, -2) @ tangents)
-    gradient = gradient + stiff * (tangents.swapaxes(-1, -2) @ gap[..., None])
-    held: Array = unit + np.linalg.solve(normal, -gradient)[..., 0]
-    return within(np.where(outside[..., None], held, end))
-
-
-def _tangents(end: Array, unit: Array) -> tuple[Array, Array]:
-    """Outward normals of the edges that a step's end lies beyond, (..., 2, 3), and how far beyond them `unit` is."""
-    radius = np.sqrt(end[..., 0] ** 2 + end[..., 1] ** 2)
-    tangents = np.zeros((*end.shape[:-1], 2, 3))
-    tangents[..., 0, :2] = end[..., :2] * ((radius > 1.0) / np.maximum(radius, 1.0))[..., None]
-    tangents[..., 1, 2] = np.sign(end[..., 2]) * (np.abs(end[..., 2]) > 1.0)
-    there = (tangents != 0.0).any(axis=-1)
-    return tangents, (tangents @ unit[..., None])[..., 0] - there

@@ -14,7 +14,7 @@ from isocharge.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
-from isocharge.train.data.nearest_contact import nearest_contact, search
+from isocharge.train.data.nearest_contact import nearest_in_field, search_field
 from isocharge.train.data.presses import LabelledPresses
 
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
@@ -65,9 +65,9 @@ def _misses(field: ChargeField, charge: Array, noise: NoiseModel, own: LabelledP
     miss, at = np.empty_like(charge), np.flatnonzero(near)
     start = field.domain.to_unit(own.contact[at])
     shift = np.log(own.charge_pC[at]) - field.log_charge(start)[:, 0]
-    miss[at] = nearest_contact(field, charge[at], noise, start, shift)[1]
+    miss[at] = nearest_in_field(field, charge[at], noise, start, shift)[1]
     far = np.flatnonzero(~near | (np.linalg.norm(np.where(near[:, None], miss, 0.0), axis=1) > FAR))
-    searched = search(field, charge[far], noise)[1]
+    searched = search_field(field, charge[far], noise)[1]
     keep = near[far] & ((miss[far] ** 2).sum(axis=1) < (searched**2).sum(axis=1))
     miss[far] = np.where(keep[:, None], miss[far], searched)
     return miss

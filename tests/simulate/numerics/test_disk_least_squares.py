@@ -1,0 +1,83 @@
+"""Least squares over the unit disk times [-1, 1]: nearest points in closed form, and SciPy's constrained minimiser."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from isocharge.simulate.numerics.disk_least_squares import bounded_step, into_domain, minimise, minimise_one
+
+RNG = np.random.default_rng(0)
+TARGETS = np.concatenate([RNG.uniform(-1.0, 1.0, (60, 3)), 30.0 * RNG.normal(size=(60, 3)), [[0.0, 0.0, 5.0]]])
+BENT = RNG.normal(size=(4, 3))
+
+
+def distances(rows, unit):
+    """The nearest point of the domain to each target."""
+    return unit - TARGETS[rows], np.broadcast_to(np.eye(3), (len(unit), 3, 3))
+
+
+def bent(rows, unit):
+    """Four residuals that are not linear, larger from row to row."""
+    angle = unit @ BENT.T + 0.1 * rows[:, None]
+    slopes = 2.0 * np.cos(angle)[:, None, :] * BENT.T
+    return 2.0 * np.sin(angle) - 1.5 - 0.1 * rows[:, None], slopes
+
+
+def test_the_nearest_point_of_the_domain():
+    unit, residual = minimise(distances, np.zeros_like(TARGETS))
+    np.testing.assert_allclose(unit, into_domain(TARGETS), atol=1e-6)
+    np.testing.assert_allclose(residual, unit - TARGETS, rtol=1e-12, atol=1e-12)
+
+
+def test_the_nearest_point_of_the_circle_takes_few_steps_however_far_the_target_lies():
+    """Along the circle only its own curvature says where the nearest point is: the start is a right angle away."""
+    angle = np.linspace(0.3, 1.5, 7)
+    far = 1e4 * np.stack([np.cos(angle), np.sin(angle), np.zeros(7)], axis=1)
+    start = np.tile([1.0, 0.0, 0.0], (7, 1))
+    identity = np.broadcast_to(np.eye(3), (7, 3, 3))
+    unit, _ = minimise(lambda rows, at: (at - far[rows], identity[rows]), start, steps=8)
+    np.testing.assert_allclose(unit, far / 1e4, atol=1e-6)
+
+
+def test_no_point_is_nearer_by_scipy():
+    starts = into_domain(RNG.uniform(-0.7, 0.7, (12, 3)))
+    unit, residual = minimise(bent, starts)
+    inside = {"type": "ineq", "fun": lambda at: 1.0 - at[0] ** 2 - at[1] ** 2}
+    for row, start in enumerate(unit):
+        solution = minimize(
+            lambda at, row=row: float((bent(np.array([row]), at[None])[0] ** 2).sum()),
+            start,
+            bounds=[(-1, 1)] * 3,
+            constraints=inside,
+            options={"ftol": 1e-13},
+        )
+        assert (residual[row] ** 2).sum() <= solution.fun + 2e-6 * (1.0 + solution.fun)
+
+
+def test_one_problem_ends_where_it_does_among_many():
+    starts = into_domain(RNG.uniform(-1.0, 1.0, (20, 3)))
+    unit, residual = minimise(bent, starts)
+    for row in range(20):
+
+        def alone(at, row=row):
+            many, slopes = bent(np.array([row]), at[None])
+            return many[0], slopes[0]
+
+        end, square = minimise_one(alone, starts[row])
+        np.testing.assert_allclose(end, unit[row], atol=1e-9)
+        assert square == pytest.approx((residual[row] ** 2).sum(), rel=1e-9)
+
+
+def test_a_step_without_damping_solves_the_linear_problem():
+    slopes, target = RNG.normal(size=(6, 3, 5)), RNG.uniform(-0.5, 0.5, size=(6, 3))
+    residual = -np.einsum("nke,nk->ne", slopes, target)
+    np.testing.assert_allclose(bounded_step(np.zeros((6, 3)), residual, slopes, np.zeros(6)), target, rtol=1e-9)
+
+
+def test_the_domain_is_reached_and_its_points_stay():
+    unit = RNG.normal(size=(500, 3))
+    inside = into_domain(unit)
+    assert np.hypot(inside[:, 0], inside[:, 1]).max() <= 1.0 + 1e-12
+    assert np.abs(inside[:, 2]).max() <= 1.0
+    already = unit[(np.hypot(unit[:, 0], unit[:, 1]) < 1.0) & (np.abs(unit[:, 2]) < 1.0)]
+    assert np.array_equal(into_domain(already), already)
