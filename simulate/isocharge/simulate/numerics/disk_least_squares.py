@@ -23,6 +23,9 @@ MOST_STEPS = 30
 CHANGE = 1e-7
 """The search is over after a step that changes |r|^2 by less than this, relative to 1 + |r|^2."""
 
+ROUNDING = 1e-12
+"""A step that raises |r|^2 by no more than this, relative to 1 + |r|^2, is taken: it may be the last to the minimum."""
+
 FIRST, LEAST, MOST = 1e-4, 1e-9, 1e4
 """Damping at the start and its bounds, relative to the mean diagonal of J'J; above the last, no step helps any more."""
 
@@ -56,13 +59,13 @@ def minimise(residuals: Residuals, start: Array, steps: int = MOST_STEPS) -> tup
         trial = bounded_step(unit[active], residual[active], slopes[active], damping[active])
         new_residual, new_slopes = residuals(active, trial)
         new_square = (new_residual**2).sum(axis=1)
-        change = new_square - square[active]
-        lower = change < 0.0
+        change = (new_square - square[active]) / (1.0 + new_square)
+        lower = change <= ROUNDING
         better = active[lower]
         unit[better], residual[better], slopes[better] = trial[lower], new_residual[lower], new_slopes[lower]
         square[better] = new_square[lower]
         damping[active] = np.where(lower, np.maximum(damping[active] * EASIER, LEAST), damping[active] * HARDER)
-        active = active[(np.abs(change) >= CHANGE * (1.0 + new_square)) & (damping[active] <= MOST)]
+        active = active[(np.abs(change) >= CHANGE) & (damping[active] <= MOST)]
     return unit, residual
 
 
@@ -77,13 +80,13 @@ def minimise_one(
         trial = bounded_step(unit, residual, slopes, damping)
         new_residual, new_slopes = residuals(trial)
         new_square = float(new_residual @ new_residual)
-        change = new_square - square
-        if change < 0.0:
+        change = (new_square - square) / (1.0 + new_square)
+        if change <= ROUNDING:
             unit, residual, slopes, square = trial, new_residual, new_slopes, new_square
             damping = max(damping * EASIER, LEAST)
         else:
             damping = damping * HARDER
-        if abs(change) < CHANGE * (1.0 + new_square) or damping > MOST:
+        if abs(change) < CHANGE or damping > MOST:
             break
     return unit, square
 

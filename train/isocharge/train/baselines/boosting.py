@@ -1,24 +1,31 @@
 """Gradient boosting: scikit-learn's histogram trees, one ensemble per coordinate, learnt from noisy copies, on what an
 affine fit leaves.
 
-The NumPy form walks all trees of all coordinates at once, one level per step.
+The plain form is the same trees as one node of an ONNX graph. Converting them by skl2onnx 1.20 fails with protobuf 7.34
+and later (it writes booleans where integers are due), so the node is written here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import onnxruntime as ort
+from onnx import TensorProto, helper, numpy_helper
 from sklearn.ensemble import HistGradientBoostingRegressor
+from sklearn.multioutput import MultiOutputRegressor
 
-from isocharge.arrays import Array, Integers
+from isocharge.arrays import Array
+from isocharge.serve.model.session import open_session
 from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
 from isocharge.train.baselines.features import LogFeatures, affine_fit, with_one
 from isocharge.train.data.domain import ContactDomain
+from isocharge.train.release.export import IR_VERSION, OPSET
 
 NAME = "gradient boosting"
 
-BATCH = 64
-"""Presses that walk the trees at once: their nodes stay in the cache."""
+TREE_DOMAIN, TREE_OPSET = "ai.onnx.ml", 3
+"""ONNX's operators for trees, and their first version with thresholds in float64."""
 
 
 @dataclass(frozen=True)
@@ -40,43 +47,40 @@ class GradientBoosting:
         """Choose the leaves, and give both forms."""
         noisy = task.noisy_train(1 if task.quick else min(task.copies, 3))
         features, unit = LogFeatures.fit(noisy.charge_pC), task.domain.to_unit(noisy.contact)
-        values, made = features(noisy.charge_pC), {}
+        values, candidates = features(noisy.charge_pC), {}
         plane = affine_fit(values, unit)
         residual = unit - with_one(values) @ plane
 
         def predict_with(leaves: int) -> Callable[[Array], Array]:
-            models = self._models(values, residual, leaves, task)
-            made[leaves] = SklearnBoosting(features, plane, models, task.domain)
-            return made[leaves].predict
+            model = self._regressor(leaves, task).fit(values, residual)
+            candidates[leaves] = SklearnBoosting(features, plane, model, task.domain)
+            return candidates[leaves].predict
 
-        leaves, words = best_of(task, self.leaves[:1] if task.quick else self.leaves, predict_with)
-        count = made[leaves].models[0].n_iter_
-        choice = (
-            f"{count} trees of {leaves} leaves per coordinate, rate {self.rate:g}, {len(unit)} noisy presses{words}"
+        leaves, comparison = best_of(task, self.leaves[:1] if task.quick else self.leaves, predict_with)
+        count = candidates[leaves].model.estimators_[0].n_iter_
+        size = f"{count} trees of {leaves} leaves per coordinate, rate {self.rate:g}"
+        library = replace(candidates[leaves], choice=f"{size}, {len(unit)} noisy presses{comparison}")
+        return library, OnnxBoosting.of(library)
+
+    def _regressor(self, leaves: int, task: FittingTask) -> MultiOutputRegressor:
+        return MultiOutputRegressor(
+            HistGradientBoostingRegressor(
+                max_iter=30 if task.quick else self.trees,
+                learning_rate=self.rate,
+                max_leaf_nodes=leaves,
+                early_stopping=False,
+                random_state=task.seed,
+            )
         )
-        library = replace(made[leaves], choice=choice)
-        return library, NumpyBoosting.of(library)
-
-    def _models(
-        self, values: Array, unit: Array, leaves: int, task: FittingTask
-    ) -> tuple[HistGradientBoostingRegressor, ...]:
-        settings = {
-            "max_iter": 30 if task.quick else self.trees,
-            "learning_rate": self.rate,
-            "max_leaf_nodes": leaves,
-            "early_stopping": False,
-            "random_state": task.seed,
-        }
-        return tuple(HistGradientBoostingRegressor(**settings).fit(values, column) for column in unit.T)
 
 
 @dataclass(frozen=True)
 class SklearnBoosting(Fitted):
-    """An affine map and three HistGradientBoostingRegressors, for x, y and ln F."""
+    """An affine map and HistGradientBoostingRegressors for x, y and ln F."""
 
     features: LogFeatures
     plane: Array
-    models: tuple[HistGradientBoostingRegressor, ...]
+    model: MultiOutputRegressor
     domain: ContactDomain
     choice: str = ""
     name: str = NAME
@@ -85,76 +89,83 @@ class SklearnBoosting(Fitted):
     def predict(self, charge_pC: Array) -> Array:
         """See `Fitted.predict`."""
         values = self.features(charge_pC)
-        boosted = np.stack([model.predict(values) for model in self.models], axis=1)
-        return self.domain.to_contact(with_one(values) @ self.plane + boosted)
+        return self.domain.to_contact(with_one(values) @ self.plane + self.model.predict(values))
 
 
 @dataclass(frozen=True)
-class NumpyBoosting(Fitted):
-    """The same trees as arrays.
+class OnnxBoosting(Fitted):
+    """The same trees in ONNX Runtime: thresholds in float64, sums in float32. Features and affine map stay in NumPy.
 
     Attributes:
         features: Of the charges.
-        plane: The affine map, shape (n_electrode + 1, 3); the trees' own start is in it.
-        feature: Which one a node looks at, shape (n_node,).
-        threshold: Left if the feature is not above it; infinite for a leaf, shape (n_node,).
-        children: Left and right node, a leaf's own number for a leaf, shape (n_node, 2).
-        value: Of a leaf, shape (n_node,).
-        roots: First node of each tree, shape (3, n_tree).
-        depth: Steps from a root to its deepest leaf.
+        plane: The affine map, shape (n_electrode + 1, 3).
+        graph: See `tree_graph`.
+        domain: What the unit coordinates refer to.
     """
 
     features: LogFeatures
     plane: Array
-    feature: Integers
-    threshold: Array
-    children: Integers
-    value: Array
-    roots: Integers
-    depth: int
+    graph: bytes
     domain: ContactDomain
     choice: str = ""
     name: str = NAME
-    form: str = "NumPy"
+    form: str = "ONNX Runtime"
 
     @classmethod
-    def of(cls, library: SklearnBoosting) -> "NumpyBoosting":
-        """From the scikit-learn form; reads its trees as scikit-learn keeps them (`_predictors`, tried with 1.9)."""
-        trees = [stage[0].nodes for model in library.models for stage in model._predictors]
-        first = np.concatenate([[0], np.cumsum([len(nodes) for nodes in trees])])
-        nodes = np.concatenate(trees)
-        offset, leaf = np.repeat(first[:-1], np.diff(first)), nodes["is_leaf"].astype(bool)
-        own = np.arange(len(nodes))
-        start = [float(model._baseline_prediction[0, 0]) for model in library.models]
-        children = [np.where(leaf, own, nodes[side].astype(np.intp) + offset) for side in ("left", "right")]
-        return cls(
-            features=library.features,
-            plane=library.plane + np.outer(np.eye(len(library.plane))[-1], start),
-            feature=np.where(leaf, 0, nodes["feature_idx"]).astype(np.intp),
-            threshold=np.where(leaf, np.inf, nodes["num_threshold"]),
-            children=np.stack(children, axis=1),
-            value=nodes["value"].astype(float),
-            roots=first[:-1].reshape(3, -1),
-            depth=int(nodes["depth"].max()),
-            domain=library.domain,
-            choice=library.choice,
-        )
+    def of(cls, library: SklearnBoosting) -> "OnnxBoosting":
+        """From the scikit-learn form."""
+        graph = tree_graph(library.model.estimators_)
+        return cls(library.features, library.plane, graph, library.domain, library.choice)
+
+    @cached_property
+    def _session(self) -> ort.InferenceSession:
+        return open_session(self.graph, self.name)
 
     def predict(self, charge_pC: Array) -> Array:
         """See `Fitted.predict`."""
         values = self.features(charge_pC)
-        parts = [self._walk(values[start : start + BATCH]) for start in range(0, len(values), BATCH)]
-        return self.domain.to_contact(np.concatenate(parts))
+        boosted = self._session.run(None, {"features": values})[0]
+        return self.domain.to_contact(with_one(values) @ self.plane + boosted)
 
-    def _walk(self, values: Array) -> Array:
-        """Unit coordinates, shape (n, 3), from features, shape (n, n_electrode)."""
-        flat, width = values.ravel(), values.shape[1]
-        node = np.tile(self.roots.ravel(), (len(values), 1))
-        row = width * np.arange(len(values))[:, None]
-        children = self.children.ravel()
-        for _ in range(self.depth):
-            right = flat.take(self.feature.take(node) + row) > self.threshold.take(node)
-            node = children.take(2 * node + right)
-        sums = self.value.take(node).reshape(len(values), 3, -1).sum(axis=2)
-        unit: Array = sums + with_one(values) @ self.plane
-        return unit
+
+def tree_graph(models: Sequence[HistGradientBoostingRegressor]) -> bytes:
+    """An ONNX graph with the input `features` [n, n_feature], float64, and the output `sums` [n, n_model], float32.
+
+    Reads the trees as scikit-learn keeps them (`_predictors` and `_baseline_prediction`, tried with 1.9): it has no
+    public access to them.
+    """
+    trees = [stage[0].nodes for model in models for stage in model._predictors]
+    sizes, nodes = [len(tree) for tree in trees], np.concatenate(trees)
+    tree, number = np.repeat(np.arange(len(trees)), sizes), np.concatenate([np.arange(size) for size in sizes])
+    target = np.repeat(np.arange(len(models)), [len(model._predictors) for model in models])[tree]
+    leaf = nodes["is_leaf"].astype(bool)
+    start = np.array([model._baseline_prediction[0, 0] for model in models])
+    node = helper.make_node(
+        "TreeEnsembleRegressor",
+        ["features"],
+        ["sums"],
+        domain=TREE_DOMAIN,
+        n_targets=len(models),
+        base_values_as_tensor=numpy_helper.from_array(start),
+        nodes_treeids=tree.tolist(),
+        nodes_nodeids=number.tolist(),
+        nodes_modes=np.where(leaf, "LEAF", "BRANCH_LEQ").tolist(),
+        nodes_featureids=np.where(leaf, 0, nodes["feature_idx"]).tolist(),
+        nodes_values_as_tensor=numpy_helper.from_array(np.where(leaf, 0.0, nodes["num_threshold"])),
+        nodes_truenodeids=np.where(leaf, 0, nodes["left"]).tolist(),
+        nodes_falsenodeids=np.where(leaf, 0, nodes["right"]).tolist(),
+        target_treeids=tree[leaf].tolist(),
+        target_nodeids=number[leaf].tolist(),
+        target_ids=target[leaf].tolist(),
+        target_weights_as_tensor=numpy_helper.from_array(nodes["value"][leaf].astype(float)),
+    )
+    features, sums = (
+        helper.make_tensor_value_info(name, kind, ["n", width])
+        for name, kind, width in (
+            ("features", TensorProto.DOUBLE, models[0].n_features_in_),
+            ("sums", TensorProto.FLOAT, len(models)),
+        )
+    )
+    graph = helper.make_graph([node], "trees", [features], [sums])
+    opsets = [helper.make_opsetid("", OPSET), helper.make_opsetid(TREE_DOMAIN, TREE_OPSET)]
+    return bytes(helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION).SerializeToString())

@@ -1,7 +1,8 @@
 """Gaussian process regression on a subset of the presses, one kernel for all coordinates.
 
 Its cost grows with the presses it keeps, so it keeps few. The NumPy form is the posterior mean alone: one row of kernel
-values times fixed weights.
+values times fixed weights. (As a graph by skl2onnx it takes 54 us for one press instead of 13, and is a fifth as fast
+in batches; in float32 it is wrong by millimetres.)
 """
 
 from collections.abc import Callable

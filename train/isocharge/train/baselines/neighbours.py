@@ -6,7 +6,6 @@ the force, so that neighbours of other forces do no harm. The direct form asks S
 checks.
 """
 
-import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -104,11 +103,6 @@ class TreeNeighbours(Fitted):
     def _residual_in_units(self) -> Array:
         residual: Array = self.residual * self.domain.scale / self.k
         return residual
-
-    @property
-    def memory(self) -> int:
-        """See `Fitted.memory`; without what follows from the rest."""
-        return len(pickle.dumps((self.features, self.tree, self.plane, self.residual, self.k, self.domain)))
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,10 @@
 
 Its scikit-learn form spends its time on checks; the NumPy form is the same polynomial. For one press it is summed
 variable by variable, coefficients of shape (degree + 1, ...) times the powers of one feature, and again; for many, each
-monomial is made from one of lower degree.
+monomial is the product of one of lower degree and a feature. (As a graph by skl2onnx, in float32 only, 495 terms take
+404 us for one press instead of 18, and are a seventh as fast in batches.)
 """
 
-import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -142,11 +142,6 @@ class NumpyPolynomial(Fitted):
             sums = sums.reshape(-1, orders.size) @ powers
         sums[2] = np.exp(sums[2])
         return sums
-
-    @property
-    def memory(self) -> int:
-        """See `Fitted.memory`; the rest follows from this."""
-        return len(pickle.dumps((self.features, self.weights, self.degree)))
 
     @cached_property
     def _orders(self) -> Array:
