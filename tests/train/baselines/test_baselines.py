@@ -16,7 +16,8 @@ from isocharge.train.baselines import (
     NearestNeighbours,
     PolynomialRidge,
 )
-from isocharge.train.data.presses import noisy_charges, position_error
+from isocharge.train.data.noise import noisy_charges
+from isocharge.train.data.presses import position_error
 
 ALLOWED_MM = {
     PolynomialRidge(): 0.1,

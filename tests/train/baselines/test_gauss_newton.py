@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import approx_fprime
 
 from isocharge.train.baselines import GaussNewton
-from isocharge.train.data.presses import noisy_charges
+from isocharge.train.data.noise import noisy_charges
 
 
 @pytest.fixture(scope="module")

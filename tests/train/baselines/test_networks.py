@@ -8,7 +8,6 @@ from isocharge.simulate import noise_model
 from isocharge.train.baselines import FittingTask, Network
 from isocharge.train.baselines.networks import (
     BoundNetwork,
-    Folded,
     NumpyNetwork,
     SessionNetwork,
     TorchNetwork,
@@ -18,6 +17,7 @@ from isocharge.train.baselines.networks import (
 from isocharge.train.data.domain import ContactDomain
 from isocharge.train.data.presses import domain_of, presses_of, split_by_position
 from isocharge.train.release.export import export_onnx
+from isocharge.train.release.folding import contact_alone
 from isocharge.train.training.network import Features, InverseNetwork
 
 CHARGE = np.random.default_rng(0).uniform(100.0, 1500.0, (400, 3))
@@ -29,19 +29,19 @@ def network():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
         made = InverseNetwork(ContactDomain(8.0, (0.05, 2.0)), Features.fit(CHARGE), (24, 24), (8, 8))
-        torch.nn.init.normal_(made.contact.straight.weight, std=0.3)
+        torch.nn.init.normal_(made.contact.skip.weight, std=0.3)
         return made.eval()
 
 
 @pytest.fixture(scope="module")
 def forms(network):
-    folded = Folded.of(network)
-    graph = contact_graph(folded)
+    layers = contact_alone(network)
+    graph = contact_graph(layers)
     return [
         TorchNetwork(network, "", "n"),
         SessionNetwork(graph, "", "n"),
         BoundNetwork(graph, "", "n"),
-        NumpyNetwork(folded, "", "n"),
+        NumpyNetwork(layers, "", "n"),
     ]
 
 

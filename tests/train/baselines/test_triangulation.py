@@ -17,7 +17,7 @@ def forms(dataset, film):
 def test_clean_presses_are_found(dataset, forms):
     presses = LabelledPresses.of(dataset.samples)[np.arange(60)]
     for form in forms:
-        contact = form.told(presses.contact[:, 2]).predict(presses.charge_pC)
+        contact = form.with_known_force(presses.contact[:, 2]).predict(presses.charge_pC)
         found = np.isfinite(contact[:, 0])
         assert found.mean() > 0.8
         assert np.median(position_error(contact[found], presses.contact[found])) < 0.02
@@ -27,6 +27,6 @@ def test_only_one_form_is_given_the_force(dataset, forms):
     unknown, given = forms
     assert (unknown.given_force, given.given_force) == (False, True)
     assert "force given" in given.name
-    assert unknown.told(np.ones(3)) is unknown
-    with pytest.raises(ValueError, match="told"):
+    assert unknown.with_known_force(np.ones(3)) is unknown
+    with pytest.raises(ValueError, match="with_known_force"):
         given.predict(dataset.samples.charge_pC[:2])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from isocharge.errors import TrainingError
 from isocharge.simulate import noise_model
-from isocharge.train.data.presses import noisy_charges
+from isocharge.train.data.noise import noisy_charges
 from isocharge.train.release.export import export_onnx
 from isocharge.train.release.release import _check_finite
 
@@ -103,7 +103,7 @@ def test_a_network_that_runs_off_the_numbers_is_not_released(fit, graph):
     _check_finite(graph, 3)
     steep = copy.deepcopy(fit.network)
     with torch.no_grad():
-        steep.contact.straight.weight *= 1e3
+        steep.contact.skip.weight *= 1e3
     with pytest.raises(TrainingError, match=r"answers contact = .* expected finite numbers for any charges"):
         _check_finite(export_onnx(steep, {}), 3)
 

@@ -9,7 +9,7 @@ from isocharge.train.training.descent import REPORT_EVERY, Descent, TrainingStag
 from isocharge.train.training.network import Perceptron
 
 
-def task(scores, steps=20 * REPORT_EVERY, settle=0):
+def task(scores, steps=20 * REPORT_EVERY, warm_up_steps=0):
     """A small network that is pulled to a target, and scores as given, one look after the other."""
     torch.manual_seed(0)
     part, given, seen = Perceptron(2, (4, 4), 1), iter(scores), []
@@ -22,7 +22,7 @@ def task(scores, steps=20 * REPORT_EVERY, settle=0):
         seen.append({name: values.clone() for name, values in part.state_dict().items()})
         return next(given), "words"
 
-    return TrainingStage("stage", part, loss, score, steps, settle), seen
+    return TrainingStage("stage", part, loss, score, steps, warm_up_steps), seen
 
 
 def run(made, patience=10**6):
@@ -50,7 +50,7 @@ def test_it_ends_when_nothing_better_has_come_for_long():
 
 
 def test_nothing_counts_while_another_loss_is_trained():
-    made, seen = task([0.0, 0.0, 2.0, 3.0], steps=4 * REPORT_EVERY, settle=2 * REPORT_EVERY)
+    made, seen = task([0.0, 0.0, 2.0, 3.0], steps=4 * REPORT_EVERY, warm_up_steps=2 * REPORT_EVERY)
     run(made, patience=REPORT_EVERY + 1)
     assert same(made.part.state_dict(), seen[2])
 

@@ -10,7 +10,8 @@ import torch
 from isocharge.errors import ConfigError, InputError, TrainingError
 from isocharge.simulate import Dataset, Samples, noise_model
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network
-from isocharge.train.data.presses import noisy_charges, position_error
+from isocharge.train.data.noise import noisy_charges
+from isocharge.train.data.presses import position_error
 from isocharge.train.release.evaluate import measure_errors
 from isocharge.train.release.release import predict_with
 

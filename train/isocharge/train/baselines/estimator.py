@@ -15,8 +15,10 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.presses import LabelledPresses, noisy_charges, position_error
+from isocharge.train.data.noise import noisy_charges
+from isocharge.train.data.presses import LabelledPresses, position_error
 
 T = TypeVar("T")
 
@@ -60,7 +62,7 @@ class FittingTask:
     def validation_error(self, predict: Callable[[Array], Array]) -> float:
         """Root-mean-square position error on noisy validation charges, mm: what hyperparameters are chosen by."""
         presses = self.noisy_validation
-        return float(np.sqrt(np.mean(position_error(predict(presses.charge_pC), presses.contact) ** 2)))
+        return rms(position_error(predict(presses.charge_pC), presses.contact))
 
 
 class Fitted(ABC):
@@ -89,7 +91,7 @@ class Fitted(ABC):
             (x_mm, y_mm, force_N), shape (n, 3); NaN where the method has no answer.
         """
 
-    def told(self, force_N: Array) -> "Fitted":
+    def with_known_force(self, force_N: Array) -> "Fitted":
         """The same, told the true forces of the presses that come next, shape (n,), N: itself, if it does not ask."""
         del force_N
         return self

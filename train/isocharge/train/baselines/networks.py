@@ -15,8 +15,6 @@ import numpy as np
 import onnx.utils
 import onnxruntime as ort
 import torch
-from onnx import TensorProto, helper
-from torch import nn
 
 from isocharge.arrays import Array
 from isocharge.serve import Predictor
@@ -24,45 +22,11 @@ from isocharge.serve.model.session import open_session
 from isocharge.simulate.dataset.shards import Dataset
 from isocharge.train.baselines.estimator import Fitted, FittingTask
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
-from isocharge.train.release.export import IR_VERSION, OPSET, GraphBuilder
+from isocharge.train.release.export import GraphBuilder, add_layers, make_model
+from isocharge.train.release.folding import FoldedLayers, contact_alone
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.training.fit import fit_network
 from isocharge.train.training.network import InverseNetwork
-
-
-@dataclass(frozen=True)
-class Folded:
-    """The contact network from ln Q to (x_mm, y_mm, ln F), whitening and units folded in.
-
-    Attributes:
-        hidden: Weights (inputs, outputs) and biases of the layers that tanh follows.
-        last: Of the last layer.
-        straight: Weights straight from the inputs to the outputs, shape (n_electrode, 3).
-    """
-
-    hidden: tuple[tuple[Array, Array], ...]
-    last: tuple[Array, Array]
-    straight: Array
-
-    @classmethod
-    def of(cls, network: InverseNetwork) -> "Folded":
-        """From a trained network."""
-        whitening, logs = network.features.matrix, np.log(network.features.typical) + network.features.mean
-        layers = [_parameters(layer) for layer in network.contact.layers()]
-        weight, bias = layers[0]
-        first = whitening @ weight
-        scale = network.domain.scale
-        straight = whitening @ _parameters(network.contact.straight)[0][:, :3] * scale
-        weight_out, bias_out = layers[-1]
-        shift = bias_out[:3] * scale + network.domain.centre - logs @ straight
-        return cls(((first, bias - logs @ first), *layers[1:-1]), (weight_out[:, :3] * scale, shift), straight)
-
-
-def _parameters(layer: nn.Linear) -> tuple[Array, Array]:
-    """Weights (inputs, outputs) and bias of a layer, zero if it has none."""
-    weight: Array = layer.weight.detach().double().numpy().T
-    bias = np.zeros(weight.shape[1]) if layer.bias is None else layer.bias.detach().double().numpy()
-    return weight, bias
 
 
 @dataclass(frozen=True)
@@ -98,36 +62,24 @@ class Network:
         )
         sizes = NetworkConfig(hidden=self.hidden, misfit_hidden=(8,) * len(self.hidden))
         network = fit_network(self.dataset, FitConfig(sizes, training), warn=lambda _: None).network
-        choice, folded = f"{self.steps} steps", Folded.of(network)
-        graph = contact_graph(folded)
+        choice, layers = f"{self.steps} steps", contact_alone(network)
+        graph = contact_graph(layers)
         return (
             TorchNetwork(network, choice, self.name),
             SessionNetwork(graph, choice, self.name),
             BoundNetwork(graph, choice, self.name),
-            NumpyNetwork(folded, choice, self.name),
+            NumpyNetwork(layers, choice, self.name),
         )
 
 
-def contact_graph(folded: Folded) -> bytes:
+def contact_graph(layers: FoldedLayers) -> bytes:
     """An ONNX graph with the input `charge_pC` [n, n_electrode] and the output `contact` [n, 3], float32."""
     build = GraphBuilder()
-    value = logs = build.add(
-        "Log", build.add("Clip", "charge_pC", build.constant(LOWEST_PC), build.constant(HIGHEST_PC))
-    )
-    for weight, bias in folded.hidden:
-        value = build.add("Tanh", build.add("Gemm", value, build.constant(weight), build.constant(bias)))
-    weight, bias = folded.last
-    beside = build.add("Gemm", logs, build.constant(folded.straight), build.constant(bias))
-    value = build.add("Gemm", value, build.constant(weight), beside)
+    within = build.add("Clip", "charge_pC", build.constant(LOWEST_PC), build.constant(HIGHEST_PC))
+    value = add_layers(build, build.add("Log", within), layers)
     plane, log_force = build.split(value, ("plane", "log_force"), (2, 1), axis=1)
     build.add("Concat", plane, build.add("Exp", log_force), to="contact", axis=1)
-    charge, contact = (
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
-        for name, width in (("charge_pC", len(folded.straight)), ("contact", 3))
-    )
-    graph = helper.make_graph(build.nodes, "contact", [charge], [contact], build.constants)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
-    return bytes(model.SerializeToString())
+    return bytes(make_model(build, "contact", len(layers.skip), {"contact": 3}).SerializeToString())
 
 
 @dataclass(frozen=True)
@@ -232,7 +184,7 @@ class _Bound:
 class NumpyNetwork(Fitted):
     """In NumPy, float64."""
 
-    folded: Folded
+    layers: FoldedLayers
     choice: str
     name: str
     form: str = "NumPy"
@@ -240,9 +192,9 @@ class NumpyNetwork(Fitted):
     def predict(self, charge_pC: Array) -> Array:
         """See `Fitted.predict`."""
         value = logs = np.log(np.minimum(np.maximum(charge_pC, LOWEST_PC), HIGHEST_PC))
-        for weight, bias in self.folded.hidden:
+        for weight, bias in self.layers.hidden:
             value = np.tanh(value @ weight + bias)
-        contact: Array = value @ self.folded.last[0] + logs @ self.folded.straight + self.folded.last[1]
+        contact: Array = value @ self.layers.last[0] + logs @ self.layers.skip + self.layers.last[1]
         contact[..., 2] = np.exp(contact[..., 2])
         return contact
 
@@ -253,7 +205,7 @@ class NumpyNetwork(Fitted):
     @property
     def memory(self) -> int:
         """See `Fitted.memory`."""
-        return len(pickle.dumps(self.folded))
+        return len(pickle.dumps(self.layers))
 
 
 def contact_of(model: bytes) -> bytes:

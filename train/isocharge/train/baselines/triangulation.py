@@ -44,16 +44,16 @@ class ContourMeeting(Fitted):
     given_force: bool = False
     force_N: Array | None = None
 
-    def told(self, force_N: Array) -> "ContourMeeting":
-        """See `Fitted.told`."""
+    def with_known_force(self, force_N: Array) -> "ContourMeeting":
+        """See `Fitted.with_known_force`."""
         return replace(self, force_N=force_N) if self.given_force else self
 
     def predict(self, charge_pC: Array) -> Array:
-        """See `Fitted.predict`; with the force given, `told` comes first."""
+        """See `Fitted.predict`; with the force given, `with_known_force` comes first."""
         charge = 1e-12 * charge_pC
         if self.given_force:
             if self.force_N is None:
-                raise ValueError("triangulation with the force given: expected told(force_N) before predict")
+                raise ValueError("triangulation with the force given: call with_known_force(force_N) before predict")
             low, high = self.contours.table.force_range
             fix = self.contours.locate(charge, np.clip(self.force_N, low, high))
         else:

@@ -22,6 +22,7 @@ from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model
+from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
@@ -100,21 +101,17 @@ class BayesLimit:
         return cls(
             presses=len(truth),
             position_median_mm=float(np.median(position)),
-            position_rms_mm=_rms(position),
+            position_rms_mm=rms(position),
             position_p95_mm=float(np.percentile(position, 95)),
             force_median_percent=float(np.median(np.abs(force))),
-            force_rms_percent=_rms(force),
-            expected_position_rms_mm=_rms(np.hypot(*std[:, :2].T)),
-            expected_force_rms_percent=100.0 * _rms(std[:, 2] / contact[:, 2]),
+            force_rms_percent=rms(force),
+            expected_position_rms_mm=rms(np.hypot(*std[:, :2].T)),
+            expected_force_rms_percent=100.0 * rms(std[:, 2] / contact[:, 2]),
         )
 
     def to_dict(self) -> dict[str, float | int]:
         """For JSON."""
         return asdict(self)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def bayes_estimate(
@@ -147,7 +144,7 @@ def bayes_estimate(
     def compute() -> list[Any]:
         posterior = Posterior(_spline(scene, forward_map), scene.noise, 1e-3 * scene.radius_mm)
         mean, std = _in_chunks(posterior, 1e-12 * charge, progress)
-        return [np.round(part, 9).tolist() for part in (_to_mm(mean), _to_mm(std))]
+        return [np.round(part, 9).tolist() for part in (_in_millimetres(mean), _in_millimetres(std))]
 
     contact, std = (np.array(part) for part in cached("bayes", key, compute))
     return contact, std
@@ -201,6 +198,6 @@ def _in_chunks(posterior: Posterior, charge: Array, progress: Progress | None) -
     return mean, std
 
 
-def _to_mm(values: Array) -> Array:
+def _in_millimetres(values: Array) -> Array:
     in_mm: Array = values * np.array([1e3, 1e3, 1.0])
     return in_mm

@@ -18,6 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from isocharge.arrays import Array, Integers
 from isocharge.errors import TrainingError
+from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.domain import ContactDomain
 
 CANDIDATES = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
@@ -75,7 +76,7 @@ class ChargeField:
                 break
             rows = slice(0, ROWS_PER_TERM * count)
             field = cls(domain, _least_squares(unit[rows], target[rows], degree, force_degree), np.inf)
-            error = float(np.sqrt(np.mean((field.charge_pC(held[0]) / held[1] - 1.0) ** 2)))
+            error = rms(field.charge_pC(held[0]) / held[1] - 1.0)
             if best is None or error < best.error:
                 best = cls(domain, field.series, error)
             if error < GOOD_ENOUGH:

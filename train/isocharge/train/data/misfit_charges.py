@@ -15,6 +15,7 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
 from isocharge.train.data.nearest_contact import nearest_in_field, search_field
+from isocharge.train.data.noise import with_noise
 from isocharge.train.data.presses import LabelledPresses
 
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
@@ -73,8 +74,8 @@ def _misses(field: ChargeField, charge: Array, noise: NoiseModel, own: LabelledP
     return miss
 
 
-def _noisy(rng: np.random.Generator, charge: Array, _: Array, noise: NoiseModel) -> Array:
-    return noise.add(1e-12 * charge, rng) * 1e12
+def _noisy_press(rng: np.random.Generator, charge: Array, _: Array, noise: NoiseModel) -> Array:
+    return with_noise(charge, noise, rng)
 
 
 def _moved(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
@@ -118,7 +119,7 @@ def _uniform_in_logs(rng: np.random.Generator, charge: Array, _: Array, __: Nois
 
 
 _DRAW = {
-    "noisy": _noisy,
+    "noisy": _noisy_press,
     "moved": _moved,
     "gains": _gains,
     "dying": _failing_electrode,

@@ -10,6 +10,7 @@ from isocharge.arrays import Array, Integers
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk_least_squares import minimise
 from isocharge.train.data.charge_field import ChargeField
+from isocharge.train.data.noise import sigma_pC
 
 CANDIDATES = 4096
 """Contacts among which starts are chosen: spread over the domain, and a quarter as many along its rim."""
@@ -33,7 +34,7 @@ def nearest_in_field(
     Returns:
         Unit coordinates (n, 3) and (Q - Q(c)) / sigma, (n, n_electrode).
     """
-    sigma = 1e12 * noise.sigma(1e-12 * charge_pC)
+    sigma = sigma_pC(noise, charge_pC)
     shift = np.zeros_like(charge_pC) if shift is None else shift
 
     def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
@@ -69,7 +70,7 @@ def _candidates() -> Array:
 
 def _nearest_rows(charge_pC: Array, known_pC: Array, noise: NoiseModel, count: int) -> Integers:
     """Numbers of the nearest candidates, shape (n, count): |Q - K|^2 multiplied out, one matrix product each."""
-    weight = (1e12 * noise.sigma(1e-12 * charge_pC)) ** -2
+    weight = sigma_pC(noise, charge_pC) ** -2
     square = weight @ (known_pC**2).T - 2.0 * (charge_pC * weight) @ known_pC.T
     rows: Integers = np.argpartition(square, count - 1, axis=1)[:, :count]
     return rows

@@ -7,8 +7,6 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.errors import DatasetError
 from isocharge.simulate.dataset.shards import Dataset, Samples
-from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.data.domain import ContactDomain
 
 FEWEST = 500
@@ -104,17 +102,6 @@ def _check(presses: LabelledPresses) -> None:
             f"sample {row}: expected positive force and charges (the features are logarithms), got "
             f"{presses.contact[row, 2]:g} N and {presses.charge_pC[row].tolist()} pC"
         )
-
-
-def misfit_noise(noise: NoiseModel) -> NoiseModel:
-    """The unit of the misfit: the training's noise, or `reference` where that is none."""
-    return noise if noise.white > 0.0 else noise_model("reference")
-
-
-def noisy_charges(presses: LabelledPresses, noise: NoiseModel, seed: int) -> Array:
-    """The presses' charges with noise, pC, shape (n, n_electrode)."""
-    noisy: Array = noise.add(presses.charge_pC * 1e-12, np.random.default_rng(seed)) * 1e12
-    return noisy
 
 
 def position_error(contact: Array, truth: Array) -> Array:

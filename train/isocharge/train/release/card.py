@@ -2,7 +2,7 @@
 
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.simulate.measuring_chain.noise_file import noise_model
-from isocharge.train.data.presses import misfit_noise
+from isocharge.train.data.noise import misfit_noise
 from isocharge.train.training.fit import Fit
 
 

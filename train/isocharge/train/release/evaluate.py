@@ -6,7 +6,9 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.train.data.presses import LabelledPresses, misfit_noise, noisy_charges, position_error
+from isocharge.simulate.numerics.statistics import rms
+from isocharge.train.data.noise import misfit_noise, noisy_charges
+from isocharge.train.data.presses import LabelledPresses, position_error
 
 Predict = Callable[[Array], tuple[Array, Array, Array]]
 """Charges (n, n_electrode), pC, to contact (n, 3), contact_std (n, 3) and misfit (n, 1)."""
@@ -15,10 +17,10 @@ DRAWS = 20
 """Draws of the noise for the misfit's rare values."""
 
 FALSE_ALARMS = 0.01
-"""Share of good presses above the misfit by which bad ones are told."""
+"""Share of good presses whose misfit is above the alarm's threshold, dimensionless."""
 
-AROUND_1_N = (0.8, 1.25)
-"""Forces that count as 1 N where faults are looked for, N."""
+ABOUT_1_N = (0.8, 1.25)
+"""Smallest and largest force that counts as 1 N where faults are looked for, N."""
 
 
 def measure_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int = 1) -> Mapping[str, float]:
@@ -37,34 +39,41 @@ def measure_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel
     """
     unit = misfit_noise(noise)
     good = np.concatenate([predict(noisy_charges(presses, unit, seed + draw))[2] for draw in range(DRAWS)])
+    alarm = float(np.percentile(good, 100.0 * (1.0 - FALSE_ALARMS)))
     contact, std, _ = predict(noisy_charges(presses, noise, seed))
     position, force = position_error(contact, presses.contact), contact[:, 2] / presses.contact[:, 2] - 1.0
     clean = position_error(predict(presses.charge_pC)[0], presses.contact)
     deviation = np.abs(contact - presses.contact) / std
     errors = {
         "position_median_mm": np.median(position),
-        "position_rms_mm": np.sqrt(np.mean(position**2)),
+        "position_rms_mm": rms(position),
         "position_p95_mm": np.percentile(position, 95),
         "position_p99_mm": np.percentile(position, 99),
         "force_median_percent": 100.0 * np.median(np.abs(force)),
-        "force_rms_percent": 100.0 * np.sqrt(np.mean(force**2)),
+        "force_rms_percent": 100.0 * rms(force),
         "force_p99_percent": 100.0 * np.percentile(np.abs(force), 99),
         "clean_position_median_mm": np.median(clean),
         "clean_position_p95_mm": np.percentile(clean, 95),
         "coverage_68": np.mean(deviation < 1.0),
         "coverage_95": np.mean(deviation < 1.96),
-        "misfit_p99": np.percentile(good, 100.0 * (1.0 - FALSE_ALARMS)),
+        "misfit_p99": alarm,
         "misfit_p999": np.percentile(good, 99.9),
-        **_found(predict, presses, unit, float(np.percentile(good, 100.0 * (1.0 - FALSE_ALARMS))), seed),
+        **_detected_faults(predict, presses, unit, alarm, seed),
     }
     return {name: float(f"{value:.4g}") for name, value in errors.items()}
 
 
-def _found(
+def about_1_N(force_N: Array) -> np.ndarray:
+    """Which forces count as 1 N, bool of the same shape."""
+    low, high = ABOUT_1_N
+    return (force_N >= low) & (force_N <= high)
+
+
+def _detected_faults(
     predict: Predict, presses: LabelledPresses, noise: NoiseModel, limit: float, seed: int
 ) -> Mapping[str, float]:
     """Share of presses of about 1 N with a fault whose misfit is above the limit, every electrode in turn."""
-    near = presses[(presses.contact[:, 2] > AROUND_1_N[0]) & (presses.contact[:, 2] < AROUND_1_N[1])]
+    near = presses[about_1_N(presses.contact[:, 2])]
     if not len(near):
         return {}
     charge, count = noisy_charges(near, noise, seed + DRAWS), near.charge_pC.shape[1]

@@ -1,8 +1,7 @@
 """The trained network as an ONNX graph, written node by node from its weights: what the model needs and nothing else.
 
-At batch one a node costs more than its arithmetic, so the graph is built for few nodes: whitening, units and scales are
-folded into the first and last layers; the two perceptrons run as one with block-diagonal weights. A test compares it
-with `InverseNetwork.forward` on clean, noisy and absurd charges.
+Its layers are folded (`release.folding`). A test compares the graph with `InverseNetwork.forward` on clean, noisy and
+absurd charges.
 """
 
 from collections.abc import Mapping
@@ -12,11 +11,10 @@ from typing import Any
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
-from scipy.linalg import block_diag
-from torch import nn
 
-from isocharge.arrays import Array
+from isocharge.serve.model.session import OUTPUTS
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
+from isocharge.train.release.folding import FoldedLayers, all_answers
 from isocharge.train.training.network import MISFIT_UNIT, InverseNetwork
 
 OPSET, IR_VERSION = 17, 8
@@ -51,7 +49,7 @@ class GraphBuilder:
 
 
 def export_onnx(network: InverseNetwork, properties: Mapping[str, str]) -> bytes:
-    """Build the graph.
+    """The model as an ONNX file.
 
     Args:
         network: The trained model.
@@ -64,73 +62,36 @@ def export_onnx(network: InverseNetwork, properties: Mapping[str, str]) -> bytes
     build, n_electrode = GraphBuilder(), network.features.typical.size
     within = build.add("Clip", "charge_pC", build.constant(LOWEST_PC), build.constant(HIGHEST_PC))
     ratios = build.add("Mul", within, build.constant(1.0 / network.features.typical))
-    answers = _perceptrons(build, network, build.add("Log", ratios))
-    plane, logs, missing = build.split(answers, ("plane", "logs", "missing"), (2, 4, n_electrode), axis=1)
+    answers = add_layers(build, build.add("Log", ratios), all_answers(network))
+    plane, logs, vector = build.split(answers, ("plane", "logs", "misfit_vector"), (2, 4, n_electrode), axis=1)
     force, _ = build.split(build.add("Exp", logs), ("force", "contact_std"), (1, 3), axis=1)
     build.add("Concat", plane, force, to="contact", axis=1)
-    squeezed = build.add("ReduceL2", missing, axes=[1], keepdims=1)
-    build.add("Mul", build.add("Sinh", squeezed), build.constant(MISFIT_UNIT), to="misfit")
-    graph = helper.make_graph(
-        build.nodes,
-        "isocharge",
-        [helper.make_tensor_value_info("charge_pC", TensorProto.FLOAT, ["n", n_electrode])],
-        [
-            helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
-            for name, width in (("contact", 3), ("contact_std", 3), ("misfit", 1))
-        ],
-        build.constants,
-    )
-    opset = helper.make_opsetid("", OPSET)
-    model = helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="isocharge")
+    length = build.add("ReduceL2", vector, axes=[1], keepdims=1)
+    build.add("Mul", build.add("Sinh", length), build.constant(MISFIT_UNIT), to="misfit")
+    model = make_model(build, "isocharge", n_electrode, OUTPUTS, producer_name="isocharge")
     helper.set_model_props(model, dict(properties))
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())
 
 
-def _perceptrons(build: GraphBuilder, network: InverseNetwork, logs: str) -> str:
-    """Both perceptrons as one, layer by layer side by side, from the logarithms of the charges.
-
-    Columns of the result: x_mm and y_mm (2), ln F (1), logarithms of the standard deviations in mm and N (3), the
-    squeezed vector of the misfit (n_electrode).
-    """
-    whitening, mean = network.whitening.double().numpy(), network.logs_mean.double().numpy()
+def add_layers(build: GraphBuilder, logs: str, layers: FoldedLayers) -> str:
+    """Add folded layers behind the logarithms of the charges."""
     value = logs
-    *hidden, last = zip(network.contact.layers(), network.missing.layers(), strict=True)
-    for number, (first, second) in enumerate(hidden):
-        both = block_diag(*map(_matrix, (first, second))) if number else whitening @ _side_by_side(first, second)
-        bias = np.r_[_bias(first), _bias(second)] - (0.0 if number else mean @ both)
-        value = build.add("Tanh", build.add("Gemm", value, build.constant(both), build.constant(bias)))
-    units, shift = _in_units(network)
-    straight = whitening @ _side_by_side(network.contact.straight, network.missing.straight) @ units
-    bias = np.r_[_bias(last[0]), _bias(last[1])] @ units + shift - mean @ straight
-    beside = build.add("Gemm", logs, build.constant(straight), build.constant(bias))
-    return build.add("Gemm", value, build.constant(block_diag(*map(_matrix, last)) @ units), beside)
+    for weight, bias in layers.hidden:
+        value = build.add("Tanh", build.add("Gemm", value, build.constant(weight), build.constant(bias)))
+    weight, bias = layers.last
+    skipped = build.add("Gemm", logs, build.constant(layers.skip), build.constant(bias))
+    return build.add("Gemm", value, build.constant(weight), skipped)
 
 
-def _matrix(layer: nn.Linear) -> Array:
-    """Weights of a layer, shape (inputs, outputs)."""
-    weights: Array = layer.weight.detach().double().numpy().T
-    return weights
-
-
-def _bias(layer: nn.Linear) -> Array:
-    bias: Array = layer.bias.detach().double().numpy()
-    return bias
-
-
-def _side_by_side(first: nn.Linear, second: nn.Linear) -> Array:
-    """Weights of two layers with the same inputs as one layer's."""
-    return np.hstack([_matrix(first), _matrix(second)])
-
-
-def _in_units(network: InverseNetwork) -> tuple[Array, Array]:
-    """Matrix and shift from the perceptrons' outputs to `_perceptrons`' columns.
-
-    A force's deviation is relative to the force, so its logarithm adds ln F.
-    """
-    scale, n_electrode = network.domain.scale, network.features.typical.size
-    matrix, shift = np.diag(np.r_[scale, np.ones(3 + n_electrode)]), np.zeros(6 + n_electrode)
-    matrix[2, 5] = scale[2]
-    shift[:3], shift[3:6] = network.domain.centre, np.log(scale)
-    shift[5] += network.domain.centre[2]
-    return matrix, shift
+def make_model(
+    build: GraphBuilder, name: str, n_electrode: int, widths: Mapping[str, int], **attributes: Any
+) -> onnx.ModelProto:
+    """The model of a finished graph with the input `charge_pC` [n, n_electrode] and outputs [n, width], all float32."""
+    inputs, outputs = (
+        [helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["n", width]) for tensor, width in columns.items()]
+        for columns in ({"charge_pC": n_electrode}, widths)
+    )
+    graph = helper.make_graph(build.nodes, name, inputs, outputs, build.constants)
+    opset = helper.make_opsetid("", OPSET)
+    return helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, **attributes)

@@ -28,7 +28,7 @@ from isocharge.simulate.dataset.shards import Dataset
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain
-from isocharge.train.data.presses import misfit_noise, noisy_charges
+from isocharge.train.data.noise import misfit_noise, noisy_charges
 from isocharge.train.release.card import model_card
 from isocharge.train.release.evaluate import Predict, measure_errors
 from isocharge.train.release.export import export_onnx

@@ -73,7 +73,7 @@ class EvaluationScene:
             orientation="random" if self.turned else "fixed",
         )
 
-    def films(
+    def forward_maps(
         self,
         sensor: Sensor | None = None,
         probes: tuple[Probe, ...] | None = None,
@@ -98,12 +98,12 @@ def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
     return tuple(probes), bool(turned)
 
 
-def press_on(films: tuple[ForwardMap, ...], sweep: Sweep) -> LabelledPresses:
+def press_on(forward_maps: tuple[ForwardMap, ...], sweep: Sweep) -> LabelledPresses:
     """Clean charges of a sweep's presses from these forward maps, one for each probe."""
-    presses = sweep.over([film.probe for film in films])
-    charge = np.empty((len(presses), len(films[0].sensor.electrodes)))
-    for number, film in enumerate(films):
+    presses = sweep.over([forward_map.probe for forward_map in forward_maps])
+    charge = np.empty((len(presses), len(forward_maps[0].sensor.electrodes)))
+    for number, forward_map in enumerate(forward_maps):
         rows = np.flatnonzero(presses.probe == number)
         chosen = presses[rows]
-        charge[rows] = film.forward(chosen.x, chosen.y, chosen.force, chosen.turn)
+        charge[rows] = forward_map.forward(chosen.x, chosen.y, chosen.force, chosen.turn)
     return LabelledPresses(np.stack([1e3 * presses.x, 1e3 * presses.y, presses.force], axis=1), 1e12 * charge)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +93,7 @@ def write_report(
             "format_version": FORMAT_VERSION,
             "command": command,
             "machine": machine(),
-            "settings": asdict(settings),
+            "settings": settings.to_dict(),
             "datasets": sections,
         }
         write_whole(draft / "report.json", (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
@@ -140,12 +140,13 @@ class _Subject:
         """Everything about this dataset: its section of the record, its pictures written."""
         settings, bench = self.settings, self.bench
         steps("solving the film for limits and contours")
-        films = bench.films(further=1.0, settings=SolveSettings(accuracy=settings.accuracy))
+        forward_maps = bench.forward_maps(further=1.0, settings=SolveSettings(accuracy=settings.accuracy))
         steps("solving the film for the test presses")
-        test = EvaluationPresses.of(bench, press_on(films if settings.quick else bench.films(), bench.sweep()))
+        test_maps = forward_maps if settings.quick else bench.forward_maps()
+        test = EvaluationPresses.of(bench, press_on(test_maps, bench.sweep()))
         steps("integrating the Bayes limit")
-        limits = error_bounds(bench, films, test.presses, test.charge_pC, settings.limited, steps.say)
-        methods = fit_all(all_methods(self.dataset, films[0], settings), self.released, self.task, test, steps)
+        limits = error_bounds(bench, forward_maps, test.presses, test.charge_pC, settings.limited, steps.say)
+        methods = fit_all(all_methods(self.dataset, forward_maps[0], settings), self.released, self.task, test, steps)
         methods = timed(methods, test, settings, steps)
         section = self._section(test, limits, methods, steps)
         section["pictures"] = _draw(folder, stem, section, self._draws(test), bench, settings, steps)

@@ -12,7 +12,9 @@ from isocharge.progress import Announce
 from isocharge.simulate import Sensor, SolveSettings, parse_probe
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.baselines import Fitted, FittingTask, GaussNewton, PolynomialRidge, ReleasedModel
-from isocharge.train.data.presses import LabelledPresses, noisy_charges
+from isocharge.train.data.noise import noisy_charges
+from isocharge.train.data.presses import LabelledPresses
+from isocharge.train.release.evaluate import FALSE_ALARMS, about_1_N
 from isocharge.train.report.bench import EvaluationScene, press_on
 from isocharge.train.report.measures import errors, rounded
 from isocharge.train.report.settings import Settings
@@ -32,14 +34,8 @@ OUTSIDE = 1.25
 ROUGH = 2e-3
 """Accuracy of charges under other probes and pretensions: far below what they change."""
 
-FALSE_ALARMS = 1.0
-"""Percent of good presses whose misfit is above the alarm's threshold."""
-
 FARTHEST = 50.0
 """Answers farther from zero, mm or N, are cut to this: polynomials explode outside of what they know."""
-
-ONE_NEWTON = (0.8, 1.25)
-"""Forces that count as about 1 N."""
 
 NOISE_SEED = 515
 """Of the noise on every case's charges, relative to the bench's."""
@@ -72,18 +68,19 @@ def cases(bench: EvaluationScene, clean: LabelledPresses, settings: Settings, pr
         return noisy_charges(presses, bench.noise, bench.seed + NOISE_SEED)
 
     for level in LEVELS:
-        yield Case("noise", f"x {level:g}", clean, _noisy(clean, bench, level))
+        yield Case("noise", f"x {level:g}", clean, _with_louder_noise(clean, bench, level))
     for notation in settings.shapes:
         progress(f"solving the film under {notation}")
         rough = SolveSettings(accuracy=max(ROUGH, settings.accuracy))
-        presses = press_on(bench.films(probes=(parse_probe(notation),), settings=rough), sweep)
+        presses = press_on(bench.forward_maps(probes=(parse_probe(notation),), settings=rough), sweep)
         yield Case("probe", notation, presses, noisy(presses))
-    if settings.worlds:
+    if settings.mismatch_cases:
         progress("solving a film with more pretension")
-        presses = press_on(bench.films(sensor=_tauter(bench.sensor), settings=SolveSettings(accuracy=ROUGH)), sweep)
+        forward_maps = bench.forward_maps(sensor=_tauter(bench.sensor), settings=SolveSettings(accuracy=ROUGH))
+        presses = press_on(forward_maps, sweep)
         yield Case("pretension", f"+{1e-6 * PRETENSION_OFF:g} MPa", presses, noisy(presses))
     yield from _wrong_gains(bench, clean, noisy(clean))
-    if settings.worlds:
+    if settings.mismatch_cases:
         progress("solving the film outside of the working area")
         yield from _outside(bench, noisy)
 
@@ -92,7 +89,7 @@ def _tauter(sensor: Sensor) -> Sensor:
     return replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension + PRETENSION_OFF))
 
 
-def _noisy(clean: LabelledPresses, bench: EvaluationScene, level: float) -> Array:
+def _with_louder_noise(clean: LabelledPresses, bench: EvaluationScene, level: float) -> Array:
     louder = NoiseModel(f"x {level:g}", level * bench.noise.white, level * bench.noise.gain)
     return noisy_charges(clean, louder, bench.seed + NOISE_SEED)
 
@@ -116,11 +113,11 @@ def _wrong_gains(bench: EvaluationScene, clean: LabelledPresses, noisy: Array) -
 def _outside(bench: EvaluationScene, noisy: Callable[[LabelledPresses], Array]) -> Iterator[Case]:
     """Presses beyond the working area, where the film is large enough."""
     try:
-        films = bench.films(further=OUTSIDE, settings=SolveSettings(accuracy=ROUGH))
+        forward_maps = bench.forward_maps(further=OUTSIDE, settings=SolveSettings(accuracy=ROUGH))
     except IsochargeError:
         return
     low, high = bench.domain.force_range_N
-    presses = press_on(films, replace(bench.sweep(OUTSIDE), force_range=(low, high)))
+    presses = press_on(forward_maps, replace(bench.sweep(OUTSIDE), force_range=(low, high)))
     beyond = np.hypot(*presses.contact[:, :2].T) > bench.domain.radius_mm
     presses = presses[np.flatnonzero(beyond)]
     reach = f"up to {(OUTSIDE - 1.0) * bench.domain.radius_mm:.2g} mm outside the working area"
@@ -138,7 +135,7 @@ def _measured(case: Case, released: ReleasedModel, rivals: list[Fitted], thresho
     truth = case.presses.contact
     contact, std, misfit = released.answer(case.charge_pC)
     alarm = misfit[:, 0] > threshold
-    about = (truth[:, 2] >= ONE_NEWTON[0]) & (truth[:, 2] <= ONE_NEWTON[1])
+    about = about_1_N(truth[:, 2])
     with np.errstate(over="ignore"):
         answers = {rival.name: np.clip(rival.predict(case.charge_pC), -FARTHEST, FARTHEST) for rival in rivals}
     found = {released.name: contact, **answers}
@@ -157,7 +154,7 @@ def threshold_of(released: ReleasedModel, clean: LabelledPresses, bench: Evaluat
     """The misfit that 1 % of good test presses exceed."""
     seeds = range(bench.seed + NOISE_SEED + 1, bench.seed + NOISE_SEED + 1 + draws)
     misfits = [released.answer(noisy_charges(clean, bench.noise, seed))[2] for seed in seeds]
-    return float(np.percentile(np.concatenate(misfits), 100.0 - FALSE_ALARMS))
+    return float(np.percentile(np.concatenate(misfits), 100.0 * (1.0 - FALSE_ALARMS)))
 
 
 def remaining(

@@ -9,10 +9,11 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.simulate import ChargeSpline, ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import CramerRao, limits_at
+from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.bayes.limit import Scene, bayes_estimate
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.report.bench import EvaluationScene
-from isocharge.train.report.measures import errors, rms, rounded
+from isocharge.train.report.measures import errors, rounded
 
 BAYES, CRAMER_RAO = "Bayes limit", "Cramér-Rao"
 """Their names in pictures."""
@@ -53,7 +54,7 @@ class ErrorBounds:
 
 def error_bounds(
     bench: EvaluationScene,
-    films: tuple[ForwardMap, ...],
+    forward_maps: tuple[ForwardMap, ...],
     presses: LabelledPresses,
     noisy_pC: Array,
     limited: int,
@@ -63,14 +64,14 @@ def error_bounds(
 
     Args:
         bench: Sensor, probe, prior and noise.
-        films: Forward maps over exactly the bench's contacts, one for each probe.
+        forward_maps: Forward maps over exactly the bench's contacts, one for each probe.
         presses: Clean test presses.
         noisy_pC: Their charges with noise, shape (n, n_electrode).
         limited: For how many of them the posterior is integrated.
         progress: Told how it goes.
     """
-    bayes, charges = None, ChargeSpline.of(films[0])
-    if len(films) == 1 and not bench.turned:
+    bayes, charges = None, ChargeSpline.of(forward_maps[0])
+    if len(forward_maps) == 1 and not bench.turned:
         scene = Scene(bench.sensor, bench.probes[0], bench.domain.radius_mm, bench.domain.force_range_N, bench.noise)
         bayes = bayes_estimate(
             scene,

@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from isocharge.arrays import Array, Integers
+from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines import ReleasedModel
 from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.presses import LabelledPresses, noisy_charges, position_error
+from isocharge.train.data.noise import noisy_charges
+from isocharge.train.data.presses import LabelledPresses, position_error
 from isocharge.train.report.bench import EvaluationScene
 from isocharge.train.report.limits import CRAMER_RAO
-from isocharge.train.report.measures import coverage, rms, rounded
+from isocharge.train.report.measures import coverage, rounded
 
 DRAW_SEED = 90_000
 """Of the draws of the noise, relative to the bench's."""

@@ -5,12 +5,8 @@ from typing import Any
 import numpy as np
 
 from isocharge.arrays import Array
+from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.presses import position_error
-
-
-def rms(values: Array) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def rounded(value: float | None, digits: int = 4) -> float | None:

@@ -27,7 +27,8 @@ from isocharge.train.baselines import (
     Triangulate,
 )
 from isocharge.train.baselines.linear_band import BAND_N
-from isocharge.train.data.presses import LabelledPresses, noisy_charges, presses_of, split_by_position
+from isocharge.train.data.noise import noisy_charges
+from isocharge.train.data.presses import LabelledPresses, presses_of, split_by_position
 from isocharge.train.report.bench import EvaluationScene
 from isocharge.train.report.measures import errors, pareto, rounded
 from isocharge.train.report.settings import Settings
@@ -96,11 +97,11 @@ def task_of(dataset: Dataset, bench: EvaluationScene, settings: Settings) -> Fit
     return FittingTask(train, validation, bench.domain, bench.noise, settings.seed, quick=settings.quick)
 
 
-def all_methods(dataset: Dataset, film: ForwardMap, settings: Settings) -> list[tuple[str, Estimator]]:
+def all_methods(dataset: Dataset, forward_map: ForwardMap, settings: Settings) -> list[tuple[str, Estimator]]:
     """Every method with its kind."""
     networks = [Network(dataset, hidden, settings.steps, settings.hold_out) for hidden in settings.sizes]
     return [
-        ("paper", Triangulate(film)),
+        ("paper", Triangulate(forward_map)),
         ("paper", LinearBand()),
         ("paper", NearestEntry()),
         ("paper", InterpolatedTable()),
@@ -134,15 +135,13 @@ def fit_all(
 
 def answers(fitted: Fitted, test: EvaluationPresses) -> Array:
     """Contacts of the noisy test presses."""
-    return fitted.told(test.presses.contact[:, 2]).predict(test.charge_pC)
+    return fitted.with_known_force(test.presses.contact[:, 2]).predict(test.charge_pC)
 
 
 def timed(methods: list[Method], test: EvaluationPresses, settings: Settings, progress: Announce) -> list[Method]:
     """The same methods with their times and sizes, taken when all of them are fitted."""
     force, charge = test.presses.contact[:, 2], test.charge_pC
-    singles = {
-        method.label: [method.fitted.told(force[i : i + 1]).one(charge[i]) for i in range(TIMED)] for method in methods
-    }
+    singles = {method.label: _singles(method.fitted, force[:TIMED], charge[:TIMED]) for method in methods}
     durations = latencies(
         singles, settings.rounds, settings.round_ms, lambda done, total: progress(f"timing: round {done} of {total}")
     )
@@ -154,8 +153,13 @@ def timed(methods: list[Method], test: EvaluationPresses, settings: Settings, pr
     return [_with_times(method, durations[method.label], per_second[method.label]) for method in methods]
 
 
+def _singles(fitted: Fitted, force: Array, charge: Array) -> list[Callable[[], object]]:
+    """One call for each press, ready to be timed."""
+    return [fitted.with_known_force(force[i : i + 1]).one(charge[i]) for i in range(len(force))]
+
+
 def _batched(fitted: Fitted, force: Array) -> Callable[[Array], object]:
-    return lambda charge: fitted.told(np.resize(force, len(charge))).predict(charge)
+    return lambda charge: fitted.with_known_force(np.resize(force, len(charge))).predict(charge)
 
 
 def _with_times(method: Method, durations: Array, per_second: float) -> Method:

@@ -4,7 +4,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from isocharge.train.baselines.linear_band import BAND_N
-from isocharge.train.report.effects import FALSE_ALARMS, FARTHEST, GAIN_OFF, PRETENSION_OFF
+from isocharge.train.release.evaluate import FALSE_ALARMS
+from isocharge.train.report.effects import FARTHEST, GAIN_OFF, PRETENSION_OFF
 
 
 def page(record: dict[str, Any]) -> str:
@@ -192,7 +193,7 @@ def _effects(section: dict[str, Any]) -> Iterator[str]:
     yield "### When the world is not as told"
     yield ""
     yield _picture(section, "noise")
-    yield _picture(section, "effects", alarms=FALSE_ALARMS, farthest=FARTHEST)
+    yield _picture(section, "effects", alarms=100.0 * FALSE_ALARMS, farthest=FARTHEST)
     names = list(next(case["errors"] for case in section["cases"] if case["errors"]))
     threshold = _number(section["alarm_threshold"])
     yield f"Position error rms, mm, and alarms of the released model (misfit above {threshold}):"

@@ -11,12 +11,13 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
 from isocharge.arrays import Integers
 from isocharge.simulate import Sensor
+from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.plots.figure import FELT, INK, new_figure, save_picture
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
 from isocharge.train.data.domain import ContactDomain
+from isocharge.train.release.evaluate import FALSE_ALARMS
 from isocharge.train.report.limits import BAYES, CRAMER_RAO
 from isocharge.train.report.maps import COORDINATES, Draws
-from isocharge.train.report.measures import rms
 
 GREY, RELEASED = "#8a95a5", FELT
 """Colours of what is beside the point, and of the released model."""
@@ -151,7 +152,7 @@ def wrong_world(cases: Sequence[dict[str, Any]], released: str, nominal: float |
             va="center",
             fontsize=8,
         )
-    right.axvline(1.0, color=INK, lw=0.9, ls="--")
+    right.axvline(100.0 * FALSE_ALARMS, color=INK, lw=0.9, ls="--")
     left.set(
         xlabel="position error, rms, mm",
         xscale="log",

@@ -1,6 +1,7 @@
 """How much work a report is."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from isocharge.simulate.mechanics.theory import ACCURACY
 
@@ -22,7 +23,7 @@ class Settings:
         limited: Test presses that the Bayes limit is integrated for.
         accuracy: Relative error of a charge in the films that are solved.
         shapes: Probes that the models do not expect, as notations.
-        worlds: Whether other pretensions and presses outside the working area are tried; each takes solves of its own.
+        mismatch_cases: Whether other pretensions and presses outside the working area are tried; both take solves.
         seed: Of everything random.
         quick: Whether methods are fitted small.
     """
@@ -39,9 +40,15 @@ class Settings:
     limited: int = 4096
     accuracy: float = ACCURACY
     shapes: tuple[str, ...] = ("circle:0.5", "circle:1.5", "circle:2.0", "rectangle:4.0x2.0", "triangle:4.0")
-    worlds: bool = True
+    mismatch_cases: bool = True
     seed: int = 0
     quick: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as `report.json` has them."""
+        table = asdict(self)
+        table["worlds"] = table.pop("mismatch_cases")
+        return table
 
 
 QUICK = Settings(
@@ -56,7 +63,7 @@ QUICK = Settings(
     limited=128,
     accuracy=1e-2,
     shapes=("circle:2.0",),
-    worlds=False,
+    mismatch_cases=False,
     quick=True,
 )
 """Everything once, small: seconds, to try it out. Its figures mean nothing."""

@@ -38,7 +38,7 @@ class TrainingStage:
         loss: From (step, generator) to the loss of a fresh batch.
         score: The loss on what is kept aside, and words about it.
         steps: How many.
-        settle: Steps before which no network counts as the best: they train another loss.
+        warm_up_steps: Steps before which no network counts as the best: they train another loss.
     """
 
     name: str
@@ -46,7 +46,7 @@ class TrainingStage:
     loss: Callable[[int, torch.Generator], Tensor]
     score: Callable[[], tuple[float, str]]
     steps: int
-    settle: int = 0
+    warm_up_steps: int = 0
 
 
 class Descent:
@@ -95,13 +95,13 @@ class Descent:
                 f"the {self.task.name} loss is {loss} at step {self.step} of {self.task.steps}; lower "
                 "training.learning_rate"
             )
-        if self.step > self.task.settle and score < self.best:
+        if self.step > self.task.warm_up_steps and score < self.best:
             self.best, self.best_step = score, self.step
             self.best_weights = copy.deepcopy(self.task.part.state_dict())
         progress(self.step, f"{self.task.name}: loss {loss:.3f}, {words}")
 
     def _stalled(self) -> bool:
-        return self.step - max(self.best_step, self.task.settle) >= self.patience
+        return self.step - max(self.best_step, self.task.warm_up_steps) >= self.patience
 
     def _state(self) -> dict[str, Any]:
         return {

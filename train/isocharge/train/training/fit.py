@@ -27,19 +27,13 @@ from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import ContactDomain
 from isocharge.train.data.fold_free import SMALLEST_SHARE, fold_free_domain
 from isocharge.train.data.misfit_charges import MisfitExamples, draw_misfit_examples
-from isocharge.train.data.presses import (
-    LabelledPresses,
-    domain_of,
-    misfit_noise,
-    noisy_charges,
-    presses_of,
-    split_by_position,
-)
+from isocharge.train.data.noise import misfit_noise, noisy_charges
+from isocharge.train.data.presses import LabelledPresses, domain_of, presses_of, split_by_position
 from isocharge.train.training.checkpoint import Checkpoint
 from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.levenberg_marquardt import FIRST, levenberg_marquardt
-from isocharge.train.training.misfit_data import WATCHED, _Learned
+from isocharge.train.training.misfit_data import WATCHED, MisfitData
 from isocharge.train.training.network import Features, InverseNetwork
 
 WARM_UP = 0.15
@@ -190,8 +184,8 @@ class _Training:
         self._descend(contact, 0)
         if config.finish_steps:
             self._finish()
-        strange = _Learned.of(self.network, self._strange_charges(), config)
-        misfit = TrainingStage("misfit", self.network.missing, strange.loss, strange.score, config.misfit_steps)
+        data = MisfitData.of(self.network, self._misfit_examples(), config)
+        misfit = TrainingStage("misfit", self.network.misfit_vector, data.loss, data.score, config.misfit_steps)
         self._descend(misfit, config.steps + config.finish_steps)
 
     def _descend(self, task: TrainingStage, before: int) -> None:
@@ -204,7 +198,7 @@ class _Training:
 
     def _contact_loss(self, step: int, random: torch.Generator) -> Tensor:
         rows = torch.randint(len(self.charge), (min(self.config.batch, len(self.charge)),), generator=random)
-        mean, log_std = self.network.posterior(_noisy(self.charge[rows], self.noise, random))
+        mean, log_std = self.network.posterior(_with_fresh_noise(self.charge[rows], self.noise, random))
         warm_up = step < round(WARM_UP * self.config.steps)
         return (_start_loss if warm_up else _likelihood_loss)(mean, log_std, self.unit[rows])
 
@@ -241,30 +235,30 @@ class _Training:
 
     def _constant_deviations(self) -> None:
         """Root-mean-square errors of the watched presses as the deviations, whatever the charges."""
-        last, straight = self.network.contact.layers()[-1], self.network.contact.straight
+        last, skip = self.network.contact.layers()[-1], self.network.contact.skip
         with torch.no_grad():
             off = self.network.contact(self.network.inputs(self.watched_charge).double())[:, :3] - self.watched_unit
-            last.weight[3:] = straight.weight[3:] = 0.0
+            last.weight[3:] = skip.weight[3:] = 0.0
             last.bias[3:] = 0.5 * (off**2).mean(dim=0).log()
 
-    def _strange_charges(self) -> MisfitExamples:
-        """Charges for the misfit; searching for their nearest contacts takes long enough to be kept."""
-        if (kept := self.checkpoint.load("charges")) is not None:
-            return MisfitExamples(*(kept[name].numpy() for name in ("charge_pC", "miss")))
-        made = draw_misfit_examples(
+    def _misfit_examples(self) -> MisfitExamples:
+        """Examples from the checkpoint, or drawn: the search for their nearest contacts takes long enough to store."""
+        if (stored := self.checkpoint.load("charges")) is not None:
+            return MisfitExamples(*(stored[name].numpy() for name in ("charge_pC", "miss")))
+        examples = draw_misfit_examples(
             self.train, self.field, misfit_noise(self.noise), self.config.misfit_charges, self.config.seed
         )
         self.checkpoint.save(
-            "charges", lambda: {name: torch.tensor(getattr(made, name)) for name in ("charge_pC", "miss")}, now=True
+            "charges", lambda: {name: torch.tensor(getattr(examples, name)) for name in ("charge_pC", "miss")}, now=True
         )
-        return made
+        return examples
 
 
 def _as_it_is(state: dict[str, Any]) -> dict[str, Any]:
     return state
 
 
-def _noisy(charge_pC: Tensor, noise: NoiseModel, random: torch.Generator) -> Tensor:
+def _with_fresh_noise(charge_pC: Tensor, noise: NoiseModel, random: torch.Generator) -> Tensor:
     sigma = torch.hypot(torch.tensor(1e12 * noise.white), noise.gain * charge_pC)
     return charge_pC + sigma * torch.randn(charge_pC.shape, generator=random)
 

@@ -14,27 +14,30 @@ WATCHED = 0.5
 
 
 @dataclass(frozen=True)
-class _Learned:
-    """The misfit network's data: inputs and squeezed vectors, the last `watched` of them kept aside."""
+class MisfitData:
+    """The misfit network's data: inputs and compressed vectors, the last `watched` of them kept aside."""
 
     network: InverseNetwork
     inputs: Tensor
-    wanted: Tensor
+    targets: Tensor
     watched: int
     batch: int
 
     @classmethod
-    def of(cls, network: InverseNetwork, strange: MisfitExamples, config: TrainingConfig) -> "_Learned":
-        inputs = network.inputs(torch.tensor(strange.charge_pC).float())
+    def of(cls, network: InverseNetwork, examples: MisfitExamples, config: TrainingConfig) -> "MisfitData":
+        inputs = network.inputs(torch.tensor(examples.charge_pC).float())
         watched = round(WATCHED * config.hold_out * len(inputs))
-        return cls(network, inputs, compress_length(torch.tensor(strange.miss)).float(), watched, config.batch)
+        return cls(network, inputs, compress_length(torch.tensor(examples.miss)).float(), watched, config.batch)
 
     def loss(self, _: int, random: torch.Generator) -> Tensor:
         rows = torch.randint(len(self.inputs) - self.watched, (self.batch,), generator=random)
-        squares: Tensor = ((self.network.missing(self.inputs[rows]) - self.wanted[rows]) ** 2).sum(dim=1)
-        return squares.mean()
+        return self._squares(self.inputs[rows], self.targets[rows]).mean()
 
     def score(self) -> tuple[float, str]:
         with torch.no_grad():
-            off = ((self.network.missing(self.inputs[-self.watched :]) - self.wanted[-self.watched :]) ** 2).sum(dim=1)
-        return off.mean().item(), f"{off.mean().item():.4f} on watched charges"
+            mean = self._squares(self.inputs[-self.watched :], self.targets[-self.watched :]).mean().item()
+        return mean, f"{mean:.4f} on watched charges"
+
+    def _squares(self, inputs: Tensor, targets: Tensor) -> Tensor:
+        squares: Tensor = ((self.network.misfit_vector(inputs) - targets) ** 2).sum(dim=1)
+        return squares

@@ -63,18 +63,18 @@ class Perceptron(nn.Module):
         layers: list[nn.Module] = []
         for before, after in pairwise(widths):
             layers += [nn.Linear(before, after), nn.Tanh()]
-        self.bent = nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
-        self.straight = nn.Linear(inputs, outputs, bias=False)
-        nn.init.zeros_(self.straight.weight)
+        self.mlp = nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
+        self.skip = nn.Linear(inputs, outputs, bias=False)
+        nn.init.zeros_(self.skip.weight)
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Shape (n, inputs) to (n, outputs)."""
-        out: Tensor = self.bent(inputs) + self.straight(inputs)
+        out: Tensor = self.mlp(inputs) + self.skip(inputs)
         return out
 
     def layers(self) -> list[nn.Linear]:
         """The bent way's layers, first to last."""
-        return [layer for layer in self.bent if isinstance(layer, nn.Linear)]
+        return [layer for layer in self.mlp if isinstance(layer, nn.Linear)]
 
     def hidden_matrices(self) -> list[Tensor]:
         """Weights from one hidden layer to the next."""
@@ -104,7 +104,7 @@ class InverseNetwork(nn.Module):
         n_electrode = features.typical.size
         self.domain, self.features = domain, features
         self.contact = Perceptron(n_electrode, hidden, 6)
-        self.missing = Perceptron(n_electrode, misfit_hidden, n_electrode)
+        self.misfit_vector = Perceptron(n_electrode, misfit_hidden, n_electrode)
         for name, values in (
             ("centre", domain.centre),
             ("scale", domain.scale),
@@ -131,7 +131,7 @@ class InverseNetwork(nn.Module):
         force = torch.exp(value[:, 2:])
         contact = torch.cat([value[:, :2], force], dim=1)
         contact_std = torch.cat([std[:, :2], std[:, 2:] * force], dim=1)
-        compress_length = torch.linalg.vector_norm(self.missing(self.inputs(charge_pC)), dim=1, keepdim=True)
+        compress_length = torch.linalg.vector_norm(self.misfit_vector(self.inputs(charge_pC)), dim=1, keepdim=True)
         return contact, contact_std, MISFIT_UNIT * torch.sinh(compress_length)
 
 
