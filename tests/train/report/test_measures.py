@@ -3,7 +3,7 @@
 import numpy as np
 from sklearn.metrics import root_mean_squared_error
 
-from isocharge.train.report.measures import coverage, errors, pareto, rounded
+from isocharge.train.report.measures import Errors, coverage, pareto, rounded
 
 
 def contacts(count, seed):
@@ -14,25 +14,25 @@ def contacts(count, seed):
 def test_errors_by_scikit_learn():
     truth = contacts(500, 0)
     found = truth + np.random.default_rng(1).normal(0.0, 0.1, truth.shape)
-    figures = errors(found, truth)
+    figures = Errors.of(found, truth)
     plane = root_mean_squared_error(truth[:, :2].ravel(), found[:, :2].ravel())
     force = root_mean_squared_error(np.ones(500), found[:, 2] / truth[:, 2])
-    np.testing.assert_allclose(figures["position_rms_mm"], np.sqrt(2.0) * plane, rtol=1e-3)
-    np.testing.assert_allclose(figures["force_rms_percent"], 100.0 * force, rtol=1e-3)
+    np.testing.assert_allclose(figures.position_rms_mm, np.sqrt(2.0) * plane, rtol=1e-3)
+    np.testing.assert_allclose(figures.force_rms_percent, 100.0 * force, rtol=1e-3)
     distances = sorted(np.linalg.norm((found - truth)[:, :2], axis=1))
-    assert distances[248] <= figures["position_median_mm"] <= distances[251]
-    assert distances[473] <= figures["position_p95_mm"] <= distances[475] * 1.001
-    assert figures["answered"] == 1.0
+    assert distances[248] <= figures.position_median_mm <= distances[251]
+    assert distances[473] <= figures.position_p95_mm <= distances[475] * 1.001
+    assert figures.answered == 1.0
 
 
 def test_presses_without_an_answer_do_not_count():
     truth = contacts(10, 2)
     found = truth + 0.1
     found[3] = np.nan
-    figures = errors(found, truth)
-    assert figures["answered"] == 0.9
-    np.testing.assert_allclose(figures["position_rms_mm"], 0.1 * np.sqrt(2.0), rtol=1e-3)
-    assert errors(np.full((10, 3), np.nan), truth)["position_rms_mm"] is None
+    figures = Errors.of(found, truth)
+    assert figures.answered == 0.9
+    np.testing.assert_allclose(figures.position_rms_mm, 0.1 * np.sqrt(2.0), rtol=1e-3)
+    assert Errors.of(np.full((10, 3), np.nan), truth).position_rms_mm is None
 
 
 def test_the_front_by_brute_force():

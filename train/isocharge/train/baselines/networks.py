@@ -208,6 +208,10 @@ class NumpyNetwork(Fitted):
         return len(pickle.dumps(self.layers))
 
 
+RELEASED = "released network"
+"""Name of the released model among the methods."""
+
+
 def contact_of(model: bytes) -> bytes:
     """The part of a released model's graph that gives the contact, without standard deviations and misfit."""
     graph = onnx.load_model_from_string(model)
@@ -219,7 +223,7 @@ class ReleasedModel(Fitted):
     """A model folder through `Predictor`: contact, standard deviations and misfit."""
 
     folder: Path
-    name: str = "released network"
+    name: str = RELEASED
     choice: str = "as released"
     form: str = "Predictor"
 

@@ -17,6 +17,8 @@ from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
 from isocharge.train.baselines.features import RULERS, LogFeatures
 from isocharge.train.data.domain import ContactDomain
 
+INTERPOLATED = "lookup table, interpolated"
+
 CHUNK = 100_000
 """Neighbours gathered at once."""
 
@@ -55,7 +57,7 @@ class InterpolatedTable:
         *(("noisy", count, ruler) for ruler in RULERS[1:] for count in (64, 128)),
     )
     copies: int = 5
-    name: str = "lookup table, interpolated"
+    name: str = INTERPOLATED
 
     def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Choose the neighbourhoods: their size, their metric, and whether their presses are noisy."""

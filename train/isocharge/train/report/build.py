@@ -14,13 +14,22 @@ from isocharge.files import new_folder, write_whole
 from isocharge.progress import StageProgress
 from isocharge.serve import ModelMetadata
 from isocharge.simulate import Dataset, Samples, SolveSettings, sensor_to_dict
-from isocharge.train.baselines import Fitted, FittingTask, ReleasedModel
+from isocharge.train.baselines import (
+    Fitted,
+    FittingTask,
+    ReleasedModel,
+    boosting,
+    gauss_newton,
+    linear_band,
+    polynomial,
+    table,
+)
 from isocharge.train.data.presses import domain_of
 from isocharge.train.report import effects, maps, pictures
 from isocharge.train.report.bench import EvaluationScene, press_on
 from isocharge.train.report.limits import BAYES, CRAMER_RAO, ErrorBounds, error_bounds
-from isocharge.train.report.measures import rounded
-from isocharge.train.report.methods import EvaluationPresses, Method, all_methods, fit_all, table, task_of, timed
+from isocharge.train.report.measures import MethodRecord, Plot, rounded
+from isocharge.train.report.methods import EvaluationPresses, Method, all_methods, fit_all, records_of, task_of, timed
 from isocharge.train.report.page import page
 from isocharge.train.report.settings import Settings
 from isocharge.train.report.speed import AXES, speed_plot
@@ -29,7 +38,7 @@ from isocharge.train.report.verdict import verdict
 
 FORMAT_VERSION = 1
 
-COMPARED = ("Gauss-Newton", "polynomial ridge", "lookup table, interpolated", "gradient boosting", "linear band")
+COMPARED = (gauss_newton.NAME, polynomial.NAME, table.INTERPOLATED, boosting.NAME, linear_band.NAME)
 """Methods beside the released model in the pictures of effects; of their forms the last, the plain one."""
 
 
@@ -96,9 +105,14 @@ def write_report(
             "settings": settings.to_dict(),
             "datasets": sections,
         }
-        write_whole(draft / "report.json", (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
+        plain = {**record, "datasets": [_plain_section(section) for section in sections]}
+        write_whole(draft / "report.json", (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())
         write_whole(draft / "report.md", page(record).encode())
-    return record
+    return plain
+
+
+def _plain_section(section: dict[str, Any]) -> dict[str, Any]:
+    return {**section, "methods": [method.to_dict() for method in section["methods"]]}
 
 
 def _stems(subjects: "list[_Subject]") -> "list[tuple[str, _Subject]]":
@@ -156,7 +170,7 @@ class _Subject:
         self, test: EvaluationPresses, limits: ErrorBounds, methods: list[Method], steps: Steps
     ) -> dict[str, Any]:
         bench, truth = self.bench, test.presses.contact
-        records = table(methods, test, limits.bayes)
+        records = records_of(methods, test, limits.bayes)
         draws = self._draws(test)
         threshold = effects.threshold_of(self.released, test.presses, bench, self.settings.draws)
         cases = effects.cases(bench, test.presses, self.settings, steps)
@@ -264,20 +278,19 @@ def _draw(
     settings: Settings,
     steps: Steps,
 ) -> dict[str, list[str]]:
-    released = section["methods"][0]["name"]
+    released: MethodRecord = section["methods"][0]
     known = {BAYES: section["limits"]["bayes"], CRAMER_RAO: section["limits"]["cramer_rao"]}
     limits = {name: limit["position_rms_mm"] for name, limit in known.items() if limit}
-    own = section["methods"][0]["errors"]["position_rms_mm"]
 
-    def speed(plot: str) -> Callable[[], Any]:
+    def speed(plot: Plot) -> Callable[[], Any]:
         return lambda: speed_plot(section["methods"], plot, limits, settings.batch)
 
     drawings: dict[str, Callable[[], Any]] = {
         **{plot: speed(plot) for plot in AXES},
         "maps": lambda: pictures.error_maps(bench.sensor, bench.domain, draws),
-        "force": lambda: pictures.against_force(section["by_force"], released),
+        "force": lambda: pictures.against_force(section["by_force"], released.name),
         "calibration": lambda: pictures.calibration(section["calibration"]),
-        "noise": lambda: pictures.noise_effect(section["cases"], released),
-        "effects": lambda: pictures.wrong_world(section["cases"], released, own),
+        "noise": lambda: pictures.noise_effect(section["cases"], released.name),
+        "effects": lambda: pictures.wrong_world(section["cases"], released.name, released.errors.position_rms_mm),
     }
     return pictures.draw_all(folder, stem, drawings, steps)

@@ -16,7 +16,7 @@ from isocharge.train.data.noise import noisy_charges
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.release.evaluate import FALSE_ALARMS, about_1_N
 from isocharge.train.report.bench import EvaluationScene, press_on
-from isocharge.train.report.measures import errors, rounded
+from isocharge.train.report.measures import Errors, rounded
 from isocharge.train.report.settings import Settings
 
 LEVELS = (0.1, 0.3, 1.0, 3.0, 10.0)
@@ -138,7 +138,7 @@ def _measured(case: Case, released: ReleasedModel, rivals: list[Fitted], thresho
     about = about_1_N(truth[:, 2])
     with np.errstate(over="ignore"):
         answers = {rival.name: np.clip(rival.predict(case.charge_pC), -FARTHEST, FARTHEST) for rival in rivals}
-    found = {released.name: contact, **answers}
+    contacts = {released.name: contact, **answers} if case.known else {}
     return {
         "group": case.group,
         "case": case.name,
@@ -146,7 +146,7 @@ def _measured(case: Case, released: ReleasedModel, rivals: list[Fitted], thresho
         "alarms_percent": rounded(100.0 * float(np.mean(alarm)), 3),
         "alarms_percent_about_1N": rounded(100.0 * float(np.mean(alarm[about])), 3) if about.any() else None,
         "coverage_68": rounded(float(np.mean(np.abs(contact - truth) < std)), 3) if case.known else None,
-        "errors": {name: errors(answer, truth) for name, answer in found.items()} if case.known else None,
+        "errors": {name: Errors.of(answer, truth).to_dict() for name, answer in contacts.items()} or None,
     }
 
 
@@ -167,15 +167,15 @@ def remaining(
     noisy, records = noisy_charges(clean, bench.noise, bench.seed + NOISE_SEED), []
     for number, name in enumerate(names):
         progress(f"fitting without electrode {name}")
-        kept = np.arange(len(names)) != number
-        fewer = replace(task, train=_only(task.train, kept), validation=_only(task.validation, kept))
+        alive = np.arange(len(names)) != number
+        fewer = replace(task, train=_only(task.train, alive), validation=_only(task.validation, alive))
         forms = [
             estimator.fit(fewer)[-1] for estimator in (PolynomialRidge(degrees=(8, 10), alphas=(1e-11,)), GaussNewton())
         ]
-        found = {form.name: errors(form.predict(noisy[:, kept]), clean.contact) for form in forms}
-        records.append({"without": name, "errors": found})
+        errors = {form.name: Errors.of(form.predict(noisy[:, alive]), clean.contact).to_dict() for form in forms}
+        records.append({"without": name, "errors": errors})
     return records
 
 
-def _only(presses: LabelledPresses, kept: np.ndarray) -> LabelledPresses:
-    return LabelledPresses(presses.contact, presses.charge_pC[:, kept])
+def _only(presses: LabelledPresses, electrodes: np.ndarray) -> LabelledPresses:
+    return LabelledPresses(presses.contact, presses.charge_pC[:, electrodes])

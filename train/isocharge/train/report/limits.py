@@ -13,7 +13,7 @@ from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.bayes.limit import Scene, bayes_estimate
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.report.bench import EvaluationScene
-from isocharge.train.report.measures import errors, rounded
+from isocharge.train.report.measures import Errors, rounded
 
 BAYES, CRAMER_RAO = "Bayes limit", "Cramér-Rao"
 """Their names in pictures."""
@@ -41,7 +41,7 @@ class ErrorBounds:
         """Root-mean-square errors for the record; Cramér-Rao's holds for unbiased estimates only."""
         bayes = None
         if self.bayes is not None:
-            bayes = {**errors(self.bayes, truth[: len(self.bayes)]), "presses": len(self.bayes)}
+            bayes = {**Errors.of(self.bayes, truth[: len(self.bayes)]).to_dict(), "presses": len(self.bayes)}
         return {
             "bayes": bayes,
             "cramer_rao": {

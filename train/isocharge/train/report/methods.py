@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from isocharge.train.baselines.linear_band import BAND_N
 from isocharge.train.data.noise import noisy_charges
 from isocharge.train.data.presses import LabelledPresses, presses_of, split_by_position
 from isocharge.train.report.bench import EvaluationScene
-from isocharge.train.report.measures import errors, pareto, rounded
+from isocharge.train.report.measures import Errors, MethodRecord, mark_fronts, rounded
 from isocharge.train.report.settings import Settings
 from isocharge.train.report.timing import latencies, throughputs
 
@@ -174,63 +173,36 @@ def _with_times(method: Method, durations: Array, per_second: float) -> Method:
     )
 
 
-def table(methods: list[Method], test: EvaluationPresses, bayes: Array | None) -> list[dict[str, Any]]:
-    """One record for each method, ready for JSON; errors over the limit where `bayes` gives its contacts."""
+def records_of(methods: list[Method], test: EvaluationPresses, bayes: Array | None) -> list[MethodRecord]:
+    """One record for each method; errors over the limit where `bayes` gives its contacts."""
     truth = test.presses.contact
-    band = truth[:, 2] <= BAND_N
-    limit = errors(bayes, truth[: len(bayes)]) if bayes is not None else None
-    records = []
-    for method in methods:
-        figures, fitted = errors(method.contact, truth), method.fitted
-        if fitted.given_force:
-            figures |= {"force_rms_percent": None, "force_median_percent": None}
-        records.append(
-            {
-                "label": method.label,
-                "name": fitted.name,
-                "form": fitted.form,
-                "kind": method.kind,
-                "choice": fitted.choice,
-                "force_given": fitted.given_force,
-                "errors": figures,
-                "errors_in_band": errors(method.contact[band], truth[band]) if band.any() else None,
-                "over_bayes": _ratio(method.contact, truth, bayes, limit),
-                "p50_us": rounded(method.p50_us),
-                "p95_us": rounded(method.p95_us),
-                "p50_of_rounds_us": [rounded(value) for value in method.rounds_us],
-                "per_second": rounded(method.per_second),
-                "memory_bytes": method.memory,
-                "fit_seconds": rounded(method.fit_seconds, 3),
-            }
-        )
-    _mark_fronts(records)
-    return records
+    limit = Errors.of(bayes, truth[: len(bayes)]) if bayes is not None else None
+    return mark_fronts([_record(method, truth, limit, 0 if bayes is None else len(bayes)) for method in methods])
 
 
-def _ratio(contact: Array, truth: Array, bayes: Array | None, limit: dict[str, Any] | None) -> float | None:
-    if bayes is None or limit is None:
-        return None
-    mine = errors(contact[: len(bayes)], truth[: len(bayes)])["position_rms_mm"]
-    return rounded(mine / limit["position_rms_mm"]) if mine else None
-
-
-FRONTS = {"latency": ("p50_us", 1.0), "throughput": ("per_second", -1.0), "memory": ("memory_bytes", 1.0)}
-"""Plot to the cost along its axis, and whether less (1) or more (-1) of it is better."""
-
-
-def _mark_fronts(records: list[dict[str, Any]]) -> None:
-    """On which plots nothing beats a method; one that is told the force, or does not answer all, does not compete."""
-    error = np.array(
-        [record["errors"]["position_rms_mm"] if competes(record) else np.nan for record in records], dtype=float
+def _record(method: Method, truth: Array, limit: Errors | None, limited: int) -> MethodRecord:
+    figures, band = Errors.of(method.contact, truth), truth[:, 2] <= BAND_N
+    if method.fitted.given_force:
+        figures = replace(figures, force_rms_percent=None, force_median_percent=None)
+    return MethodRecord(
+        name=method.fitted.name,
+        form=method.fitted.form,
+        kind=method.kind,
+        choice=method.fitted.choice,
+        force_given=method.fitted.given_force,
+        errors=figures,
+        errors_in_band=Errors.of(method.contact[band], truth[band]) if band.any() else None,
+        over_bayes=_ratio(Errors.of(method.contact[:limited], truth[:limited]), limit) if limit else None,
+        p50_us=method.p50_us,
+        p95_us=method.p95_us,
+        p50_of_rounds_us=method.rounds_us,
+        per_second=method.per_second,
+        memory_bytes=method.memory,
+        fit_seconds=method.fit_seconds,
     )
-    fronts = {
-        plot: pareto(sign * np.array([record[key] for record in records], dtype=float), error)
-        for plot, (key, sign) in FRONTS.items()
-    }
-    for number, record in enumerate(records):
-        record["best_on"] = [plot for plot, front in fronts.items() if front[number]]
 
 
-def competes(record: dict[str, Any]) -> bool:
-    """Whether a method answers what the others answer."""
-    return not record["force_given"] and record["errors"]["answered"] == 1.0
+def _ratio(errors: Errors, limit: Errors) -> float | None:
+    if errors.position_rms_mm is None or limit.position_rms_mm is None:
+        return None
+    return rounded(errors.position_rms_mm / limit.position_rms_mm)

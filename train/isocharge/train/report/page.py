@@ -1,11 +1,15 @@
-"""The page: summary, one table, pictures with captions; Markdown from the record alone."""
+"""The page: summary, one table, pictures with captions; Markdown from the record alone.
+
+The record is that of `report.json`, but for the methods, which are `MethodRecord`s."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from isocharge.train.baselines.linear_band import BAND_N
+from isocharge.train.baselines import linear_band
+from isocharge.train.baselines.networks import RELEASED
 from isocharge.train.release.evaluate import FALSE_ALARMS
 from isocharge.train.report.effects import FARTHEST, GAIN_OFF, PRETENSION_OFF
+from isocharge.train.report.measures import MethodRecord
 
 
 def page(record: dict[str, Any]) -> str:
@@ -22,18 +26,19 @@ def page(record: dict[str, Any]) -> str:
 
 
 def _summary(section: dict[str, Any]) -> Iterator[str]:
-    released, limits = section["methods"][0], section["limits"]
-    errors = released["errors"]
+    released: MethodRecord = section["methods"][0]
+    limits = section["limits"]
+    errors = released.errors
     yield f"**{section['sensor']}**, released model `{section['model']['label']}`:"
     yield ""
     yield (
-        f"- It errs by {errors['position_rms_mm']:.3g} mm rms ({errors['position_median_mm']:.3g} mm median) and by "
-        f"{errors['force_rms_percent']:.3g} % of the force, and takes {released['p50_us']:.3g} us for one press."
+        f"- It errs by {errors.position_rms_mm:.3g} mm rms ({errors.position_median_mm:.3g} mm median) and by "
+        f"{errors.force_rms_percent:.3g} % of the force, and takes {released.p50_us:.3g} us for one press."
     )
-    if released["over_bayes"]:
+    if released.over_bayes:
         bayes = limits["bayes"]
         yield (
-            f"- That is {released['over_bayes']:.3f} times the Bayes limit, {bayes['position_rms_mm']:.3g} mm and "
+            f"- That is {released.over_bayes:.3f} times the Bayes limit, {bayes['position_rms_mm']:.3g} mm and "
             f"{bayes['force_rms_percent']:.3g} % of the force on the same charges: no method can do better on average."
         )
     yield from (f"- {sentence}" for sentence in section["verdict"]["sentences"])
@@ -61,57 +66,44 @@ def _section(section: dict[str, Any], settings: dict[str, Any]) -> Iterator[str]
     yield from _choices(section["methods"])
 
 
-def _table(records: Sequence[dict[str, Any]], limits: dict[str, Any]) -> Iterator[str]:
+def _table(records: Sequence[MethodRecord], limits: dict[str, Any]) -> Iterator[str]:
     yield (
         "| method | computed by | position rms, mm | median | 95 % | over Bayes | force rms, % | one, us | 95 % | "
         "per second | bytes |"
     )
     yield "|---|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|"
-    for name, limit in (("*Bayes limit*", limits["bayes"]), ("*Cramér-Rao, unbiased*", limits["cramer_rao"])):
-        if limit:
-            cells = [
-                name,
-                "",
-                _number(limit["position_rms_mm"]),
-                _number(limit["position_median_mm"]),
-                _number(limit.get("position_p95_mm")),
-                "1" if "Bayes" in name else "",
-                _number(limit["force_rms_percent"]),
-                "",
-                "",
-                "",
-                "",
-            ]
-            yield _row(cells)
+    for name, key, over_bayes in (("*Bayes limit*", "bayes", "1"), ("*Cramér-Rao, unbiased*", "cramer_rao", "")):
+        if limit := limits[key]:
+            positions = [_number(limit.get(f"position_{figure}_mm")) for figure in ("rms", "median", "p95")]
+            yield _row([name, "", *positions, over_bayes, _number(limit["force_rms_percent"]), "", "", "", ""])
     for record in sorted(records, key=_order):
         yield _row(_cells(record))
     yield ""
     yield (
         "Bold: nothing is both faster (one prediction) and more accurate. *Force given*: told the true force, which no "
         "sensor knows. A share answered below 100 %: errors are of those presses only. Within the band up to "
-        f"{BAND_N:g} N, as the paper has it: {_band(records)}."
+        f"{linear_band.BAND_N:g} N, as the paper has it: {_band(records)}."
     )
 
 
-def _order(record: dict[str, Any]) -> tuple[float, float]:
-    return record["errors"]["position_rms_mm"] or float("inf"), record["p50_us"]
+def _order(record: MethodRecord) -> tuple[float, float]:
+    return record.errors.position_rms_mm or float("inf"), record.p50_us
 
 
-def _cells(record: dict[str, Any]) -> list[str]:
-    errors, answered = record["errors"], record["errors"]["answered"]
-    name = record["name"] + (f" ({100 * answered:.3g} % answered)" if answered < 1.0 else "")
+def _cells(record: MethodRecord) -> list[str]:
+    errors = record.errors
     cells = [
-        name,
-        record["form"],
-        *(_number(errors[key]) for key in ("position_rms_mm", "position_median_mm", "position_p95_mm")),
-        _number(record["over_bayes"]),
-        _number(errors["force_rms_percent"]),
-        _number(record["p50_us"]),
-        _number(record["p95_us"]),
-        f"{record['per_second']:,.0f}",
-        f"{record['memory_bytes']:,}",
+        record.name + (f" ({100 * errors.answered:.3g} % answered)" if errors.answered < 1.0 else ""),
+        record.form,
+        *(_number(value) for value in (errors.position_rms_mm, errors.position_median_mm, errors.position_p95_mm)),
+        _number(record.over_bayes),
+        _number(errors.force_rms_percent),
+        _number(record.p50_us),
+        _number(record.p95_us),
+        f"{record.per_second:,.0f}",
+        f"{record.memory_bytes:,}",
     ]
-    return [f"**{cell}**" if cell else "" for cell in cells] if "latency" in record["best_on"] else cells
+    return [f"**{cell}**" if cell else "" for cell in cells] if "latency" in record.best_on else cells
 
 
 def _row(cells: Sequence[str]) -> str:
@@ -122,13 +114,14 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
 
 
-def _band(records: Sequence[dict[str, Any]]) -> str:
-    words = []
+def _band(records: Sequence[MethodRecord]) -> str:
+    """Errors of the linear band and of the released network where the band holds."""
+    parts = []
     for record in records:
-        band = record["errors_in_band"]
-        if record["name"] in ("linear band", "released network") and band and band["position_rms_mm"]:
-            words.append(f"{record['name']} {band['position_rms_mm']:.3g} mm and {band['force_rms_percent']:.3g} %")
-    return "; ".join(words) or "no presses"
+        errors = record.errors_in_band
+        if record.name in (linear_band.NAME, RELEASED) and errors and errors.position_rms_mm:
+            parts.append(f"{record.name} {errors.position_rms_mm:.3g} mm and {errors.force_rms_percent:.3g} %")
+    return "; ".join(parts) or "no presses"
 
 
 CAPTIONS = {
@@ -242,16 +235,14 @@ def _without(section: dict[str, Any]) -> Iterator[str]:
     yield ""
 
 
-def _choices(records: Sequence[dict[str, Any]]) -> Iterator[str]:
+def _choices(records: Sequence[MethodRecord]) -> Iterator[str]:
     yield "### Choices"
     yield ""
     yield "| method | chosen | fitting, s |"
     yield "|---|---|--:|"
-    seen: set[str] = set()
-    for record in records:
-        if record["name"] not in seen:
-            seen.add(record["name"])
-            yield _row([record["name"], record["choice"], _number(record["fit_seconds"])])
+    first_forms = {record.name: record for record in reversed(records)}
+    for record in reversed(first_forms.values()):
+        yield _row([record.name, record.choice, _number(record.fit_seconds)])
     yield ""
 
 

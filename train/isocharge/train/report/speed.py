@@ -9,6 +9,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter
 
 from isocharge.arrays import Array
 from isocharge.simulate.plots.figure import INK, new_figure
+from isocharge.train.baselines import networks
+from isocharge.train.report.measures import MethodRecord, Plot
 from isocharge.train.report.pictures import GREY, LIMIT_STYLES, RELEASED
 
 KINDS = {"paper": "#7a5195", "learnt": "#2f7f6f", "fitted map": "#c47f17", "network": "#2b6cb0"}
@@ -33,15 +35,15 @@ MARKERS = {
 }
 """Markers of what computes a method."""
 
-AXES = {
-    "latency": ("p50_us", "time of one prediction, median, us"),
-    "throughput": ("per_second", "predictions per second in batches of {batch}"),
-    "memory": ("memory_bytes", "memory of the method, bytes"),
+AXES: dict[Plot, str] = {
+    "latency": "time of one prediction, median, us",
+    "throughput": "predictions per second in batches of {batch}",
+    "memory": "memory of the method, bytes",
 }
-"""Plot to the figure along its horizontal axis, and its words."""
+"""Plot to the words along its horizontal axis."""
 
 
-def speed_plot(records: Sequence[dict[str, Any]], plot: str, limits: dict[str, float], batch: int) -> Figure:
+def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: dict[str, float], batch: int) -> Figure:
     """Position error against latency, throughput or memory, one point for each method and form.
 
     Args:
@@ -50,22 +52,21 @@ def speed_plot(records: Sequence[dict[str, Any]], plot: str, limits: dict[str, f
         limits: Name to position error, mm, of what is drawn as a line, unless every method is below it.
         batch: Presses in a batch, for the words.
     """
-    key, words = AXES[plot]
     figure = new_figure(10.5, 6.6)
     axes = figure.subplots()
-    shown = [record for record in records if record["errors"]["position_rms_mm"]]
-    fair = [record["errors"]["position_rms_mm"] for record in shown if not record["force_given"]]
+    shown = [record for record in records if record.errors.position_rms_mm]
+    fair = [record.error_mm for record in shown if not record.force_given]
     limits = {name: value for name, value in limits.items() if value <= max(fair)}  # unbiased near a fold: centimetres
     _error_axis(axes, fair + list(limits.values()))
-    _points(axes, shown, key)
-    _front(axes, shown, key, plot)
+    _points(axes, shown, plot)
+    _front(axes, shown, plot)
     for name, value in limits.items():
         axes.axhline(value, color=INK, lw=1.4, ls=LIMIT_STYLES[name], zorder=1)
-    axes.set(xscale="log", xlabel=words.format(batch=batch), ylabel="position error, rms, mm")
+    axes.set(xscale="log", xlabel=AXES[plot].format(batch=batch), ylabel="position error, rms, mm")
     axes.grid(alpha=0.25, which="both", lw=0.5)
     if plot == "throughput":
         axes.invert_xaxis()
-    _name_all(axes, shown, key, limits)
+    _name_all(axes, shown, plot, limits)
     _legend(axes, shown)
     return figure
 
@@ -103,20 +104,20 @@ def _ticks(low: float, high: float, height: Callable[[float], float]) -> list[fl
     return sorted(ticks)
 
 
-def _points(axes: Any, records: Sequence[dict[str, Any]], key: str) -> None:
+def _points(axes: Any, records: Sequence[MethodRecord], plot: Plot) -> None:
     """Points, the forms of one method joined by a thin line."""
-    for name in dict.fromkeys(record["name"] for record in records):
-        forms = [record for record in records if record["name"] == name]
-        spots = sorted((record[key], _height(axes, record)) for record in forms)
+    for name in dict.fromkeys(record.name for record in records):
+        forms = [record for record in records if record.name == name]
+        spots = sorted((record.cost(plot), _height(axes, record)) for record in forms)
         axes.plot(*np.array(spots).T, color=_colour(forms[0]), lw=0.9, alpha=0.6, zorder=2)
     for record in records:
-        released = record["form"] == "Predictor"
+        released = record.form == "Predictor"
         colour = _colour(record)
-        hollow = record["force_given"] or record["errors"]["answered"] < 1.0
+        hollow = record.force_given or record.errors.answered < 1.0
         axes.plot(
-            record[key],
+            record.cost(plot),
             _height(axes, record),
-            MARKERS.get(record["form"], "o"),
+            MARKERS.get(record.form, "o"),
             color=colour,
             mfc="white" if hollow else colour,
             ms=17 if released else 7,
@@ -125,8 +126,8 @@ def _points(axes: Any, records: Sequence[dict[str, Any]], key: str) -> None:
         )
 
 
-def _front(axes: Any, records: Sequence[dict[str, Any]], key: str, plot: str) -> None:
-    front = sorted((r[key], r["errors"]["position_rms_mm"]) for r in records if plot in r["best_on"])
+def _front(axes: Any, records: Sequence[MethodRecord], plot: Plot) -> None:
+    front = sorted((record.cost(plot), record.error_mm) for record in records if plot in record.best_on)
     if len(front) > 1:
         style = "steps-post" if plot != "throughput" else "steps-pre"
         axes.plot(
@@ -141,14 +142,14 @@ def _front(axes: Any, records: Sequence[dict[str, Any]], key: str, plot: str) ->
         )
 
 
-def _name_all(axes: Any, records: Sequence[dict[str, Any]], key: str, limits: dict[str, float]) -> None:
+def _name_all(axes: Any, records: Sequence[MethodRecord], plot: Plot, limits: dict[str, float]) -> None:
     """Names of methods and limits in a column beside the plot, kept apart, each led to its height."""
     entries = [(value, f"{name}, {value:.3g} mm", INK) for name, value in limits.items()]
     edge = axes.get_xlim()[1]
-    for name in dict.fromkeys(record["name"] for record in records):
-        forms = [record for record in records if record["name"] == name]
+    for name in dict.fromkeys(record.name for record in records):
+        forms = [record for record in records if record.name == name]
         error, colour = _height(axes, forms[0]), _colour(forms[0])
-        nearest = (min if edge < axes.get_xlim()[0] else max)(record[key] for record in forms)
+        nearest = (min if edge < axes.get_xlim()[0] else max)(record.cost(plot) for record in forms)
         axes.plot([nearest, edge], [error, error], color=colour, lw=0.5, alpha=0.35, zorder=1)
         entries.append((error, _short(forms[0]), colour))
     entries.sort(key=lambda entry: entry[0])
@@ -181,12 +182,12 @@ def _axes_height(axes: Any, value: float) -> float:
     return float(axes.transAxes.inverted().transform(axes.transData.transform((1.0, value)))[1])
 
 
-def _height(axes: Any, record: dict[str, Any]) -> float:
-    return max(float(record["errors"]["position_rms_mm"]), float(axes.get_ylim()[0]))
+def _height(axes: Any, record: MethodRecord) -> float:
+    return max(record.error_mm, float(axes.get_ylim()[0]))
 
 
-def _colour(record: dict[str, Any]) -> str:
-    return RELEASED if record["name"].startswith("released") else KINDS[record["kind"]]
+def _colour(record: MethodRecord) -> str:
+    return RELEASED if record.name.startswith(networks.RELEASED) else KINDS[record.kind]
 
 
 def spread(wanted: Sequence[float], apart: float) -> list[float]:
@@ -202,20 +203,20 @@ def spread(wanted: Sequence[float], apart: float) -> list[float]:
     return heights
 
 
-def _short(record: dict[str, Any]) -> str:
-    errors, notes = record["errors"], []
-    if record["force_given"]:
-        notes.append(f"{errors['position_rms_mm']:.3g} mm")
-    if errors["answered"] < 1.0:
-        notes.append(f"{100 * errors['answered']:.3g} % answered")
-    return str(record["name"]) + (f" ({', '.join(notes)})" if notes else "")
+def _short(record: MethodRecord) -> str:
+    notes = []
+    if record.force_given:
+        notes.append(f"{record.error_mm:.3g} mm")
+    if record.errors.answered < 1.0:
+        notes.append(f"{100 * record.errors.answered:.3g} % answered")
+    return record.name + (f" ({', '.join(notes)})" if notes else "")
 
 
-def _legend(axes: Any, records: Sequence[dict[str, Any]]) -> None:
-    for kind in dict.fromkeys(record["kind"] for record in records):
+def _legend(axes: Any, records: Sequence[MethodRecord]) -> None:
+    for kind in dict.fromkeys(record.kind for record in records):
         axes.plot([], [], "-", lw=4, color=KINDS[kind], label=KIND_WORDS[kind])
     for form in MARKERS:
-        if any(record["form"] == form for record in records):
+        if any(record.form == form for record in records):
             colour = RELEASED if form == "Predictor" else GREY
             axes.plot([], [], MARKERS[form], color=colour, label=_form_words(form), ms=7)
     axes.figure.legend(loc="outside lower center", fontsize=8, ncol=5, frameon=False)
