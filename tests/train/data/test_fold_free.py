@@ -61,7 +61,9 @@ def test_three_uniaxial_electrodes_fold_inside_five_mm_and_the_user_is_told(tmp_
 
 
 def test_where_nothing_is_left_it_is_refused(dataset, monkeypatch):
-    monkeypatch.setattr("isocharge.train.training.fit.unfolded", lambda field, _: replace(field.domain, radius_mm=0.8))
+    monkeypatch.setattr(
+        "isocharge.train.training.fit.fold_free_domain", lambda field, _: replace(field.domain, radius_mm=0.8)
+    )
     with pytest.raises(DatasetError, match=r"folds 0\.8 mm from the centre, of 8 mm asked for"):
         fit_network(dataset, TINY)
 

@@ -1,11 +1,14 @@
 """Training configuration: a TOML file with two tables, or the defaults below."""
 
-import tomllib
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from isocharge.errors import ConfigError
+from isocharge.tables import Table, is_whole, read_toml
+
+T = TypeVar("T", "NetworkConfig", "TrainingConfig")
 
 LIMITS = {
     "steps": (1, 10_000_000),
@@ -18,6 +21,12 @@ LIMITS = {
     "threads": (1, 64),
 }
 """Smallest and largest value of the whole numbers under [training]."""
+
+WIDEST = 4096
+"""Largest width of a layer."""
+
+MOST_ELECTRODES = 64
+"""Largest number of electrodes that a configuration may ask for."""
 
 
 @dataclass(frozen=True)
@@ -35,17 +44,7 @@ class NetworkConfig:
     electrodes: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("hidden", "misfit_hidden"):
-            widths = getattr(self, name)
-            if not widths or not all(type(width) is int and 1 <= width <= 4096 for width in widths):
-                raise ConfigError(f"network.{name}: expected widths from 1 to 4096, got {widths}")
-        if len(self.hidden) != len(self.misfit_hidden):
-            raise ConfigError(
-                f"network.misfit_hidden: expected as many layers as network.hidden ({len(self.hidden)}; they run side "
-                f"by side), got {self.misfit_hidden}"
-            )
-        if type(self.electrodes) is not int or not (self.electrodes == 0 or 3 <= self.electrodes <= 64):
-            raise ConfigError(f"network.electrodes: expected 0 (as the dataset) or 3 to 64, got {self.electrodes!r}")
+        _check_network(Table(vars(self), "", ConfigError, "network"))
 
 
 @dataclass(frozen=True)
@@ -79,19 +78,7 @@ class TrainingConfig:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        for name, (low, high) in LIMITS.items():
-            value = getattr(self, name)
-            if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-                raise ConfigError(f"training.{name}: expected a whole number from {low} to {high}, got {value!r}")
-        if not 0.0 < self.learning_rate < 1.0:
-            raise ConfigError(f"training.learning_rate: expected a number between 0 and 1, got {self.learning_rate!r}")
-        if not 0.0 < self.hold_out < 0.6:
-            raise ConfigError(f"training.hold_out: expected a share between 0 and 0.6, got {self.hold_out!r}")
-        if self.finish_steps and self.noise != "clean":
-            raise ConfigError(
-                f"training.finish_steps: expected 0 with the noise {self.noise!r} (it would learn the noise by heart), "
-                f'got {self.finish_steps}; training.noise = "clean" allows it'
-            )
+        _check_training(Table(vars(self), "", ConfigError, "training"))
 
 
 @dataclass(frozen=True)
@@ -114,42 +101,47 @@ def load_config(path: Path) -> FitConfig:
     Raises:
         ConfigError: If the file cannot be read, a key is unknown, or a value has the wrong type or range.
     """
-    try:
-        tables = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not a TOML file: {error}") from error
-    try:
-        _check_keys(tables, {"network": NetworkConfig, "training": TrainingConfig}, "")
-        network = _table(NetworkConfig, tables.get("network", {}), "network.")
-        training = _table(TrainingConfig, tables.get("training", {}), "training.")
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
-    return FitConfig(network, training)
+    tables = Table(read_toml(path, "a training configuration", ConfigError), str(path), ConfigError)
+    tables.only("network", "training")
+    network, training = tables.table("network", {}), tables.table("training", {})
+    return FitConfig(
+        _read(network, NetworkConfig(), _check_network), _read(training, TrainingConfig(), _check_training)
+    )
 
 
-def _check_keys(table: dict[str, Any], known: Any, prefix: str) -> None:
-    for key in table:
-        if key not in known:
-            raise ConfigError(f"unknown key {prefix + key!r}; known are {', '.join(known)}")
+def _read(table: Table, defaults: T, check: Callable[[Table], None]) -> T:
+    """The table's values in place of the defaults, checked."""
+    table.only(*(entry.name for entry in fields(defaults)))
+    check(Table({**vars(defaults), **table.values}, table.where, ConfigError, table.path))
+    values: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in table.values.items()
+    }
+    return replace(defaults, **values)
 
 
-def _table(kind: Any, table: Any, prefix: str) -> Any:
-    if not isinstance(table, dict):
-        raise ConfigError(f"{prefix.rstrip('.')}: expected a table, got {table!r}")
-    defaults = {entry.name: entry for entry in fields(kind)}
-    _check_keys(table, defaults, prefix)
-    values = {key: _typed(value, getattr(kind(), key), prefix + key) for key, value in table.items()}
-    return kind(**values)
+def _check_network(table: Table) -> None:
+    hidden, misfit_hidden = (table.sequence(key, of="widths") for key in ("hidden", "misfit_hidden"))
+    for key, widths in (("hidden", hidden), ("misfit_hidden", misfit_hidden)):
+        if not widths or not all(is_whole(width) and 1 <= width <= WIDEST for width in widths):
+            table.refuse(key, f"widths from 1 to {WIDEST}")
+    if len(hidden) != len(misfit_hidden):
+        table.refuse(
+            "misfit_hidden", f"as many layers as network.hidden ({len(hidden)}; they run side by side)", misfit_hidden
+        )
+    electrodes = table.get("electrodes")
+    if not is_whole(electrodes) or not (electrodes == 0 or 3 <= electrodes <= MOST_ELECTRODES):
+        table.refuse("electrodes", f"0 (as the dataset) or 3 to {MOST_ELECTRODES}")
 
 
-def _typed(value: Any, default: Any, where: str) -> Any:
-    """The value as the default's type."""
-    if isinstance(default, tuple) and isinstance(value, list):
-        return tuple(value)
-    if isinstance(default, float) and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    if type(value) is not type(default):
-        raise ConfigError(f"{where}: expected {type(default).__name__}, got {value!r}")
-    return value
+def _check_training(table: Table) -> None:
+    for key, (least, most) in LIMITS.items():
+        table.whole(key, least=least, most=most)
+    for key, below in (("learning_rate", 1.0), ("hold_out", 0.6)):
+        if not 0.0 < table.number(key) < below:
+            table.refuse(key, f"a number between 0 and {below:g}")
+    noise = table.text("noise")
+    if table.get("finish_steps") and noise != "clean":
+        table.refuse(
+            "finish_steps",
+            f'0 with the noise {noise!r}, which it would learn by heart (training.noise = "clean" allows it)',
+        )
