@@ -29,9 +29,8 @@ def main(folder: Path, quick: bool = False) -> Contact:
     at, force = (3e-3, -2e-3), 1.0
     charge_pC = 1e12 * touch_charge(sensor, press(sensor.film, probe, at, force))
     contact = Predictor(release.folder).predict(charge_pC)
-    print(
-        f"pressed at (3, -2) mm with 1 N, felt at ({contact.x_mm:.2f}, {contact.y_mm:.2f}) mm, {contact.force_N:.3f} N"
-    )
+    estimate = f"({contact.x_mm:.2f}, {contact.y_mm:.2f}) mm, {contact.force_N:.3f} N"
+    print(f"pressed at (3, -2) mm with 1 N, estimated at {estimate}")
     return contact
 
 

@@ -49,7 +49,7 @@ class FittingTask:
     quick: bool = False
 
     def noisy_train(self, copies: int) -> LabelledPresses:
-        """The training presses so many times, each time with fresh noise on the charges."""
+        """`copies` of the training presses, each with fresh noise on the charges."""
         charge = [noisy_charges(self.train, self.noise, self.seed + FIRST_COPY + copy) for copy in range(copies)]
         return LabelledPresses(np.tile(self.train.contact, (copies, 1)), np.concatenate(charge))
 
@@ -71,8 +71,8 @@ class Fitted(ABC):
     Attributes:
         name: The method.
         form: What computes it: a library's name or "NumPy".
-        choice: The hyperparameters and how they were chosen, in words.
-        given_force: Whether it has to be told the true force, as no sensor can.
+        choice: The hyperparameters and how they were chosen, as a text.
+        given_force: Whether it needs the true force, which no sensor knows.
     """
 
     name: str
@@ -92,12 +92,12 @@ class Fitted(ABC):
         """
 
     def with_known_force(self, force_N: Array) -> "Fitted":
-        """The same, told the true forces of the presses that come next, shape (n,), N: itself, if it does not ask."""
+        """The same with the true forces of the next presses, shape (n,), N; itself if it does not need them."""
         del force_N
         return self
 
     def one(self, charge_pC: Array) -> Callable[[], object]:
-        """One press, charges of shape (n_electrode,), ready to be computed and timed: the fastest way there is."""
+        """One press, charges of shape (n_electrode,), ready to be computed and timed, by the fastest call."""
         row = np.array(charge_pC, dtype=float)[np.newaxis]
         return lambda: self.predict(row)
 
@@ -132,7 +132,7 @@ def best_of(task: FittingTask, candidates: Iterable[T], fit: Callable[[T], Calla
         fit: From hyperparameters to a function like `Fitted.predict`.
 
     Returns:
-        The candidate, and words on what it was compared with.
+        The candidate, and a text on what it was compared with.
     """
     tried = [(task.validation_error(fit(candidate)), number, candidate) for number, candidate in enumerate(candidates)]
     error, _, best = min(tried, key=lambda entry: entry[:2])

@@ -22,7 +22,7 @@ from isocharge.train.data.domain import ContactDomain
 NAME = "Gaussian process"
 
 BATCH = 256
-"""Presses whose kernel rows are made at once."""
+"""Presses whose kernel rows are computed at once."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class GaussianProcess:
         few = 150 if task.quick else self.learnt_from
         kernel = _learnt_kernel(values[:few], unit[:few], task.seed)
         model = GaussianProcessRegressor(kernel, optimizer=None, normalize_y=True, random_state=task.seed)
-        choice = f"{len(rows)} noisy presses, {_words(kernel)}; lengths by marginal likelihood on {few} of them"
+        choice = f"{len(rows)} noisy presses, {_kernel_text(kernel)}; lengths by marginal likelihood on {few} of them"
         library = SklearnProcess(features, model.fit(values, unit), task.domain, choice)
         return library, NumpyProcess.of(library)
 
@@ -61,7 +61,7 @@ def _learnt_kernel(values: Array, unit: Array, seed: int) -> Kernel:
         return GaussianProcessRegressor(start, normalize_y=True, random_state=seed).fit(values, unit).kernel_
 
 
-def _words(kernel: Kernel) -> str:
+def _kernel_text(kernel: Kernel) -> str:
     lengths = ", ".join(f"{length:.2g}" for length in np.atleast_1d(kernel.k1.k2.length_scale))
     return f"RBF lengths {lengths}, white {kernel.k2.noise_level:.2g}"
 

@@ -51,10 +51,12 @@ class LinearBand:
                 f"linear band: expected at least {FEWEST} presses of at most {BAND_N} N, got {len(band)}; "
                 "sweep smaller forces"
             )
-        made = {degree: tabulate(band, degree, task.domain.radius_mm) for degree in self.degrees}
-        degree, words = best_of(task, self.degrees[:1] if task.quick else self.degrees, lambda d: made[d].predict)
-        choice = f"{len(band)} presses up to {BAND_N} N, slopes of degree {degree}{words}"
-        return (replace(made[degree], choice=choice),)
+        tables = {degree: tabulate(band, degree, task.domain.radius_mm) for degree in self.degrees}
+        degree, comparison = best_of(
+            task, self.degrees[:1] if task.quick else self.degrees, lambda d: tables[d].predict
+        )
+        choice = f"{len(band)} presses up to {BAND_N} N, slopes of degree {degree}{comparison}"
+        return (replace(tables[degree], choice=choice),)
 
 
 def tabulate(band: LabelledPresses, degree: int, radius_mm: float) -> "BandTable":

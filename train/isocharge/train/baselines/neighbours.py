@@ -40,17 +40,17 @@ class NearestNeighbours:
         """Choose k and the metric, and give both forms."""
         noisy = task.noisy_train(1 if task.quick else task.copies)
         whitened, unit = LogFeatures.fit(noisy.charge_pC), task.domain.to_unit(noisy.contact)
-        made: dict[tuple[int, tuple[float, float]], TreeNeighbours] = {}
+        candidates: dict[tuple[int, tuple[float, float]], TreeNeighbours] = {}
         for ruler in self.rulers[1:2] if task.quick else self.rulers:
             features = whitened.measured_by(ruler)
             tree = cKDTree(features(noisy.charge_pC))
             plane = affine_fit(np.asarray(tree.data), unit)
             residual = unit - with_one(np.asarray(tree.data)) @ plane
             for count in self.counts:
-                made[count, ruler] = TreeNeighbours(features, tree, plane, residual, count, task.domain)
-        best, words = best_of(task, made, lambda candidate: made[candidate].predict)
-        choice = f"k = {best[0]} of {len(unit)} noisy presses, force axis x {best[1][0]:g}{words}"
-        direct = replace(made[best], choice=choice)
+                candidates[count, ruler] = TreeNeighbours(features, tree, plane, residual, count, task.domain)
+        best, comparison = best_of(task, candidates, lambda candidate: candidates[candidate].predict)
+        choice = f"k = {best[0]} of {len(unit)} noisy presses, force axis x {best[1][0]:g}{comparison}"
+        direct = replace(candidates[best], choice=choice)
         return SklearnNeighbours.of(direct), direct
 
 

@@ -1,6 +1,6 @@
 """Networks of several sizes, trained by the usual pipeline, and what carries them: torch, ONNX Runtime, NumPy.
 
-The rivals give a contact and nothing else, so here the contact network runs alone, without deviations and misfit; the
+The other methods give a contact and nothing else, so the contact network runs alone, without deviations and misfit; the
 released model, `ReleasedModel`, gives all seven numbers.
 """
 
@@ -34,7 +34,7 @@ class Network:
     """A network of one size.
 
     Attributes:
-        dataset: What it learns from; its own split by position, with the task's seed and share.
+        dataset: What it learns from; split by position with the task's seed and share.
         hidden: Widths.
         steps: Optimiser steps.
         hold_out: Share of the positions that the task holds back.

@@ -28,7 +28,7 @@ MOST_TERMS = 500
 """Monomials at most; more bring nothing under noise and cost time."""
 
 BATCH = 1024
-"""Presses whose monomials are made at once, so that they stay in the cache."""
+"""Presses whose monomials are computed at once, so that they stay in the cache."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,13 @@ class PolynomialRidge:
             model = make_pipeline(PolynomialFeatures(degree), ridge).fit(boxed, unit)
             return SklearnPolynomial(features, model, task.domain)
 
-        made = {candidate: fitted(candidate) for candidate in (candidates[:1] if task.quick else candidates)}
-        best, words = best_of(task, made, lambda candidate: made[candidate].predict)
+        models = {candidate: fitted(candidate) for candidate in (candidates[:1] if task.quick else candidates)}
+        best, comparison = best_of(task, models, lambda candidate: models[candidate].predict)
         terms = comb(n_electrode + best[0], n_electrode)
-        choice = f"degree {best[0]} ({terms} terms), ridge {best[1]:g} of the rows, {len(unit)} noisy presses{words}"
-        library = replace(made[best], choice=choice)
+        choice = (
+            f"degree {best[0]} ({terms} terms), ridge {best[1]:g} of the rows, {len(unit)} noisy presses{comparison}"
+        )
+        library = replace(models[best], choice=choice)
         return library, NumpyPolynomial.of(library)
 
 

@@ -33,7 +33,7 @@ class NearestEntry:
     name: str = "lookup table, nearest entry"
 
     def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
-        """All training presses are entries; there is nothing to choose."""
+        """All training presses are entries; nothing is chosen."""
         features = LogFeatures.fit(task.train.charge_pC)
         unit = task.domain.to_unit(task.train.contact)
         maps = np.concatenate([np.zeros((len(unit), features.shift.size, 3)), unit[:, None]], axis=1)
@@ -71,11 +71,13 @@ class InterpolatedTable:
             maps = affine_maps(entries, features(learnt.charge_pC), task.domain.to_unit(learnt.contact), count)
             return AffineTable(features, cKDTree(entries), maps, task.domain, self.name)
 
-        made = {candidate: table(candidate) for candidate in (self.candidates[1:2] if task.quick else self.candidates)}
-        best, words = best_of(task, made, lambda candidate: made[candidate].predict)
+        tables = {
+            candidate: table(candidate) for candidate in (self.candidates[1:2] if task.quick else self.candidates)
+        }
+        best, comparison = best_of(task, tables, lambda candidate: tables[candidate].predict)
         learnt = f"{best[1]} {best[0]} neighbours, force axis x {best[2][0]:g}"
-        choice = f"{len(task.train)} entries, affine maps through {learnt}{words}"
-        return (replace(made[best], choice=choice),)
+        choice = f"{len(task.train)} entries, affine maps through {learnt}{comparison}"
+        return (replace(tables[best], choice=choice),)
 
 
 def affine_maps(entries: Array, features: Array, unit: Array, count: int) -> Array:
@@ -120,7 +122,7 @@ class AffineTable(Fitted):
         tree: Features of the entries.
         maps: See `affine_maps`.
         domain: What the unit coordinates refer to.
-        affine: Whether the slopes are used; the entry's own contact if not.
+        affine: Whether the slopes are used; the entry's contact if not.
     """
 
     features: LogFeatures

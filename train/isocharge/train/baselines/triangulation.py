@@ -18,23 +18,23 @@ class Triangulate:
     """The method.
 
     Attributes:
-        film: Where its contours come from: the simulator's own forward map.
+        forward_map: Where its contours come from: the simulator's forward map.
     """
 
-    film: ForwardMap
+    forward_map: ForwardMap
     name: str = "triangulation"
 
     def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
         """Table the forward map's contours within the domain; with the force unknown, and given."""
-        made = Triangulation.from_map(self.film, radius=1e-3 * task.domain.radius_mm)
-        choice = f"contours from {self.film.solves} solves"
-        unknown = ContourMeeting(made, choice, self.name)
-        given = ContourMeeting(made, choice, f"{self.name}, force given", given_force=True)
+        contours = Triangulation.from_map(self.forward_map, radius=1e-3 * task.domain.radius_mm)
+        choice = f"contours from {self.forward_map.solves} solves"
+        unknown = ContourFix(contours, choice, self.name)
+        given = ContourFix(contours, choice, f"{self.name}, force given", given_force=True)
         return unknown, given
 
 
 @dataclass(frozen=True)
-class ContourMeeting(Fitted):
+class ContourFix(Fitted):
     """Where the contours meet; NaN where they do not, or twice."""
 
     contours: Triangulation
@@ -44,7 +44,7 @@ class ContourMeeting(Fitted):
     given_force: bool = False
     force_N: Array | None = None
 
-    def with_known_force(self, force_N: Array) -> "ContourMeeting":
+    def with_known_force(self, force_N: Array) -> "ContourFix":
         """See `Fitted.with_known_force`."""
         return replace(self, force_N=force_N) if self.given_force else self
 

@@ -1,4 +1,4 @@
-"""Results that take a minute and do not change, kept in the user's cache folder as JSON.
+"""Results that take a minute and do not change, stored in the user's cache folder as JSON.
 
 The folder is `$ISOCHARGE_CACHE`, else `$XDG_CACHE_HOME/isocharge`, else `~/.cache/isocharge`. A file is named by the
 hash of all that its result depends on; one that is damaged counts as absent.
@@ -15,15 +15,15 @@ from isocharge.files import sha256_of, write_whole
 
 
 def cache_folder() -> Path:
-    """Where results are kept; it need not exist yet."""
-    if own := os.environ.get("ISOCHARGE_CACHE"):
-        return Path(own)
+    """The folder of stored results; it need not exist yet."""
+    if folder := os.environ.get("ISOCHARGE_CACHE"):
+        return Path(folder)
     shared = os.environ.get("XDG_CACHE_HOME")
     return (Path(shared) if shared else Path.home() / ".cache") / "isocharge"
 
 
 def cached(name: str, key: dict[str, Any], compute: Callable[[], Any]) -> Any:
-    """The result of `compute`, from the cache if it is there, otherwise computed and kept.
+    """The result of `compute`, from the cache, or computed and stored.
 
     Args:
         name: What the result is, for the file's name.
@@ -32,15 +32,15 @@ def cached(name: str, key: dict[str, Any], compute: Callable[[], Any]) -> Any:
     """
     question = _text(key)
     path = cache_folder() / f"{name}-{sha256_of(question)[:24]}.json"
-    found = _read(path, key)
-    if found is not None:
-        return found
+    stored = _read(path, key)
+    if stored is not None:
+        return stored
     result = json.loads(_text(compute()))  # as a later call will read it
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, _text({"key": key, "sha256": sha256_of(_text(result)), "result": result}))
     except OSError as error:
-        warnings.warn(f"{path}: the result cannot be kept and will be computed again: {error}", stacklevel=2)
+        warnings.warn(f"{path}: the result cannot be stored and will be computed again: {error}", stacklevel=2)
     return result
 
 
@@ -51,8 +51,8 @@ def _text(value: Any) -> bytes:
 def _read(path: Path, key: dict[str, Any]) -> Any:
     """What a file holds, or None if it is absent, damaged or about something else."""
     try:
-        found = json.loads(path.read_bytes())
-        whole = sha256_of(_text(found["result"])) == found["sha256"]
-        return found["result"] if whole and _text(found["key"]) == _text(key) else None
+        stored = json.loads(path.read_bytes())
+        whole = sha256_of(_text(stored["result"])) == stored["sha256"]
+        return stored["result"] if whole and _text(stored["key"]) == _text(key) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -9,7 +9,7 @@ from isocharge.arrays import Array, Booleans, Integers
 from isocharge.simulate.numerics.disk import onto_disk
 
 EDGE = 8
-"""Points across a cell on the edge of the disk that are counted in or out."""
+"""Points across a cell on the edge of the disk; each counts as inside or outside."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Cells:
         yield self[edge].cut(radius).cut(radius)
 
     def _four(self, offset: float) -> "Cells":
-        """Half as wide, their centres by so many sides off the middle in both directions."""
+        """Four half as wide in place of each, their centres `offset` sides off its middle in both directions."""
         corner = offset * self.side * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
         centre = (self.centre[:, None] + corner).reshape(-1, 2)
         return Cells(np.repeat(self.press, 4), np.repeat(self.root, 4), centre, 0.5 * self.side)
@@ -58,7 +58,7 @@ class Cells:
     def inside(self, radius: float) -> tuple[Array, Array]:
         """Share of each cell that lies in the disk, shape (n,), and that share's centre, shape (n, 2).
 
-        A corner that holds none of the points that are counted has half of one's share.
+        A corner without any of the counted points has half of one point's share.
         """
         share, centre = np.ones(len(self)), self.centre.copy()
         edge = np.flatnonzero(self.on_edge(radius))

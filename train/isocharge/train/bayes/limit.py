@@ -3,7 +3,7 @@
     scene = Scene(load_sensor("three-25um-biaxial"), Circle(1e-3), radius_mm=8.0, force_range_N=(0.05, 2.0))
     print(bayes_limit(scene).position_rms_mm)
 
-Both functions keep their results in the cache folder (`isocharge.train.bayes.cache`).
+Both functions store their results in the cache folder (`isocharge.train.bayes.cache`).
 """
 
 from dataclasses import asdict, dataclass, field
@@ -33,7 +33,7 @@ PRESSES = 4000
 """Test presses of `bayes_limit`: the rms is then known to 3 %, its ratio to an estimator's on the same ones better."""
 
 METHOD = 1
-"""Of the integration; a higher number makes kept results be computed anew."""
+"""Version of the integration; results of an older version are computed again."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class BayesLimit:
     """Errors of the posterior mean.
 
     Attributes:
-        presses: How many were tried.
+        presses: Number of presses.
         position_median_mm, position_rms_mm, position_p95_mm: Of the distance from the true position.
         force_median_percent, force_rms_percent: Of the relative error of the force.
         expected_position_rms_mm, expected_force_rms_percent: What the posterior's own standard deviations say; they
@@ -121,14 +121,13 @@ def bayes_estimate(
     forward_map: ForwardMap | ChargeSpline | None = None,
     progress: Progress | None = None,
 ) -> tuple[Array, Array]:
-    """Posterior means for noisy charges: some 15 ms for each, from the cache if the same charges were given before.
+    """Posterior means for noisy charges: some 15 ms for each, from the cache if the same charges were asked before.
 
     Args:
         scene: Sensor, probe, prior and noise.
         charge_pC: Noisy touch charges, shape (n, n_electrode), pC.
-        forward_map: The scene's, if it is there already; it may reach farther than the scene, and with exactly the
-            scene's forces.
-        progress: Told how many presses are done.
+        forward_map: The scene's, if it exists; it may reach farther than the scene, with exactly the scene's forces.
+        progress: Called with the presses done and all presses.
 
     Returns:
         Contact (x_mm, y_mm, force_N) and standard deviation of each, both (n, 3). The force is E[1/F] / E[1/F^2],
@@ -158,32 +157,34 @@ def bayes_limit(
     forward_map: ForwardMap | None = None,
     progress: Progress | None = None,
 ) -> BayesLimit:
-    """The limit of a scene on presses drawn from its prior: a minute, then kept.
+    """The limit of a scene on presses drawn from its prior: a minute, then from the cache.
 
     Args:
         scene: Sensor, probe, prior and noise.
-        presses: How many.
+        presses: Number of presses.
         seed: Of presses and noise.
-        forward_map: The scene's, if it is there already.
-        progress: Told how many presses are done.
+        forward_map: The scene's, if it exists.
+        progress: Called with the presses done and all presses.
     """
 
     def compute() -> dict[str, Any]:
-        made = forward_map or scene.forward_map()
+        charges = forward_map or scene.forward_map()
         sweep = Sweep(1e-3 * scene.radius_mm, scene.force_range_N, presses, seed, sampling="random")
         x, y, force, _ = sweep.presses()
-        charge = scene.noise.add(made.forward(x, y, force), np.random.default_rng([seed, 1]))
-        contact, std = bayes_estimate(scene, 1e12 * charge, forward_map=made, progress=progress)
+        charge = scene.noise.add(charges.forward(x, y, force), np.random.default_rng([seed, 1]))
+        contact, std = bayes_estimate(scene, 1e12 * charge, forward_map=charges, progress=progress)
         return BayesLimit.of(contact, std, np.stack([1e3 * x, 1e3 * y, force], axis=1)).to_dict()
 
     return BayesLimit(**cached("bayes-limit", {**scene.key(), "presses": presses, "seed": seed}, compute))
 
 
 def _spline(scene: Scene, forward_map: ForwardMap | ChargeSpline | None) -> ChargeSpline:
-    made = forward_map or scene.forward_map()
-    if made.force_range != scene.force_range_N:
-        raise InputError(f"forces of the map: expected the scene's, {scene.force_range_N} N, got {made.force_range} N")
-    return made if isinstance(made, ChargeSpline) else ChargeSpline.of(made)
+    charges = forward_map or scene.forward_map()
+    if charges.force_range != scene.force_range_N:
+        raise InputError(
+            f"forces of the map: expected the scene's, {scene.force_range_N} N, got {charges.force_range} N"
+        )
+    return charges if isinstance(charges, ChargeSpline) else ChargeSpline.of(charges)
 
 
 def _in_chunks(posterior: Posterior, charge: Array, progress: Progress | None) -> tuple[Array, Array]:

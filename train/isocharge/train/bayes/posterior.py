@@ -6,8 +6,8 @@ the true charge, so the likelihood carries its normalisation,
     p(Q | x, y, ln F) = prod_e exp(-(Q_e - q_e)^2 / (2 sigma_e^2)) / sigma_e,   q = Q(x, y, F),   sigma_e = sigma(q_e).
 
 Positions are integrated over square cells, cut in four where the posterior may have mass until they are small against
-its width; wherever that mass lies, in one place or several, in an ellipse or a sickle, it is found, because a cell is
-left only when no contact in it can explain the charges. In each cell the force is integrated about its best value by
+its width; wherever that mass lies, in one place or several, in an ellipse or a sickle, none of it is lost: a cell is
+dropped only when no contact in it can explain the charges. In each cell the force is integrated about its best value by
 Gauss and Legendre's rule, cut off at the ends of the range. The midpoint rule on a Gaussian is exact to 1e-5 with cells
 of 1.25 standard deviations (Trefethen and Weideman 2014); only the edge of the disk wants more.
 """
@@ -34,7 +34,7 @@ ACROSS = 32
 """Cells across the disk to begin with."""
 
 MOST_CUTS = 10
-"""How often a cell may be cut in four: down to a thirty-thousandth of the disk."""
+"""Cuts of a cell in four at most: down to a thirty-thousandth of the disk."""
 
 STEP = 1.25
 """Largest side of a cell in standard deviations of the position, in the direction that the charges tell best."""
@@ -75,7 +75,7 @@ class Posterior:
             )
 
     def mean_and_std(self, charge: Array) -> tuple[Array, Array]:
-        """Of noisy charges, shape (n, n_electrode), C: each (n, 3) for x, y, F in m and N.
+        """Mean and standard deviation of (x, y, F), m and N, each (n, 3), from noisy charges (n, n_electrode), C.
 
         The mean of the force is E[1/F] / E[1/F^2], of all estimates the one with the least mean square relative error.
         """
@@ -106,10 +106,10 @@ class Posterior:
         return cells, self.charges.terms(onto_disk(centre, self.radius)), steepest
 
     def _integrate(self, charge: Array) -> tuple[Array, Array]:
-        found = list(self._cells(charge))
-        side = np.concatenate([np.full(len(cells), cells.side) for cells in found])
-        press = np.concatenate([cells.press for cells in found])
-        shares, centres = zip(*(cells.inside(self.radius) for cells in found), strict=True)
+        levels = list(self._cells(charge))
+        side = np.concatenate([np.full(len(cells), cells.side) for cells in levels])
+        press = np.concatenate([cells.press for cells in levels])
+        shares, centres = zip(*(cells.inside(self.radius) for cells in levels), strict=True)
         order = np.argsort(press, kind="stable")
         share, press, centre = np.concatenate(shares)[order], press[order], np.concatenate(centres)[order]
         logs, weight = self._over_force(centre, charge[press])
@@ -127,16 +127,20 @@ class Posterior:
             best = np.full(len(charge), np.inf)
             np.minimum.at(best, cells.press, chi2)
             excess = np.maximum(np.sqrt(chi2) - np.sqrt(0.5) * cells.side * reach, 0.0) ** 2 - best[cells.press]
-            kept = np.flatnonzero(excess <= MARGIN)
+            alive = np.flatnonzero(excess <= MARGIN)
             stiffest = np.zeros(len(charge))
-            np.maximum.at(stiffest, cells.press[kept], self._stiffness(cells.centre[kept], terms[kept], logs[kept]))
+            np.maximum.at(
+                stiffest,
+                cells.press[alive],
+                self._stiffness(cells.centre[alive], terms[alive], logs[alive]),
+            )
             cut_off = np.zeros(len(charge), dtype=bool)
             cut_off[cells.press[cells.on_edge(self.radius) & (chi2 <= best[cells.press] + NEAR)]] = True
             done = (stiffest * cells.side <= self.step)[cells.press] | (cut == MOST_CUTS)
             ready = cells[done & (chi2 <= best[cells.press] + MARGIN)]
             yield ready[~cut_off[ready.press]]
             yield from ready[cut_off[ready.press]].finer(self.radius)
-            cells = cells[kept][~done[kept]].cut(self.radius)
+            cells = cells[alive][~done[alive]].cut(self.radius)
             if not len(cells):
                 return
             terms = self.charges.terms(onto_disk(cells.centre, self.radius))

@@ -14,13 +14,13 @@ from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import ContactDomain
 
 SURE = 3e-4
-"""Error of the fitted charges above which nothing is said: the slopes of a poor fit fold by themselves."""
+"""Largest error of the fitted charges, relative, for which folds are looked for: a poor fit has folds of its own."""
 
 RIM = 0.98
-"""Share of the radius that is looked at: at the very rim no press holds the slopes from outside."""
+"""Searched radius over the domain's, dimensionless: at the very rim no press holds the slopes from outside."""
 
 SMALLEST_SHARE = 0.2
-"""Share of the asked radius that has to be left for a training to make sense."""
+"""Smallest fold-free radius over the dataset's, dimensionless, for which a training makes sense."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class FieldModel:
 
 
 def fold_free_domain(field: ChargeField, noise: NoiseModel) -> ContactDomain:
-    """The domain without what lies beyond the nearest fold; as it is if there is none, or if nobody can say."""
+    """The field's domain up to the nearest fold; all of it without folds, or where the fit is too poor to say."""
     if field.error > SURE:
         return field.domain
     area = working_area(FieldModel(field), noise, twins=False)

@@ -1,4 +1,4 @@
-"""Charges that the misfit is learned from: of good presses, of bad ones, and of none at all.
+"""Charges that the misfit is learned from: of good presses, of bad ones, and of no press at all.
 
 The misfit network answers whatever charges come in, so it has to have seen all kinds: presses with their noise, charges
 off the image of the forward map by any distance, wrong gains, dying electrodes, forces far outside, two presses at once
@@ -52,20 +52,20 @@ def draw_misfit_examples(
     """
     rng = np.random.default_rng(seed)
     rows = rng.integers(len(presses), size=count)
-    own = presses[rows]
+    chosen = presses[rows]
     kinds = np.array(list(KINDS))[rng.choice(len(KINDS), size=count, p=list(KINDS.values()))]
-    charge = np.empty_like(own.charge_pC)
+    charge = np.empty_like(chosen.charge_pC)
     for kind in KINDS:
-        charge[kinds == kind] = _DRAW[kind](rng, own.charge_pC[kinds == kind], presses.charge_pC, noise)
+        charge[kinds == kind] = _DRAW[kind](rng, chosen.charge_pC[kinds == kind], presses.charge_pC, noise)
     charge = np.clip(charge, LOWEST_PC, HIGHEST_PC)
-    return MisfitExamples(charge, _misses(field, charge, noise, own, np.isin(kinds, ("noisy", "moved"))))
+    return MisfitExamples(charge, _misses(field, charge, noise, chosen, np.isin(kinds, ("noisy", "moved"))))
 
 
-def _misses(field: ChargeField, charge: Array, noise: NoiseModel, own: LabelledPresses, near: np.ndarray) -> Array:
+def _misses(field: ChargeField, charge: Array, noise: NoiseModel, chosen: LabelledPresses, near: np.ndarray) -> Array:
     """Those `near` their own press start there, and the field is shifted to be right there; the others search."""
     miss, at = np.empty_like(charge), np.flatnonzero(near)
-    start = field.domain.to_unit(own.contact[at])
-    shift = np.log(own.charge_pC[at]) - field.log_charge(start)[:, 0]
+    start = field.domain.to_unit(chosen.contact[at])
+    shift = np.log(chosen.charge_pC[at]) - field.log_charge(start)[:, 0]
     miss[at] = nearest_in_field(field, charge[at], noise, start, shift)[1]
     far = np.flatnonzero(~near | (np.linalg.norm(np.where(near[:, None], miss, 0.0), axis=1) > FAR))
     searched = search_field(field, charge[far], noise)[1]

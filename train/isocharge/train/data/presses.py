@@ -105,6 +105,6 @@ def _check(presses: LabelledPresses) -> None:
 
 
 def position_error(contact: Array, truth: Array) -> Array:
-    """Distance between felt and true position, mm, shape (n,), from contacts of shape (n, 3)."""
+    """Distance between estimated and true position, mm, shape (n,), from contacts of shape (n, 3)."""
     distance: Array = np.hypot(contact[:, 0] - truth[:, 0], contact[:, 1] - truth[:, 1])
     return distance

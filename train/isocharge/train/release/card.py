@@ -78,15 +78,15 @@ def _unit(fit: Fit) -> str:
 
 def _what_misfit_sees(metadata: ModelMetadata) -> str:
     errors = metadata.errors
-    found = ""
+    shares = ""
     if "found_dead_electrode" in errors:
-        found = (
+        shares = (
             f"Of presses of about 1 N the former finds {100 * errors['found_gain_20_percent']:.3g} % where one gain\n"
             f"is off by 20 %, and {100 * errors['found_dead_electrode']:.3g} % where one electrode is dead."
         )
     if len(metadata.electrodes) == 3:
         return (
             "Three charges and three unknowns: nearly every triple fits some contact, so it sees only what leads out\n"
-            f"of the working area or the forces.\n{found}"
+            f"of the working area or the forces.\n{shares}"
         )
-    return f"Charges that disagree with each other (a wrong gain, a dead electrode, two presses) raise it.\n{found}"
+    return f"Charges that disagree with each other (a wrong gain, a dead electrode, two presses) raise it.\n{shares}"

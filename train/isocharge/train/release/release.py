@@ -56,7 +56,7 @@ NEARLY_ALL = 0.999
 """Share of the presses that the limits are for: where charges tell little, a float32 has not the digits."""
 
 ABSURD = 10.0
-"""How much further apart the rest may be, and answers to charges that no film gives."""
+"""Factor on the limits for all other presses, and for charges that no film gives."""
 
 
 @dataclass(frozen=True)
@@ -92,15 +92,14 @@ def train_model(
         command: How to make this model again, for the card.
         version: Number of the version folder.
         fresh: Throw away what an earlier run left.
-        progress: Told about steps, loss and errors.
-        warn: Told where the map folds, and of damaged parts of an earlier run.
+        progress: Called with steps done, all steps, and a text with the loss and errors.
+        warn: Called where the map folds, and about damaged parts of an earlier run.
 
     Returns:
         Where it is and how well it does.
 
     Raises:
-        OutputExists: If the version is already there, or an unfinished run of other settings; checked before the work
-            begins.
+        OutputExists: If the version exists, or an unfinished run of other settings; checked before the work begins.
         DatasetError: If the dataset cannot train an inverse.
         TrainingError: If training fails, or the exported file and the network disagree.
     """
@@ -181,8 +180,8 @@ def _golden_charges(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     of a float32 is 3e-5 mm, and no two runtimes agree to the tolerance of golden vectors.
     """
     std = predict_with(fit)(fit.held.charge_pC)[1]
-    told = fit.held[np.flatnonzero(std[:, 0] + std[:, 1] <= np.median(std[:, 0] + std[:, 1]))]
-    clean = told[np.linspace(0, len(told) - 1, GOLDEN // 2).astype(int)]
+    sure = fit.held[np.flatnonzero(std[:, 0] + std[:, 1] <= np.median(std[:, 0] + std[:, 1]))]
+    clean = sure[np.linspace(0, len(sure) - 1, GOLDEN // 2).astype(int)]
     half = clean[np.arange(0, len(clean), 2)]
     noisy = noisy_charges(half, misfit_noise(noise_model(fit.config.training.noise)), seed=2)
     absurd = half.charge_pC * np.geomspace(1e-3, 1e3, len(half))[:, None]
@@ -215,7 +214,7 @@ def _check_finite(graph: bytes, n_electrode: int) -> None:
 
 
 def _compare(graph: bytes, fit: Fit, charge_pC: np.ndarray, slack: float) -> None:
-    """The file must answer as the network does, which is computed in double precision here."""
+    """The file must answer as the network does, which is computed in double precision."""
     answers = run(open_session(graph, "the exported graph"), charge_pC)
     with torch.no_grad():
         exact = [tensor.numpy() for tensor in copy.deepcopy(fit.network).double()(torch.tensor(charge_pC).double())]

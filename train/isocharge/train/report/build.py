@@ -39,7 +39,7 @@ from isocharge.train.report.verdict import verdict
 FORMAT_VERSION = 1
 
 COMPARED = (gauss_newton.NAME, polynomial.NAME, table.INTERPOLATED, boosting.NAME, linear_band.NAME)
-"""Methods beside the released model in the pictures of effects; of their forms the last, the plain one."""
+"""Methods in the pictures of effects next to the released model; of their forms the last, the plain one."""
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Steps:
 
     Attributes:
         total: Steps in all, as far as is known.
-        tell: Told about them.
+        tell: Called with steps done, all steps, and a text.
         done: Steps done.
     """
 
@@ -56,16 +56,16 @@ class Steps:
     tell: StageProgress | None
     done: int = 0
 
-    def __call__(self, words: str) -> None:
+    def __call__(self, text: str) -> None:
         """One more step begins."""
         self.done += 1
         self.total = max(self.total, self.done)
-        self.say(words)
+        self.say(text)
 
-    def say(self, words: str) -> None:
-        """News of the present step."""
+    def say(self, text: str) -> None:
+        """A text about the present step."""
         if self.tell:
-            self.tell(self.done - 1, self.total, words)
+            self.tell(self.done - 1, self.total, text)
 
 
 def write_report(
@@ -83,13 +83,13 @@ def write_report(
         subjects: Datasets, each with the version folder of the released model for it.
         settings: How much work; the full report if absent.
         command: How to make this report again, for the page.
-        progress: Told about steps.
+        progress: Called with steps done, all steps, and the step that begins.
 
     Returns:
         The record, as in `report.json`.
 
     Raises:
-        OutputExists: If the folder is already there.
+        OutputExists: If the folder exists.
         DatasetError: If a dataset cannot teach the methods.
         ModelError: If a model is for another layout or knows less than its dataset.
     """
@@ -146,7 +146,7 @@ class _Subject:
 
     @property
     def steps(self) -> int:
-        """How many times progress is told something, roughly."""
+        """Number of steps that progress is called with, roughly."""
         remaining = 0 if len(self.bench.sensor.electrodes) < 4 else len(self.bench.sensor.electrodes)
         return 22 + len(self.settings.sizes) + 2 * self.settings.rounds + len(self.settings.shapes) + remaining
 
@@ -192,7 +192,7 @@ class _Subject:
             "calibration": maps.calibration(bench.domain, draws),
             "alarm_threshold": rounded(threshold),
             "cases": effects.measure(cases, self.released, _compared(methods), threshold),
-            "without_one": effects.remaining(self.task, bench, test.presses, steps),
+            "without_one": effects.without_one_electrode(self.task, bench, test.presses, steps),
         }
 
     def _draws(self, test: EvaluationPresses) -> maps.Draws:
@@ -209,11 +209,11 @@ def _known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
     Raises:
         ModelError: If the model is for another sensor, or knows fewer forces.
     """
-    here, there = sensor_to_dict(dataset.sensor), dict(model.sensor)
-    keys = sorted(key for key in (here.keys() | there.keys()) - {"name"} if here.get(key) != there.get(key))
+    expected, got = sensor_to_dict(dataset.sensor), dict(model.sensor)
+    keys = sorted(key for key in (expected.keys() | got.keys()) - {"name"} if expected.get(key) != got.get(key))
     if keys:
         raise ModelError(
-            f"model {model.label}: expected the dataset's sensor {here['name']!r}, got {there.get('name')!r} with "
+            f"model {model.label}: expected the dataset's sensor {expected['name']!r}, got {got.get('name')!r} with "
             f"another {', '.join(keys)}; choose its own model with --model, or train one"
         )
     domain, (low, high) = domain_of(dataset), model.force_range_N
@@ -291,6 +291,6 @@ def _draw(
         "force": lambda: pictures.against_force(section["by_force"], released.name),
         "calibration": lambda: pictures.calibration(section["calibration"]),
         "noise": lambda: pictures.noise_effect(section["cases"], released.name),
-        "effects": lambda: pictures.wrong_world(section["cases"], released.name, released.errors.position_rms_mm),
+        "effects": lambda: pictures.mismatch_effect(section["cases"], released.name, released.errors.position_rms_mm),
     }
     return pictures.draw_all(folder, stem, drawings, steps)

@@ -1,4 +1,4 @@
-"""What it costs when the world is not as the model was told: noise, probe, pretension, gains, a dead electrode."""
+"""Errors where the film differs from what the model assumes: noise, probe, pretension, gains, a dead electrode."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -20,16 +20,16 @@ from isocharge.train.report.measures import Errors, rounded
 from isocharge.train.report.settings import Settings
 
 LEVELS = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Factors on the noise."""
+"""Factors on the noise, dimensionless."""
 
 PRETENSION_OFF = 0.2e6
-"""Pretension that nobody knew of, Pa."""
+"""Pretension that the models do not know of, Pa."""
 
 GAIN_OFF, GAIN_WRONG = 0.01, 0.2
 """Standard deviation of unknown gains, and the gain that is plainly wrong."""
 
 OUTSIDE = 1.25
-"""Presses outside the working area lie within so many of its radii."""
+"""Distance of presses outside the working area, at most, relative to its radius, dimensionless."""
 
 ROUGH = 2e-3
 """Accuracy of charges under other probes and pretensions: far below what they change."""
@@ -38,12 +38,12 @@ FARTHEST = 50.0
 """Answers farther from zero, mm or N, are cut to this: polynomials explode outside of what they know."""
 
 NOISE_SEED = 515
-"""Of the noise on every case's charges, relative to the bench's."""
+"""Seed of the noise on every case's charges, relative to the scene's."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """Presses in a world that the models were not told of.
+    """Presses that differ from what the models assume.
 
     Attributes:
         group: "noise", "probe", "pretension", "gain", "dead electrode" or "elsewhere".
@@ -76,7 +76,9 @@ def cases(bench: EvaluationScene, clean: LabelledPresses, settings: Settings, pr
         yield Case("probe", notation, presses, noisy(presses))
     if settings.mismatch_cases:
         progress("solving a film with more pretension")
-        forward_maps = bench.forward_maps(sensor=_tauter(bench.sensor), settings=SolveSettings(accuracy=ROUGH))
+        forward_maps = bench.forward_maps(
+            sensor=_with_more_pretension(bench.sensor), settings=SolveSettings(accuracy=ROUGH)
+        )
         presses = press_on(forward_maps, sweep)
         yield Case("pretension", f"+{1e-6 * PRETENSION_OFF:g} MPa", presses, noisy(presses))
     yield from _wrong_gains(bench, clean, noisy(clean))
@@ -85,7 +87,7 @@ def cases(bench: EvaluationScene, clean: LabelledPresses, settings: Settings, pr
         yield from _outside(bench, noisy)
 
 
-def _tauter(sensor: Sensor) -> Sensor:
+def _with_more_pretension(sensor: Sensor) -> Sensor:
     return replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension + PRETENSION_OFF))
 
 
@@ -100,14 +102,17 @@ def _wrong_gains(bench: EvaluationScene, clean: LabelledPresses, noisy: Array) -
     gains = 1.0 + GAIN_OFF * rng.standard_normal(noisy.shape)
     yield Case("gain", f"each off by {100 * GAIN_OFF:g} % rms", clean, gains * noisy)
     for number, name in enumerate(bench.sensor.electrode_names):
-        here = np.arange(noisy.shape[1]) == number
+        affected = np.arange(noisy.shape[1]) == number
         yield Case(
-            "gain", f"{name} off by {100 * GAIN_WRONG:g} %", clean, np.where(here, (1.0 + GAIN_WRONG) * noisy, noisy)
+            "gain",
+            f"{name} off by {100 * GAIN_WRONG:g} %",
+            clean,
+            np.where(affected, (1.0 + GAIN_WRONG) * noisy, noisy),
         )
     silence = 1e12 * bench.noise.white * rng.standard_normal(noisy.shape)
     for number, name in enumerate(bench.sensor.electrode_names):
-        here = np.arange(noisy.shape[1]) == number
-        yield Case("dead electrode", f"{name} dead", clean, np.where(here, silence, noisy))
+        affected = np.arange(noisy.shape[1]) == number
+        yield Case("dead electrode", f"{name} dead", clean, np.where(affected, silence, noisy))
 
 
 def _outside(bench: EvaluationScene, noisy: Callable[[LabelledPresses], Array]) -> Iterator[Case]:
@@ -157,10 +162,10 @@ def threshold_of(released: ReleasedModel, clean: LabelledPresses, bench: Evaluat
     return float(np.percentile(np.concatenate(misfits), 100.0 * (1.0 - FALSE_ALARMS)))
 
 
-def remaining(
+def without_one_electrode(
     task: FittingTask, bench: EvaluationScene, clean: LabelledPresses, progress: Announce
 ) -> list[dict[str, Any]]:
-    """A known dead electrode: methods fitted anew to the charges that remain. Nothing for fewer than three of those."""
+    """A known dead electrode: methods fitted again to the charges that remain. Empty where fewer than three remain."""
     names = bench.sensor.electrode_names
     if len(names) < 4:
         return []

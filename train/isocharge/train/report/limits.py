@@ -68,7 +68,7 @@ def error_bounds(
         presses: Clean test presses.
         noisy_pC: Their charges with noise, shape (n, n_electrode).
         limited: For how many of them the posterior is integrated.
-        progress: Told how it goes.
+        progress: Called with a text.
     """
     bayes, charges = None, ChargeSpline.of(forward_maps[0])
     if len(forward_maps) == 1 and not bench.turned:

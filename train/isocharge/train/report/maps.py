@@ -1,4 +1,4 @@
-"""Where the errors are: over the film, over the force, in which corners worst, and whether the deviations are true."""
+"""Where the errors are: over the film, over the force, the worst regions; and whether the deviations hold."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -71,14 +71,14 @@ def force_bins(domain: ContactDomain, force_N: Array, bins: int = FORCE_BINS) ->
     return np.sqrt(edges[:-1] * edges[1:]), number
 
 
-def by_force(domain: ContactDomain, truth: Array, found: dict[str, Array], cramer_rao_mm: Array) -> dict[str, Any]:
+def by_force(domain: ContactDomain, truth: Array, contacts: dict[str, Array], cramer_rao_mm: Array) -> dict[str, Any]:
     """Root-mean-square position error, mm, of several methods and Cramér-Rao's in bins of the force."""
     middle, number = force_bins(domain, truth[:, 2])
     lines = {}
-    for name, contact in found.items():
+    for name, contact in contacts.items():
         error = position_error(contact, truth[: len(contact)])
-        here = [error[(number[: len(contact)] == k) & np.isfinite(error)] for k in range(len(middle))]
-        lines[name] = [rounded(rms(part)) if part.size else None for part in here]
+        in_bins = [error[(number[: len(contact)] == k) & np.isfinite(error)] for k in range(len(middle))]
+        lines[name] = [rounded(rms(part)) if part.size else None for part in in_bins]
     lines[CRAMER_RAO] = [rounded(rms(cramer_rao_mm[number == k])) for k in range(len(middle)) if (number == k).any()]
     return {"force_N": [rounded(value) for value in middle], "position_rms_mm": lines}
 
@@ -101,7 +101,7 @@ def worst_regions(
     few = _cells(domain, truth[: len(bayes)]) if bayes is not None else None
     return [
         {
-            **_cell_words(domain, int(k)),
+            **_cell_limits(domain, int(k)),
             "position_rms_mm": rounded(rms(error[cell == k])),
             "force_rms_percent": rounded(rms(force[cell == k])),
             "over_bayes": _over_bayes(bayes, contact, truth, few == k)
@@ -112,10 +112,10 @@ def worst_regions(
     ]
 
 
-def _over_bayes(bayes: Array, contact: Array, truth: Array, here: np.ndarray) -> float | None:
-    if not here.any():
+def _over_bayes(bayes: Array, contact: Array, truth: Array, cell: np.ndarray) -> float | None:
+    if not cell.any():
         return None
-    rows = np.flatnonzero(here)
+    rows = np.flatnonzero(cell)
     mine, limit = (rms(position_error(each[rows], truth[rows])) for each in (contact, bayes))
     return rounded(mine / limit, 3)
 
@@ -128,7 +128,7 @@ def _cells(domain: ContactDomain, truth: Array) -> Integers:
     return cell
 
 
-def _cell_words(domain: ContactDomain, cell: int) -> dict[str, Any]:
+def _cell_limits(domain: ContactDomain, cell: int) -> dict[str, Any]:
     ring, sector, force = cell // (SECTORS * FORCES), cell // FORCES % SECTORS, cell % FORCES
     radii = domain.radius_mm * np.sqrt(np.array([ring, ring + 1]) / RINGS)
     edges = np.geomspace(*domain.force_range_N, FORCES + 1)[force : force + 2]
@@ -163,8 +163,8 @@ def _parts(domain: ContactDomain, draws: Draws) -> Iterator[dict[str, Any]]:
         yield _part(f"{low:.1f} to {high:.1f} mm from the centre", draws, (distance >= low) & (distance <= high))
 
 
-def _part(name: str, draws: Draws, here: np.ndarray) -> dict[str, Any]:
-    covered = coverage(draws.contact[here], draws.std[here], draws.truth[here], np.array(SHARES))
+def _part(name: str, draws: Draws, rows: np.ndarray) -> dict[str, Any]:
+    covered = coverage(draws.contact[rows], draws.std[rows], draws.truth[rows], np.array(SHARES))
     return {
         "where": name,
         **{

@@ -42,10 +42,10 @@ TEST_NOISE = 4242
 
 @dataclass(frozen=True)
 class Method:
-    """A method in one form, and what it made of the test presses.
+    """A method in one form, and its answers to the test presses.
 
     Attributes:
-        fitted: It.
+        fitted: The method.
         kind: "paper", "learnt", "fitted map" or "network".
         contact: Its answers, shape (n, 3).
         fit_seconds: What fitting all forms took.

@@ -80,7 +80,7 @@ def _table(records: Sequence[MethodRecord], limits: dict[str, Any]) -> Iterator[
         yield _row(_cells(record))
     yield ""
     yield (
-        "Bold: nothing is both faster (one prediction) and more accurate. *Force given*: told the true force, which no "
+        "Bold: nothing is both faster (one prediction) and more accurate. *Force given*: by the true force, which no "
         "sensor knows. A share answered below 100 %: errors are of those presses only. Within the band up to "
         f"{linear_band.BAND_N:g} N, as the paper has it: {_band(records)}."
     )
@@ -127,7 +127,7 @@ def _band(records: Sequence[MethodRecord]) -> str:
 CAPTIONS = {
     "latency": "Position error (rms, mm) against the time of one prediction (median, us). Points of one method are "
     "joined; markers say what computes it. Dashed: the front that nothing beats. The error axis is stretched near the "
-    "limit. Hollow: told the force, or not all presses answered.",
+    "limit. Hollow: the true force given, or not all presses answered.",
     "throughput": "The same against predictions per second in batches of {batch} (more to the left).",
     "memory": "The same against the bytes a method needs to predict.",
     "maps": "Errors of the released model over the film: rms over forces and {draws} draws of the noise. Squares: "
@@ -136,9 +136,9 @@ CAPTIONS = {
     "calibration": "Share of true contacts inside the released model's central intervals against the nominal level; "
     "shaded: 2 percentage points.",
     "noise": "Position error (rms, mm) when the noise is not the one that the methods were fitted for.",
-    "effects": "Left: position error (rms, mm) when the probe, the pretension or gains are not as the methods were "
-    "told; answers beyond {farthest:g} mm or N are cut there. Right: share of presses whose misfit gives an alarm, at "
-    "{alarms:g} % false alarms (dashed).",
+    "effects": "Left: position error (rms, mm) when the probe, the pretension or gains are not as the methods "
+    "assume; answers beyond {farthest:g} mm or N are cut there. Right: share of presses whose misfit gives an alarm, "
+    "at {alarms:g} % false alarms (dashed).",
 }
 
 
@@ -159,7 +159,7 @@ def _where(section: dict[str, Any]) -> Iterator[str]:
     yield _picture(section, "force")
     yield "Worst regions of the released model:"
     yield ""
-    yield "| from the centre, mm | direction, deg | force, N | position rms, mm | over Bayes there | force rms, % |"
+    yield "| from the centre, mm | direction, deg | force, N | position rms, mm | over Bayes | force rms, % |"
     yield "|--:|--:|--:|--:|--:|--:|"
     for region in section["worst_regions"]:
         ranges = [f"{_number(low)} to {_number(high)}" for low, high in (region[k] for k in REGION)]
@@ -183,7 +183,7 @@ def _calibration(section: dict[str, Any]) -> Iterator[str]:
 
 
 def _effects(section: dict[str, Any]) -> Iterator[str]:
-    yield "### When the world is not as told"
+    yield "### When the film, the probe or the chain differ from the model"
     yield ""
     yield _picture(section, "noise")
     yield _picture(section, "effects", alarms=100.0 * FALSE_ALARMS, farthest=FARTHEST)
@@ -198,7 +198,7 @@ def _effects(section: dict[str, Any]) -> Iterator[str]:
     yield ""
     yield (
         f"Gains: every electrode off by {100 * GAIN_OFF:g} % rms, another draw for every press. Pretension: "
-        f"{1e-6 * PRETENSION_OFF:g} MPa more than the models were told. Force and intervals are the released model's."
+        f"{1e-6 * PRETENSION_OFF:g} MPa more than the models assume. Force and intervals are the released model's."
     )
     yield ""
     yield from _without(section)
@@ -217,13 +217,13 @@ def _without(section: dict[str, Any]) -> Iterator[str]:
     records = section["without_one"]
     if not records:
         yield (
-            "A dead electrode leaves two charges of three, which cannot tell x, y and force: nothing is to be fitted "
-            "to them. What the model makes of it is in the table above."
+            "A dead electrode leaves two charges of three, which cannot determine x, y and force: nothing is to be "
+            "fitted to them. What the model makes of it is in the table above."
         )
         yield ""
         return
     names = list(records[0]["errors"])
-    yield "A dead electrode that is known to be dead leaves three charges; methods fitted anew to those:"
+    yield "A dead electrode that is known to be dead leaves three charges; methods fitted again to those:"
     yield ""
     yield f"| without | {' | '.join(f'{name}: position rms, mm | force rms, %' for name in names)} |"
     yield "|---|" + "--:|--:|" * len(names)

@@ -1,4 +1,4 @@
-"""Colours and lines that the report's pictures have in common."""
+"""The report's pictures of errors, calibration and effects, and the colours and lines of all its pictures."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ from isocharge.train.report.limits import BAYES, CRAMER_RAO
 from isocharge.train.report.maps import COORDINATES, Draws
 
 GREY, RELEASED = "#8a95a5", FELT
-"""Colours of what is beside the point, and of the released model."""
+"""Colours of secondary lines, and of the released model."""
 
 LINES = ("#2b6cb0", "#2f7f6f", "#c47f17", "#7a5195", "#8c564b", "#4c9be8")
 """Colours of methods where kinds do not tell them apart."""
@@ -32,7 +32,7 @@ LIMIT_STYLES = {BAYES: "-", CRAMER_RAO: ":"}
 def error_maps(sensor: Sensor, domain: ContactDomain, draws: Draws) -> Figure:
     """Root-mean-square errors of the released model over the film."""
     figure = new_figure(11.5, 5.0)
-    for axes, values, words in zip(
+    for axes, values, label in zip(
         figure.subplots(1, 2),
         (draws.position_mm, draws.force_percent),
         ("position error, rms, mm", "relative force error, rms, %"),
@@ -41,7 +41,7 @@ def error_maps(sensor: Sensor, domain: ContactDomain, draws: Draws) -> Figure:
         cells = axes.hexbin(*draws.truth[:, :2].T, values, gridsize=22, reduce_C_function=rms, cmap="viridis", lw=0.1)
         cells.set_clip_path(Circle((0, 0), domain.radius_mm, transform=axes.transData))
         cells.set_clim(*np.percentile(np.ma.compressed(cells.get_array()), (0.5, 99.5)))
-        axes.figure.colorbar(cells, ax=axes, shrink=0.85, label=words)
+        axes.figure.colorbar(cells, ax=axes, shrink=0.85, label=label)
         draw_electrodes(axes, sensor)
         draw_working_area(axes, 1e-3 * domain.radius_mm)
         frame_film(axes, sensor, 1e-3 * domain.radius_mm)
@@ -130,8 +130,8 @@ def _method_lines(axes: Any, x: Sequence[float], lines: dict[str, list[float]], 
         )
 
 
-def wrong_world(cases: Sequence[dict[str, Any]], released: str, nominal: float | None) -> Figure:
-    """Errors and alarms where the film, probe or chain is not as the models were told."""
+def mismatch_effect(cases: Sequence[dict[str, Any]], released: str, nominal: float | None) -> Figure:
+    """Errors and alarms where the film, probe or chain is not as the models assume."""
     some = [case for case in cases if case["group"] != "noise"]
     figure = new_figure(11.5, 1.9 + 0.36 * len(some))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1.0))
@@ -140,7 +140,7 @@ def wrong_world(cases: Sequence[dict[str, Any]], released: str, nominal: float |
     if nominal:
         left.axvline(nominal, color=RELEASED, lw=0.9, ls="--")
         left.annotate(
-            "as told", (nominal, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=8
+            "as assumed", (nominal, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=8
         )
     right.barh(height, [case["alarms_percent"] for case in some], color=RELEASED, alpha=0.8, height=0.6)
     for y, case in zip(height, some, strict=True):
@@ -157,7 +157,7 @@ def wrong_world(cases: Sequence[dict[str, Any]], released: str, nominal: float |
         xlabel="position error, rms, mm",
         xscale="log",
         yticks=height,
-        yticklabels=[_case_words(case) for case in some],
+        yticklabels=[_case_label(case) for case in some],
         ylim=(-0.7, len(some) - 0.3),
     )
     right.set(xlabel="presses with an alarm from the misfit, %", xlim=(0, 112))
@@ -183,7 +183,7 @@ def _error_dots(axes: Any, cases: Sequence[dict[str, Any]], height: Integers, re
         )
 
 
-def _case_words(case: dict[str, Any]) -> str:
+def _case_label(case: dict[str, Any]) -> str:
     return f"{case['group']}: {case['case']}" if case["group"] in ("probe", "pretension", "gain") else str(case["case"])
 
 

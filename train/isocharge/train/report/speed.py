@@ -16,7 +16,7 @@ from isocharge.train.report.pictures import GREY, LIMIT_STYLES, RELEASED
 KINDS = {"paper": "#7a5195", "learnt": "#2f7f6f", "fitted map": "#c47f17", "network": "#2b6cb0"}
 """Colours of the kinds of methods."""
 
-KIND_WORDS = {
+KIND_LABELS = {
     "paper": "Mirbagheri et al. 2007",
     "learnt": "learnt from presses",
     "fitted map": "search on a forward map",
@@ -40,7 +40,7 @@ AXES: dict[Plot, str] = {
     "throughput": "predictions per second in batches of {batch}",
     "memory": "memory of the method, bytes",
 }
-"""Plot to the words along its horizontal axis."""
+"""Label of each plot's horizontal axis."""
 
 
 def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: dict[str, float], batch: int) -> Figure:
@@ -50,7 +50,7 @@ def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: dict[str, fl
         records: Of the methods.
         plot: Which of AXES.
         limits: Name to position error, mm, of what is drawn as a line, unless every method is below it.
-        batch: Presses in a batch, for the words.
+        batch: Presses in a batch, for the label.
     """
     figure = new_figure(10.5, 6.6)
     axes = figure.subplots()
@@ -73,7 +73,7 @@ def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: dict[str, fl
 
 STRETCH = 0.97
 """The error axis is logarithmic in the distance from this share of the smallest error: stretched near the limit. What
-is told the force may lie below; it is drawn at the axis' lower end."""
+is given the force may lie below; it is drawn at the axis' lower end."""
 
 
 def _error_axis(axes: Any, errors: Sequence[float]) -> None:
@@ -95,7 +95,7 @@ NICE = ((1, 2, 5), (1.5, 3, 4, 7), (1.2, 1.7, 2.5, 6, 8), tuple(np.arange(1.05, 
 
 
 def _ticks(low: float, high: float, height: Callable[[float], float]) -> list[float]:
-    """Round numbers from low to high, the nicest first, at heights (0 to 1) that keep their words apart."""
+    """Round numbers from low to high, the nicest first, at heights (0 to 1) that keep their labels apart."""
     ticks: list[float] = []
     for digits in NICE:
         for tick in (float(f"{digit * 10.0**power:.6g}") for power in range(-3, 2) for digit in digits):
@@ -143,7 +143,7 @@ def _front(axes: Any, records: Sequence[MethodRecord], plot: Plot) -> None:
 
 
 def _name_all(axes: Any, records: Sequence[MethodRecord], plot: Plot, limits: dict[str, float]) -> None:
-    """Names of methods and limits in a column beside the plot, kept apart, each led to its height."""
+    """Names of methods and limits in a column right of the plot, without overlap, each with a line to its height."""
     entries = [(value, f"{name}, {value:.3g} mm", INK) for name, value in limits.items()]
     edge = axes.get_xlim()[1]
     for name in dict.fromkeys(record.name for record in records):
@@ -155,9 +155,9 @@ def _name_all(axes: Any, records: Sequence[MethodRecord], plot: Plot, limits: di
     entries.sort(key=lambda entry: entry[0])
     axes.set_xlim(axes.get_xlim()[0], edge)
     heights = [_axes_height(axes, entry[0]) for entry in entries]
-    for (error, words, colour), height in zip(entries, spread(heights, 0.037), strict=True):
+    for (error, label, colour), height in zip(entries, spread(heights, 0.037), strict=True):
         axes.annotate(
-            words,
+            label,
             (1.0, error),
             xycoords=("axes fraction", "data"),
             xytext=(1.05, height),
@@ -190,12 +190,12 @@ def _colour(record: MethodRecord) -> str:
     return RELEASED if record.name.startswith(networks.RELEASED) else KINDS[record.kind]
 
 
-def spread(wanted: Sequence[float], apart: float) -> list[float]:
-    """Heights at least so far apart, in the same ascending order, as near to the wanted ones as a sweep brings them."""
+def spread(targets: Sequence[float], apart: float) -> list[float]:
+    """Heights at least `apart` from each other, in the same ascending order, near the target heights."""
     heights: list[float] = []
-    for height in wanted:
+    for height in targets:
         heights.append(max(height, heights[-1] + apart) if heights else height)
-    beyond = heights[-1] - max(1.0, wanted[-1])
+    beyond = heights[-1] - max(1.0, targets[-1])
     if beyond > 0.0:
         heights[-1] -= beyond
         for k in range(len(heights) - 2, -1, -1):
@@ -214,13 +214,13 @@ def _short(record: MethodRecord) -> str:
 
 def _legend(axes: Any, records: Sequence[MethodRecord]) -> None:
     for kind in dict.fromkeys(record.kind for record in records):
-        axes.plot([], [], "-", lw=4, color=KINDS[kind], label=KIND_WORDS[kind])
+        axes.plot([], [], "-", lw=4, color=KINDS[kind], label=KIND_LABELS[kind])
     for form in MARKERS:
         if any(record.form == form for record in records):
             colour = RELEASED if form == "Predictor" else GREY
-            axes.plot([], [], MARKERS[form], color=colour, label=_form_words(form), ms=7)
+            axes.plot([], [], MARKERS[form], color=colour, label=_form_label(form), ms=7)
     axes.figure.legend(loc="outside lower center", fontsize=8, ncol=5, frameon=False)
 
 
-def _form_words(form: str) -> str:
+def _form_label(form: str) -> str:
     return "released model (Predictor)" if form == "Predictor" else form

@@ -1,6 +1,6 @@
-"""The state of a training run, kept every few seconds, so that a killed run goes on and ends with the same weights.
+"""The state of a training run, saved every few seconds, so that a killed run goes on and ends with the same weights.
 
-Each stage has a part of its own in the run's draft (`isocharge.resumable_run`): written whole, with a checksum.
+Each stage has a part in the run's draft (`isocharge.resumable_run`): written whole, with a checksum.
 """
 
 import io
@@ -13,11 +13,11 @@ import torch
 from isocharge.resumable_run import ResumableRun
 
 EVERY_S = 3.0
-"""Seconds between two writes of a stage that is under way."""
+"""Seconds between two writes of a running stage."""
 
 
 class Checkpoint:
-    """Keeps states of stages in a draft, or nowhere.
+    """Saves states of stages in a draft, or nowhere.
 
     Args:
         draft: Where; nowhere if absent.
@@ -29,15 +29,15 @@ class Checkpoint:
         self._written = clock()
 
     def load(self, stage: str) -> Any:
-        """The state that was kept last, or None."""
+        """The state that was saved last, or None."""
         data = self._draft.load(stage) if self._draft else None
         return None if data is None else torch.load(io.BytesIO(data), weights_only=True)
 
     def save(self, stage: str, state: Callable[[], Any], *, now: bool = False) -> None:
-        """Keep a state made of tensors, numbers and texts; unless `now`, only if some seconds have passed.
+        """Save a state of tensors, numbers and texts; unless `now`, only if `EVERY_S` seconds have passed.
 
         Raises:
-            OutputError: If the file system refuses; what was kept before stays.
+            OutputError: If the file system refuses; what was saved before stays.
         """
         if self._draft is None or not (now or self._clock() - self._written >= EVERY_S):
             return

@@ -58,8 +58,8 @@ class TrainingConfig:
         misfit_charges: Charges that it learns from.
         batch: Samples per step.
         learning_rate: Largest rate of the schedule (Adam's; Muon's is a multiple).
-        patience: Steps without a better network after which a stage ends early; the best one is kept.
-        hold_out: Share of the positions kept for measuring errors; half as many are watched while it trains.
+        patience: Steps without a better network after which a stage ends early with the best one.
+        hold_out: Share of the positions held out for measuring errors; half as many are watched while it trains.
         noise: Level of the noise model that is added afresh in every step.
         seed: Of weights, batches, noise and split.
         threads: CPU threads; one is nearly as fast as two at this size and does not suffer when the cores are busy.
@@ -113,9 +113,8 @@ def _read(table: Table, defaults: T, check: Callable[[Table], None]) -> T:
     """The table's values in place of the defaults, checked."""
     table.only(*(entry.name for entry in fields(defaults)))
     check(Table({**vars(defaults), **table.values}, table.where, ConfigError, table.path))
-    values: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in table.values.items()
-    }
+    lists = {key: tuple(value) for key, value in table.values.items() if isinstance(value, list)}
+    values: dict[str, Any] = {**table.values, **lists}
     return replace(defaults, **values)
 
 

@@ -1,8 +1,8 @@
 """First-order training of one part of the model: optimisers, schedule, early stop, checkpoint.
 
-Hidden layers are trained by Muon (Jordan et al. 2024), the rest by Adam with a short memory; at equal steps the pair
-halves the error that plain Adam reaches on clean charges. The rate rises over a tenth of the steps and falls to nothing
-along a cosine.
+Hidden layers are trained by Muon (Jordan et al. 2024), all other parameters by Adam with a short memory; at equal
+steps the pair halves the error that plain Adam reaches on clean charges. The rate rises over a tenth of the steps and
+falls to nothing along a cosine.
 """
 
 import copy
@@ -19,13 +19,13 @@ from isocharge.train.training.checkpoint import Checkpoint
 from isocharge.train.training.network import Perceptron
 
 MUON_RATE = 6.0
-"""Muon's rate over Adam's: a step of Muon has a given size whatever the gradient."""
+"""Ratio of Muon's rate to Adam's: a step of Muon has a given size whatever the gradient."""
 
 RISE = 0.1
-"""Share of the steps over which the rate rises."""
+"""Length of the rate's rise over all steps, dimensionless."""
 
 REPORT_EVERY = 200
-"""Steps between two looks at presses that are kept aside."""
+"""Steps between two evaluations on presses that training does not see."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class TrainingStage:
         name: Of the stage, for checkpoint and messages.
         part: The network.
         loss: From (step, generator) to the loss of a fresh batch.
-        score: The loss on what is kept aside, and words about it.
-        steps: How many.
+        score: The loss on presses that training does not see, and a text about it.
+        steps: Number of steps.
         warm_up_steps: Steps before which no network counts as the best: they train another loss.
     """
 
@@ -89,7 +89,7 @@ class Descent:
         return loss
 
     def _look(self, loss: float, progress: Callable[[int, str], None]) -> None:
-        score, words = self.task.score()
+        score, text = self.task.score()
         if not (math.isfinite(loss) and math.isfinite(score)):
             raise TrainingError(
                 f"the {self.task.name} loss is {loss} at step {self.step} of {self.task.steps}; lower "
@@ -98,7 +98,7 @@ class Descent:
         if self.step > self.task.warm_up_steps and score < self.best:
             self.best, self.best_step = score, self.step
             self.best_weights = copy.deepcopy(self.task.part.state_dict())
-        progress(self.step, f"{self.task.name}: loss {loss:.3f}, {words}")
+        progress(self.step, f"{self.task.name}: loss {loss:.3f}, {text}")
 
     def _stalled(self) -> bool:
         return self.step - max(self.best_step, self.task.warm_up_steps) >= self.patience
@@ -115,8 +115,8 @@ class Descent:
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.task.part.load_state_dict(state["part"])
-        for optimiser, kept in zip(self.optimisers, state["optimisers"], strict=True):
-            optimiser.load_state_dict(kept)
+        for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
+            optimiser.load_state_dict(saved)
         self.random.set_state(state["random"])
         self.step, (self.best, self.best_step) = state["step"], state["best"]
         self.best_weights = state["best_weights"]
@@ -132,8 +132,8 @@ def _rate_share(done: float) -> float:
 def _optimisers(part: Perceptron, rate: float) -> list[torch.optim.Optimizer]:
     matrices = part.hidden_matrices()
     hidden = {id(matrix) for matrix in matrices}
-    rest = [parameter for parameter in part.parameters() if id(parameter) not in hidden]
-    adam = torch.optim.Adam(rest, lr=rate, betas=(0.9, 0.98))
+    others = [parameter for parameter in part.parameters() if id(parameter) not in hidden]
+    adam = torch.optim.Adam(others, lr=rate, betas=(0.9, 0.98))
     muon = [torch.optim.Muon(matrices, lr=MUON_RATE * rate, weight_decay=0.0)] if matrices else []
     optimisers: list[torch.optim.Optimizer] = [*muon, adam]
     for optimiser in optimisers:

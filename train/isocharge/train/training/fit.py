@@ -37,7 +37,7 @@ from isocharge.train.training.misfit_data import WATCHED, MisfitData
 from isocharge.train.training.network import Features, InverseNetwork
 
 WARM_UP = 0.15
-"""Share of the steps that learn the mean by least squares."""
+"""Length of the first stage, which learns the mean by least squares, over all steps, dimensionless."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Fit:
     Attributes:
         network: The model.
         field: The forward map that the misfit was learned with.
-        held: Presses kept for measuring errors.
+        held: Presses held out for measuring errors.
         config: What it was trained with.
         asked: The domain of the dataset; larger than the network's where the map folds.
     """
@@ -72,9 +72,9 @@ def fit_network(
     Args:
         dataset: Clean charges; noise is added here.
         config: Sizes, steps, seed.
-        progress: Told about steps, loss and errors on presses that are kept aside.
+        progress: Called with steps done, all steps, and a text with the loss and errors on watched presses.
         checkpoint: Keeps the state, so that a stopped run goes on.
-        warn: Told where the map folds.
+        warn: Called where the map folds.
 
     Raises:
         ConfigError: If the noise level is unknown.
@@ -87,8 +87,8 @@ def fit_network(
     _check_electrodes(dataset, config)
     with _threads_and_seed(training):
         domain, presses = _without_folds(asked, presses, training, warn)
-        rest, held = split_by_position(presses, training.hold_out, training.seed)
-        train, watched = split_by_position(rest, WATCHED * training.hold_out, training.seed + 1)
+        trainable, held = split_by_position(presses, training.hold_out, training.seed)
+        train, watched = split_by_position(trainable, WATCHED * training.hold_out, training.seed + 1)
         field = _field(domain, train, watched)
         network = InverseNetwork(
             domain, Features.fit(train.charge_pC), config.network.hidden, config.network.misfit_hidden
@@ -103,11 +103,11 @@ def _field(domain: ContactDomain, train: LabelledPresses, watched: LabelledPress
 
 
 def _check_electrodes(dataset: Dataset, config: FitConfig) -> None:
-    names, wanted = dataset.sensor.electrode_names, config.network.electrodes
-    if wanted and wanted != len(names):
+    names, expected = dataset.sensor.electrode_names, config.network.electrodes
+    if expected and expected != len(names):
         raise ConfigError(
-            f"network.electrodes: the configuration is for {wanted} electrodes, the dataset of {dataset.sensor.name!r} "
-            f"has {len(names)} ({', '.join(names)}); use another dataset or leave the key out"
+            f"network.electrodes: the configuration is for {expected} electrodes, the dataset of "
+            f"{dataset.sensor.name!r} has {len(names)} ({', '.join(names)}); use another dataset or leave the key out"
         )
 
 
@@ -135,7 +135,7 @@ def _without_folds(
 
 @contextmanager
 def _threads_and_seed(training: TrainingConfig) -> Iterator[None]:
-    """Seed and thread count for the block, the caller's own restored after it.
+    """Seed and thread count for the block, the caller's restored after it.
 
     BLAS is held to the same number: its threads spin at barriers, and a busy second core makes them many times slower.
     """
@@ -190,11 +190,11 @@ class _Training:
 
     def _descend(self, task: TrainingStage, before: int) -> None:
         descent = Descent(task, self.config.learning_rate, self.config.patience, self.config.seed)
-        descent.run(self.checkpoint, lambda step, words: self._tell(before + step, words))
+        descent.run(self.checkpoint, lambda step, text: self._report(before + step, text))
 
-    def _tell(self, done: int, words: str) -> None:
+    def _report(self, done: int, text: str) -> None:
         if self.progress:
-            self.progress(done, self.total, words)
+            self.progress(done, self.total, text)
 
     def _contact_loss(self, step: int, random: torch.Generator) -> Tensor:
         rows = torch.randint(len(self.charge), (min(self.config.batch, len(self.charge)),), generator=random)
@@ -213,16 +213,16 @@ class _Training:
     def _finish(self) -> None:
         """Levenberg-Marquardt for the mean in double precision; the deviations are then those of watched presses."""
         part = self.network.contact.double()
-        inputs, wanted = self.network.inputs(self.charge).double(), self.unit.double()
+        inputs, targets = self.network.inputs(self.charge).double(), self.unit.double()
         state = self.checkpoint.load("finish") or {"step": 0, "damping": FIRST, "part": part.state_dict()}
         part.load_state_dict(state["part"])
         step = state["step"]
         left = self.config.finish_steps - step
-        for square, damping in levenberg_marquardt(part, inputs, wanted, left, state["damping"]):
+        for square, damping in levenberg_marquardt(part, inputs, targets, left, state["damping"]):
             step += 1
             state = {"step": step, "damping": damping, "part": part.state_dict()}
             self.checkpoint.save("finish", partial(_as_it_is, state))
-            self._tell(self.config.steps + step, f"finish: {square:.3g}, {self._mean_off()}")
+            self._report(self.config.steps + step, f"finish: {square:.3g}, {self._mean_off()}")
         self.checkpoint.save("finish", lambda: {**state, "step": self.config.finish_steps}, now=True)
         self._constant_deviations()
         part.float()

@@ -33,7 +33,7 @@ def levenberg_marquardt(
         part: A network; every parameter is moved.
         inputs: Shape (n, ...).
         targets: Shape (n, k); further outputs of the network are left out.
-        steps: How many steps at most; it ends earlier where no step helps any more.
+        steps: Most steps; it ends earlier where no step helps any more.
         damping: What the last call yielded, to go on from there.
 
     Yields:
@@ -80,16 +80,16 @@ def _normal_equations(
     count = sum(value.numel() for value in values.values())
     normal, slope = torch.zeros(count, count, dtype=inputs.dtype), torch.zeros(count, dtype=inputs.dtype)
     with torch.no_grad():
-        for some, wanted in zip(torch.split(inputs, CHUNK), torch.split(targets, CHUNK), strict=True):
-            rows: Mapping[str, Tensor] = of_sample(values, some, wanted)
+        for some, target in zip(torch.split(inputs, CHUNK), torch.split(targets, CHUNK), strict=True):
+            rows: Mapping[str, Tensor] = of_sample(values, some, target)
             jacobian = torch.cat([rows[name].flatten(2) for name in values], dim=2).flatten(0, 1)
             normal.addmm_(jacobian.T, jacobian)
-            slope.addmv_(jacobian.T, residual(values, some, wanted).flatten())
+            slope.addmv_(jacobian.T, residual(values, some, target).flatten())
     return normal, slope
 
 
 def _step(normal: Tensor, slope: Tensor, damping: float) -> Tensor:
-    """-(J' J + damping diag(J' J))^-1 J' r, with a floor under the diagonal: a parameter may have no say at all."""
+    """-(J' J + damping diag(J' J))^-1 J' r, with a floor under the diagonal: a parameter may have no effect at all."""
     diagonal = normal.diagonal()
     damped = normal + torch.diag(damping * diagonal.clamp(min=1e-9 * float(diagonal.max())))
     factor, failed = torch.linalg.cholesky_ex(damped)

@@ -10,12 +10,12 @@ from isocharge.train.training.config import TrainingConfig
 from isocharge.train.training.network import InverseNetwork, compress_length
 
 WATCHED = 0.5
-"""Positions that are watched while it trains, over those that are held out."""
+"""Ratio of the positions that are watched while it trains to those that are held out."""
 
 
 @dataclass(frozen=True)
 class MisfitData:
-    """The misfit network's data: inputs and compressed vectors, the last `watched` of them kept aside."""
+    """The misfit network's data: inputs and compressed vectors, the last `watched` of them not trained on."""
 
     network: InverseNetwork
     inputs: Tensor

@@ -51,10 +51,10 @@ class Features:
 
 
 class Perceptron(nn.Module):
-    """Linear layers with tanh between them, and beside them one straight from the inputs to the outputs.
+    """Linear layers with tanh between them, and a linear layer that skips them from the inputs to the outputs.
 
     The logarithm of the force is nearly linear in those of the charges, and has to be right to a thousandth of its
-    range: with the straight layer the others need only learn what is bent.
+    range: with the skip layer the others need only learn what is not linear.
     """
 
     def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int) -> None:
@@ -73,7 +73,7 @@ class Perceptron(nn.Module):
         return out
 
     def layers(self) -> list[nn.Linear]:
-        """The bent way's layers, first to last."""
+        """The linear layers between which tanh stands, first to last."""
         return [layer for layer in self.mlp if isinstance(layer, nn.Linear)]
 
     def hidden_matrices(self) -> list[Tensor]:
@@ -131,8 +131,8 @@ class InverseNetwork(nn.Module):
         force = torch.exp(value[:, 2:])
         contact = torch.cat([value[:, :2], force], dim=1)
         contact_std = torch.cat([std[:, :2], std[:, 2:] * force], dim=1)
-        compress_length = torch.linalg.vector_norm(self.misfit_vector(self.inputs(charge_pC)), dim=1, keepdim=True)
-        return contact, contact_std, MISFIT_UNIT * torch.sinh(compress_length)
+        length = torch.linalg.vector_norm(self.misfit_vector(self.inputs(charge_pC)), dim=1, keepdim=True)
+        return contact, contact_std, MISFIT_UNIT * torch.sinh(length)
 
 
 def compress_length(miss: Tensor) -> Tensor:
