@@ -3,7 +3,7 @@
 import numpy as np
 
 from isocharge.train.data.domain import ContactDomain
-from isocharge.train.report.maps import FORCES, RINGS, SECTORS, _cell_words, _cells, by_force, force_bins
+from isocharge.train.report.maps import FORCES, RINGS, SECTORS, _cell_limits, _cells, by_force, force_bins
 
 DOMAIN = ContactDomain(8.0, (0.05, 2.0))
 
@@ -22,7 +22,7 @@ def test_cells_hold_the_presses_that_their_words_say():
     assert cells.max() < RINGS * SECTORS * FORCES
     radius, angle = np.hypot(*truth[:, :2].T), np.rad2deg(np.arctan2(truth[:, 1], truth[:, 0])) % 360.0
     for cell in np.unique(cells):
-        words, here = _cell_words(DOMAIN, int(cell)), cells == cell
+        words, here = _cell_limits(DOMAIN, int(cell)), cells == cell
         columns = {"radius_mm": radius, "angle_deg": angle, "force_N": truth[:, 2]}
         for values, (low, high) in ((columns[name], words[name]) for name in columns):
             assert (values[here] >= low * 0.99 - 1e-9).all()

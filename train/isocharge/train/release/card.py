@@ -1,5 +1,7 @@
 """The model card: what a model is for, what it reaches, what it cannot do, and how to make it again."""
 
+from collections.abc import Mapping
+
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.data.noise import misfit_noise
@@ -8,7 +10,12 @@ from isocharge.train.training.fit import Fit
 
 def model_card(metadata: ModelMetadata, fit: Fit) -> str:
     """The text of `card.md`."""
-    errors, (low, high), noise = metadata.errors, metadata.force_range_N, metadata.noise
+    sections = [_interface(metadata, fit), _errors(metadata.errors, len(fit.held)), _misfit(metadata, fit), LIMITS]
+    return "\n".join([*sections, _command(metadata)])
+
+
+def _interface(metadata: ModelMetadata, fit: Fit) -> str:
+    (low, high), noise = metadata.force_range_N, metadata.noise
     electrodes = ", ".join(metadata.electrodes)
     return f"""# {metadata.name}, version {metadata.version}
 
@@ -22,8 +29,11 @@ Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of o
 | forces | {low:g} to {high:g} N |
 | probes | {", ".join(metadata.probes)}{_unknown_probe(metadata)} |
 | trained for the noise | {noise["name"]}: {noise["white_pC"]:g} pC and {100 * float(noise["gain"]):g} % |
+"""
 
-## Measured on {len(fit.held)} presses that training never saw
+
+def _errors(errors: Mapping[str, float], presses: int) -> str:
+    return f"""## Measured on {presses} presses that training never saw
 
 Forces log-uniform, positions uniform over the working area.
 
@@ -38,21 +48,31 @@ Forces log-uniform, positions uniform over the working area.
 | force, 99 % | {errors["force_p99_percent"]:g} % | |
 | coverage of the 68 % intervals | {100 * errors["coverage_68"]:.3g} % | |
 | coverage of the 95 % intervals | {100 * errors["coverage_95"]:.3g} % | |
+"""
 
+
+def _misfit(metadata: ModelMetadata, fit: Fit) -> str:
+    errors = metadata.errors
+    return f"""\
 The misfit is the distance, in units of the noise{_unit(fit)}, of the charges from the nearest single contact that the
 model knows; a network gives it, learned from exact searches. 1 % of good presses exceed {errors["misfit_p99"]:g},
 0.1 % exceed {errors["misfit_p999"]:g}.
 {_what_misfit_sees(metadata)}
+"""
 
-## Limits
+
+LIMITS = """## Limits
 
 - The truth behind these figures is the simulator, not a film. On a real film, pretension and gains that
   nobody has measured matter more.
 - One press at a time. Outside the working area and forces the answer is finite and wrong; the misfit is then large in
   many cases, not in all.
 - The deviations hold for the noise named above; gains that are off by 1 % add more than all of it.
+"""
 
-## Make it again
+
+def _command(metadata: ModelMetadata) -> str:
+    return f"""## Make it again
 
 ```bash
 {metadata.made_with["command"] or "(made by a program, see metadata)"}
