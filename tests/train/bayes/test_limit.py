@@ -121,7 +121,7 @@ def test_a_damaged_file_is_computed_anew(damage):
 def test_where_nothing_can_be_kept_it_still_answers(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("ISOCHARGE_CACHE", str(tmp_path / "file" / "below"))
-    with pytest.warns(UserWarning, match="cannot be kept"):
+    with pytest.warns(UserWarning, match="cannot be stored"):
         assert cached("thing", {"a": 1}, Counted())["value"] == 1.5
 
 
