@@ -1,10 +1,9 @@
 """Gauss-Newton on an interpolated forward map: the contact whose charges fit best, maximum a posteriori.
 
 The forward map is the Chebyshev series of `ChargeField`, fitted to clean training presses; the residuals are
-(Q - Q(c)) / sigma(Q). The prior, uniform over the disk and the range of log force, is a constraint: where a step leaves
-it, the linear problem is solved once more with the step's end held to the edge's tangent, and the end is projected.
-Levenberg damping makes every step an improvement. The start is the nearest of a few presses, and the next nearest where
-that led to charges that do not fit.
+(Q - Q(c)) / sigma(Q). The prior, uniform over the disk and the range of log force, is a constraint, held by the active
+set of `simulate.numerics.disk_least_squares`; damping makes every step an improvement. The start is the nearest of a
+few presses, and the next nearest where that led to charges that do not fit.
 
 The SciPy form hands the same residuals to `scipy.optimize.least_squares` in polar coordinates, where the disk is a box,
 press by press.
@@ -32,7 +31,7 @@ STARTS = 600
 """Presses that a start is chosen from."""
 
 TOLERANCE = 1e-5
-"""Step in unit coordinates at which a press is done: 0.1 um or 1e-5 of the force."""
+"""Step in unit coordinates at which SciPy stops: 0.1 um or 1e-5 of the force."""
 
 DOUBTFUL = 12.0
 """Sum of squared residuals from which another start is tried: noise alone, with a charge or none to spare, hardly
