@@ -2,8 +2,9 @@
 
     python tests/benchmarks/bench_http.py [--environments DIR] [--rounds 12] [--requests 400] [--seconds 4] [--json]
 
-FastAPI and MLServer get environments of their own in `--environments`, made once. Client and servers share the cores;
-the client is a plain socket, the same for all. Latency: one request at a time over one open connection, contenders take
+FastAPI and MLServer get environments of their own in `--environments`, made once; one that cannot be installed or does
+not start is left out, and stderr says why. Client and servers share the cores; the client is a plain socket, the same
+for all. Latency: one request at a time over one open connection, contenders take
 turns within each round. Throughput: 32 connections, each with one request under way. Ratios come from the same rounds.
 A batch of 1024 is measured twice: bytes on a socket, and arrays in and out of Triton's stock client.
 """
@@ -35,11 +36,21 @@ HERE = Path(__file__).parent
 PACKAGES = {"fastapi": ["fastapi", "uvicorn[standard]", "onnxruntime"], "mlserver": ["mlserver", "onnxruntime"]}
 CONNECTIONS = 32
 
+Address = tuple[str, int] | str
+"""Host and port, or the path of a Unix socket."""
+
+Contenders = dict[str, tuple[Address, str]]
+"""Name to address and path of the request."""
+
+
+class NotStarted(RuntimeError):
+    """A server that cannot be installed or does not start."""
+
 
 class Connection:
     """One open connection that can have one request under way."""
 
-    def __init__(self, address: tuple[str, int] | str) -> None:
+    def __init__(self, address: Address) -> None:
         self.socket = socket.socket(socket.AF_UNIX if isinstance(address, str) else socket.AF_INET)
         self.socket.connect(address)
         if not isinstance(address, str):
@@ -101,11 +112,18 @@ def free_port() -> int:
 
 
 def python_of(name: str, environments: Path) -> Path:
-    """The interpreter of a rival's environment, made if it is not there."""
-    folder = environments / name
+    """The interpreter of a rival's environment, made if it is not there; absolute, as the rival has its own folder.
+
+    Raises:
+        NotStarted: If its packages cannot be installed.
+    """
+    folder = environments.absolute() / name
     if not (folder / "done").exists():
         venv.create(folder, with_pip=True, clear=True)
-        subprocess.run([folder / "bin/python", "-m", "pip", "install", "--quiet", *PACKAGES[name]], check=True)
+        install = [folder / "bin/python", "-m", "pip", "install", "--quiet", *PACKAGES[name]]
+        done = subprocess.run(install, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise NotStarted(f"pip cannot install {' '.join(PACKAGES[name])}: {done.stderr.strip()[-500:]}")
         (folder / "done").touch()
     return folder / "bin/python"
 
@@ -134,14 +152,16 @@ def mlserver_folder(folder: Path, port: int, model: Path) -> Path:
 
 
 @contextmanager
-def running(
-    words: list[str | Path], address: tuple[str, int] | str, **options: Any
-) -> Iterator[subprocess.Popen[bytes]]:
-    """A server process, from its first accepted connection to the end of the block."""
-    with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen(words, stdout=said, stderr=said, **options)
+def running(command: list[str | Path], address: Address, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
+    """A server process, from its first accepted connection to the end of the block.
+
+    Raises:
+        NotStarted: If it ends instead of listening.
+    """
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(command, stdout=output, stderr=output, **options)
         try:
-            _wait_for(process, address, said)
+            _wait_for(process, address, output)
             yield process
         finally:
             process.send_signal(signal.SIGTERM)
@@ -152,7 +172,7 @@ def running(
                 process.wait()
 
 
-def _wait_for(process: subprocess.Popen[bytes], address: tuple[str, int] | str, said: IO[bytes]) -> None:
+def _wait_for(process: subprocess.Popen[bytes], address: Address, output: IO[bytes]) -> None:
     """Wait until something listens, and a moment more: MLServer listens before it has loaded its model."""
     for _ in range(600):
         try:
@@ -160,47 +180,62 @@ def _wait_for(process: subprocess.Popen[bytes], address: tuple[str, int] | str, 
             time.sleep(2.0)
             break
         except OSError:
+            if process.poll() is not None:
+                break
             time.sleep(0.1)
     if process.poll() is not None:
-        said.seek(0)
-        raise RuntimeError(f"{process.args} ended: {said.read().decode()[-3000:]}")
+        output.seek(0)
+        raise NotStarted(f"{process.args} ended: {output.read().decode()[-3000:]}")
 
 
-def start(stack: ExitStack, model: str, environments: Path | None) -> dict[str, tuple[tuple[str, int] | str, str]]:
-    """Start every contender: name to address and path."""
+def start(stack: ExitStack, model: str, environments: Path | None) -> Contenders:
+    """Start every contender; without `environments`, only ours and the bare route."""
     folder = find_model(model).resolve()
-    file, name = folder / "model.onnx", load_model(folder).metadata.name
-    work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-    ours, path = (
-        [Path(sys.executable).with_name("isocharge"), "serve", "http", "--models", folder.parents[1]],
-        "/v2/models/",
-    )
-    tcp = {key: ("127.0.0.1", free_port()) for key in ("isocharge", "bare route", "FastAPI", "MLServer tuned")}
-    uds = str(work / "isocharge.sock")
-    stack.enter_context(running([*ours, "--port", str(tcp["isocharge"][1])], tcp["isocharge"]))
+    path = f"/v2/models/{load_model(folder).metadata.name}/infer"
+    tcp, uds = _local_address(), str(_temporary_folder(stack) / "isocharge.sock")
+    ours = [Path(sys.executable).with_name("isocharge"), "serve", "http", "--models", folder.parents[1]]
+    stack.enter_context(running([*ours, "--port", str(tcp[1])], tcp))
     stack.enter_context(running([*ours, "--uds", uds], uds))
-    bare = [sys.executable, HERE / "rivals/bare_app.py", str(tcp["bare route"][1]), file]
-    stack.enter_context(running(bare, tcp["bare route"]))
-    made: dict[str, tuple[tuple[str, int] | str, str]] = {
-        "isocharge": (tcp["isocharge"], f"{path}{name}/infer"),
-        "isocharge, Unix socket": (uds, f"{path}{name}/infer"),
-        "bare route": (tcp["bare route"], f"{path}{name}/infer"),
-    }
-    if environments is not None:
-        fastapi = [python_of("fastapi", environments), HERE / "rivals/fastapi_app.py", str(tcp["FastAPI"][1]), file]
-        stack.enter_context(running(fastapi, tcp["FastAPI"]))
-        settings = mlserver_folder(work, tcp["MLServer tuned"][1], file)
-        mlserver = [python_of("mlserver", environments).with_name("mlserver"), "start", settings]
-        variables = os.environ | {"PYTHONPATH": str(settings)}
-        stack.enter_context(running(mlserver, tcp["MLServer tuned"], cwd=settings, env=variables))
-        made |= {
-            "FastAPI": (tcp["FastAPI"], f"{path}{name}/infer"),
-            "MLServer tuned": (tcp["MLServer tuned"], f"{path}model/infer"),
-        }
-    return made
+    bare = _start_script(stack, Path(sys.executable), "bare_app.py", folder / "model.onnx")
+    contenders = {"isocharge": (tcp, path), "isocharge, Unix socket": (uds, path), "bare route": (bare, path)}
+    rivals = {"FastAPI": _start_fastapi, "MLServer tuned": _start_mlserver} if environments else {}
+    for name, start_rival in rivals.items():
+        try:
+            contenders[name] = start_rival(stack, environments, folder / "model.onnx", path)
+        except NotStarted as error:
+            print(f"left out: {name}: {error}", file=sys.stderr)
+    return contenders
 
 
-def latencies(address: tuple[str, int] | str, request: bytes, count: int) -> np.ndarray:
+def _local_address() -> tuple[str, int]:
+    return "127.0.0.1", free_port()
+
+
+def _temporary_folder(stack: ExitStack) -> Path:
+    return Path(stack.enter_context(tempfile.TemporaryDirectory()))
+
+
+def _start_script(stack: ExitStack, python: Path, script: str, model: Path) -> Address:
+    """Start a server of the folder `rivals`, which takes a port and a model file."""
+    address = _local_address()
+    stack.enter_context(running([python, HERE / "rivals" / script, str(address[1]), model], address))
+    return address
+
+
+def _start_fastapi(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
+    return _start_script(stack, python_of("fastapi", environments), "fastapi_app.py", model), path
+
+
+def _start_mlserver(stack: ExitStack, environments: Path, model: Path, _path: str) -> tuple[Address, str]:
+    """MLServer, which runs in the folder of its settings."""
+    address = _local_address()
+    settings = mlserver_folder(_temporary_folder(stack), address[1], model)
+    command = [python_of("mlserver", environments).with_name("mlserver"), "start", settings]
+    stack.enter_context(running(command, address, cwd=settings, env=os.environ | {"PYTHONPATH": str(settings)}))
+    return address, "/v2/models/model/infer"
+
+
+def latencies(address: Address, request: bytes, count: int) -> np.ndarray:
     """Durations of requests one after another on a new connection, us; the first one is thrown away."""
     connection, clock, durations = Connection(address), time.perf_counter_ns, np.empty(count)
     connection.send(request)
@@ -214,7 +249,7 @@ def latencies(address: tuple[str, int] | str, request: bytes, count: int) -> np.
     return durations / 1e3
 
 
-def throughput(address: tuple[str, int] | str, request: bytes, seconds: float) -> float:
+def throughput(address: Address, request: bytes, seconds: float) -> float:
     """Answers per second over 32 connections, each with one request under way.
 
     The client shares the cores, so it does as little as it can: the same request has an answer of the same length.
@@ -240,7 +275,7 @@ def throughput(address: tuple[str, int] | str, request: bytes, seconds: float) -
     return answers / (now - begin)
 
 
-def _answer_size(address: tuple[str, int] | str, request: bytes) -> int:
+def _answer_size(address: Address, request: bytes) -> int:
     """Bytes of a good answer, its headers included."""
     connection = Connection(address)
     connection.send(request)
@@ -253,14 +288,14 @@ def _answer_size(address: tuple[str, int] | str, request: bytes) -> int:
 
 
 def take_turns(
-    contenders: dict[str, tuple[tuple[str, int] | str, bytes]], rounds: int, number: int
+    contenders: dict[str, tuple[Address, bytes]], rounds: int, number: int
 ) -> dict[str, np.ndarray]:
     """Durations of each contender, shape (rounds, number), us; the first round only warms up."""
-    kept: dict[str, list[np.ndarray]] = {name: [] for name in contenders}
+    durations: dict[str, list[np.ndarray]] = {name: [] for name in contenders}
     for _ in range(rounds + 1):
         for name, (address, request) in contenders.items():
-            kept[name].append(latencies(address, request, number))
-    return {name: np.array(durations[1:]) for name, durations in kept.items()}
+            durations[name].append(latencies(address, request, number))
+    return {name: np.array(of_name[1:]) for name, of_name in durations.items()}
 
 
 def rows(durations: dict[str, np.ndarray], against: str) -> Iterator[dict[str, Any]]:

@@ -5,6 +5,8 @@ import json
 import pytest
 from matplotlib.image import imread
 
+from isocharge.cli.simulate.identify import probe_sentence
+
 UNIAXIAL = ("simulate", "identify", "three-25um-uniaxial", "--radius", "4", "--force", "0.5", "1")
 
 
@@ -45,7 +47,16 @@ def test_other_probes_and_the_size(command):
     assert rows[-1]["told_apart_share"] > 0.2
     assert "circle:2.0 against circle:1.0" in err
     assert json.loads(out)["size"][-1]["radius_std_best_percent"] < 30.0
-    assert "The radius at 1 N: known to" in err
+    assert "The radius at 1 N is known to" in err
+
+
+def test_the_sentence_names_the_threshold_that_was_used(monkeypatch):
+    """It once said three standard deviations whatever the threshold was."""
+    row = {"probe": "circle:2.0", "force_N": 1.0, "within_mm": 8.0, "told_apart_share": 0.25, "sigmas_median": 2.0}
+    row |= {"sigmas_most": 9.0, "position_error_median_mm": 0.1, "position_error_p95_mm": 0.2}
+    threshold = "isocharge.simulate.identifiability.probe_discrimination.DISTINGUISHABLE_SIGMAS"
+    monkeypatch.setattr(threshold, 4.5)
+    assert "differ by 4.5 standard deviations or more at 25% of the positions" in probe_sentence(row, "circle:1.0")
 
 
 @pytest.mark.slow

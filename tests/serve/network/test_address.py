@@ -51,10 +51,16 @@ def test_a_unix_socket(handler, start_http, tmp_path):
     server = start_http(handler, uds=path)
     assert server.url == f"unix:{path}"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert answer_of(path).startswith(b"HTTP/1.1 200")
+
+
+def answer_of(path):
+    """The first bytes of what the server on a Unix socket answers."""
     with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(20)
         connection.connect(str(path))
         connection.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
-        assert connection.recv(1000).startswith(b"HTTP/1.1 200")
+        return connection.recv(1000)
 
 
 def test_a_socket_left_by_a_killed_server_is_taken_over(handler, start_http, tmp_path):
@@ -62,6 +68,7 @@ def test_a_socket_left_by_a_killed_server_is_taken_over(handler, start_http, tmp
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(str(path))
     start_http(handler, uds=path)
+    assert answer_of(path).startswith(b"HTTP/1.1 200")
 
 
 def test_places_that_are_taken(handler, start_http, tmp_path):

@@ -75,8 +75,11 @@ def identify_command(
     if output is not None:
         _write(output, found[0], numbers)
     typer.echo(json_module.dumps(numbers) if json else _table(numbers))
-    for line in (found[0].area.words, *_words(numbers)):
-        say(line)
+    say(found[0].area.words)
+    for row in numbers["other_probes"]:
+        say(probe_sentence(row, numbers["probe"]))
+    for row in numbers["size"]:
+        say(_size_sentence(row))
 
 
 def _solve(sensor: "Sensor", probe: "Probe", force: tuple[float, float], radius: float | None) -> "ForwardMap":
@@ -132,25 +135,25 @@ def _table(numbers: dict[str, Any]) -> str:
     return "\n".join([head, *rows])
 
 
-def _words(numbers: dict[str, Any]) -> list[str]:
-    """What is to be said of size and shape."""
-    first = numbers["probe"]
-    shapes = [
-        f"{row['probe']} against {first} at {row['force_N']:.3g} N within {row['within_mm']:.1f} mm: told apart "
-        f"({3} standard deviations) at {row['told_apart_share']:.0%} of the places, {row['sigmas_median']:.1f} "
-        f"standard deviations at the median, {row['sigmas_most']:.1f} at most; taken for {first} it is felt "
-        f"{row['position_error_median_mm']:.3f} mm off at the median, {row['position_error_p95_mm']:.3f} mm at 95 %."
-        for row in numbers["other_probes"]
-    ]
-    return shapes + [_size_words(row) for row in numbers["size"]]
+def probe_sentence(row: dict[str, Any], first: str) -> str:
+    """For people: how often another probe is distinguished from the first, and the error where it is taken for it."""
+    from isocharge.simulate.identifiability import probe_discrimination
+
+    return (
+        f"{row['probe']} against {first} at {row['force_N']:.3g} N within {row['within_mm']:.1f} mm: the charges "
+        f"differ by {probe_discrimination.DISTINGUISHABLE_SIGMAS:g} standard deviations or more at "
+        f"{row['told_apart_share']:.0%} of the positions, by {row['sigmas_median']:.1f} at the median and "
+        f"{row['sigmas_most']:.1f} at most. Taken for {first}, its position is wrong by "
+        f"{row['position_error_median_mm']:.3f} mm at the median and {row['position_error_p95_mm']:.3f} mm at 95 %."
+    )
 
 
-def _size_words(row: dict[str, Any]) -> str:
+def _size_sentence(row: dict[str, Any]) -> str:
     x, y = row["best_at_mm"]
     return (
-        f"The radius at {row['force_N']:g} N: known to {row['radius_std_median_percent']:.0f} % at the median place, "
-        f"to {row['radius_std_best_percent']:.0f} % at best, at ({x:.1f}, {y:.1f}) mm; to a third or better at "
-        f"{row['told_share']:.0%} of the places."
+        f"The radius at {row['force_N']:g} N is known to {row['radius_std_median_percent']:.0f} % at the median "
+        f"position and to {row['radius_std_best_percent']:.0f} % at the best, ({x:.1f}, {y:.1f}) mm; to a third or "
+        f"better at {row['told_share']:.0%} of the positions."
     )
 
 
