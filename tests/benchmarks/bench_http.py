@@ -291,9 +291,7 @@ def _answer_size(address: Address, request: bytes) -> int:
     return len(data)
 
 
-def take_turns(
-    contenders: dict[str, tuple[Address, bytes]], rounds: int, number: int
-) -> dict[str, np.ndarray]:
+def take_turns(contenders: dict[str, tuple[Address, bytes]], rounds: int, number: int) -> dict[str, np.ndarray]:
     """Durations of each contender, shape (rounds, number), us; the first round only warms up."""
     durations: dict[str, list[np.ndarray]] = {name: [] for name in contenders}
     for _ in range(rounds + 1):

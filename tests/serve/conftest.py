@@ -140,7 +140,7 @@ def predictor(models: Path) -> Predictor:
 
 
 @pytest.fixture
-def shelf(film, tmp_path):
+def store(film, tmp_path):
     """The linear model in two versions, in a folder of the test's own."""
     film.write(tmp_path / "models")
     film.write(tmp_path / "models", version=2)
@@ -148,9 +148,9 @@ def shelf(film, tmp_path):
 
 
 @pytest.fixture
-def handler(shelf):
+def handler(store):
     """A handler for these models."""
-    return Handler(shelf)
+    return Handler(store)
 
 
 @pytest.fixture(scope="session")

@@ -11,9 +11,6 @@ import socket
 import pytest
 import tritonclient.grpc
 
-from isocharge.cli.serve.http import BATCH, BODY_BYTES, CONNECTIONS, HEADER_S, IDLE_S
-from isocharge.serve.network.limits import ServerLimits
-
 BODY = json.dumps(
     {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}]}
 )
@@ -139,12 +136,6 @@ def test_bad_starts(start, models, tmp_path):
         for process, code, said in cases:
             got, error = ended(process)
             assert (got, error[: len(said)]) == (code, said)
-
-
-def test_the_options_defaults_are_the_limits():
-    limits = ServerLimits()
-    assert (limits.batch, limits.body_bytes, limits.connections) == (BATCH, BODY_BYTES, CONNECTIONS)
-    assert (limits.idle_seconds, limits.header_seconds) == (IDLE_S, HEADER_S)
 
 
 def test_the_token_may_come_from_the_environment(start, monkeypatch):

@@ -15,8 +15,8 @@ from isocharge.serve.network.protocol.infer import InferRequest, infer
 
 
 @pytest.fixture
-def folder(shelf, tmp_path):  # noqa: ARG001
-    """The folder of the model that the shelf holds in two versions."""
+def folder(store, tmp_path):  # noqa: ARG001
+    """The folder of the model that the store holds in two versions."""
     return tmp_path / "models/linear"
 
 
@@ -36,8 +36,8 @@ def spoil(version, how):
         golden.write_text(json.dumps(content | {"sha256": sha256_of(b"no graph")}))
 
 
-def states(shelf):
-    return [(row.name, row.version, row.state) for row in shelf.index()]
+def states(store):
+    return [(row.name, row.version, row.state) for row in store.index()]
 
 
 DAMAGE = {
@@ -51,10 +51,10 @@ DAMAGE = {
 def test_latest_is_by_number(film, tmp_path):
     for version in (2, 10, 9):
         film.write(tmp_path, version=version)
-    shelf = open_model_store(tmp_path)
-    assert shelf.get("linear").version == "10"
-    assert shelf.get("linear", "9").version == "9"
-    assert shelf.versions("linear") == ["2", "9", "10"]
+    store = open_model_store(tmp_path)
+    assert store.get("linear").version == "10"
+    assert store.get("linear", "9").version == "9"
+    assert store.versions("linear") == ["2", "9", "10"]
 
 
 @pytest.mark.parametrize(("how", "said"), DAMAGE.items())
@@ -63,25 +63,25 @@ def test_a_damaged_version_is_refused_and_others_serve(film, tmp_path, how, said
         film.write(tmp_path, version=version)
     film.write(tmp_path, name="other")
     spoil(tmp_path / "linear/2", how)
-    shelf = open_model_store(tmp_path)
-    assert shelf.get("linear").version == "1"
-    assert states(shelf) == [("linear", "1", "READY"), ("linear", "2", "UNAVAILABLE"), ("other", "1", "READY")]
-    (reason,) = shelf.refusals()
+    store = open_model_store(tmp_path)
+    assert store.get("linear").version == "1"
+    assert states(store) == [("linear", "1", "READY"), ("linear", "2", "UNAVAILABLE"), ("other", "1", "READY")]
+    (reason,) = store.refusals()
     with pytest.raises(ModelError, match=said):
         raise ModelError(reason)
     with pytest.raises(ModelNotFound, match="'linear/2' is not found; serving: linear/1, other/1"):
-        shelf.get("linear", "2")
+        store.get("linear", "2")
 
 
 def test_a_model_in_another_ones_folder_is_refused(film, tmp_path):
     film.write(tmp_path)
     shutil.copytree(tmp_path / "linear", tmp_path / "other")
     shutil.copytree(tmp_path / "linear/1", tmp_path / "linear/2")
-    shelf = open_model_store(tmp_path)
-    assert [served.metadata.label for served in shelf.all()] == ["linear/1"]
+    store = open_model_store(tmp_path)
+    assert [served.metadata.label for served in store.all()] == ["linear/1"]
     assert all(
         f"expected the model {name}" in reason
-        for name, reason in zip(("linear/2", "other/1"), shelf.refusals(), strict=True)
+        for name, reason in zip(("linear/2", "other/1"), store.refusals(), strict=True)
     )
 
 
@@ -104,66 +104,66 @@ def test_no_sound_model_at_all(film, tmp_path):
 
 
 @pytest.mark.parametrize(("how", "said"), DAMAGE.items())
-def test_a_damaged_swap_keeps_the_last_good(shelf, folder, how, said):
-    before = shelf.get("linear")
+def test_a_damaged_swap_keeps_the_last_good(store, folder, how, said):
+    before = store.get("linear")
     spoil(folder / "2", how)
     for _ in range(2):
         with pytest.raises(ModelError, match=said):
-            shelf.load("linear")
-        assert shelf.get("linear") is before
-        assert shelf.get("linear", "2") is before
-    assert [row.reason != "" for row in shelf.index()] == [False, True]
-    assert states(shelf) == [("linear", "1", "READY"), ("linear", "2", "READY")]
+            store.load("linear")
+        assert store.get("linear") is before
+        assert store.get("linear", "2") is before
+    assert [row.reason != "" for row in store.index()] == [False, True]
+    assert states(store) == [("linear", "1", "READY"), ("linear", "2", "READY")]
 
 
-def test_a_new_version_becomes_the_latest(film, shelf, tmp_path):
+def test_a_new_version_becomes_the_latest(film, store, tmp_path):
     film.write(tmp_path / "models", version=3)
-    assert shelf.get("linear").version == "2"
-    shelf.load("linear")
-    assert shelf.get("linear").version == "3"
+    assert store.get("linear").version == "2"
+    store.load("linear")
+    assert store.get("linear").version == "3"
 
 
-def test_a_version_that_was_removed_goes(shelf, folder):
+def test_a_version_that_was_removed_goes(store, folder):
     shutil.rmtree(folder / "2")
-    shelf.load("linear")
-    assert shelf.versions("linear") == ["1"]
+    store.load("linear")
+    assert store.versions("linear") == ["1"]
     with pytest.raises(ModelNotFound):
-        shelf.get("linear", "2")
+        store.get("linear", "2")
 
 
-def test_a_model_that_was_removed_serves_on(shelf, folder):
+def test_a_model_that_was_removed_serves_on(store, folder):
     shutil.rmtree(folder)
     with pytest.raises(ModelNotFound, match="'linear' is not found in the repository"):
-        shelf.load("linear")
-    assert shelf.get("linear").version == "2"
+        store.load("linear")
+    assert store.get("linear").version == "2"
 
 
-def test_unload_and_load(shelf):
-    shelf.unload("linear")
-    assert states(shelf) == [("linear", "1", "UNAVAILABLE"), ("linear", "2", "UNAVAILABLE")]
-    assert {row.reason for row in shelf.index()} == {"unloaded"}
-    for call in (shelf.get, shelf.unload, shelf.named):
+def test_unload_and_load(store):
+    store.unload("linear")
+    assert states(store) == [("linear", "1", "UNAVAILABLE"), ("linear", "2", "UNAVAILABLE")]
+    assert {row.reason for row in store.index()} == {"unloaded"}
+    for call in (store.get, store.unload, store.named):
         with pytest.raises(ModelNotFound, match="serving: no model"):
             call("linear")
-    shelf.load("linear")
-    assert shelf.get("linear").version == "2"
+    store.load("linear")
+    assert store.get("linear").version == "2"
 
 
-def test_a_model_that_came_later_can_be_loaded(film, shelf, tmp_path):
+def test_a_model_that_came_later_can_be_loaded(film, store, tmp_path):
     film.write(tmp_path / "models", name="later")
-    assert ("later", "", "UNAVAILABLE") in states(shelf)
-    shelf.load("later")
-    assert shelf.get("later").version == "1"
+    assert ("later", "", "UNAVAILABLE") in states(store)
+    store.load("later")
+    assert store.get("later").version == "1"
 
 
 @pytest.mark.parametrize("name", ["", "..", "linear/1", "../models/linear", "/"])
-def test_a_name_is_no_path(shelf, name):
-    for call in (shelf.get, shelf.load, shelf.unload):
+def test_a_name_is_no_path(store, name):
+    for call in (store.get, store.load, store.unload):
         with pytest.raises(ModelNotFound):
             call(name)
 
 
-def test_swaps_neither_drop_nor_mix_answers(film, shelf, folder):
+def test_swaps_neither_drop_nor_mix_answers(film, store, folder):
     """Two models of one name whose answers differ take turns on disk while threads ask without pause."""
     turned = type(film)(1.5 * film.directions @ np.array([[0.0, 1.0], [-1.0, 0.0]]))
     request = InferRequest("", film.golden_pC(), ("contact", "contact_std", "misfit"), frozenset())
@@ -172,7 +172,7 @@ def test_swaps_neither_drop_nor_mix_answers(film, shelf, folder):
     def ask():
         answers = []
         while not stop.is_set():
-            contact = infer(shelf.get("linear", "2"), request).outputs["contact"]
+            contact = infer(store.get("linear", "2"), request).outputs["contact"]
             answers.append((contact[0, 0], contact[7, 1]))
         return answers
 
@@ -181,7 +181,7 @@ def test_swaps_neither_drop_nor_mix_answers(film, shelf, folder):
         for source in (turned, film) * 8:
             shutil.rmtree(folder / "2")
             source.write(folder.parent, version=2)
-            shelf.load("linear")
+            store.load("linear")
         stop.set()
         for asked in asking:
             seen += asked.result()

@@ -10,14 +10,12 @@ import typer
 from isocharge.cli.shared.terminal import say
 from isocharge.errors import InputError
 from isocharge.extras import require
+from isocharge.server_defaults import BODY_BYTES, CONNECTIONS, HEADER_SECONDS, IDLE_SECONDS, MAX_BATCH
 
 if TYPE_CHECKING:
     from isocharge.serve.network.protocol import Handler
     from isocharge.serve.network.tls import Tls
     from isocharge.serve.network.token import Token
-
-BATCH, BODY_BYTES, CONNECTIONS, IDLE_S, HEADER_S = 4096, 1 << 20, 1024, 75.0, 10.0
-"""The defaults of `isocharge.serve.network.limits`, which help must not import; a test compares them."""
 
 
 def http_command(
@@ -49,11 +47,15 @@ def http_command(
         Path | None,
         typer.Option("--tls-key", metavar="PEM", help="Its private key. (default: in the certificate's file)"),
     ] = None,
-    max_batch: Annotated[int, typer.Option("--max-batch", min=1, help="Presses in one request.")] = BATCH,
+    max_batch: Annotated[int, typer.Option("--max-batch", min=1, help="Presses in one request.")] = MAX_BATCH,
     max_body_bytes: Annotated[int, typer.Option("--max-body-bytes", min=1, help="Body of a request.")] = BODY_BYTES,
     max_connections: Annotated[int, typer.Option("--max-connections", min=1, help="Open at a time.")] = CONNECTIONS,
-    idle_s: Annotated[float, typer.Option("--idle-s", min=0.1, help="A connection may idle so long, s.")] = IDLE_S,
-    header_s: Annotated[float, typer.Option("--header-s", min=0.1, help="Headers may take so long, s.")] = HEADER_S,
+    idle_s: Annotated[
+        float, typer.Option("--idle-s", min=0.1, help="A connection may idle so long, s.")
+    ] = IDLE_SECONDS,
+    header_s: Annotated[
+        float, typer.Option("--header-s", min=0.1, help="Headers may take so long, s.")
+    ] = HEADER_SECONDS,
 ) -> None:
     """Serve models over HTTP: the Open Inference Protocol, version 2, as Triton and KServe speak it.
 
@@ -84,13 +86,13 @@ def http_command(
     )
     secret = None if token is None else Token(token)
     tls = None if tls_cert is None else Tls(tls_cert, tls_key)
-    shelf = open_model_store(models)
-    for reason in shelf.refusals():
+    store = open_model_store(models)
+    for reason in store.refusals():
         say(f"refused: {reason}")
-    handler = Handler(shelf, limits)
+    handler = Handler(store, limits)
     server = HttpServer(App(handler, secret), address, limits=limits, tls=tls)
     with suppress(KeyboardInterrupt), closing(server), _grpc(handler, host, grpc_port, secret, tls) as grpc_url:
-        say("serving " + ", ".join(served.metadata.label for served in shelf.all()) + "; Ctrl-C stops")
+        say("serving " + ", ".join(served.metadata.label for served in store.all()) + "; Ctrl-C stops")
         for url in filter(None, (server.url, grpc_url)):
             print(url, flush=True)
         server.run()

@@ -1,5 +1,12 @@
-"""What counts as charges for a model: the right number of finite numbers, in the order of its electrodes."""
+"""What counts as charges for a model: the right number of finite numbers, in the order of its electrodes.
 
+The hot paths ask `write_finite` for plain numbers and `as_singles` for arrays; what these do not take is examined
+number by number, so that the error names the electrode.
+"""
+
+import math
+import struct
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -8,8 +15,26 @@ from numpy.typing import ArrayLike, NDArray
 from isocharge.arrays import Singles
 from isocharge.errors import ChargeError
 
-SQUARES = 1e38
-"""If the squares of some charges add up to no more than this, each of them is finite and fits into float32."""
+LARGEST_SQUARE_SUM = 1e38
+"""Sum of squared charges, pC^2, up to which each charge is certainly finite and fits into float32."""
+
+
+def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
+    """Write numbers as float32 if they are finite and fit; the fast way for the few numbers of one press.
+
+    Args:
+        write: Takes the numbers one by one, as `struct.Struct("=3f").pack_into` does, and raises what that raises.
+        values: The numbers, as many as `write` takes.
+
+    Returns:
+        Whether they were written and are finite; if not, what was written is not to be used.
+    """
+    try:
+        numbers = tuple(values)
+        write(*numbers)
+        return math.isfinite(sum(numbers))  # float32 numbers cannot overflow a sum of float64
+    except (struct.error, TypeError, ValueError, OverflowError):
+        return False
 
 
 def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
@@ -61,7 +86,9 @@ def as_singles(charges: NDArray[Any], electrodes: tuple[str, ...], *, one_press:
         ChargeError: If a charge is not finite; its electrode is named, and its row unless there is only `one_press`.
     """
     flat = charges.ravel()
-    if charges.dtype.kind == "f" and np.vdot(flat, flat) <= SQUARES:  # one call instead of three and an errstate
+    if (
+        charges.dtype.kind == "f" and np.vdot(flat, flat) <= LARGEST_SQUARE_SUM
+    ):  # one call instead of three and an errstate
         return np.ascontiguousarray(charges, dtype=np.float32)
     return _examined(charges, electrodes, one_press)
 

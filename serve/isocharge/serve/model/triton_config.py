@@ -1,9 +1,7 @@
 """`config.pbtxt`: with it Triton serves a model folder without changes."""
 
 from isocharge.serve.model.session import INPUT, OUTPUTS
-
-MAX_BATCH = 4096
-"""Largest batch that Triton may form; the graph itself has no limit."""
+from isocharge.server_defaults import MAX_BATCH
 
 
 def triton_config(name: str, electrodes: int) -> str:

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from isocharge.serve.model.triton_config import MAX_BATCH
+from isocharge.errors import TooLarge
+from isocharge.server_defaults import BODY_BYTES, CONNECTIONS, HEADER_SECONDS, IDLE_SECONDS, MAX_BATCH
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -11,18 +12,27 @@ class ServerLimits:
 
     Attributes:
         batch: Presses in one request.
-        body_bytes: Of a request, compressed or not.
-        header_bytes: Request line and headers together.
-        header_seconds: From the first byte of a request, or from connecting, to the end of its headers.
-        body_seconds: From there to the end of the body; and again until the client has taken the answer.
-        idle_seconds: Between requests.
-        connections: Open at a time.
+        body_bytes: Size of a request's body, compressed or not.
+        header_bytes: Size of request line and headers together.
+        header_seconds: Time from the first byte of a request, or from connecting, to the end of its headers.
+        body_seconds: Time from there to the end of the body; and again until the client has taken the answer.
+        idle_seconds: Time between requests.
+        connections: Connections that are open at a time.
     """
 
     batch: int = MAX_BATCH
-    body_bytes: int = 1 << 20
+    body_bytes: int = BODY_BYTES
     header_bytes: int = 1 << 14
-    header_seconds: float = 10.0
+    header_seconds: float = HEADER_SECONDS
     body_seconds: float = 30.0
-    idle_seconds: float = 75.0
-    connections: int = 1024
+    idle_seconds: float = IDLE_SECONDS
+    connections: int = CONNECTIONS
+
+    def check_body(self, size: int) -> None:
+        """Check the size of a body, or of as much of it as has arrived.
+
+        Raises:
+            TooLarge: If it is above `body_bytes`.
+        """
+        if size > self.body_bytes:
+            raise TooLarge(f"expected a body of at most {self.body_bytes} bytes, got more; send smaller batches")

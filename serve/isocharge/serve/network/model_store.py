@@ -20,7 +20,7 @@ from isocharge.serve.network.statistics import Statistics
 from isocharge.serve.prediction.bound_press import BoundPress
 
 UNLOADED = "unloaded"
-"""The reason that the index gives for a model which somebody took off the shelf."""
+"""The reason that the index gives for a model that a client unloaded."""
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,6 @@ allocates no array and is faster than a plain `session.run`. Batches go through 
 The loop of a host program uses `predict_into` with its two arrays; people use `predict`, which checks and explains.
 """
 
-import math
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from isocharge.arrays import Array, Singles
 from isocharge.errors import ChargeError, ModelError
-from isocharge.serve.model.charges import as_batch, as_press
+from isocharge.serve.model.charges import as_batch, as_press, write_finite
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import Model, load_model
 from isocharge.serve.model.repository import find_model
@@ -99,13 +97,8 @@ class Predictor:
         Raises:
             ChargeError: If the number of charges is another, or one is not finite.
         """
-        try:
-            values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else tuple(charge_pC)
-            self._press.write(*values)
-            usable = math.isfinite(sum(values))
-        except (struct.error, TypeError, ValueError, OverflowError):
-            usable = False
-        if not usable:  # off the fast path: raises what is wrong, or converts
+        values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
+        if not write_finite(self._press.write, values):  # raises what is wrong, or converts
             self._press.write(*as_press(charge_pC, self._metadata.electrodes))
         self._press.run()
         return Contact(*self._press.read())

@@ -94,8 +94,8 @@ def test_bad_requests_are_refused_with_the_reason(start, fields, status, said):
     assert caught.value.code() is grpc.StatusCode[status]
 
 
-def test_a_message_beyond_the_limit(start, shelf):
-    ask = start(handler=Handler(shelf, ServerLimits(body_bytes=1000)))
+def test_a_message_beyond_the_limit(start, store):
+    ask = start(handler=Handler(store, ServerLimits(body_bytes=1000)))
     with pytest.raises(grpc.RpcError) as caught:
         ask("ModelInfer", model_name="linear", raw_input_contents=[bytes(2000)])
     assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
@@ -141,11 +141,11 @@ def test_a_port_that_is_taken(handler):
             pass
 
 
-def test_errors_that_are_ours_are_not_told(start, shelf, monkeypatch, caplog):
+def test_errors_that_are_ours_are_not_told(start, store, monkeypatch, caplog):
     def fail(*_):
         raise ZeroDivisionError("a secret")
 
-    monkeypatch.setattr(shelf, "all", fail)
+    monkeypatch.setattr(store, "all", fail)
     with pytest.raises(grpc.RpcError, match="internal error") as caught:
         start()("ServerReady")
     assert caught.value.code() is grpc.StatusCode.INTERNAL

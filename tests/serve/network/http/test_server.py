@@ -73,9 +73,9 @@ def refused(data):
 
 
 @pytest.fixture
-def limited(shelf, start_http):
+def limited(store, start_http):
     """Start a server with limits of the test's."""
-    return lambda **limits: start_http(Handler(shelf, ServerLimits(**limits)))
+    return lambda **limits: start_http(Handler(store, ServerLimits(**limits)))
 
 
 @pytest.fixture
@@ -252,8 +252,8 @@ def test_a_client_that_hangs_up_in_the_middle(server):
     assert post(server)[0] == 200
 
 
-def test_a_token(shelf, start_http):
-    server = start_http(Handler(shelf), token=Token("open sesame"))
+def test_a_token(store, start_http):
+    server = start_http(Handler(store), token=Token("open sesame"))
     assert post(server, Authorization="Bearer open sesame")[0] == 200
     for headers in ({}, {"Authorization": "Bearer open"}, {"Authorization": "open sesame"}):
         status, content = post(server, **headers)
@@ -276,10 +276,10 @@ def authority(tmp_path_factory):
 
 
 @pytest.mark.parametrize("files", [("cert.pem", "key.pem"), ("both.pem", None)])
-def test_tls(shelf, start_http, authority, files):
+def test_tls(store, start_http, authority, files):
     made, folder = authority
     certificate, key = (name and folder / name for name in files)
-    server = start_http(Handler(shelf), tls=Tls(certificate, key))
+    server = start_http(Handler(store), tls=Tls(certificate, key))
     assert server.url.startswith("https://")
     context = ssl.create_default_context()
     made.configure_trust(context)
@@ -289,16 +289,16 @@ def test_tls(shelf, start_http, authority, files):
     client.close()
 
 
-def test_stopping_finishes_what_is_in_flight(handler, shelf, monkeypatch):
+def test_stopping_finishes_what_is_in_flight(handler, store, monkeypatch):
     """A load that takes a second is answered although the server is told to stop meanwhile; no request comes after."""
-    began, load = Event(), shelf.load
+    began, load = Event(), store.load
 
     def slow(name):
         began.set()
         time.sleep(1.0)
         load(name)
 
-    monkeypatch.setattr(shelf, "load", slow)
+    monkeypatch.setattr(store, "load", slow)
     server = HttpServer(App(handler), Address(), limits=handler.limits)
     thread = Thread(target=server.run)
     thread.start()
@@ -314,10 +314,10 @@ def test_stopping_finishes_what_is_in_flight(handler, shelf, monkeypatch):
         connect(server)
 
 
-def test_answers_come_in_the_order_of_requests(server, shelf, monkeypatch):
+def test_answers_come_in_the_order_of_requests(server, store, monkeypatch):
     """What is answered on the spot does not overtake what takes long, on one connection."""
-    load = shelf.load
-    monkeypatch.setattr(shelf, "load", lambda name: (time.sleep(0.3), load(name)))
+    load = store.load
+    monkeypatch.setattr(store, "load", lambda name: (time.sleep(0.3), load(name)))
     requests = ("POST /v2/repository/models/linear/load", "GET /v2/health/live", "GET /nope", "GET /v2/health/ready")
     with connect(server) as connection:
         for request in requests:
@@ -378,14 +378,14 @@ def pieces(*bodies, last=True):
     ]
 
 
-def test_as_an_asgi_application(shelf):
+def test_as_an_asgi_application(store):
     """Any ASGI server may run it; a body may come in pieces, never end, or break off."""
-    app = App(Handler(shelf, ServerLimits(body_bytes=1000)), Token("a"))
+    app = App(Handler(store, ServerLimits(body_bytes=1000)), Token("a"))
     ready, body = asyncio.run(through_asgi(app, "GET", "/v2/health/ready", pieces(b"")))
     assert (ready["status"], body["body"]) == (200, b'{"ready":true}')
     start, _ = asyncio.run(through_asgi(app, "GET", "/v2", pieces(b"")))
     assert start["status"] == 401
-    app = App(Handler(shelf, ServerLimits(body_bytes=1000)))
+    app = App(Handler(store, ServerLimits(body_bytes=1000)))
     start, body = asyncio.run(through_asgi(app, "POST", INFER, pieces(BODY[:9], BODY[9:20], BODY[20:])))
     assert (start["status"], json.loads(body["body"])["model_name"]) == (200, "linear")
     start, _ = asyncio.run(through_asgi(app, "POST", INFER, pieces(*[bytes(300)] * 9, last=False)))
@@ -396,15 +396,15 @@ def test_as_an_asgi_application(shelf):
     assert asyncio.run(through_asgi(app, "POST", load, pieces(b"")))[1]["body"] == b"{}"
 
 
-def test_a_load_holds_nobody_up(server, shelf, monkeypatch):
-    began, go_on, load = Event(), Event(), shelf.load
+def test_a_load_holds_nobody_up(server, store, monkeypatch):
+    began, go_on, load = Event(), Event(), store.load
 
     def slow(name):
         began.set()
         go_on.wait(20)
         load(name)
 
-    monkeypatch.setattr(shelf, "load", slow)
+    monkeypatch.setattr(store, "load", slow)
     with ThreadPoolExecutor(1) as threads:
         asked = threads.submit(post, server, b"", "/v2/repository/models/linear/load")
         assert began.wait(10)

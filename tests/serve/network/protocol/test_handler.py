@@ -32,7 +32,7 @@ def ask(handler):
 
 
 @pytest.fixture
-def bare(tmp_path, shelf):  # noqa: ARG001
+def bare(tmp_path, store):  # noqa: ARG001
     """The same file in a session with nothing of ours around it: charges to outputs by name."""
     session = onnxruntime.InferenceSession(tmp_path / "models/linear/2/model.onnx", providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
@@ -327,40 +327,40 @@ def test_bad_compression(ask, way, body, status, said):
     assert (got, said in error) == (status, True)
 
 
-def test_a_body_beyond_the_limit(shelf):
-    handler = Handler(shelf, ServerLimits(body_bytes=100))
+def test_a_body_beyond_the_limit(store):
+    handler = Handler(store, ServerLimits(body_bytes=100))
     assert handler.answer("POST", INFER, [], bytes(101)).status == 413
 
 
-def test_errors_that_are_ours_are_logged_and_not_told(ask, shelf, monkeypatch, caplog):
+def test_errors_that_are_ours_are_logged_and_not_told(ask, store, monkeypatch, caplog):
     def fail(*_):
         raise ZeroDivisionError("a secret")
 
-    monkeypatch.setattr(shelf, "all", fail)
+    monkeypatch.setattr(store, "all", fail)
     status, error = refusal(ask("GET", "/v2/health/ready"))
     assert (status, error) == (500, "internal error; the server's log says more")
     assert "a secret" in caplog.text
 
 
-def test_index_of_what_is_ready(ask, shelf):
-    shelf.unload("linear")
+def test_index_of_what_is_ready(ask, store):
+    store.unload("linear")
     assert len(orjson.loads(ask("POST", "/v2/repository/index", b"{}")[2])) == 2
     assert orjson.loads(ask("POST", "/v2/repository/index", b'{"ready": true}')[2]) == []
     assert refusal(ask("POST", "/v2/repository/index", b'{"ready": 1}'))[0] == 400
 
 
-def test_metadata_say_what_the_file_says(ask, shelf):
+def test_metadata_say_what_the_file_says(ask, store):
     properties = orjson.loads(ask("GET", "/v2/models/linear")[2])["properties"]
-    assert properties == shelf.get("linear").metadata.to_props()
+    assert properties == store.get("linear").metadata.to_props()
 
 
-def test_the_page_lists_models_with_their_cards(ask, shelf, tmp_path):
+def test_the_page_lists_models_with_their_cards(ask, store, tmp_path):
     (tmp_path / "models/linear/2/card.md").write_text("# Card\n\n| a | b |\n|---|---|\n| 1 | <script>x</script> |\n")
     page = ask("GET", "/")[2].decode()
     assert page.count("<article>") == 2
     assert "<h1>The linear film</h1>" in page
     assert "<td>&lt;script&gt;x&lt;/script&gt;</td>" in page
-    shelf.unload("linear")
+    store.unload("linear")
     assert "No model is loaded" in ask("GET", "/")[2].decode()
 
 

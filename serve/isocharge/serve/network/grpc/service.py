@@ -1,6 +1,5 @@
 """The methods of `inference.GRPCInferenceService`, on the models of the HTTP handler."""
 
-import logging
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -8,15 +7,13 @@ from typing import Any
 import grpc
 from google.protobuf.json_format import ParseDict
 
-from isocharge.errors import IsochargeError, ModelNotFound, RequestError
+from isocharge.errors import ModelNotFound, RequestError
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE
 from isocharge.serve.network.grpc.tensors import read_infer, write_answer
 from isocharge.serve.network.protocol import Handler, describe
 from isocharge.serve.network.protocol.infer import answer_inference
-from isocharge.serve.network.protocol.status import INTERNAL, grpc_status
+from isocharge.serve.network.protocol.status import client_message, grpc_status
 from isocharge.serve.network.token import Token
-
-log = logging.getLogger(__name__)
 
 OPEN = ("ServerLive", "ServerReady")
 """Methods that need no token."""
@@ -27,17 +24,17 @@ class Service:
 
     def __init__(self, handler: Handler) -> None:
         """Answer from the handler's models, within its limits."""
-        self._shelf, self._limits = handler.shelf, handler.limits
+        self._store, self._limits = handler.store, handler.limits
 
     def ServerLive(self, _: Any) -> dict[str, Any]:
         return {"live": True}
 
     def ServerReady(self, _: Any) -> dict[str, Any]:
-        return {"ready": bool(self._shelf.all())}
+        return {"ready": bool(self._store.all())}
 
     def ModelReady(self, asked: Any) -> dict[str, Any]:
         try:
-            return {"ready": bool(self._shelf.get(asked.name, asked.version))}
+            return {"ready": bool(self._store.get(asked.name, asked.version))}
         except ModelNotFound:
             return {"ready": False}
 
@@ -45,29 +42,29 @@ class Service:
         return describe.server_metadata()
 
     def ModelMetadata(self, asked: Any) -> dict[str, Any]:
-        return describe.model_metadata(self._shelf.get(asked.name, asked.version), self._shelf)
+        return describe.model_metadata(self._store.get(asked.name, asked.version), self._store)
 
     def ModelConfig(self, asked: Any) -> dict[str, Any]:
-        return {"config": describe.model_config(self._shelf.get(asked.name, asked.version), self._limits)}
+        return {"config": describe.model_config(self._store.get(asked.name, asked.version), self._limits)}
 
     def ModelStatistics(self, asked: Any) -> dict[str, Any]:
-        return describe.statistics_of(self._shelf, asked.name, asked.version)
+        return describe.statistics_of(self._store, asked.name, asked.version)
 
     def RepositoryIndex(self, asked: Any) -> dict[str, Any]:
-        return {"models": describe.repository_index(self._shelf, ready=asked.ready)}
+        return {"models": describe.repository_index(self._store, ready=asked.ready)}
 
     def RepositoryModelLoad(self, asked: Any) -> dict[str, Any]:
         if asked.parameters:
             raise RequestError(describe.NO_LOAD_PARAMETERS)
-        self._shelf.load(asked.model_name)
+        self._store.load(asked.model_name)
         return {}
 
     def RepositoryModelUnload(self, asked: Any) -> dict[str, Any]:
-        self._shelf.unload(asked.model_name)
+        self._store.unload(asked.model_name)
         return {}
 
     def ModelInfer(self, asked: Any) -> Any:
-        served = self._shelf.get(asked.model_name, asked.model_version)
+        served = self._store.get(asked.model_name, asked.model_version)
         read = partial(read_infer, asked, served.metadata.electrodes, self._limits.batch)
         return answer_inference(served, read, lambda answer: write_answer(answer, METHODS["ModelInfer"][1]()))
 
@@ -76,7 +73,7 @@ class Service:
         try:
             return {"infer_response": self.ModelInfer(asked)}
         except Exception as error:
-            return {"error_message": _words(error)}
+            return {"error_message": client_message(error)}
 
 
 def handlers(service: Service, token: Token | None) -> grpc.GenericRpcHandler:
@@ -95,7 +92,7 @@ def _method(name: str, answer: Callable[[Any], Any], token: Token | None) -> grp
             _check(secret, context)
             return _message(answer(asked), response)
         except Exception as error:  # the one place where an error becomes an answer
-            return context.abort(grpc.StatusCode[grpc_status(error)], _words(error))
+            return context.abort(grpc.StatusCode[grpc_status(error)], client_message(error))
 
     def many(asked: Iterator[Any], context: grpc.ServicerContext) -> Iterator[Any]:
         yield from (one(each, context) for each in asked)
@@ -118,11 +115,3 @@ def _message(fields: Any, response: type[Any]) -> Any:
     parts = {name: value for name, value in fields.items() if hasattr(value, "DESCRIPTOR")}
     plain = {name: value for name, value in fields.items() if name not in parts}
     return ParseDict(plain, response(**parts))
-
-
-def _words(error: Exception) -> str:
-    """What a client is told; an error that is not ours is logged."""
-    if isinstance(error, IsochargeError):
-        return str(error)
-    log.exception("a request failed", exc_info=error)
-    return INTERNAL

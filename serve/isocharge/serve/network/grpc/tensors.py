@@ -7,7 +7,7 @@ import numpy as np
 from isocharge.arrays import Singles
 from isocharge.errors import RequestError
 from isocharge.serve.network.protocol.infer import InferAnswer, InferRequest
-from isocharge.serve.network.protocol.request import NOT_HERE
+from isocharge.serve.network.protocol.parameters import UNSUPPORTED
 from isocharge.serve.network.protocol.tensors import charges_from_bytes, charges_from_values, check_head, check_outputs
 
 CONTENTS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
@@ -15,13 +15,13 @@ CONTENTS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
 
 
 def read_infer(message: Any, electrodes: tuple[str, ...], batch: int) -> InferRequest:
-    """The request in a ModelInferRequest. Raw numbers are answered with raw numbers, others with others.
+    """The request in a ModelInferRequest. Raw numbers are answered with raw numbers, typed ones with typed ones.
 
     Raises:
         RequestError, ChargeError, TooLarge: If it is not one for a model with these electrodes.
     """
     for holder in (*message.inputs, *message.outputs):
-        for name in NOT_HERE:
+        for name in UNSUPPORTED:
             if name in holder.parameters:
                 raise RequestError(f"the parameters of {holder.name[:100]!r}: {name!r} is not supported by this server")
     outputs = check_outputs([output.name for output in message.outputs])

@@ -6,7 +6,8 @@ from typing import Any
 
 from isocharge.errors import TokenError, TooLarge
 from isocharge.serve.network.protocol import Handler, Response
-from isocharge.serve.network.protocol.handler import Headers, error_response
+from isocharge.serve.network.protocol.handler import Headers
+from isocharge.serve.network.protocol.response import error_response
 from isocharge.serve.network.token import Token
 
 Message = MutableMapping[str, Any]
@@ -55,10 +56,9 @@ class App:
 
     async def _whole(self, message: Message, receive: Receive) -> bytes:
         """A body that comes in pieces, bounded as it grows."""
-        body, limit = bytearray(message["body"]), self._handler.limits.body_bytes
+        body = bytearray(message["body"])
         while message.get("more_body"):
-            if len(body) > limit:
-                raise TooLarge(f"the body is larger than the {limit} bytes that are read")
+            self._handler.limits.check_body(len(body))
             message = await receive()
             if message["type"] == "http.disconnect":
                 raise ConnectionResetError

@@ -18,12 +18,13 @@ from functools import lru_cache
 from typing import Any
 
 import httptools
-import orjson
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
+from isocharge.errors import TooLarge
 from isocharge.serve.network.http.app import App
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Response
+from isocharge.serve.network.protocol.response import error_response, refusal
 
 UNSENT_BYTES = 1 << 22
 """A client that asks on and on and takes no answer is hung up on when so much waits for it."""
@@ -60,7 +61,7 @@ class BoundedProtocol(HttpToolsProtocol):
         super().connection_made(transport)
         self._allow(self.limits.header_seconds)
         if len(self.connections) > self.limits.connections:
-            self._refuse(503, f"all {self.limits.connections} connections are taken; try again later")
+            self._refuse(refusal(503, f"all {self.limits.connections} connections are taken; try again later"))
 
     def data_received(self, data: bytes) -> None:
         """Parse; what is then still unfinished is counted and timed."""
@@ -88,10 +89,13 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def on_body(self, body: bytes) -> None:
         """A piece of the body, up to the limit."""
-        if not self._is_refused:
-            self._body += body
-        if len(self._body) > self.limits.body_bytes:
-            self._refuse(413, f"the body is larger than the {self.limits.body_bytes} bytes that are read")
+        if self._is_refused:
+            return
+        self._body += body
+        try:
+            self.limits.check_body(len(self._body))
+        except TooLarge as error:
+            self._refuse(error_response(error))
 
     def on_message_complete(self) -> None:
         """The whole request is there: answer it, unless it was refused."""
@@ -132,7 +136,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def send_400_response(self, msg: str) -> None:
         """What cannot be parsed at all."""
-        self._refuse(400, msg)
+        self._refuse(refusal(400, msg))
 
     def shutdown(self) -> None:
         """The server stops: a request that has begun is still answered, as the last one."""
@@ -145,7 +149,7 @@ class BoundedProtocol(HttpToolsProtocol):
     def overdue(self) -> None:
         """End a connection that took too long: with words to one that is sending, without to one that is not."""
         if self._phase in (Phase.HEADERS, Phase.BODY) and not self._is_refused:
-            self._refuse(408, f"waited too long for {self._phase.value}")
+            self._refuse(refusal(408, f"waited too long for {self._phase.value}"))
         else:
             self.transport.abort()
 
@@ -162,11 +166,7 @@ class BoundedProtocol(HttpToolsProtocol):
     def _write(self, response: Response, *, with_body: bool) -> None:
         """Send an answer in one piece."""
         is_last = self._is_last or not self.parser.should_keep_alive()
-        parts = [STATUS_LINE[response.status]]
-        for name, value in response.headers:
-            parts += (name, b": ", value, b"\r\n")
-        parts += (b"connection: close\r\n\r\n" if is_last else b"\r\n", response.body if with_body else b"")
-        self.transport.write(b"".join(parts))
+        self.transport.write(_text_of(response, is_last=is_last, with_body=with_body))
         if is_last:
             self.transport.close()
         elif self.flow.write_paused and self.transport.get_write_buffer_size() > UNSENT_BYTES:
@@ -192,21 +192,29 @@ class BoundedProtocol(HttpToolsProtocol):
         return len(self.url) + sum(len(name) + len(value) + 4 for name, value in self.headers)
 
     def _refuse_headers(self) -> None:
-        self._refuse(431, f"the request line and headers are longer than {self.limits.header_bytes} bytes")
+        limit = self.limits.header_bytes
+        self._refuse(refusal(431, f"the request line and headers are longer than {limit} bytes"))
 
-    def _refuse(self, status: int, words: str) -> None:
+    def _refuse(self, response: Response) -> None:
         """Answer without asking the application, read no more requests, and hang up when the client does or soon."""
         if self._is_refused or self.transport.is_closing():
             return
         self._is_refused = True
-        body = orjson.dumps({"error": words})
-        head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(body)
-        self.transport.write(b"".join([STATUS_LINE[status], head, body]))
+        self.transport.write(_text_of(response, is_last=True))
         if self.transport.can_write_eof():
             self.transport.write_eof()
             self._allow(LINGER_SECONDS)
         else:
             self.transport.close()
+
+
+def _text_of(response: Response, *, is_last: bool, with_body: bool = True) -> bytes:
+    """A response as HTTP sends it; the last one says that the connection closes."""
+    parts = [STATUS_LINE[response.status]]
+    for name, value in response.headers:
+        parts += (name, b": ", value, b"\r\n")
+    parts += (b"connection: close\r\n\r\n" if is_last else b"\r\n", response.body if with_body else b"")
+    return b"".join(parts)
 
 
 @lru_cache(64)

@@ -26,13 +26,13 @@ def server_metadata() -> dict[str, Any]:
     return {"name": "isocharge", "version": version("isocharge"), "extensions": list(EXTENSIONS)}
 
 
-def model_metadata(served: LoadedVersion, shelf: ModelStore) -> dict[str, Any]:
+def model_metadata(served: LoadedVersion, store: ModelStore) -> dict[str, Any]:
     """Tensors of a model, and under `properties` everything that its file says about itself, as JSON texts."""
     metadata = served.metadata
     widths = {INPUT: len(metadata.electrodes)}
     return {
         "name": metadata.name,
-        "versions": shelf.versions(metadata.name),
+        "versions": store.versions(metadata.name),
         "platform": PLATFORM,
         "inputs": [_tensor(name, width) for name, width in widths.items()],
         "outputs": [_tensor(name, width) for name, width in OUTPUTS.items()],
@@ -57,13 +57,13 @@ def model_config(served: LoadedVersion, limits: ServerLimits) -> dict[str, Any]:
     }
 
 
-def statistics_of(shelf: ModelStore, name: str = "", version: str = "") -> dict[str, Any]:
+def statistics_of(store: ModelStore, name: str = "", version: str = "") -> dict[str, Any]:
     """Counters of a version of a model, of all its versions, or of all models.
 
     Raises:
         ModelNotFound: If it does not serve.
     """
-    models = [shelf.get(name, version)] if version else shelf.named(name) if name else shelf.all()
+    models = [store.get(name, version)] if version else store.named(name) if name else store.all()
     return {
         "model_stats": [
             {"name": served.metadata.name, "version": served.version, **served.statistics.to_json()}
@@ -72,6 +72,6 @@ def statistics_of(shelf: ModelStore, name: str = "", version: str = "") -> dict[
     }
 
 
-def repository_index(shelf: ModelStore, *, ready: bool) -> list[dict[str, str]]:
+def repository_index(store: ModelStore, *, ready: bool) -> list[dict[str, str]]:
     """Every version in the repository; with `ready`, only what serves."""
-    return [vars(row) for row in shelf.index() if row.state == "READY" or not ready]
+    return [vars(row) for row in store.index() if row.state == "READY" or not ready]

@@ -11,11 +11,11 @@ from isocharge.serve.network.protocol.tensors import DATATYPES
 Json = dict[str, Any]
 
 
-def openapi(shelf: ModelStore, limits: ServerLimits) -> Json:
+def openapi(store: ModelStore, limits: ServerLimits) -> Json:
     """The document, OpenAPI 3.1."""
-    models = sorted({served.metadata.name for served in shelf.all()})
-    versions = sorted({str(served.metadata.version) for served in shelf.all()})
-    widths = sorted({len(served.metadata.electrodes) for served in shelf.all()})
+    models = sorted({served.metadata.name for served in store.all()})
+    versions = sorted({str(served.metadata.version) for served in store.all()})
+    widths = sorted({len(served.metadata.electrodes) for served in store.all()})
     return {
         "openapi": "3.1.0",
         "info": {

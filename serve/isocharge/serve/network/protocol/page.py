@@ -25,10 +25,10 @@ details h2 { font-size: 1.05rem; margin: 1.2rem 0 .4rem }
 """
 
 
-def page(shelf: ModelStore) -> str:
+def page(store: ModelStore) -> str:
     """The page as HTML; it loads nothing else."""
-    refused = "".join(f'<p class="refused">Refused: {escape(reason)}</p>' for reason in shelf.refusals())
-    articles = "".join(map(_article, shelf.all())) or "<p>No model is loaded.</p>"
+    refused = "".join(f'<p class="refused">Refused: {escape(reason)}</p>' for reason in store.refusals())
+    articles = "".join(map(_article, store.all())) or "<p>No model is loaded.</p>"
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>isocharge</title><style>{STYLE}</style></head><body>

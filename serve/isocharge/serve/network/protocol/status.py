@@ -1,6 +1,19 @@
-"""What an error is to a client: the one place where the exception tree becomes status codes."""
+"""What an error is to a client: the one place where the exception tree becomes status codes and messages."""
 
-from isocharge.errors import InputError, ModelNotFound, TokenError, TooLarge, UnknownEncoding, UnknownPath, WrongMethod
+import logging
+
+from isocharge.errors import (
+    InputError,
+    IsochargeError,
+    ModelNotFound,
+    TokenError,
+    TooLarge,
+    UnknownEncoding,
+    UnknownPath,
+    WrongMethod,
+)
+
+log = logging.getLogger(__name__)
 
 _STATUS: tuple[tuple[type[Exception], int, str], ...] = (
     (ModelNotFound, 404, "NOT_FOUND"),
@@ -11,10 +24,10 @@ _STATUS: tuple[tuple[type[Exception], int, str], ...] = (
     (TokenError, 401, "UNAUTHENTICATED"),
     (InputError, 400, "INVALID_ARGUMENT"),
 )
-"""The first class that fits counts."""
+"""Error, HTTP status, gRPC status; the first class that fits counts."""
 
 INTERNAL = "internal error; the server's log says more"
-"""What a client is told about an error that is none of ours."""
+"""The message of an error that isocharge did not raise on purpose."""
 
 
 def http_status(error: Exception) -> int:
@@ -25,3 +38,11 @@ def http_status(error: Exception) -> int:
 def grpc_status(error: Exception) -> str:
     """The name of the gRPC status of an error."""
     return next((name for kind, _, name in _STATUS if isinstance(error, kind)), "INTERNAL")
+
+
+def client_message(error: Exception) -> str:
+    """The message that a client gets; an error that isocharge did not raise on purpose goes into the log instead."""
+    if isinstance(error, IsochargeError):
+        return str(error)
+    log.exception("a request failed", exc_info=error)
+    return INTERNAL
