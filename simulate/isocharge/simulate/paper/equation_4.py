@@ -10,7 +10,7 @@ from isocharge.arrays import Array
 from isocharge.simulate.paper.choices import PAPER, normalised_cubic
 from isocharge.simulate.paper.entry import Entry, Row
 from isocharge.simulate.paper.solves import Solves
-from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
+from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure, shades
 
 RANGE, BAND = (0.25, 2.0), 0.02
 """Range of forces of the comparison with eq. 4, N; largest difference of normalised charges that count as the same,
@@ -278,7 +278,7 @@ def _draw_curves(axes: Any, films: list[list[ChargeForce]]) -> None:
 
 
 def _draw_exponents(axes: Any, films: list[list[ChargeForce]]) -> None:
-    for row, colour in zip(films, _colours(len(films)), strict=True):
+    for row, colour in zip(films, shades(len(films)), strict=True):
         axes.semilogx(FINE, [row[0].exponent(f) for f in FINE], color=colour, label=_um(row[0]))
     taut = films[0][-1]
     axes.semilogx(FINE, [taut.exponent(f) for f in FINE], "--", color=FELT, label=_name(taut))
@@ -287,13 +287,6 @@ def _draw_exponents(axes: Any, films: list[list[ChargeForce]]) -> None:
     axes.set(xlabel="force, N", ylabel="d(ln charge) / d(ln force)", title="local exponent, no pretension (one with)")
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-
-
-def _colours(count: int) -> Array:
-    from matplotlib import colormaps
-
-    colours: Array = colormaps["viridis"](np.linspace(0.0, 0.9, count))
-    return colours
 
 
 def _draw_grid(axes: Any, films: list[list[ChargeForce]], title: str, value: Any, form: str) -> None:

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from isocharge.simulate.contours.field_contours import Contour
-from isocharge.simulate.plots.figure import FELT, INK, PRESSED
+from isocharge.simulate.plots.figure import FELT, INK, PRESSED, shades
 
 
 def draw_contours(axes: Any, contours: Sequence[Contour], colour: str, label: str = "", width: float = 1.2) -> None:
@@ -35,9 +34,9 @@ def draw_mapping(axes: Any, mapping: Mapping, degrees: bool = True) -> None:
 
 
 def draw_curves(axes: Any, points: Curves, lines: Curves | None = None, legend: bool = True) -> None:
-    """Charge against distance on each line of a mapping: marks where the scheme presses, lines between."""
-    shades = _shades(points.mapping.angle.size)
-    for number, (angle, colour) in enumerate(zip(points.mapping.angle, shades, strict=True)):
+    """Charge against distance on each line of a mapping: marks where the scheme presses, lines between them."""
+    colours = shades(points.mapping.angle.size)
+    for number, (angle, colour) in enumerate(zip(points.mapping.angle, colours, strict=True)):
         name = f"{np.rad2deg(angle):.0f}°"
         axes.plot(1e3 * points.mapping.distance, 1e12 * points.own[number], "o", color=colour, ms=3.5)
         smooth = lines or points
@@ -47,10 +46,3 @@ def draw_curves(axes: Any, points: Curves, lines: Curves | None = None, legend: 
     axes.grid(alpha=0.3)
     if legend:
         axes.legend(title="line from x", fontsize=8, ncols=2)
-
-
-def _shades(count: int) -> Array:
-    from matplotlib import colormaps
-
-    shades: Array = colormaps["viridis"](np.linspace(0.0, 0.92, count))
-    return shades

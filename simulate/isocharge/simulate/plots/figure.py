@@ -1,49 +1,70 @@
-"""Pictures of a film: electrodes, probe, working area, curves and contours, to scale, in mm and pC.
+"""Figures without a window: colours, sizes, and how they become files. Every picture of isocharge is made with it.
 
-The one home of what every picture of a sensor has in common; the demo, the commands and the paper's figures share it.
-Needs matplotlib and is imported where a picture is made only.
+It needs matplotlib, so it is imported only where a picture is drawn.
 """
 
 from io import BytesIO
 from pathlib import Path
 
-from matplotlib import rc_context
+import numpy as np
+from matplotlib import colormaps, rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from isocharge.arrays import Array
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing, write_whole
 
 INK, PRESSED, FELT = "#1b2a41", "#9aa5b1", "#d1495b"
-"""Colours of outlines, of what was pressed and of what was felt."""
+"""Colours of outlines, of true presses and of estimated ones."""
 
 COLOURS = ("#d1495b", "#2e6f9e", "#3a8f5c", "#c98a1b")
-"""Of the electrodes, in their order."""
+"""Colours of the electrodes, in their order."""
 
 FORMATS = ("png", "svg", "pdf")
+"""Formats of a picture; a file's suffix names its own."""
 
 DPI = 130
+"""Resolution of PNG files, dots per inch."""
+
+PALEST = 0.92
+"""End of the viridis scale that `shades` uses, from 0 to 1: its last yellow cannot be seen on white."""
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """A figure of so many inches that no window belongs to."""
+    """A figure that no window belongs to; width and height in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
+def shades(count: int) -> Array:
+    """Colours of lines that have an order, from dark to pale: RGBA, shape (count, 4)."""
+    colours: Array = colormaps["viridis"](np.linspace(0.0, PALEST, count))
+    return colours
+
+
 def check_picture(path: Path) -> None:
-    """Raise InputError for a suffix that is no picture's, OutputExists if the file is there."""
+    """Check the name of a picture before anything is computed.
+
+    Raises:
+        InputError: If its suffix is none of FORMATS.
+        OutputExists: If the file exists.
+    """
     if path.suffix.lstrip(".").lower() not in FORMATS:
         raise InputError(f"{path}: expected a picture's name ending in {', '.join(FORMATS)}, got {path.suffix!r}")
     refuse_existing(path)
 
 
-def save_picture(figure: Figure, path: Path) -> None:
-    """Write a figure in the format of the path's suffix, whole or not at all; the same figure gives the same bytes."""
-    kind = path.suffix.lstrip(".").lower()
-    dated = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
-    page = BytesIO()
+def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
+    """A figure as PNG, SVG or PDF; the same figure gives the same bytes."""
+    dates: dict[str, str | None] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
+    buffer = BytesIO()
     with rc_context({"svg.hashsalt": "isocharge", "svg.fonttype": "none"}):
-        figure.savefig(page, format=kind, dpi=DPI, metadata=dated)
-    write_whole(path, page.getvalue())
+        figure.savefig(buffer, format=kind, dpi=DPI, metadata=dates)
+    return buffer.getvalue()
+
+
+def save_picture(figure: Figure, path: Path) -> None:
+    """Write a figure in the format of the path's suffix, whole or not at all."""
+    write_whole(path, picture_bytes(figure, path.suffix.lstrip(".").lower()))

@@ -1,4 +1,4 @@
-"""The film to scale: electrodes, probe, working area, charge map."""
+"""The film to scale: electrodes, probe, working area, charge map, deflection."""
 
 from typing import Any
 
@@ -6,14 +6,19 @@ import numpy as np
 from matplotlib.patches import Circle as Disk
 from matplotlib.patches import Polygon as Patch
 
+from isocharge.arrays import Array
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.plots.figure import FELT, INK
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.solver.equilibrium import Equilibrium
+
+INNER = 0.999999
+"""Share of the film's radius up to which its deflection is drawn: the rim itself may be outside by rounding."""
 
 
 def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool = True, ink: str = INK) -> None:
-    """Outlines of the electrodes where they really sit, with their names."""
+    """Outlines of the electrodes at their calibrated positions, with their names."""
     for electrode in sensor.electrodes:
         corners = 1e3 * sensor.calibration.place(np.array(electrode.corners))
         colour = FELT if electrode.name == highlight else ink
@@ -24,14 +29,8 @@ def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool 
 
 def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "", colour: str = FELT) -> None:
     """The footprint of a press at (x, y), m."""
-    style: dict[str, Any] = {
-        "fill": True,
-        "fc": colour,
-        "ec": colour,
-        "alpha": 0.35,
-        "zorder": 2,
-        "label": label or None,
-    }
+    style: dict[str, Any] = {"fill": True, "fc": colour, "ec": colour, "alpha": 0.35, "zorder": 2}
+    style["label"] = label or None
     x, y = 1e3 * at[0], 1e3 * at[1]
     if isinstance(probe, Circle):
         axes.add_patch(Disk((x, y), 1e3 * probe.radius, **style))
@@ -54,13 +53,47 @@ def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> Non
         axes.set_title(title)
 
 
-def draw_charge_map(axes: Any, film: ForwardMap, number: int, force: float = 1.0, count: int = 81) -> None:
+def draw_charge_map(axes: Any, forward_map: ForwardMap, number: int, force: float = 1.0, count: int = 81) -> None:
     """Shades and labelled contours of one electrode's charge over the position of a press."""
-    radius = film.radius * np.sqrt(np.linspace(0.0, 1.0, count // 2))
-    angle = np.linspace(0.0, 2.0 * np.pi, count)
-    x, y = np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))
-    charge = 1e12 * film.forward(x.ravel(), y.ravel(), np.full(x.size, force))
+    x, y = _polar_grid(forward_map.radius, count // 2, count)
+    charge = 1e12 * forward_map.forward(x.ravel(), y.ravel(), np.full(x.size, force))
     values = charge[:, number].reshape(x.shape)
     axes.contourf(1e3 * x, 1e3 * y, values, levels=30, cmap="YlGnBu")
     lines = axes.contour(1e3 * x, 1e3 * y, values, levels=12, colors=INK, linewidths=0.8)
     axes.clabel(lines, fmt="%.0f", fontsize=7)
+
+
+def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
+    """Deflection of the whole film as shades, seen from above."""
+    radius = equilibrium.film.radius
+    x, y = _polar_grid(INNER * radius, 240, 361)
+    deflection = equilibrium.deflection(np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
+    shades = axes.contourf(1e3 * x, 1e3 * y, 1e3 * deflection, levels=24, cmap="viridis_r")
+    axes.figure.colorbar(shades, ax=axes, shrink=0.8, label="deflection, mm")
+    axes.add_patch(Disk((0, 0), 1e3 * radius, fill=False, color=INK))
+    axes.set(title=f"the film under {equilibrium.force:g} N", xlabel="x, mm", ylabel="y, mm", aspect="equal")
+
+
+def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
+    """Deflection on a cut through the probe and the centre of the film, not to scale."""
+    along = np.linspace(-INNER, INNER, 801) * equilibrium.film.radius
+    at = np.array(equilibrium.at)
+    distance = float(np.linalg.norm(at))
+    direction = at / distance if distance > 0.0 else np.array([1.0, 0.0])
+    deflection = 1e3 * equilibrium.deflection(along[:, None] * direction)
+    axes.plot(1e3 * along, -deflection, color=INK, lw=1.5)
+    centre, half = 1e3 * distance, 1e3 * equilibrium.probe.reach
+    axes.plot([centre - half, centre + half], [0.25, 0.25], color=FELT, lw=5, solid_capstyle="butt")
+    axes.annotate("", (centre, -deflection.max()), (centre, 0.2), arrowprops={"arrowstyle": "->", "color": FELT})
+    axes.set(
+        title=f"cut through probe and centre: {deflection.max():.2f} mm deep",
+        xlabel="along the cut, mm",
+        ylabel="-deflection, mm (stretched)",
+    )
+
+
+def _polar_grid(radius: float, rings: int, angles: int) -> tuple[Array, Array]:
+    """Points x and y on a disk, m, shape (rings, angles) each, with rings of equal area."""
+    distance = radius * np.sqrt(np.linspace(0.0, 1.0, rings))
+    angle = np.linspace(0.0, 2.0 * np.pi, angles)
+    return np.outer(distance, np.cos(angle)), np.outer(distance, np.sin(angle))

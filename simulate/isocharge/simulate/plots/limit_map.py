@@ -1,57 +1,54 @@
 """The picture of `isocharge simulate identify`: least possible errors over the film, folds, working area."""
 
-from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disk
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from isocharge.arrays import Array
-from isocharge.simulate.plots.figure import FELT, INK
+from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes
 
 if TYPE_CHECKING:
     from isocharge.simulate.identifiability.identification import Identification, LimitMap
 
 SMALLEST_MM, LARGEST_MM = 0.02, 5.0
-"""Errors at the ends of the colours."""
+"""Position errors at the ends of the colours, mm; smaller and larger ones have the colours of the ends."""
 
 TICKS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+"""Position errors that the colour bar names, mm."""
 
 
-def draw_identification(found: "Identification") -> bytes:
-    """Maps under the least and the greatest force, and the error against distance; PNG."""
-    figure = Figure(figsize=(16.0, 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
+def identification_picture(identification: "Identification") -> Figure:
+    """Maps under the least and the greatest force, and the error against distance."""
+    figure = new_figure(16.0, 5.2)
     weak, strong, curves = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
-    for axes, made in ((weak, found.maps[0]), (strong, found.maps[-1])):
-        shades = draw_limit_map(axes, found, made)
+    for axes, limit_map in ((weak, identification.maps[0]), (strong, identification.maps[-1])):
+        shades = draw_limit_map(axes, identification, limit_map)
     figure.colorbar(
         shades, ax=[weak, strong], label="least position error (rms), mm", ticks=TICKS, format="%g", pad=0.01
     )
-    _draw_distance(curves, found)
-    figure.suptitle(f"{found.sensor.name}, {found.probe.notation}, noise {found.noise.name}", fontsize=13)
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    _draw_distance(curves, identification)
+    title = f"{identification.sensor.name}, {identification.probe.notation}, noise {identification.noise.name}"
+    figure.suptitle(title, fontsize=13)
+    return figure
 
 
-def draw_limit_map(axes: Any, found: "Identification", made: "LimitMap") -> Any:
+def draw_limit_map(axes: Any, identification: "Identification", limit_map: "LimitMap") -> Any:
     """Position errors under one force as colours, with folds, working area and electrodes to scale."""
-    at, error = 1e3 * _closed(made.rings.position), 1e3 * _closed(made.position)
+    position, error = 1e3 * _closed(limit_map.rings.position), 1e3 * _closed(limit_map.position)
     levels = np.geomspace(SMALLEST_MM, LARGEST_MM, 25)
     shown = np.clip(error, SMALLEST_MM, LARGEST_MM)
-    shades = axes.contourf(at[..., 0], at[..., 1], shown, levels, norm=LogNorm(), cmap="viridis")
-    folds = 1e3 * found.area.folds
+    shades = axes.contourf(position[..., 0], position[..., 1], shown, levels, norm=LogNorm(), cmap="viridis")
+    folds = 1e3 * identification.area.folds
     axes.plot(*folds.T, ".", color=FELT, ms=3)
-    axes.add_patch(Disk((0, 0), 1e3 * found.area.radius, fill=False, ls="--", lw=1.8, color="white"))
-    draw_electrodes(axes, found.sensor)
-    reach = 1e3 * found.area.searched
-    title = f"{made.force:g} N; dashed: working area, {1e3 * found.area.radius:g} mm"
+    axes.add_patch(Disk((0, 0), 1e3 * identification.area.radius, fill=False, ls="--", lw=1.8, color="white"))
+    draw_electrodes(axes, identification.sensor)
+    reach = 1e3 * identification.area.searched
+    title = f"{limit_map.force:g} N; dashed: working area, {1e3 * identification.area.radius:g} mm"
     title += "; red: folds" if len(folds) else ""
     axes.set(title=title, xlabel="x, mm", ylabel="y, mm", aspect="equal")
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
@@ -65,22 +62,32 @@ def _closed(values: Array) -> Array:
     return np.concatenate([centre, around])
 
 
-def _draw_distance(axes: Any, found: "Identification") -> None:
+def _draw_distance(axes: Any, identification: "Identification") -> None:
     """Median and worst error of every ring against its distance from the centre."""
-    for number, made in enumerate(found.maps):
-        colour = ("#8fb8de", "#3a7ca5", INK)[number - len(found.maps)]
-        distance = 1e3 * made.rings.distance
-        axes.semilogy(distance, 1e3 * np.median(made.position, axis=1), color=colour, label=f"{made.force:g} N")
-        axes.semilogy(distance, 1e3 * made.position.max(axis=1), ":", color=colour)
+    area = identification.area
+    for number, limit_map in enumerate(identification.maps):
+        colour = ("#8fb8de", "#3a7ca5", INK)[number - len(identification.maps)]
+        distance = 1e3 * limit_map.rings.distance
+        axes.semilogy(
+            distance, 1e3 * np.median(limit_map.position, axis=1), color=colour, label=f"{limit_map.force:g} N"
+        )
+        axes.semilogy(distance, 1e3 * limit_map.position.max(axis=1), ":", color=colour)
     axes.plot([], [], ":", color=INK, label="worst of the ring")
-    axes.axhline(1e3 * found.area.error, color=FELT, lw=0.8)
-    axes.axvline(1e3 * found.area.radius, ls="--", color=INK, label=f"working area, {1e3 * found.area.radius:g} mm")
-    if np.isfinite(found.area.fold_radius):
+    axes.axhline(1e3 * area.error, color=FELT, lw=0.8)
+    axes.axvline(
+        1e3 * area.radius,
+        ls="--",
+        color=INK,
+        label=f"working area, {1e3 * area.radius:g} mm",
+    )
+    if np.isfinite(area.fold_radius):
         axes.axvline(
-            1e3 * found.area.fold_radius, color=FELT, label=f"first fold, {1e3 * found.area.fold_radius:.1f} mm"
+            1e3 * area.fold_radius,
+            color=FELT,
+            label=f"first fold, {1e3 * area.fold_radius:.1f} mm",
         )
     axes.set(xlabel="distance from the centre, mm", ylabel="least position error (rms), mm", ylim=(0.005, 20.0))
-    axes.set(xlim=(0.0, 1e3 * found.area.searched))
+    axes.set(xlim=(0.0, 1e3 * area.searched))
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(ScalarFormatter())
     axes.yaxis.set_minor_formatter(NullFormatter())
