@@ -19,7 +19,8 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Where a piezoelectric tactile film is touched and how hard, from three or four charges.",
+    help="Find where a piezoelectric tactile film is touched, and how hard, from the charges of three or four "
+    "electrodes.",
 )
 app.command("demo")(demo_command)
 app.add_typer(simulate_app, name="simulate")

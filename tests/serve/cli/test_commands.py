@@ -176,7 +176,7 @@ def test_virtual_sensor_for_a_time(start):
 def test_virtual_sensor_does_not_overwrite(tmp_path):
     taken = tmp_path / "film"
     taken.write_text("mine")
-    with pytest.raises(OutputExists, match="film: something is there already"):
+    with pytest.raises(OutputExists, match="film: the path exists already"):
         run("virtual", "three-25um-biaxial", "--link", taken, "--seconds", "0")
     assert taken.read_text() == "mine"
 

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from isocharge.cli.serve.doctor import _in_words
+from isocharge.cli.serve.doctor import report_lines
 from isocharge.errors import PortError
 from isocharge.serve import Script, VirtualSensor, device_from_table, encode_text, examine
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
@@ -71,7 +71,7 @@ def test_check_of_a_channel_without_a_number():
     assert [(c.name, c.offset_pC) for c in report.channels] == [("A", None), ("B", 1.5), ("C", 2.5)]
     assert report.channels[0].unusable == report.good > 100
     assert "charges on channel A" in missing(report)
-    assert "?" in "\n".join(_in_words(report))
+    assert "?" in "\n".join(report_lines(report))
     json.dumps(asdict(report), allow_nan=False)
 
 

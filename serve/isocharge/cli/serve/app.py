@@ -10,7 +10,8 @@ from isocharge.cli.serve.stream import stream_command
 from isocharge.cli.serve.virtual import virtual_command
 
 serve_app = typer.Typer(
-    no_args_is_help=True, help="Charges to contacts: from a file, from a port, over HTTP, from a virtual sensor."
+    no_args_is_help=True,
+    help="Estimate contacts from charges: from a file, from a sensor's port, over HTTP. Or play a virtual sensor.",
 )
 serve_app.command("predict")(predict_command)
 serve_app.command("stream")(stream_command)

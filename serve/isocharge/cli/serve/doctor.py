@@ -1,4 +1,4 @@
-"""`isocharge serve doctor`: what is on a port, in words or as JSON."""
+"""`isocharge serve doctor`: what is on a port, as text or as JSON."""
 
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -7,25 +7,36 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from isocharge.cli.serve.options import DeviceOption, ModelsOption, board_of
+from isocharge.cli.shared.options import JsonOption
 
 if TYPE_CHECKING:
     from isocharge.serve import Examination
 
 
 def doctor_command(
-    port: Annotated[str, typer.Option("--port", metavar="URL", help="Device path or pyserial URL of the sensor.")],
+    port: Annotated[
+        str, typer.Option("--port", metavar="URL", help="Port of the sensor: device path or pyserial URL.")
+    ],
     device: DeviceOption = None,
     model: Annotated[
-        str | None, typer.Option("--model", metavar="MODEL", help="The model that is meant for it. (default: any)")
+        str | None,
+        typer.Option(
+            "--model",
+            metavar="MODEL",
+            help="Model that is to be used, name or path: its electrodes are looked for. (default: none)",
+        ),
     ] = None,
     models: ModelsOption = None,
-    seconds: Annotated[float, typer.Option("--seconds", min=0.5, max=3600.0, help="How long to listen, s.")] = 5.0,
+    seconds: Annotated[float, typer.Option("--seconds", min=0.5, max=3600.0, help="Time to listen, s.")] = 5.0,
     baud: Annotated[
-        int | None, typer.Option("--baud", min=1, help="Bits per second. (default: the usual ones are tried)")
+        int | None,
+        typer.Option("--baud", min=1, help="Speed of the port, bits per second. (default: the usual ones in turn)"),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object instead of words.")] = False,
+    json: JsonOption = False,
 ) -> None:
-    """Say what is on a port, and what is missing to get a touch. Leave the film alone meanwhile.
+    """Listen on a port, and report which frames arrive, how good the charges are, and what is missing for a touch.
+
+    Leave the film alone meanwhile: offset, noise and drift are those of a film at rest.
 
     Example: isocharge serve doctor --port /dev/ttyACM0
     """
@@ -35,26 +46,30 @@ def doctor_command(
     from isocharge.serve.live.port_check import BAUDS
 
     electrodes = Predictor(model, models=models).metadata.electrodes if model else ()
-    found = examine(
-        port, bauds=(baud,) if baud else BAUDS, seconds=seconds, device=board_of(device), electrodes=electrodes
+    bauds, board = (baud,) if baud else BAUDS, board_of(device)
+    examination = examine(port, bauds=bauds, seconds=seconds, device=board, electrodes=electrodes)
+    print(dumps(asdict(examination)) if json else "\n".join(report_lines(examination)))
+
+
+def report_lines(examination: "Examination") -> Iterator[str]:
+    """An examination as text for people."""
+    yield f"{examination.url} at {examination.baud} baud: {examination.format}"
+    yield f"{examination.bytes_seen} bytes in {examination.seconds:.1f} s, {examination.rate_Hz:.1f} frames/s"
+    yield f"{examination.good} good frames, {examination.bad} bad pieces"
+    numbers = (
+        "frames have no numbers"
+        if examination.lost is None
+        else f"{examination.lost} lost, {examination.repeated} repeated"
     )
-    print(dumps(asdict(found)) if json else "\n".join(_in_words(found)))
-
-
-def _in_words(found: "Examination") -> Iterator[str]:
-    yield f"{found.url} at {found.baud} baud: {found.format}"
-    yield f"{found.bytes_seen} bytes in {found.seconds:.1f} s, {found.rate_Hz:.1f} frames/s"
-    yield f"{found.good} good frames, {found.bad} bad pieces"
-    numbers = "frames have no numbers" if found.lost is None else f"{found.lost} lost, {found.repeated} repeated"
-    yield f"{numbers}; {'a' if found.device_clock else 'no'} device clock"
-    if found.channels:
+    yield f"{numbers}; {'a' if examination.device_clock else 'no'} device clock"
+    if examination.channels:
         yield "channel    offset pC   noise pC  drift pC/s  50 Hz pC  60 Hz pC"
-    for channel in found.channels:
+    for channel in examination.channels:
         figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
         columns = zip(figures, (12, 11, 12, 10, 10), (2, 3, 2, 2, 2), strict=True)
         yield f"{channel.name:8.8s}" + "".join(_column(*column) for column in columns)
-    yield "missing to get a touch: nothing" if not found.missing else "missing to get a touch:"
-    yield from (f"- {words}" for words in found.missing)
+    yield "missing to get a touch: nothing" if not examination.missing else "missing to get a touch:"
+    yield from (f"- {sentence}" for sentence in examination.missing)
 
 
 def _column(figure: float | None, width: int, digits: int) -> str:

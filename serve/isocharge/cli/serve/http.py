@@ -1,4 +1,4 @@
-"""`isocharge serve http`: the models over HTTP, and over gRPC beside it if a port is given."""
+"""`isocharge serve http`: the models over HTTP, and over gRPC too if a port is given."""
 
 import os
 from contextlib import AbstractContextManager, closing, nullcontext, suppress
@@ -21,46 +21,63 @@ if TYPE_CHECKING:
 def http_command(
     models: Annotated[
         Path | None,
-        typer.Option("--models", metavar="DIR", help="Folder of models. (default: where names are looked up)"),
+        typer.Option(
+            "--models", metavar="DIR", help="Folder of the models to serve. (default: all in the usual places)"
+        ),
     ] = None,
-    host: Annotated[str, typer.Option("--host", help="Name or address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="TCP port; 0 takes a free one.")] = 8000,
+    host: Annotated[str, typer.Option("--host", help="Name or IP address to listen on.")] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="TCP port for HTTP; 0 takes a free one.")
+    ] = 8000,
     uds: Annotated[
-        Path | None, typer.Option("--uds", metavar="PATH", help="Unix socket instead of host and port. (default: none)")
+        Path | None,
+        typer.Option(
+            "--uds", metavar="PATH", help="Unix socket to listen on instead of host and port. (default: none)"
+        ),
     ] = None,
     grpc_port: Annotated[
-        int | None, typer.Option("--grpc-port", min=0, max=65535, help="Serve gRPC here too. (default: no gRPC)")
+        int | None,
+        typer.Option("--grpc-port", min=0, max=65535, help="TCP port for gRPC; 0 takes a free one. (default: no gRPC)"),
     ] = None,
     token: Annotated[
         str | None,
         typer.Option(
-            "--token", envvar="ISOCHARGE_TOKEN", help="What clients must send as Bearer token. (default: none)"
+            "--token",
+            envvar="ISOCHARGE_TOKEN",
+            help="Secret that clients must send as `Authorization: Bearer TOKEN`. (default: none)",
         ),
     ] = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Let other machines in without a token. (default: no)")
+        bool, typer.Option("--insecure", help="Let other machines connect without a token. (default: refuse to start)")
     ] = False,
     tls_cert: Annotated[
-        Path | None, typer.Option("--tls-cert", metavar="PEM", help="Certificate chain: serve TLS. (default: plain)")
+        Path | None,
+        typer.Option("--tls-cert", metavar="PEM", help="Certificate chain; turns TLS on. (default: no TLS)"),
     ] = None,
     tls_key: Annotated[
         Path | None,
-        typer.Option("--tls-key", metavar="PEM", help="Its private key. (default: in the certificate's file)"),
+        typer.Option("--tls-key", metavar="PEM", help="Private key of it. (default: in the certificate's file)"),
     ] = None,
-    max_batch: Annotated[int, typer.Option("--max-batch", min=1, help="Presses in one request.")] = MAX_BATCH,
-    max_body_bytes: Annotated[int, typer.Option("--max-body-bytes", min=1, help="Body of a request.")] = BODY_BYTES,
-    max_connections: Annotated[int, typer.Option("--max-connections", min=1, help="Open at a time.")] = CONNECTIONS,
+    max_batch: Annotated[
+        int, typer.Option("--max-batch", min=1, help="Largest number of presses in one request.")
+    ] = MAX_BATCH,
+    max_body_bytes: Annotated[
+        int, typer.Option("--max-body-bytes", min=1, help="Largest body of a request, bytes.")
+    ] = BODY_BYTES,
+    max_connections: Annotated[
+        int, typer.Option("--max-connections", min=1, help="Largest number of connections at a time.")
+    ] = CONNECTIONS,
     idle_s: Annotated[
-        float, typer.Option("--idle-s", min=0.1, help="A connection may idle so long, s.")
+        float, typer.Option("--idle-s", min=0.1, help="Longest time between two requests of a connection, s.")
     ] = IDLE_SECONDS,
     header_s: Annotated[
-        float, typer.Option("--header-s", min=0.1, help="Headers may take so long, s.")
+        float, typer.Option("--header-s", min=0.1, help="Longest time for the headers of a request, s.")
     ] = HEADER_SECONDS,
 ) -> None:
-    """Serve models over HTTP: the Open Inference Protocol, version 2, as Triton and KServe speak it.
+    """Serve models over HTTP, and over gRPC if asked, with the Open Inference Protocol v2 of Triton and KServe.
 
-    Prints the address once it answers there; `/` is a page for people, `/openapi.json` for programs. Ctrl-C stops it
-    after the requests that are under way.
+    Charges are in pC, positions in mm, forces in N. Prints the address once the server answers; `/` there is a page for
+    people, `/openapi.json` for programs. Ctrl-C stops it after the requests that have begun.
 
     Example: isocharge serve http --port 8000
     """
@@ -76,7 +93,7 @@ def http_command(
     address = Address(host, port, uds)
     check_exposure(address if grpc_port is None else Address(host), token=token is not None, insecure=insecure)
     if tls_key is not None and tls_cert is None:
-        raise InputError("--tls-key: expected --tls-cert with it")
+        raise InputError("--tls-key: expected --tls-cert too, got the key alone")
     limits = ServerLimits(
         batch=max_batch,
         body_bytes=max_body_bytes,
@@ -101,10 +118,10 @@ def http_command(
 def _grpc(
     handler: "Handler", host: str, port: int | None, token: "Token | None", tls: "Tls | None"
 ) -> AbstractContextManager[str]:
-    """The gRPC server beside the other one; its address."""
+    """The gRPC server next to the HTTP server; yields its address, empty without a port."""
     if port is None:
         return nullcontext("")
-    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # its core would say in its own way what our errors say
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # its core would print what our errors say already
     with require("grpc"):
         from isocharge.serve.network.grpc import grpc_server
     return grpc_server(handler, host, port, token, tls)

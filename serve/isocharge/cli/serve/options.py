@@ -1,4 +1,4 @@
-"""Options that the live commands share."""
+"""Options of several serving commands."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -12,18 +12,22 @@ if TYPE_CHECKING:
 ModelsOption = Annotated[
     Path | None,
     typer.Option(
-        "--models", metavar="DIR", help="Folder of models in which a name is looked up first. (default: none)"
+        "--models",
+        metavar="DIR",
+        help="Folder in which a model's name is looked up before the usual places. (default: none)",
     ),
 ]
 
 DeviceOption = Annotated[
     Path | None,
-    typer.Option("--device", metavar="FILE", help="What is known about the board, TOML. (default: nothing)"),
+    typer.Option(
+        "--device", metavar="FILE", help="Description of the board that sends the charges, TOML. (default: none)"
+    ),
 ]
 
 
 class Output(StrEnum):
-    """What goes to stdout."""
+    """Format of the records on stdout."""
 
     json = "json"
     csv = "csv"
@@ -31,18 +35,28 @@ class Output(StrEnum):
 
 
 class PolicyName(StrEnum):
-    """Which frames get a record."""
+    """Frames that get a record."""
 
     every = "every"
     latest = "latest"
 
 
 OutputOption = Annotated[
-    Output, typer.Option("--output", help="On stdout: lines of JSON, CSV with a header, or nothing.")
+    Output, typer.Option("--output", help="Records on stdout: a line of JSON each, CSV with a header, or none.")
+]
+
+UdpOption = Annotated[
+    str | None,
+    typer.Option(
+        "--udp",
+        metavar="HOST:PORT",
+        help="Also send each record as JSON in a UDP packet, as to PlotJuggler. (default: no)",
+    ),
 ]
 
 
 def board_of(path: Path | None) -> "Device":
+    """The board that a device file describes; without one, any board."""
     from isocharge.serve import load_device
     from isocharge.serve.live.device import ANY_BOARD
 

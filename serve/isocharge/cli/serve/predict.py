@@ -1,7 +1,4 @@
-"""`isocharge serve predict`: charges from a file to contacts.
-
-Data go to stdout, words for people to stderr. Everything heavy is imported inside the command that needs it.
-"""
+"""`isocharge serve predict`: charges from a file to contacts."""
 
 import sys
 from collections.abc import Iterable
@@ -12,10 +9,9 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.serve.options import ModelsOption
+from isocharge.cli.shared.options import ModelArgument
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.errors import InputError
-
-ModelArgument = Annotated[str, typer.Argument(metavar="MODEL", help="Model name, or path of a model folder.")]
 
 
 def predict_command(
@@ -23,15 +19,16 @@ def predict_command(
     file: Annotated[
         str,
         typer.Argument(
-            metavar="FILE.csv", help="CSV with the electrodes as header and touch charges in pC; - reads stdin."
+            metavar="FILE.csv",
+            help="CSV file with the electrodes' names as header and a press in each row, charges in pC; - reads stdin.",
         ),
     ],
     json: Annotated[
-        bool, typer.Option("--json", help="One prediction record per line instead of CSV. (default: CSV)")
+        bool, typer.Option("--json", help="Print one prediction record per line as JSON. (default: CSV)")
     ] = False,
     models: ModelsOption = None,
 ) -> None:
-    """Turn touch charges (pC) into contacts (mm, N) with standard deviations.
+    """Turn charges of presses (pC) into positions (mm) and forces (N) with their standard deviations.
 
     Example: isocharge serve predict three-25um-biaxial presses.csv > contacts.csv
     """
@@ -49,7 +46,7 @@ def predict_command(
 
 
 def _text(file: str) -> TextIOWrapper:
-    """A file, or stdin for `-`, as text for the csv module; a byte order mark is swallowed."""
+    """A file, or stdin for `-`, as text for the csv module, without a byte order mark."""
     try:
         data = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
     except OSError as error:
@@ -58,6 +55,6 @@ def _text(file: str) -> TextIOWrapper:
 
 
 def _print_lines(lines: Iterable[str]) -> None:
-    """Data to stdout, each line at once."""
+    """Print each line at once: a reader on a pipe waits for it."""
     for line in lines:
         print(line, flush=True)

@@ -1,7 +1,4 @@
-"""Where the records of `serve stream` and `serve replay` go, and the line that closes them.
-
-Data go to stdout, words for people to stderr. Everything heavy is imported inside the command that needs it.
-"""
+"""Where the records of `serve stream` and `serve replay` go, and the summary at the end."""
 
 import sys
 from collections import deque
@@ -16,14 +13,14 @@ if TYPE_CHECKING:
     from isocharge.serve import PredictionRecord, TouchStream
 
 LATENCIES = 100_000
-"""The closing line's percentiles are over so many latest records at most."""
+"""Number of records, the latest ones, over which the summary's percentiles are taken."""
 
 Lines = Callable[["PredictionRecord", str], None]
-"""Takes each record and its line of JSON."""
+"""Called with each record and its line of JSON."""
 
 
-def _pass_on(records: "Iterable[tuple[PredictionRecord, str]]", write: Lines, latencies: deque[float]) -> None:
-    """Write records as they come; a new tare is said, latencies are kept."""
+def write_records(records: "Iterable[tuple[PredictionRecord, str]]", write: Lines, latencies: deque[float]) -> None:
+    """Write records as they come, announce each new tare, and remember the latencies."""
     tare = None
     for record, line in records:
         write(record, line)
@@ -35,8 +32,8 @@ def _pass_on(records: "Iterable[tuple[PredictionRecord, str]]", write: Lines, la
             latencies.append(record.latency_us)
 
 
-def _writer(stack: ExitStack, output: Output, udp: str | None, electrodes: tuple[str, ...]) -> Lines:
-    """What writes each record: to stdout at once, and to the network."""
+def record_writer(stack: ExitStack, output: Output, udp: str | None, electrodes: tuple[str, ...]) -> Lines:
+    """The function that writes each record: to stdout at once, and to the network."""
     from isocharge.serve import UdpSink, csv_header, csv_line
 
     sink = stack.enter_context(UdpSink(udp)) if udp else None
@@ -53,16 +50,17 @@ def _writer(stack: ExitStack, output: Output, udp: str | None, electrodes: tuple
     return write
 
 
-def _closing_line(path: "TouchStream", latencies: deque[float]) -> str:
-    counts, gaps, own = path.parser.counts, path.gaps, path.counts
-    said = (
-        f"{counts.frames} frames, {gaps.lost} lost, {gaps.repeated} repeated, {gaps.restarts} restarts; "
-        f"{counts.crc_errors} CRC errors, {counts.malformed} malformed, {counts.bytes_dropped} bytes dropped, "
-        f"{counts.resyncs} resynchronisations; {own.outages} reconnects, {own.skipped} skipped"
+def summary(touch: "TouchStream", latencies: deque[float]) -> str:
+    """Counts of frames and faults, and percentiles of the latency."""
+    frames, gaps, stream = touch.parser.counts, touch.gaps, touch.counts
+    text = (
+        f"{frames.frames} frames, {gaps.lost} lost, {gaps.repeated} repeated, {gaps.restarts} restarts; "
+        f"{frames.crc_errors} CRC errors, {frames.malformed} malformed, {frames.bytes_dropped} bytes dropped, "
+        f"{frames.resyncs} resynchronisations; {stream.outages} reconnects, {stream.skipped} skipped"
     )
     if not latencies:
-        return said
+        return text
     import numpy as np
 
     p50, p99 = np.percentile(latencies, (50, 99))
-    return f"{said}; last byte to record p50 {p50:.0f} us, p99 {p99:.0f} us"
+    return f"{text}; last byte to record p50 {p50:.0f} us, p99 {p99:.0f} us"

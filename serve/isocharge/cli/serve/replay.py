@@ -7,25 +7,26 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.serve.options import ModelsOption, Output, OutputOption
-from isocharge.cli.serve.record_output import LATENCIES, _closing_line, _pass_on, _writer
+from isocharge.cli.serve.options import ModelsOption, Output, OutputOption, UdpOption
+from isocharge.cli.serve.record_output import LATENCIES, record_writer, summary, write_records
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import say
 
 
 def replay_command(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Recording of `serve stream --record`.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Recording of `isocharge serve stream --record`.")],
     model: Annotated[
-        str | None, typer.Option("--model", metavar="MODEL", help="Another model. (default: the one of the recording)")
+        str | None,
+        typer.Option("--model", metavar="MODEL", help="Model to use, name or path. (default: that of the recording)"),
     ] = None,
     models: ModelsOption = None,
-    real_time: Annotated[bool, typer.Option("--real-time/--fast", help="At the pace of then, or all at once.")] = False,
+    real_time: Annotated[
+        bool, typer.Option("--real-time/--fast", help="Play at the pace of the recording, or as fast as possible.")
+    ] = False,
     output: OutputOption = Output.json,
-    udp: Annotated[
-        str | None, typer.Option("--udp", metavar="HOST:PORT", help="Also send each record there. (default: no)")
-    ] = None,
+    udp: UdpOption = None,
 ) -> None:
-    """Play a recording through the same path: the same model gives the same records, bit for bit.
+    """Play a recording of raw bytes again: the same model gives the same records, bit for bit.
 
     Example: isocharge serve replay touch.rec --real-time
     """
@@ -39,6 +40,6 @@ def replay_command(
     latencies: deque[float] = deque(maxlen=LATENCIES)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
-        write = _writer(stack, output, udp, predictor.metadata.electrodes)
-        _pass_on(replay(recording, path, clock, real_time=real_time), write, latencies)
-    say(_closing_line(path, latencies))
+        write = record_writer(stack, output, udp, predictor.metadata.electrodes)
+        write_records(replay(recording, path, clock, real_time=real_time), write, latencies)
+    say(summary(path, latencies))

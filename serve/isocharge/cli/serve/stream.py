@@ -12,8 +12,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.serve.options import DeviceOption, ModelsOption, Output, OutputOption, PolicyName, board_of
-from isocharge.cli.serve.record_output import LATENCIES, _closing_line, _pass_on, _writer
+from isocharge.cli.serve.options import (
+    DeviceOption,
+    ModelsOption,
+    Output,
+    OutputOption,
+    PolicyName,
+    UdpOption,
+    board_of,
+)
+from isocharge.cli.serve.record_output import LATENCIES, record_writer, summary, write_records
+from isocharge.cli.shared.options import ModelArgument
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import say
 
@@ -23,46 +32,62 @@ if TYPE_CHECKING:
 
 
 def stream_command(
-    model: Annotated[str, typer.Argument(metavar="MODEL", help="Model name, or path of a model folder.")],
+    model: ModelArgument,
     port: Annotated[
         str,
-        typer.Option("--port", metavar="URL", help="Device path or pyserial URL of the sensor, a file, - for stdin."),
+        typer.Option(
+            "--port",
+            metavar="URL",
+            help="Port of the sensor: device path or pyserial URL; or a file of bytes; - reads stdin.",
+        ),
     ],
     models: ModelsOption = None,
     device: DeviceOption = None,
     output: OutputOption = Output.json,
-    udp: Annotated[
-        str | None,
-        typer.Option(
-            "--udp", metavar="HOST:PORT", help="Also send records there, as PlotJuggler reads them. (default: no)"
-        ),
-    ] = None,
+    udp: UdpOption = None,
     record: Annotated[
         Path | None,
-        typer.Option("--record", metavar="FILE", help="Keep raw bytes and records for `serve replay`. (default: no)"),
+        typer.Option(
+            "--record",
+            metavar="FILE",
+            help="Also write raw bytes and records for `isocharge serve replay`. (default: no)",
+        ),
     ] = None,
     policy: Annotated[
-        PolicyName, typer.Option("--policy", help="A record for every frame, or for the latest only if several came.")
+        PolicyName,
+        typer.Option(
+            "--policy", help="If several frames come at once: a record for each of them, or for the latest alone."
+        ),
     ] = PolicyName.every,
     reconnect: Annotated[
-        bool, typer.Option("--reconnect/--no-reconnect", help="Open a lost port again, for ever, or fail.")
+        bool,
+        typer.Option("--reconnect/--no-reconnect", help="If the port is lost: try for ever to open it again, or fail."),
     ] = True,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0.0, help="Stop after so many seconds. (default: never)")
+        float | None, typer.Option("--seconds", min=0.0, help="Time after which to stop, s. (default: at Ctrl-C)")
     ] = None,
     count: Annotated[
-        int | None, typer.Option("--count", min=1, help="Stop after so many records. (default: never)")
+        int | None, typer.Option("--count", min=1, help="Number of records after which to stop. (default: at Ctrl-C)")
     ] = None,
-    wait: Annotated[float, typer.Option("--wait", min=0.0, max=3600.0, help="Wait so long for the port, s.")] = 0.0,
-    baud: Annotated[int, typer.Option("--baud", min=1, help="Bits per second; USB ports ignore it.")] = 115200,
+    wait: Annotated[
+        float, typer.Option("--wait", min=0.0, max=3600.0, help="Time to wait until the port exists, s.")
+    ] = 0.0,
+    baud: Annotated[
+        int, typer.Option("--baud", min=1, help="Speed of the port, bits per second; USB ports ignore it.")
+    ] = 115200,
     offset_limit_pC: Annotated[
         float | None,
-        typer.Option("--offset-limit-pC", min=0.0, help="Largest charge of an untouched electrode, pC. (default: 100)"),
+        typer.Option(
+            "--offset-limit-pC",
+            min=0.0,
+            help="Largest charge at rest that the tare accepts, pC. (default: 100, or as --device says)",
+        ),
     ] = None,
 ) -> None:
-    """Follow a sensor live: a prediction record per frame, one line of JSON each, until Ctrl-C.
+    """Follow a sensor live: read its port, and print position (mm) and force (N) for every frame of charges.
 
-    The first 100 frames (0.5 s at 200 Hz) are used to tare: leave the film alone meanwhile. SIGUSR1 asks for a new one.
+    The first 100 frames (0.5 s at 200 Hz) are the tare, the charges at rest: leave the film alone meanwhile. The signal
+    SIGUSR1 starts a new tare. Ctrl-C stops.
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
@@ -80,15 +105,15 @@ def stream_command(
         source = stack.enter_context(open_source(_awaited(port, wait), baud=baud, reconnect=reconnect))
         stack.enter_context(_tare_on_signal(live))
         stack.enter_context(_alarm(seconds))
-        write = _writer(stack, output, udp, predictor.metadata.electrodes)
+        write = record_writer(stack, output, udp, predictor.metadata.electrodes)
         if recorder:
             stack.enter_context(recorder)
         records = stack.enter_context(closing(live.follow(source)))  # closed before the recorder
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
-            _pass_on(islice(records, count), write, latencies)
+            write_records(islice(records, count), write, latencies)
         finally:
-            say(_closing_line(path, latencies))
+            say(summary(path, latencies))
     if recorder is not None and recorder.failed:
         raise typer.Exit(1)
 

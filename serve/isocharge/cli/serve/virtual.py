@@ -1,7 +1,4 @@
-"""`isocharge serve virtual`: a sensor made of the simulator's forward map and amplifier.
-
-serve's pC, mm and N are on one side, the simulator's SI on the other.
-"""
+"""`isocharge serve virtual`: a sensor made of the simulator's forward map and amplifier."""
 
 import threading
 from collections.abc import Iterator
@@ -14,21 +11,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from isocharge.cli.shared.options import ProbeOption, SensorArgument
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import progress, say
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
+from isocharge.default_scene import DEFAULT_FORCE_RANGE
 from isocharge.errors import InputError, OutputExists
 
 if TYPE_CHECKING:
     from isocharge.serve import Script
     from isocharge.serve.virtual_sensor.sensor import Encode
 
-FORCE_MIN_N = 0.05
-"""Smallest force that a virtual sensor plays, N."""
-
 
 class FrameFormat(StrEnum):
-    """What the virtual board sends; described frames come with a device file."""
+    """Format of the frames; a device file describes others."""
 
     binary = "binary"
     csv = "csv"
@@ -38,59 +34,75 @@ class FrameFormat(StrEnum):
 
 
 def virtual_command(
-    sensor: Annotated[str, typer.Argument(metavar="SENSOR", help="Built-in sensor, or a TOML file.")],
+    sensor: SensorArgument,
     seconds: Annotated[
         float | None,
-        typer.Option("--seconds", min=0.0, max=1e6, help="Play for so many seconds. (default: until Ctrl-C)"),
+        typer.Option("--seconds", min=0.0, max=1e6, help="Time after which to stop, s. (default: at Ctrl-C)"),
     ] = None,
     rate_Hz: Annotated[float, typer.Option("--rate-Hz", min=1.0, max=5000.0, help="Frames per second, Hz.")] = 200.0,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of presses, noise and offsets.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of presses, noise and offsets.")] = 0,
     force_max: Annotated[
         float, typer.Option("--force-max", min=0.05, help="Largest force, N; the smallest is 0.05 N.")
-    ] = 2.0,
+    ] = DEFAULT_FORCE_RANGE[1],
     noise: Annotated[
         str, typer.Option("--noise", help="Amplifier: clean, reference, bench, surgery, or a TOML file.")
     ] = "reference",
-    probe: Annotated[str, typer.Option("--probe", help="What presses; circle:R with the radius in mm.")] = "circle:1.0",
+    probe: ProbeOption = "circle:1.0",
     link: Annotated[
-        Path | None, typer.Option("--link", metavar="PATH", help="Make a link to the port here. (default: none)")
+        Path | None,
+        typer.Option("--link", metavar="PATH", help="Symbolic link to make to the port. (default: none)"),
     ] = None,
     script: Annotated[
         Path | None,
         typer.Option(
-            "--script", metavar="FILE", help="CSV with seconds, x_mm, y_mm, force_N. (default: random presses)"
+            "--script",
+            metavar="FILE",
+            help="Presses to play, CSV with seconds, x_mm, y_mm, force_N. (default: random presses)",
         ),
     ] = None,
-    frames: Annotated[FrameFormat, typer.Option("--frames", help="What the board sends.")] = FrameFormat.binary,
+    frames: Annotated[FrameFormat, typer.Option("--frames", help="Format of the frames.")] = FrameFormat.binary,
     device: Annotated[
         Path | None,
-        typer.Option("--device", metavar="FILE", help="Send the described frames of this device file. (default: none)"),
+        typer.Option(
+            "--device", metavar="FILE", help="Device file whose described frames are sent, TOML. (default: --frames)"
+        ),
     ] = None,
-    lose: Annotated[float, typer.Option("--lose", min=0.0, max=1.0, help="Share of frames that are lost.")] = 0.0,
+    lose: Annotated[
+        float, typer.Option("--lose", min=0.0, max=1.0, help="Fault: share of the frames that are lost, 0 to 1.")
+    ] = 0.0,
     corrupt: Annotated[
-        float, typer.Option("--corrupt", min=0.0, max=1.0, help="Share of bytes that are flipped, dropped or added.")
+        float,
+        typer.Option(
+            "--corrupt", min=0.0, max=1.0, help="Fault: share of the bytes that are flipped, dropped or added, 0 to 1."
+        ),
     ] = 0.0,
     gap_every: Annotated[
-        float, typer.Option("--gap-every", min=0.0, help="Be silent for 0.1 s so often, s; 0 for never.")
+        float, typer.Option("--gap-every", min=0.0, help="Fault: time between silences of 0.1 s, s; 0 for none.")
     ] = 0.0,
     unplug_every: Annotated[
-        float, typer.Option("--unplug-every", min=0.0, help="Vanish for 0.5 s so often, s; 0 for never.")
+        float,
+        typer.Option("--unplug-every", min=0.0, help="Fault: time between disappearances of 0.5 s, s; 0 for none."),
     ] = 0.0,
-    clock_ppm: Annotated[float, typer.Option("--clock-ppm", help="How much too fast the board's clock is.")] = 0.0,
+    clock_ppm: Annotated[
+        float, typer.Option("--clock-ppm", help="Fault: error of the board's clock, ppm; positive runs fast.")
+    ] = 0.0,
     temperature_step_K: Annotated[
         float | None,
-        typer.Option("--temperature-step-K", help="Warm the film after 10 s. (default: as the noise says)"),
+        typer.Option("--temperature-step-K", help="Temperature step of the film after 10 s, K. (default: by --noise)"),
     ] = None,
     drift_pC_per_s: Annotated[
-        float | None, typer.Option("--drift-pC-per-s", min=0.0, help="Bias current. (default: as the noise says)")
+        float | None,
+        typer.Option("--drift-pC-per-s", min=0.0, help="Drift from the bias current, pC/s. (default: by --noise)"),
     ] = None,
     limit_pC: Annotated[
-        float | None, typer.Option("--limit-pC", min=1.0, help="The converter's limit. (default: as the noise says)")
+        float | None,
+        typer.Option("--limit-pC", min=1.0, help="Largest charge that the converter reads, pC. (default: by --noise)"),
     ] = None,
 ) -> None:
-    """Play a sensor: presses that wander over the film, sent as frames on a pseudo-terminal.
+    """Play a sensor: simulate presses that wander over the film, and send their charges as frames on a pseudo-terminal.
 
-    Prints the path of the port, then plays until Ctrl-C. The presses are simulated; the first second is without touch.
+    Prints the path of the port, then plays until Ctrl-C. The first second of random presses is without touch, for the
+    tare.
 
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
@@ -98,8 +110,8 @@ def virtual_command(
     from isocharge.simulate import ForwardMap, load_amplifier, load_sensor, parse_probe
 
     scene, amplifier = (load_sensor(sensor), parse_probe(probe)), load_amplifier(noise)
-    wrong: dict[str, Any] = {"step": temperature_step_K, "bias": _pico(drift_pC_per_s), "limit": _pico(limit_pC)}
-    amplifier = replace(amplifier, **{name: value for name, value in wrong.items() if value is not None})
+    changes: dict[str, Any] = {"step": temperature_step_K, "bias": _pico(drift_pC_per_s), "limit": _pico(limit_pC)}
+    amplifier = replace(amplifier, **{name: value for name, value in changes.items() if value is not None})
     faults = Faults(
         lose_share=lose,
         corrupt_share=corrupt,
@@ -109,25 +121,28 @@ def virtual_command(
     )
     encode, presses = _encoder(frames, device), _presses(script, rate_Hz)
     with progress("solving the film") as advance:
-        film = ForwardMap.build(*scene, force_range=(FORCE_MIN_N, force_max), progress=advance)
+        forward_map = ForwardMap.build(*scene, force_range=(DEFAULT_FORCE_RANGE[0], force_max), progress=advance)
     _refuse_taken(link)
-    player = virtual_sensor(film, amplifier, seed, rate_Hz, script=presses, encode=encode, faults=faults, link=link)
+    player = virtual_sensor(
+        forward_map, amplifier, seed, rate_Hz, script=presses, encode=encode, faults=faults, link=link
+    )
     with until_stopped(), _link_errors(link), player:
         print(player.port_path, flush=True)
         say(f"playing {sensor} at {rate_Hz:g} Hz; Ctrl-C stops")
         threading.Event().wait(seconds)
     say(
-        f"{player.sent} frames sent, {player.withheld} withheld because nobody read them, {player.lost} lost and "
+        f"{player.sent} frames sent, {player.withheld} withheld because no program read them, {player.lost} lost and "
         f"{player.corrupted} damaged on purpose, {player.unplugged} times unplugged"
     )
 
 
 def _pico(value: float | None) -> float | None:
+    """pC or pC/s in C or C/s."""
     return None if value is None else value * 1e-12
 
 
 def _encoder(frames: FrameFormat, device: Path | None) -> "Encode":
-    """What turns a frame into bytes."""
+    """The function that turns a frame into bytes."""
     from isocharge.serve import encode_frame, encode_text, load_device
 
     if device is None:
@@ -151,7 +166,7 @@ def _presses(script: Path | None, rate_Hz: float) -> "Script | None":
 
 def _refuse_taken(link: Path | None) -> None:
     if link is not None and (link.exists() or link.is_symlink()):
-        raise OutputExists(f"--link {link}: something is there already; remove it or choose another path")
+        raise OutputExists(f"--link {link}: the path exists already; remove it or choose another path")
 
 
 @contextmanager
@@ -161,4 +176,4 @@ def _link_errors(link: Path | None) -> Iterator[None]:
     except OSError as error:
         if link is None or error.filename2 != str(link):
             raise
-        raise InputError(f"--link {link}: cannot be made ({error.strerror}); choose another path") from error
+        raise InputError(f"--link {link}: the link cannot be made ({error.strerror}); choose another path") from error

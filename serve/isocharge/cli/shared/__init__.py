@@ -1,4 +1,4 @@
-"""What several commands share: options, words and bars on stderr, stopping, the virtual sensor.
+"""What several commands share: options, forward maps, messages and bars on stderr, stopping, the virtual sensor.
 
 May import: nothing else of isocharge.cli.
 """

@@ -1,47 +1,80 @@
-"""Options of several commands, and how their texts are read."""
+"""Arguments and options that stand in several commands, and the numbers that their texts hold."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.terminal import progress, progress_rows, say
 from isocharge.errors import InputError
 
-if TYPE_CHECKING:
-    from isocharge.simulate import ForwardMap, Probe, Sensor
+PROBE_HELP = (
+    "Footprint, mm: circle:RADIUS, rectangle:WIDTHxHEIGHT, triangle:SIDE or polygon:X,Y;X,Y;...; @DEGREES at the end "
+    "turns it."
+)
 
-PROBE_HELP = "What presses, mm: circle:R, rectangle:WxH, triangle:SIDE, polygon:X,Y;X,Y;..., each turned by @DEGREES."
+SensorArgument = Annotated[
+    str, typer.Argument(metavar="SENSOR", help="Name of a built-in sensor, or a TOML file that describes one.")
+]
 
-SensorArgument = Annotated[str, typer.Argument(metavar="SENSOR", help="Built-in sensor, or a TOML file.")]
+ModelArgument = Annotated[str, typer.Argument(metavar="MODEL", help="Name of a model, or path of a model folder.")]
 
-ProbeOption = Annotated[str, typer.Option("--probe", help=PROBE_HELP)]
+ProbeOption = Annotated[str, typer.Option("--probe", metavar="SHAPE", help=PROBE_HELP)]
 
-ForceOption = Annotated[float, typer.Option("--force", help="How hard, N, positive pushes.")]
+ForceOption = Annotated[float, typer.Option("--force", metavar="N", help="Force of the press, N; positive pushes.")]
 
-JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object instead of a table.")]
+ForceRangeOption = Annotated[
+    tuple[float, float], typer.Option("--force", metavar="MIN MAX", help="Smallest and largest force, N.")
+]
+
+RadiusOption = Annotated[
+    str,
+    typer.Option(
+        "--radius",
+        metavar="MM|auto",
+        help="Largest distance of a press from the film's centre, mm; auto finds the working area, where the charges "
+        "determine the position to 1 mm.",
+    ),
+]
+
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", min=1, max=64, help="Processes; the results do not depend on them. (default: one per core)"
+    ),
+]
+
+FreshOption = Annotated[
+    bool, typer.Option("--fresh", help="Delete what a stopped run left, and begin again. (default: go on from there)")
+]
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="Training settings, TOML. (default: those of the released models)"),
+]
+
+NewFolderOption = Annotated[
+    Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to make for the results; it must not exist yet.")
+]
 
 PictureOption = Annotated[
     Path | None,
-    typer.Option("--output", "-o", metavar="PICTURE", help="Draw it: a new .png, .svg or .pdf. (default: none)"),
+    typer.Option(
+        "--output", "-o", metavar="PICTURE", help="Also draw it, into a new .png, .svg or .pdf file. (default: no)"
+    ),
 ]
 
-
-def _check_picture(output: Path) -> None:
-    from isocharge.simulate.plots.figure import check_picture
-
-    check_picture(output)
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text. (default: text)")]
 
 
-def _solve(sensor: "Sensor", probe: str, radius: float, force: float) -> "ForwardMap":
-    from isocharge.simulate import ForwardMap, parse_probe
+def most_workers(workers: int | None) -> int:
+    """The processes that were asked for; one per core if none were."""
+    from isocharge.simulate.execution.workers import cores
 
-    with progress("solving the film") as advance:
-        pressing = parse_probe(probe)
-        return ForwardMap.build(sensor, pressing, radius * (1.0 + 1e-6), (force, force), progress=advance)
+    return workers or min(cores(), 64)
 
 
-def position(text: str) -> tuple[float, float]:
+def position_of(text: str) -> tuple[float, float]:
+    """Position (x, y), m, from `--at`."""
     try:
         x, y = (float(part) * 1e-3 for part in text.split(","))
     except ValueError as error:
@@ -49,28 +82,9 @@ def position(text: str) -> tuple[float, float]:
     return x, y
 
 
-def number_mm(text: str) -> float:
+def radius_mm_of(text: str) -> float:
+    """Radius, mm, from `--radius` where it is not `auto`."""
     try:
         return float(text)
     except ValueError as error:
         raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error
-
-
-def auto_radius(sensor: "Sensor", probes: "list[Probe]", force: tuple[float, float]) -> float:
-    """Radius of the disk that is in the working area of every probe under `reference` noise, m."""
-    from isocharge.simulate import noise_model, working_area
-    from isocharge.simulate.identifiability.identification import map_to_search
-
-    areas = []
-    for probe in probes:
-        with progress_rows((f"finding the working area of {probe.notation}", "solves")) as (advance,):
-            made = map_to_search(sensor, probe, force, advance)
-        areas.append(working_area(made, noise_model("reference")))
-        say(f"{probe.notation}: {areas[-1].words}")
-    radius = min(area.radius for area in areas)
-    if radius == 0.0:
-        raise InputError(
-            "--radius auto: nowhere do the charges tell the contact well enough; see 'isocharge simulate identify', or "
-            "give a radius"
-        )
-    return radius

@@ -1,4 +1,4 @@
-"""How a command that runs until it is told to stop is told so."""
+"""How a command that runs until it is stopped ends well."""
 
 import os
 import signal
@@ -9,14 +9,14 @@ from contextlib import contextmanager
 
 @contextmanager
 def until_stopped() -> Iterator[None]:
-    """Ctrl-C, a SIGTERM and a reader that closes the pipe all mean: enough, and well done."""
+    """Leave the block without an error at Ctrl-C, at SIGTERM, and when the reader of stdout goes away."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     except KeyboardInterrupt:
         pass
     except BrokenPipeError:
-        # What is still in stdout's buffer goes nowhere, without a complaint at exit.
+        # What is still in stdout's buffer is thrown away, or Python would complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     finally:
         signal.signal(signal.SIGTERM, before)

@@ -1,4 +1,4 @@
-"""Words, numbers and progress bars for people, on stderr; bars only where a terminal shows them."""
+"""Messages and progress bars for people, on stderr; bars only if stderr is a terminal."""
 
 import shlex
 import sys
@@ -8,31 +8,31 @@ from contextlib import contextmanager
 import typer
 
 Advance = Callable[..., None]
-"""`advance(done, total)` or `advance(done, total, words)`."""
+"""`advance(done, total)` or `advance(done, total, note)`: moves a progress bar; the note stands behind it."""
 
 
-def say(words: str) -> None:
-    """Words for people to stderr."""
-    typer.echo(words, err=True)
+def say(message: str) -> None:
+    """Print a message for people on stderr."""
+    typer.echo(message, err=True)
 
 
 def this_command() -> str:
-    """The command line as it was given, for cards that say how to make a thing again."""
+    """The command line as it was given, for cards and reports that say how they were made."""
     return shlex.join(["isocharge", *sys.argv[1:]])
 
 
 @contextmanager
 def progress(title: str) -> Iterator[Advance]:
-    """A progress bar with the time that is left; yields the function that moves it."""
+    """A progress bar with the remaining time; yields the function that moves it."""
     with progress_rows((title, "")) as (advance,):
         yield advance
 
 
 @contextmanager
 def progress_rows(*rows: tuple[str, str]) -> Iterator[tuple[Advance, ...]]:
-    """A progress bar for each (title, unit), shown once it moves: time left, and so many of the unit a second.
+    """A progress bar for each (title, unit), shown once it moves, with the remaining time and the units per second.
 
-    Yields the functions that move them; one that falls back begins anew.
+    Yields the functions that move them. A bar that is moved back starts its clock again.
     """
     from rich.console import Console
     from rich.progress import (
@@ -59,18 +59,18 @@ def progress_rows(*rows: tuple[str, str]) -> Iterator[tuple[Advance, ...]]:
         Rate(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[words]}"),
+        TextColumn("{task.fields[note]}"),
     )
     with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
 
         def mover(title: str, unit: str, visible: bool) -> Advance:
-            row = bar.add_task(title, total=None, start=visible, visible=visible, words="", unit=unit)
+            row = bar.add_task(title, total=None, start=visible, visible=visible, note="", unit=unit)
 
-            def advance(done: int, total: int, words: str = "") -> None:
+            def advance(done: int, total: int, note: str = "") -> None:
                 task = bar.tasks[row]
                 if not task.started or done < task.completed:
                     bar.reset(row, visible=True)
-                bar.update(row, completed=done, total=total, words=words)
+                bar.update(row, completed=done, total=total, note=note)
 
             return advance
 
@@ -78,7 +78,7 @@ def progress_rows(*rows: tuple[str, str]) -> Iterator[tuple[Advance, ...]]:
 
 
 def rate(per_second: float | None, unit: str) -> str:
-    """As "1,234 samples/s"; nothing while it is not known."""
+    """A rate as "1,234 samples/s"; empty if it is unknown or has no unit."""
     if not unit or per_second is None:
         return ""
     return f"{per_second:,.0f} {unit}/s" if per_second >= 10.0 else f"{per_second:.1f} {unit}/s"

@@ -9,11 +9,11 @@ if TYPE_CHECKING:
     from isocharge.simulate import Amplifier, ForwardMap
 
 SCRIPT_S = 60.0
-"""Length of what a virtual sensor plays before it begins again, s."""
+"""Length of the random script that a virtual sensor repeats, s."""
 
 
 def virtual_sensor(
-    film: "ForwardMap",
+    forward_map: "ForwardMap",
     noise: "str | Amplifier",
     seed: int,
     rate_Hz: float = 200.0,
@@ -24,22 +24,26 @@ def virtual_sensor(
     """A sensor that plays wandering presses over the whole domain of a forward map.
 
     Args:
-        film: The forward map.
+        forward_map: Charges of the presses.
         noise: Level of the noise model, or an amplifier.
-        seed: Of presses, noise and offsets.
+        seed: Seed of presses, noise and offsets.
         rate_Hz: Frames per second.
-        script: What is pressed instead.
-        options: Of `VirtualSensor`: format, faults, link.
+        script: Presses to play instead of random ones.
+        options: Options of `VirtualSensor`: encode, faults, link.
     """
     from isocharge.serve import VirtualSensor, wander
     from isocharge.simulate import load_amplifier
 
     amplifier = load_amplifier(noise) if isinstance(noise, str) else noise
     presses = script or wander(
-        seed=seed, seconds=SCRIPT_S, rate_Hz=rate_Hz, radius_mm=film.radius * 1e3, force_range_N=film.force_range
+        seed=seed,
+        seconds=SCRIPT_S,
+        rate_Hz=rate_Hz,
+        radius_mm=forward_map.radius * 1e3,
+        force_range_N=forward_map.force_range,
     )
     return VirtualSensor(
-        partial(_charge_pC, film),
+        partial(_charge_pC, forward_map),
         presses,
         noise=_measuring(amplifier, rate_Hz),
         seed=seed,
@@ -47,20 +51,20 @@ def virtual_sensor(
     )
 
 
-def _charge_pC(film: "ForwardMap", x_mm: Any, y_mm: Any, force_N: Any) -> Any:
-    """Charges of presses; below the map's smallest force they fall as a membrane's do, with force to the 2/3."""
-    low = film.force_range[0]
+def _charge_pC(forward_map: "ForwardMap", x_mm: Any, y_mm: Any, force_N: Any) -> Any:
+    """Charges of presses; below the map's smallest force they fall with force to the 2/3, as those of a membrane do."""
+    low = forward_map.force_range[0]
     share = (force_N.clip(max=low) / low) ** (2.0 / 3.0)
-    return film.forward(x_mm * 1e-3, y_mm * 1e-3, force_N.clip(min=low)) * share[:, None] * 1e12
+    return forward_map.forward(x_mm * 1e-3, y_mm * 1e-3, force_N.clip(min=low)) * share[:, None] * 1e12
 
 
 def _measuring(amplifier: "Amplifier", rate_Hz: float) -> Callable[..., Any]:
     """The amplifier as the virtual sensor calls it, in pC; it is switched on with the first block."""
-    at_work: list[Any] = []
+    states: list[Any] = []
 
     def measure(charge_pC: Any, rng: Any) -> Any:
-        if not at_work:
-            at_work.append(amplifier.start(charge_pC.shape[1], rate_Hz, rng))
-        return at_work[0](charge_pC * 1e-12) * 1e12
+        if not states:
+            states.append(amplifier.start(charge_pC.shape[1], rate_Hz, rng))
+        return states[0](charge_pC * 1e-12) * 1e12
 
     return measure

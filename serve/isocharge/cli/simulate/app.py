@@ -9,7 +9,9 @@ from isocharge.cli.simulate.paper import paper_command
 from isocharge.cli.simulate.point import point_command
 from isocharge.cli.simulate.sweep import sweep_command
 
-simulate_app = typer.Typer(no_args_is_help=True, help="From a press to the charges of the electrodes.")
+simulate_app = typer.Typer(
+    no_args_is_help=True, help="Compute the charges of presses, and what charges determine about a press."
+)
 simulate_app.command("point")(point_command)
 simulate_app.command("sweep")(sweep_command)
 simulate_app.command("curves")(curves_command)

@@ -1,4 +1,4 @@
-"""`isocharge simulate identify`: what the charges of a sensor can tell about a press."""
+"""`isocharge simulate identify`: what the charges of a sensor determine about a press."""
 
 import json as json_module
 from math import degrees, isfinite
@@ -7,49 +7,65 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from isocharge.cli.shared.options import PROBE_HELP, SensorArgument
+from isocharge.cli.shared.forward_maps import solve_forward_map, solve_map_to_search
+from isocharge.cli.shared.options import PROBE_HELP, ForceRangeOption, JsonOption, SensorArgument
 from isocharge.cli.shared.terminal import progress, say
 from isocharge.default_scene import DEFAULT_FORCE_RANGE
 from isocharge.errors import InputError
 from isocharge.files import new_folder, refuse_existing, write_whole
 
 if TYPE_CHECKING:
-    from isocharge.simulate import ForwardMap, Probe, Sensor
+    from isocharge.simulate import ForwardMap, Probe
     from isocharge.simulate.identifiability.identification import Identification
 
 PICTURE, NUMBERS = "identify.png", "identify.json"
 """Files in an output folder."""
 
-NOISE_HELP = "Noise of the readings: reference, bench, surgery, or a TOML file with white_pC, proportional."
+NOISE_HELP = "Noise of the readings: reference, bench, surgery, or a TOML file with white_pC and proportional."
 
 
 def identify_command(
     sensor: SensorArgument,
     probe: Annotated[
         list[str] | None,
-        typer.Option("--probe", help=f"{PROBE_HELP} Given again: can the charges tell it from the first?"),
+        typer.Option(
+            "--probe",
+            metavar="SHAPE",
+            help=f"{PROBE_HELP} May be repeated: are the others distinguished from the first? (default: circle:1.0)",
+        ),
     ] = None,
-    force: Annotated[
-        tuple[float, float], typer.Option("--force", metavar="MIN MAX", help="Smallest and largest force, N.")
-    ] = DEFAULT_FORCE_RANGE,
+    force: ForceRangeOption = DEFAULT_FORCE_RANGE,
     noise: Annotated[str, typer.Option("--noise", metavar="LEVEL|FILE.toml", help=NOISE_HELP)] = "reference",
     error: Annotated[
-        float, typer.Option("--error", metavar="MM", help="Position error allowed in the working area at any force.")
+        float, typer.Option("--error", metavar="MM", help="Largest position error in the working area, mm, rms.")
     ] = 1.0,
     radius: Annotated[
         float | None,
-        typer.Option("--radius", help="How far from the centre to look, mm. (default: to the electrodes' far corners)"),
+        typer.Option(
+            "--radius",
+            metavar="MM",
+            help="Distance from the centre up to which presses are looked at, mm. (default: to the electrodes' far "
+            "corners)",
+        ),
     ] = None,
-    size: Annotated[bool, typer.Option("--size", help="Ask whether the charges tell a circle's radius, too.")] = False,
+    size: Annotated[
+        bool, typer.Option("--size", help="Also say how well the charges determine a circle's radius. (default: no)")
+    ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR|PNG", help="Folder for map and numbers, or file for the map."),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DIR|PNG",
+            help="New folder for map and numbers, or new .png file for the map alone. (default: neither)",
+        ),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="The numbers as one JSON object on stdout.")] = False,
+    json: JsonOption = False,
 ) -> None:
-    """What the charges can tell: the least possible errors over the film, where the map folds, and the working area.
+    """Say how well the charges determine a press: smallest errors over the film, ambiguities, working area.
 
-    The errors are Cramer-Rao limits, mm and percent; no unbiased method does better.
+    The errors are Cramer-Rao limits, mm for the position and percent for the force: no unbiased method has smaller
+    ones.
 
     Example: isocharge simulate identify three-25um-biaxial --probe circle:1.0 --error 0.5 -o limits
     """
@@ -59,40 +75,36 @@ def identify_command(
     if output is not None:
         refuse_existing(output)
     if size and probe and not probe[0].startswith("circle"):
-        raise InputError(f"--size: expected a circle first, whose radius is its size, got {probe[0]!r}")
+        raise InputError(f"--size: expected a circle as first --probe, whose radius is its size, got {probe[0]!r}")
     if not (isfinite(error) and error > 0.0):
         raise InputError(f"--error: expected a positive number of mm, got {error}")
-    film_sensor, level = load_sensor(sensor), noise_model(noise)
-    if level.white <= 0.0:
-        raise InputError(f"--noise: expected white noise above 0 pC, got {noise!r}: without it nothing limits")
+    film_sensor, noise_level = load_sensor(sensor), noise_model(noise)
+    if noise_level.white <= 0.0:
+        raise InputError(
+            f"--noise: expected white noise above 0 pC, got {noise!r}: without noise the errors have no lower limit"
+        )
     probes = [parse_probe(text) for text in probe or ["circle:1.0"]]
-    reach = None if radius is None else 1e-3 * radius
-    maps = [_solve(film_sensor, each, force, reach) for each in probes]
-    found = [identify(made, level, error=1e-3 * error) for made in maps]
-    numbers = found[0].to_dict()
-    numbers["other_probes"] = _mistakes(found)
-    numbers["size"] = _size(maps[0], found[0]) if size else []
+    maps = [
+        solve_map_to_search(film_sensor, each, force)
+        if radius is None
+        else solve_forward_map(film_sensor, each, 1e-3 * radius, force)
+        for each in probes
+    ]
+    identifications = [identify(forward_map, noise_level, error=1e-3 * error) for forward_map in maps]
+    numbers = identifications[0].to_dict()
+    numbers["other_probes"] = _confusions(identifications)
+    numbers["size"] = _size(maps[0], identifications[0]) if size else []
     if output is not None:
-        _write(output, found[0], numbers)
+        _write(output, identifications[0], numbers)
     typer.echo(json_module.dumps(numbers) if json else _table(numbers))
-    say(found[0].area.words)
+    say(identifications[0].area.words)
     for row in numbers["other_probes"]:
         say(probe_sentence(row, numbers["probe"]))
     for row in numbers["size"]:
         say(_size_sentence(row))
 
 
-def _solve(sensor: "Sensor", probe: "Probe", force: tuple[float, float], radius: float | None) -> "ForwardMap":
-    from isocharge.simulate import ForwardMap
-    from isocharge.simulate.identifiability.identification import map_to_search
-
-    with progress(f"solving the film under {probe.notation}") as advance:
-        if radius is None:
-            return map_to_search(sensor, probe, force, advance)
-        return ForwardMap.build(sensor, probe, radius, force, progress=advance)
-
-
-def _mistakes(found: "list[Identification]") -> list[dict[str, Any]]:
+def _confusions(identifications: "list[Identification]") -> list[dict[str, Any]]:
     """Each of the other probes taken for the first."""
     from isocharge.simulate.identifiability.probe_discrimination import (
         explain_with_other_probe,
@@ -100,12 +112,13 @@ def _mistakes(found: "list[Identification]") -> list[dict[str, Any]]:
         spread_contacts,
     )
 
-    first, rows = found[0], []
-    for other in found[1:]:
+    first, rows = identifications[0], []
+    for other in identifications[1:]:
         reach = min(first.area.radius, other.area.radius)
         for force in inner_forces(first.area.force_range) if reach else ():
-            taken = explain_with_other_probe(other.charges, first.charges, first.noise, spread_contacts(reach, force))
-            rows.append({"probe": _name(other.probe), "within_mm": 1e3 * reach, **taken.to_dict()})
+            contacts = spread_contacts(reach, force)
+            confusion = explain_with_other_probe(other.charges, first.charges, first.noise, contacts)
+            rows.append({"probe": _name(other.probe), "within_mm": 1e3 * reach, **confusion.to_dict()})
     return rows
 
 
@@ -114,13 +127,14 @@ def _name(probe: "Probe") -> str:
     return probe.notation + (f"@{degrees(probe.angle):.4g}" if probe.angle else "")
 
 
-def _size(made: "ForwardMap", found: "Identification") -> list[dict[str, Any]]:
-    """How well the charges tell a circle's radius."""
+def _size(forward_map: "ForwardMap", identification: "Identification") -> list[dict[str, Any]]:
+    """How well the charges determine a circle's radius."""
     from isocharge.simulate.identifiability.probe_discrimination import radius_limits
 
-    forces, reach = [each.force for each in found.maps], found.area.radius
+    forces, reach = [limits.force for limits in identification.maps], identification.area.radius
     with progress("solving the film under other radii") as advance:
-        return [told.to_dict() for told in radius_limits(made, found.charges, found.noise, forces, reach, advance)]
+        limits = radius_limits(forward_map, identification.charges, identification.noise, forces, reach, advance)
+        return [limit.to_dict() for limit in limits]
 
 
 def _table(numbers: dict[str, Any]) -> str:
@@ -157,13 +171,14 @@ def _size_sentence(row: dict[str, Any]) -> str:
     )
 
 
-def _write(output: Path, found: "Identification", numbers: dict[str, Any]) -> None:
-    from isocharge.simulate.plots.limit_map import draw_identification
+def _write(output: Path, identification: "Identification", numbers: dict[str, Any]) -> None:
+    from isocharge.simulate.plots.figure import picture_bytes
+    from isocharge.simulate.plots.limit_map import identification_picture
 
-    text = json_module.dumps(numbers, indent=1).encode()
+    picture = picture_bytes(identification_picture(identification))
     if output.suffix == ".png":
-        write_whole(output, draw_identification(found))
+        write_whole(output, picture)
         return
     with new_folder(output) as folder:
-        (folder / PICTURE).write_bytes(draw_identification(found))
-        (folder / NUMBERS).write_bytes(text)
+        (folder / PICTURE).write_bytes(picture)
+        (folder / NUMBERS).write_bytes(json_module.dumps(numbers, indent=1).encode())

@@ -3,12 +3,21 @@
 import json as json_module
 from contextlib import AbstractContextManager
 from enum import StrEnum
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.shared.options import SensorArgument, auto_radius, number_mm
+from isocharge.cli.shared.forward_maps import sweep_radius
+from isocharge.cli.shared.options import (
+    PROBE_HELP,
+    ForceRangeOption,
+    FreshOption,
+    NewFolderOption,
+    RadiusOption,
+    SensorArgument,
+    WorkersOption,
+    most_workers,
+)
 from isocharge.cli.shared.terminal import progress_rows, say
 from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import InputError
@@ -16,21 +25,19 @@ from isocharge.errors import InputError
 if TYPE_CHECKING:
     from isocharge.simulate.execution.workers import Workers
 
-MOST_WORKERS = 64
-
 SWEEP_ROWS = (("solving the film", "solves"), ("pressing", "presses"))
-"""Titles and units of a sweep's progress."""
+"""Titles and units of the progress bars of a sweep."""
 
 
 class Orientation(StrEnum):
-    """How probes are turned in a sweep."""
+    """Angle of the probe in each press."""
 
     fixed = "fixed"
     random = "random"
 
 
 class Sampling(StrEnum):
-    """How the presses of a sweep are spread."""
+    """How the presses of a sweep spread over positions and forces."""
 
     sobol = "sobol"
     random = "random"
@@ -39,39 +46,36 @@ class Sampling(StrEnum):
 
 def sweep_command(
     sensor: SensorArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Dataset folder to make.")],
+    output: NewFolderOption,
     probe: Annotated[
-        list[str] | None, typer.Option("--probe", help="What presses; may be given again. (default: circle:1.0)")
+        list[str] | None,
+        typer.Option("--probe", metavar="SHAPE", help=f"{PROBE_HELP} May be repeated. (default: circle:1.0)"),
     ] = None,
-    radius: Annotated[
-        str,
-        typer.Option(
-            "--radius", metavar="MM|auto", help="Largest distance from the centre, mm, or auto: the working area's."
-        ),
-    ] = f"{1e3 * DEFAULT_RADIUS}",
-    force: Annotated[
-        tuple[float, float], typer.Option("--force", metavar="MIN MAX", help="Smallest and largest force, N.")
-    ] = DEFAULT_FORCE_RANGE,
-    samples: Annotated[int, typer.Option("--samples", help="How many presses.")] = 20_000,
+    radius: RadiusOption = f"{1e3 * DEFAULT_RADIUS}",
+    force: ForceRangeOption = DEFAULT_FORCE_RANGE,
+    samples: Annotated[int, typer.Option("--samples", help="Number of presses, of all probes together.")] = 20_000,
     orientation: Annotated[
-        Orientation, typer.Option("--orientation", help="Turn the probe further in each press.")
+        Orientation, typer.Option("--orientation", help="Angle of the probe: as given, or a random one in each press.")
     ] = Orientation.fixed,
     sampling: Annotated[
-        Sampling, typer.Option("--sampling", help="How the presses are spread; a grid takes at most --samples.")
-    ] = Sampling.sobol,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the presses.")] = 0,
-    workers: Annotated[
-        int | None,
+        Sampling,
         typer.Option(
-            "--workers", min=1, max=MOST_WORKERS, help="Processes; the data do not depend on them. (default: cores)"
+            "--sampling", help="How presses spread over positions and forces; a grid has at most --samples of them."
+        ),
+    ] = Sampling.sobol,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the presses; the same seed, the same data.")] = 0,
+    workers: WorkersOption = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            "--cluster",
+            metavar="ADDRESS",
+            help="Dask scheduler to use instead, like tcp://10.0.0.1:8786. (default: no)",
         ),
     ] = None,
-    cluster: Annotated[
-        str | None, typer.Option("--cluster", metavar="ADDR", help="Dask cluster instead, as tcp://10.0.0.1:8786.")
-    ] = None,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Throw away what a stopped run left.")] = False,
+    fresh: FreshOption = False,
 ) -> None:
-    """Simulate many presses, spread over the working area and the forces, and write them as a dataset.
+    """Simulate many presses, spread over positions and forces, and write their charges as a dataset for training.
 
     A run that was stopped or killed leaves DIR.part; the same command goes on from there and writes the same bytes.
 
@@ -84,7 +88,7 @@ def sweep_command(
         raise InputError("expected either --workers or --cluster, got both")
     film_sensor, probes = load_sensor(sensor), [parse_probe(text) for text in probe or ["circle:1.0"]]
     refuse_finished(output)
-    reach = auto_radius(film_sensor, probes, force) if radius == "auto" else 1e-3 * number_mm(radius)
+    reach = sweep_radius(radius, film_sensor, probes, force)
     sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)
     try:
         with _workers(workers, cluster) as crew, progress_rows(*SWEEP_ROWS) as (solving, sampled):
@@ -99,12 +103,12 @@ def sweep_command(
             )
     except KeyboardInterrupt:
         if (part := output.with_name(f"{output.name}.part")).exists():
-            say(f"stopped; what is done is kept in {part}, and the same command goes on")
+            say(f"stopped; what is done is kept in {part}, and the same command goes on from there")
         raise
     say(f"{json_module.loads((output / 'manifest.json').read_text())['samples']} presses in {output}")
 
 
 def _workers(workers: int | None, cluster: str | None) -> AbstractContextManager["Workers"]:
-    from isocharge.simulate.execution.workers import cores, dask_workers, local_workers
+    from isocharge.simulate.execution.workers import dask_workers, local_workers
 
-    return dask_workers(cluster) if cluster else local_workers(workers or min(cores(), MOST_WORKERS))
+    return dask_workers(cluster) if cluster else local_workers(most_workers(workers))

@@ -5,6 +5,6 @@ import typer
 from isocharge.cli.train.fit import fit_command
 from isocharge.cli.train.report import report_command
 
-train_app = typer.Typer(no_args_is_help=True, help="From a dataset to a model.")
+train_app = typer.Typer(no_args_is_help=True, help="Train models on simulated charges; compare methods.")
 train_app.command("fit")(fit_command)
 train_app.command("report")(report_command)

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.shared.options import PROBE_HELP, auto_radius, number_mm
+from isocharge.cli.shared.forward_maps import sweep_radius
+from isocharge.cli.shared.options import PROBE_HELP, ConfigOption, FreshOption, RadiusOption
 from isocharge.cli.shared.terminal import progress, say, this_command
 from isocharge.default_scene import DEFAULT_RADIUS
 from isocharge.errors import InputError
@@ -17,39 +18,44 @@ if TYPE_CHECKING:
     from isocharge.train import Release
 
 SAMPLES = 24_000
-"""Presses that are simulated where no dataset is given."""
+"""Number of presses that are simulated if no dataset is given."""
 
 
 def fit_command(
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="models/NAME", help="Model folder; its name is the model's.")
+        Path,
+        typer.Option("--output", "-o", metavar="models/NAME", help="Model folder; its name becomes the model's name."),
     ],
     dataset: Annotated[
-        Path | None, typer.Argument(metavar="[DATASET]", help="Dataset folder, as `simulate sweep` makes it.")
+        Path | None,
+        typer.Argument(metavar="[DATASET]", help="Dataset folder of `isocharge simulate sweep`. (default: --sensor)"),
     ] = None,
     sensor: Annotated[
-        str | None, typer.Option("--sensor", help="Simulate 24,000 presses on this sensor instead, 0.05 to 2 N.")
+        str | None,
+        typer.Option(
+            "--sensor",
+            metavar="SENSOR",
+            help="Simulate 24,000 presses on this sensor instead, from 0.05 to 2 N; a built-in name or a TOML file. "
+            "(default: DATASET)",
+        ),
     ] = None,
     probe: Annotated[
         list[str] | None,
-        typer.Option("--probe", help=f"With --sensor: {PROBE_HELP} May be given again. (default: circle:1.0)"),
-    ] = None,
-    radius: Annotated[
-        str,
         typer.Option(
-            "--radius",
-            metavar="MM|auto",
-            help="With --sensor: largest distance from the centre, mm, or auto.",
+            "--probe", metavar="SHAPE", help=f"With --sensor: {PROBE_HELP} May be repeated. (default: circle:1.0)"
         ),
-    ] = f"{1e3 * DEFAULT_RADIUS}",
-    config: Annotated[
-        Path | None, typer.Option("--config", metavar="FILE", help="Training configuration, TOML. (default: built in)")
     ] = None,
-    version: Annotated[int, typer.Option("--version", min=1, help="Number of the version folder to make.")] = 1,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Throw away what a stopped run left.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object: folder and measured errors.")] = False,
+    radius: RadiusOption = f"{1e3 * DEFAULT_RADIUS}",
+    config: ConfigOption = None,
+    version: Annotated[int, typer.Option("--version", min=1, help="Version of the model: the folder in NAME.")] = 1,
+    fresh: FreshOption = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the folder and the measured errors as one JSON object. (default: no)")
+    ] = False,
 ) -> None:
-    """Train a network, export it as ONNX, measure it, and write the model folder with its card.
+    """Train a network on charges, measure its errors, and write a model folder: ONNX file, card, golden vectors.
+
+    The presses come from DATASET, or are simulated first: --probe and --radius say how, and belong to --sensor.
 
     A run that was stopped or killed leaves models/NAME/VERSION.part; the same command goes on from there and makes the
     same model.
@@ -57,7 +63,7 @@ def fit_command(
     Example: isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
     """
     if (dataset is None) == (sensor is None):
-        raise InputError("train fit: expected either a DATASET folder or --sensor SENSOR, not both and not neither")
+        raise InputError(f"expected either a DATASET folder or --sensor SENSOR, got {'both' if dataset else 'neither'}")
     from isocharge.train import load_config, train_model
 
     refuse_existing(output / str(version))
@@ -73,11 +79,11 @@ def fit_command(
                 version=version,
                 fresh=fresh,
                 progress=advance,
-                warn=lambda words: say(f"caution: {words}"),
+                warn=lambda message: say(f"caution: {message}"),
             )
     except KeyboardInterrupt:
         if (part := output / f"{version}.part").exists():
-            say(f"stopped; what is done is kept in {part}, and the same command goes on")
+            say(f"stopped; what is done is kept in {part}, and the same command goes on from there")
         raise
     if json:
         typer.echo(json_module.dumps({"folder": str(release.folder), "errors": dict(release.metadata.errors)}))
@@ -91,13 +97,13 @@ def _read(folder: Path) -> "Dataset":
 
 
 def _simulate(sensor: str, probes: list[str], radius: str) -> "Dataset":
-    """A sweep with its defaults, kept only as long as it is needed; a few seconds, so in this process."""
+    """A sweep with its defaults, deleted once it is read; it takes a few seconds, so one process is enough."""
     from tempfile import TemporaryDirectory
 
     from isocharge.simulate import Sweep, SweepCallbacks, load_sensor, parse_probe, read_dataset, run_sweep
 
     film_sensor, pressing, forces = load_sensor(sensor), [parse_probe(text) for text in probes], Sweep().force_range
-    reach = auto_radius(film_sensor, pressing, forces) if radius == "auto" else 1e-3 * number_mm(radius)
+    reach = sweep_radius(radius, film_sensor, pressing, forces)
     with TemporaryDirectory() as folder, progress("solving the film") as advance:
         sweep = Sweep(reach, samples=SAMPLES)
         return read_dataset(

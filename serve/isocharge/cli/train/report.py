@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from isocharge.cli.shared.options import NewFolderOption
 from isocharge.cli.shared.terminal import progress, say, this_command
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing
@@ -13,38 +14,40 @@ from isocharge.files import refuse_existing
 
 def report_command(
     datasets: Annotated[
-        list[Path], typer.Argument(metavar="DATASET...", help="Folders as `simulate sweep` makes them.")
+        list[Path], typer.Argument(metavar="DATASET...", help="Dataset folders of `isocharge simulate sweep`.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to make, with report.md.")],
+    output: NewFolderOption,
     model: Annotated[
         list[str] | None,
         typer.Option(
             "--model",
-            help="Released model to compare, once for each DATASET; name or path. (default: the sensor's name)",
+            metavar="MODEL",
+            help="Model to compare, name or path; once for each DATASET. (default: the one named as the sensor)",
         ),
     ] = None,
     quick: Annotated[
         bool,
-        typer.Option("--quick", help="Everything small, in half a minute, to try it out; its figures mean nothing."),
+        typer.Option("--quick", help="Try it out on little data, in half a minute; its figures mean nothing."),
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the record, as in report.json.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the record, as in report.json. (default: no)")] = False,
 ) -> None:
-    """Every method on the same noisy presses: error (mm, % of force) against time (us), throughput and memory (bytes).
+    """Compare a model with other methods: error (mm, % of force) against time (us), throughput and memory (bytes).
 
-    Takes some minutes for a dataset of 24,000 presses. Nothing else should run meanwhile: times are measured.
+    All methods answer the same noisy presses. It takes some minutes for a dataset of 24,000 presses. Let nothing else
+    run meanwhile: times are measured.
 
     Example: isocharge train report presses -o report
     """
     refuse_existing(output)
     if model and len(model) != len(datasets):
-        raise InputError(f"--model: expected one for each of {len(datasets)} datasets, got {len(model)}")
+        raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
     from isocharge.serve import find_model
     from isocharge.simulate import read_dataset
     from isocharge.train.report import QUICK, Settings, write_report
 
-    read = [read_dataset(folder) for folder in datasets]
-    names = model or [dataset.sensor.name for dataset in read]
-    subjects = [(dataset, find_model(name)) for dataset, name in zip(read, names, strict=True)]
+    loaded = [read_dataset(folder) for folder in datasets]
+    names = model or [dataset.sensor.name for dataset in loaded]
+    subjects = [(dataset, find_model(name)) for dataset, name in zip(loaded, names, strict=True)]
     with progress("report") as advance:
         record = write_report(
             output, subjects, QUICK if quick else Settings(), command=this_command(), progress=advance

@@ -58,7 +58,7 @@ def check_picture(path: Path) -> None:
 
 def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
     """A figure as PNG, SVG or PDF; the same figure gives the same bytes."""
-    dates: dict[str, str | None] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
+    dates: dict[str, None] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
     buffer = BytesIO()
     with rc_context({"svg.hashsalt": "isocharge", "svg.fonttype": "none"}):
         figure.savefig(buffer, format=kind, dpi=DPI, metadata=dates)

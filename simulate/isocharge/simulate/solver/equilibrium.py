@@ -4,14 +4,15 @@ The film is round and its elasticity isotropic, so every press is solved on the 
 read: one equilibrium serves all angles, electrode layouts and piezoelectric coefficients.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from isocharge.arrays import Array, Complexes, Integers
 from isocharge.errors import SceneError
+from isocharge.json_values import finite_or_none
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mechanics.stress import principal_stresses, strain, stress, turn_stress
 from isocharge.simulate.mechanics.theory import Theory, bending_length, modelling_error
@@ -68,6 +69,20 @@ class Equilibrium:
     residual: float
     seconds: float
     proven_error: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: deflection under the probe, theory, estimated error, and how the solve went."""
+        return {
+            "deflection_mm": 1e3 * float(self.deflection(np.array([self.at]))[0]),
+            "theory": self.theory.name,
+            "status": self.status,
+            "iterations": self.iterations,
+            "residual": self.residual,
+            "seconds": self.seconds,
+            "estimated_error": finite_or_none(self.estimated_error),
+            "groups": {**asdict(self.groups), "bending_length": self.bending_length},
+            "warnings": list(self.warnings),
+        }
 
     @property
     def estimated_error(self) -> float:
