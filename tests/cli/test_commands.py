@@ -84,6 +84,10 @@ def test_a_point_as_json(command):
     assert report["deflection_mm"] == pytest.approx(2.812061, rel=1e-4)  # collocation, tests/data/film_cases.json
     assert report["charge_pC"]["A"] == pytest.approx(848, rel=1e-3)
     assert report["status"] == "converged"
+    assert report["groups"]["bending_length"] > 0.0
+    assert ["MPa" in warning for warning in report["warnings"]] == [True]
+    assert report["estimated_error"] < 1e-3
+    assert next(iter(report)) == "charge_pC"
 
 
 def test_a_point_as_a_table(command):

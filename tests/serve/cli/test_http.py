@@ -126,7 +126,7 @@ def test_bad_starts(start, models, tmp_path):
             (start("--host", "0.0.0.0"), 2, "InputError: --host 0.0.0.0 lets other machines in: give --token TOKEN"),
             (start("--uds", "x", "--host", "0.0.0.0", "--grpc-port", 0), 2, "InputError: --host 0.0.0.0 lets other"),
             (start("--token", ""), 2, "InputError: token: expected printable ASCII"),
-            (start("--tls-key", "x"), 2, "InputError: --tls-key: expected --tls-cert with it"),
+            (start("--tls-key", "x"), 2, "InputError: --tls-key: expected --tls-cert too"),
             (start("--tls-cert", tmp_path / "cert.pem"), 2, f"InputError: {tmp_path}/cert.pem: not a certificate"),
             (start("--tls-cert", tmp_path / "none.pem"), 2, f"InputError: {tmp_path}/none.pem: not a certificate"),
             (start(folder=tmp_path / "empty"), 2, f"ModelError: {tmp_path}/empty: expected models"),

@@ -28,7 +28,7 @@ def fit_command(
     ],
     dataset: Annotated[
         Path | None,
-        typer.Argument(metavar="[DATASET]", help="Dataset folder of `isocharge simulate sweep`. (default: --sensor)"),
+        typer.Argument(metavar="DATASET", help="Dataset folder of `isocharge simulate sweep`. (default: --sensor)"),
     ] = None,
     sensor: Annotated[
         str | None,

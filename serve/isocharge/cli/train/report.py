@@ -27,7 +27,9 @@ def report_command(
     ] = None,
     quick: Annotated[
         bool,
-        typer.Option("--quick", help="Try it out on little data, in half a minute; its figures mean nothing."),
+        typer.Option(
+            "--quick", help="Try it on little data, in half a minute; the figures mean nothing. (default: all data)"
+        ),
     ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the record, as in report.json. (default: no)")] = False,
 ) -> None:
