@@ -1,7 +1,7 @@
 """The command `isocharge`: the composition root, the only part that sees all stages.
 
 Each stage has its commands in a package here, one file a command; a command imports its stage when it runs, so that
-help is instant. Data go to stdout, words for people to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage or input.
+help is instant. Data go to stdout, messages for people to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage or input.
 """
 
 import signal

@@ -160,7 +160,7 @@ def _tare_on_signal(live: "RecordedStream") -> Iterator[None]:
 
 @contextmanager
 def _log_to_stderr() -> Iterator[None]:
-    """Warnings of the live path are words for people."""
+    """Print warnings of the live path for people."""
     handler = logging.StreamHandler()
     logger = logging.getLogger("isocharge.serve")
     logger.addHandler(handler)

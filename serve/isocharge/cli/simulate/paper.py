@@ -1,4 +1,4 @@
-"""`isocharge simulate paper`: Mirbagheri et al. (2007) with our numbers beside the paper's."""
+"""`isocharge simulate paper`: Mirbagheri et al. (2007), our numbers next to the paper's."""
 
 import time
 from typing import Annotated
@@ -20,7 +20,7 @@ def paper_command(
     ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the numbers, as in paper.json. (default: no)")] = False,
 ) -> None:
-    """Reproduce Mirbagheri et al. (2007): its figures and numbers with ours beside them, and why they differ.
+    """Reproduce Mirbagheri et al. (2007): its figures and numbers next to ours, and why they differ.
 
     Writes paper.md, paper.json and each figure (mm, pC, N) as PNG and SVG into a new folder.
 

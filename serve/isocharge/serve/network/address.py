@@ -1,4 +1,4 @@
-"""Where a server listens: a TCP address or a Unix socket, safe unless told otherwise."""
+"""Where a server listens: a TCP address or a Unix socket; by default only this machine can connect."""
 
 import contextlib
 import errno
@@ -11,11 +11,12 @@ from pathlib import Path
 
 from isocharge.errors import InputError, ListenError
 
-WHY = {
+ADVICE = {
     errno.EADDRINUSE: "another program listens there; stop it or choose another port",
-    errno.EADDRNOTAVAIL: "this machine has no such address; choose one of its own",
+    errno.EADDRNOTAVAIL: "this machine has no such address; choose one that it has",
     errno.EACCES: "this user may not listen there; choose another place, or a port above 1023",
 }
+"""Reason and advice for each error of the system."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Address:
         except OSError as error:
             if isinstance(error, ListenError):
                 raise
-            why = WHY.get(error.errno or 0, error.strerror or str(error))
+            why = ADVICE.get(error.errno or 0, error.strerror or str(error))
             raise ListenError(f"cannot listen on {self.uds or f'{self.host}:{self.port}'}: {why}") from error
 
     def release(self) -> None:
@@ -57,7 +58,7 @@ class Address:
             self.uds.unlink(missing_ok=True)
 
     def url(self, listening: socket.socket, *, secure: bool) -> str:
-        """What to tell clients; a Unix socket's is its path, as curl's `--unix-socket` takes it."""
+        """The URL for clients; of a Unix socket its path, as curl's `--unix-socket` takes it."""
         if self.uds:
             return f"unix:{self.uds}"
         host = f"[{self.host}]" if ":" in self.host else self.host
@@ -76,7 +77,7 @@ def check_exposure(address: Address, *, token: bool, insecure: bool) -> None:
     """Refuse to serve others than this machine by accident.
 
     Raises:
-        InputError: If the address is open to others and there is neither a token nor leave to go without.
+        InputError: If the address is open to others and there is neither a token nor `insecure`.
     """
     if not (address.is_private or token or insecure):
         raise InputError(
@@ -87,16 +88,16 @@ def check_exposure(address: Address, *, token: bool, insecure: bool) -> None:
 
 def _listen_tcp(host: str, port: int, backlog: int) -> socket.socket:
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        infos = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (socket.gaierror, UnicodeError) as error:
         raise ListenError(f"cannot listen on {host}:{port}: no such host ({error})") from error
-    family, kind, protocol, _, place = min(found, key=lambda info: info[0] != socket.AF_INET)  # localhost is 127.0.0.1
-    return _bound(socket.socket(family, kind, protocol), place, backlog)
+    family, kind, protocol, _, place = min(infos, key=lambda info: info[0] != socket.AF_INET)  # localhost is 127.0.0.1
+    return _listening(socket.socket(family, kind, protocol), place, backlog)
 
 
-def _bound(listening: socket.socket, place: object, backlog: int) -> socket.socket:
+def _listening(listening: socket.socket, place: object, backlog: int) -> socket.socket:
     try:
-        # A port whose last user was killed is free at once; one that somebody listens on stays refused.
+        # A port whose last user was killed is free at once; a port on which a program listens stays refused.
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind(place)  # type: ignore[arg-type]
         listening.listen(backlog)
@@ -110,7 +111,7 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
     _remove_stale(path)
     before = os.umask(0o177)
     try:
-        return _bound(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM), str(path), backlog)
+        return _listening(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM), str(path), backlog)
     finally:
         os.umask(before)
 

@@ -1,9 +1,9 @@
 """The models that a server serves: every version of every model of its folders, loaded, checked, replaced whole.
 
-A version is checked as far as it can be before anybody is answered with it: checksum, metadata, shapes, and the golden
-vectors computed anew. One that fails is refused with the reason, and the others serve on. To load a model again reads
-its files into new sessions and then changes one reference: a request that is under way finishes with the version it
-began with, and a version whose new files are refused goes on with the old ones.
+A version is checked before it answers: checksum, metadata, shapes, and the golden vectors, which are computed again. A
+version that fails is refused with the reason, and the others go on serving. To load a model again reads its files into
+new sessions and then changes one reference: a request that has begun finishes with its version, and a version whose new
+files are refused goes on with the old ones.
 """
 
 import threading
@@ -34,7 +34,7 @@ class LoadedVersion:
     _own: threading.local = field(default_factory=threading.local, repr=False)
 
     def press(self) -> BoundPress:
-        """Bound memory for one press, the calling thread's own."""
+        """Bound memory for one press; each thread has its own."""
         try:
             return self._own.press  # type: ignore[no-any-return]
         except AttributeError:
@@ -44,7 +44,7 @@ class LoadedVersion:
 
 @dataclass(frozen=True)
 class ModelVersions:
-    """What is known of one model: the versions that serve, and why others do not (version to reason)."""
+    """The versions of one model that serve, and why others do not (version to reason)."""
 
     versions: Mapping[int, LoadedVersion]
     refused: Mapping[int, str]
@@ -66,25 +66,25 @@ class IndexRow:
 
 
 class ModelStore:
-    """Models by name and version. Reading is for any thread; loading and unloading take their turn."""
+    """Models by name and version. Any thread may read; loads and unloads run one after another."""
 
     def __init__(self, folders: Callable[[], Mapping[str, Path]]) -> None:
         """Load everything.
 
         Args:
-            folders: Model name to model folder, asked anew for each load and index.
+            folders: Gives model name to model folder; called for each load and index.
 
         Raises:
-            ModelError: If there is no model, or none that is sound.
+            ModelError: If there is no model, or no version passes its checks.
         """
         self._folders = folders
         self._turn = threading.Lock()
         self._entries: dict[str, ModelVersions] = {}
         self._answering: dict[tuple[str, str], LoadedVersion] = {}
         for name, folder in folders().items():
-            self._put(name, _read_entry(name, folder, {}))
+            self._put(name, _load_versions(name, folder, {}))
         if not self._answering:
-            raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'there is none'}")
+            raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'no model was found'}")
 
     def get(self, name: str, version: str = "") -> LoadedVersion:
         """The model to answer with; the highest version if none is given.
@@ -92,16 +92,16 @@ class ModelStore:
         Raises:
             ModelNotFound: If it does not serve; the message says what does.
         """
-        served = self._answering.get((name, version))
-        if served is None:
-            asked = f"{name}/{version}" if version else name
+        loaded = self._answering.get((name, version))
+        if loaded is None:
+            label = f"{name}/{version}" if version else name
             serving = ", ".join(sorted(s.metadata.label for s in self.all())) or "no model"
-            raise ModelNotFound(f"model {asked!r:.200} is not found; serving: {serving}")
-        return served
+            raise ModelNotFound(f"model {label!r:.200} is not found; serving: {serving}")
+        return loaded
 
     def all(self) -> list[LoadedVersion]:
         """Every version that serves, by name and version."""
-        return [served for _, entry in sorted(self._entries.items()) for _, served in sorted(entry.versions.items())]
+        return [loaded for _, entry in sorted(self._entries.items()) for _, loaded in sorted(entry.versions.items())]
 
     def named(self, name: str) -> list[LoadedVersion]:
         """Every version of one model that serves, ascending.
@@ -110,7 +110,7 @@ class ModelStore:
             ModelNotFound: If none does.
         """
         self.get(name)
-        return [served for served in self.all() if served.metadata.name == name]
+        return [loaded for loaded in self.all() if loaded.metadata.name == name]
 
     def versions(self, name: str) -> list[str]:
         """Versions of a model that serve, ascending."""
@@ -130,21 +130,21 @@ class ModelStore:
         """Read a model's files again and put all its versions in place of the old ones.
 
         Raises:
-            ModelNotFound: If there is no such model in the folders.
-            ModelError: If a version is refused; the sound ones serve, and an old one stays in place of a refused one.
+            ModelNotFound: If the folders hold no such model.
+            ModelError: If a version is refused; the others serve, and the old files of the refused one go on serving.
         """
         with self._turn:
             folder = self._folders().get(name)
             if folder is None:
                 raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
             known = self._entries.get(name)
-            entry = _read_entry(name, folder, known.versions if known else {})
+            entry = _load_versions(name, folder, known.versions if known else {})
             self._put(name, entry)
         if entry.refused:
             raise ModelError("; ".join(reason for _, reason in sorted(entry.refused.items())))
 
     def unload(self, name: str) -> None:
-        """Take a model off; requests that are under way finish.
+        """Stop serving a model; requests that have begun finish.
 
         Raises:
             ModelNotFound: If it does not serve.
@@ -155,9 +155,9 @@ class ModelStore:
             self._put(name, ModelVersions({}, dict.fromkeys(versions, UNLOADED)))
 
     def _put(self, name: str, entry: ModelVersions) -> None:
-        """Change what serves in two assignments, each seen whole by whoever reads."""
-        answering = {key: served for key, served in self._answering.items() if key[0] != name}
-        answering |= {(name, str(version)): served for version, served in entry.versions.items()}
+        """Change what serves in two assignments, so that a reader sees each change whole."""
+        answering = {key: loaded for key, loaded in self._answering.items() if key[0] != name}
+        answering |= {(name, str(version)): loaded for version, loaded in entry.versions.items()}
         if entry.latest is not None:
             answering[name, ""] = entry.latest
         self._answering = answering
@@ -168,7 +168,7 @@ def open_model_store(models: Path | None = None) -> ModelStore:
     """The models of one folder; without it, of every place where `find_model` looks, the first place winning.
 
     Raises:
-        ModelError: If `models` is not a folder, holds no model, or none that is sound.
+        ModelError: If `models` is not a folder, holds no model, or none passes its checks.
     """
     roots = [models] if models is not None else repositories()
     if models is not None and not model_names(models):
@@ -177,12 +177,12 @@ def open_model_store(models: Path | None = None) -> ModelStore:
     return ModelStore(lambda: MappingProxyType({n: root / n for root in reversed(roots) for n in model_names(root)}))
 
 
-def _read_entry(name: str, folder: Path, old: Mapping[int, LoadedVersion]) -> ModelVersions:
-    """Load every version; one that is refused leaves the old one where it was."""
+def _load_versions(name: str, folder: Path, old: Mapping[int, LoadedVersion]) -> ModelVersions:
+    """Load every version; in place of a refused one, the old one stays."""
     versions, refused = {}, {}
     for version, path in version_folders(folder).items():
         try:
-            versions[version] = _read(name, version, path)
+            versions[version] = _load_version(name, version, path)
         except ModelError as error:
             refused[version] = str(error)
             if version in old:
@@ -190,12 +190,12 @@ def _read_entry(name: str, folder: Path, old: Mapping[int, LoadedVersion]) -> Mo
     return ModelVersions(versions, refused)
 
 
-def _read(name: str, version: int, folder: Path) -> LoadedVersion:
+def _load_version(name: str, version: int, folder: Path) -> LoadedVersion:
     model = load_model(folder)
     if (model.metadata.name, model.metadata.version) != (name, version):
         raise ModelError(
             f"{folder}: expected the model {name}/{version}, as the folders say, got {model.metadata.label}; "
-            "move it into folders of its own name and version"
+            "move it into folders of that name and version"
         )
     check_golden(model)
     return LoadedVersion(model, model.metadata, str(version))

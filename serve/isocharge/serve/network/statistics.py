@@ -1,4 +1,4 @@
-"""How often a served model was asked, and where the time went: the counters of Triton's statistics extension."""
+"""Requests to a model, and the time they took: the counters of Triton's statistics extension."""
 
 import threading
 import time
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 STAGES = ("compute_input", "compute_infer", "compute_output")
-"""Reading the request, running the model, writing the answer."""
+"""Triton's names for reading the request, running the model, writing the answer."""
 
 
 @dataclass
@@ -15,10 +15,10 @@ class Statistics:
 
     Attributes:
         presses: Rows that were answered.
-        answered, refused: Requests.
+        answered, refused: Numbers of requests.
         stages_ns: Time spent on the answered ones in each of STAGES.
         refused_ns: Time spent on the others.
-        last_ms: When the last one was answered, unix time.
+        last_ms: Time of the last answer, unix time, ms.
     """
 
     presses: int = 0
@@ -30,7 +30,7 @@ class Statistics:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def succeeded(self, presses: int, stages_ns: tuple[int, int, int]) -> None:
-        """A request for so many presses was answered; `stages_ns` in the order of STAGES."""
+        """Count an answered request: its number of presses, and its time in each of STAGES."""
         spent = self.stages_ns
         with self._lock:
             self.presses += presses
@@ -41,13 +41,13 @@ class Statistics:
             self.last_ms = time.time_ns() // 1_000_000
 
     def failed(self, ns: int) -> None:
-        """A request was refused after so long."""
+        """Count a refused request and the time that it took."""
         with self._lock:
             self.refused += 1
             self.refused_ns += ns
 
     def to_json(self) -> dict[str, Any]:
-        """The counters as Triton words them; nothing queues here."""
+        """The counters under Triton's names; no request waits in a queue."""
         with self._lock:
             spent = dict(zip(STAGES, self.stages_ns, strict=True)) | {"queue": 0, "success": sum(self.stages_ns)}
             durations = {name: {"count": self.answered, "ns": ns} for name, ns in spent.items()}

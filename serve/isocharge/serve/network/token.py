@@ -27,5 +27,5 @@ class Token:
             TokenError: If it does not carry the token.
         """
         if not hmac.compare_digest(authorization, self._expected):
-            said = "a wrong one" if authorization else "none"
-            raise TokenError(f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {said}")
+            sent = "a wrong one" if authorization else "none"
+            raise TokenError(f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {sent}")

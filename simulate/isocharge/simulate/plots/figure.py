@@ -1,4 +1,4 @@
-"""Figures without a window: colours, sizes, and how they become files. Every picture of isocharge is made with it.
+"""Figures without a window: colours, sizes, and how they become files. Every picture of isocharge uses it.
 
 It needs matplotlib, so it is imported only where a picture is drawn.
 """
@@ -48,7 +48,7 @@ def check_picture(path: Path) -> None:
     """Check the name of a picture before anything is computed.
 
     Raises:
-        InputError: If its suffix is none of FORMATS.
+        InputError: If its suffix is not one of FORMATS.
         OutputExists: If the file exists.
     """
     if path.suffix.lstrip(".").lower() not in FORMATS:

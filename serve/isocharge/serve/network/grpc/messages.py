@@ -1,6 +1,6 @@
-"""The protocol's messages as classes, made from the compiled `inference.proto`.
+"""The protocol's messages as classes, built from the compiled `inference.proto`.
 
-They live in a pool of their own, so that a program may use this server and another implementation of the same protocol,
+They live in a separate pool, so that a program may use this server and another implementation of the same protocol,
 whose messages have the same names, side by side.
 """
 

@@ -1,4 +1,4 @@
-"""The gRPC server: threads of its own beside the HTTP server, the same models, limits, token and certificate."""
+"""The gRPC server: separate threads, but the models, limits, token and certificate of the HTTP server."""
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +13,7 @@ from isocharge.serve.network.tls import Tls
 from isocharge.serve.network.token import Token
 
 THREADS, GRACE_SECONDS = 4, 10
-"""Requests answered at a time, and how long those under way may take once the server is told to stop."""
+"""Requests answered at a time, and the time that requests which have begun get when the server stops, s."""
 
 
 @contextmanager
@@ -23,7 +23,7 @@ def grpc_server(
     """Serve for as long as the block lasts.
 
     Args:
-        handler: Of the HTTP server; its models and limits are used.
+        handler: Handler of the HTTP server; its models and limits are used.
         host, port: Where to listen; port 0 takes a free one.
         token: What clients must send, as metadata `authorization`; without it everybody is answered.
         tls: Certificate and key; without them the connection is plain.
@@ -51,7 +51,7 @@ def grpc_server(
 
 
 def _listen(server: grpc.Server, place: str, tls: Tls | None) -> int:
-    """The port that it became."""
+    """The port that the server listens on."""
     try:
         if tls is None:
             return int(server.add_insecure_port(place))

@@ -32,46 +32,46 @@ class Service:
     def ServerReady(self, _: Any) -> dict[str, Any]:
         return {"ready": bool(self._store.all())}
 
-    def ModelReady(self, asked: Any) -> dict[str, Any]:
+    def ModelReady(self, request: Any) -> dict[str, Any]:
         try:
-            return {"ready": bool(self._store.get(asked.name, asked.version))}
+            return {"ready": bool(self._store.get(request.name, request.version))}
         except ModelNotFound:
             return {"ready": False}
 
     def ServerMetadata(self, _: Any) -> dict[str, Any]:
         return describe.server_metadata()
 
-    def ModelMetadata(self, asked: Any) -> dict[str, Any]:
-        return describe.model_metadata(self._store.get(asked.name, asked.version), self._store)
+    def ModelMetadata(self, request: Any) -> dict[str, Any]:
+        return describe.model_metadata(self._store.get(request.name, request.version), self._store)
 
-    def ModelConfig(self, asked: Any) -> dict[str, Any]:
-        return {"config": describe.model_config(self._store.get(asked.name, asked.version), self._limits)}
+    def ModelConfig(self, request: Any) -> dict[str, Any]:
+        return {"config": describe.model_config(self._store.get(request.name, request.version), self._limits)}
 
-    def ModelStatistics(self, asked: Any) -> dict[str, Any]:
-        return describe.statistics_of(self._store, asked.name, asked.version)
+    def ModelStatistics(self, request: Any) -> dict[str, Any]:
+        return describe.statistics_of(self._store, request.name, request.version)
 
-    def RepositoryIndex(self, asked: Any) -> dict[str, Any]:
-        return {"models": describe.repository_index(self._store, ready=asked.ready)}
+    def RepositoryIndex(self, request: Any) -> dict[str, Any]:
+        return {"models": describe.repository_index(self._store, ready=request.ready)}
 
-    def RepositoryModelLoad(self, asked: Any) -> dict[str, Any]:
-        if asked.parameters:
+    def RepositoryModelLoad(self, request: Any) -> dict[str, Any]:
+        if request.parameters:
             raise RequestError(describe.NO_LOAD_PARAMETERS)
-        self._store.load(asked.model_name)
+        self._store.load(request.model_name)
         return {}
 
-    def RepositoryModelUnload(self, asked: Any) -> dict[str, Any]:
-        self._store.unload(asked.model_name)
+    def RepositoryModelUnload(self, request: Any) -> dict[str, Any]:
+        self._store.unload(request.model_name)
         return {}
 
-    def ModelInfer(self, asked: Any) -> Any:
-        served = self._store.get(asked.model_name, asked.model_version)
-        read = partial(read_infer, asked, served.metadata.electrodes, self._limits.batch)
-        return answer_inference(served, read, lambda answer: write_answer(answer, METHODS["ModelInfer"][1]()))
+    def ModelInfer(self, request: Any) -> Any:
+        loaded = self._store.get(request.model_name, request.model_version)
+        read = partial(read_infer, request, loaded.metadata.electrodes, self._limits.batch)
+        return answer_inference(loaded, read, lambda answer: write_answer(answer, METHODS["ModelInfer"][1]()))
 
-    def ModelStreamInfer(self, asked: Any) -> dict[str, Any]:
-        """One answer for one request of a stream; an error is an answer and ends nothing."""
+    def ModelStreamInfer(self, request: Any) -> dict[str, Any]:
+        """One answer for one request of a stream; an error is an answer too, and the stream goes on."""
         try:
-            return {"infer_response": self.ModelInfer(asked)}
+            return {"infer_response": self.ModelInfer(request)}
         except Exception as error:
             return {"error_message": client_message(error)}
 
@@ -83,23 +83,23 @@ def handlers(service: Service, token: Token | None) -> grpc.GenericRpcHandler:
 
 
 def _method(name: str, answer: Callable[[Any], Any], token: Token | None) -> grpc.RpcMethodHandler:
-    request, response = METHODS[name]
+    request_type, response_type = METHODS[name]
     secret = None if name in OPEN else token
-    codec = {"request_deserializer": request.FromString, "response_serializer": response.SerializeToString}
+    codec = {"request_deserializer": request_type.FromString, "response_serializer": response_type.SerializeToString}
 
-    def one(asked: Any, context: grpc.ServicerContext) -> Any:
+    def answer_one(request: Any, context: grpc.ServicerContext) -> Any:
         try:
             _check(secret, context)
-            return _message(answer(asked), response)
+            return _message(answer(request), response_type)
         except Exception as error:  # the one place where an error becomes an answer
             return context.abort(grpc.StatusCode[grpc_status(error)], client_message(error))
 
-    def many(asked: Iterator[Any], context: grpc.ServicerContext) -> Iterator[Any]:
-        yield from (one(each, context) for each in asked)
+    def answer_each(requests: Iterator[Any], context: grpc.ServicerContext) -> Iterator[Any]:
+        yield from (answer_one(request, context) for request in requests)
 
     if name == "ModelStreamInfer":
-        return grpc.stream_stream_rpc_method_handler(many, **codec)
-    return grpc.unary_unary_rpc_method_handler(one, **codec)
+        return grpc.stream_stream_rpc_method_handler(answer_each, **codec)
+    return grpc.unary_unary_rpc_method_handler(answer_one, **codec)
 
 
 def _check(token: Token | None, context: grpc.ServicerContext) -> None:
@@ -109,7 +109,7 @@ def _check(token: Token | None, context: grpc.ServicerContext) -> None:
 
 
 def _message(fields: Any, response: type[Any]) -> Any:
-    """The answer's message, from its fields or as it is."""
+    """The message of an answer, from its fields; a message stays as it is."""
     if isinstance(fields, response):
         return fields
     parts = {name: value for name, value in fields.items() if hasattr(value, "DESCRIPTOR")}

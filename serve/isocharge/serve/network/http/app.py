@@ -17,7 +17,7 @@ Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 
 OPEN = ("/v2/health/live", "/v2/health/ready")
-"""Paths that need no token: what starts and watches servers has none."""
+"""Paths that need no token: programs that start and watch servers have none."""
 
 
 class App:
@@ -41,20 +41,20 @@ class App:
         """Answer one request, in another thread if that may take long."""
         message = await receive()
         try:
-            body = await self._whole(message, receive) if message.get("more_body") else message.get("body", b"")
+            body = await self._whole_body(message, receive) if message.get("more_body") else message.get("body", b"")
         except ConnectionResetError:
-            return  # nobody is there to answer
+            return  # the client went away
         except TooLarge as error:  # the rest of the body is still on its way: no further request can follow it
             response = error_response(error)
             response.headers.append((b"connection", b"close"))
         else:
-            asked = scope["method"], scope["path"], scope["headers"], body
-            later = self.blocks(scope["path"])
-            response = await asyncio.to_thread(self.answer, *asked) if later else self.answer(*asked)
+            request = scope["method"], scope["path"], scope["headers"], body
+            slow = self.blocks(scope["path"])
+            response = await asyncio.to_thread(self.answer, *request) if slow else self.answer(*request)
         await send({"type": "http.response.start", "status": response.status, "headers": response.headers})
         await send({"type": "http.response.body", "body": response.body})
 
-    async def _whole(self, message: Message, receive: Receive) -> bytes:
+    async def _whole_body(self, message: Message, receive: Receive) -> bytes:
         """A body that comes in pieces, bounded as it grows."""
         body = bytearray(message["body"])
         while message.get("more_body"):

@@ -1,12 +1,12 @@
 """HTTP on one connection: bounded, and without a detour for what is answered in microseconds.
 
 uvicorn's httptools protocol makes a task, an event and three dictionaries for each request before the application sees
-it: twice the time that the answer takes. So a request is kept until it is whole, and then answered on the spot; only
-what may take long, and what comes behind it on the same connection, goes through uvicorn as ASGI.
+it: twice the time that the answer takes. So a request is collected until it is complete, and then answered at once;
+only what may take long, and what follows it on the same connection, goes through uvicorn as ASGI.
 
 uvicorn also bounds neither headers nor the time they take. A timer for each request would cost as much as parsing it,
-so a connection only notes by when it must have done its next step, and the server looks through the connections now
-and then (`close_overdue`).
+so a connection only notes the deadline of its next step, and the server looks through the connections now and then
+(`close_overdue`).
 """
 
 import asyncio
@@ -27,14 +27,14 @@ from isocharge.serve.network.protocol import Response
 from isocharge.serve.network.protocol.response import error_response, refusal
 
 UNSENT_BYTES = 1 << 22
-"""A client that asks on and on and takes no answer is hung up on when so much waits for it."""
+"""Answers that may wait for a client that sends requests and reads none, bytes; then the connection is closed."""
 
 LINGER_SECONDS = 2.0
-"""A refused client may go on sending for so long; to hang up at once would take the refusal away from it again."""
+"""Time that a refused client may go on sending, s: if the connection closed at once, it might never read why."""
 
 
 class Phase(Enum):
-    """What a connection waits for."""
+    """The next thing that a connection waits for."""
 
     IDLE = "a request"
     HEADERS = "the end of the headers"
@@ -50,28 +50,28 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
-        self.by = math.inf  # the loop's time, s
+        self.deadline = math.inf  # the loop's time, s
         self._phase = self._timed = Phase.IDLE
         self._chunk = self._fed = 0  # bytes of this piece, and of all since the request began
         self._body = bytearray()
         self._is_last = self._is_refused = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take a connection, or say that there are too many."""
+        """Accept a connection, or refuse it if there are too many."""
         super().connection_made(transport)
         self._allow(self.limits.header_seconds)
         if len(self.connections) > self.limits.connections:
             self._refuse(refusal(503, f"all {self.limits.connections} connections are taken; try again later"))
 
     def data_received(self, data: bytes) -> None:
-        """Parse; what is then still unfinished is counted and timed."""
+        """Parse; a request that is then still incomplete is measured and timed."""
         if self._is_refused or self.transport.is_closing():
             return
         self._chunk = len(data)
         self._fed += self._chunk
         super().data_received(data)
         if self._phase is Phase.HEADERS or self._phase is Phase.BODY:
-            self._unfinished()
+            self._measure_incomplete()
 
     def on_message_begin(self) -> None:
         """A request begins, somewhere in this piece of data."""
@@ -80,7 +80,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self.expect_100_continue = False
 
     def on_headers_complete(self) -> None:
-        """The headers are all there; they are measured if they can be too long at all."""
+        """The headers are complete; they are measured if enough bytes arrived for them to be too long."""
         self._phase = Phase.BODY
         if self._fed > self.limits.header_bytes and self._header_bytes() > self.limits.header_bytes:
             self._refuse_headers()
@@ -98,7 +98,7 @@ class BoundedProtocol(HttpToolsProtocol):
             self._refuse(error_response(error))
 
     def on_message_complete(self) -> None:
-        """The whole request is there: answer it, unless it was refused."""
+        """The request is complete: answer it, unless it was refused."""
         if self._is_refused or self.transport.is_closing():
             return
         self._phase = Phase.ANSWER
@@ -109,10 +109,10 @@ class BoundedProtocol(HttpToolsProtocol):
         else:
             method = self.parser.get_method().decode("latin-1")
             self._write(self.direct.answer(method, path, self.headers, bytes(self._body)), with_body=method != "HEAD")
-            self._rest()
+            self._wait_for_request()
 
     def on_response_complete(self) -> None:
-        """uvicorn has sent an answer; as there, but without its timer."""
+        """uvicorn has sent an answer: do what its own method does, but start no timer."""
         self.server_state.total_requests += 1
         if self.transport.is_closing():
             return
@@ -120,22 +120,22 @@ class BoundedProtocol(HttpToolsProtocol):
         if self.pipeline:
             self._start_asgi_task(*self.pipeline.pop())
         else:
-            self._rest()
+            self._wait_for_request()
 
     def pause_writing(self) -> None:
-        """The client does not take its answer; it has so long to go on."""
+        """The client does not read its answer; it has `body_seconds` to go on."""
         self._allow(self.limits.body_seconds)
         super().pause_writing()
         self.flow.pause_reading()
 
     def resume_writing(self) -> None:
-        """The client has taken what there was."""
+        """The client has read what was waiting."""
         super().resume_writing()
         self.flow.resume_reading()
         self._allow(self.limits.idle_seconds)
 
     def send_400_response(self, msg: str) -> None:
-        """What cannot be parsed at all."""
+        """Refuse what is not HTTP."""
         self._refuse(refusal(400, msg))
 
     def shutdown(self) -> None:
@@ -147,14 +147,14 @@ class BoundedProtocol(HttpToolsProtocol):
             super().shutdown()
 
     def overdue(self) -> None:
-        """End a connection that took too long: with words to one that is sending, without to one that is not."""
+        """End a connection that took too long; a client that is sending gets the reason."""
         if self._phase in (Phase.HEADERS, Phase.BODY) and not self._is_refused:
             self._refuse(refusal(408, f"waited too long for {self._phase.value}"))
         else:
             self.transport.abort()
 
     def _answer_as_asgi(self) -> None:
-        """Let uvicorn have the whole request, now that there is something to wait for."""
+        """Hand the whole request to uvicorn: its answer may take long."""
         url, headers, body = self.url, self.headers, bytes(self._body)
         super().on_message_begin()
         self.url = url
@@ -172,12 +172,12 @@ class BoundedProtocol(HttpToolsProtocol):
         elif self.flow.write_paused and self.transport.get_write_buffer_size() > UNSENT_BYTES:
             self.transport.abort()
 
-    def _rest(self) -> None:
+    def _wait_for_request(self) -> None:
         """Wait for the next request."""
         self._phase = self._timed = Phase.IDLE
         self._allow(self.limits.idle_seconds)
 
-    def _unfinished(self) -> None:
+    def _measure_incomplete(self) -> None:
         if self._phase is Phase.HEADERS and self._fed > self.limits.header_bytes:
             self._refuse_headers()
         if self._timed is not self._phase and not self._is_refused:
@@ -185,8 +185,8 @@ class BoundedProtocol(HttpToolsProtocol):
             self._allow(self.limits.header_seconds if self._phase is Phase.HEADERS else self.limits.body_seconds)
 
     def _allow(self, seconds: float) -> None:
-        if not self.flow.write_paused:  # an answer that is not taken leaves no time for anything else
-            self.by = self.loop.time() + seconds
+        if not self.flow.write_paused:  # the time for a client that reads no answer is already running
+            self.deadline = self.loop.time() + seconds
 
     def _header_bytes(self) -> int:
         return len(self.url) + sum(len(name) + len(value) + 4 for name, value in self.headers)
@@ -231,5 +231,6 @@ def bounded(app: App, limits: ServerLimits) -> type[BoundedProtocol]:
 
 def close_overdue(connections: Iterable[Any], now: float) -> None:
     """End every connection whose time is over."""
-    for connection in [c for c in connections if c.by < now]:
-        connection.overdue()
+    for connection in list(connections):
+        if connection.deadline < now:
+            connection.overdue()

@@ -12,21 +12,22 @@ from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.tls import Tls
 
 GRACE_SECONDS = 10
-"""What is in flight has so long to finish once the server is told to stop."""
+"""Time that requests which have begun get when the server stops, s."""
 
 BACKLOG = 2048
+"""Connections that may wait to be accepted."""
 
 
 class _Uvicorn(uvicorn.Server):
     """uvicorn, looking after overdue connections while it waits."""
 
     async def on_tick(self, counter: int) -> bool:
-        close_overdue(list(self.server_state.connections), asyncio.get_running_loop().time())
+        close_overdue(self.server_state.connections, asyncio.get_running_loop().time())
         return await super().on_tick(counter)
 
 
 class HttpServer:
-    """A server that listens from the moment it is made until it is closed, and answers while `run` runs."""
+    """A server that listens from its construction until `close`, and answers while `run` runs."""
 
     def __init__(self, app: App, address: Address, *, limits: ServerLimits, tls: Tls | None = None) -> None:
         """Listen.
@@ -55,8 +56,8 @@ class HttpServer:
         self.url = address.url(self._socket, secure=tls is not None)
 
     def run(self) -> None:
-        """Answer until SIGTERM or SIGINT, or `stop`; then finish what is in flight."""
-        logging.getLogger("uvicorn").setLevel(logging.CRITICAL)  # clients' mistakes are told to clients
+        """Answer until SIGTERM, SIGINT or `stop`; then finish the requests that have begun."""
+        logging.getLogger("uvicorn").setLevel(logging.CRITICAL)  # mistakes of clients are answered, not logged
         self._server.run([self._socket])
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""The body of an inference answer: JSON, followed by the tensors that were wanted in binary."""
+"""The body of an inference answer: JSON, followed by the tensors that the request asked for in binary."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
     """Put an answer into bytes.
 
     Args:
-        answer: What the model said, and which outputs to send in binary.
+        answer: Outputs of the model, and which of them to send in binary.
 
     Returns:
         The body, and where its JSON ends if binary tensors follow.

@@ -17,6 +17,7 @@ EXTENSIONS = (
 )
 
 PLATFORM = "onnxruntime_onnx"
+"""Triton's name for ONNX models."""
 
 NO_LOAD_PARAMETERS = "load: parameters are not supported; put the files into the model's folder and load it again"
 
@@ -26,9 +27,9 @@ def server_metadata() -> dict[str, Any]:
     return {"name": "isocharge", "version": version("isocharge"), "extensions": list(EXTENSIONS)}
 
 
-def model_metadata(served: LoadedVersion, store: ModelStore) -> dict[str, Any]:
+def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:
     """Tensors of a model, and under `properties` everything that its file says about itself, as JSON texts."""
-    metadata = served.metadata
+    metadata = loaded.metadata
     widths = {INPUT: len(metadata.electrodes)}
     return {
         "name": metadata.name,
@@ -44,15 +45,15 @@ def _tensor(name: str, width: int) -> dict[str, Any]:
     return {"name": name, "datatype": "FP32", "shape": [-1, width]}
 
 
-def model_config(served: LoadedVersion, limits: ServerLimits) -> dict[str, Any]:
+def model_config(loaded: LoadedVersion, limits: ServerLimits) -> dict[str, Any]:
     """A model's configuration as Triton would have it; unlike Triton by default, every version serves."""
     return {
-        "name": served.metadata.name,
+        "name": loaded.metadata.name,
         "platform": PLATFORM,
         "backend": "onnxruntime",
         "version_policy": {"all": {}},
         "max_batch_size": limits.batch,
-        "input": [{"name": INPUT, "data_type": "TYPE_FP32", "dims": [len(served.metadata.electrodes)]}],
+        "input": [{"name": INPUT, "data_type": "TYPE_FP32", "dims": [len(loaded.metadata.electrodes)]}],
         "output": [{"name": name, "data_type": "TYPE_FP32", "dims": [width]} for name, width in OUTPUTS.items()],
     }
 
@@ -66,8 +67,8 @@ def statistics_of(store: ModelStore, name: str = "", version: str = "") -> dict[
     models = [store.get(name, version)] if version else store.named(name) if name else store.all()
     return {
         "model_stats": [
-            {"name": served.metadata.name, "version": served.version, **served.statistics.to_json()}
-            for served in models
+            {"name": loaded.metadata.name, "version": loaded.version, **loaded.statistics.to_json()}
+            for loaded in models
         ]
     }
 

@@ -6,10 +6,10 @@ import zlib
 from isocharge.errors import RequestError, TooLarge, UnknownEncoding
 
 WORTH_BYTES = 1024
-"""A shorter answer is sent as it is: setting up a compressor takes longer than sending it."""
+"""Size from which an answer is compressed, bytes: to send a shorter one is faster than to set up a compressor."""
 
 _WINDOW = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
-"""zlib's word for the wrapper around the data; HTTP's deflate is zlib's own."""
+"""zlib's `wbits` of each encoding; HTTP's deflate is the zlib format."""
 
 
 def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:

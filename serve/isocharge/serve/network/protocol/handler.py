@@ -1,4 +1,4 @@
-"""Requests of the Open Inference Protocol to answers: method, path, headers and body in; status, headers and body out.
+"""Answers requests of the Open Inference Protocol: method, path, headers and body in; status, headers and body out.
 
 This module knows no transport. Everything but loading and unloading takes microseconds, or milliseconds for the
 largest batch, and may be called from any thread; `blocks` says for which paths a server had better use another thread.
@@ -30,7 +30,7 @@ MODELS, REPOSITORY = "/v2/models/", "/v2/repository/models/"
 
 
 class Request(NamedTuple):
-    """A request, its body no longer compressed, and the model that its path names."""
+    """A request with its body unpacked, and the model that its path names."""
 
     headers: Mapping[bytes, bytes]
     body: bytes
@@ -59,9 +59,9 @@ class Handler:
             "/v2/repository/index": ("POST", self._index),
         }
         self._of_model: dict[str, Route] = {
-            "": ("GET", lambda request: json_response(describe.model_metadata(self._served(request), store))),
-            "ready": ("GET", lambda request: json_response({"ready": bool(self._served(request))})),
-            "config": ("GET", lambda request: json_response(describe.model_config(self._served(request), self.limits))),
+            "": ("GET", lambda request: json_response(describe.model_metadata(self._loaded(request), store))),
+            "ready": ("GET", lambda request: json_response({"ready": bool(self._loaded(request))})),
+            "config": ("GET", lambda request: json_response(describe.model_config(self._loaded(request), self.limits))),
             "stats": ("GET", self._stats),
             "infer": ("POST", self._infer),
         }
@@ -112,17 +112,17 @@ class Handler:
             pass
         raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
 
-    def _served(self, request: Request) -> LoadedVersion:
+    def _loaded(self, request: Request) -> LoadedVersion:
         return self.store.get(request.name, request.version)
 
     def _stats(self, request: Request) -> Response:
         return json_response(describe.statistics_of(self.store, request.name, request.version))
 
     def _infer(self, request: Request) -> Response:
-        served, headers = self.store.get(request.name, request.version), request.headers
+        loaded, headers = self.store.get(request.name, request.version), request.headers
         length = headers.get(b"inference-header-content-length")
-        read = partial(read_infer, request.body, length, served.metadata.electrodes, self.limits.batch)
-        body, json_length = answer_inference(served, read, write_answer)
+        read = partial(read_infer, request.body, length, loaded.metadata.electrodes, self.limits.batch)
+        body, json_length = answer_inference(loaded, read, write_answer)
         return _infer_response(body, json_length, headers.get(b"accept-encoding", b""))
 
     def _ready(self, _: Request) -> Response:

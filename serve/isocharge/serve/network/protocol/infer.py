@@ -1,4 +1,4 @@
-"""One inference: charges in, the chosen outputs out, whoever carries them."""
+"""One inference: charges in, the chosen outputs out, for every transport."""
 
 import time
 from collections.abc import Callable
@@ -14,22 +14,23 @@ from isocharge.serve.prediction.bound_press import BoundPress
 
 Written = TypeVar("Written")
 
-ENDS = tuple(accumulate(OUTPUTS.values()))
+_ENDS = tuple(accumulate(OUTPUTS.values()))
 
-WIDTH = ENDS[-1]
+WIDTH = _ENDS[-1]
+"""Numbers that the model answers for one press."""
 
-COLUMNS = {name: slice(end - OUTPUTS[name], end) for name, end in zip(OUTPUTS, ENDS, strict=True)}
+COLUMNS = {name: slice(end - OUTPUTS[name], end) for name, end in zip(OUTPUTS, _ENDS, strict=True)}
 """Where each output lies in the row of numbers that is bound for one press."""
 
 
 class InferRequest(NamedTuple):
-    """What is asked of a model.
+    """Charges for a model, and which of its outputs to answer with.
 
     Attributes:
         id: Echoed in the answer; empty if the request has none.
         charge_pC: Shape (n, electrodes), pC.
         outputs: Names, in the order of the answer.
-        binary: Those of them that are to be sent in binary.
+        binary: Names of the outputs that are sent in binary.
     """
 
     id: str
@@ -39,10 +40,10 @@ class InferRequest(NamedTuple):
 
 
 class InferAnswer(NamedTuple):
-    """What a model answers.
+    """Outputs of a model for one request.
 
     Attributes:
-        name, version: Which model it was.
+        name, version: The model that answered.
         id, binary: As in the request.
         outputs: By name, shape (n, width).
     """
@@ -54,14 +55,14 @@ class InferAnswer(NamedTuple):
     binary: frozenset[str]
 
 
-def infer(served: LoadedVersion, request: InferRequest) -> InferAnswer:
+def infer(loaded: LoadedVersion, request: InferRequest) -> InferAnswer:
     """Run the model; may be called from any thread."""
     charges, names = request.charge_pC, request.outputs
     if len(charges) == 1:
-        outputs = _one_press(served.press(), charges[0], names)
+        outputs = _one_press(loaded.press(), charges[0], names)
     else:
-        outputs = dict(zip(names, served.model.session.run(names, {INPUT: charges}), strict=True))
-    return InferAnswer(served.metadata.name, served.version, request.id, outputs, request.binary)
+        outputs = dict(zip(names, loaded.model.session.run(names, {INPUT: charges}), strict=True))
+    return InferAnswer(loaded.metadata.name, loaded.version, request.id, outputs, request.binary)
 
 
 def _one_press(press: BoundPress, charge_pC: Singles, names: tuple[str, ...]) -> dict[str, Singles]:
@@ -72,14 +73,14 @@ def _one_press(press: BoundPress, charge_pC: Singles, names: tuple[str, ...]) ->
 
 
 def answer_inference(
-    served: LoadedVersion, read: Callable[[], InferRequest], write: Callable[[InferAnswer], Written]
+    loaded: LoadedVersion, read: Callable[[], InferRequest], write: Callable[[InferAnswer], Written]
 ) -> Written:
     """Read a request, run the model, write the answer, and count it.
 
     Args:
-        served: The model.
-        read: Gives the request, or raises why it is none.
-        write: Puts the answer into what the transport sends.
+        loaded: The model.
+        read: Returns the request, or raises what is wrong with it.
+        write: Turns the answer into what the transport sends.
 
     Raises:
         Whatever `read` raises.
@@ -89,11 +90,11 @@ def answer_inference(
     try:
         request = read()
         was_read = clock()
-        answer = infer(served, request)
+        answer = infer(loaded, request)
         ran = clock()
         written = write(answer)
     except Exception:
-        served.statistics.failed(clock() - began)
+        loaded.statistics.failed(clock() - began)
         raise
-    served.statistics.succeeded(len(request.charge_pC), (was_read - began, ran - was_read, clock() - ran))
+    loaded.statistics.succeeded(len(request.charge_pC), (was_read - began, ran - was_read, clock() - ran))
     return written

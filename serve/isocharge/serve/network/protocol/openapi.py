@@ -13,9 +13,9 @@ Json = dict[str, Any]
 
 def openapi(store: ModelStore, limits: ServerLimits) -> Json:
     """The document, OpenAPI 3.1."""
-    models = sorted({served.metadata.name for served in store.all()})
-    versions = sorted({str(served.metadata.version) for served in store.all()})
-    widths = sorted({len(served.metadata.electrodes) for served in store.all()})
+    models = sorted({loaded.metadata.name for loaded in store.all()})
+    versions = sorted({str(loaded.metadata.version) for loaded in store.all()})
+    widths = sorted({len(loaded.metadata.electrodes) for loaded in store.all()})
     return {
         "openapi": "3.1.0",
         "info": {

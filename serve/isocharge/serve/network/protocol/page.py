@@ -1,4 +1,4 @@
-"""The page for people: which models are served, with their cards, and how to ask them."""
+"""The page for people: the models with their cards, and an example of a request to each."""
 
 from html import escape
 
@@ -39,8 +39,8 @@ def page(store: ModelStore) -> str:
 """
 
 
-def _article(served: LoadedVersion) -> str:
-    metadata = served.metadata
+def _article(loaded: LoadedVersion) -> str:
+    metadata = loaded.metadata
     low, high = metadata.force_range_N
     facts = {
         "sensor": metadata.frame_id,
@@ -51,25 +51,25 @@ def _article(served: LoadedVersion) -> str:
     rows = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts.items())
     path = f"v2/models/{metadata.name}/versions/{metadata.version}"
     return f"""<article><h2>{escape(metadata.name)} <span class="quiet">version {metadata.version}</span></h2>
-<dl>{rows}</dl><pre>{escape(_example(served, path))}</pre>
+<dl>{rows}</dl><pre>{escape(_example(loaded, path))}</pre>
 <p><a href="{path}">metadata</a> · <a href="{path}/config">configuration</a> · <a href="{path}/stats">statistics</a></p>
-<details open><summary>Model card</summary>{_card(served.model)}</details></article>
+<details open><summary>Model card</summary>{_card(loaded.model)}</details></article>
 """
 
 
-def _example(served: LoadedVersion, path: str) -> str:
-    press = ", ".join(f"{charge:.1f}" for charge in served.model.golden.charge_pC[0].tolist())
-    tensor = f'"name": "charge_pC", "datatype": "FP32", "shape": [1, {len(served.metadata.electrodes)}]'
+def _example(loaded: LoadedVersion, path: str) -> str:
+    press = ", ".join(f"{charge:.1f}" for charge in loaded.model.golden.charge_pC[0].tolist())
+    tensor = f'"name": "charge_pC", "datatype": "FP32", "shape": [1, {len(loaded.metadata.electrodes)}]'
     body = f'{{"inputs": [{{{tensor}, "data": [{press}]}}]}}'
     return f"SERVER=...  # the address of this page\ncurl $SERVER/{path}/infer -d '{body}'"
 
 
 def _card(model: Model) -> str:
-    """The card beside the model as HTML; markup in it stays text."""
+    """The card in the model's folder as HTML; HTML in it stays text."""
     try:
         text = (model.folder / "card.md").read_text("utf-8")
     except (OSError, UnicodeDecodeError):
         return "<p>This model has no card.</p>"
-    from markdown_it import MarkdownIt  # a tenth of a second that a server's start is better without
+    from markdown_it import MarkdownIt  # takes 0.1 s, which a server's start need not
 
     return str(MarkdownIt("commonmark", {"html": False}).enable("table").render(text))
