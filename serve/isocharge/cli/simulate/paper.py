@@ -33,8 +33,8 @@ def paper_command(
     refuse_existing(output)
     began = time.perf_counter()
     choices = Choices.quick() if quick else Choices()
-    with local_workers(most_workers(workers)) as crew, progress_rows(*ROWS) as (solved, triangulated, drawn):
-        write_paper(output, choices, crew, solved=solved, triangulated=triangulated, drawn=drawn)
+    with local_workers(most_workers(workers)) as pool, progress_rows(*ROWS) as (solved, triangulated, drawn):
+        write_paper(output, choices, pool, solved=solved, triangulated=triangulated, drawn=drawn)
     if json:
         typer.echo((output / "paper.json").read_text("utf-8"), nl=False)
     say(f"{output / 'paper.md'}, {time.perf_counter() - began:.0f} s")

@@ -91,13 +91,13 @@ def sweep_command(
     reach = sweep_radius(radius, film_sensor, probes, force)
     sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)
     try:
-        with _workers(workers, cluster) as crew, progress_rows(*SWEEP_ROWS) as (solving, sampled):
+        with _workers(workers, cluster) as pool, progress_rows(*SWEEP_ROWS) as (solving, sampled):
             run_sweep(
                 output,
                 film_sensor,
                 probes,
                 sweep,
-                workers=crew,
+                workers=pool,
                 callbacks=SweepCallbacks(solving, sampled, say),
                 fresh=fresh,
             )
