@@ -237,8 +237,8 @@ def _summary(
     live_median, live_p95 = np.percentile(live.error_mm, (50, 95))
     size = (folder / "models" / SENSOR / "1" / "model.onnx").stat().st_size
     rows = [
-        ("position error with noise", f"median {median:.3f} mm, 95 % {p95:.3f} mm"),
-        ("position error live, over the port", f"median {live_median:.3f} mm, 95 % {live_p95:.3f} mm"),
+        ("position error, with noise", f"median {median:.3f} mm, 95 % {p95:.3f} mm"),
+        ("position error, live", f"median {live_median:.3f} mm, 95 % {live_p95:.3f} mm"),
         (
             "force error",
             f"median {100 * np.median(np.abs(force_error)):.2f} %, rms {100 * np.sqrt(np.mean(force_error**2)):.2f} %",
