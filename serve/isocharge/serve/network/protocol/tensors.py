@@ -4,8 +4,8 @@
 """
 
 import struct
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -141,9 +141,15 @@ def charges_from_values(values: Any, head: Head, electrodes: tuple[str, ...]) ->
     # that holds one or the other is looked at below.
     if type(values) is list and len(values) == rows * columns and not (True in values or False in values):
         charges = np.empty(head.shape, np.float32)
-        if write_finite(partial(struct.pack_into, f"={len(values)}f", charges.data, 0), values):
+        if write_finite(partial(_packer(len(values)), charges.data, 0), values):
             return charges
     return _examined(values, head, electrodes)
+
+
+@lru_cache(64)
+def _packer(count: int) -> Callable[..., None]:
+    """Packs this many float32 numbers into a buffer."""
+    return struct.Struct(f"={count}f").pack_into
 
 
 def _examined(values: Any, head: Head, electrodes: tuple[str, ...]) -> Singles:
