@@ -63,7 +63,7 @@ def draw_misfit_examples(
 
 def _misses(field: ChargeField, charge: Array, noise: NoiseModel, chosen: LabelledPresses, near: np.ndarray) -> Array:
     """Those `near` their own press start there, and the field is shifted to be right there; the others search."""
-    miss, at = np.empty_like(charge), np.flatnonzero(near)
+    miss, at = np.zeros_like(charge), np.flatnonzero(near)
     start = field.domain.to_unit(chosen.contact[at])
     shift = np.log(chosen.charge_pC[at]) - field.log_charge(start)[:, 0]
     miss[at] = nearest_in_field(field, charge[at], noise, start, shift)[1]
