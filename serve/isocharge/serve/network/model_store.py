@@ -31,15 +31,15 @@ class LoadedVersion:
     metadata: ModelMetadata
     version: str
     statistics: Statistics = field(default_factory=Statistics)
-    _own: threading.local = field(default_factory=threading.local, repr=False)
+    _of_thread: threading.local = field(default_factory=threading.local, repr=False)
 
     def press(self) -> BoundPress:
         """Bound memory for one press; each thread has its own."""
         try:
-            return self._own.press  # type: ignore[no-any-return]
+            return self._of_thread.press  # type: ignore[no-any-return]
         except AttributeError:
-            self._own.press = BoundPress(self.model.session, len(self.metadata.electrodes))
-            return self._own.press  # type: ignore[no-any-return]
+            self._of_thread.press = BoundPress(self.model.session, len(self.metadata.electrodes))
+            return self._of_thread.press  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)

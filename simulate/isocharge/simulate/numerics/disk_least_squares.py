@@ -45,7 +45,7 @@ def minimise(residuals: Residuals, start: Array, steps: int = MOST_STEPS) -> tup
     Args:
         residuals: The problems.
         start: Shape (n, 3); points outside D start from its nearest point.
-        steps: At most so many.
+        steps: Largest number of steps.
 
     Returns:
         Points in D, shape (n, 3), and their residuals, shape (n, k).

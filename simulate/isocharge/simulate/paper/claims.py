@@ -14,7 +14,7 @@ from isocharge.simulate.paper.solves import FORCE, Solves, sample
 from isocharge.simulate.paper.triangulation_errors import Accuracy, Errors, largest_change
 
 D33, PYRO, KELVIN = -30e-12, 30e-6, 0.1
-"""Of PVDF, C/N and C/(m^2 K), and a temperature step (K) that a finger makes easily."""
+"""d33 (C/N) and pyroelectric coefficient (C/(m^2 K)) of PVDF, and a temperature step (K) that a finger makes easily."""
 
 
 def claims(solves: Solves, accuracy: Accuracy) -> Entry:

@@ -76,7 +76,7 @@ class ChargeForce:
 
 
 def films_of(solves: Solves) -> list[list[ChargeForce]]:
-    """Of every thickness, every pretension."""
+    """Charge against force, for every thickness a list with one curve for each pretension."""
     choices = solves.choices
     logs = np.log(np.array(choices.force))
     return [

@@ -35,7 +35,7 @@ class FieldModel:
 
     @property
     def radius(self) -> float:
-        """Of the disk, m."""
+        """Largest distance of a contact from the centre, m."""
         return 1e-3 * RIM * self.field.domain.radius_mm
 
     @property

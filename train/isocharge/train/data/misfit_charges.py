@@ -19,7 +19,7 @@ from isocharge.train.data.noise import with_noise
 from isocharge.train.data.presses import LabelledPresses
 
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
-"""Share of each kind."""
+"""Kinds of charges, and the share of the examples that each makes up, dimensionless."""
 
 FAR = 6.0
 """Distance above which a press's own place may not be the nearest: searched as the others are."""

@@ -17,7 +17,7 @@ from isocharge.train.report.limits import CRAMER_RAO
 from isocharge.train.report.measures import coverage, rounded
 
 DRAW_SEED = 90_000
-"""Of the draws of the noise, relative to the bench's."""
+"""Seed of the noise draws, relative to the scene's seed."""
 
 RINGS, SECTORS, FORCES = 4, 12, 3
 """Cells that the worst regions are looked for in: rings of equal area, sectors, equal steps of log force."""
