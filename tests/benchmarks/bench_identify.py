@@ -1,4 +1,4 @@
-"""What the built-in sensors' charges can tell: the table and the picture of simulate/README.md.
+"""What the built-in sensors' charges can tell: the table and the picture of simulate/docs/identifiability.md.
 
     python tests/benchmarks/bench_identify.py [-o simulate/pictures/identify.png]
 

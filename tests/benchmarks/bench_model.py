@@ -1,4 +1,4 @@
-"""Released models against the Bayes limit, their intervals and their misfit: the tables of train/README.md.
+"""Released models against the Bayes limit, their intervals and their misfit: the tables of train/docs/accuracy.md.
 
     python tests/benchmarks/bench_model.py [MODEL ...] [--presses 6000] [--draws 40000] [--seed 1] [--json]
 

@@ -4,7 +4,7 @@
     >>> touch = Predictor("three-25um-biaxial")
     >>> contact = touch.predict([850.0, 840.0, 846.0])  # pC on A, B, C
 
-`serve/README.md` says what is in which module.
+The packages follow the way of a frame; `serve/README.md` shows them.
 """
 
 from isocharge.serve.frames.autodetect import AutoParser

@@ -1,8 +1,8 @@
 """Where the presses of a sweep lie: spread over probes, the disk, the forces and, if asked, the orientations.
 
-sobol   scrambled Sobol points: fewer gaps and clumps than independent draws (Owen 1998); each probe has its own
-random  independent draws
-grid    every force at every orientation at every place of a square lattice: no more presses than asked for
+    sobol   scrambled Sobol points: fewer gaps and clumps than independent draws (Owen 1998); each probe has its own
+    random  independent draws
+    grid    every force at every orientation at every place of a square lattice: no more presses than asked for
 
 Sobol and random presses are uniform over the disk and in the logarithm of the force; the probes take turns.
 """
