@@ -17,11 +17,11 @@ from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.train.bayes.limit import BayesLimit, Scene, bayes_estimate
+from isocharge.train.data.alarms import alarm_threshold
 from isocharge.train.report.build import inner_radius
 from isocharge.train.report.measures import coverage
 
 RELEASED = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial")
-FALSE_ALARMS = 0.01
 BEYOND_MM = ((0.5, 1.0), (1.0, 2.0))
 APART_MM = 8.0
 NOISE = noise_model("reference")
@@ -102,7 +102,7 @@ def _ends(shares: np.ndarray) -> list[float]:
 def faults(bench: Bench, count: int) -> dict[str, Any]:
     """Shares of presses flagged, with the limit that one good press in a hundred exceeds."""
     good = bench.answers(bench.charge(*bench.presses(count).T)).misfit
-    limit = float(np.quantile(good, 1.0 - FALSE_ALARMS))
+    limit = alarm_threshold(good)
 
     def flagged(charge: np.ndarray) -> float:
         return float(np.mean(bench.answers(charge).misfit > limit))

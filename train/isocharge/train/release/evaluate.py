@@ -7,6 +7,7 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.statistics import rms
+from isocharge.train.data.alarms import about_1_N, alarm_threshold
 from isocharge.train.data.noise import misfit_noise, noisy_charges
 from isocharge.train.data.presses import LabelledPresses, position_error
 
@@ -15,12 +16,6 @@ Predict = Callable[[Array], tuple[Array, Array, Array]]
 
 DRAWS = 20
 """Draws of the noise for the misfit's rare values."""
-
-FALSE_ALARMS = 0.01
-"""Share of good presses whose misfit is above the alarm's threshold, dimensionless."""
-
-ABOUT_1_N = (0.8, 1.25)
-"""Smallest and largest force that counts as 1 N where faults are looked for, N."""
 
 
 def measure_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int = 1) -> Mapping[str, float]:
@@ -39,7 +34,7 @@ def measure_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel
     """
     unit = misfit_noise(noise)
     good = np.concatenate([predict(noisy_charges(presses, unit, seed + draw))[2] for draw in range(DRAWS)])
-    alarm = float(np.percentile(good, 100.0 * (1.0 - FALSE_ALARMS)))
+    alarm = alarm_threshold(good)
     contact, std, _ = predict(noisy_charges(presses, noise, seed))
     position, force = position_error(contact, presses.contact), contact[:, 2] / presses.contact[:, 2] - 1.0
     clean = position_error(predict(presses.charge_pC)[0], presses.contact)
@@ -61,12 +56,6 @@ def measure_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel
         **_detected_faults(predict, presses, unit, alarm, seed),
     }
     return {name: float(f"{value:.4g}") for name, value in errors.items()}
-
-
-def about_1_N(force_N: Array) -> np.ndarray:
-    """Which forces count as 1 N, bool of the same shape."""
-    low, high = ABOUT_1_N
-    return (force_N >= low) & (force_N <= high)
 
 
 def _detected_faults(

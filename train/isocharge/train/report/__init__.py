@@ -1,6 +1,6 @@
 """The report on speed against error: every method on the same presses, with the limits drawn in.
 
-May import: baselines, release, bayes, training, data.
+May import: baselines, bayes, data.
 
 from isocharge.train.report import write_report
 

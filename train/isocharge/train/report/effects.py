@@ -12,9 +12,9 @@ from isocharge.progress import Announce
 from isocharge.simulate import Sensor, SolveSettings, parse_probe
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.baselines import Fitted, FittingTask, GaussNewton, PolynomialRidge, ReleasedModel
+from isocharge.train.data.alarms import about_1_N, alarm_threshold
 from isocharge.train.data.noise import noisy_charges
 from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.release.evaluate import FALSE_ALARMS, about_1_N
 from isocharge.train.report.bench import EvaluationScene, press_on
 from isocharge.train.report.measures import Errors, rounded
 from isocharge.train.report.settings import Settings
@@ -159,7 +159,7 @@ def threshold_of(released: ReleasedModel, clean: LabelledPresses, bench: Evaluat
     """The misfit that 1 % of good test presses exceed."""
     seeds = range(bench.seed + NOISE_SEED + 1, bench.seed + NOISE_SEED + 1 + draws)
     misfits = [released.answer(noisy_charges(clean, bench.noise, seed))[2] for seed in seeds]
-    return float(np.percentile(np.concatenate(misfits), 100.0 * (1.0 - FALSE_ALARMS)))
+    return alarm_threshold(np.concatenate(misfits))
 
 
 def without_one_electrode(

@@ -7,7 +7,7 @@ from typing import Any
 
 from isocharge.train.baselines import linear_band
 from isocharge.train.baselines.networks import RELEASED
-from isocharge.train.release.evaluate import FALSE_ALARMS
+from isocharge.train.data.alarms import FALSE_ALARMS
 from isocharge.train.report.effects import FARTHEST, GAIN_OFF, PRETENSION_OFF
 from isocharge.train.report.measures import MethodRecord
 

@@ -14,8 +14,8 @@ from isocharge.simulate import Sensor
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.plots.figure import FELT, INK, new_figure, save_picture
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
+from isocharge.train.data.alarms import FALSE_ALARMS
 from isocharge.train.data.domain import ContactDomain
-from isocharge.train.release.evaluate import FALSE_ALARMS
 from isocharge.train.report.limits import BAYES, CRAMER_RAO
 from isocharge.train.report.maps import COORDINATES, Draws
 
