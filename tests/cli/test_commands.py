@@ -98,8 +98,8 @@ def test_a_point_as_a_table(command):
     assert err == ""
 
 
-SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1", "--samples", "17000"]
-"""A sweep of a small family, in two shards."""
+SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1", "--samples", "34000"]
+"""A sweep of a small family, in three shards: while two workers make the last, the first is there to be seen."""
 
 
 @pytest.mark.parametrize(

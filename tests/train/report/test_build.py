@@ -170,4 +170,4 @@ def test_as_many_models_as_datasets(presses, tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit) as done:
         main()
     assert done.value.code == 2
-    assert "expected one for each of 1 datasets, got 2" in capsys.readouterr().err
+    assert "expected one model for each of 1 datasets, got 2" in capsys.readouterr().err
