@@ -5,9 +5,9 @@ BIN := $(VENV)/bin
 
 .PHONY: demo test test-all docs bench soak release report proto clean
 
-# Tests without ports and clocks; all others of serve run one at a time.
-FREE := $(addprefix tests/serve/,frames model prediction signal_chain network network/protocol)
-ALONE := $(filter-out $(FREE) %/conftest.py %/__pycache__,$(wildcard tests/serve/* tests/serve/network/*)) tests/test_live.py
+# Tests that measure time, or wait for a port to come back: one at a time. All others share the cores, a file a worker.
+ALONE := tests/serve/live tests/serve/port tests/serve/virtual_sensor tests/serve/test_end_to_end.py tests/test_live.py
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
 demo: $(VENV)/installed
 	$(BIN)/isocharge demo
@@ -17,8 +17,8 @@ test: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest $(addprefix --ignore=,$(ALONE)) -n 2 --dist loadfile # arithmetic: both cores
-	$(BIN)/python -m pytest $(ALONE) # ports and clocks: one at a time
+	$(ONE_THREAD) $(BIN)/python -m pytest $(addprefix --ignore=,$(ALONE)) -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest $(ALONE)
 
 test-all: docs
 	$(BIN)/python -m pytest -m "slow or not slow"
