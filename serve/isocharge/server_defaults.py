@@ -1,4 +1,4 @@
-"""How much a server takes from a client unless told otherwise.
+"""The default numbers of a server's bounds: sizes, connections, seconds.
 
 These numbers have no imports, so that `isocharge serve http --help` can show them at once.
 """

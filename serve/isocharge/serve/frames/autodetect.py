@@ -1,4 +1,4 @@
-"""Recognition of what a board sends: our binary frames or lines of text.
+"""Recognition of what a board sends: our binary frames or lines of text. Described frames need a device file.
 
 Both parsers read the bytes until one of them has a frame: a binary frame whose checksum fits, or a text layout that
 came three times in a row. The bytes are cut where either of them could end a frame, so chunks do not matter.

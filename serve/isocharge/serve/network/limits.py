@@ -1,4 +1,4 @@
-"""How much a server takes from a client: the bounds on requests, connections and time."""
+"""The bounds of a server on requests, connections and time; default numbers are in `isocharge.server_defaults`."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""The check of contacts against the domain that a model was trained for."""
+"""The flags `outside` and `misfit`: the check of contacts against the domain that a model was trained for."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""The disk automorphism that carries the mesh to the probe, and how sectors and rings are graded on it."""
+"""The disk automorphism of `placement`: its parameters for a probe, and how sectors and rings are graded on it."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ GRADING = 0.65
 
 
 def automorphism_onto(at: Array, radius: Array) -> tuple[Array, Array]:
-    """(c, rho) that carry |z| = rho onto the circle of this centre and radius (film radius one); see the module."""
+    """(c, rho) that carry |z| = rho onto the circle of this centre and radius (film radius one); see `placement`."""
     outer, inner = np.arctanh(at + radius), np.arctanh(at - radius)
     return np.tanh(0.5 * (outer + inner)), np.tanh(0.5 * (outer - inner))
 

@@ -2,7 +2,8 @@
 
 A flat film without pretension has no transverse stiffness, and plain Newton fails in many ways. What works: a start
 of Schwerin's shape, an energy line search, and some tension added to the tangent only, in proportion to the residual,
-so that the step stays a descent direction and the convergence near the equilibrium stays quadratic.
+so that the step stays a descent direction and the convergence near the equilibrium stays quadratic. It gives up after
+`MAX_ITERATIONS`, or where steps no longer shrink (`PATIENCE`); how small a residual has to be is in `settings`.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The Open Inference Protocol, version 2, without a transport: requests in, answers out, as plain values.
+"""The Open Inference Protocol, version 2, without a transport: requests in, answers and statuses out.
 
 May import: network, prediction, model.
 

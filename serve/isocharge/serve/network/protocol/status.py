@@ -1,4 +1,4 @@
-"""What an error is to a client: the one place where the exception tree becomes status codes and messages."""
+"""HTTP and gRPC statuses of errors: the one place where the exception tree becomes status codes and messages."""
 
 import logging
 
