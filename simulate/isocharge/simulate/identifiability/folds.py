@@ -1,9 +1,9 @@
 """Folds of a charge map.
 
 Charges determine a contact only where the map from (x, y, ln F) to the charges is one to one. Across a fold it is not:
-J = d(Q)/d(x, y, ln F) loses rank and the map turns over. With three electrodes det J changes sign across the fold.
-With more, J is not square; the map turns over between neighbours a and b if det(J(a)' W J(b)) < 0, W = 1 / sigma^2. For
-three electrodes this is the sign of det J(a) det J(b), so one rule serves all.
+its derivative J = d(Q)/d(x, y, ln F) loses rank and the map turns over. With three electrodes det J changes sign across
+the fold. With more, J is not square; the map turns over between neighbours a and b if det(J(a)' W J(b)) < 0, with the
+weights W = 1 / sigma^2. For three electrodes this is the sign of det J(a) det J(b), so one rule serves all.
 
 Electrodes on one circle fold a biaxial film near this circle, however many they are: their charges hardly change if the
 press moves to its mirror image in the circle.
