@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from isocharge.serve import ModelMetadata, Predictor, write_model
+from isocharge.serve import ModelMetadata, PredictionRecord, Predictor, write_model
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import App, HttpServer
 from isocharge.serve.network.model_store import open_model_store
@@ -180,3 +180,42 @@ def start_http(stopping):
     for server, _ in started:
         server.stop()
     stopping.extend(started)
+
+
+@pytest.fixture
+def contract():
+    """The fields of a prediction record, in their order."""
+    return [
+        *(
+            "timestamp",
+            "t_device_us",
+            "seq",
+            "x_mm",
+            "y_mm",
+            "force_N",
+            "x_std_mm",
+            "y_std_mm",
+            "force_std_N",
+            "misfit",
+        ),
+        *("contact", "charge_pC", "charge_raw_pC", "tare_pC", "flags", "latency_us", "model", "frame_id"),
+    ]
+
+
+@pytest.fixture
+def record(contract):
+    """Make a prediction record; fields that are not given are as in an ordinary press, or None."""
+
+    def make(**changes):
+        values = dict.fromkeys(contract) | {
+            "contact": True,
+            "flags": ("gap",),
+            "model": "linear/1",
+            "frame_id": "linear-film",
+            "x_mm": 1.23456789,
+            "charge_pC": {"A": 800.0625, "B": None},
+            "timestamp": 1763600000.1234567,
+        }
+        return PredictionRecord(**(values | changes))
+
+    return make

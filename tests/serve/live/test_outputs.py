@@ -8,35 +8,16 @@ import socket
 import pytest
 
 from isocharge.errors import InputError
-from isocharge.serve import PredictionRecord, UdpSink, csv_header, csv_line
-
-CONTRACT = [
-    *("timestamp", "t_device_us", "seq", "x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit"),
-    *("contact", "charge_pC", "charge_raw_pC", "tare_pC", "flags", "latency_us", "model", "frame_id"),
-]
-
-
-def record(**changes):
-    values = dict.fromkeys(CONTRACT) | {
-        "contact": True,
-        "flags": ("gap",),
-        "model": "linear/1",
-        "frame_id": "linear-film",
-        "x_mm": 1.23456789,
-        "charge_pC": {"A": 800.0625, "B": None},
-        "timestamp": 1763600000.1234567,
-    }
-    return PredictionRecord(**(values | changes))
-
+from isocharge.serve import UdpSink, csv_header, csv_line
 
 ELECTRODES = ("A", "B")
 
 
-def test_csv_has_the_fields_of_a_record():
+def test_csv_has_the_fields_of_a_record(contract, record):
     row_of = record(tare_pC={"A": 1.0, "B": -2.5}, contact=True, seq=7, flags=("gap", "outside"))
     table = io.StringIO(csv_header(ELECTRODES) + "\n" + csv_line(row_of, ELECTRODES) + "\n")
     (row,) = csv.DictReader(table)
-    flat = [name for name in CONTRACT if not name.endswith("_pC")]
+    flat = [name for name in contract if not name.endswith("_pC")]
     assert [name for name in row if "." not in name] == flat
     assert (row["seq"], row["x_mm"], row["y_mm"], row["contact"]) == ("7", "1.234568", "", "true")
     assert (row["charge_pC.A"], row["charge_pC.B"]) == ("800.062500", "")
@@ -45,7 +26,7 @@ def test_csv_has_the_fields_of_a_record():
 
 
 @pytest.mark.parametrize("name", ["mine, left hand", 'the "good" one', "two\nlines", "cr\rlf", " blank "])
-def test_csv_takes_any_name(name):
+def test_csv_takes_any_name(name, record):
     """Electrodes too may have any name."""
     electrodes = ("A", name)
     charges = {"A": 1.0, name: 2.0}
@@ -55,7 +36,7 @@ def test_csv_takes_any_name(name):
     assert None not in row
 
 
-def test_csv_has_no_quotes_in_an_ordinary_row():
+def test_csv_has_no_quotes_in_an_ordinary_row(record):
     assert csv_line(record(charge_pC={"A": 1.0, "B": 2.0}), ELECTRODES) == (
         "1763600000.123457,,,1.234568,,,,,,,true,1.000000,2.000000,,,,,gap,,linear/1,linear-film"
     )
@@ -70,7 +51,7 @@ def flattened(prefix, value):
     return {prefix: float(value)} if isinstance(value, bool | int | float) else {}
 
 
-def test_datagrams_are_what_plotjuggler_reads():
+def test_datagrams_are_what_plotjuggler_reads(record):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
         listener.settimeout(5.0)

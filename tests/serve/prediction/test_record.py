@@ -4,26 +4,6 @@ import json
 
 import pytest
 
-from isocharge.serve import PredictionRecord
-
-CONTRACT = [
-    *("timestamp", "t_device_us", "seq", "x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit"),
-    *("contact", "charge_pC", "charge_raw_pC", "tare_pC", "flags", "latency_us", "model", "frame_id"),
-]
-
-
-def record(**changes):
-    values = dict.fromkeys(CONTRACT) | {
-        "contact": True,
-        "flags": ("gap",),
-        "model": "linear/1",
-        "frame_id": "linear-film",
-        "x_mm": 1.23456789,
-        "charge_pC": {"A": 800.0625, "B": None},
-        "timestamp": 1763600000.1234567,
-    }
-    return PredictionRecord(**(values | changes))
-
 
 def strictly(text):
     def refuse(constant):
@@ -32,11 +12,11 @@ def strictly(text):
     return json.loads(text, parse_constant=refuse)
 
 
-def test_record_has_the_fields_in_their_order():
-    assert list(strictly(record().to_json())) == CONTRACT
+def test_record_has_the_fields_in_their_order(contract, record):
+    assert list(strictly(record().to_json())) == contract
 
 
-def test_record_is_one_line_of_plain_values():
+def test_record_is_one_line_of_plain_values(record):
     text = record().to_json()
     assert "\n" not in text
     got = strictly(text)
@@ -47,6 +27,6 @@ def test_record_is_one_line_of_plain_values():
     assert got["timestamp"] == 1763600000.123457
 
 
-def test_record_never_holds_nan():
+def test_record_never_holds_nan(record):
     with pytest.raises(ValueError, match="not JSON compliant"):
         record(misfit=float("nan")).to_json()
