@@ -69,6 +69,16 @@ def test_predict_to_records(presses, models):
     ]
 
 
+def test_predict_from_a_file_of_measured_presses(presses, models):
+    """Its further columns cost a word on stderr."""
+    expected = run("predict", "linear", presses, "--models", models).stdout
+    header, *rows = presses.read_text().splitlines()
+    presses.write_text("\n".join(["x_mm,y_mm,force_N," + header, *(f"1,,2,{row}" for row in rows)]))
+    result = run("predict", "linear", presses, "--models", models)
+    assert result.stdout == expected
+    assert result.stderr == f"{presses}: ignored columns: ['x_mm', 'y_mm', 'force_N']\n"
+
+
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"], ids=["plain", "byte order mark"])
 def test_predict_from_stdin(presses, models, mark):
     expected = run("predict", "linear", presses, "--models", models).stdout
@@ -79,8 +89,8 @@ def test_predict_from_stdin(presses, models, mark):
 @pytest.mark.parametrize(
     ("model", "text", "error", "said"),
     [
-        ("linear", "A,B\n1,2\n", ChargeError, "stdin: expected one column for each .*missing: 'C'"),
-        ("linear", "A,B,C\n1,2,\n", ChargeError, "stdin, line 2: electrode 'C'"),
+        ("linear", "A,B\n1,2\n", ChargeError, "stdin: expected a header with one column for each .*missing: 'C'"),
+        ("linear", "A,B,C\n1,2,\n", ChargeError, "stdin, line 2, column 'C'"),
         ("linear", "", ChargeError, "stdin: empty"),
         ("cubic", "A,B,C\n", ModelError, "no model 'cubic'"),
     ],
