@@ -27,6 +27,7 @@ from isocharge.serve.port.device_clock import DeviceClock
 from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
 from isocharge.serve.port.serial_port import Chunk, Port
 from isocharge.serve.port.source import open_source
+from isocharge.serve.prediction.check import Check, check_presses
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.prediction.predictor import Contact, Contacts, Predictor
 from isocharge.serve.prediction.record import PredictionRecord
@@ -45,6 +46,7 @@ __all__ = [
     "AutoParser",
     "BinaryParser",
     "Chain",
+    "Check",
     "Chunk",
     "Contact",
     "Contacts",
@@ -81,6 +83,7 @@ __all__ = [
     "UdpSink",
     "VirtualSensor",
     "check_golden",
+    "check_presses",
     "csv_header",
     "csv_line",
     "device_from_table",

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import signal
 import socket
 import time
@@ -45,7 +46,7 @@ def sensor(film):
         yield sensor
 
 
-@pytest.mark.parametrize("command", ["predict", "stream", "virtual", "replay", "doctor"])
+@pytest.mark.parametrize("command", ["predict", "check", "stream", "virtual", "replay", "doctor"])
 def test_help_has_an_example(command):
     text = run(command, "--help").stdout
     assert f"Example: isocharge serve {command} " in " ".join(text.split())
@@ -104,6 +105,81 @@ def test_predict_refuses_with_the_reason(models, model, text, error, said):
 def test_predict_without_a_file(models, file):
     with pytest.raises(InputError, match=r"cannot be read .*expected a CSV file, or - for stdin"):
         run("predict", "linear", file, "--models", models)
+
+
+@pytest.fixture
+def measured(tmp_path, film):
+    """Write presses of the linear film, their forces read on a scale with an error of its own."""
+
+    def write(*, scale=1.0, count=6, known="x_mm,y_mm,force_N"):
+        rng = np.random.default_rng(1)
+        x, y, force = rng.uniform(-4, 4, count), rng.uniform(-4, 4, count), rng.uniform(0.2, 1.5, count)
+        values = dict(zip(("x_mm", "y_mm", "force_N"), (x, y, scale * force), strict=True))
+        table = np.column_stack([*(values[name] for name in known.split(",")), film.charge_pC(x, y, force)])
+        path = tmp_path / "measured.csv"
+        path.write_text(f"{known},A,B,C,day\n" + "".join(",".join(map(repr, row)) + ",1\n" for row in table.tolist()))
+        return path
+
+    return write
+
+
+def test_check_of_a_film_that_fits(measured, models, command):
+    path = measured()
+    code, out, err = command("serve", "check", "linear", path, "--models", models)
+    assert (code, err) == (0, f"{path}: ignored columns: ['day']\n")
+    lines = out.splitlines()
+    assert lines[0].split() == ["line", "x,", "mm", "y,", "mm", "force,", "N", "off,", "mm", "off,", "%", "flags"]
+    assert [line.split()[0] for line in lines[1:7]] == list("234567")
+    assert lines[-1] == "fits: noise explains the errors"
+
+
+def test_check_of_a_film_that_does_not_fit(measured, models, command):
+    code, out, _ = command("serve", "check", "linear", measured(scale=0.9), "--models", models)
+    assert code == 1
+    assert "does not fit: 0 mm and 11 % beyond noise: calibrate the film again" in out
+    assert "forces are 1.111 +- 0.0041 times the known ones" in out
+
+
+def test_check_takes_the_rig_s_uncertainty(measured, models, command):
+    words = ["serve", "check", "linear", measured(scale=0.97), "--models", models, "--json"]
+    assert [command(*words, "--force-std", share)[0] for share in (0.01, 0.05)] == [1, 0]
+    values = json.loads(command(*words, "--position-std", "0.4", "--force-std", "0.05")[1])
+    assert values["position_mm"]["rig"] == pytest.approx(0.4 * 2**0.5)
+    assert values["force_percent"]["rig"] == pytest.approx(5.0)
+    assert values["force_percent"]["rms"] == pytest.approx(100 * (1 / 0.97 - 1), rel=1e-3)
+    assert values["model"] == "linear/1"
+
+
+def test_check_of_many_presses_shows_the_worst(measured, models, command):
+    _, out, _ = command("serve", "check", "linear", measured(count=100, known="force_N"), "--models", models)
+    assert out.startswith("the 40 worst of 100 presses; --json has all\n")
+    assert out.splitlines()[2].split()[-2] == "-"
+    assert "position" not in out
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_check_of_too_few_presses(measured, models, command, count):
+    code, out, _ = command("serve", "check", "linear", measured(count=count), "--models", models)
+    assert (code, "too few presses to say" in out) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "said"),
+    [
+        ("x_mm,y_mm,A,B\n1,2,3,4\n", [], "PressError: .*missing: 'C'"),
+        ("x_mm,y_mm,A,B,C\n", [], "PressError: .*expected one press or more"),
+        ("force_N,A,B,C\n1,2,3,4\n", ["--force-std", "0"], "PressError: force_std: expected a positive share"),
+        ("force_N,A,B,C\n1,2,3,4\n", ["--position-std", "nan"], "PressError: position_std_mm: expected a positive"),
+        (None, [], "PressError: .*cannot be read"),
+    ],
+)
+def test_check_refuses_with_the_reason(tmp_path, models, command, text, words, said):
+    path = tmp_path / "measured.csv"
+    if text is not None:
+        path.write_text(text)
+    code, out, err = command("serve", "check", "linear", path, "--models", models, *words)
+    assert (code, out) == (2, "")
+    assert re.match(said, err)
 
 
 def test_stream_counts_records(sensor, models):
