@@ -23,6 +23,7 @@ with require("simulate"):
     from isocharge.simulate.dataset.sweep import run_sweep, solve_maps, write_sweep
     from isocharge.simulate.forward.charge_model import ChargeFunction
     from isocharge.simulate.forward.charge_spline import ChargeSpline
+    from isocharge.simulate.forward.film_family import FilmFamily
     from isocharge.simulate.forward.forward_map import ForwardMap
     from isocharge.simulate.forward.readout import contact_charge, pretension_charge, thermal_charge, touch_charge
     from isocharge.simulate.identifiability.cramer_rao import CramerRao, limits_at
@@ -34,6 +35,7 @@ with require("simulate"):
     from isocharge.simulate.mesh.resolution import Resolution
     from isocharge.simulate.sensor.electrode import Calibration, Electrode
     from isocharge.simulate.sensor.film import Film, Piezo
+    from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread, virtual_film
     from isocharge.simulate.sensor.probe import Circle, Polygon, Probe, parse_probe
     from isocharge.simulate.sensor.sensor import Sensor
     from isocharge.simulate.sensor.sensor_file import (
@@ -64,6 +66,9 @@ __all__ = [
     "Electrode",
     "Equilibrium",
     "Film",
+    "FilmFamily",
+    "FilmPrior",
+    "FilmSpread",
     "Fix",
     "ForwardMap",
     "Mapping",
@@ -101,6 +106,7 @@ __all__ = [
     "theory_for",
     "thermal_charge",
     "touch_charge",
+    "virtual_film",
     "working_area",
     "write_dataset",
     "write_sensor",

@@ -72,11 +72,12 @@ def solve_family(
         for distance in family.distance
         for turn in family.solved_turns
     ]
-    stress = np.stack(list(_report(map_jobs(_solve_chain, chains), len(chains), progress)))
+    stress = np.stack(list(report_each(map_jobs(_solve_chain, chains), len(chains), progress)))
     return stress.reshape(family.distance.size, family.solved_turns.size, family.force.size, -1)
 
 
-def _report(results: Iterable[Array], total: int, progress: Progress | None) -> Iterator[Array]:
+def report_each(results: Iterable[Array], total: int, progress: Progress | None) -> Iterator[Array]:
+    """The results one by one; `progress` is called with (done, total) after each."""
     for done, result in enumerate(results, start=1):
         if progress:
             progress(done, total)

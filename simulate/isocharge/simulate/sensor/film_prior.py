@@ -1,0 +1,175 @@
+"""What nobody knows of a real film: its parameters, and how they spread about what a sensor's file says.
+
+Film, coefficients, gains and the place of the electrodes are known to some percent or tenths of a millimetre before
+anything is measured; the pretension is hardly known at all. A calibration starts from this spread, a virtual film is a
+draw from it, and a network for all films is trained over it.
+
+Parameters are deviations from the sensor's file, so that zero is the film as described, but for the pretension, which
+is the pretension itself:
+
+    pretension                     Pa
+    young, thickness, d31, d32     ln(value / described value), dimensionless
+    shift_x, shift_y, rotation     of the electrodes, added to the described ones, m and rad
+    probe_radius                   added to the described radius, m
+    gain A, gain B, ...            ln(gain / described gain), dimensionless, by electrode
+"""
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.errors import SceneError
+from isocharge.simulate.sensor.electrode import Calibration
+from isocharge.simulate.sensor.film import Film, Piezo
+from isocharge.simulate.sensor.probe import Circle
+from isocharge.simulate.sensor.sensor import Sensor
+
+SHARED = ("pretension", "young", "thickness", "d31", "d32", "shift_x", "shift_y", "rotation", "probe_radius")
+"""Parameters that every film has; gains follow, one for each electrode."""
+
+REACH = 2.5
+"""Largest deviation that a film or a calibration may have, in standard deviations; the pretension ends at `TAUTEST`."""
+
+TAUTEST = 4.0 / 3.0
+"""Largest pretension that a calibration may find, over the largest of the spread."""
+
+PROBES = (0.5, 1.5)
+"""Smallest and largest radius of a probe that a calibration may find, over the described one."""
+
+
+@dataclass(frozen=True)
+class FilmSpread:
+    """How far films spread: the largest pretension, and one standard deviation of everything else.
+
+    Attributes:
+        pretension: Largest pretension, Pa; all from none to this are equally likely.
+        young: Of the logarithm of Young's modulus, dimensionless, as those of thickness, d31, d32 and gain.
+        thickness: As above.
+        d31: As above.
+        d32: As above.
+        shift: Displacement of the electrodes along x and along y, m.
+        rotation: Turn of the electrodes, rad.
+        probe_radius: m.
+        gain: Of every electrode's gain, each by itself.
+    """
+
+    pretension: float = 3e6
+    young: float = 0.2
+    thickness: float = 0.05
+    d31: float = 0.2
+    d32: float = 0.2
+    shift: float = 0.3e-3
+    rotation: float = float(np.deg2rad(2.0))
+    probe_radius: float = 0.3e-3
+    gain: float = 0.05
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise SceneError(f"spread of {field.name}: expected a positive number, got {value}")
+
+
+@dataclass(frozen=True)
+class FilmPrior:
+    """The films that a described sensor may be, under a probe whose radius is not exactly known either.
+
+    Attributes:
+        sensor: The sensor as described.
+        probe: The probe as described; round, since its radius is one of the parameters.
+        spread: How far the films spread.
+    """
+
+    sensor: Sensor
+    probe: Circle
+    spread: FilmSpread = FilmSpread()
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, in their order."""
+        return (*SHARED, *(f"gain {name}" for name in self.sensor.electrode_names))
+
+    @cached_property
+    def mean(self) -> Array:
+        """Means of the parameters, shape (n_parameter,): the film as described, half of the largest pretension."""
+        mean = np.zeros(len(self.names))
+        mean[0] = 0.5 * self.spread.pretension
+        return mean
+
+    @cached_property
+    def std(self) -> Array:
+        """Standard deviations of the parameters, shape (n_parameter,)."""
+        spread, count = self.spread, len(self.sensor.electrodes)
+        shared = [spread.pretension / np.sqrt(12.0), spread.young, spread.thickness, spread.d31, spread.d32]
+        placed = [spread.shift, spread.shift, spread.rotation, min(spread.probe_radius, 0.3 * self.probe.radius)]
+        return np.array([*shared, *placed, *[spread.gain] * count])
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Smallest and largest parameters that a film or a calibration may have, each of shape (n_parameter,)."""
+        low, high = self.mean - REACH * self.std, self.mean + REACH * self.std
+        low[0], high[0] = 0.0, TAUTEST * self.spread.pretension
+        radius = self.names.index("probe_radius")
+        low[radius] = max(low[radius], (PROBES[0] - 1.0) * self.probe.radius)
+        high[radius] = min(high[radius], (PROBES[1] - 1.0) * self.probe.radius)
+        return low, high
+
+    @property
+    def described(self) -> Array:
+        """The parameters of the film exactly as described, shape (n_parameter,)."""
+        parameters = np.zeros(len(self.names))
+        parameters[0] = self.sensor.film.pretension
+        return parameters
+
+    def draw(self, rng: np.random.Generator, count: int) -> Array:
+        """Films drawn from the spread, shape (count, n_parameter); deviations beyond the bounds are drawn again."""
+        drawn = self.mean + self.std * rng.standard_normal((count, len(self.names)))
+        while (outside := (drawn < self.bounds[0]) | (drawn > self.bounds[1])).any():
+            again = self.mean + self.std * rng.standard_normal(drawn.shape)
+            drawn = np.where(outside, again, drawn)
+        drawn[:, 0] = self.spread.pretension * rng.random(count)
+        return drawn
+
+    def film(self, parameters: Array) -> tuple[Sensor, Circle]:
+        """The sensor and the probe that parameters, shape (n_parameter,), describe.
+
+        Raises:
+            SensorError: If there can be no such sensor: electrodes moved off the film, or a negative pretension.
+        """
+        values = dict(zip(self.names, (float(value) for value in parameters), strict=True))
+        before = self.sensor.calibration
+        described, piezo = self.sensor.film, self.sensor.piezo
+        gains = {
+            name: before.gain.get(name, 1.0) * float(np.exp(values[f"gain {name}"]))
+            for name in self.sensor.electrode_names
+        }
+        shift = (before.shift[0] + values["shift_x"], before.shift[1] + values["shift_y"])
+        sensor = replace(
+            self.sensor,
+            film=_film(described, values),
+            piezo=Piezo(
+                piezo.d31 * float(np.exp(values["d31"])),
+                piezo.d32 * float(np.exp(values["d32"])),
+                piezo.d33,
+                piezo.pyro,
+            ),
+            calibration=Calibration(gains, shift, before.rotation + values["rotation"]),
+        )
+        return sensor, Circle(self.probe.radius + values["probe_radius"])
+
+
+def _film(described: Film, values: dict[str, float]) -> Film:
+    return replace(
+        described,
+        young=described.young * float(np.exp(values["young"])),
+        thickness=described.thickness * float(np.exp(values["thickness"])),
+        pretension=values["pretension"],
+    )
+
+
+def virtual_film(sensor: Sensor, probe: Circle, seed: int) -> tuple[Sensor, Circle]:
+    """A film drawn from the spread about a sensor and a probe: the bench that nobody has measured yet."""
+    prior = FilmPrior(sensor, probe)
+    return prior.film(prior.draw(np.random.default_rng(seed), 1)[0])
