@@ -16,6 +16,7 @@ from isocharge.cli.serve.app import serve_app
 from isocharge.errors import ChargeError, InputError, ModelError, OutputExists, PortError, PortLost, SensorError
 from isocharge.serve import BinaryParser, Port, Script, VirtualSensor, wander
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
+from isocharge.simulate import Circle, ForwardMap, load_sensor, virtual_film
 
 
 @pytest.fixture
@@ -366,6 +367,87 @@ def test_scripted_presses_as_text_are_felt(start, tmp_path):
     result = run("stream", "three-25um-biaxial", "--port", link, "--count", 400)
     last = json.loads(result.stdout.splitlines()[-1])
     assert (last["x_mm"], last["y_mm"], last["force_N"]) == pytest.approx((1.0, 2.0, 0.5), abs=0.05)
+
+
+HELD = "seconds,x_mm,y_mm,force_N\n0,0,0,0\n0.5,0,0,0\n0.501,1,2,0.5\n60,1,2,0.5\n"
+"""A script: half a second without touch, then one press that is held."""
+
+
+def held_charge_pC(start, folder, sensor, film):
+    """The touch charges of HELD that the command plays, pC, and what it says on stderr."""
+    link, script = folder / f"film{film}", folder / "held.csv"
+    script.write_text(HELD)
+    words = ["--link", link, "--script", script, "--force-max", "0.5", "--noise", "clean", "--film", film]
+    process = start("virtual", sensor, *words)
+    process.stdout.readline()
+    parser, frames = BinaryParser(), []
+    with Port(str(link)) as port:
+        for chunk in port:
+            frames += parser.feed(chunk.data)
+            if len(frames) > 250:
+                break
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=20)
+    values = np.array([frame.values for frame in frames])
+    rest = values[values.sum(axis=1) < values.sum(axis=1).mean()]
+    return values[-1] - rest[0], err
+
+
+def charge_of_film_pC(sensor, seed):
+    """The same from a forward map of the film that the seed draws."""
+    film, probe = virtual_film(load_sensor(sensor), Circle(1e-3), seed)
+    forward_map = ForwardMap.build(film, probe, 3e-3, (0.2, 0.5))
+    return 1e12 * forward_map.forward(np.array([1e-3]), np.array([2e-3]), np.array([0.5]))[0]
+
+
+def test_virtual_film_plays_the_charges_of_its_film_and_does_not_tell_it(start, tmp_path):
+    """Seed 9 draws a rather slack film, which is solved in the shortest time."""
+    sensor = "three-25um-biaxial"
+    charge_pC, err = held_charge_pC(start, tmp_path, sensor, 9)
+    np.testing.assert_allclose(charge_pC, charge_of_film_pC(sensor, 9), rtol=2e-3)
+    described = ForwardMap.build(load_sensor(sensor), Circle(1e-3), 3e-3, (0.2, 0.5))
+    described_pC = 1e12 * described.forward(np.array([1e-3]), np.array([2e-3]), np.array([0.5]))[0]
+    assert np.abs(charge_pC / described_pC - 1.0).max() > 0.02
+    first, last = err.splitlines()
+    assert first == "playing film 9 of three-25um-biaxial at 200 Hz; Ctrl-C stops"
+    assert re.fullmatch(r"\d+ frames sent, \d+ withheld because no program read them, 0 lost and 0 .*", last)
+
+
+@pytest.mark.slow
+def test_a_seed_is_a_film(start, tmp_path):
+    sensor = "four-25um-biaxial"
+    charges = []
+    for run_number, film in enumerate((3, 3, 4)):
+        folder = tmp_path / str(run_number)
+        folder.mkdir()
+        charges.append(held_charge_pC(start, folder, sensor, film)[0])
+        np.testing.assert_allclose(charges[-1], charge_of_film_pC(sensor, film), rtol=2e-3)
+    np.testing.assert_array_equal(charges[0], charges[1])
+    assert np.abs(charges[2] / charges[0] - 1.0).max() > 0.05
+
+
+def test_virtual_film_of_a_seed_is_one_draw(monkeypatch):
+    """What the command solves: the same for the same seed, another for another, the described without one."""
+    solved = []
+
+    def build(sensor, probe, **_):
+        solved.append((sensor, probe))
+        raise InputError("not solved in this test")
+
+    monkeypatch.setattr(ForwardMap, "build", build)
+    for words in ((), ("--film", 3), ("--film", 3, "--seed", 8), ("--film", 4)):
+        with pytest.raises(InputError, match="not solved"):
+            run("virtual", "four-25um-biaxial", "--probe", "circle:1.5", *words)
+    described = load_sensor("four-25um-biaxial"), Circle(1.5e-3)
+    assert solved[0] == described
+    assert solved[1] == solved[2] == virtual_film(*described, 3)
+    assert solved[3] == virtual_film(*described, 4) != solved[1]
+
+
+@pytest.mark.parametrize("probe", ["rectangle:4x2", "triangle:4"])
+def test_virtual_film_needs_a_round_probe(probe):
+    with pytest.raises(InputError, match=f"--film: expected a round --probe like circle:1.0.*got '{probe}'"):
+        run("virtual", "three-25um-biaxial", "--film", 1, "--probe", probe)
 
 
 def test_virtual_sensor_of_described_frames_with_faults(start, tmp_path):
