@@ -150,10 +150,10 @@ def test_predict_into_allocates_no_array(predictor):
     charges, out = np.full(3, 100.0, np.float32), np.zeros(7, np.float32)
     predictor.predict_into(charges, out)
     tracemalloc.start()
-    for _ in range(1000):
+    for _ in range(20_000):
         predictor.predict_into(charges, out)
     (grown, _), _ = tracemalloc.get_traced_memory(), tracemalloc.stop()
-    assert grown < 1000
+    assert grown < 20_000  # an array each is 2 MB; onnxruntime holds up to 10 kB after other tests, however many calls
 
 
 def test_predictor_in_threads(film, models, predictor):
