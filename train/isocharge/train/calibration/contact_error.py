@@ -4,8 +4,8 @@ An estimator that takes a film for another by dp errs by the contact that explai
 
     dc = -G dp,   G = (J' W J)^-1 J' W P,
 
-J and P the derivatives of the charges by contact and parameters, W one over the noise variance. With C the covariance of
-the parameters the error left is G C G'; noise alone leaves (J' W J)^-1, the Cramer-Rao limit.
+J and P the derivatives of the charges by contact and parameters, W one over the noise variance. With C the covariance
+of the parameters the error left is G C G'; noise alone leaves (J' W J)^-1, the Cramer-Rao limit.
 """
 
 from dataclasses import dataclass

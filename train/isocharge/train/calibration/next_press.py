@@ -1,8 +1,8 @@
 """Where to press next: the presses that would lower the error of contacts most.
 
-A press at a place adds information about the film, however it turns out; the error left by not knowing the film follows
-from the information alone (linearised, at the film as known by now). The presses are chosen one after the other, each the
-best given those before (A-optimal design, greedily; Pukelsheim 1993).
+A press at a place adds information about the film, however it turns out; the error left by not knowing the film
+follows from the information alone (linearised, at the film as known by now). The presses are chosen one after the
+other, each the best given those before (A-optimal design, greedily; Pukelsheim 1993).
 """
 
 from dataclasses import dataclass
