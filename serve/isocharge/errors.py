@@ -30,6 +30,10 @@ class ChargeError(InputError):
     """Charges do not fit the model: wrong number, NaN, infinite."""
 
 
+class PressError(InputError):
+    """Measured presses cannot be used: wrong column, not a number, force that is not positive."""
+
+
 class DeviceError(InputError):
     """The description of a device is wrong: unknown key, frame whose parts do not add up, unknown checksum."""
 

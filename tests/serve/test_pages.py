@@ -41,7 +41,8 @@ def test_frame_example():
 
 
 @pytest.mark.parametrize("example", [*examples("python")])
-def test_python_example_prints_what_it_says(example, start_http, run_example):
+def test_python_example_prints_what_it_says(example, start_http, run_example, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     if "127.0.0.1:8000" in example:
         example = example.replace("127.0.0.1:8000", start_http(Handler(open_model_store())).url.removeprefix("http://"))
     run_example(example, "serve")
@@ -56,6 +57,8 @@ def test_commands_run_line_by_line(example, tmp_path, run_commands):
     if "curl" in example:
         outputs = json.loads(printed[printed.index("{") :])["outputs"]
         assert outputs[0]["data"] == pytest.approx([3.0, -2.0, 1.0], abs=0.02)
+    if "serve check" in example:
+        assert f"```text\n{printed}```" in PAGES["measured_presses.md"]
     if "doctor" in example:
         assert "binary frames of isocharge" in printed
         assert (tmp_path / "again.jsonl").read_text() == (tmp_path / "touch.jsonl").read_text()

@@ -27,6 +27,8 @@ from isocharge.serve.port.device_clock import DeviceClock
 from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
 from isocharge.serve.port.serial_port import Chunk, Port
 from isocharge.serve.port.source import open_source
+from isocharge.serve.prediction.check import Check, check_presses
+from isocharge.serve.prediction.measured_presses import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.prediction.predictor import Contact, Contacts, Predictor
 from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
@@ -44,6 +46,7 @@ __all__ = [
     "AutoParser",
     "BinaryParser",
     "Chain",
+    "Check",
     "Chunk",
     "Contact",
     "Contacts",
@@ -58,6 +61,7 @@ __all__ = [
     "FrameLayout",
     "HumRule",
     "LeakRule",
+    "MeasuredPresses",
     "Model",
     "ModelMetadata",
     "Parser",
@@ -79,6 +83,7 @@ __all__ = [
     "UdpSink",
     "VirtualSensor",
     "check_golden",
+    "check_presses",
     "csv_header",
     "csv_line",
     "device_from_table",
@@ -91,10 +96,12 @@ __all__ = [
     "load_model",
     "open_source",
     "read_charges",
+    "read_presses",
     "read_script",
     "stream",
     "table_records",
     "wander",
     "write_contacts",
     "write_model",
+    "write_presses",
 ]

@@ -38,7 +38,14 @@ with require("simulate"):
     from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread, virtual_film
     from isocharge.simulate.sensor.probe import Circle, Polygon, Probe, parse_probe
     from isocharge.simulate.sensor.sensor import Sensor
-    from isocharge.simulate.sensor.sensor_file import built_in_sensors, load_sensor, sensor_from_dict, sensor_to_dict
+    from isocharge.simulate.sensor.sensor_file import (
+        built_in_sensors,
+        load_sensor,
+        sensor_from_dict,
+        sensor_to_dict,
+        sensor_to_toml,
+        write_sensor,
+    )
     from isocharge.simulate.solver.equilibrium import Equilibrium
     from isocharge.simulate.solver.press import press
     from isocharge.simulate.solver.settings import SolveSettings
@@ -94,6 +101,7 @@ __all__ = [
     "run_sweep",
     "sensor_from_dict",
     "sensor_to_dict",
+    "sensor_to_toml",
     "solve_maps",
     "theory_for",
     "thermal_charge",
@@ -101,5 +109,6 @@ __all__ = [
     "virtual_film",
     "working_area",
     "write_dataset",
+    "write_sensor",
     "write_sweep",
 ]

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import signal
 import socket
 import time
@@ -15,6 +16,7 @@ from isocharge.cli.serve.app import serve_app
 from isocharge.errors import ChargeError, InputError, ModelError, OutputExists, PortError, PortLost, SensorError
 from isocharge.serve import BinaryParser, Port, Script, VirtualSensor, wander
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
+from isocharge.simulate import Circle, ForwardMap, load_sensor, virtual_film
 
 
 @pytest.fixture
@@ -45,7 +47,7 @@ def sensor(film):
         yield sensor
 
 
-@pytest.mark.parametrize("command", ["predict", "stream", "virtual", "replay", "doctor"])
+@pytest.mark.parametrize("command", ["predict", "check", "stream", "virtual", "replay", "doctor"])
 def test_help_has_an_example(command):
     text = run(command, "--help").stdout
     assert f"Example: isocharge serve {command} " in " ".join(text.split())
@@ -69,6 +71,16 @@ def test_predict_to_records(presses, models):
     ]
 
 
+def test_predict_from_a_file_of_measured_presses(presses, models):
+    """Its further columns cost a word on stderr."""
+    expected = run("predict", "linear", presses, "--models", models).stdout
+    header, *rows = presses.read_text().splitlines()
+    presses.write_text("\n".join(["x_mm,y_mm,force_N," + header, *(f"1,,2,{row}" for row in rows)]))
+    result = run("predict", "linear", presses, "--models", models)
+    assert result.stdout == expected
+    assert result.stderr == f"{presses}: ignored columns: ['x_mm', 'y_mm', 'force_N']\n"
+
+
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"], ids=["plain", "byte order mark"])
 def test_predict_from_stdin(presses, models, mark):
     expected = run("predict", "linear", presses, "--models", models).stdout
@@ -79,8 +91,8 @@ def test_predict_from_stdin(presses, models, mark):
 @pytest.mark.parametrize(
     ("model", "text", "error", "said"),
     [
-        ("linear", "A,B\n1,2\n", ChargeError, "stdin: expected one column for each .*missing: 'C'"),
-        ("linear", "A,B,C\n1,2,\n", ChargeError, "stdin, line 2: electrode 'C'"),
+        ("linear", "A,B\n1,2\n", ChargeError, "stdin: expected a header with one column for each .*missing: 'C'"),
+        ("linear", "A,B,C\n1,2,\n", ChargeError, "stdin, line 2, column 'C'"),
         ("linear", "", ChargeError, "stdin: empty"),
         ("cubic", "A,B,C\n", ModelError, "no model 'cubic'"),
     ],
@@ -94,6 +106,81 @@ def test_predict_refuses_with_the_reason(models, model, text, error, said):
 def test_predict_without_a_file(models, file):
     with pytest.raises(InputError, match=r"cannot be read .*expected a CSV file, or - for stdin"):
         run("predict", "linear", file, "--models", models)
+
+
+@pytest.fixture
+def measured(tmp_path, film):
+    """Write presses of the linear film, their forces read on a scale with an error of its own."""
+
+    def write(*, scale=1.0, count=6, known="x_mm,y_mm,force_N"):
+        rng = np.random.default_rng(1)
+        x, y, force = rng.uniform(-4, 4, count), rng.uniform(-4, 4, count), rng.uniform(0.2, 1.5, count)
+        values = dict(zip(("x_mm", "y_mm", "force_N"), (x, y, scale * force), strict=True))
+        table = np.column_stack([*(values[name] for name in known.split(",")), film.charge_pC(x, y, force)])
+        path = tmp_path / "measured.csv"
+        path.write_text(f"{known},A,B,C,day\n" + "".join(",".join(map(repr, row)) + ",1\n" for row in table.tolist()))
+        return path
+
+    return write
+
+
+def test_check_of_a_film_that_fits(measured, models, command):
+    path = measured()
+    code, out, err = command("serve", "check", "linear", path, "--models", models)
+    assert (code, err) == (0, f"{path}: ignored columns: ['day']\n")
+    lines = out.splitlines()
+    assert lines[0].split() == ["line", "x,", "mm", "y,", "mm", "force,", "N", "off,", "mm", "off,", "%", "flags"]
+    assert [line.split()[0] for line in lines[1:7]] == list("234567")
+    assert lines[-1] == "fits: noise explains the errors"
+
+
+def test_check_of_a_film_that_does_not_fit(measured, models, command):
+    code, out, _ = command("serve", "check", "linear", measured(scale=0.9), "--models", models)
+    assert code == 1
+    assert "does not fit: 0 mm and 11 % beyond noise: calibrate the film again" in out
+    assert "forces are 1.111 +- 0.0041 times the known ones" in out
+
+
+def test_check_takes_the_rig_s_uncertainty(measured, models, command):
+    words = ["serve", "check", "linear", measured(scale=0.97), "--models", models, "--json"]
+    assert [command(*words, "--force-std", share)[0] for share in (0.01, 0.05)] == [1, 0]
+    values = json.loads(command(*words, "--position-std", "0.4", "--force-std", "0.05")[1])
+    assert values["position_mm"]["rig"] == pytest.approx(0.4 * 2**0.5)
+    assert values["force_percent"]["rig"] == pytest.approx(5.0)
+    assert values["force_percent"]["rms"] == pytest.approx(100 * (1 / 0.97 - 1), rel=1e-3)
+    assert values["model"] == "linear/1"
+
+
+def test_check_of_many_presses_shows_the_worst(measured, models, command):
+    _, out, _ = command("serve", "check", "linear", measured(count=100, known="force_N"), "--models", models)
+    assert out.startswith("the 40 worst of 100 presses; --json has all\n")
+    assert out.splitlines()[2].split()[-2] == "-"
+    assert "position" not in out
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_check_of_too_few_presses(measured, models, command, count):
+    code, out, _ = command("serve", "check", "linear", measured(count=count), "--models", models)
+    assert (code, "too few presses to say" in out) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "said"),
+    [
+        ("x_mm,y_mm,A,B\n1,2,3,4\n", [], "PressError: .*missing: 'C'"),
+        ("x_mm,y_mm,A,B,C\n", [], "PressError: .*expected one press or more"),
+        ("force_N,A,B,C\n1,2,3,4\n", ["--force-std", "0"], "PressError: force_std: expected a positive share"),
+        ("force_N,A,B,C\n1,2,3,4\n", ["--position-std", "nan"], "PressError: position_std_mm: expected a positive"),
+        (None, [], "PressError: .*cannot be read"),
+    ],
+)
+def test_check_refuses_with_the_reason(tmp_path, models, command, text, words, said):
+    path = tmp_path / "measured.csv"
+    if text is not None:
+        path.write_text(text)
+    code, out, err = command("serve", "check", "linear", path, "--models", models, *words)
+    assert (code, out) == (2, "")
+    assert re.match(said, err)
 
 
 def test_stream_counts_records(sensor, models):
@@ -280,6 +367,87 @@ def test_scripted_presses_as_text_are_felt(start, tmp_path):
     result = run("stream", "three-25um-biaxial", "--port", link, "--count", 400)
     last = json.loads(result.stdout.splitlines()[-1])
     assert (last["x_mm"], last["y_mm"], last["force_N"]) == pytest.approx((1.0, 2.0, 0.5), abs=0.05)
+
+
+HELD = "seconds,x_mm,y_mm,force_N\n0,0,0,0\n0.5,0,0,0\n0.501,1,2,0.5\n60,1,2,0.5\n"
+"""A script: half a second without touch, then one press that is held."""
+
+
+def held_charge_pC(start, folder, sensor, film):
+    """The touch charges of HELD that the command plays, pC, and what it says on stderr."""
+    link, script = folder / f"film{film}", folder / "held.csv"
+    script.write_text(HELD)
+    words = ["--link", link, "--script", script, "--force-max", "0.5", "--noise", "clean", "--film", film]
+    process = start("virtual", sensor, *words)
+    process.stdout.readline()
+    parser, frames = BinaryParser(), []
+    with Port(str(link)) as port:
+        for chunk in port:
+            frames += parser.feed(chunk.data)
+            if len(frames) > 250:
+                break
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=20)
+    values = np.array([frame.values for frame in frames])
+    rest = values[values.sum(axis=1) < values.sum(axis=1).mean()]
+    return values[-1] - rest[0], err
+
+
+def charge_of_film_pC(sensor, seed):
+    """The same from a forward map of the film that the seed draws."""
+    film, probe = virtual_film(load_sensor(sensor), Circle(1e-3), seed)
+    forward_map = ForwardMap.build(film, probe, 3e-3, (0.2, 0.5))
+    return 1e12 * forward_map.forward(np.array([1e-3]), np.array([2e-3]), np.array([0.5]))[0]
+
+
+def test_virtual_film_plays_the_charges_of_its_film_and_does_not_tell_it(start, tmp_path):
+    """Seed 9 draws a rather slack film, which is solved in the shortest time."""
+    sensor = "three-25um-biaxial"
+    charge_pC, err = held_charge_pC(start, tmp_path, sensor, 9)
+    np.testing.assert_allclose(charge_pC, charge_of_film_pC(sensor, 9), rtol=2e-3)
+    described = ForwardMap.build(load_sensor(sensor), Circle(1e-3), 3e-3, (0.2, 0.5))
+    described_pC = 1e12 * described.forward(np.array([1e-3]), np.array([2e-3]), np.array([0.5]))[0]
+    assert np.abs(charge_pC / described_pC - 1.0).max() > 0.02
+    first, last = err.splitlines()
+    assert first == "playing film 9 of three-25um-biaxial at 200 Hz; Ctrl-C stops"
+    assert re.fullmatch(r"\d+ frames sent, \d+ withheld because no program read them, 0 lost and 0 .*", last)
+
+
+@pytest.mark.slow
+def test_a_seed_is_a_film(start, tmp_path):
+    sensor = "four-25um-biaxial"
+    charges = []
+    for run_number, film in enumerate((3, 3, 4)):
+        folder = tmp_path / str(run_number)
+        folder.mkdir()
+        charges.append(held_charge_pC(start, folder, sensor, film)[0])
+        np.testing.assert_allclose(charges[-1], charge_of_film_pC(sensor, film), rtol=2e-3)
+    np.testing.assert_array_equal(charges[0], charges[1])
+    assert np.abs(charges[2] / charges[0] - 1.0).max() > 0.05
+
+
+def test_virtual_film_of_a_seed_is_one_draw(monkeypatch):
+    """What the command solves: the same for the same seed, another for another, the described without one."""
+    solved = []
+
+    def build(sensor, probe, **_):
+        solved.append((sensor, probe))
+        raise InputError("not solved in this test")
+
+    monkeypatch.setattr(ForwardMap, "build", build)
+    for words in ((), ("--film", 3), ("--film", 3, "--seed", 8), ("--film", 4)):
+        with pytest.raises(InputError, match="not solved"):
+            run("virtual", "four-25um-biaxial", "--probe", "circle:1.5", *words)
+    described = load_sensor("four-25um-biaxial"), Circle(1.5e-3)
+    assert solved[0] == described
+    assert solved[1] == solved[2] == virtual_film(*described, 3)
+    assert solved[3] == virtual_film(*described, 4) != solved[1]
+
+
+@pytest.mark.parametrize("probe", ["rectangle:4x2", "triangle:4"])
+def test_virtual_film_needs_a_round_probe(probe):
+    with pytest.raises(InputError, match=f"--film: expected a round --probe like circle:1.0.*got '{probe}'"):
+        run("virtual", "three-25um-biaxial", "--film", 1, "--probe", probe)
 
 
 def test_virtual_sensor_of_described_frames_with_faults(start, tmp_path):

@@ -24,10 +24,37 @@ def read(text):
         "C,A,B\n3,1,2\n6.5,4,5",
         "\n A , B,C \n1, 2,3\n,,\n4,5,65e-1\n",
         '"A","B","C"\n"1",2,3\n4,5,6.5\n',
+        '# of "today\n\nA,B,C\n1,2,3,,\n  # 7,8,9\n4,5,6.5\n',
     ],
 )
 def test_charges_are_the_same_from_every_kind_of_csv(text):
     np.testing.assert_array_equal(read(text), [[1, 2, 3], [4, 5, 6.5]])
+
+
+def test_further_columns_are_ignored_with_a_word():
+    words = []
+    text = io.StringIO("x_mm,A,B,,C,x_mm\nhere,1,2,?,3,\n")
+    np.testing.assert_array_equal(read_charges(text, NAMES, "presses.csv", words.append), [[1, 2, 3]])
+    assert words == ["presses.csv: ignored columns: ['x_mm', '', 'x_mm']"]
+
+
+def test_an_electrode_that_looks_like_a_comment_or_begins_with_a_blank():
+    assert read_charges(io.StringIO("#1, A\n3,4\n#2,x\n"), ("#1", " A"), "presses.csv").tolist() == [[3, 4]]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (",".join(f"column {i}" for i in range(2000)), "expected at most 1,000 columns, got 2,000"),
+        ("A" * 200_000, "line 1: expected at most 100,000 characters, got more"),
+        ("A,B," + "x" * 90_000, "missing: 'C'"),
+        ("A,B,C\n" + ",".join("1" * 20_000), "line 2: expected 3 cells"),
+    ],
+)
+def test_a_message_stays_short(text, said):
+    with pytest.raises(ChargeError, match=said) as caught:
+        read(text)
+    assert len(str(caught.value)) < 600
 
 
 def test_charges_of_a_header_alone():
@@ -37,17 +64,20 @@ def test_charges_of_a_header_alone():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", r"presses.csv: empty; expected a header with the electrodes \('A', 'B', 'C'\)"),
+        ("", r"presses.csv: empty; expected a header with one column for each of the electrodes \('A', 'B', 'C'\)"),
         ("\n\n", "empty"),
         ("A,B\n1,2\n", "missing: 'C'"),
-        ("A,B,C,D\n1,2,3,4\n", "unknown: 'D'"),
         ("A,B,C,C\n1,2,3,4\n", "repeated: 'C'"),
-        ("1,2,3\n4,5,6\n", "unknown: '1', '2', '3'"),
-        ("A;B;C\n1;2;3\n", "unknown: 'A;B;C'"),
-        ("A,B,C\n1,2,3\n\n4,,6\n", "presses.csv, line 4: electrode 'B': expected a charge in pC, got ''"),
-        ("A,B,C\n1,2,x\n", "line 2: electrode 'C': expected a charge in pC, got 'x'"),
-        ("C,B,A\n1,nan,3\n", "line 2: electrode 'B': .* got 'nan'"),
-        ("A,B,C\n1,2,-inf\n", "line 2: electrode 'C': .* got '-inf'"),
+        ("1,2,3\n4,5,6\n", "missing: 'A', 'B', 'C'"),
+        ("A;B;C\n1;2;3\n", r"missing: .*separated by ';': .* with: tr ',;' '\.,' < FILE > NEW\.csv"),
+        ("A\tB\tC\n1\t2\t3\n", r"missing: .*separated by '\\t': "),
+        ("A,B,C\n1,2,3\n\n4,,6\n", "presses.csv, line 4, column 'B': expected a charge in pC, got an empty cell"),
+        ("A,B,C\n1,2,x\n", "line 2, column 'C': expected a charge in pC, got 'x'"),
+        ("C,B,A\n1,nan,3\n", "line 2, column 'B': .* got 'nan'"),
+        ("A,B,C\n1,2,-inf\n", "line 2, column 'C': .* got '-inf'"),
+        ("A,B,C\n1,2,1e39\n", "line 2, column 'C': .* got '1e39'"),
+        ("A,B,C\n1,1_0,3\n", "line 2, column 'B': .* got '1_0'"),
+        ('A,B,C\n1,"2,5",3\n', "line 2, column 'B': .* got '2,5'; write a decimal point"),
         ("A,B,C\n1,2\n", "line 2: expected 3 cells as in the header, got 2"),
         ("A,B,C\n1,2,3,4\n", "line 2: expected 3 cells as in the header, got 4"),
     ],

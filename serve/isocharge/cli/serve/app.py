@@ -2,6 +2,7 @@
 
 import typer
 
+from isocharge.cli.serve.check import check_command
 from isocharge.cli.serve.doctor import doctor_command
 from isocharge.cli.serve.http import http_command
 from isocharge.cli.serve.predict import predict_command
@@ -14,6 +15,7 @@ serve_app = typer.Typer(
     help="Estimate contacts from charges: from a file, from a sensor's port, over HTTP. Or play a virtual sensor.",
 )
 serve_app.command("predict")(predict_command)
+serve_app.command("check")(check_command)
 serve_app.command("stream")(stream_command)
 serve_app.command("replay")(replay_command)
 serve_app.command("doctor")(doctor_command)

@@ -11,6 +11,7 @@ import typer
 from isocharge.cli.serve.options import ModelsOption
 from isocharge.cli.shared.options import ModelArgument
 from isocharge.cli.shared.stopping import until_stopped
+from isocharge.cli.shared.terminal import say
 from isocharge.errors import InputError
 
 
@@ -20,7 +21,8 @@ def predict_command(
         str,
         typer.Argument(
             metavar="FILE.csv",
-            help="CSV file with the electrodes' names as header and a press in each row, charges in pC; - reads stdin.",
+            help="CSV file with the electrodes' names in the header and a press in each row, charges in pC; further "
+            "columns are ignored. - reads stdin.",
         ),
     ],
     json: Annotated[
@@ -36,7 +38,7 @@ def predict_command(
 
     predictor = Predictor(model, models=models)
     where = "stdin" if file == "-" else file
-    charge_pC = read_charges(_text(file), predictor.metadata.electrodes, where)
+    charge_pC = read_charges(_text(file), predictor.metadata.electrodes, where, say)
     with until_stopped():
         if json:
             _print_lines(record.to_json() for record in table_records(charge_pC, predictor))

@@ -21,6 +21,7 @@ from isocharge.errors import InputError, OutputExists
 if TYPE_CHECKING:
     from isocharge.serve import Script
     from isocharge.serve.virtual_sensor.sensor import Encode
+    from isocharge.simulate import Probe, Sensor
 
 
 class FrameFormat(StrEnum):
@@ -48,6 +49,17 @@ def virtual_command(
         str, typer.Option("--noise", help="Amplifier: clean, reference, bench, surgery, or a TOML file.")
     ] = "reference",
     probe: ProbeOption = "circle:1.0",
+    film: Annotated[
+        int | None,
+        typer.Option(
+            "--film",
+            min=0,
+            metavar="SEED",
+            help="Play a film drawn at random about SENSOR and --probe, as on a bench that nobody has measured: "
+            "pretension, stiffness, thickness, coefficients, gains, place of the electrodes, radius of the probe. "
+            "(default: SENSOR as described)",
+        ),
+    ] = None,
     link: Annotated[
         Path | None,
         typer.Option("--link", metavar="PATH", help="Symbolic link to make to the port. (default: none)"),
@@ -107,9 +119,9 @@ def virtual_command(
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
     from isocharge.serve import Faults
-    from isocharge.simulate import ForwardMap, load_amplifier, load_sensor, parse_probe
+    from isocharge.simulate import ForwardMap, load_amplifier
 
-    scene, amplifier = (load_sensor(sensor), parse_probe(probe)), load_amplifier(noise)
+    scene, amplifier = _scene(sensor, probe, film), load_amplifier(noise)
     changes: dict[str, Any] = {"step": temperature_step_K, "bias": _pico(drift_pC_per_s), "limit": _pico(limit_pC)}
     amplifier = replace(amplifier, **{name: value for name, value in changes.items() if value is not None})
     faults = Faults(
@@ -128,12 +140,24 @@ def virtual_command(
     )
     with until_stopped(), _link_errors(link), player:
         print(player.port_path, flush=True)
-        say(f"playing {sensor} at {rate_Hz:g} Hz; Ctrl-C stops")
+        say(f"playing {sensor if film is None else f'film {film} of {sensor}'} at {rate_Hz:g} Hz; Ctrl-C stops")
         threading.Event().wait(seconds)
     say(
         f"{player.sent} frames sent, {player.withheld} withheld because no program read them, {player.lost} lost and "
         f"{player.corrupted} damaged on purpose, {player.unplugged} times unplugged"
     )
+
+
+def _scene(sensor: str, probe: str, film: int | None) -> "tuple[Sensor, Probe]":
+    """What is played: sensor and probe as described, or those of a film that a seed draws about them."""
+    from isocharge.simulate import Circle, load_sensor, parse_probe, virtual_film
+
+    described, pressing = load_sensor(sensor), parse_probe(probe)
+    if film is None:
+        return described, pressing
+    if not isinstance(pressing, Circle):
+        raise InputError(f"--film: expected a round --probe like circle:1.0, whose radius is drawn too, got {probe!r}")
+    return virtual_film(described, pressing, film)
 
 
 def _pico(value: float | None) -> float | None:

@@ -1,4 +1,4 @@
-"""From charges to contacts in process: predictor, validity, prediction record, tables of charges.
+"""From charges to contacts in process: predictor, validity, record, tables of charges and of measured presses.
 
 May import: model, flags.
 """

@@ -1,84 +1,60 @@
 """Charges from a CSV file; contacts to one, or to prediction records.
 
-The header of the charges names the electrodes, in any order. The rows are touch charges in pC: no tare is subtracted,
-and every row is a contact.
+The header of the charges names the electrodes, in any order, and may have further columns. The rows are touch charges
+in pC: no tare is subtracted, and every row is a contact.
 """
 
 import csv
-from collections.abc import Iterable, Iterator
+import math
+from array import array
+from collections.abc import Callable, Iterable, Iterator
 from typing import TextIO
 
 import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import ChargeError
+from isocharge.serve.prediction.csv_numbers import CsvNumbers, ignored_words
 from isocharge.serve.prediction.predictor import Contacts, Predictor
 from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.prediction.validity import Domain
 
+CHARGE = "a charge in pC"
 
-def read_charges(lines: Iterable[str], electrodes: tuple[str, ...], where: str) -> Array:
+
+def read_charges(
+    lines: Iterable[str],
+    electrodes: tuple[str, ...],
+    where: str,
+    warn: Callable[[str], None] = lambda _: None,
+) -> Array:
     """Read a CSV of charges.
 
     Args:
-        lines: Lines of the file; CRLF and blank lines do not matter.
-        electrodes: The columns that are expected.
+        lines: Lines of the file; CRLF, blank lines and lines that begin with # do not matter.
+        electrodes: The columns that are read; a file of measured presses may have more.
         where: The file, for messages.
+        warn: Called with a sentence if columns are ignored.
 
     Returns:
         Charges in the order of `electrodes`, shape (n, electrodes), pC.
 
     Raises:
-        ChargeError: If a column is missing, unknown or there twice, or a cell is not a finite number.
+        ChargeError: If a column is missing or there twice, or a cell is not a finite number.
     """
-    rows = _numbered_rows(lines, where)
-    _, header = next(rows, (0, None))
-    if header is None:
-        raise ChargeError(f"{where}: empty; expected a header with the electrodes {electrodes} and charges in pC")
-    columns = _columns([name.strip() for name in header], electrodes, where)
-    charges = [_charges(row, header, columns, f"{where}, line {line}") for line, row in rows]
+    expected = f"a header with one column for each of the electrodes {electrodes} and charges in pC"
+    table = CsvNumbers(lines, electrodes, where, ChargeError, expected)
+    columns = table.columns(electrodes)
+    ignored = [name for name in table.header if name not in columns]
+    if ignored:
+        warn(ignored_words(where, ignored))
+    charges = array("d")
+    for line, row in table.rows(columns, dict.fromkeys(electrodes, CHARGE)):
+        if math.isnan(sum(row)):
+            name = electrodes[[math.isnan(value) for value in row].index(True)]
+            raise ChargeError(f"{where}, line {line}, column {name!r}: expected {CHARGE}, got an empty cell")
+        charges.extend(row)
     return np.array(charges, dtype=np.float64).reshape(-1, len(electrodes))
-
-
-def _numbered_rows(lines: Iterable[str], where: str) -> Iterator[tuple[int, list[str]]]:
-    """Rows that are not blank, with their line numbers from 1."""
-    reader = csv.reader(lines)
-    try:
-        for row in reader:
-            if any(cell.strip() for cell in row):
-                yield reader.line_num, row
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise ChargeError(f"{where}, line {reader.line_num + 1}: not CSV text in UTF-8 ({error})") from error
-
-
-def _columns(header: list[str], electrodes: tuple[str, ...], where: str) -> list[int]:
-    """The column of each electrode."""
-    unknown = [name for name in header if name not in electrodes]
-    missing = [name for name in electrodes if name not in header]
-    twice = sorted({name for name in header if header.count(name) > 1})
-    for what, names in (("unknown", unknown), ("missing", missing), ("repeated", twice)):
-        if names:
-            raise ChargeError(
-                f"{where}: expected one column for each of the electrodes {electrodes}, got the header {header}; "
-                f"{what}: {', '.join(map(repr, names))}"
-            )
-    return [header.index(name) for name in electrodes]
-
-
-def _charges(row: list[str], header: list[str], columns: list[int], where: str) -> list[float]:
-    if len(row) != len(header):
-        raise ChargeError(f"{where}: expected {len(header)} cells as in the header, got {len(row)}: {row}")
-    return [_charge(row[column], header[column].strip(), where) for column in columns]
-
-
-def _charge(cell: str, electrode: str, where: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = np.nan
-    if not abs(value) <= float(np.finfo(np.float32).max):
-        raise ChargeError(f"{where}: electrode {electrode!r}: expected a charge in pC, got {cell!r}")
-    return value
 
 
 def write_contacts(contacts: Contacts, out: TextIO) -> None:

@@ -1,6 +1,6 @@
 """The sensor file: TOML with units in its keys, to and from `Sensor`. Unknown keys are errors, and missing ones too."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -8,10 +8,12 @@ from typing import Any, cast, get_args
 import numpy as np
 
 from isocharge.errors import SensorError
+from isocharge.files import refuse_existing, write_whole
 from isocharge.simulate.sensor.electrode import Calibration, Electrode
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.sensor import Readout, Sensor
 from isocharge.tables import Table, parse_toml, read_toml
+from isocharge.toml_text import to_toml
 
 SECTIONS = ("name", "readout", "surface", "film", "piezo", "electrodes", "calibration")
 
@@ -76,6 +78,36 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
             "rotation_deg": _tidy(float(np.rad2deg(calibration.rotation))),
         },
     }
+
+
+def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
+    """The text of a sensor's file, from which `load_sensor` gives the sensor back to round-off.
+
+    Args:
+        sensor: The sensor.
+        comment: Lines for the head of the file, without #.
+
+    Raises:
+        SensorError: If no file can hold this sensor: squares of several sides with the edge readout, an empty name.
+    """
+    text = to_toml(sensor_to_dict(sensor), comment)
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise SensorError(f"sensor {sensor.name!r}: a name is no text that UTF-8 can hold ({error})") from error
+    sensor_from_dict(parse_toml(text, f"sensor {sensor.name!r}", SensorError), f"sensor {sensor.name!r}")
+    return text
+
+
+def write_sensor(sensor: Sensor, path: Path, comment: Iterable[str] = ()) -> None:
+    """Write a sensor's file, as `sensor_to_toml`; it appears whole or not at all.
+
+    Raises:
+        SensorError: As `sensor_to_toml`.
+        OutputExists: If there is something at `path` already.
+    """
+    refuse_existing(path)
+    write_whole(path, sensor_to_toml(sensor, comment).encode())
 
 
 def _electrode_tables(sensor: Sensor) -> dict[str, Any]:

@@ -1,0 +1,204 @@
+"""How wrong a model is on measured presses: its errors, the part that noise and rig explain, and a verdict.
+
+The model's standard deviations say how far noise of the charges moves an answer, the file how well the rig knows place
+and force. If the errors are larger than both together, the film is not the model's: it has aged, its pretension has
+crept, or it was never calibrated. Such drift shows first as a common scale of the forces and a common shift.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from isocharge.arrays import Booleans
+from isocharge.json_values import plain_values
+from isocharge.serve.flags import MISFIT
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.prediction.agreement import Agreement, ErrorSummary
+from isocharge.serve.prediction.chi_squared import chi_squared_survival
+from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.prediction.press_errors import NOT_TRAINED, PressErrors, misfit_limit, press_errors
+
+FEWEST = 3
+"""Presses below which nothing is said: one bad press among two cannot be told from a bad film."""
+
+BAD_PROBABILITY = 1e-3
+"""Probability that noise makes the worst of all presses look bad."""
+
+BAD_SHARE = 0.1
+"""Largest share of bad presses, at least one, that a film may have and still fit."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """What measured presses say about a model.
+
+    Attributes:
+        model: `name/version`.
+        presses, counted: Number of presses in the file, and of those that the figures below are about.
+        position_mm, force_percent: Errors; None if no place, or no force, is known.
+        agreement: Sum of squares and common part.
+        fits: Whether noise explains the errors; None if there are too few presses to say.
+        verdict: The answer in words.
+        notes: What else a reader should know, a sentence each.
+        errors: The presses one by one.
+    """
+
+    model: str
+    presses: int
+    counted: int
+    position_mm: ErrorSummary | None
+    force_percent: ErrorSummary | None
+    agreement: Agreement
+    fits: bool | None
+    verdict: str
+    notes: tuple[str, ...]
+    errors: PressErrors
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON, names with units; None where something is unknown."""
+        both, degrees = self.agreement, self.agreement.degrees
+        values = {
+            "model": self.model,
+            "fits": self.fits,
+            "verdict": self.verdict,
+            "notes": self.notes,
+            "presses": self.presses,
+            "counted": self.counted,
+            "position_mm": self.position_mm and asdict(self.position_mm),
+            "force_percent": self.force_percent and asdict(self.force_percent),
+            "chi_squared": both.chi_squared,
+            "degrees_of_freedom": degrees,
+            "chi_squared_per_degree": both.chi_squared / degrees if degrees else None,
+            "p_value": both.p_value,
+            "shift_mm": [both.shift_x.mean, both.shift_y.mean],
+            "shift_std_mm": [both.shift_x.std, both.shift_y.std],
+            "force_scale": 1.0 + both.force.mean,
+            "force_scale_std": both.force.std,
+            "common_p_value": both.common_p_value,
+            "each": [self.errors.row(press) for press in range(self.presses)],
+        }
+        return {name: plain_values(value) for name, value in values.items()}
+
+
+def check_presses(predictor: Predictor, presses: MeasuredPresses) -> Check:
+    """Compare a model with measured presses.
+
+    A press counts if all its charges are known, its place or its force is known, and what is known lies in the model's
+    working area and range of forces. A few bad presses are named and left out if all others agree with the model.
+
+    Raises:
+        PressError: If the electrodes are not the model's, in its order.
+    """
+    errors = press_errors(predictor, presses)
+    rows, bad = _without_bad(errors)
+    agreement, count = Agreement.of(errors, rows), int(rows.sum())
+    fits = agreement.acceptable if count >= FEWEST else None
+    position, force = _position(errors, rows), _force(errors, rows)
+    return Check(
+        model=predictor.metadata.label,
+        presses=len(presses),
+        counted=count,
+        position_mm=position,
+        force_percent=force,
+        agreement=agreement,
+        fits=fits,
+        verdict=_verdict(fits, count, position, force),
+        notes=tuple(_notes(errors, rows, bad, agreement, predictor.metadata)),
+        errors=errors,
+    )
+
+
+def _without_bad(errors: PressErrors) -> tuple[Booleans, Booleans]:
+    """The rows to judge by, and the bad ones that were left out: only where all others then agree with the model."""
+    counted = errors.counted
+    if not Agreement.of(errors, counted).acceptable:
+        bad = _bad(errors, counted)
+        few = 0 < bad.sum() <= max(1.0, BAD_SHARE * counted.sum()) and counted.sum() - bad.sum() >= FEWEST
+        if few and Agreement.of(errors, counted & ~bad).acceptable:
+            return counted & ~bad, bad
+    return counted, np.zeros_like(counted)
+
+
+def _bad(errors: PressErrors, counted: Booleans) -> Booleans:
+    """Presses that noise would hardly make, shape (n,)."""
+    bad, limit = np.zeros_like(counted), BAD_PROBABILITY / max(1, counted.sum())
+    squares = errors.error**2 / errors.variance
+    for press in np.flatnonzero(counted & (np.nansum(squares, axis=1) > 9.0)):  # others are not worth the function
+        known = squares[press][~np.isnan(squares[press])]
+        bad[press] = chi_squared_survival(float(known.sum()), known.size) < limit
+    return bad
+
+
+def _position(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
+    known = rows & ~np.isnan(errors.error[:, 0])
+    parts = (np.sum(std[known, :2] ** 2, axis=1) for std in (errors.noise_std, errors.rig_std))
+    return ErrorSummary.of(errors.position_error_mm[known], *parts)
+
+
+def _force(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
+    known = rows & ~np.isnan(errors.error[:, 2])
+    parts = ((100.0 * std[known, 2]) ** 2 for std in (errors.noise_std, errors.rig_std))
+    return ErrorSummary.of(100.0 * np.abs(errors.error[known, 2]), *parts)
+
+
+def _verdict(fits: bool | None, count: int, position: ErrorSummary | None, force: ErrorSummary | None) -> str:
+    if fits is None:
+        return f"too few presses to say: {count} can be compared, {FEWEST} are needed"
+    if fits:
+        return "fits: noise explains the errors"
+    parts = [f"{position.beyond:.2g} mm"] if position else []
+    parts += [f"{force.beyond:.2g} %"] if force else []
+    return f"does not fit: {' and '.join(parts)} beyond noise: calibrate the film again"
+
+
+def _notes(
+    errors: PressErrors, rows: Booleans, bad: Booleans, agreement: Agreement, metadata: ModelMetadata
+) -> Iterator[str]:
+    """What else a reader should know."""
+    for reason in sorted(set(filter(None, errors.left_out))):
+        chosen = [line for line, other in zip(errors.lines, errors.left_out, strict=True) if other == reason]
+        yield f"{len(chosen)} of {len(rows)} presses do not count: {_words(reason, metadata)} ({_lines(chosen)})"
+    if bad.any():
+        yield f"{_lines(np.array(errors.lines)[bad].tolist())}: nothing like the other presses, left out; look at it"
+    misfits = sum(MISFIT in flags for flags in errors.flags)
+    if misfits > 1.0 + 0.03 * len(rows):
+        yield (
+            f"{misfits} of {len(rows)} presses have a misfit above {misfit_limit(metadata):.3g}, which 1 % of good "
+            "ones have: no single press on the model's film gives such charges (gain, tare, swapped or dead electrodes)"
+        )
+    yield from _common_notes(agreement)
+
+
+def _words(reason: str, metadata: ModelMetadata) -> str:
+    if reason != NOT_TRAINED:
+        return reason
+    low, high = metadata.force_range_N
+    reach = np.linalg.norm(np.array(metadata.working_area_mm), axis=1).max()
+    return (
+        f"outside the model's working area (up to {reach:.3g} mm from the centre) or forces ({low:.3g} to "
+        f"{high:.3g} N); if these are most, look at the units"
+    )
+
+
+def _common_notes(agreement: Agreement) -> Iterator[str]:
+    """The common shift and scale, if noise does not explain them."""
+    x, y, force = agreement.shift_x, agreement.shift_y, agreement.force
+    if max(abs(x.significance), abs(y.significance)) > 3.0:
+        yield (
+            f"positions are off by ({x.mean:.2g}, {y.mean:.2g}) +- {max(x.std, y.std):.2g} mm on the average: "
+            "electrodes or rig are shifted"
+        )
+    if abs(force.significance) > 3.0:
+        yield (
+            f"forces are {1.0 + force.mean:.4g} +- {force.std:.2g} times the known ones on the average, as after a "
+            "change of pretension, d31 or gains"
+        )
+
+
+def _lines(lines: list[int]) -> str:
+    """ "line 3", or "lines 3, 4, 5, 6, 7 and 12 more"."""
+    more = f" and {len(lines) - 5} more" if len(lines) > 5 else ""
+    return f"line{'s' if len(lines) > 1 else ''} {', '.join(map(str, lines[:5]))}{more}"

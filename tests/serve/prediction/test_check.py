@@ -1,0 +1,221 @@
+"""What measured presses say about a model: of the linear film, whose inverse and noise are known in closed form.
+
+The model's standard deviations are 50 mm pC / sum of charges, and 7e-4 N for the force. Answers are moved by just such
+noise, so that chi-squared, its distribution and every share of the errors are known.
+"""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from isocharge.errors import PressError
+from isocharge.serve import MeasuredPresses, Predictor, check_presses
+from isocharge.serve.prediction.agreement import Common, ErrorSummary
+
+RIG_MM, RIG_SHARE = 0.05, 0.004
+
+
+@pytest.fixture
+def measure(film):
+    """Presses of a film whose places and forces the rig knows with its noise, and whose charges make the model err."""
+
+    def measure(n, *, seed=0, force_scale=1.0, shift_mm=(0.0, 0.0), known=(True, True), noise=1.0, radius_mm=5.0):
+        rng = np.random.default_rng(seed)
+        contact = np.column_stack([rng.uniform(-radius_mm, radius_mm, (2, n)).T, rng.uniform(0.1, 1.8, n)])
+        contact[:, :2] /= np.sqrt(2.0)
+        std = 50.0 / (2400.0 * contact[:, 2])  # of the model, from the sum of the charges
+        moved = contact + noise * rng.normal(size=(n, 3)) * np.column_stack([std, std, np.full(n, 7e-4)])
+        moved += [*shift_mm, 0.0]
+        moved[:, 2] *= force_scale
+        contact[:, :2] += RIG_MM * rng.normal(size=(n, 2))
+        contact[:, 2] /= 1.0 + RIG_SHARE * rng.normal(size=n)
+        contact[:, :2] *= 1.0 if known[0] else np.nan
+        contact[:, 2] *= 1.0 if known[1] else np.nan
+        stds = np.full(n, RIG_MM), np.full(n, RIG_SHARE)
+        return MeasuredPresses(contact, film.charge_pC(*moved.T), *stds, film.electrodes, tuple(range(2, n + 2)))
+
+    return measure
+
+
+def test_errors_of_single_presses(film, predictor):
+    """Exact charges of displaced presses: the errors are the displacements."""
+    contact = np.array([[1.0, 2.0, 0.5], [-3.0, 0.5, 1.0], [np.nan, np.nan, 1.0], [0.0, 1.0, np.nan]])
+    pressed = np.array([[1.3, 1.6, 0.55], [-3.0, 0.5, 0.98], [0.0, 0.0, 1.02], [0.0, 1.5, 1.0]])
+    stds = np.full(4, 0.1), np.full(4, 0.01)
+    presses = MeasuredPresses(contact, film.charge_pC(*pressed.T), *stds, film.electrodes, (2, 3, 4, 5))
+    errors = check_presses(predictor, presses).errors
+    nan = np.nan
+    np.testing.assert_allclose(errors.position_error_mm, [0.5, 0.0, nan, 0.5], atol=1e-5)
+    np.testing.assert_allclose(errors.error[:, 2], [0.1, -0.02, 0.02, nan], atol=1e-6)
+    np.testing.assert_allclose(errors.answer[:, :3], pressed, atol=1e-5)
+    std = 50.0 / (2400.0 * pressed[:, 2])
+    np.testing.assert_allclose(errors.noise_std[:, 0], np.where([1, 1, 0, 1], std, nan), rtol=1e-5)
+    np.testing.assert_allclose(errors.noise_std[:, 2], [7e-4 / 0.5, 7e-4, 7e-4, nan], rtol=1e-5)
+    np.testing.assert_array_equal(errors.rig_std[:, 2], [0.01, 0.01, 0.01, nan])
+
+
+def test_a_film_that_fits(predictor, measure):
+    check = check_presses(predictor, measure(400, seed=3))
+    assert (check.fits, check.verdict, check.notes) == (True, "fits: noise explains the errors", ())
+    assert check.agreement.degrees == 1200
+    assert check.agreement.chi_squared / 1200 == pytest.approx(1.0, abs=3 * (2 / 1200) ** 0.5)
+    for part in (check.position_mm, check.force_percent):
+        assert part.presses == 400
+        assert part.rms == pytest.approx(part.explained, rel=0.1)
+        assert part.explained == pytest.approx(np.hypot(part.noise, part.rig))
+        assert part.beyond < 0.45 * part.rms
+        assert part.median < part.rms < part.max
+    assert check.position_mm.rig == pytest.approx(RIG_MM * 2**0.5)
+    assert check.force_percent.rig == pytest.approx(100 * RIG_SHARE)
+
+
+def test_a_film_that_fits_is_hardly_ever_called_another(predictor, measure):
+    """p values of films that fit are uniform, and the verdict errs as rarely as it says."""
+    checks = [check_presses(predictor, measure(12, seed=seed)) for seed in range(300)]
+    assert stats.kstest([check.agreement.p_value for check in checks], "uniform").pvalue > 0.01
+    assert sum(not check.fits for check in checks) <= 8  # 1 % of 300, and three deviations
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_scale_of_the_force_is_recognised(predictor, measure, seed):
+    check = check_presses(predictor, measure(20, seed=seed, force_scale=1.05))
+    assert check.fits is False
+    assert check.verdict.startswith("does not fit: ")
+    assert check.verdict.endswith(" beyond noise: calibrate the film again")
+    assert check.agreement.force.mean == pytest.approx(0.05, abs=4 * check.agreement.force.std)
+    assert check.force_percent.beyond == pytest.approx(5.0, abs=0.5)
+    assert check.position_mm.beyond < 0.05
+    (note,) = check.notes
+    assert "forces are 1.0" in note
+    assert "times the known ones" in note
+
+
+def test_a_common_shift_is_recognised_before_the_sum_of_squares_tells(predictor, measure):
+    check = check_presses(predictor, measure(40, seed=1, shift_mm=(0.06, 0.0)))
+    assert check.fits is False
+    assert check.agreement.p_value > check.agreement.common_p_value
+    assert check.agreement.shift_x.mean == pytest.approx(0.06, abs=4 * check.agreement.shift_x.std)
+    assert any(note.startswith("positions are off by (0.0") for note in check.notes)
+
+
+def test_scatter_without_a_common_part_is_recognised(predictor, measure):
+    check = check_presses(predictor, measure(30, seed=2, noise=5.0))
+    assert check.fits is False
+    assert check.agreement.common_p_value > 1e-3
+    squares = np.sum(check.errors.error[:, :2] ** 2, axis=1).mean() - check.position_mm.explained**2
+    assert check.position_mm.beyond == pytest.approx(squares**0.5)
+
+
+@pytest.mark.parametrize(("known", "degrees"), [((True, False), 40), ((False, True), 20)])
+def test_place_or_force_alone(predictor, measure, known, degrees):
+    check = check_presses(predictor, measure(20, known=known))
+    assert (check.fits, check.agreement.degrees) == (True, degrees)
+    assert (check.position_mm is None, check.force_percent is None) == (not known[0], not known[1])
+    wrong = check_presses(predictor, measure(20, known=known, noise=8.0, force_scale=1.1))
+    assert wrong.fits is False
+    assert ("mm" in wrong.verdict, "%" in wrong.verdict) == known
+
+
+@pytest.mark.parametrize(("count", "fits"), [(1, None), (2, None), (3, True)])
+def test_few_presses(predictor, measure, count, fits):
+    check = check_presses(predictor, measure(count, seed=4))
+    assert check.fits is fits
+    assert fits or check.verdict == f"too few presses to say: {count} can be compared, 3 are needed"
+
+
+def test_a_bad_press_is_named_and_does_not_condemn_the_film(predictor, measure):
+    presses = measure(12, seed=5)
+    presses.contact[7, :2] += 2.0
+    check = check_presses(predictor, presses)
+    assert (check.fits, check.counted) == (True, 11)
+    assert check.notes == ("line 9: nothing like the other presses, left out; look at it",)
+    assert check.position_mm.max < 1.0
+    presses.contact[3:5, :2] -= 2.0  # three of twelve are too many
+    worse = check_presses(predictor, presses)
+    assert (worse.fits, worse.counted) == (False, 12)
+
+
+def test_presses_that_do_not_count(predictor, measure):
+    presses = measure(10, seed=6)
+    presses.contact[0, 2] = 40.0  # N: meant as g
+    presses.contact[1, :2] = 30.0  # mm
+    presses.contact[2] = np.nan
+    presses.charge_pC[3, 1] = np.nan
+    check = check_presses(predictor, presses)
+    assert (check.presses, check.counted, check.fits) == (10, 6, True)
+    assert check.errors.left_out[:5] == (
+        *("not trained for", "not trained for", "neither place nor force is known", "a charge is unknown", ""),
+    )
+    assert [note.partition(":")[0] for note in check.notes] == [
+        "1 of 10 presses do not count",
+        "1 of 10 presses do not count",
+        "2 of 10 presses do not count",
+    ]
+    assert "0.05 to 2 N); if these are most, look at the units (lines 2, 3)" in check.notes[2]
+    row = check.to_dict()["each"][3]
+    assert (row["x_mm"], row["x_error_mm"], row["left_out"]) == (None, None, "a charge is unknown")
+
+
+def test_flags_of_the_answers(film, predictor, measure):
+    """Misfit against the model's own 1 %; the linear model's misfit is the sum of negative charges."""
+    presses = measure(6)
+    presses.charge_pC[0] = film.charge_pC([20.0], [0.0], [1.0])[0]
+    presses.charge_pC[1] = [-3.0, 900.0, 900.0]
+    check = check_presses(predictor, presses)
+    assert check.errors.flags[0] == ("outside",)
+    assert "misfit" not in check.errors.flags[1]  # 3 is below the default, 5
+
+
+def test_the_misfit_s_limit_is_the_model_s(film, tmp_path, measure):
+    film.write(tmp_path, errors={"misfit_p99": 2.5, "misfit_p999": 9.0})
+    presses = measure(6)
+    presses.charge_pC[1:4] = [-3.0, 900.0, 900.0]
+    check = check_presses(Predictor("linear", models=tmp_path), presses)
+    assert ["misfit" in flags for flags in check.errors.flags] == [False, True, True, True, False, False]
+    assert any(
+        note.startswith("3 of 6 presses have a misfit above 2.5, which 1 % of good ones") for note in check.notes
+    )
+
+
+def test_another_layout_is_refused(predictor, measure):
+    presses = measure(3)
+    for electrodes in (("C", "B", "A"), ("A", "B", "D")):
+        with pytest.raises(PressError, match=r"expected charges of the electrodes \('A', 'B', 'C'\) of linear/1, got"):
+            check_presses(predictor, replace(presses, electrodes=electrodes))
+
+
+def test_to_dict_is_json(predictor, measure):
+    check = check_presses(predictor, measure(5, known=(False, True)))
+    values = json.loads(json.dumps(check.to_dict(), allow_nan=False))
+    assert values["fits"] is True
+    assert (values["position_mm"], values["shift_mm"], values["shift_std_mm"]) == (None, [None, None], [None, None])
+    assert values["force_percent"]["rms"] == pytest.approx(check.force_percent.rms)
+    assert values["force_scale"] == pytest.approx(1.0 + check.agreement.force.mean)
+    assert values["chi_squared_per_degree"] == pytest.approx(check.agreement.chi_squared / 5)
+    assert [press["line"] for press in values["each"]] == [2, 3, 4, 5, 6]
+    empty = check_presses(predictor, measure(5)[:0]).to_dict()
+    assert (empty["fits"], empty["chi_squared_per_degree"], empty["p_value"], empty["each"]) == (None, None, None, [])
+    json.dumps(empty, allow_nan=False)
+
+
+def test_common_part_is_the_weighted_mean():
+    rng = np.random.default_rng(0)
+    std = rng.uniform(0.5, 2.0, 500)
+    error = 0.3 + std * rng.normal(size=500)
+    common = Common.of(np.append(error, np.nan), np.append(std, 1.0) ** 2)
+    mean, weight = np.average(error, weights=std**-2, returned=True)
+    assert common.mean == pytest.approx(mean)
+    assert common.std == pytest.approx(weight**-0.5, rel=0.1)
+    wider = Common.of(0.3 + 3.0 * (error - 0.3), std**2)
+    assert wider.std == pytest.approx(3.0 * weight**-0.5, rel=0.1)
+
+
+def test_summary_of_known_numbers():
+    summary = ErrorSummary.of(np.array([3.0, 4.0]), np.array([2.0, 4.0]), np.array([1.0, 0.0]))
+    assert (summary.rms, summary.median, summary.max) == (12.5**0.5, 3.5, 4.0)
+    assert (summary.noise, summary.rig, summary.explained, summary.beyond) == (3**0.5, 0.5**0.5, 3.5**0.5, 3.0)
+    assert ErrorSummary.of(np.array([1.0]), np.array([4.0]), np.array([0.0])).beyond == 0.0
+    assert ErrorSummary.of(np.array([]), np.array([]), np.array([])) is None

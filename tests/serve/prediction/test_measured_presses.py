@@ -1,0 +1,256 @@
+"""Measured presses: any spreadsheet's file is read, what is wrong is named, and writing loses nothing."""
+
+import csv
+import io
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from isocharge.errors import PressError
+from isocharge.serve import MeasuredPresses, read_presses, write_presses
+from isocharge.serve.prediction import csv_numbers, measured_presses
+from isocharge.serve.prediction.measured_presses import KINDS, parse_presses
+
+NAMES = ("A", "B", "C")
+HEADER = "x_mm,y_mm,force_N,A,B,C"
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Read a text, or bytes, as a file `presses.csv`."""
+
+    def read(text, **options):
+        path = tmp_path / "presses.csv"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_presses(path, NAMES, **options)
+
+    return read
+
+
+def test_every_column_arrives(read):
+    presses = read(f"{HEADER},position_std_mm,force_std\n1,-2,0.5,10,20,30,0.05,0.003\n")
+    assert presses.contact.tolist() == [[1.0, -2.0, 0.5]]
+    assert presses.charge_pC.tolist() == [[10.0, 20.0, 30.0]]
+    assert (presses.position_std_mm.tolist(), presses.force_std.tolist()) == ([0.05], [0.003])
+    assert (presses.electrodes, presses.lines, presses.ignored, len(presses)) == (NAMES, (2,), (), 1)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"\xef\xbb\xbfx_mm,y_mm,force_N,A,B,C\r\n1,2,0.5,10,20,30\r\n\r\n",
+        b'# rig 7, "left\nx_mm,y_mm,force_N,A,B,C\n\n # dropped,\n1,2,0.5,10,20,30\n',
+        b" C , A,B ,force_N, y_mm,x_mm\n30, 10 ,20,5e-1,+2.,1.\n",
+        b'"x_mm","y_mm","force_N","A","B","C"\n"1","2",".5","10","20","30"',
+        b"x_mm,y_mm,force_N,A,B,C,,\n1,2,0.5,10,20,30,,\n,,,,,,,\n",
+        b"day,x_mm,y_mm,force_N,A,B,C\nMonday,1,2,0.5,10,20,30\n",
+    ],
+    ids=["spreadsheet", "comments", "order and blanks", "quotes", "empty columns", "another column"],
+)
+def test_the_same_press_from_every_kind_of_file(read, text):
+    assert read(text) == read(f"{HEADER}\n1,2,0.5,10,20,30\n")
+
+
+def test_columns_that_are_neither_are_named(read):
+    assert read("day,x_mm,y_mm,note,A,B,C\n1,2,3,a,4,5,6\n").ignored == ("day", "note")
+
+
+def test_unknown_values(read):
+    presses = read(f"{HEADER}\n,,0.5,10,20,30\n1,2,,10,,30\n,,,10,20,30\n")
+    nan = np.nan
+    np.testing.assert_array_equal(presses.contact, [[nan, nan, 0.5], [1, 2, nan], [nan, nan, nan]])
+    np.testing.assert_array_equal(presses.charge_pC[1], [10, nan, 30])
+
+
+@pytest.mark.parametrize(("columns", "row"), [("force_N", "0.5"), ("x_mm,y_mm", "1,2")])
+def test_columns_that_are_absent_are_unknown(read, columns, row):
+    presses = read(f"{columns},A,B,C\n{row},10,20,30\n")
+    assert np.isnan(presses.contact).sum() == (2 if columns == "force_N" else 1)
+
+
+def test_uncertainty_is_the_caller_s_where_the_file_has_none(read):
+    presses = read(f"{HEADER},force_std\n1,2,3,4,5,6,0.003\n1,2,3,4,5,6,\n", position_std_mm=0.3, force_std=0.02)
+    assert presses.position_std_mm.tolist() == [0.3, 0.3]
+    assert presses.force_std.tolist() == [0.003, 0.02]
+    plain = read(f"{HEADER}\n1,2,3,4,5,6\n")
+    assert (plain.position_std_mm.tolist(), plain.force_std.tolist()) == ([0.1], [0.01])
+
+
+def test_rows(read):
+    presses = read("force_N,A,B,C,d\n" + "".join(f"{n},1,2,3,\n" for n in (1, 2, 3)))
+    last = presses[2]
+    assert (len(last), last.lines, last.contact[0, 2], last.ignored) == (1, (4,), 3.0, ("d",))
+    assert presses[-1] == last
+    assert presses[1:] == presses[[1, 2]] == presses[np.array([False, True, True])] != presses
+    assert [press.lines for press in presses] == [(2,), (3,), (4,)]
+    assert len(presses[:0]) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", r"presses\.csv: empty; expected a header with x_mm, y_mm, force_N and the electrodes \('A', 'B', 'C'\)"),
+        (HEADER, "expected one press or more below the header, got none"),
+        (f"{HEADER}\n,,,,,\n", "expected one press or more below the header, got none"),
+        ("x_mm,y_mm,force_N,A,C\n1,2,3,4,5\n", "got the header .*; missing: 'B'$"),
+        (f"{HEADER},B\n1,2,3,4,5,6,7\n", "got the header .*; repeated: 'B'$"),
+        (f"{HEADER},force_N\n1,2,3,4,5,6,7\n", "repeated: 'force_N'$"),
+        ("x_mm,A,B,C\n1,2,3,4\n", r"expected the columns x_mm and y_mm, or neither, .* add 'y_mm'"),
+        ("y_mm,A,B,C\n1,2,3,4\n", "add 'x_mm'"),
+        (f"{HEADER}\n1,,3,4,5,6\n", "line 2: expected both x_mm and y_mm, or two empty cells"),
+        (f"{HEADER}\n1,2,3,4,5,6\n1,2,x,4,5,6\n", "line 3, column 'force_N': expected a positive force in N.*got 'x'"),
+        (f"{HEADER}\n1,2,1_0,4,5,6\n", "line 2, column 'force_N': .* got '1_0'"),
+        (f"{HEADER}\n1,2,\u0661,4,5,6\n", "column 'force_N': .* got '\u0661'"),
+        (f"{HEADER}\n1,inf,3,4,5,6\n", "line 2, column 'y_mm': expected a position in mm.*got 'inf'"),
+        (f"{HEADER}\n1,1e999,3,4,5,6\n", "line 2, column 'y_mm': .*got '1e999'"),
+        (f"{HEADER}\n1,2,3,nan,5,6\n", "line 2, column 'A': expected a charge in pC, got 'nan'"),
+        (f"{HEADER}\n\n1,2,0,4,5,6\n", "line 3, column 'force_N': expected a positive force in N.*got 0$"),
+        (f"{HEADER}\n# x\n1,2,-0.5,4,5,6\n", "line 3, column 'force_N': .*got -0.5$"),
+        (
+            f"{HEADER},position_std_mm\n1,2,3,4,5,6,0\n",
+            "column 'position_std_mm': expected a positive standard .*got 0$",
+        ),
+        (f"{HEADER},force_std\n1,2,3,4,5,6,-1\n", "column 'force_std': .*got -1$"),
+        (f"{HEADER},force_std\n1,2,3,4,5,6,5\n", r"a positive share of the force up to 1 \(0\.01 is 1 %\), got 5$"),
+        (f"{HEADER}\n1,2,3,,,\n", "line 2: expected a charge of one electrode or more, got none; fill it in"),
+        (f"{HEADER}\n1,2,3,4,5\n", "line 2: expected 6 cells as in the header, got 5"),
+        (f"{HEADER}\n1,2,3,4,5,6,7\n", "line 2: expected 6 cells as in the header, got 7"),
+        (f"{HEADER}\n1,2,3,4,5,6".replace(",", ";"), r"separated by ';': save the file .*tr ',;' '\.,' < FILE > NEW"),
+        (f'{HEADER}\n1,2,"0,5",4,5,6\n', "column 'force_N': .*got '0,5'; write a decimal point"),
+        (b"x_mm,y_mm,force_N,A,B,C\n1,2,3,4,5,\xff\n", "not CSV text in UTF-8"),
+        ("x_mm,y_mm,force_N,A,B,C\n".encode("utf-16"), "not CSV text in UTF-8"),
+    ],
+)
+def test_presses_that_are_refused(read, text, said):
+    with pytest.raises(PressError, match=said) as caught:
+        read(text)
+    assert "presses.csv" in str(caught.value)
+    assert len(str(caught.value)) < 600
+
+
+def test_the_command_of_the_message_repairs_the_file(read, tmp_path, shell):
+    text = f"{HEADER}\n1,5;2;0,5;4;5;6".replace(HEADER, HEADER.replace(",", ";"))
+    with pytest.raises(PressError) as caught:
+        read(text)
+    words = str(caught.value).partition("as with: ")[2].replace("FILE", "presses.csv").replace("NEW.csv", "new.csv")
+    shell(words, cwd=tmp_path)
+    assert read_presses(tmp_path / "new.csv", NAMES) == read(f"{HEADER}\n1.5,2,0.5,4,5,6\n")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        ",".join(["x" * 90] * 1000),
+        ",".join(["x"] * 1001),
+        "x" * 1_000_000,
+        HEADER + "\n" + "1," * 40_000,
+        HEADER + "\n" + "1" * 90_000 + ",2,3,4,5,6",
+        HEADER + '\n"' + "1\n" * 100_000,
+        ",".join(["A"] * 900),
+    ],
+    ids=["header", "columns", "line", "cells", "digits", "open quote", "repeated"],
+)
+def test_absurd_sizes_are_refused_in_short(read, text):
+    with pytest.raises(PressError) as caught:
+        read(text)
+    assert len(str(caught.value)) < 700
+
+
+def test_too_many_presses(monkeypatch, read):
+    monkeypatch.setattr(measured_presses, "MOST_ROWS", 3)
+    assert len(read(HEADER + "\n1,2,3,4,5,6" * 3)) == 3
+    with pytest.raises(PressError, match="expected at most 3 presses, got more; split the file"):
+        read(HEADER + "\n1,2,3,4,5,6" * 4)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"position_std_mm": 0.0}, "position_std_mm: expected a positive standard deviation in mm, got 0.0"),
+        ({"position_std_mm": float("nan")}, "position_std_mm: .* got nan"),
+        ({"force_std": -0.1}, "force_std: expected a positive share"),
+        ({"force_std": 1.5}, "force_std: .* got 1.5"),
+    ],
+)
+def test_defaults_that_are_refused(read, options, said):
+    with pytest.raises(PressError, match=said):
+        read(f"{HEADER}\n1,2,3,4,5,6\n", **options)
+
+
+@pytest.mark.parametrize("names", [(), ("A", "A"), ("",), ("force_N",), ("force_std", "A"), ("A\nB",)])
+def test_electrodes_that_cannot_be_columns(names):
+    with pytest.raises(PressError, match="electrode"):
+        parse_presses(["x_mm,y_mm,A\n", "1,2,3\n"], names, "presses.csv")
+
+
+@pytest.mark.parametrize("name", ["nowhere.csv", "."])
+def test_no_file(tmp_path, name):
+    with pytest.raises(PressError, match=r"cannot be read .*expected a CSV file of presses"):
+        read_presses(tmp_path / name, NAMES)
+
+
+def test_shapes_that_disagree():
+    ones = np.ones(2)
+    with pytest.raises(PressError, match=r"charge_pC: expected an array of shape \(2, 3\), got \(2, 2\)"):
+        MeasuredPresses(np.ones((2, 3)), np.ones((2, 2)), ones, 0.1 * ones, NAMES, (1, 2))
+
+
+# Round trips
+
+FINITE = st.floats(-csv_numbers.LARGEST, csv_numbers.LARGEST)
+POSITIVE = st.floats(0.0, csv_numbers.LARGEST, exclude_min=True)
+TEXT = st.text(st.characters(codec="utf-8"), min_size=1, max_size=8)
+
+
+@st.composite
+def some_presses(draw):
+    names = tuple(draw(st.lists(TEXT, min_size=1, max_size=4, unique=True)))
+    assume(not set(names) & set(KINDS) and not any(mark in name for name in names for mark in "\r\n"))
+    unknown = st.just(np.nan)
+    place = st.one_of(st.tuples(FINITE, FINITE), st.tuples(unknown, unknown))
+    row = st.tuples(place, POSITIVE | unknown, st.lists(FINITE | unknown, min_size=len(names), max_size=len(names)))
+    rows = [r for r in draw(st.lists(row, min_size=1, max_size=5)) if not np.isnan(r[2]).all()]
+    assume(rows)
+    stds = [[draw(POSITIVE), draw(st.floats(0.0, 1.0, exclude_min=True))] for _ in rows]
+    return MeasuredPresses(
+        np.array([[*place, force] for place, force, _ in rows]),
+        np.array([charges for *_, charges in rows]),
+        *np.array(stds).T,
+        names,
+        tuple(range(1, len(rows) + 1)),
+    )
+
+
+@given(presses=some_presses())
+@settings(derandomize=True, max_examples=300)
+def test_what_is_written_is_read(presses, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "written.csv"
+    write_presses(path, presses)
+    assert read_presses(path, presses.electrodes) == presses
+    text = io.StringIO()
+    write_presses(text, presses)
+    assert text.getvalue().encode() == path.read_bytes()
+
+
+def test_a_written_file_is_plain_csv(read):
+    text = io.StringIO()
+    write_presses(text, read(f"{HEADER}\n1,2,,10,,30\n"))
+    assert list(csv.DictReader(text.getvalue().splitlines())) == [
+        {"x_mm": "1.0", "y_mm": "2.0", "force_N": "", "A": "10.0", "B": "", "C": "30.0"}
+        | {"position_std_mm": "0.1", "force_std": "0.01"}
+    ]
+
+
+@given(data=st.binary(max_size=200) | st.text(max_size=200).map(lambda text: (HEADER + "\n" + text).encode()))
+@settings(derandomize=True, max_examples=300)
+def test_any_bytes_are_presses_or_a_press_error(data, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "any.csv"
+    path.write_bytes(data)
+    try:
+        presses = read_presses(path, NAMES)
+    except PressError as error:
+        assert str(path) in str(error)  # noqa: PT017
+    else:
+        assert len(presses) > 0
