@@ -5,7 +5,9 @@ An estimator that takes a film for another by dp errs by the contact that explai
     dc = -G dp,   G = (J' W J)^-1 J' W P,
 
 J and P the derivatives of the charges by contact and parameters, W one over the noise variance. With C the covariance
-of the parameters the error left is G C G'; noise alone leaves (J' W J)^-1, the Cramer-Rao limit.
+of the parameters the error left is G C G'; noise alone leaves (J' W J)^-1, the Cramer-Rao limit. To J' W J belongs what
+is known of a contact beforehand, that it lies in the working area and the range of forces: no estimator errs by more,
+also where the map folds.
 """
 
 from dataclasses import dataclass
@@ -30,6 +32,12 @@ def spread_contacts(domain: ContactDomain, count: int = CONTACTS) -> Array:
     return np.column_stack([at.real, at.imag, force])
 
 
+def _spread(domain: ContactDomain) -> Array:
+    """Standard deviations of (x_mm, y_mm, ln F) over a domain, shape (3,)."""
+    low, high = np.log(domain.force_range_N)
+    return np.array([0.5 * domain.radius_mm, 0.5 * domain.radius_mm, max(high - low, 0.1) / np.sqrt(12.0)])
+
+
 @dataclass(frozen=True)
 class ContactSensitivity:
     """How contacts answer to noise and to a wrong film, linearised at one film.
@@ -52,7 +60,7 @@ class ContactSensitivity:
         by_contact = charges.by_contact(forward_map, contact)
         weight = 1.0 / sigma_pC(noise, charges.charge_pC(parameters, contact))[:, :, None]
         slopes = weight * by_contact
-        covariance = np.linalg.inv(np.einsum("nki,nkj->nij", slopes, slopes))
+        covariance = np.linalg.inv(np.einsum("nki,nkj->nij", slopes, slopes) + np.diag(_spread(domain) ** -2))
         by_film = weight * charges.by_parameter(parameters, contact, by_contact)
         answer = -np.einsum("nij,nkj,nkp->nip", covariance, slopes, by_film)
         return cls(contact, answer, covariance)

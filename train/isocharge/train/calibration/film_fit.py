@@ -41,6 +41,9 @@ FEWEST_TO_JUDGE = 4
 TOLERANCE = 1e-4
 """Relative change of the sum of squares, or of the parameters, at which a fit ends."""
 
+MOST_STEPS = 25
+"""Steps of a fit at most; from the prior's mean it takes eight."""
+
 MARGIN = 1e-3
 """Distance of a start from the bounds, in standard deviations: the trust region begins inside."""
 
@@ -90,9 +93,10 @@ def fit_film(
         adjusted = adjust_contacts(charges, best, data, search_places(charges, best, data))
         evaluations += used + again
     jacobian = problem.jacobian(best, data[keep], np.ones(int(keep.sum())))
+    inverse: Array = np.linalg.inv(jacobian.T @ jacobian).astype(float)
     return FilmPosterior(
         parameters=best,
-        covariance=np.linalg.inv(jacobian.T @ jacobian),
+        covariance=inverse,
         contact=np.column_stack([adjusted.contact[:, :2], np.exp(adjusted.contact[:, 2])]),
         chi2=adjusted.chi2,
         freedom=freedom,
@@ -176,7 +180,7 @@ class _Problem:
             x_scale=1.0,
             ftol=TOLERANCE,
             xtol=TOLERANCE,
-            max_nfev=40,
+            max_nfev=MOST_STEPS,
         )
         return result.x * prior.std, adjusted_at(result.x), int(result.nfev)
 

@@ -12,7 +12,7 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
-from isocharge.train.calibration.contact_error import ContactSensitivity, spread_contacts
+from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.data.domain import ContactDomain
 from isocharge.train.data.noise import sigma_pC
@@ -69,7 +69,8 @@ def information_of(
     normal = np.einsum("nki,nkj->nij", slopes, slopes) + known
     across = np.einsum("nki,nkp->nip", slopes, by_film)
     own: Array = np.einsum("nkp,nkq->npq", by_film, by_film)
-    return own - np.einsum("nip,nij,njq->npq", across, np.linalg.inv(normal), across)
+    information: Array = own - np.einsum("nip,nij,njq->npq", across, np.linalg.inv(normal), across)
+    return information
 
 
 def next_presses(
@@ -97,7 +98,7 @@ def next_presses(
     """
     parameters = charges.prior.mean if parameters is None else parameters
     covariance = np.eye(parameters.size) if covariance is None else covariance
-    sensitivity = ContactSensitivity.at(charges, parameters, spread_contacts(domain), noise)
+    sensitivity = ContactSensitivity.at(charges, parameters, domain, noise)
     cost, candidates = sensitivity.cost(), _candidates(domain)
     offered = information_of(charges, parameters, candidates, noise, position_std_mm, force_std)
     proposed, information = [], np.linalg.inv(covariance)
@@ -106,7 +107,8 @@ def next_presses(
         best = int(np.argmin(np.einsum("pq,nqp->n", cost, after)))
         information = information + offered[best]
         left = sensitivity.left(after[best])
-        proposed.append(ProposedPress(*candidates[best].tolist(), left.position_mm, left.force_percent))
+        x_mm, y_mm, force_N = candidates[best].tolist()
+        proposed.append(ProposedPress(x_mm, y_mm, force_N, left.position_mm, left.force_percent))
     return proposed
 
 
