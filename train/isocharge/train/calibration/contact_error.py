@@ -54,13 +54,17 @@ class ContactSensitivity:
     noise: Array
 
     @classmethod
-    def at(cls, charges: FilmCharges, parameters: Array, contact: Array, noise: NoiseModel) -> "ContactSensitivity":
-        """At contacts (x_mm, y_mm, force_N), shape (n, 3), on one film."""
+    def at(
+        cls, charges: FilmCharges, parameters: Array, domain: ContactDomain, noise: NoiseModel
+    ) -> "ContactSensitivity":
+        """At contacts spread over a domain, on one film."""
+        contact = spread_contacts(domain)
         forward_map = charges.forward_map(parameters)
         by_contact = charges.by_contact(forward_map, contact)
         weight = 1.0 / sigma_pC(noise, charges.charge_pC(parameters, contact))[:, :, None]
         slopes = weight * by_contact
-        covariance = np.linalg.inv(np.einsum("nki,nkj->nij", slopes, slopes) + np.diag(_spread(domain) ** -2))
+        information = np.einsum("nki,nkj->nij", slopes, slopes) + np.diag(_spread(domain) ** -2)
+        covariance = np.linalg.inv(information)
         by_film = weight * charges.by_parameter(parameters, contact, by_contact)
         answer = -np.einsum("nij,nkj,nkp->nip", covariance, slopes, by_film)
         return cls(contact, answer, covariance)
