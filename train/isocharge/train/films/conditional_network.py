@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from isocharge.train.training.network import Trainable
+
 BASES = 6
 """Matrices that a layer's weights are made of, besides the constant one."""
 
@@ -20,7 +22,7 @@ FIRST_BASIS, FIRST_SHARE = 0.3, 0.3
 """Sizes at the start: of the bases, over the constant matrix; of phi."""
 
 
-class ConditionalPerceptron(nn.Module):
+class ConditionalPerceptron(Trainable):
     """Perceptrons of many films at once.
 
     Args:

@@ -136,13 +136,18 @@ def _response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: 
     plain[[D31, D32]] = plain[len(SHARED) :] = 0.0
     forward_map, piezo = family.forward_map(*prior.film(plain)), prior.sensor.piezo
     at = (contact * [1e-3, 1e-3, 1.0]).T
-    alone = (Piezo(piezo.d31, 0.0), Piezo(0.0, piezo.d32), Piezo(0.0, 0.0, piezo.d33))
-    parts = [
-        np.zeros((len(contact), len(prior.sensor.electrodes)))
-        if part == Piezo(0.0, 0.0)
-        else replace(forward_map, sensor=replace(forward_map.sensor, piezo=part)).forward(*at)
-        for part in alone
-    ]
+    none = np.zeros((len(contact), len(prior.sensor.electrodes)))
+
+    def charge(d31: float, d32: float, d33: float = 0.0) -> Array:
+        """Charges in C, zero without coefficients."""
+        if d31 == d32 == 0.0:
+            return none
+        sensor = replace(forward_map.sensor, piezo=Piezo(d31, d32, d33))
+        return replace(forward_map, sensor=sensor).forward(*at)
+
+    parts = [charge(piezo.d31, 0.0), charge(0.0, piezo.d32), none]
+    if piezo.d33 != 0.0:
+        parts[2] = charge(piezo.d31, piezo.d32, piezo.d33) - parts[0] - parts[1]
     response: Array = PC * np.stack(parts, axis=-1)
     return response
 
