@@ -34,7 +34,7 @@ class FilmsConfig:
     hidden: tuple[int, ...] = (96, 96, 96)
     misfit_hidden: tuple[int, ...] = (64, 64, 64)
     films: int = 4096
-    presses: int = 256
+    presses: int = 128
     watched: int = 64
     steps: int = 22_000
     misfit_films: int = 320
