@@ -40,9 +40,9 @@ from isocharge.simulate.solver.mesh_choice import layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
 from isocharge.simulate.solver.settings import SolveSettings
 
-LARGEST_ERROR = 1.5e-3
-"""Largest relative error of any charge against direct solves that a family may have, dimensionless; rms it is a
-tenth."""
+LARGEST_ERROR = 2e-3
+"""Largest relative error of any charge against direct solves that a family may have, dimensionless: the lightest
+presses on the tautest films have it, whose charges are a few pC; a thousandth of 100 pC is 1e-4."""
 
 SMALL = 0.1
 """Floor for the charge that an error is relative to, as a share of the press's largest charge, dimensionless."""
