@@ -37,6 +37,7 @@ def write_film_model(
     errors: Mapping[str, float] | None = None,
     made_with: Mapping[str, Any] | None = None,
     further: Mapping[str, bytes] | None = None,
+    widen: tuple[float, float] = (1.0, 1.0),
 ) -> Path:
     """Fold the network for one film and write it as a model, golden vectors included; under a second.
 
@@ -49,6 +50,7 @@ def write_film_model(
         errors: For the metadata; measured on fresh presses of the film if absent.
         made_with: For the metadata, beside the versions of isocharge and Python: the command, for one.
         further: More files for the version folder, by name.
+        widen: Factors on the deviations of position and force, for what is not known of the film.
 
     Returns:
         The version folder.
@@ -61,7 +63,8 @@ def write_film_model(
     """
     sensor, probe = films.prior.film(parameters)
     check_target(folder, version, sensor.electrode_names)
-    network, presses = films.fold(parameters), fresh_presses(films, parameters, PRESSES)
+    network = films.fold(parameters).widened(*widen)
+    presses = fresh_presses(films, parameters, PRESSES)
     about = ModelMetadata(
         name=folder.resolve().name,
         version=version,
@@ -73,7 +76,11 @@ def write_film_model(
         noise=films.noise.to_dict(),
         dataset_sha256=films.sha256,
         errors=measure_errors(network.predict, presses, films.noise) if errors is None else errors,
-        made_with={"isocharge": metadata.version("isocharge"), "python": platform.python_version(), **(made_with or {})},
+        made_with={
+            "isocharge": metadata.version("isocharge"),
+            "python": platform.python_version(),
+            **(made_with or {}),
+        },
     )
     graph = export_onnx(network, about.to_props())
     golden = check_graph(graph, network.predict, presses, misfit_noise(films.noise))

@@ -5,7 +5,7 @@ units into the last, and perceptrons that share their inputs run as one with blo
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -101,6 +101,13 @@ class FoldedNetwork:
         length = np.linalg.norm(answers[:, 6:], axis=1, keepdims=True)
         return contact, np.exp(answers[:, 3:6]), MISFIT_UNIT * np.sinh(length)
 
+    def widened(self, position: float, force: float) -> "FoldedNetwork":
+        """The network with larger standard deviations: factors for those of position and force."""
+        weight, bias = self.layers.last
+        added = np.zeros_like(bias)
+        added[3:6] = np.log([position, position, force])
+        return replace(self, layers=replace(self.layers, last=(weight, bias + added)))
+
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
     """Both perceptrons, from ln(Q / typical)."""
@@ -136,7 +143,9 @@ def contact_alone(network: InverseNetwork) -> FoldedLayers:
     matrix = np.vstack([np.diag(network.domain.scale), np.zeros((3, 3))])
     features = network.features
     mean = np.log(features.typical) + features.mean
-    return FoldedLayers.of((PlainPerceptron.of(network.contact),), features.matrix, mean, (matrix, network.domain.centre))
+    return FoldedLayers.of(
+        (PlainPerceptron.of(network.contact),), features.matrix, mean, (matrix, network.domain.centre)
+    )
 
 
 def _side_by_side(perceptrons: Sequence[PlainPerceptron]) -> tuple[list[Layer], Layer]:
