@@ -21,7 +21,7 @@ ASSUMED, FITTED = "#b9c4cf", "#3a7ca5"
 
 
 def calibration_picture(calibration: Calibration) -> Figure:
-    """Two maps of the error that the film leaves, the quantities in units of what was assumed, misses of the presses."""
+    """Maps of the error that the film leaves, quantities in units of what was assumed, misses of the presses."""
     figure = new_figure(15.0, 9.4)
     (before, after), (told, misses) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
     for axes, error, title in (
