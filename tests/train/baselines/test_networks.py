@@ -17,7 +17,7 @@ from isocharge.train.baselines.networks import (
 from isocharge.train.data.domain import ContactDomain
 from isocharge.train.data.presses import domain_of, presses_of, split_by_position
 from isocharge.train.release.export import export_onnx
-from isocharge.train.release.folding import contact_alone
+from isocharge.train.release.folding import contact_alone, fold_network
 from isocharge.train.training.network import Features, InverseNetwork
 
 CHARGE = np.random.default_rng(0).uniform(100.0, 1500.0, (400, 3))
@@ -68,7 +68,7 @@ def test_memory_is_that_of_the_weights(network, forms):
 
 
 def test_the_contact_cut_out_of_a_released_graph(network, forms):
-    cut = contact_of(export_onnx(network, {}))
+    cut = contact_of(export_onnx(fold_network(network), {}))
     alone = BoundNetwork(cut, "", "n")
     assert [output.name for output in alone.session.get_outputs()] == ["contact"]
     np.testing.assert_allclose(alone.predict(CHARGE), forms[1].predict(CHARGE), rtol=1e-4, atol=1e-4)

@@ -13,6 +13,10 @@ from isocharge.extras import require
 
 with require("train"):
     from isocharge.train.bayes.limit import BayesLimit, Scene, bayes_estimate, bayes_limit
+    from isocharge.train.calibration.calibrate import Calibration, CalibrationScene, EarlierFilm, calibrate
+    from isocharge.train.calibration.films_for import SensorFilms, films_for
+    from isocharge.train.calibration.folder import read_earlier, write_calibration
+    from isocharge.train.calibration.next_press import ProposedPress, next_presses
     from isocharge.train.release.evaluate import measure_errors
     from isocharge.train.release.release import Release, train_model
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
@@ -20,16 +24,26 @@ with require("train"):
 
 __all__ = [
     "BayesLimit",
+    "Calibration",
+    "CalibrationScene",
+    "EarlierFilm",
     "Fit",
     "FitConfig",
     "NetworkConfig",
+    "ProposedPress",
     "Release",
     "Scene",
+    "SensorFilms",
     "TrainingConfig",
     "bayes_estimate",
     "bayes_limit",
+    "calibrate",
+    "films_for",
     "fit_network",
     "load_config",
     "measure_errors",
+    "next_presses",
+    "read_earlier",
     "train_model",
+    "write_calibration",
 ]

@@ -10,8 +10,10 @@ renamed.
 """
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import onnxruntime as ort
 from numpy.typing import ArrayLike
@@ -91,7 +93,12 @@ def check_golden(model: Model) -> None:
 
 
 def write_model(
-    folder: Path, onnx_model: bytes, metadata: ModelMetadata, golden_charge_pC: ArrayLike, card: str
+    folder: Path,
+    onnx_model: bytes,
+    metadata: ModelMetadata,
+    golden_charge_pC: ArrayLike,
+    card: str,
+    further: Mapping[str, bytes] = MappingProxyType({}),
 ) -> Path:
     """Write a new version of a model.
 
@@ -101,6 +108,7 @@ def write_model(
         metadata: The same metadata.
         golden_charge_pC: Inputs of the golden vectors, shape (n, electrodes), pC.
         card: Text of the model card.
+        further: More files for the version folder, by name; a server leaves them alone.
 
     Returns:
         The version folder.
@@ -123,6 +131,8 @@ def write_model(
         write_whole(draft / "model.onnx", onnx_model)
         write_whole(draft / "golden.json", golden.to_json().encode())
         write_whole(draft / "card.md", card.encode())
+        for name, content in further.items():
+            write_whole(draft / name, content)
         _check_draft(draft, metadata)
     write_whole(folder / "config.pbtxt", triton_config(metadata.name, len(metadata.electrodes)).encode())
     return target

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.errors import SceneError
+from isocharge.errors import SceneError, SensorError
 from isocharge.simulate.sensor.electrode import Calibration
 from isocharge.simulate.sensor.film import Film, Piezo
 from isocharge.simulate.sensor.probe import Circle
@@ -158,6 +158,58 @@ class FilmPrior:
             calibration=Calibration(gains, shift, before.rotation + values["rotation"]),
         )
         return sensor, Circle(self.probe.radius + values["probe_radius"])
+
+    def parameters_of(self, sensor: Sensor, probe: Circle) -> Array:
+        """The parameters of a sensor that differs from the described one by them alone: the inverse of `film`.
+
+        Raises:
+            SensorError: If it differs otherwise: other electrodes, another radius, another readout.
+        """
+        described = self.sensor
+        for what, value, expected in (
+            ("electrodes", _shapes(sensor), _shapes(described)),
+            ("readout", (sensor.readout, sensor.surface), (described.readout, described.surface)),
+            ("film radius (mm) and poisson", _round_film(sensor.film), _round_film(described.film)),
+            ("d33 (pC/N)", 1e12 * sensor.piezo.d33, 1e12 * described.piezo.d33),
+        ):
+            if value != expected:
+                raise SensorError(f"{sensor.name}: {what}: expected those of {described.name}, {expected}, got {value}")
+        film, piezo, calibration = sensor.film, sensor.piezo, sensor.calibration
+        before = described.calibration
+        logs = {
+            "young": film.young / described.film.young,
+            "thickness": film.thickness / described.film.thickness,
+            "d31": _ratio(piezo.d31, described.piezo.d31),
+            "d32": _ratio(piezo.d32, described.piezo.d32),
+            **{
+                f"gain {name}": calibration.gain.get(name, 1.0) / before.gain.get(name, 1.0)
+                for name in sensor.electrode_names
+            },
+        }
+        if min(logs.values()) <= 0.0:
+            raise SensorError(f"{sensor.name}: d31 and d32: expected the signs of {described.name}")
+        differences = {
+            "pretension": film.pretension,
+            "shift_x": calibration.shift[0] - before.shift[0],
+            "shift_y": calibration.shift[1] - before.shift[1],
+            "rotation": calibration.rotation - before.rotation,
+            "probe_radius": probe.radius - self.probe.radius,
+            **{name: float(np.log(ratio)) for name, ratio in logs.items()},
+        }
+        return np.array([differences[name] for name in self.names])
+
+
+def _shapes(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
+    """Corners of the electrodes as described, mm, rounded to a nanometre."""
+    return {e.name: [(round(1e3 * x, 6), round(1e3 * y, 6)) for x, y in e.corners] for e in sensor.electrodes}
+
+
+def _round_film(film: Film) -> tuple[float, float]:
+    return round(1e3 * film.radius, 6), round(film.poisson, 9)
+
+
+def _ratio(value: float, described: float) -> float:
+    return 1.0 if value == described == 0.0 else value / described if described else 0.0
 
 
 def _film(described: Film, values: dict[str, float]) -> Film:

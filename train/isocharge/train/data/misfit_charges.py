@@ -12,9 +12,8 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
-from isocharge.train.data.nearest_contact import nearest_in_field, search_field
+from isocharge.train.data.nearest_contact import CANDIDATES, NearestField, nearest_in_field, search_field
 from isocharge.train.data.noise import with_noise
 from isocharge.train.data.presses import LabelledPresses
 
@@ -39,7 +38,13 @@ class MisfitExamples:
 
 
 def draw_misfit_examples(
-    presses: LabelledPresses, field: ChargeField, noise: NoiseModel, count: int, seed: int
+    presses: LabelledPresses,
+    field: NearestField,
+    noise: NoiseModel,
+    count: int,
+    seed: int,
+    *,
+    candidates: int = CANDIDATES,
 ) -> MisfitExamples:
     """Draw charges of every kind and find their nearest contacts.
 
@@ -49,6 +54,7 @@ def draw_misfit_examples(
         noise: Noise of good presses, and the unit of distance.
         count: How many.
         seed: Of all that is drawn.
+        candidates: Contacts among which searches start.
     """
     rng = np.random.default_rng(seed)
     rows = rng.integers(len(presses), size=count)
@@ -58,17 +64,24 @@ def draw_misfit_examples(
     for kind in KINDS:
         charge[kinds == kind] = _DRAW[kind](rng, chosen.charge_pC[kinds == kind], presses.charge_pC, noise)
     charge = np.clip(charge, LOWEST_PC, HIGHEST_PC)
-    return MisfitExamples(charge, _misses(field, charge, noise, chosen, np.isin(kinds, ("noisy", "moved"))))
+    return MisfitExamples(charge, _misses(field, charge, noise, chosen, np.isin(kinds, ("noisy", "moved")), candidates))
 
 
-def _misses(field: ChargeField, charge: Array, noise: NoiseModel, chosen: LabelledPresses, near: np.ndarray) -> Array:
+def _misses(
+    field: NearestField,
+    charge: Array,
+    noise: NoiseModel,
+    chosen: LabelledPresses,
+    near: np.ndarray,
+    candidates: int,
+) -> Array:
     """Those `near` their own press start there, and the field is shifted to be right there; the others search."""
     miss, at = np.zeros_like(charge), np.flatnonzero(near)
     start = field.domain.to_unit(chosen.contact[at])
     shift = np.log(chosen.charge_pC[at]) - field.log_charge(start)[:, 0]
     miss[at] = nearest_in_field(field, charge[at], noise, start, shift)[1]
     far = np.flatnonzero(~near | (np.linalg.norm(np.where(near[:, None], miss, 0.0), axis=1) > FAR))
-    searched = search_field(field, charge[far], noise)[1]
+    searched = search_field(field, charge[far], noise, candidates=candidates)[1]
     keep = near[far] & ((miss[far] ** 2).sum(axis=1) < (searched**2).sum(axis=1))
     miss[far] = np.where(keep[:, None], miss[far], searched)
     return miss

@@ -3,13 +3,15 @@
 min over contacts c of the domain of |(Q - Q(c)) / sigma|,   sigma of the measured charges Q.
 """
 
+from typing import Protocol
+
 import numpy as np
 from scipy.stats import qmc
 
 from isocharge.arrays import Array, Integers
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk_least_squares import minimise
-from isocharge.train.data.charge_field import ChargeField
+from isocharge.train.data.domain import ContactDomain
 from isocharge.train.data.noise import sigma_pC
 
 CANDIDATES = 4096
@@ -19,8 +21,19 @@ CHUNK = 2048
 """Charges compared with all candidates at once."""
 
 
+class NearestField(Protocol):
+    """The forward map that is searched: a `ChargeField`, or another with the same two members."""
+
+    @property
+    def domain(self) -> ContactDomain:
+        """Where contacts are searched for."""
+
+    def log_charge(self, unit: Array) -> Array:
+        """ln Q and its derivatives by the unit coordinates: contacts (n, 3) in them to (n, 4, n_electrode)."""
+
+
 def nearest_in_field(
-    field: ChargeField, charge_pC: Array, noise: NoiseModel, start: Array, shift: Array | None = None
+    field: NearestField, charge_pC: Array, noise: NoiseModel, start: Array, shift: Array | None = None
 ) -> tuple[Array, Array]:
     """The contact that descent from a start leads to.
 
@@ -45,12 +58,14 @@ def nearest_in_field(
     return minimise(residuals, start)
 
 
-def search_field(field: ChargeField, charge_pC: Array, noise: NoiseModel, starts: int = 2) -> tuple[Array, Array]:
+def search_field(
+    field: NearestField, charge_pC: Array, noise: NoiseModel, starts: int = 2, candidates: int = CANDIDATES
+) -> tuple[Array, Array]:
     """The nearest contact from the best few of many starts; arguments and result as `nearest_in_field`."""
-    candidates = _candidates()
-    charges = np.exp(field.log_charge(candidates)[:, 0])
+    spread = _spread(candidates)
+    charges = np.exp(field.log_charge(spread)[:, 0])
     nearest = np.concatenate([_nearest_rows(some, charges, noise, starts) for some in _chunks(charge_pC)])
-    answers = [nearest_in_field(field, charge_pC, noise, candidates[rows]) for rows in nearest.T]
+    answers = [nearest_in_field(field, charge_pC, noise, spread[rows]) for rows in nearest.T]
     squares = np.stack([(miss**2).sum(axis=1) for _, miss in answers])
     best = squares.argmin(axis=0), np.arange(len(charge_pC))
     return np.stack([unit for unit, _ in answers])[best], np.stack([miss for _, miss in answers])[best]
@@ -60,9 +75,9 @@ def _chunks(charge_pC: Array) -> list[Array]:
     return np.array_split(charge_pC, len(charge_pC) // CHUNK + 1)
 
 
-def _candidates() -> Array:
-    """Contacts in unit coordinates, shape (CANDIDATES, 3)."""
-    sobol = qmc.Sobol(3, scramble=False).random(CANDIDATES)
+def _spread(count: int) -> Array:
+    """Contacts in unit coordinates, shape (count, 3)."""
+    sobol = qmc.Sobol(3, scramble=False).random(count)
     radius, angle = np.sqrt(sobol[:, 0]), 2.0 * np.pi * sobol[:, 1]
     radius[::4] = 1.0
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), 2.0 * sobol[:, 2] - 1.0], axis=1)

@@ -1,6 +1,6 @@
-"""The trained network as an ONNX graph, written node by node from its weights: what the model needs and nothing else.
+"""A folded network as an ONNX graph, written node by node from its weights: what the model needs and nothing else.
 
-Its layers are folded (`release.folding`). A test compares the graph with `InverseNetwork.forward` on clean, noisy and
+A test compares the graph with `InverseNetwork.forward` on clean, noisy and
 absurd charges.
 """
 
@@ -14,8 +14,8 @@ from onnx import TensorProto, helper, numpy_helper
 
 from isocharge.serve.model.session import OUTPUTS
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
-from isocharge.train.release.folding import FoldedLayers, all_answers
-from isocharge.train.training.network import MISFIT_UNIT, InverseNetwork
+from isocharge.train.release.folding import FoldedLayers, FoldedNetwork
+from isocharge.train.training.network import MISFIT_UNIT
 
 OPSET, IR_VERSION = 17, 8
 """Old enough for runtimes of 2022 on, new enough for every operator used."""
@@ -48,21 +48,21 @@ class GraphBuilder:
         return self.add_many("Split", data, self.constant(sizes, np.int64), to=names, axis=axis)
 
 
-def export_onnx(network: InverseNetwork, properties: Mapping[str, str]) -> bytes:
+def export_onnx(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
     """The model as an ONNX file.
 
     Args:
-        network: The trained model.
+        network: The model, folded (`release.folding`).
         properties: Metadata, written into `metadata_props`.
 
     Returns:
         The ONNX file: input `charge_pC` [n, n_electrode]; outputs `contact` [n, 3], `contact_std` [n, 3],
         `misfit` [n, 1], all float32.
     """
-    build, n_electrode = GraphBuilder(), network.features.typical.size
+    build, n_electrode = GraphBuilder(), network.typical.size
     within = build.add("Clip", "charge_pC", build.constant(LOWEST_PC), build.constant(HIGHEST_PC))
-    ratios = build.add("Mul", within, build.constant(1.0 / network.features.typical))
-    answers = add_layers(build, build.add("Log", ratios), all_answers(network))
+    ratios = build.add("Mul", within, build.constant(1.0 / network.typical))
+    answers = add_layers(build, build.add("Log", ratios), network.layers)
     plane, logs, vector = build.split(answers, ("plane", "logs", "misfit_vector"), (2, 4, n_electrode), axis=1)
     force, _ = build.split(build.add("Exp", logs), ("force", "contact_std"), (1, 3), axis=1)
     build.add("Concat", plane, force, to="contact", axis=1)

@@ -5,17 +5,37 @@ units into the last, and perceptrons that share their inputs run as one with blo
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
 from torch import nn
 
 from isocharge.arrays import Array
-from isocharge.train.training.network import InverseNetwork, Perceptron
+from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain
+from isocharge.train.training.network import MISFIT_UNIT, InverseNetwork, Perceptron
 
 Layer = tuple[Array, Array]
 """Weights (inputs, outputs) and bias."""
+
+
+@dataclass(frozen=True)
+class PlainPerceptron:
+    """A trained perceptron in NumPy.
+
+    Attributes:
+        layers: Between which tanh stands, first to last.
+        skip: Weights straight from the inputs to the outputs, shape (inputs, outputs).
+    """
+
+    layers: tuple[Layer, ...]
+    skip: Array
+
+    @classmethod
+    def of(cls, perceptron: Perceptron) -> "PlainPerceptron":
+        """The weights of a torch module, in double precision."""
+        layers = tuple((_matrix(layer), layer.bias.detach().double().numpy()) for layer in perceptron.layers())
+        return cls(layers, _matrix(perceptron.skip))
 
 
 @dataclass(frozen=True)
@@ -33,7 +53,7 @@ class FoldedLayers:
     skip: Array
 
     @classmethod
-    def of(cls, perceptrons: Sequence[Perceptron], whitening: Array, mean: Array, units: Layer) -> "FoldedLayers":
+    def of(cls, perceptrons: Sequence[PlainPerceptron], whitening: Array, mean: Array, units: Layer) -> "FoldedLayers":
         """Fold perceptrons of equally many layers.
 
         Args:
@@ -45,27 +65,77 @@ class FoldedLayers:
         (first, *between), last = _side_by_side(perceptrons)
         matrix, shift = units
         weight = whitening @ first[0]
-        skip = whitening @ np.hstack([_matrix(perceptron.skip) for perceptron in perceptrons]) @ matrix
+        skip = whitening @ np.hstack([perceptron.skip for perceptron in perceptrons]) @ matrix
         return cls(
             hidden=((weight, first[1] - mean @ weight), *between),
             last=(last[0] @ matrix, last[1] @ matrix + shift - mean @ skip),
             skip=skip,
         )
 
+    def answers(self, logs: Array) -> Array:
+        """Logarithms of the charges (n, n_electrode) to (n, n_answer), in double precision."""
+        value = logs
+        for weight, bias in self.hidden:
+            value = np.tanh(value @ weight + bias)
+        answers: Array = value @ self.last[0] + self.last[1] + logs @ self.skip
+        return answers
 
-def all_answers(network: InverseNetwork) -> FoldedLayers:
-    """Both perceptrons, from ln(Q / typical).
 
-    Answers: x_mm and y_mm (2), ln F (1), logarithms of the standard deviations in mm and N (3), the misfit vector
-    (n_electrode). A force's deviation is relative to the force, so its logarithm adds ln F.
+@dataclass(frozen=True)
+class FoldedNetwork:
+    """A whole model as plain layers: what the exported graph computes, here in double precision.
+
+    Attributes:
+        layers: From ln(Q / typical) to: x_mm and y_mm (2), ln F (1), logarithms of the standard deviations in mm and N
+            (3), the misfit vector (n_electrode).
+        typical: Powers of two near the charges' geometric means, shape (n_electrode,), pC.
     """
-    scale, centre, n_electrode = network.domain.scale, network.domain.centre, network.features.typical.size
-    matrix, shift = np.diag(np.r_[scale, np.ones(3 + n_electrode)]), np.zeros(6 + n_electrode)
-    matrix[2, 5] = scale[2]
-    shift[:3], shift[3:6] = centre, np.log(scale)
-    shift[5] += centre[2]
+
+    layers: FoldedLayers
+    typical: Array
+
+    def predict(self, charge_pC: Array) -> tuple[Array, Array, Array]:
+        """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
+        answers = self.layers.answers(np.log(np.clip(charge_pC, LOWEST_PC, HIGHEST_PC) / self.typical))
+        contact = np.concatenate([answers[:, :2], np.exp(answers[:, 2:3])], axis=1)
+        length = np.linalg.norm(answers[:, 6:], axis=1, keepdims=True)
+        return contact, np.exp(answers[:, 3:6]), MISFIT_UNIT * np.sinh(length)
+
+    def widened(self, position: float, force: float) -> "FoldedNetwork":
+        """The network with larger standard deviations: factors for those of position and force."""
+        weight, bias = self.layers.last
+        added = np.zeros_like(bias)
+        added[3:6] = np.log([position, position, force])
+        return replace(self, layers=replace(self.layers, last=(weight, bias + added)))
+
+
+def fold_network(network: InverseNetwork) -> FoldedNetwork:
+    """Both perceptrons, from ln(Q / typical)."""
+    n_electrode = network.features.typical.size
+    perceptrons = [PlainPerceptron.of(part) for part in (network.contact, network.misfit_vector)]
     whitening, mean = network.whitening.double().numpy(), network.logs_mean.double().numpy()
-    return FoldedLayers.of((network.contact, network.misfit_vector), whitening, mean, (matrix, shift))
+    units = answer_units(network.domain, np.eye(3), np.zeros(3), n_electrode)
+    return FoldedNetwork(FoldedLayers.of(perceptrons, whitening, mean, units), network.features.typical)
+
+
+def answer_units(domain: ContactDomain, turn: Array, offset: Array, n_electrode: int) -> Layer:
+    """Matrix and shift from outputs of the perceptrons to answers.
+
+    A force's deviation is relative to the force, so its logarithm adds ln F.
+
+    Args:
+        domain: Centre and scale of the unit coordinates.
+        turn: Matrix T, shape (3, 3), of the unit coordinates T u + o, u what the network gives.
+        offset: The vector o, shape (3,).
+        n_electrode: Width of the misfit vector.
+    """
+    scale, shift = domain.scale, np.zeros(6 + n_electrode)
+    matrix = np.eye(6 + n_electrode)
+    matrix[:3, :3] = turn.T * scale
+    shift[:3], shift[3:6] = offset * scale + domain.centre, np.log(scale)
+    matrix[:3, 5] = matrix[:3, 2]
+    shift[5] += shift[2]
+    return matrix, shift
 
 
 def contact_alone(network: InverseNetwork) -> FoldedLayers:
@@ -73,16 +143,18 @@ def contact_alone(network: InverseNetwork) -> FoldedLayers:
     matrix = np.vstack([np.diag(network.domain.scale), np.zeros((3, 3))])
     features = network.features
     mean = np.log(features.typical) + features.mean
-    return FoldedLayers.of((network.contact,), features.matrix, mean, (matrix, network.domain.centre))
+    return FoldedLayers.of(
+        (PlainPerceptron.of(network.contact),), features.matrix, mean, (matrix, network.domain.centre)
+    )
 
 
-def _side_by_side(perceptrons: Sequence[Perceptron]) -> tuple[list[Layer], Layer]:
+def _side_by_side(perceptrons: Sequence[PlainPerceptron]) -> tuple[list[Layer], Layer]:
     """Layers that tanh follows, and the last; the first shares its inputs, the others are block-diagonal."""
-    stages = zip(*(perceptron.layers() for perceptron in perceptrons), strict=True)
+    stages = zip(*(perceptron.layers for perceptron in perceptrons), strict=True)
     layers = [
         (
-            block_diag(*map(_matrix, stage)) if number else np.hstack([_matrix(layer) for layer in stage]),
-            np.concatenate([layer.bias.detach().double().numpy() for layer in stage]),
+            block_diag(*(weight for weight, _ in stage)) if number else np.hstack([weight for weight, _ in stage]),
+            np.concatenate([bias for _, bias in stage]),
         )
         for number, stage in enumerate(stages)
     ]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from isocharge.errors import TrainingError
 from isocharge.train.training.checkpoint import Checkpoint
-from isocharge.train.training.network import Perceptron
+from isocharge.train.training.network import Trainable
 
 MUON_RATE = 6.0
 """Ratio of Muon's rate to Adam's: a step of Muon has a given size whatever the gradient."""
@@ -39,14 +39,16 @@ class TrainingStage:
         score: The loss on presses that training does not see, and a text about it.
         steps: Number of steps.
         warm_up_steps: Steps before which no network counts as the best: they train another loss.
+        largest_gradient: Norm to which gradients are cut after them.
     """
 
     name: str
-    part: Perceptron
+    part: Trainable
     loss: Callable[[int, torch.Generator], Tensor]
     score: Callable[[], tuple[float, str]]
     steps: int
     warm_up_steps: int = 0
+    largest_gradient: float = math.inf
 
 
 class Descent:
@@ -83,6 +85,8 @@ class Descent:
         loss = self.task.loss(self.step, self.random)
         self.task.part.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
+        if self.step >= self.task.warm_up_steps and math.isfinite(self.task.largest_gradient):
+            torch.nn.utils.clip_grad_norm_(self.task.part.parameters(), self.task.largest_gradient)
         for optimiser in self.optimisers:
             optimiser.step()
         self.step += 1
@@ -129,7 +133,7 @@ def _rate_share(done: float) -> float:
     return 0.5 * (1.0 + math.cos(math.pi * (done - RISE) / (1.0 - RISE)))
 
 
-def _optimisers(part: Perceptron, rate: float) -> list[torch.optim.Optimizer]:
+def _optimisers(part: Trainable, rate: float) -> list[torch.optim.Optimizer]:
     matrices = part.hidden_matrices()
     hidden = {id(matrix) for matrix in matrices}
     others = [parameter for parameter in part.parameters() if id(parameter) not in hidden]

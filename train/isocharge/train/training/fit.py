@@ -85,7 +85,7 @@ def fit_network(
     noise_model(training.noise)  # an unknown level is said before the work
     asked, presses = domain_of(dataset), presses_of(dataset)
     _check_electrodes(dataset, config)
-    with _threads_and_seed(training):
+    with threads_and_seed(training.threads, training.seed):
         domain, presses = _without_folds(asked, presses, training, warn)
         trainable, held = split_by_position(presses, training.hold_out, training.seed)
         train, watched = split_by_position(trainable, WATCHED * training.hold_out, training.seed + 1)
@@ -134,16 +134,16 @@ def _without_folds(
 
 
 @contextmanager
-def _threads_and_seed(training: TrainingConfig) -> Iterator[None]:
+def threads_and_seed(count: int, seed: int) -> Iterator[None]:
     """Seed and thread count for the block, the caller's restored after it.
 
     BLAS is held to the same number: its threads spin at barriers, and a busy second core makes them many times slower.
     """
     threads = torch.get_num_threads()
-    torch.set_num_threads(training.threads)
+    torch.set_num_threads(count)
     try:
-        with threadpool_limits(training.threads, user_api="blas"), torch.random.fork_rng(devices=[]):
-            torch.manual_seed(training.seed)
+        with threadpool_limits(count, user_api="blas"), torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
             yield
     finally:
         torch.set_num_threads(threads)
@@ -198,14 +198,14 @@ class _Training:
 
     def _contact_loss(self, step: int, random: torch.Generator) -> Tensor:
         rows = torch.randint(len(self.charge), (min(self.config.batch, len(self.charge)),), generator=random)
-        mean, log_std = self.network.posterior(_with_fresh_noise(self.charge[rows], self.noise, random))
+        mean, log_std = self.network.posterior(with_fresh_noise(self.charge[rows], self.noise, random))
         warm_up = step < round(WARM_UP * self.config.steps)
-        return (_start_loss if warm_up else _likelihood_loss)(mean, log_std, self.unit[rows])
+        return (start_loss if warm_up else likelihood_loss)(mean, log_std, self.unit[rows])
 
     def _contact_score(self) -> tuple[float, str]:
         with torch.no_grad():
             mean, log_std = self.network.posterior(self.watched_charge)
-            loss = _likelihood_loss(mean, log_std, self.watched_unit).item()
+            loss = likelihood_loss(mean, log_std, self.watched_unit).item()
             off = ((mean - self.watched_unit) * self.network.scale) ** 2
         position, force = off[:, :2].sum(dim=1).mean().sqrt().item(), off[:, 2].mean().sqrt().item()
         return loss, f"{loss:.3f} on watched presses: {position:.4f} mm and {100.0 * force:.3f} % of force rms"
@@ -258,18 +258,18 @@ def _as_it_is(state: dict[str, Any]) -> dict[str, Any]:
     return state
 
 
-def _with_fresh_noise(charge_pC: Tensor, noise: NoiseModel, random: torch.Generator) -> Tensor:
+def with_fresh_noise(charge_pC: Tensor, noise: NoiseModel, random: torch.Generator) -> Tensor:
     sigma = torch.hypot(torch.tensor(1e12 * noise.white), noise.gain * charge_pC)
     return charge_pC + sigma * torch.randn(charge_pC.shape, generator=random)
 
 
-def _start_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:
+def start_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:
     """Least squares for the mean; the deviations follow it without pulling at it."""
     squares = (mean - unit) ** 2
     follow = log_std + 0.5 * squares.detach() * torch.exp(-2.0 * log_std)
     return (30.0 * squares + 0.1 * follow).sum(dim=1).mean()
 
 
-def _likelihood_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:
+def likelihood_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:
     """Negative logarithm of a Gaussian likelihood, but for a constant."""
     return (log_std + 0.5 * ((mean - unit) * torch.exp(-log_std)) ** 2).sum(dim=1).mean()

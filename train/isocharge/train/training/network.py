@@ -10,6 +10,7 @@ as the length of a vector, (Q - Q(c)) / sigma at the nearest contact: that vecto
 the image of the forward map. Lengths from a tenth to thousands are brought into reach of a network by asinh.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -50,7 +51,15 @@ class Features:
         return cls(typical, mean, axes.T * (np.sqrt(len(logs)) / np.maximum(singular, 1e-12)))
 
 
-class Perceptron(nn.Module):
+class Trainable(nn.Module, ABC):
+    """A part of a model that `Descent` trains."""
+
+    @abstractmethod
+    def hidden_matrices(self) -> list[Tensor]:
+        """Weights from one hidden layer to the next, which Muon trains."""
+
+
+class Perceptron(Trainable):
     """Linear layers with tanh between them, and a linear layer that skips them from the inputs to the outputs.
 
     The logarithm of the force is nearly linear in those of the charges, and has to be right to a thousandth of its

@@ -1,0 +1,78 @@
+"""A perceptron whose weights depend on a context: computed once per film, after which it is a plain perceptron.
+
+A small network turns the context into psi. Layer l then has the weights W_l0 + sum_k phi_lk W_lk, with phi linear in
+psi, and a bias that is linear in psi; so has the layer that skips the others.
+"""
+
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from isocharge.train.training.network import Trainable
+
+BASES = 6
+"""Matrices that a layer's weights are made of, besides the constant one."""
+
+PSI = 64
+"""Width of the context's network."""
+
+FIRST_BASIS, FIRST_SHARE = 0.3, 0.3
+"""Sizes at the start: of the bases, over the constant matrix; of phi."""
+
+
+class ConditionalPerceptron(Trainable):
+    """Perceptrons of many films at once.
+
+    Args:
+        inputs: Number of electrodes.
+        hidden: Widths of the hidden layers.
+        outputs: Number of outputs.
+        context: Number of context values.
+        bases: Matrices that a layer's weights are made of, besides the constant one.
+        psi: Width of the context's network.
+    """
+
+    def __init__(
+        self, inputs: int, hidden: tuple[int, ...], outputs: int, context: int, bases: int = BASES, psi: int = PSI
+    ) -> None:
+        super().__init__()
+        sizes = list(pairwise((inputs, *hidden, outputs)))
+        self.context = nn.Sequential(nn.Linear(context, psi), nn.Tanh(), nn.Linear(psi, psi), nn.Tanh())
+        self.constant = nn.ParameterList([_uniform(1.0, *size) for size in sizes])
+        self.bases = nn.ParameterList([_uniform(FIRST_BASIS, *size, count=bases) for size in sizes])
+        self.bias = nn.ModuleList([nn.Linear(psi, size[1]) for size in sizes])
+        self.skip = nn.Parameter(torch.zeros(inputs, outputs))
+        self.skip_bases = nn.Parameter(torch.zeros(bases, inputs, outputs))
+        self.phi = nn.Linear(psi, bases * (len(sizes) + 1))
+        for linear in self.bias:
+            nn.init.zeros_(linear.weight)  # type: ignore[arg-type]
+        nn.init.normal_(self.phi.weight, std=FIRST_SHARE / np.sqrt(psi))
+        nn.init.zeros_(self.phi.bias)
+
+    def forward(self, inputs: Tensor, context: Tensor) -> Tensor:
+        """Inputs (n_film, n, inputs) and contexts (n_film, n_context) to (n_film, n, outputs)."""
+        psi = self.context(context)
+        phi = self.phi(psi).view(len(context), len(self.constant) + 1, -1)
+        value, last = inputs, len(self.constant) - 1
+        for number, (constant, bases, bias) in enumerate(zip(self.constant, self.bases, self.bias, strict=True)):
+            weight = constant + torch.einsum("fk,kio->fio", phi[:, number], bases)
+            value = torch.baddbmm(bias(psi)[:, None], value, weight)
+            value = value if number == last else torch.tanh(value)
+        skip = self.skip + torch.einsum("fk,kio->fio", phi[:, -1], self.skip_bases)
+        return value + torch.bmm(inputs, skip)
+
+    def hidden_matrices(self) -> list[Tensor]:
+        """Constant weights from one hidden layer to the next."""
+        return list(self.constant)[1:-1]
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Weights by name, as `ConditionalWeights` takes them."""
+        return {name: values.detach().double().numpy() for name, values in self.state_dict().items()}
+
+
+def _uniform(share: float, inputs: int, outputs: int, count: int = 0) -> nn.Parameter:
+    """Weights of shape (inputs, outputs), or `count` of them, uniform in +-share / sqrt(inputs)."""
+    shape = (count, inputs, outputs) if count else (inputs, outputs)
+    return nn.Parameter(share * (2.0 * torch.rand(shape) - 1.0) / np.sqrt(inputs))

@@ -1,0 +1,179 @@
+"""The films file, `films.npz` beside a model: all that is needed for a model of another film. Its writer and reader.
+
+    about              JSON: format, sensor, probe, spread, domain, noise
+    family.*           the forward maps of the films (`FilmFamily.to_arrays`)
+    contact.*          weights of the contact network, integers of `BITS` bits, with their scales
+    misfit.*           weights of the misfit network
+    mean, whitening    of the inputs
+    sha256             checksum of all the above
+
+The last bits of the integers are nearly noise, so that fewer bits make a smaller compressed file.
+"""
+
+import hashlib
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isocharge.arrays import Array
+from isocharge.errors import InputError, ModelError
+from isocharge.simulate.forward.film_family import FilmFamily
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread
+from isocharge.simulate.sensor.probe import Circle
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
+from isocharge.train.data.domain import ContactDomain
+from isocharge.train.films.conditional_weights import ConditionalWeights
+from isocharge.train.films.film_scaling import FilmScaling
+from isocharge.train.films.films_model import FilmsModel
+
+FILE = "films.npz"
+"""Name of the file in a version folder."""
+
+FORMAT = 1
+"""Version of the file's format."""
+
+BITS = 13
+"""Bits of a weight, its sign included: relative to the largest of its row."""
+
+AGAIN = "copy the model's folder again, or train it again (isocharge train fit --films)"
+
+
+def films_bytes(films: FilmsModel) -> bytes:
+    """The file of a model."""
+    arrays = {
+        "about": np.array(json.dumps(_about(films), allow_nan=False)),
+        "mean": films.mean,
+        "whitening": films.whitening,
+        **{f"family.{name}": np.asarray(value) for name, value in films.family.to_arrays().items()},
+        **_packed("contact", films.contact.arrays),
+        **_packed("misfit", films.misfit.arrays),
+    }
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays, sha256=np.array(_checksum(arrays)))
+    return buffer.getvalue()
+
+
+def read_films(version_folder: Path) -> FilmsModel:
+    """Read the network for all films beside a model.
+
+    Args:
+        version_folder: The folder that holds `model.onnx`, as `find_model` gives it.
+
+    Raises:
+        ModelError: If the file is missing or damaged, or of another format.
+    """
+    path = version_folder / FILE
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise ModelError(
+            f"{path}: missing; expected the version folder of a model for all films, as `isocharge train fit --films` "
+            "writes it"
+        ) from error
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
+    return films_from_bytes(data, str(path))
+
+
+def films_from_bytes(data: bytes, where: str) -> FilmsModel:
+    """The model in a file's bytes; `where` is for messages.
+
+    Raises:
+        ModelError: If they are damaged or of another format.
+    """
+    arrays = _arrays(data, where)
+    try:
+        about = json.loads(str(arrays["about"]))
+        if about["format"] != FORMAT:
+            raise ModelError(f"{where}: format {about['format']} is not supported (this version reads {FORMAT})")
+        return _model(about, arrays, hashlib.sha256(data).hexdigest())
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        if isinstance(error, ModelError):
+            raise
+        raise ModelError(f"{where}: damaged ({type(error).__name__}: {error}); {AGAIN}") from error
+
+
+def _arrays(data: bytes, where: str) -> dict[str, np.ndarray]:
+    """All arrays but the checksum, which must be theirs."""
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        expected = str(arrays.pop("sha256"))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        raise ModelError(f"{where}: damaged ({type(error).__name__}: {error}); {AGAIN}") from error
+    if (actual := _checksum(arrays)) != expected:
+        raise ModelError(f"{where}: damaged: expected the checksum {expected:.12}..., got {actual:.12}...; {AGAIN}")
+    return arrays
+
+
+def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
+    total = hashlib.sha256()
+    for name in sorted(arrays):
+        array = arrays[name]
+        total.update(f"{name} {array.dtype.str} {array.shape} ".encode())
+        total.update(array.tobytes())
+    return total.hexdigest()
+
+
+def _about(films: FilmsModel) -> dict[str, Any]:
+    prior = films.prior
+    return {
+        "format": FORMAT,
+        "sensor": sensor_to_dict(prior.sensor),
+        "probe_radius": prior.probe.radius,
+        "spread": asdict(prior.spread),
+        "radius_mm": films.domain.radius_mm,
+        "force_range_N": list(films.domain.force_range_N),
+        "noise": asdict(films.noise),
+    }
+
+
+def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str) -> FilmsModel:
+    prior = FilmPrior(
+        sensor_from_dict(about["sensor"]), Circle(float(about["probe_radius"])), FilmSpread(**about["spread"])
+    )
+    low, high = about["force_range_N"]
+    domain = ContactDomain(float(about["radius_mm"]), (float(low), float(high)))
+    model = FilmsModel(
+        family=FilmFamily.from_arrays(_within(arrays, "family")),
+        scaling=FilmScaling(prior, domain),
+        mean=arrays["mean"],
+        whitening=arrays["whitening"],
+        contact=_unpacked(_within(arrays, "contact")),
+        misfit=_unpacked(_within(arrays, "misfit")),
+        noise=NoiseModel(**about["noise"]),
+        sha256=sha256,
+    )
+    n_electrode = len(prior.sensor.electrodes)
+    if model.mean.shape != (n_electrode,) or model.whitening.shape != (n_electrode, n_electrode):
+        raise InputError(f"inputs of {model.mean.size} electrodes, a sensor with {n_electrode}")
+    model.fold(prior.mean)  # what does not fit together is said now
+    return model
+
+
+def _within(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray]:
+    """The arrays of one part, by their names in it."""
+    prefix = f"{part}."
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
+def _packed(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarray]:
+    """Weights as integers; matrices with a scale for each row."""
+    packed: dict[str, np.ndarray] = {}
+    for name, values in weights.items():
+        scale = np.float32(np.maximum(np.abs(values).max(axis=-1, keepdims=True), 1e-30) / (2 ** (BITS - 1) - 1))
+        packed |= {f"{part}.{name}": np.round(values / scale).astype(np.int16), f"{part}.{name}.scale": scale}
+    return packed
+
+
+def _unpacked(packed: Mapping[str, np.ndarray]) -> ConditionalWeights:
+    names = [name for name in packed if not name.endswith(".scale")]
+    return ConditionalWeights({name: packed[name] * packed[f"{name}.scale"].astype(float) for name in names})
