@@ -12,10 +12,10 @@ from isocharge.arrays import Array
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, write_model
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
+from isocharge.train.data.noise import misfit_noise
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.films.film_presses import draw_contacts, film_charge
 from isocharge.train.films.films_model import FilmsModel
-from isocharge.train.data.noise import misfit_noise
 from isocharge.train.release.evaluate import measure_errors
 from isocharge.train.release.export import export_onnx
 from isocharge.train.release.graph_check import check_graph, disk_polygon
@@ -68,12 +68,16 @@ def write_film_model(
         sensor=sensor_to_dict(sensor),
         electrodes=sensor.electrode_names,
         working_area_mm=disk_polygon(films.domain),
-        probes=(str(probe),),
+        probes=(probe.notation,),
         force_range_N=films.domain.force_range_N,
         noise=films.noise.to_dict(),
         dataset_sha256=films.sha256,
         errors=measure_errors(network.predict, presses, films.noise) if errors is None else errors,
-        made_with={"isocharge": metadata.version("isocharge"), "python": platform.python_version(), **(made_with or {})},
+        made_with={
+            "isocharge": metadata.version("isocharge"),
+            "python": platform.python_version(),
+            **(made_with or {}),
+        },
     )
     graph = export_onnx(network, about.to_props())
     golden = check_graph(graph, network.predict, presses, misfit_noise(films.noise))

@@ -105,7 +105,8 @@ def draw_film_presses(
 def draw_contacts(rng: np.random.Generator, domain: ContactDomain, count: int) -> Array:
     """Contacts (x_mm, y_mm, force_N), shape (count, 3): uniform over the disk, forces log-uniform."""
     radius, angle = domain.radius_mm * np.sqrt(rng.random(count)), 2.0 * np.pi * rng.random(count)
-    force = np.exp(rng.uniform(*np.log(domain.force_range_N), count))
+    low, high = np.log(domain.force_range_N)
+    force = np.exp(rng.uniform(low, high, count))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), force], axis=1)
 
 

@@ -44,8 +44,8 @@ class FilmsModel:
     def of(cls, fit: FilmsFit, noise: NoiseModel) -> "FilmsModel":
         """What a training gave, in full precision."""
         inputs = fit.inputs
-        weights = (ConditionalWeights(part) for part in (fit.contact, fit.misfit))
-        return cls(fit.family, inputs.scaling, inputs.mean, inputs.whitening, *weights, noise)
+        contact, misfit = ConditionalWeights(fit.contact), ConditionalWeights(fit.misfit)
+        return cls(fit.family, inputs.scaling, inputs.mean, inputs.whitening, contact, misfit, noise)
 
     @property
     def prior(self) -> FilmPrior:
@@ -75,7 +75,4 @@ class FilmsModel:
         typical = 2.0 ** np.round(logs_mean / np.log(2.0))
         turn, offset = self.scaling.turn(parameters), self.scaling.offset(parameters)
         units = answer_units(self.domain, turn, offset, self.mean.size)
-        return FoldedNetwork(
-            FoldedLayers.of(perceptrons, self.whitening, logs_mean - np.log(typical), units), typical
-        )
-
+        return FoldedNetwork(FoldedLayers.of(perceptrons, self.whitening, logs_mean - np.log(typical), units), typical)

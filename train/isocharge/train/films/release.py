@@ -147,7 +147,7 @@ def _identity(prior: FilmPrior, config: FilmsConfig) -> dict[str, Any]:
     """All that decides about the weights."""
     return {
         "sensor": sensor_to_dict(prior.sensor),
-        "probe": str(prior.probe),
+        "probe": prior.probe.notation,
         "spread": asdict(prior.spread),
         "noise": noise_model(config.noise).to_dict(),
         "config": config.to_dict(),

@@ -136,7 +136,9 @@ def contact_alone(network: InverseNetwork) -> FoldedLayers:
     matrix = np.vstack([np.diag(network.domain.scale), np.zeros((3, 3))])
     features = network.features
     mean = np.log(features.typical) + features.mean
-    return FoldedLayers.of((PlainPerceptron.of(network.contact),), features.matrix, mean, (matrix, network.domain.centre))
+    return FoldedLayers.of(
+        (PlainPerceptron.of(network.contact),), features.matrix, mean, (matrix, network.domain.centre)
+    )
 
 
 def _side_by_side(perceptrons: Sequence[PlainPerceptron]) -> tuple[list[Layer], Layer]:
