@@ -13,6 +13,10 @@ from isocharge.extras import require
 
 with require("train"):
     from isocharge.train.bayes.limit import BayesLimit, Scene, bayes_estimate, bayes_limit
+    from isocharge.train.films.config import FilmsConfig
+    from isocharge.train.films.films_file import read_films
+    from isocharge.train.films.films_model import FilmsModel, write_film_model
+    from isocharge.train.films.release import train_films
     from isocharge.train.release.evaluate import measure_errors
     from isocharge.train.release.release import Release, train_model
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
@@ -20,6 +24,8 @@ with require("train"):
 
 __all__ = [
     "BayesLimit",
+    "FilmsConfig",
+    "FilmsModel",
     "Fit",
     "FitConfig",
     "NetworkConfig",
@@ -31,5 +37,8 @@ __all__ = [
     "fit_network",
     "load_config",
     "measure_errors",
+    "read_films",
+    "train_films",
     "train_model",
+    "write_film_model",
 ]

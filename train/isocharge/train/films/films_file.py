@@ -31,7 +31,7 @@ from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train.data.domain import ContactDomain
-from isocharge.train.films.conditional_weights import ConditionalWeights
+from isocharge.train.films.conditional_network import ConditionalWeights
 from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.films.films_model import FilmsModel
 
