@@ -78,7 +78,7 @@ def fit_films(
     Raises:
         ConfigError: If the noise level is unknown.
         SceneError, SolveError: If some presses cannot exist or be solved.
-        DatasetError: If a charge is not positive.
+        DatasetError: If too many charges are not positive.
         TrainingError: If the loss is not finite.
     """
     noise_model(config.noise)  # an unknown level is said before the work
