@@ -78,7 +78,7 @@ def fit_films(
     Raises:
         ConfigError: If the noise level is unknown.
         SceneError, SolveError: If some presses cannot exist or be solved.
-        DatasetError: If a charge is not positive.
+        DatasetError: If too many charges are not positive.
         TrainingError: If the loss is not finite.
     """
     noise_model(config.noise)  # an unknown level is said before the work
@@ -107,7 +107,7 @@ class _FilmsTraining:
         presses = self._part("presses", PRESSES_STEPS, "presses", lambda advance: self._presses(family, advance))
         inputs = FilmInputs.fit(FilmScaling(self.prior, self.domain), FilmPresses.from_arrays(presses))
         contact = self._contact(inputs, FilmPresses.from_arrays(presses))
-        examples = self._part("examples", MISFIT_STEPS, "nearest contacts", lambda advance: self._examples(family, advance))
+        examples = self._part("examples", MISFIT_STEPS, "nearest contacts", lambda call: self._examples(family, call))
         misfit = self._misfit(inputs, examples)
         return FilmsFit(inputs, family, contact, misfit, self.config)
 
@@ -164,22 +164,19 @@ class _FilmsTraining:
         batch = (config.batch_films, config.batch_presses)
         noise = noise_model(config.noise)
         stage = ContactStage(part, inputs, presses, noise, config.watched, batch, warm_up, config.seed)
-        self._descend(
-            TrainingStage("contact", part, stage.loss, stage.score, config.steps, warm_up, LARGEST_GRADIENT), config.steps
-        )
+        task = TrainingStage("contact", part, stage.loss, stage.score, config.steps, warm_up, LARGEST_GRADIENT)
+        self._descend(task)
         return part.to_arrays()
 
     def _misfit(self, inputs: FilmInputs, examples: dict[str, np.ndarray]) -> dict[str, Array]:
         config = self.config
         part: ConditionalPerceptron = self._network(inputs, config.misfit_hidden, inputs.mean.size)
         stage = MisfitStage.of(part, inputs, examples, (config.batch_films, config.batch_presses))
-        self._descend(
-            TrainingStage("misfit", part, stage.loss, stage.score, config.misfit_steps, 0, LARGEST_GRADIENT),
-            config.misfit_steps,
-        )
+        task = TrainingStage("misfit", part, stage.loss, stage.score, config.misfit_steps, 0, LARGEST_GRADIENT)
+        self._descend(task)
         return part.to_arrays()
 
-    def _descend(self, task: TrainingStage, steps: int) -> None:
+    def _descend(self, task: TrainingStage) -> None:
         """Train to the end: the schedule's last steps are the best."""
-        Descent(task, self.config.learning_rate, steps, self.config.seed).run(self.checkpoint, self._report)
-        self.done += steps
+        Descent(task, self.config.learning_rate, task.steps, self.config.seed).run(self.checkpoint, self._report)
+        self.done += task.steps

@@ -15,7 +15,7 @@ from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.solve_family import report_each
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.sensor.film_prior import FilmPrior
-from isocharge.train.data.domain import ContactDomain
+from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain
 from isocharge.train.data.misfit_charges import draw_misfit_examples
 from isocharge.train.data.noise import PC
 from isocharge.train.data.presses import LabelledPresses
@@ -35,7 +35,8 @@ WATCHED = 0.06
 
 @dataclass(frozen=True)
 class MapField:
-    """A film's forward map as the search for the nearest contact takes it (`ChargeField`): values and derivatives.
+    """A film's forward map as the search for the nearest contact takes it (`NearestField`), charges clipped as the
+    model clips them.
 
     Attributes:
         domain: Where contacts are searched for.
@@ -54,7 +55,7 @@ class MapField:
 
     def _logs(self, unit: Array) -> Array:
         x, y, force = (self.domain.to_contact(unit) * [1e-3, 1e-3, 1.0]).T
-        logs: Array = np.log(PC * self.forward_map.forward(x, y, force))
+        logs: Array = np.log(np.clip(PC * self.forward_map.forward(x, y, force), LOWEST_PC, HIGHEST_PC))
         return logs
 
 
@@ -79,7 +80,8 @@ def draw_misfit_films(
     parameters = prior.draw(np.random.default_rng([seed, 2]), films)
     work = partial(_one_film, prior, family, domain, noise, charges, seed)
     drawn = list(report_each(map_jobs(work, enumerate(parameters)), films, progress))
-    return {"parameters": parameters, "charge_pC": np.stack([d[0] for d in drawn]), "miss": np.stack([d[1] for d in drawn])}
+    charge, miss = np.stack(drawn, axis=1)
+    return {"parameters": parameters, "charge_pC": charge, "miss": miss}
 
 
 def _one_film(
