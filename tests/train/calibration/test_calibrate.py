@@ -38,16 +38,16 @@ def test_the_error_left_is_near_the_linearised_limit(layout):
 def test_what_presses_tell_is_told_and_what_not_is_not(scene):
     truth, presses = rig(scene.charges, 12, seed=1)
     calibration = quietly(presses, scene)
-    told = calibration.quantities
-    assert told["pretension_MPa"].told
-    assert told["response_percent"].told
-    assert told["gain_A_percent"].told
-    assert not told["young_percent"].told
-    assert not told["thickness_percent"].told
+    table = calibration.quantities
+    assert table["pretension_MPa"].identified
+    assert table["response_percent"].identified
+    assert table["gain_A_percent"].identified
+    assert not table["young_percent"].identified
+    assert not table["thickness_percent"].identified
     text = " ".join(calibration.words)
     assert "cannot tell" in text
     assert "Young's modulus by itself" in text
-    low, high = told["pretension_MPa"].interval_95
+    low, high = table["pretension_MPa"].interval_95
     assert low < 1e-6 * truth[0] < high
 
 
@@ -117,8 +117,8 @@ def test_proposed_presses_tell_more_than_random_ones(scene):
     at_random = []
     for seed in range(8):
         at = contacts(np.random.default_rng(seed), 5)
-        told = information_of(scene.charges, prior.mean, at, scene.noise, 0.1, 0.01).sum(axis=0)
-        at_random.append(sensitivity.left(np.linalg.inv(np.eye(prior.mean.size) + told)).position_mm)
+        information = information_of(scene.charges, prior.mean, at, scene.noise, 0.1, 0.01).sum(axis=0)
+        at_random.append(sensitivity.left(np.linalg.inv(np.eye(prior.mean.size) + information)).position_mm)
     assert left[-1] < 0.8 * np.median(at_random)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.simulate.sensor.film_prior import FilmPrior
 
-TOLD = 0.5
+IDENTIFIED = 0.5
 """Standard deviation after the presses over that before, below which a quantity counts as told, dimensionless."""
 
 NORMAL_95 = 1.959964
@@ -43,9 +43,9 @@ class Quantity:
     weights: Array
 
     @property
-    def told(self) -> bool:
+    def identified(self) -> bool:
         """Whether the presses have told it: its standard deviation at least halved."""
-        return self.std <= TOLD * self.before_std
+        return self.std <= IDENTIFIED * self.before_std
 
     @property
     def interval_95(self) -> tuple[float, float]:
@@ -56,7 +56,7 @@ class Quantity:
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         table = {key: value for key, value in asdict(self).items() if key not in ("name", "weights")}
-        return table | {"interval_95": list(self.interval_95), "told": self.told}
+        return table | {"interval_95": list(self.interval_95), "identified": self.identified}
 
 
 def quantities(prior: FilmPrior, parameters: Array, covariance: Array, before: Array) -> dict[str, Quantity]:
@@ -140,10 +140,10 @@ def _rows(prior: FilmPrior) -> Mapping[str, tuple[str, float, Array]]:
     return table
 
 
-def in_words(told: Mapping[str, Quantity]) -> tuple[str, ...]:
+def in_words(table: Mapping[str, Quantity]) -> tuple[str, ...]:
     """What the presses tell and what they cannot, a sentence each."""
-    known = [quantity for quantity in told.values() if quantity.told]
-    unknown = [quantity for quantity in told.values() if not quantity.told]
+    known = [quantity for quantity in table.values() if quantity.identified]
+    unknown = [quantity for quantity in table.values() if not quantity.identified]
     sentences = [f"Known now: {_listed(known)}."] if known else []
     if unknown:
         sentences.append(
@@ -151,10 +151,10 @@ def in_words(told: Mapping[str, Quantity]) -> tuple[str, ...]:
             + ", ".join(quantity.meaning.removesuffix(", over the described one, %") for quantity in unknown)
             + "; what is given for them is hardly more than what was assumed before."
         )
-    if not told["young_percent"].told and told["response_percent"].told:
+    if not table["young_percent"].identified and table["response_percent"].identified:
         sentences.append(
             "Young's modulus, piezoelectric coefficients and gain cannot be told apart; what they give together, the "
-            f"charge of a press, is known to {told['response_percent'].std:.2g} %, and that is what contacts need."
+            f"charge of a press, is known to {table['response_percent'].std:.2g} %, and that is what contacts need."
         )
     return tuple(sentences)
 
