@@ -14,6 +14,7 @@ import json
 import time
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +32,18 @@ from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.film_charges import charges_of
 from isocharge.train.calibration.next_press import information_of
 from isocharge.train.data.noise import sigma_pC, with_noise
+from isocharge.train.training.checkpoint import Checkpoint
+from isocharge.train.training.descent import Descent, TrainingStage
+from isocharge.train.training.network import Features, InverseNetwork
 
 SENSORS = ("four-25um-biaxial", "three-25um-biaxial", "four-25um-uniaxial")
 COUNTS = (1, 3, 5, 8, 15, 30)
 POSITION_MM, FORCE = 0.1, 0.01
 CONTACTS = 1000
 """Fresh contacts on which errors are measured, for each film."""
+
+POOLED_FILMS, POOLED_PRESSES, POOLED_STEPS = 4000, 16, 5000
+"""What the network without context learns from, and for how long."""
 
 TUNING_STEPS = 300
 """Steps of fine-tuning on the presses alone."""
@@ -111,6 +118,59 @@ def fine_tuned(chosen: SensorFilms, presses: MeasuredPresses, charge_pC: np.ndar
     with torch.no_grad():
         tuned = answers(torch.tensor(charge_pC)).numpy()
     return np.column_stack([tuned[:, :2], np.exp(tuned[:, 2])])
+
+
+def without_context(sensor: str) -> InverseNetwork:
+    """One network for all films that is not told the film: the mean over the films, by maximum likelihood."""
+    films, rng = films_of(sensor).films, np.random.default_rng(3)
+    parts = []
+    for parameters in films.prior.draw(rng, POOLED_FILMS):
+        at = contacts(rng, films, POOLED_PRESSES)
+        parts.append((at, charges_of(films.family.forward_map(*films.prior.film(parameters)), at)))
+    contact, charge_pC = (np.concatenate(part) for part in zip(*parts, strict=True))
+    torch.manual_seed(0)
+    network = InverseNetwork(films.domain, Features.fit(charge_pC), (96, 96, 96), (8,))
+    charge, unit = torch.tensor(charge_pC).float(), torch.tensor(films.domain.to_unit(contact)).float()
+    held = len(charge) // 10
+
+    def loss_of(rows: torch.Tensor, step: int, random: torch.Generator) -> torch.Tensor:
+        sigma = torch.hypot(torch.tensor(1.0), 0.002 * charge[rows])
+        noisy = charge[rows] + sigma * torch.randn(sigma.shape, generator=random)
+        mean, log_std = network.posterior(noisy)
+        miss = mean - unit[rows]
+        if step < POOLED_STEPS // 7:
+            return (
+                (30.0 * miss**2 + 0.1 * (log_std + 0.5 * miss.detach() ** 2 * torch.exp(-2.0 * log_std))).sum(1).mean()
+            )
+        return (log_std + 0.5 * (miss * torch.exp(-log_std)) ** 2).sum(dim=1).mean()
+
+    def loss(step: int, random: torch.Generator) -> torch.Tensor:
+        return loss_of(held + torch.randint(len(charge) - held, (1024,), generator=random), step, random)
+
+    def score() -> tuple[float, str]:
+        with torch.no_grad():
+            return loss_of(torch.arange(held), POOLED_STEPS, torch.Generator().manual_seed(5)).item(), ""
+
+    stage = TrainingStage("contact", network.contact, loss, score, POOLED_STEPS, POOLED_STEPS // 7)
+    Descent(stage, 0.005, POOLED_STEPS, 0).run(Checkpoint(), lambda _step, _text: None)
+    return network.eval()
+
+
+def pooled_errors(job: tuple[str, int, int]) -> list[tuple[float, float]]:
+    """Errors of that network on the fresh contacts of every film."""
+    torch.set_num_threads(1)
+    sensor, first, count = job
+    films, network = films_of(sensor).films, without_context(sensor)
+    rows = []
+    for seed in range(first, first + count):
+        rng = np.random.default_rng([seed, 13])
+        at = contacts(rng, films, CONTACTS)
+        film = films.family.forward_map(*films.prior.film(films.prior.draw(np.random.default_rng([seed, 7]), 1)[0]))
+        charge_pC = with_noise(charges_of(film, at), films.noise, rng)
+        with torch.no_grad():
+            answer = network(torch.tensor(charge_pC).float())[0].double().numpy()
+        rows.append(errors(answer, at))
+    return rows
 
 
 def gauss_newton(chosen: SensorFilms, parameters: np.ndarray, charge_pC: np.ndarray) -> np.ndarray:
@@ -249,6 +309,9 @@ def picture(tables: dict[str, dict[str, Any]], path: Path) -> None:
     for column, (sensor, table) in enumerate(tables.items()):
         for axis, (axes, unit) in enumerate(zip(rows[:, column], ("mm", "percent"), strict=True)):
             axes.axhline(table["uncalibrated"][axis], color="#b03a3a", ls="--", label="no calibration")
+            axes.axhline(
+                table["without_context"][axis], color="#7a7a7a", ls="-.", label="one network, not told the film"
+            )
             for label, (key, colour, marker) in styles.items():
                 values = [table[str(n)][key][axis] if table[str(n)][key] else np.nan for n in COUNTS]
                 axes.plot(COUNTS, values, marker=marker, color=colour, lw=1.0, label=label)
@@ -282,11 +345,13 @@ def main() -> None:
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     tables: dict[str, dict[str, Any]] = {}
-    with ProcessPoolExecutor(options.workers) as pool:
+    with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
         for sensor in options.sensor or SENSORS:
             seeds = range(1000 * options.seed, 1000 * options.seed + options.films)
             jobs = [(sensor, seed, number < options.fine) for number, seed in enumerate(seeds)]
             tables[sensor] = summary(list(pool.map(study, jobs)))
+            pooled = pool.submit(pooled_errors, (sensor, seeds[0], options.films)).result()
+            tables[sensor]["without_context"] = [_rms(row[axis] for row in pooled) for axis in (0, 1)]
             counts = list(pool.map(covered, [(sensor, 500 + seed) for seed in range(options.coverage)]))
             inside, total = np.sum(counts, axis=0) if counts else (0, 0)
             tables[sensor]["coverage_95"] = float(inside / total) if total else None
