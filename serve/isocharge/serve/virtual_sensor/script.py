@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from isocharge.arrays import Array, Booleans
 from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import SceneError
+from isocharge.number_text import number_of
 
 REST_S = 1.0
 """Rest at the start of a script, s: time for a tare."""
@@ -70,8 +71,8 @@ def read_script(lines: Iterable[str], rate_Hz: float, where: str) -> Script:
     """
     names = ("seconds", "x_mm", "y_mm", "force_N")
     try:
-        rows = [[float(row[name]) for name in names] for row in csv.DictReader(lines)]
-    except (KeyError, TypeError, ValueError) as error:
+        rows = [[number_of(row[name]) for name in names] for row in csv.DictReader(lines)]
+    except (csv.Error, KeyError, TypeError, ValueError) as error:
         raise SceneError(f"{where}: expected numbers in the columns {', '.join(names)} ({error})") from error
     seconds, x_mm, y_mm, force_N = np.array(rows).reshape(-1, 4).T
     if not (len(rows) > 1 and np.isfinite(rows).all() and (np.diff(seconds) > 0).all() and force_N.min() >= 0):

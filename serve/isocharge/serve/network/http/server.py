@@ -8,6 +8,7 @@ import uvicorn
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http.app import App
 from isocharge.serve.network.http.connection import bounded, close_overdue
+from isocharge.serve.network.http.handshake import behind_tls
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.tls import Tls
 
@@ -36,11 +37,11 @@ class HttpServer:
             InputError: If a TLS file cannot be used.
             ListenError: If the address is taken or impossible.
         """
-        context = tls.context() if tls else None
+        protocol = bounded(app, limits)
         config = uvicorn.Config(
             app,
             loop="uvloop",
-            http=bounded(app, limits),
+            http=behind_tls(protocol, tls.context()) if tls else protocol,
             ws="none",
             lifespan="off",
             log_config=None,
@@ -49,10 +50,10 @@ class HttpServer:
             date_header=False,
             proxy_headers=False,
             timeout_graceful_shutdown=GRACE_SECONDS,
-            ssl_context_factory=(lambda *_: context) if context else None,
         )
         self._server, self._address = _Uvicorn(config), address
         self._socket = address.listen(BACKLOG)
+        self._file = address.file()
         self.url = address.url(self._socket, secure=tls is not None)
 
     def run(self) -> None:
@@ -67,4 +68,4 @@ class HttpServer:
     def close(self) -> None:
         """Listen no more."""
         self._socket.close()
-        self._address.release()
+        self._address.release(self._file)
