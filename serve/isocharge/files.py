@@ -35,10 +35,12 @@ def read_whole(path: Path, most: int = MOST_BYTES) -> bytes:
     Raises:
         OSError: If it cannot be read, is no regular file, or is larger; `strerror` says which.
     """
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-        state = os.fstat(file.fileno())
-        if not stat.S_ISREG(state.st_mode):
-            raise OSError(errno.EINVAL, "not a regular file", str(path))
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    state = os.fstat(descriptor)
+    if not stat.S_ISREG(state.st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    with os.fdopen(descriptor, "rb") as file:
         data = file.read(most + 1) if state.st_size <= most else b""
         if max(len(data), state.st_size) > most:
             raise OSError(errno.EFBIG, f"larger than {most} bytes", str(path))

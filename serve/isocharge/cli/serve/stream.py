@@ -23,7 +23,7 @@ from isocharge.cli.serve.options import (
 )
 from isocharge.cli.serve.record_output import LATENCIES, record_writer, summary, write_records
 from isocharge.cli.shared.options import ModelArgument
-from isocharge.cli.shared.standard_streams import stdout_writer
+from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import say
 
@@ -108,7 +108,7 @@ def stream_command(
         source = stack.enter_context(open_source(_awaited(port, wait), baud=baud, reconnect=reconnect))
         stack.enter_context(_tare_on_signal(live))
         stack.enter_context(_alarm(seconds))
-        lines = stack.enter_context(LineQueue(stdout_writer()))
+        lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
         put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
         write = record_writer(stack, output, udp, predictor.metadata.electrodes, put)
         if recorder:

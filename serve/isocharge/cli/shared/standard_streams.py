@@ -65,6 +65,17 @@ def stdout_writer() -> Callable[[str], None]:
     return lambda text: _write_all(descriptor, text.encode())
 
 
+def stdout_is_ready() -> bool:
+    """Whether stdout would take a line without waiting, after a tenth of a second at most.
+
+    A pipe that is ready has room for `PIPE_BUF` bytes, more than a record has.
+    """
+    try:
+        return bool(select.select([], [sys.stdout.fileno()], [], 0.1)[1])
+    except (OSError, ValueError, io.UnsupportedOperation):
+        return True  # whatever is wrong, the write says it
+
+
 def _write_buffered(text: str) -> None:
     sys.stdout.write(text)
     sys.stdout.flush()

@@ -25,18 +25,21 @@ class LineQueue:
         lost: Lines that were never written, the oldest of those that waited.
     """
 
-    def __init__(self, write: Callable[[str], object], most: int = MOST_LINES) -> None:
+    def __init__(
+        self, write: Callable[[str], object], is_ready: Callable[[], bool] = lambda: True, most: int = MOST_LINES
+    ) -> None:
         """Set up the queue.
 
         Args:
-            write: Called in the thread with each line; may take as long as it likes.
+            write: Called in the thread with each line.
+            is_ready: Called before that; waits a little while, and says whether the consumer would take a line now.
             most: Lines that may wait.
         """
         self.lost = 0
-        self._write, self._most = write, most
+        self._write, self._is_ready, self._most = write, is_ready, most
         self._lines: deque[str] = deque()
         self._change = threading.Condition()
-        self._written, self._is_writing, self._is_closed = 0, False, False
+        self._written, self._is_waiting, self._is_closed = 0, False, False  # waiting: a line that was taken out
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="lines", daemon=True)  # it may hang in a write for ever
 
@@ -77,9 +80,9 @@ class LineQueue:
                 self._change.wait(max(0.0, end - time.monotonic()))
                 if self._written > written:
                     written, end = self._written, time.monotonic() + PATIENCE_S
-            self.lost += len(self._lines) + self._is_writing
+            self.lost += len(self._lines) + self._is_waiting
             self._lines.clear()
-            self._is_writing, self._is_closed = False, True
+            self._is_waiting, self._is_closed = False, True
             self._change.notify_all()
             self._raise_error()
 
@@ -90,27 +93,34 @@ class LineQueue:
             raise error
 
     def _waits(self) -> bool:
-        """Whether a line waits, or is under way, that may still be written."""
-        return self._error is None and not self._is_closed and bool(self._lines or self._is_writing)
+        """Whether a line waits that may still be written."""
+        return self._error is None and not self._is_closed and bool(self._lines or self._is_waiting)
 
     def _run(self) -> None:
         while (line := self._next()) is not None:
             try:
+                if not self._goes_out():
+                    return
                 self._write(line)
             except Exception as error:  # raised again where lines are put in
                 with self._change:
-                    self._error = error
+                    self._error, self._is_waiting = error, False
                     self._change.notify_all()
                 return
 
     def _next(self) -> str | None:
-        """The next line to write, or None at the end; the line before was written."""
+        """The next line to write, or None at the end."""
         with self._change:
-            self._written += self._is_writing
-            self._is_writing = False
-            self._change.notify_all()
             self._change.wait_for(lambda: self._lines or self._is_closed)
-            if not self._lines:
-                return None
-            self._is_writing = True
-            return self._lines.popleft()
+            self._is_waiting = bool(self._lines)
+            return self._lines.popleft() if self._lines else None
+
+    def _goes_out(self) -> bool:
+        """Wait for the consumer; False if the queue was closed meanwhile, and the line counted as lost."""
+        while not self._is_ready() and not self._is_closed:
+            pass
+        with self._change:
+            self._written += self._is_waiting
+            self._is_waiting = False
+            self._change.notify_all()
+            return not self._is_closed

@@ -1,4 +1,4 @@
-"""Clients that open calls and say nothing: they are refused or bounded by what their metadata say, and hold nobody up."""
+"""Clients that open calls and say nothing: refused or bounded by what their metadata say, they hold nobody up."""
 
 import itertools
 import time
