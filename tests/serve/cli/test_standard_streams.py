@@ -137,28 +137,30 @@ def test_memory_of_a_long_table(models, presses, tmp_path, output):
 
 def test_a_slow_reader_stops_neither_chain_nor_recording(models, film, tmp_path):
     """It takes nothing for seconds: what it missed is counted, and the recording has everything."""
-    with VirtualSensor(film.charge_pC, wander(seed=2, seconds=30.0, rate_Hz=2000.0)) as sensor:
-        process = subprocess.Popen(
-            f"{ISOCHARGE} serve stream linear --port {sensor.url} --models {models}"
-            f" --record {tmp_path}/touch.rec --count 14000".split(),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        first = process.stdout.readline()
-        time.sleep(8.0)
-        out, err = process.communicate(timeout=60)
-    assert process.returncode == 0
-    recorded = [
-        record for line in (tmp_path / "touch.rec").read_text().splitlines() if "seq" in (record := json.loads(line))
-    ]
-    assert [record["seq"] for record in recorded] == [(recorded[0]["seq"] + k) % 65536 for k in range(14000)]
+    recording, words = tmp_path / "touch.rec", tmp_path / "stderr"
+    with VirtualSensor(film.charge_pC, wander(seed=2, seconds=60.0, rate_Hz=2000.0)) as sensor:
+        command = f"{ISOCHARGE} serve stream linear --port {sensor.url} --models {models} --record {recording}"
+        with (
+            words.open("w") as err,
+            subprocess.Popen(
+                [*command.split(), "--count", "18000"], stdout=subprocess.PIPE, stderr=err, text=True
+            ) as process,
+        ):
+            first = process.stdout.readline()
+            end = time.monotonic() + 30
+            while recording.stat().st_size < 8.5e6 and time.monotonic() < end:
+                time.sleep(0.1)  # some 14,000 records, more than the queue and the pipe hold
+            out = process.stdout.read()
+        said = words.read_text()
+    assert process.returncode == 0, said
+    recorded = [record for line in recording.read_text().splitlines() if "seq" in (record := json.loads(line))]
+    assert [record["seq"] for record in recorded] == [(recorded[0]["seq"] + k) % 65536 for k in range(18000)]
     lines = [json.loads(line) for line in [first, *out.splitlines()]]
-    lost = int(err.split(" records not written")[0].rpartition("; ")[2]) if "records not written" in err else 0
-    assert len(lines) + lost == 14000
+    lost = int(said.split(" records not written")[0].rpartition("; ")[2])
+    assert len(lines) + lost == 18000
     assert lost > 0
     assert lines[-1]["seq"] == recorded[-1]["seq"]  # the newest are there, the oldest are not
-    assert " 0 lost, 0 repeated" in err
+    assert " 0 lost, 0 repeated" in said
 
 
 def test_a_reader_who_never_reads_does_not_keep_the_stream(models, film):

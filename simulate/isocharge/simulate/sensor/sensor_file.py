@@ -13,6 +13,9 @@ from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.sensor import Readout, Sensor
 from isocharge.tables import Table, parse_toml, read_toml
 
+FARTHEST_MM = 1e6
+"""Largest coordinate of a point, mm."""
+
 SECTIONS = ("name", "readout", "surface", "film", "piezo", "electrodes", "calibration")
 
 
@@ -142,6 +145,8 @@ def _electrode(table: Table, name: str) -> Electrode:
 def _metres(table: Table, key: str, point_mm: object) -> tuple[float, float]:
     """A point of the plane, m."""
     x_mm, y_mm = table.as_numbers(key, point_mm, count=2, of="[x, y] in mm")
+    if max(abs(x_mm), abs(y_mm)) > FARTHEST_MM:
+        table.refuse(key, f"[x, y] in mm, each at most {FARTHEST_MM:g}", point_mm)
     return 1e-3 * x_mm, 1e-3 * y_mm
 
 
