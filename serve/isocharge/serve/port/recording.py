@@ -173,11 +173,12 @@ class Recording:
         number = 1
         try:
             with self._path.open(encoding="utf-8", errors="replace") as file:
-                for number, line in enumerate(bounded_lines(file, LONGEST_ENTRY), start=1):
+                for line in bounded_lines(file, LONGEST_ENTRY):
                     if not line.endswith("\n"):
                         return  # the power failed while it was written
                     if number > 1:
                         yield _entry(Table(parse_json(line, "entry", RecordingError), "", RecordingError))
+                    number += 1
         except (OSError, ValueError) as error:
             raise RecordingError(f"{self._path}, line {number}: damaged ({cut(str(error))})") from error
 

@@ -154,8 +154,9 @@ def write_manifest(
 
 def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
     shapes = {name: column.shape for name, column in samples.columns().items()}
-    expected = {name: (len(samples),) for name in COLUMNS} | {"charge_pC": (len(samples), n_electrode)}
-    if shapes != expected or len(samples) == 0:
+    count = len(samples) if samples.x_mm.ndim else 0
+    expected = {name: (count,) for name in COLUMNS} | {"charge_pC": (count, n_electrode)}
+    if shapes != expected or count == 0:
         raise DatasetError(f"{where}: expected columns of shapes {expected}, at least one sample, got {shapes}")
     for name, column in samples.columns().items():
         kinds = "U" if name == "probe" else "fiu"
