@@ -82,7 +82,7 @@ def test_frames_with_faults(name, attack, faults):
         cut = rng.randrange(len(data) + 1)
         return data[:cut], data[cut:]
 
-    attack(f"frames {name}", read, pieces, 75_000)
+    attack(f"frames {name}", read, pieces, 90_000)
 
 
 def test_bombs(attack):

@@ -173,7 +173,7 @@ def test_bodies_with_faults(attack, faults):
         response = handler.answer("POST", PATH, *case)
         assert response.status < 500, response
 
-    attack("wire bodies", read, bodies, 150_000)
+    attack("wire bodies", read, bodies, 200_000)
 
 
 def test_grpc_bytes_with_faults(server, attack, faults):

@@ -155,7 +155,7 @@ def write_manifest(
 def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
     shapes = {name: column.shape for name, column in samples.columns().items()}
     count = len(samples) if samples.x_mm.ndim else 0
-    expected = {name: (count,) for name in COLUMNS} | {"charge_pC": (count, n_electrode)}
+    expected = dict.fromkeys(COLUMNS, (count,)) | {"charge_pC": (count, n_electrode)}
     if shapes != expected or count == 0:
         raise DatasetError(f"{where}: expected columns of shapes {expected}, at least one sample, got {shapes}")
     for name, column in samples.columns().items():

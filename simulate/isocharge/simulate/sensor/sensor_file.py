@@ -139,6 +139,8 @@ def _electrode(table: Table, name: str) -> Electrode:
         corners = polygon.sequence("polygon_mm", of="[x, y]")
         return Electrode(name, tuple(_metres(polygon, "polygon_mm", corner) for corner in corners))
     side = table.number("side_mm", above=0.0)
+    if side > FARTHEST_MM:
+        table.refuse("side_mm", f"at most {FARTHEST_MM:g}")
     return Electrode.of_square(name, _metres(table, name, table.get(name)), side * 1e-3)
 
 
