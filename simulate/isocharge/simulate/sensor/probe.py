@@ -175,8 +175,8 @@ def parse_probe(text: str) -> Probe:
     match = NOTATION.fullmatch(text.strip())
     if match is None:
         raise SceneError(
-            f"probe {cut(text)!r}: expected 'circle:R', 'rectangle:WxH', 'triangle:S' or 'polygon:X,Y;X,Y;X,Y' in mm, each "
-            "optionally turned as in 'triangle:4.0@30' (degrees)"
+            f"probe {cut(text)!r}: expected 'circle:R', 'rectangle:WxH', 'triangle:S' or 'polygon:X,Y;X,Y;X,Y' in mm, "
+            "each optionally turned as in 'triangle:4.0@30' (degrees)"
         )
     angle = float(np.deg2rad(float(match["angle"] or 0.0)))
     if match["circle"]:
