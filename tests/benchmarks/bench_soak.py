@@ -3,7 +3,7 @@
     python tests/benchmarks/bench_soak.py [--requests 1000000] [--model NAME|PATH] [--seed 0] [--json]
 
 Requests are JSON and binary, of one press and of three, drawn from 1000 that were made before; a quarter of them goes
-over gRPC, numbers raw. An answer must equal, bit for bit, what `Predictor` says of the same charges. Ten times the model
+over gRPC. An answer must equal, bit for bit, what `Predictor` says of the same charges. Ten times the model
 is loaded anew while the others go on. Memory is the server's resident set, from the end of a warm-up (a twentieth of
 the requests) to the end.
 """

@@ -318,10 +318,10 @@ def test_binary_nan_is_refused_by_name(ask):
     [
         ("br", b"x", 415, "expected gzip, deflate or identity"),
         ("gzip", b"no gzip", 400, "the body is not 'gzip'"),
-        ("gzip", gzip.compress(b"{}")[:-3], 400, "ends before"),
-        ("gzip", gzip.compress(b"{}") * 2, 400, "goes on after"),
+        ("gzip", gzip.compress(b"{}", mtime=0)[:-3], 400, "ends before"),
+        ("gzip", gzip.compress(b"{}", mtime=0) * 2, 400, "goes on after"),
         ("deflate", zlib.compress(b"{}") + b"more", 400, "goes on after"),
-        ("gzip", gzip.compress(bytes(1 << 24)), 413, "unpacks to more than 1048576 bytes"),
+        ("gzip", gzip.compress(bytes(1 << 24), mtime=0), 413, "unpacks to more than 1048576 bytes"),
     ],
 )
 def test_bad_compression(ask, way, body, status, said):
