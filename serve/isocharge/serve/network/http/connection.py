@@ -79,7 +79,9 @@ class BoundedProtocol(HttpToolsProtocol):
         """Parse at once what is short and may be answered now; the rest in slices, in turns with other connections."""
         if self._is_refused or self.transport.is_closing():
             return
-        if len(data) <= SLICE_BYTES and not self._unparsed and self._may_answer():
+        cycle = self.cycle  # the tests of `_may_answer` stand here: a call takes longer than they do
+        may_answer = (cycle is None or cycle.response_complete) and not self.flow.write_paused
+        if may_answer and not self._unparsed and len(data) <= SLICE_BYTES:
             self._parse(data)
             return
         self._unparsed += data
@@ -128,34 +130,32 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def _parse(self, data: bytes) -> None:
         """Parse a piece; a request that is then still incomplete is measured and timed."""
-        self._fed += len(data)
-        while data:
-            self._chunk, self._starts_in_chunk = len(data), self._phase in (Phase.IDLE, Phase.ANSWER)
-            try:
-                self.parser.feed_data(data)
-                break
-            except httptools.HttpParserUpgrade as upgrade:
-                data = self._without_upgrade(data[upgrade.args[0] :])
-            except httptools.HttpParserError:
-                self._refuse(refusal(400, "Invalid HTTP request received."))
-                return
+        self._chunk = len(data)
+        self._fed += self._chunk
+        self._starts_in_chunk = self._phase is Phase.IDLE or self._phase is Phase.ANSWER
+        try:
+            self.parser.feed_data(data)
+        except httptools.HttpParserUpgrade as upgrade:
+            self._parse_without_upgrade(data[upgrade.args[0] :])
+        except httptools.HttpParserError:
+            self._refuse(refusal(400, "Invalid HTTP request received."))
         if self._phase is Phase.HEADERS or self._phase is Phase.BODY:
             self._measure_incomplete()
 
-    def _without_upgrade(self, rest: bytes) -> bytes:
-        """The request that asks for another protocol, as if it had not, for a new parser: HTTP lets a server ignore it.
+    def _parse_without_upgrade(self, rest: bytes) -> None:
+        """Parse a request that asks for another protocol as if it had not, with a new parser: HTTP lets a server do so.
 
         The old parser has taken everything after the headers for that protocol.
         """
         method = self.parser.get_method()
         if method == b"CONNECT":
             self._refuse(refusal(400, "CONNECT: this server opens no tunnels"))
-            return b""
+            return
         self.parser, self._phase = httptools.HttpRequestParser(self), Phase.IDLE
         self.parser.set_dangerous_leniencies(lenient_data_after_close=True)  # as uvicorn does
         lines = [b"%s %s HTTP/1.1" % (method, self.url)]
         lines += [b"%s: %s" % (name, _plain_connection(name, value)) for name, value in self.headers]
-        return b"\r\n".join(line for line in lines if not line.startswith(b"upgrade:")) + b"\r\n\r\n" + rest
+        self._parse(b"\r\n".join(line for line in lines if not line.startswith(b"upgrade:")) + b"\r\n\r\n" + rest)
 
     def on_message_begin(self) -> None:
         """A request begins, somewhere in this piece of data; of what is before it in the piece, it knows nothing."""
@@ -167,7 +167,8 @@ class BoundedProtocol(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         """The headers are complete; they are measured if enough bytes arrived for them to be too long."""
         self._phase = Phase.BODY
-        if self._header_bytes() > self.limits.header_bytes:
+        longest = self._fed + SLICE_BYTES  # with the piece in which the request began, if that began with another
+        if longest > self.limits.header_bytes and self._header_bytes() > self.limits.header_bytes:
             self._refuse_headers()
         elif self.expect_100_continue and not self.parser.should_upgrade():
             self.transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
