@@ -198,3 +198,16 @@ def test_a_request_with_the_last_byte_of_the_handshake(store, start_http, certif
                 data += client.read(1 << 16)
             except ssl.SSLWantReadError:
                 continue
+
+
+def test_who_never_asks_makes_room(store, start_http):
+    """When all places are taken, the oldest connection without one complete request gives its own."""
+    server = start_http(Handler(store, ServerLimits(connections=20)))
+    with ExitStack() as stack:
+        silent = [stack.enter_context(connect(server)) for _ in range(20)]
+        for number, connection in enumerate(silent):
+            connection.sendall(infer()[: number * 7])
+        for _ in range(5):
+            with connect(server) as good:
+                good.sendall(infer(b"Connection: close\r\n"))
+                assert statuses(everything(good)) == [b"200"]

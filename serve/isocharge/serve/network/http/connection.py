@@ -61,6 +61,7 @@ class BoundedProtocol(HttpToolsProtocol):
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
         self.deadline = math.inf  # the loop's time, s
+        self.has_asked = False  # whether a request was ever complete
         self._phase = self._timed = Phase.IDLE
         self._chunk = self._fed = 0  # bytes of this piece, and of all since the request began
         self._body, self._unparsed = bytearray(), bytearray()
@@ -72,8 +73,19 @@ class BoundedProtocol(HttpToolsProtocol):
         """Accept a connection, or refuse it if there are too many."""
         super().connection_made(transport)
         self._allow(self.limits.header_seconds)
-        if len(self.connections) > self.limits.connections:
+        if len(self.connections) > self.limits.connections and not self._make_room():
             self._refuse(refusal(503, f"all {self.limits.connections} connections are taken; try again later"))
+
+    def _make_room(self) -> bool:
+        """End the connection that has waited longest without one complete request; False if each has had one."""
+        connections: set[Any] = self.connections  # type: ignore[assignment]
+        silent = [other for other in connections if other is not self and not other.has_asked]
+        if not silent:
+            return False
+        oldest = min(silent, key=lambda other: other.deadline)
+        connections.discard(oldest)
+        oldest.transport.abort()
+        return True
 
     def data_received(self, data: bytes) -> None:
         """Parse at once what is short and may be answered now; the rest in slices, in turns with other connections."""
@@ -187,7 +199,7 @@ class BoundedProtocol(HttpToolsProtocol):
         """The request is complete: answer it, unless it was refused."""
         if self._is_refused or self.transport.is_closing() or self.parser.should_upgrade():
             return  # refused, or to be parsed again
-        self._phase = Phase.ANSWER
+        self._phase, self.has_asked = Phase.ANSWER, True
         path = _path(self.url)
         if self.direct.blocks(path) or not (self.cycle is None or self.cycle.response_complete):
             self._allow(math.inf)
