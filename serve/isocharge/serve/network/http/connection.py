@@ -78,7 +78,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def _make_room(self) -> bool:
         """End the connection that has waited longest without one complete request; False if each has had one."""
-        connections: set[Any] = self.connections  # type: ignore[assignment]
+        connections: set[Any] = self.connections
         silent = [other for other in connections if other is not self and not other.has_asked]
         if not silent:
             return False
