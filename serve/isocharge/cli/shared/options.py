@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from isocharge.errors import InputError
+from isocharge.number_text import number_of
 
 PROBE_HELP = (
     "Footprint, mm: circle:RADIUS, rectangle:WIDTHxHEIGHT, triangle:SIDE or polygon:X,Y;X,Y;...; @DEGREES at the end "
@@ -76,7 +77,7 @@ def most_workers(workers: int | None) -> int:
 def position_of(text: str) -> tuple[float, float]:
     """Position (x, y), m, from `--at`."""
     try:
-        x, y = (float(part) * 1e-3 for part in text.split(","))
+        x, y = (number_of(part.strip()) * 1e-3 for part in text.split(","))
     except ValueError as error:
         raise InputError(f"--at: expected two numbers in mm like '3,-2', got {text!r}") from error
     return x, y
@@ -85,6 +86,6 @@ def position_of(text: str) -> tuple[float, float]:
 def radius_mm_of(text: str) -> float:
     """Radius, mm, from `--radius` where it is not `auto`."""
     try:
-        return float(text)
+        return number_of(text)
     except ValueError as error:
         raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error
