@@ -21,12 +21,13 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import ModelError, PressError
-from isocharge.files import write_whole
+from isocharge.files import read_whole, write_whole
 from isocharge.json_values import plain_values
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.repository import version_folders
 from isocharge.serve.prediction.measured_presses import write_presses
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
+from isocharge.tables import parse_json
 from isocharge.train.calibration.calibrate import Calibration, CalibrationScene, EarlierFilm, loosened
 from isocharge.train.calibration.card import calibration_card
 from isocharge.train.calibration.picture import calibration_picture
@@ -120,7 +121,7 @@ def read_earlier(folder: Path, scene: CalibrationScene) -> EarlierFilm:
     """
     path = folder / RESULT
     try:
-        table: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        table: dict[str, Any] = parse_json(read_whole(path), str(path), PressError)
         names, prior = tuple(table["parameters"]), scene.charges.prior
         if names != prior.names or table["sensor"] != prior.sensor.name:
             raise PressError(
