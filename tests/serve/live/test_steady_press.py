@@ -40,7 +40,7 @@ def rest(seconds, level=0.0):
     return np.full((round(seconds * RATE_HZ), 4), level)
 
 
-def held(seconds, change=lambda t: 1.0, press=PRESS):
+def held(seconds, change=lambda _: 1.0, press=PRESS):
     return np.array([press * change(k / RATE_HZ) for k in range(round(seconds * RATE_HZ))])
 
 
