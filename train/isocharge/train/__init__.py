@@ -17,6 +17,7 @@ with require("train"):
     from isocharge.train.calibration.films_for import SensorFilms, films_for
     from isocharge.train.calibration.folder import read_earlier, write_calibration
     from isocharge.train.calibration.next_press import ProposedPress, next_presses
+    from isocharge.train.calibration.session import BenchSession
     from isocharge.train.release.evaluate import measure_errors
     from isocharge.train.release.release import Release, train_model
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
@@ -24,6 +25,7 @@ with require("train"):
 
 __all__ = [
     "BayesLimit",
+    "BenchSession",
     "Calibration",
     "CalibrationScene",
     "EarlierFilm",

@@ -20,6 +20,9 @@ from isocharge.serve.signal_chain.chain import Reading
 CHECKS_PER_WINDOW = 10
 """How often a window is looked at while it moves by its own length: a board may send thousands of frames a second."""
 
+AWAY = "the port was away: leave the film alone until it is tared"
+"""Why a press is refused that was lost with its port."""
+
 ALIKE = 0.3
 """Largest difference of the charges' relative slopes, over their mean, at which all electrodes change alike."""
 
@@ -135,7 +138,7 @@ class PressWatch:
         reading, t_s = timed.reading, timed.time.clock_s
         if RECONNECTED in reading.flags or RESTART in reading.flags:
             self._rest.clear()
-            return self._refuse("the port was away: leave the film alone until it is tared", Phase.taring)
+            return self._refuse(AWAY, Phase.taring)
         if reading.charge_pC is None:  # no tare yet, or a frame without numbers
             self._phase = Phase.taring if TARE in reading.flags else self._phase
             return Watched(self._phase)

@@ -63,7 +63,12 @@ def save_session(folder: Path, presses: MeasuredPresses) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         write_presses(folder / SESSION, presses)
     else:
-        (folder / SESSION).unlink(missing_ok=True)
+        end_session(folder)
+
+
+def end_session(folder: Path) -> None:
+    """Remove the presses of a session whose calibration is written: the version folder has them."""
+    (folder / SESSION).unlink(missing_ok=True)
 
 
 def write_calibration(folder: Path, calibration: Calibration, films: FilmsModel, command: str = "") -> Path:

@@ -49,6 +49,11 @@ class ProposedPress:
     position_mm: float
     force_percent: float
 
+    @property
+    def contact(self) -> Array:
+        """(x_mm, y_mm, force_N), shape (3,)."""
+        return np.array([self.x_mm, self.y_mm, self.force_N])
+
 
 def information_of(
     charges: FilmCharges, parameters: Array, contact: Array, noise: NoiseModel, position_std_mm: float, force_std: float

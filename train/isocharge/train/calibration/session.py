@@ -177,18 +177,16 @@ class BenchSession:
             return False
         return self.calibration.left.position_mm <= self._until * self.calibration.sensitivity.of_noise().position_mm
 
-    def take(self, charge_pC: Array, contact: Array | None = None) -> None:
+    def take(self, charge_pC: Array, contact: Array) -> None:
         """Take a press, save all, and fit the film.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
-            contact: (x_mm, y_mm, force_N), NaN where unknown, shape (3,); the proposed press if absent.
+            contact: (x_mm, y_mm, force_N), NaN where unknown, shape (3,).
 
         Raises:
             PressError: If there can be no such press; nothing is taken.
         """
-        if contact is None:
-            contact = np.array([self.proposed.x_mm, self.proposed.y_mm, self.proposed.force_N])
         self.check(contact)
         contacts, charges = np.vstack([self.presses.contact, contact]), np.vstack([self.presses.charge_pC, charge_pC])
         taken = self.presses
@@ -266,9 +264,10 @@ class BenchSession:
         return (known, *map(self._bad_words, self.calibration.bad_lines))
 
     def _bad_words(self, number: int) -> str:
+        press = press_words(self.presses.contact[number - 1])
         return (
-            f"Press {number}, {press_words(self.presses.contact[number - 1])}, fits no film that the others fit, and is "
-            f"left out: was it there, and as hard? `u {number}` takes it back."
+            f"Press {number}, {press}, fits no film that the others fit, and is left out: was it there, and as hard? "
+            f"u {number} takes it back."
         )
 
 

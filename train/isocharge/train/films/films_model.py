@@ -75,4 +75,7 @@ class FilmsModel:
         typical = 2.0 ** np.round(logs_mean / np.log(2.0))
         turn, offset = self.scaling.turn(parameters), self.scaling.offset(parameters)
         units = answer_units(self.domain, turn, offset, self.mean.size)
-        return FoldedNetwork(FoldedLayers.of(perceptrons, self.whitening, logs_mean - np.log(typical), units), typical)
+        return FoldedNetwork(
+            FoldedLayers.of(perceptrons, self.whitening, logs_mean - np.log(typical), units), typical
+        )
+

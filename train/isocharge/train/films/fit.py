@@ -107,9 +107,7 @@ class _FilmsTraining:
         presses = self._part("presses", PRESSES_STEPS, "presses", lambda advance: self._presses(family, advance))
         inputs = FilmInputs.fit(FilmScaling(self.prior, self.domain), FilmPresses.from_arrays(presses))
         contact = self._contact(inputs, FilmPresses.from_arrays(presses))
-        examples = self._part(
-            "examples", MISFIT_STEPS, "nearest contacts", lambda advance: self._examples(family, advance)
-        )
+        examples = self._part("examples", MISFIT_STEPS, "nearest contacts", lambda advance: self._examples(family, advance))
         misfit = self._misfit(inputs, examples)
         return FilmsFit(inputs, family, contact, misfit, self.config)
 
@@ -167,8 +165,7 @@ class _FilmsTraining:
         noise = noise_model(config.noise)
         stage = ContactStage(part, inputs, presses, noise, config.watched, batch, warm_up, config.seed)
         self._descend(
-            TrainingStage("contact", part, stage.loss, stage.score, config.steps, warm_up, LARGEST_GRADIENT),
-            config.steps,
+            TrainingStage("contact", part, stage.loss, stage.score, config.steps, warm_up, LARGEST_GRADIENT), config.steps
         )
         return part.to_arrays()
 

@@ -79,11 +79,7 @@ def draw_misfit_films(
     parameters = prior.draw(np.random.default_rng([seed, 2]), films)
     work = partial(_one_film, prior, family, domain, noise, charges, seed)
     drawn = list(report_each(map_jobs(work, enumerate(parameters)), films, progress))
-    return {
-        "parameters": parameters,
-        "charge_pC": np.stack([d[0] for d in drawn]),
-        "miss": np.stack([d[1] for d in drawn]),
-    }
+    return {"parameters": parameters, "charge_pC": np.stack([d[0] for d in drawn]), "miss": np.stack([d[1] for d in drawn])}
 
 
 def _one_film(
