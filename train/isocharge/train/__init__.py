@@ -18,6 +18,10 @@ with require("train"):
     from isocharge.train.calibration.folder import read_earlier, write_calibration
     from isocharge.train.calibration.next_press import ProposedPress, next_presses
     from isocharge.train.calibration.session import BenchSession
+    from isocharge.train.films.config import FilmsConfig
+    from isocharge.train.films.films_file import read_films
+    from isocharge.train.films.films_model import FilmsModel, write_film_model
+    from isocharge.train.films.release import train_films
     from isocharge.train.release.evaluate import measure_errors
     from isocharge.train.release.release import Release, train_model
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
@@ -29,6 +33,8 @@ __all__ = [
     "Calibration",
     "CalibrationScene",
     "EarlierFilm",
+    "FilmsConfig",
+    "FilmsModel",
     "Fit",
     "FitConfig",
     "NetworkConfig",
@@ -46,6 +52,9 @@ __all__ = [
     "measure_errors",
     "next_presses",
     "read_earlier",
+    "read_films",
+    "train_films",
     "train_model",
     "write_calibration",
+    "write_film_model",
 ]

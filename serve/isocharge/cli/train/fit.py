@@ -1,13 +1,15 @@
 """`isocharge train fit`: a dataset, or a sensor, to a model."""
 
 import json as json_module
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from isocharge.cli.shared.forward_maps import sweep_radius
-from isocharge.cli.shared.options import PROBE_HELP, ConfigOption, FreshOption, RadiusOption
+from isocharge.cli.shared.options import PROBE_HELP, ConfigOption, FreshOption, RadiusOption, radius_mm_of
 from isocharge.cli.shared.terminal import progress, say, this_command
 from isocharge.default_scene import DEFAULT_RADIUS
 from isocharge.errors import InputError
@@ -46,6 +48,14 @@ def fit_command(
         ),
     ] = None,
     radius: RadiusOption = f"{1e3 * DEFAULT_RADIUS}",
+    films: Annotated[
+        bool,
+        typer.Option(
+            "--films",
+            help="With --sensor: train one network for every film that the sensor may be, for `isocharge train "
+            "calibrate`; some 20 minutes on 2 cores. (default: the film as described)",
+        ),
+    ] = False,
     config: ConfigOption = None,
     version: Annotated[int, typer.Option("--version", min=1, help="Version of the model: the folder in NAME.")] = 1,
     fresh: FreshOption = False,
@@ -55,7 +65,9 @@ def fit_command(
 ) -> None:
     """Train a network on charges, measure its errors, and write a model folder: ONNX file, card, golden vectors.
 
-    The presses come from DATASET, or are simulated first: --probe and --radius say how, and belong to --sensor.
+    The presses come from DATASET, or are simulated first: --probe and --radius say how, and belong to --sensor. With
+    --films the sensor's film is not taken as described: pretension, stiffness, coefficients, gains and the place of the
+    electrodes are drawn as they spread between films, and the folder also gets films.npz, the network for all of them.
 
     A run that was stopped or killed leaves models/NAME/VERSION.part; the same command goes on from there and makes the
     same model.
@@ -64,17 +76,16 @@ def fit_command(
     """
     if (dataset is None) == (sensor is None):
         raise InputError(f"expected either a DATASET folder or --sensor SENSOR, got {'both' if dataset else 'neither'}")
-    from isocharge.train import load_config, train_model
-
     refuse_existing(output / str(version))
-    settings = load_config(config) if config else None
-    presses = _read(dataset) if dataset else _simulate(str(sensor), probe or ["circle:1.0"], radius)
+    if films:
+        _refuse_with_films(dataset, config)
+        train = _train_films(str(sensor), probe or ["circle:1.0"], radius)
+    else:
+        train = _train_on_presses(dataset, sensor, probe or ["circle:1.0"], radius, config)
     try:
         with progress("training") as advance:
-            release = train_model(
-                presses,
+            release = train(
                 output,
-                settings,
                 command=this_command(),
                 version=version,
                 fresh=fresh,
@@ -88,6 +99,46 @@ def fit_command(
     if json:
         typer.echo(json_module.dumps({"folder": str(release.folder), "errors": dict(release.metadata.errors)}))
     say(_summary(release))
+
+
+def _train_on_presses(
+    dataset: Path | None, sensor: str | None, probes: list[str], radius: str, config: Path | None
+) -> "Callable[..., Release]":
+    """Trains on a dataset, read or simulated."""
+    from isocharge.train import load_config, train_model
+
+    settings = load_config(config) if config else None
+    presses = _read(dataset) if dataset else _simulate(str(sensor), probes, radius)
+    return partial(train_model, presses, config=settings)
+
+
+def _refuse_with_films(dataset: Path | None, config: Path | None) -> None:
+    if dataset:
+        raise InputError("--films: expected --sensor SENSOR, got a DATASET, which is of one film")
+    if config:
+        raise InputError("--films: expected no --config: its settings are for one film; leave it out")
+
+
+def _train_films(sensor: str, probes: list[str], radius: str) -> "Callable[..., Release]":
+    """Trains on the films that a sensor may be, in a process for each core."""
+    from isocharge.simulate import Circle, FilmPrior, load_sensor, parse_probe
+    from isocharge.train import FilmsConfig
+
+    if radius == "auto":
+        raise InputError("--films: expected --radius in mm, got auto: the working area differs from film to film")
+    pressing = [parse_probe(text) for text in probes]
+    if len(pressing) != 1 or not isinstance(pressing[0], Circle):
+        raise InputError(f"--films: expected one round probe (circle:RADIUS), got {', '.join(probes)}")
+    prior, config = FilmPrior(load_sensor(sensor), pressing[0]), FilmsConfig(radius=1e-3 * radius_mm_of(radius))
+    return partial(_train_films_with_workers, prior, config=config)
+
+
+def _train_films_with_workers(*arguments: Any, **options: Any) -> "Release":
+    from isocharge.simulate.execution.workers import cores, local_workers
+    from isocharge.train import train_films
+
+    with local_workers(cores()) as workers:
+        return train_films(*arguments, **options, map_jobs=workers.in_order)
 
 
 def _read(folder: Path) -> "Dataset":

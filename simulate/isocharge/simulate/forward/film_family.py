@@ -15,7 +15,7 @@ In a file, coefficients and modes are integers of 16 bits, each mode with its ow
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, cast, get_args
 
 import numpy as np
@@ -26,7 +26,7 @@ from isocharge.errors import InputError, SceneError, SolveError
 from isocharge.progress import Progress
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.family import Family
-from isocharge.simulate.forward.film_grid import AXES, FilmGrid, FilmLimits, limits_of
+from isocharge.simulate.forward.film_grid import AXES, COUNTS, FilmGrid, FilmLimits, limits_of
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import touch_charge
 from isocharge.simulate.forward.solve_family import check_family
@@ -88,6 +88,7 @@ class FilmFamily:
         radius: float = DEFAULT_RADIUS,
         force_range: tuple[float, float] = DEFAULT_FORCE_RANGE,
         *,
+        counts: tuple[int, ...] = COUNTS,
         map_jobs: JobMap = map,
         progress: Progress | None = None,
     ) -> "FilmFamily":
@@ -97,6 +98,7 @@ class FilmFamily:
             prior: The films.
             radius: Largest distance of a press from the centre, m.
             force_range: Smallest and largest force, N.
+            counts: Nodes along each of `AXES`; a narrow spread needs fewer.
             map_jobs: Runs the solves, in this process by default.
             progress: Called with (done, total) groups of solves.
 
@@ -105,7 +107,7 @@ class FilmFamily:
             SolveError: If an equilibrium or the interpolation error is not reached.
         """
         film, limits = prior.sensor.film, limits_of(prior, radius, force_range)
-        grid, a = FilmGrid.spread(limits), film.radius
+        grid, a = FilmGrid.spread(limits, counts), film.radius
         widest = Circle(limits["reach"][1] * a)
         check_family(film, widest, radius, force_range)
         middle = float(np.sqrt(force_range[0] * force_range[1]))
@@ -183,6 +185,9 @@ class FilmFamily:
             coefficients, modes, scale = arrays["coefficients"], arrays["modes"], arrays["mode_scale"]
             if coefficients.shape != (*shape, len(modes)) or scale.shape != (len(modes), 1) or len(shape) != len(AXES):
                 raise ValueError(f"coefficients {coefficients.shape} and modes {modes.shape} do not fit {shape}")
+            sizes = len(arrays["limits"]), arrays["grid"].size, arrays["resolution"].size
+            if sizes != (len(AXES), sum(shape), len(fields(Resolution))):
+                raise ValueError(f"limits, grid and resolution have {sizes} numbers")
             if str(arrays["surface"]) not in get_args(Surface):
                 raise ValueError(f"surface {arrays['surface']!s}")
             return cls(

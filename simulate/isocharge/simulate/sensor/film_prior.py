@@ -166,8 +166,12 @@ class FilmPrior:
             SensorError: If it differs otherwise: other electrodes, another radius, another readout.
         """
         described = self.sensor
+        if _shapes(sensor) != _shapes(described):
+            raise SensorError(
+                f"{sensor.name}: expected the electrodes of {described.name} ({_centres(described)}), got others "
+                f"({_centres(sensor)})"
+            )
         for what, value, expected in (
-            ("electrodes", _shapes(sensor), _shapes(described)),
             ("readout", (sensor.readout, sensor.surface), (described.readout, described.surface)),
             ("film radius (mm) and poisson", _round_film(sensor.film), _round_film(described.film)),
             ("d33 (pC/N)", 1e12 * sensor.piezo.d33, 1e12 * described.piezo.d33),
@@ -202,6 +206,11 @@ class FilmPrior:
 def _shapes(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
     """Corners of the electrodes as described, mm, rounded to a nanometre."""
     return {e.name: [(round(1e3 * x, 6), round(1e3 * y, 6)) for x, y in e.corners] for e in sensor.electrodes}
+
+
+def _centres(sensor: Sensor) -> str:
+    places = [(e.name, 1e3 * e.centre[0], 1e3 * e.centre[1]) for e in sensor.electrodes]
+    return ", ".join(f"{name} at ({x:.4g}, {y:.4g})" for name, x, y in places[:8]) + " mm" + ", ..." * (len(places) > 8)
 
 
 def _round_film(film: Film) -> tuple[float, float]:

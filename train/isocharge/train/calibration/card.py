@@ -36,16 +36,16 @@ The model answers within {calibration.scene.domain.radius_mm:g} mm of the centre
 def _quantities(table: Mapping[str, Quantity]) -> str:
     rows = "\n".join(
         f"| `{quantity.name}` | {quantity.meaning} | {quantity.value:.4g} | {quantity.std:.2g} | "
-        f"{quantity.before_std:.2g} | {'yes' if quantity.told else 'no'} |"
+        f"{quantity.before_std:.2g} | {'yes' if quantity.identified else 'no'} |"
         for quantity in table.values()
     )
     return f"""## The film
 
-| quantity | what it is | value | standard deviation | before | told |
+| quantity | what it is | value | standard deviation | before | identified |
 |---|---|---|---|---|---|
 {rows}
 
-Told: the presses at least halved its standard deviation. `sensor.toml` has single parameters, of which only the
+Identified: the presses at least halved its standard deviation. `sensor.toml` has single parameters, of which only the
 combinations above are known; `calibration.json` has their correlations.
 """
 

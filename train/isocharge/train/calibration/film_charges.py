@@ -12,7 +12,7 @@ from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 from isocharge.simulate.sensor.probe import Circle
 
-STEP = 0.02
+STEP = 0.005
 """Step of the differences by a parameter, in standard deviations of its prior: the map is smooth on that scale."""
 
 STEPPED = ("pretension", "thickness", "shift_x", "shift_y", "rotation", "probe_radius")

@@ -31,8 +31,7 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.calibrate import Calibration, CalibrationScene, EarlierFilm, loosened
 from isocharge.train.calibration.card import calibration_card
 from isocharge.train.calibration.picture import calibration_picture
-from isocharge.train.films.film_model import write_film_model
-from isocharge.train.films.films_model import FilmsModel
+from isocharge.train.films.films_model import FilmsModel, write_film_model
 
 RESULT, SENSOR, PRESSES, PICTURE = "calibration.json", "sensor.toml", "presses.csv", "calibration.png"
 """Names of the files."""

@@ -77,8 +77,8 @@ def information_of(
     known = np.diag([position_std_mm**-2.0, position_std_mm**-2.0, force_std**-2.0])
     normal = np.einsum("nki,nkj->nij", slopes, slopes) + known
     across = np.einsum("nki,nkp->nip", slopes, by_film)
-    own: Array = np.einsum("nkp,nkq->npq", by_film, by_film)
-    information: Array = own - np.einsum("nip,nij,njq->npq", across, np.linalg.inv(normal), across)
+    at_known_contact: Array = np.einsum("nkp,nkq->npq", by_film, by_film)
+    information: Array = at_known_contact - np.einsum("nip,nij,njq->npq", across, np.linalg.inv(normal), across)
     return information
 
 

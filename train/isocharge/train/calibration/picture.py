@@ -16,6 +16,9 @@ from isocharge.train.calibration.contact_error import ContactError
 LEVELS_MM = (0.02, 5.0)
 """Errors at the ends of the colours, mm."""
 
+TICKS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+"""Errors that the colour bar names, mm."""
+
 ASSUMED, FITTED = "#b9c4cf", "#3a7ca5"
 """Colours of what was assumed before the presses and of what they say."""
 
@@ -23,7 +26,7 @@ ASSUMED, FITTED = "#b9c4cf", "#3a7ca5"
 def calibration_picture(calibration: Calibration) -> Figure:
     """Maps of the error that the film leaves, quantities in units of what was assumed, misses of the presses."""
     figure = new_figure(15.0, 9.4)
-    (before, after), (told, misses) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
+    (before, after), (identified, misses) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
     for axes, error, title in (
         (before, calibration.left_before, "before the presses"),
         (after, calibration.left, f"after {len(calibration.presses)} presses"),
@@ -31,8 +34,10 @@ def calibration_picture(calibration: Calibration) -> Figure:
         shades = _draw_error(axes, calibration, error)
         axes.set_title(f"{title}: {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)")
     _draw_presses(after, calibration)
-    figure.colorbar(shades, ax=[before, after], label="position error by not knowing the film (rms), mm", format="%g")
-    _draw_quantities(told, calibration)
+    figure.colorbar(
+        shades, ax=[before, after], label="position error by not knowing the film (rms), mm", ticks=TICKS, format="%g"
+    )
+    _draw_quantities(identified, calibration)
     _draw_misses(misses, calibration)
     figure.suptitle(f"calibration of {calibration.film[0].name}", fontsize=13)
     return figure
@@ -76,17 +81,17 @@ def _draw_quantities(axes: Any, calibration: Calibration) -> None:
     for number, quantity in enumerate(quantities):
         centre = float(quantity.weights @ (now - before)) / quantity.before_std
         half = 1.96 * quantity.std / quantity.before_std
-        axes.plot([centre - half, centre + half], [number, number], color=FITTED if quantity.told else INK, lw=5)
+        axes.plot([centre - half, centre + half], [number, number], color=FITTED if quantity.identified else INK, lw=5)
         axes.plot(centre, number, "|", color="white", ms=9)
         axes.annotate(
             f"{quantity.value:.3g} ± {quantity.std:.2g}", (4.2, number), va="center", fontsize=8, annotation_clip=False
         )
-    axes.plot([], [], color=FITTED, lw=5, label="told by the presses, 95 %")
-    axes.plot([], [], color=INK, lw=5, label="not told")
+    axes.plot([], [], color=FITTED, lw=5, label="identified by the presses, 95 %")
+    axes.plot([], [], color=INK, lw=5, label="not identified")
     axes.set(yticks=row, yticklabels=[quantity.name for quantity in quantities], xlim=(-4.0, 4.0))
     axes.set(xlabel="from what was assumed, in its standard deviations", title="what the presses tell")
     axes.tick_params(axis="y", labelsize=8)
-    axes.legend(fontsize=8, loc="lower left")
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3)
 
 
 def _draw_misses(axes: Any, calibration: Calibration) -> None:

@@ -50,8 +50,8 @@ def films_card(
 A network for every film that the sensor `{about.sensor["name"]}` may be. `films.npz` holds it; told a film, it gives a
 plain model of that film in under a second. `isocharge train calibrate` does that after a few presses on a real film.
 
-`model.onnx` is that plain model for {assumed}. It serves before anything
-is calibrated, and errs as the right column says.
+`model.onnx` is that plain model for {assumed}.
+It serves before anything is calibrated, and errs as the right column says.
 
 | | |
 |---|---|
@@ -86,7 +86,7 @@ exceed a misfit of {exact["misfit_p99"]:g}, 0.1 % one of {exact["misfit_p999"]:g
 
 ## Limits
 
-- The truth behind these figures is the simulator. A film that wrinkles, creeps or is not uniform is none of these films.
+- The truth behind these figures is the simulator. A film that wrinkles, creeps or is not uniform is none of these.
 - The tauter a film, the nearer to the centre its charges stop telling the place: the worst films above. A map that
   folds within the working area cannot be turned back there by any model.
 - One press at a time. Outside the working area and forces the answer is finite and wrong; the misfit is then large in

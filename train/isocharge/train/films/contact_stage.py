@@ -1,4 +1,4 @@
-"""What the contact network for all films learns from: presses with fresh noise, gains and coefficients in every step."""
+"""What the contact network for all films learns from: presses with noise and factors drawn anew in every step."""
 
 from dataclasses import dataclass
 

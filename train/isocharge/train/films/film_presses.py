@@ -24,6 +24,10 @@ from isocharge.train.data.noise import PC
 CHUNK = 16
 """Films that one job computes."""
 
+MOST_NEGATIVE = 0.2
+"""Share of the presses that may give some electrode no positive charge: light ones on taut uniaxial films do. What is
+below 1 pC counts as 1 pC, and the other electrodes have to say it."""
+
 D31, D32 = SHARED.index("d31"), SHARED.index("d32")
 """Places of the coefficients among the parameters."""
 
@@ -91,7 +95,7 @@ def draw_film_presses(
     """Draw films from the prior, and presses on each: uniform over the disk, forces log-uniform.
 
     Raises:
-        DatasetError: If a clean charge is not positive.
+        DatasetError: If too many charges are not positive.
     """
     parameters = prior.draw(np.random.default_rng([seed, 0]), films)
     jobs = [(start, parameters[start : start + CHUNK]) for start in range(0, films, CHUNK)]
@@ -105,7 +109,8 @@ def draw_film_presses(
 def draw_contacts(rng: np.random.Generator, domain: ContactDomain, count: int) -> Array:
     """Contacts (x_mm, y_mm, force_N), shape (count, 3): uniform over the disk, forces log-uniform."""
     radius, angle = domain.radius_mm * np.sqrt(rng.random(count)), 2.0 * np.pi * rng.random(count)
-    force = np.exp(rng.uniform(*np.log(domain.force_range_N), count))
+    low, high = np.log(domain.force_range_N)
+    force = np.exp(rng.uniform(low, high, count))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), force], axis=1)
 
 
@@ -153,12 +158,12 @@ def _response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: 
 
 
 def _check_positive(drawn: FilmPresses) -> None:
-    charge = drawn.charge_pC()
-    wrong = np.argwhere(~(charge > 0.0))
-    if len(wrong):
-        film, row, electrode = (int(index) for index in wrong[0])
+    useless = (drawn.charge_pC() <= 0.0).any(axis=-1)
+    if useless.mean() > MOST_NEGATIVE:
+        film, row = (int(index) for index in np.argwhere(useless)[0])
         raise DatasetError(
-            f"film {film}, press {row}: expected positive charges (the features are logarithms), got "
-            f"{charge[film, row, electrode]:g} pC of electrode number {electrode} at "
-            f"{drawn.contact[film, row].tolist()} (mm, mm, N); ask for a smaller radius"
+            f"{useless.mean():.0%} of the presses give an electrode no positive charge, expected at most "
+            f"{MOST_NEGATIVE:.0%} (the features are logarithms); the first: film {film}, "
+            f"{drawn.contact[film, row].tolist()} (mm, mm, N), {drawn.charge_pC()[film, row].tolist()} pC; check d31 "
+            "and d32, or ask for a smaller radius"
         )

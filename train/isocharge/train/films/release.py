@@ -23,9 +23,8 @@ from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.films.card import films_card
 from isocharge.train.films.config import FilmsConfig
-from isocharge.train.films.film_model import PRESSES, fresh_presses, write_film_model
 from isocharge.train.films.films_file import FILE, films_bytes, films_from_bytes
-from isocharge.train.films.films_model import FilmsModel
+from isocharge.train.films.films_model import PRESSES, FilmsModel, fresh_presses, write_film_model
 from isocharge.train.films.fit import FilmsFit, fit_films
 from isocharge.train.films.measure import FreshFilms, films_errors, fresh_films
 from isocharge.train.release.evaluate import measure_errors
@@ -130,13 +129,13 @@ class _Measured:
     def of(cls, films: FilmsModel) -> "_Measured":
         """The film with the lower error on fresh films of: the described one, and the mean of the prior."""
         drawn: FreshFilms = fresh_films(films)
-        choices = [(films.prior.described, "as described"), (films.prior.mean, "the mean of all")]
+        choices = [(films.prior.described, "as described"), (films.prior.mean, "in the middle of all")]
         tried = [(dict(films_errors(films, drawn, parameters)), parameters, word) for parameters, word in choices]
         unknown, parameters, word = min(tried, key=lambda entry: entry[0]["position_rms_mm"])
-        other = max(entry[0]["position_rms_mm"] for entry in tried)
+        others = ", ".join(f"{rival}: {errors['position_rms_mm']:g} mm" for errors, _, rival in tried if rival != word)
         text = (
-            f"the film {word}, with a pretension of {1e-6 * parameters[0]:g} MPa ({unknown['position_rms_mm']:g} mm rms "
-            f"over all films;\n{'the mean of all' if word == 'as described' else 'as described'}: {other:g} mm)"
+            f"the film {word}, with a pretension of {1e-6 * parameters[0]:g} MPa.\nThat film errs least over all films "
+            f"({unknown['position_rms_mm']:g} mm rms; {others})"
         )
         presses = fresh_presses(films, parameters, PRESSES)
         exact = measure_errors(films.fold(parameters).predict, presses, films.noise)
@@ -147,7 +146,7 @@ def _identity(prior: FilmPrior, config: FilmsConfig) -> dict[str, Any]:
     """All that decides about the weights."""
     return {
         "sensor": sensor_to_dict(prior.sensor),
-        "probe": str(prior.probe),
+        "probe": prior.probe.notation,
         "spread": asdict(prior.spread),
         "noise": noise_model(config.noise).to_dict(),
         "config": config.to_dict(),

@@ -141,11 +141,9 @@ def answer_units(domain: ContactDomain, turn: Array, offset: Array, n_electrode:
 def contact_alone(network: InverseNetwork) -> FoldedLayers:
     """The contact network without standard deviations, from ln Q to (x_mm, y_mm, ln F)."""
     matrix = np.vstack([np.diag(network.domain.scale), np.zeros((3, 3))])
-    features = network.features
+    features, contact = network.features, PlainPerceptron.of(network.contact)
     mean = np.log(features.typical) + features.mean
-    return FoldedLayers.of(
-        (PlainPerceptron.of(network.contact),), features.matrix, mean, (matrix, network.domain.centre)
-    )
+    return FoldedLayers.of((contact,), features.matrix, mean, (matrix, network.domain.centre))
 
 
 def _side_by_side(perceptrons: Sequence[PlainPerceptron]) -> tuple[list[Layer], Layer]:

@@ -35,6 +35,7 @@ from isocharge.train.training.checkpoint import Checkpoint
 from isocharge.train.training.config import FitConfig
 from isocharge.train.training.fit import Fit, fit_network
 
+
 @dataclass(frozen=True)
 class Release:
     """A model that was written.
