@@ -68,10 +68,10 @@ def test_what_was_there_before_the_touch_is_no_touch_charge():
 
 
 def test_a_press_that_settles_late_is_taken_late():
-    """The force comes in with a time constant of 0.4 s: the mean may be off by the drift that is allowed, 0.3 %."""
+    """The force comes in with a time constant of 0.4 s: the mean may be off by the drift that is allowed, 0.5 %."""
     (seen,) = [one for one in watched(rest(1), held(6, lambda t: 1 - math.exp(-t / 0.4))) if one.press]
     assert seen.held_s > 1.5
-    np.testing.assert_allclose(seen.press.charge_pC, PRESS, rtol=0.005)
+    np.testing.assert_allclose(seen.press.charge_pC, PRESS, rtol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_press_that_settles_late_is_taken_late():
     [
         (lambda t: math.exp(-t / 10.0), r"fall by (9\.\d|10) % per second on all .* \[leak\] tau_s = (9\.\d|10) "),
         (lambda t: 0.5 + 0.05 * t, "rise by .* % per second: hold the force"),
-        (lambda t: np.array([1 + 0.02 * t, 1 - 0.02 * t, 1.0, 1.0]), "the press moves"),
+        (lambda t: np.array([1 + 0.03 * t, 1 - 0.03 * t, 1.0, 1.0]), "the press moves"),
         (lambda t: 1.0 + 0.1 * math.sin(40.0 * t), "the charge of A shakes by"),
     ],
 )
@@ -95,6 +95,13 @@ def test_a_trembling_hand_is_taken():
     """1 % of the charge at 9 Hz; the mean is right all the same."""
     (press,) = [one.press for one in watched(rest(1), held(4, lambda t: 1 + 0.014 * math.sin(56.0 * t))) if one.press]
     np.testing.assert_allclose(press.charge_pC, PRESS, rtol=0.005)
+
+
+def test_a_press_without_a_rest_before_it_is_refused():
+    """What was there before the touch is not known: a charge without it may be wrong by any amount."""
+    seen = watched(rest(1), held(2), rest(0.05), held(2), rest(1))
+    assert events(seen) == ["waiting", "settling", "taken", "lift", "waiting", "settling", "refused", "lift", "waiting"]
+    assert "too soon" in next(one.reason for one in seen if one.phase is Phase.refused)
 
 
 def test_a_short_press_is_refused_and_a_blip_is_nothing():

@@ -23,6 +23,9 @@ CHECKS_PER_WINDOW = 10
 AWAY = "the port was away: leave the film alone until it is tared"
 """Why a press is refused that was lost with its port."""
 
+LEAST_REST = 3
+"""Frames of rest before a touch, at least."""
+
 ALIKE = 0.3
 """Largest difference of the charges' relative slopes, over their mean, at which all electrodes change alike."""
 
@@ -36,8 +39,8 @@ class SteadyRule:
         fewest: Frames in a window, at least.
         scatter_sigmas: Largest scatter about a straight line, in standard deviations of the noise.
         noise_share: Noise of a charge under load as a share of it, on top of the noise at rest; a hand trembles by 1 %.
-        drift_share: Largest drift over the window, as a share of the mean charge of the electrodes: a place known to
-            0.1 mm leaves 1 %.
+        drift_share: Largest drift of a charge over the window, as a share of it or of the mean of all: less than a place
+            known to 0.1 mm leaves, 1 %, and what a time constant that is 5 % wrong leaves of a leak of 10 s.
         drift_sigmas: Standard errors of the drift that are allowed on top.
         latest_s: Time after the touch at which a press that has not settled is refused, s: the longer it is held, the
             more the leak has been guessed.
@@ -50,7 +53,7 @@ class SteadyRule:
     fewest: int = 20
     scatter_sigmas: float = 3.0
     noise_share: float = 0.007
-    drift_share: float = 0.003
+    drift_share: float = 0.005
     drift_sigmas: float = 4.0
     latest_s: float = 8.0
     shortest_s: float = 0.1
@@ -126,7 +129,7 @@ class PressWatch:
         self._window: deque[tuple[float, Array, tuple[str, ...]]] = deque()
         self._rest_pC = np.zeros(len(electrodes))
         self._begin_s = self._end_s = self._check_s = -np.inf
-        self._reason = ""
+        self._reason, self._has_rest = "", False
 
     def arm(self) -> None:
         """From now on, take only a press that has not begun yet."""
@@ -165,6 +168,7 @@ class PressWatch:
     def _touch(self, t_s: float) -> None:
         """A press begins: what was there just before is rest."""
         rest = [charge_pC for at_s, charge_pC in self._rest if at_s <= t_s - self._rule.edge_s]
+        self._has_rest = len(rest) >= LEAST_REST
         self._rest_pC = np.mean(rest, axis=0) if rest else np.zeros(len(self._electrodes))
         self._rest.clear()
         self._window.clear()
@@ -174,6 +178,8 @@ class PressWatch:
         rule, self._end_s = self._rule, t_s
         if SATURATED in reading.flags:
             return self._refuse("an amplifier is at its limit: press less hard", Phase.lift)
+        if not self._has_rest and t_s - self._begin_s >= rule.shortest_s:
+            return self._refuse("pressed too soon: leave the film alone for half a second before", Phase.lift)
         self._window.append((t_s, charge_pC, reading.flags))
         while self._window[0][0] < t_s - rule.window_s:
             self._window.popleft()
@@ -223,7 +229,8 @@ def unsteadiness(rule: SteadyRule, press: SteadyPress, noise_pC: Array, electrod
         worst = int(excess.argmax())
         return f"the charge of {electrodes[worst]} shakes by {press.scatter_pC[worst]:.2g} pC"
     error_pC = press.scatter_pC * np.sqrt(12.0 / press.frames)
-    if (np.abs(press.drift_pC) <= rule.drift_share * size_pC + rule.drift_sigmas * error_pC).all():
+    allowed_pC = rule.drift_share * np.maximum(np.abs(press.charge_pC), size_pC) + rule.drift_sigmas * error_pC
+    if (np.abs(press.drift_pC) <= allowed_pC).all():
         return ""
     return _drift_words(press)
 

@@ -22,7 +22,7 @@ from isocharge.train.calibration.calibrate import (
     EarlierFilm,
     calibrate,
 )
-from isocharge.train.calibration.next_press import ProposedPress, next_presses
+from isocharge.train.calibration.next_press import ProposedPress, information_of, next_presses
 
 FEWEST_TO_SAY = 2
 """Presses from which the error left is said: one press alone says little."""
@@ -155,7 +155,7 @@ class BenchSession:
             PressError: If every place was skipped.
         """
         if self._proposed is None:
-            known = self.calibration.posterior if self.calibration else self.before
+            known = self.calibration.posterior if self.calibration else self._planned()
             scene, (position_std_mm, force_std) = self.scene, self._std
             (self._proposed,) = next_presses(
                 scene.charges,
@@ -169,6 +169,15 @@ class BenchSession:
                 avoid_mm=np.array(self._skipped).reshape(-1, 2),
             )
         return self._proposed
+
+    def _planned(self) -> EarlierFilm:
+        """What would be known if the presses said what presses at their places say: those that no film explains."""
+        placed = self.presses.contact[np.isfinite(self.presses.contact).all(axis=1)]
+        if not len(placed):
+            return self.before
+        scene, parameters = self.scene, self.before.parameters
+        said = information_of(scene.charges, parameters, placed, scene.noise, *self._std).sum(axis=0)
+        return EarlierFilm(parameters, np.linalg.inv(np.linalg.inv(self.before.covariance) + said))
 
     @property
     def enough(self) -> bool:
