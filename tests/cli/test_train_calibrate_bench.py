@@ -77,6 +77,7 @@ class Script:
 
 
 STEADY = Watched(Phase.taken, press=SteadyPress(np.full(4, 500.0), np.ones(4), np.ones(4), 0.7, 0.5, 100, ()))
+TARED = Watched(Phase.waiting, np.zeros(4))
 HELD = Watched(Phase.settling, np.full(4, 400.0), 0.3)
 
 
@@ -157,15 +158,17 @@ LIST = np.array([[1.0, 1.0, 0.5], [2.0, 2.0, 0.5], [3.0, 3.0, np.nan]])
 
 
 def test_presses_of_a_machine_are_those_of_its_list(capsys):
-    session, script, _ = dialogue(STEADY, refused("it moves"), HELD, STEADY, person=False, contacts=LIST)
+    session, script, _ = dialogue(TARED, STEADY, refused("it moves"), HELD, STEADY, person=False, contacts=LIST)
     np.testing.assert_array_equal(session.taken, LIST[[0, 2]])
     assert script.armed == 0
-    assert "row 2 is left out: it moves" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert said.index("let the machine begin") < said.index("1. 0.50 N")
+    assert "row 2 is left out: it moves" in said
 
 
 def test_a_port_that_goes_away_under_a_machine_ends_the_session():
     with pytest.raises(PortLost, match="go on with row 2 of its list"):
-        dialogue(STEADY, refused(AWAY), person=False, contacts=LIST)
+        dialogue(TARED, STEADY, refused(AWAY), person=False, contacts=LIST)
 
 
 @pytest.fixture(scope="module")

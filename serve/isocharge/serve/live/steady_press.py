@@ -23,6 +23,12 @@ CHECKS_PER_WINDOW = 10
 AWAY = "the port was away: leave the film alone until it is tared"
 """Why a press is refused that was lost with its port."""
 
+TOO_SOON = (
+    "pressed too soon after the last touch: leave the film alone for half a second before; if that does not help, the "
+    "amplifier leaks: a device file needs [leak]"
+)
+"""Why a press is refused before which there was no rest."""
+
 LEAST_REST = 3
 """Frames of rest before a touch, at least."""
 
@@ -39,8 +45,8 @@ class SteadyRule:
         fewest: Frames in a window, at least.
         scatter_sigmas: Largest scatter about a straight line, in standard deviations of the noise.
         noise_share: Noise of a charge under load as a share of it, on top of the noise at rest; a hand trembles by 1 %.
-        drift_share: Largest drift of a charge over the window, as a share of it or of the mean of all: less than a place
-            known to 0.1 mm leaves, 1 %, and what a time constant that is 5 % wrong leaves of a leak of 10 s.
+        drift_share: Largest drift of a charge over the window, as a share of it or of the mean of all: half of what a
+            place known to 0.1 mm leaves, and what a time constant that is 5 % wrong leaves of a leak of 10 s.
         drift_sigmas: Standard errors of the drift that are allowed on top.
         latest_s: Time after the touch at which a press that has not settled is refused, s: the longer it is held, the
             more the leak has been guessed.
@@ -129,7 +135,7 @@ class PressWatch:
         self._window: deque[tuple[float, Array, tuple[str, ...]]] = deque()
         self._rest_pC = np.zeros(len(electrodes))
         self._begin_s = self._end_s = self._check_s = -np.inf
-        self._reason, self._has_rest = "", False
+        self._reason, self._calmest_pC, self._has_rest = "", np.inf, False
 
     def arm(self) -> None:
         """From now on, take only a press that has not begun yet."""
@@ -162,7 +168,8 @@ class PressWatch:
         while self._rest and self._rest[0][0] < t_s - self._rule.rest_s - self._rule.edge_s:
             self._rest.popleft()
         if unsettled and held_s >= self._rule.shortest_s:
-            return self._refuse(f"released after {held_s:.1f} s, before it was steady: hold it longer", Phase.waiting)
+            reason = self._reason or "hold it longer"
+            return self._refuse(f"released after {held_s:.1f} s, before it was steady: {reason}", Phase.waiting)
         return Watched(Phase.waiting, charge_pC)
 
     def _touch(self, t_s: float) -> None:
@@ -173,13 +180,14 @@ class PressWatch:
         self._rest.clear()
         self._window.clear()
         self._phase, self._begin_s, self._check_s, self._reason = Phase.settling, t_s, t_s, ""
+        self._calmest_pC = np.inf
 
     def _settle(self, reading: Reading, charge_pC: Array, t_s: float) -> Watched:
         rule, self._end_s = self._rule, t_s
         if SATURATED in reading.flags:
             return self._refuse("an amplifier is at its limit: press less hard", Phase.lift)
         if not self._has_rest and t_s - self._begin_s >= rule.shortest_s:
-            return self._refuse("pressed too soon: leave the film alone for half a second before", Phase.lift)
+            return self._refuse(TOO_SOON, Phase.lift)
         self._window.append((t_s, charge_pC, reading.flags))
         while self._window[0][0] < t_s - rule.window_s:
             self._window.popleft()
@@ -188,10 +196,12 @@ class PressWatch:
             self._check_s = t_s
             noise_pC = reading.tare.noise_pC if reading.tare else np.zeros_like(charge_pC)
             press = self._measured(t_s)
-            self._reason = unsteadiness(rule, press, noise_pC, self._electrodes)
-            if not self._reason:
+            reason = unsteadiness(rule, press, noise_pC, self._electrodes)
+            if not reason:
                 self._phase = Phase.lift
                 return Watched(Phase.taken, press=press)
+            if press.scatter_pC.max() <= self._calmest_pC:  # not that of a window in which the probe leaves
+                self._calmest_pC, self._reason = float(press.scatter_pC.max()), reason
         if t_s - self._begin_s > rule.latest_s:
             reason = self._reason or "too few frames come"
             return self._refuse(f"not steady within {rule.latest_s:g} s: {reason}", Phase.lift)

@@ -81,6 +81,7 @@ class Dialogue:
         from isocharge.train.calibration.session import press_words
 
         first = _done(self._session, contacts)
+        self._await_rest()
         for number, contact in enumerate(contacts[first:], start=first + 1):
             self._screen.say(f"{number}. {press_words(contact)}")
             outcome = self._outcome()
@@ -94,14 +95,25 @@ class Dialogue:
             self._screen.taken(outcome)
             self._take(outcome, contact)
 
-    def _outcome(self) -> "SteadyPress | str":
-        """The next press, or why it is refused."""
+    def _await_rest(self) -> None:
+        """Wait for the tare: a press before would be lost, and all after it be taken for others."""
+        while (event := self._next_reading()).phase != "waiting":
+            self._screen.show(event)
+        self._screen.say("the film is tared: let the machine begin")
+
+    def _next_reading(self) -> "Watched":
+        """The next reading; what is typed means nothing to a machine."""
         while True:
             event = self._events.next()
             if isinstance(event, Ended):
                 raise event.error or InputError("the port ended before the last press of the list")
-            if isinstance(event, Typed):
-                continue
+            if not isinstance(event, Typed):
+                return event
+
+    def _outcome(self) -> "SteadyPress | str":
+        """The next press, or why it is refused."""
+        while True:
+            event = self._next_reading()
             if event.press is not None:
                 return event.press
             if event.phase == "refused":

@@ -78,7 +78,7 @@ def calibrate_at_port(
     session = _session(bench, chosen, before, folder, std)
     if contacts is not None:
         _check_list(session, contacts, bench.press_list)
-    with _kept(session, folder), _events(bench, chosen) as events:
+    with _presses_stay(session, folder), _events(bench, chosen) as events:
         screen = Screen(session.presses.electrodes)
         machine = contacts is not None
         dialogue = Dialogue(session, events, screen, partial(_print_press, machine=machine) if json_lines else _silent)
@@ -89,7 +89,7 @@ def calibrate_at_port(
                 dialogue.with_machine(contacts)
         finally:
             screen.rest()
-    with _kept(session, folder):
+    with _presses_stay(session, folder):
         return _result(session)
 
 
@@ -169,19 +169,19 @@ def _keyboard() -> int:
 
 
 @contextmanager
-def _kept(session: "BenchSession", folder: Path) -> Iterator[None]:
+def _presses_stay(session: "BenchSession", folder: Path) -> Iterator[None]:
     """Say where the presses are if the session does not end well."""
     from isocharge.train.calibration.folder import SESSION
 
-    kept = f"{{}} presses are in {folder / SESSION}; the same command goes on with them"
+    saved = f"{{}} presses are in {folder / SESSION}; the same command goes on with them"
     try:
         yield
     except KeyboardInterrupt:
-        say("stopped: " + (kept.format(len(session)) if len(session) else "no press was taken"))
+        say("stopped: " + (saved.format(len(session)) if len(session) else "no press was taken"))
         raise typer.Exit(1) from None
     except Exception:
         if len(session):
-            say(kept.format(len(session)))
+            say(saved.format(len(session)))
         raise
 
 
