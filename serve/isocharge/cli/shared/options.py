@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from isocharge.errors import InputError
+from isocharge.number_text import number_of
 
 if TYPE_CHECKING:
     from isocharge.serve import Device
@@ -94,7 +95,7 @@ def most_workers(workers: int | None) -> int:
 def position_of(text: str) -> tuple[float, float]:
     """Position (x, y), m, from `--at`."""
     try:
-        x, y = (float(part) * 1e-3 for part in text.split(","))
+        x, y = (number_of(part.strip()) * 1e-3 for part in text.split(","))
     except ValueError as error:
         raise InputError(f"--at: expected two numbers in mm like '3,-2', got {text!r}") from error
     return x, y
@@ -103,6 +104,6 @@ def position_of(text: str) -> tuple[float, float]:
 def radius_mm_of(text: str) -> float:
     """Radius, mm, from `--radius` where it is not `auto`."""
     try:
-        return float(text)
+        return number_of(text)
     except ValueError as error:
         raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error

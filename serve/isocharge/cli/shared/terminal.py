@@ -8,13 +8,18 @@ from contextlib import contextmanager
 
 import typer
 
+from isocharge.cli.shared.standard_streams import forget
+
 Advance = Callable[..., None]
 """`advance(done, total)` or `advance(done, total, note)`: moves a progress bar; the note stands behind it."""
 
 
 def say(message: str) -> None:
-    """Print a message for people on stderr."""
-    typer.echo(message, err=True)
+    """Print a message for people on stderr; if that is full or gone, the command goes on without."""
+    try:
+        typer.echo(message, err=True)
+    except OSError:
+        forget(2)
 
 
 def this_command() -> str:

@@ -6,7 +6,8 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import PressError
-from isocharge.serve.prediction.csv_numbers import CsvNumbers, bounded_lines
+from isocharge.files import bounded_lines
+from isocharge.serve.prediction.csv_numbers import CsvNumbers
 from isocharge.serve.prediction.measured_presses import CONTACT, KINDS
 
 

@@ -29,8 +29,8 @@ from isocharge.train.training.fit import WARM_UP, threads_and_seed
 BEYOND = 1.5e-3
 """How far the family reaches beyond the domain, m: a calibration moves presses whose place is not exactly known."""
 
-FORCES_BEYOND = 1.2
-"""The same for forces, a factor."""
+FORCES_BEYOND = (0.8, 1.2)
+"""The same for forces: factors of the smallest and the largest."""
 
 LARGEST_GRADIENT = 5.0
 """Norm to which gradients are cut: films whose map nearly folds pull hard."""
@@ -136,7 +136,7 @@ class _FilmsTraining:
 
     def _family(self, advance: Progress) -> dict[str, Any]:
         low, high = self.config.force_range
-        forces = (low / FORCES_BEYOND, high * FORCES_BEYOND)
+        forces = (low * FORCES_BEYOND[0], high * FORCES_BEYOND[1])
         radius = self.config.radius + BEYOND
         return FilmFamily.build(self.prior, radius, forces, map_jobs=self.map_jobs, progress=advance).to_arrays()
 
