@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test test-all attack docs bench soak release report proto clean
 
 # Tests that measure time, or wait for a port to come back: one at a time. All others share the cores, a file a worker.
-ALONE := tests/serve/live tests/serve/port tests/serve/virtual_sensor tests/serve/test_end_to_end.py tests/test_live.py
+ALONE := tests/serve/live tests/serve/port tests/serve/virtual_sensor tests/serve/test_end_to_end.py tests/test_live.py tests/test_bench.py
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
 demo: $(VENV)/installed

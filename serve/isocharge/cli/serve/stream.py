@@ -1,6 +1,5 @@
 """`isocharge serve stream`: prediction records from a port as they come."""
 
-import logging
 import signal
 import time
 from collections import deque
@@ -13,19 +12,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from isocharge.cli.serve.options import (
-    DeviceOption,
     ModelsOption,
     Output,
     OutputOption,
     PolicyName,
     UdpOption,
-    board_of,
 )
 from isocharge.cli.serve.record_output import LATENCIES, record_writer, summary, write_records
-from isocharge.cli.shared.options import ModelArgument
+from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
 from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
 from isocharge.cli.shared.stopping import until_stopped
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.terminal import log_to_stderr, say
 
 if TYPE_CHECKING:
     from isocharge.serve import Device
@@ -104,7 +101,7 @@ def stream_command(
     live = RecordedStream(path, recorder)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
-        stack.enter_context(_log_to_stderr())
+        stack.enter_context(log_to_stderr())
         source = stack.enter_context(open_source(_awaited(port, wait), baud=baud, reconnect=reconnect))
         stack.enter_context(_tare_on_signal(live))
         stack.enter_context(_alarm(seconds))
@@ -162,15 +159,3 @@ def _tare_on_signal(live: "RecordedStream") -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGUSR1, before)
-
-
-@contextmanager
-def _log_to_stderr() -> Iterator[None]:
-    """Print warnings of the live path for people."""
-    handler = logging.StreamHandler()
-    logger = logging.getLogger("isocharge.serve")
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)

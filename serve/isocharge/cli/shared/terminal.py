@@ -1,5 +1,6 @@
 """Messages and progress bars for people, on stderr; bars only if stderr is a terminal."""
 
+import logging
 import shlex
 import sys
 from collections.abc import Callable, Iterator
@@ -24,6 +25,18 @@ def say(message: str) -> None:
 def this_command() -> str:
     """The command line as it was given, for cards and reports that say how they were made."""
     return shlex.join(["isocharge", *sys.argv[1:]])
+
+
+@contextmanager
+def log_to_stderr() -> Iterator[None]:
+    """Print warnings of the live path for people."""
+    handler = logging.StreamHandler()
+    logger = logging.getLogger("isocharge.serve")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
 
 
 @contextmanager
