@@ -157,7 +157,7 @@ def _check_usage(file: Path | None, output: Path | None, next_count: int, port: 
     if port is None and at_bench:
         raise InputError("--yes, --script, --fresh and --device belong to --port; give the port of the sensor")
     if port is None and file is None and not next_count:
-        raise InputError("expected PRESSES.csv, --port URL, or --next K for presses to begin with, got none of them")
+        raise InputError("expected PRESSES.csv, or --next K for presses to begin with, or --port URL, got none of them")
     if port is None and file is None and output is not None:
         raise InputError("--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out")
 
