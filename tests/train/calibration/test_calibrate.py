@@ -86,7 +86,7 @@ MISTAKES = {
     "metres": (lambda c, q: (c / [1e3, 1e3, 1.0], q), "written in metres"),
     "micrometres": (lambda c, q: (c * [1e3, 1e3, 1.0], q), "off the film"),
     "dead": (lambda c, q: (c, np.where(np.arange(4) == 2, 0.4, q)), "electrode 'C' is dead"),
-    "negative": (lambda c, q: (c, q * [1.0, -1.0, 1.0, 1.0]), "electrode 'B': half of its charges are negative"),
+    "negative": (lambda c, q: (c, q * [1.0, -1.0, 1.0, 1.0]), "electrode 'B': 12 of its 12 charges are negative"),
     "missing": (lambda c, q: (c, np.where(np.arange(4) == 3, np.nan, q)), "electrode 'D': no press has a charge"),
     "other rows": (lambda c, q: (c, np.roll(q, 3, axis=0)), "no film of 'four-25um-biaxial' explains"),
 }
