@@ -8,6 +8,7 @@ import typer
 
 from isocharge.cli.shared.options import JsonOption, ProbeOption
 from isocharge.cli.shared.terminal import say, this_command
+from isocharge.cli.train.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
 from isocharge.errors import InputError
 
 if TYPE_CHECKING:
@@ -39,20 +40,8 @@ def calibrate_command(
         ),
     ] = None,
     probe: ProbeOption = "circle:1.0",
-    position_std_mm: Annotated[
-        float,
-        typer.Option(
-            "--position-std", metavar="MM", help="Standard deviation of known x and y, mm, where the file has none."
-        ),
-    ] = 0.1,
-    force_std: Annotated[
-        float,
-        typer.Option(
-            "--force-std",
-            metavar="SHARE",
-            help="Standard deviation of known forces, a share of the force in N, where the file has none.",
-        ),
-    ] = 0.01,
+    position_std_mm: PositionStdOption = 0.1,
+    force_std: ForceStdOption = 0.01,
     next_count: Annotated[
         int,
         typer.Option("--next", metavar="K", min=0, max=100, help="Propose this many presses that would tell most."),
@@ -65,10 +54,7 @@ def calibrate_command(
             help="Start from the calibration in this folder, allowing for drift since then. (default: the sensor file)",
         ),
     ] = None,
-    models: Annotated[
-        Path | None,
-        typer.Option("--models", metavar="DIR", help="Folder of models to search first. (default: the usual folders)"),
-    ] = None,
+    models: ModelsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Calibrate a film: find its parameters from measured presses, and write a model that is right about it.
@@ -88,7 +74,8 @@ def calibrate_command(
     chosen = films_for(load_sensor(sensor), parse_probe(probe), models)
     calibration = None
     if file is not None:
-        presses = _read(file, chosen, position_std_mm, force_std)
+        names = chosen.films.prior.sensor.electrode_names
+        presses = read_presses_of(file, names, position_std_mm, force_std)
         calibration = _calibrated(presses, chosen, earlier)
         if output is not None:
             _write(output, calibration, chosen)
@@ -103,17 +90,6 @@ def calibrate_command(
             f"press {press.force_N:.2f} N at ({press.x_mm:.1f}, {press.y_mm:.1f}) mm: "
             f"leaves {press.position_mm:.3f} mm, {press.force_percent:.2f} %"
         )
-
-
-def _read(file: Path, chosen: "SensorFilms", position_std_mm: float, force_std: float) -> "MeasuredPresses":
-    from isocharge.serve import read_presses
-    from isocharge.serve.prediction.csv_numbers import ignored_words
-
-    names = chosen.films.prior.sensor.electrode_names
-    presses = read_presses(file, names, position_std_mm=position_std_mm, force_std=force_std)
-    if presses.ignored:
-        say(ignored_words(str(file), presses.ignored))
-    return presses
 
 
 def _calibrated(presses: "MeasuredPresses", chosen: "SensorFilms", earlier: Path | None) -> "Calibration":

@@ -66,8 +66,7 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
 
 def complete(presses: MeasuredPresses) -> Booleans:
     """Presses of which place, force and every charge are known, shape (n,)."""
-    known: Booleans = np.isfinite(presses.contact).all(axis=1) & np.isfinite(presses.charge_pC).all(axis=1)
-    return known
+    return np.asarray(np.isfinite(presses.contact).all(axis=1) & np.isfinite(presses.charge_pC).all(axis=1))
 
 
 def check_enough(count: int, of: int, sensor: str) -> None:

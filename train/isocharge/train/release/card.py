@@ -11,8 +11,9 @@ from isocharge.train.training.fit import Fit
 
 def model_card(metadata: ModelMetadata, fit: Fit, test: MeasuredTest | None = None) -> str:
     """The text of `card.md`; `test` has the measured presses that the errors are of, if they are."""
-    errors, truth = _errors(metadata.errors, len(fit.held)), SIMULATED_TRUTH
-    if test is not None:
+    if test is None:
+        errors, truth = _errors(metadata.errors, len(fit.held)), SIMULATED_TRUTH
+    else:
         errors, truth = test.origin + _measured_errors(metadata.errors), MEASURED_TRUTH
     cautions = "".join(f"- {caution}.\n" for caution in fit.cautions)
     limits = f"## Limits\n\n{truth}{cautions}{LIMITS}"

@@ -106,7 +106,9 @@ def fit_network(
     return Fit(network, field, held, config, asked, is_measured(dataset), tuple(cautions))
 
 
-def _split(presses: LabelledPresses, training: TrainingConfig, measured: bool) -> tuple[LabelledPresses, LabelledPresses]:
+def _split(
+    presses: LabelledPresses, training: TrainingConfig, measured: bool
+) -> tuple[LabelledPresses, LabelledPresses]:
     """Presses to train on, and those held out."""
     if not measured:
         return split_by_position(presses, training.hold_out, training.seed)
