@@ -25,7 +25,7 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.fold_free import SMALLEST_SHARE, fold_free_domain
+from isocharge.train.data.fold_free import SMALLEST_SHARE, fold_free_domain, probable_fold_mm
 from isocharge.train.data.measured import held_out, is_measured
 from isocharge.train.data.misfit_charges import MisfitExamples, draw_misfit_examples
 from isocharge.train.data.noise import misfit_noise, noisy_charges
@@ -132,10 +132,18 @@ def _check_electrodes(dataset: Dataset, config: FitConfig) -> None:
 def _without_folds(
     asked: ContactDomain, presses: LabelledPresses, training: TrainingConfig, warn: Warn
 ) -> tuple[ContactDomain, LabelledPresses]:
-    """The largest disk in which the map does not fold, and the presses in it."""
+    """The largest disk in which the map certainly does not fold, and the presses in it."""
     field = _field(asked, *split_by_position(presses, training.hold_out, training.seed))
-    domain = fold_free_domain(field, misfit_noise(noise_model(training.noise)))
+    noise = misfit_noise(noise_model(training.noise))
+    domain = fold_free_domain(field, noise)
     if domain == asked:
+        if np.isfinite(fold_mm := probable_fold_mm(field, noise)):
+            warn(
+                f"the map from contacts to charges seems to fold about {fold_mm:.2g} mm from the centre, where two "
+                f"contacts give the same charges; the presses cannot tell it for certain, and the model is trained "
+                f"across it, up to {asked.radius_mm:g} mm; see 'isocharge simulate identify', then ask for a smaller "
+                "radius or add an electrode"
+            )
         return asked, presses
     if domain.radius_mm < SMALLEST_SHARE * asked.radius_mm:
         raise DatasetError(
