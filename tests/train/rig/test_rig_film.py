@@ -49,6 +49,7 @@ def left(film, truth, share):
     return [100.0 * float(np.sqrt(np.mean(error**2))) for error in errors]
 
 
+@pytest.mark.slow
 def test_what_calibration_cannot_take_the_correction_does(films, truth):
     film = calibrated_film(measured(truth, 120, 1.0), films, DOMAIN, lambda _: None)
     calibrated, corrected = left(film, truth, 1.0)
@@ -64,6 +65,7 @@ def test_a_film_that_physics_explains_is_not_corrected(films, truth):
     assert film.scatter == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.slow
 def test_a_press_that_was_misread_is_left_out(films, truth):
     presses = measured(truth, 60, 0.0)
     presses.charge_pC[7, 2] *= 3.0

@@ -50,8 +50,9 @@ def report_command(
     """Compare a model with other methods: error (mm, % of force) against time (us), throughput and memory (bytes).
 
     All methods answer the same noisy presses. Measured presses are judged as they are, by a fifth that no method has
-    seen: no simulator has a say, and what needs one is left out. --probe is what made the presses of PRESSES.csv. It takes some minutes for a dataset of 24,000 presses. Let nothing else
-    run meanwhile: times are measured.
+    seen: no simulator has a say, and what needs one is left out. --probe is what made the presses of PRESSES.csv.
+
+    It takes some minutes for a dataset of 24,000 presses. Let nothing else run meanwhile: times are measured.
 
     Example: isocharge train report presses -o report
     """
