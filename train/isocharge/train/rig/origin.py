@@ -40,7 +40,10 @@ def _sentences(film: RigFilm, presses: MeasuredPresses, held: Booleans, held_fil
         yield from film.calibration.words
     yield _correction(film, presses)
     if film.scattered:
-        yield f"The presses scatter {film.scatter:.2g} times as much as noise and rig are said to."
+        yield (
+            f"The presses scatter about the corrected map by {film.scatter:.2g} times what noise and rig explain: more "
+            "noise than assumed, or a film that the correction follows only roughly."
+        )
 
 
 def _correction(film: RigFilm, presses: MeasuredPresses) -> str:

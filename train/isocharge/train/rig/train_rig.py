@@ -98,8 +98,8 @@ def train_rig(
     film = _film(rig, films, presses[~held], domain, warn)
     if film.scattered:
         warn(
-            f"the presses scatter {film.scatter:.2g} times as much as noise and rig are said to; the model's standard "
-            "deviations are for the noise it is trained with (training.noise in --config)"
+            f"the presses scatter about the corrected map by {film.scatter:.2g} times what noise and rig explain; the "
+            "model's standard deviations are for the noise it is trained with (training.noise in --config)"
         )
     config = config or FitConfig()
     return train_model(
