@@ -3,10 +3,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all docs bench soak release report proto clean
+.PHONY: demo test test-all attack docs bench soak release report proto clean
 
 # Tests that measure time, or wait for a port to come back: one at a time. All others share the cores, a file a worker.
-ALONE := tests/serve/live tests/serve/port tests/serve/virtual_sensor tests/serve/test_end_to_end.py tests/test_live.py
+ALONE := tests/serve/live tests/serve/port tests/serve/virtual_sensor tests/serve/test_end_to_end.py tests/test_live.py tests/test_bench.py
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
 demo: $(VENV)/installed
@@ -22,6 +22,11 @@ test: $(VENV)/installed
 
 test-all: docs
 	$(BIN)/python -m pytest -m "slow or not slow"
+
+# More than a million bad inputs for every reader, and a good client beside each attack; ten minutes on two cores.
+attack: $(VENV)/installed
+	$(BIN)/python -m pytest tests/attacks -m slow -rP
+	$(ONE_THREAD) $(BIN)/python -m pytest tests/attacks --all-attacks -n 2 --timeout 900
 
 # The reference of all modules, from their docstrings: build/docs/index.html. A warning is an error.
 docs: $(VENV)/installed

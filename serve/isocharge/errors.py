@@ -74,6 +74,10 @@ class TooLarge(RequestError):
     """A request is larger than the server's limits."""
 
 
+class TooMany(RequestError):
+    """More calls are open than the server's limits allow."""
+
+
 class UnknownEncoding(RequestError):
     """A body is compressed in a way that the server does not read."""
 

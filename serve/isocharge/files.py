@@ -1,19 +1,62 @@
 """Files and folders that exist whole or not at all."""
 
+import errno
 import hashlib
 import os
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
 from isocharge.errors import IsochargeError, OutputError, OutputExists
+
+MOST_BYTES = 64 << 20
+"""Largest file that is read whole, bytes: far more than any file of ours has."""
+
+LONGEST_LINE = 1 << 20
+"""Longest line of a text that is read line by line, characters."""
 
 
 def sha256_of(data: bytes) -> str:
     """Hexadecimal SHA-256."""
     return hashlib.sha256(data).hexdigest()
+
+
+def read_whole(path: Path, most: int = MOST_BYTES) -> bytes:
+    """The bytes of a regular file.
+
+    Args:
+        path: The file. A pipe or a device is refused, because to read one may never end.
+        most: Largest size, bytes.
+
+    Raises:
+        OSError: If it cannot be read, is no regular file, or is larger; `strerror` says which.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    state = os.fstat(descriptor)
+    if not stat.S_ISREG(state.st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    with os.fdopen(descriptor, "rb") as file:
+        data = file.read(most + 1) if state.st_size <= most else b""
+        if max(len(data), state.st_size) > most:
+            raise OSError(errno.EFBIG, f"larger than {most} bytes", str(path))
+        return data
+
+
+def bounded_lines(file: TextIO, longest: int = LONGEST_LINE) -> Iterator[str]:
+    """The lines of a text, each with its end, none longer than can be held.
+
+    Raises:
+        ValueError: If a line has more than `longest` characters, or is no text in the encoding of the file.
+    """
+    while line := file.readline(longest + 1):
+        if len(line) > longest:
+            raise ValueError(f"a line is longer than {longest} characters")
+        yield line
 
 
 def refuse_existing(path: Path) -> None:

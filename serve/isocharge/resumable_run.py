@@ -13,14 +13,20 @@ import fcntl
 import json
 import shutil
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from isocharge.errors import InputError, OutputError, OutputExists, SolveError, TrainingError
-from isocharge.files import new_folder, refuse_existing, sha256_of, sync_folder, write_whole
+from isocharge.files import new_folder, read_whole, refuse_existing, sha256_of, sync_folder, write_whole
 from isocharge.progress import Warn
+from isocharge.tables import cut, read_json
+
+Content = TypeVar("Content")
+
+MOST_PART_BYTES = 1 << 30
+"""Largest part of a run, bytes."""
 
 
 class ResumableRun:
@@ -48,18 +54,29 @@ class ResumableRun:
 
     def load(self, name: str, *, final: bool = False) -> bytes | None:
         """A finished part, or None if it must be computed; a damaged part gives a warning and None."""
+        return self.load_as(name, bytes, final=final)
+
+    def load_as(self, name: str, decode: Callable[[bytes], Content], *, final: bool = False) -> Content | None:
+        """As `load`, and decoded; a part that cannot be decoded is damaged, too, whatever its checksum says.
+
+        Args:
+            name: Of the part.
+            decode: From its bytes to its content; may raise any error.
+            final: Whether it belongs to the target.
+        """
         try:
-            checksum = (self._parts / f"{name}.sha256").read_text()
-        except (FileNotFoundError, UnicodeDecodeError):
+            checksum = read_whole(self._parts / f"{name}.sha256").decode()
+        except (OSError, UnicodeDecodeError):
             return None
         path = self._place(name, final)
-        data = path.read_bytes() if path.is_file() else b""
-        if sha256_of(data) == checksum:
-            return data
-        self._warn(
-            f"{path} is damaged: expected sha256 {checksum[:12]}..., got {sha256_of(data)[:12]}...; computed again"
-        )
-        return None
+        try:
+            data = read_whole(path, MOST_PART_BYTES)
+            if sha256_of(data) != checksum:
+                raise ValueError(f"expected sha256 {checksum[:12]}..., got {sha256_of(data)[:12]}...")
+            return decode(data)
+        except Exception as error:  # decoders of other packages raise what they like
+            self._warn(f"{path} is damaged: {cut(str(error) or type(error).__name__)}; computed again")
+            return None
 
     def is_empty(self) -> bool:
         """Whether no part is finished yet."""
@@ -198,8 +215,8 @@ def _lock(folder: Path) -> Iterator[None]:
 
 def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
     try:
-        saved = json.loads((folder / "run.json").read_text())
-    except (FileNotFoundError, ValueError) as error:
+        saved = read_json(folder / "run.json", "the settings of a run", InputError)
+    except InputError as error:
         raise OutputExists(
             f"{folder} is in the way: it holds no run.json that can be read; choose another output or remove it"
         ) from error
@@ -217,4 +234,4 @@ def _differences(saved: Any, current: Any, name: str = "") -> Iterator[str]:
             if saved.get(key) != current.get(key):
                 yield from _differences(saved.get(key), current.get(key), f"{name}.{key}" if name else key)
     else:
-        yield f"{name or 'run.json'} is {saved} there, {current} here"
+        yield f"{name or 'run.json'} is {cut(str(saved))} there, {cut(str(current))} here"

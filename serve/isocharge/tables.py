@@ -6,22 +6,42 @@ A `Table` knows the file it comes from, its own name in it, and the error to rai
     mine.toml: unknown key 'film.radius'; known are radius_mm, thickness_um
     mine.toml: key 'film.radius_mm' is missing
 
-A number is an int or a float, never a bool, and finite. Long values are cut in messages.
+A number is an int or a float, never a bool, and finite; a whole number has 63 bits at most. Long values are cut in
+messages. Tables and lists that are nested deeper than `DEEPEST` are refused where the text is read, so that nothing
+behind it, which may go down into them by recursion, has to think of that.
 """
 
+import json
 import math
+import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NoReturn, TypeGuard
 
 from isocharge.errors import InputError
+from isocharge.files import read_whole
 
 REQUIRED: Final = object()
 """The default of a key that must be there."""
 
 LONGEST_VALUE = 200
 """Characters of a wrong value, or of a list of keys, that a message shows."""
+
+LONGEST_TEXT = 1000
+"""Characters of a text: names stand in messages, records and pages."""
+
+DEEPEST = 32
+"""Levels of tables and lists in each other; our files have up to six."""
+
+_TOO_DEEP = f"nested in more than {DEEPEST} levels"
+
+_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
+_DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_PART}\.[ \t]*+){{{DEEPEST}}}")
+"""A key with more dots than `DEEPEST`, before it is parsed: Python needs memory as the square of their number."""
+
+MOST_TOML_BYTES, MOST_JSON_BYTES = 1 << 18, 1 << 22
+"""Largest file of settings, bytes; Python reads TOML a hundred times slower than JSON."""
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
@@ -35,14 +55,14 @@ def is_number(value: object) -> TypeGuard[int | float]:
 
 
 def is_whole(value: object) -> TypeGuard[int]:
-    """Whether a value is an int; a bool is not."""
-    return isinstance(value, int) and not isinstance(value, bool)
+    """Whether a value is an int of 64 bits; a bool is not."""
+    return isinstance(value, int) and not isinstance(value, bool) and -(1 << 63) <= value < 1 << 63
 
 
 def shown(value: object) -> str:
     """A value for a message: its repr, cut after `LONGEST_VALUE` characters."""
     try:
-        return _cut(repr(value))
+        return cut(repr(value))
     except (RecursionError, ValueError):  # nested too deeply; an int with more digits than Python prints
         return f"a {type(value).__name__} that is too large to print"
 
@@ -55,21 +75,56 @@ def read_toml(path: Path, what: str, error: type[InputError]) -> dict[str, Any]:
         what: What the file should be, for messages: "a device file".
         error: Raised if it cannot be read, or is no TOML in UTF-8.
     """
+    return parse_toml(_text(path, MOST_TOML_BYTES, what, "TOML", error), str(path), error)
+
+
+def read_json(path: Path, what: str, error: type[InputError]) -> Any:
+    """The value in a JSON file; the arguments are those of `read_toml`."""
+    return parse_json(_text(path, MOST_JSON_BYTES, what, "JSON", error), str(path), error)
+
+
+def _text(path: Path, most: int, what: str, language: str, error: type[InputError]) -> str:
     try:
-        text = path.read_text("utf-8")
+        return read_whole(path, most).decode("utf-8")
     except OSError as cause:
-        raise error(f"{path}: cannot be read ({cause.strerror}); expected {what} in TOML") from cause
+        raise error(f"{path}: cannot be read ({cause.strerror}); expected {what} in {language}") from cause
     except UnicodeDecodeError as cause:
-        raise error(f"{path}: not a TOML file: not text in UTF-8: {cause}") from cause
-    return parse_toml(text, str(path), error)
+        raise error(f"{path}: not a {language} file: not text in UTF-8: {cause}") from cause
 
 
 def parse_toml(text: str, where: str, error: type[InputError]) -> dict[str, Any]:
     """The tables of a text in TOML; `where` opens the message of the error that is raised if it is none."""
     try:
-        return tomllib.loads(text)
+        if _DEEP_KEY.search(text):
+            raise ValueError(_TOO_DEEP)
+        tables: dict[str, Any] = _flat_enough(tomllib.loads(text))
+        return tables
     except (ValueError, RecursionError) as cause:
-        raise error(f"{where}: not a TOML file: {cause}") from cause
+        raise error(f"{where}: not a TOML file: {cut(str(cause))}") from cause
+
+
+def parse_json(text: str | bytes, where: str, error: type[InputError]) -> Any:
+    """The value of a text in JSON; `where`, if not empty, opens the message of the error that is raised otherwise."""
+    try:
+        return _flat_enough(json.loads(text))
+    except (ValueError, RecursionError) as cause:
+        raise error(f"{where + ': ' if where else ''}expected JSON, got {shown(text)} ({cut(str(cause))})") from cause
+
+
+def _flat_enough(value: Any) -> Any:
+    """A value, unless it is nested deeper than `DEEPEST`; without recursion, as it may be nested a million times."""
+    level = [value]
+    for _ in range(DEEPEST + 1):
+        level = [item for holder in level for item in _items(holder)]
+        if not level:
+            return value
+    raise ValueError(_TOO_DEEP)
+
+
+def _items(holder: Any) -> Iterable[Any]:
+    if isinstance(holder, dict):
+        return holder.values()
+    return holder if isinstance(holder, list) else ()
 
 
 class Table:
@@ -103,7 +158,7 @@ class Table:
         """
         for key in self.values:
             if key not in known:
-                self._fail(f"unknown key {shown(self._name(key))}; known are {_cut(', '.join(known))}")
+                self._fail(f"unknown key {shown(self._name(key))}; known are {cut(', '.join(known))}")
         return self
 
     def get(self, key: str, default: Any = REQUIRED) -> Any:
@@ -159,10 +214,12 @@ class Table:
         return value
 
     def text(self, key: str, default: Any = REQUIRED, *, or_empty: bool = False) -> str:
-        """A text that is not empty, unless it may be."""
+        """A text that is not empty, unless it may be, and not longer than `LONGEST_TEXT`."""
         value = self.get(key, default)
         if not isinstance(value, str) or not (value or or_empty):
             self.refuse(key, "a text", value)
+        if len(value) > LONGEST_TEXT:
+            self.refuse(key, f"a text of at most {LONGEST_TEXT} characters", value)
         return value
 
     def choice(self, key: str, options: Sequence[str], default: Any = REQUIRED) -> str:
@@ -212,7 +269,7 @@ class Table:
         raise self.error(f"{self.where}: {message}" if self.where else message)
 
     def _name(self, key: str) -> str:
-        return f"{self.path}.{key}" if self.path else key
+        return cut(f"{self.path}.{key}" if self.path else key)
 
 
 def _kind_of_number(noun: str, least: float, most: float, above: float) -> str:
@@ -234,5 +291,6 @@ def _plain(bound: float) -> str:
     return f"{bound:g}" if isinstance(bound, float) else str(bound)
 
 
-def _cut(text: str) -> str:
+def cut(text: str) -> str:
+    """A text for a message, cut after `LONGEST_VALUE` characters."""
     return text if len(text) <= LONGEST_VALUE else text[:LONGEST_VALUE] + "..."

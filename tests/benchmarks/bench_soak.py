@@ -1,10 +1,11 @@
-"""A long run over HTTP: 32 connections, every answer compared with the in-process one, the server's memory watched.
+"""A long run: 10 clients over HTTP and 6 over gRPC, every answer compared with that in process, memory watched.
 
     python tests/benchmarks/bench_soak.py [--requests 1000000] [--model NAME|PATH] [--seed 0] [--json]
 
-Requests are JSON and binary, of one press and of three, drawn from 1000 that were made before; an answer must equal,
-bit for bit, what `Predictor` says of the same charges. Every 100,000 requests the model is loaded anew while the
-others go on. Memory is the server's resident set, from the end of a warm-up (a twentieth of the requests) to the end.
+Requests are JSON and binary, of one press and of three, drawn from 1000 that were made before; a quarter of them goes
+over gRPC. An answer must equal, bit for bit, what `Predictor` says of the same charges. Ten times the model
+is loaded anew while the others go on. Memory is the server's resident set, from the end of a warm-up (a twentieth of
+the requests) to the end.
 """
 
 import argparse
@@ -16,17 +17,21 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
+import grpc
 import numpy as np
 import orjson
-from bench_http import CONNECTIONS, Connection, binary_request, free_port, http_request, json_request, running
+from bench_http import Connection, binary_request, free_port, http_request, json_request, running
 from bench_predictor import machine
 
 from isocharge.serve import Predictor, find_model
+from isocharge.serve.network.grpc.messages import METHODS, SERVICE
 
 KINDS = 1000
-RELOAD_EVERY = 100_000
+RELOADS = 10
+HTTP_CLIENTS, GRPC_CLIENTS, GRPC_SHARE = 10, 6, 0.25
 
 
 def exchanges(predictor: Predictor, path: str, seed: int) -> list[tuple[bytes, bytes]]:
@@ -70,7 +75,7 @@ def soak(address: tuple[str, int], made: list[tuple[bytes, bytes]], count: int) 
     """Send and compare; yields after each thousand of answers how many there were."""
     asked, answers = itertools.cycle(made), 0
     with selectors.DefaultSelector() as waiting:
-        for _ in range(CONNECTIONS):
+        for _ in range(HTTP_CLIENTS):
             connection = Connection(address)
             request, expected = next(asked)
             waiting.register(connection.socket, selectors.EVENT_READ, [connection, expected])
@@ -88,6 +93,44 @@ def soak(address: tuple[str, int], made: list[tuple[bytes, bytes]], count: int) 
                     yield answers
 
 
+class GrpcClient(Thread):
+    """Asks and compares over a gRPC connection of its own."""
+
+    def __init__(self, address: tuple[str, int], predictor: Predictor, count: int, seed: int) -> None:
+        super().__init__()
+        self._address, self._predictor, self._count, self._seed = address, predictor, count, seed
+        self.failure: BaseException | None = None
+
+    def run(self) -> None:
+        try:
+            with grpc.insecure_channel(
+                "{}:{}".format(*self._address), [("grpc.use_local_subchannel_pool", 1)]
+            ) as channel:
+                self._ask(channel)
+        except BaseException as error:  # said by the main thread
+            self.failure = error
+
+    def _ask(self, channel: grpc.Channel) -> None:
+        request_type, response_type = METHODS["ModelInfer"]
+        infer = channel.unary_unary(
+            f"/{SERVICE}/ModelInfer",
+            request_serializer=request_type.SerializeToString,
+            response_deserializer=response_type.FromString,
+        )
+        rng, electrodes = np.random.default_rng(self._seed), len(self._predictor.metadata.electrodes)
+        made = []
+        for number in range(KINDS):
+            charges = rng.uniform(100.0, 1500.0, (1 if number % 4 else 3, electrodes)).astype(np.float32)
+            tensor = {"name": "charge_pC", "datatype": "FP32", "shape": list(charges.shape)}
+            name = self._predictor.metadata.name
+            request = request_type(model_name=name, inputs=[tensor], raw_input_contents=[charges.tobytes()])
+            made.append((request, _expected(self._predictor, charges)))
+        for request, expected in itertools.islice(itertools.cycle(made), self._count):
+            got = b"".join(infer(request, timeout=60).raw_output_contents)
+            if got != expected:
+                raise RuntimeError(f"gRPC: expected {expected!r}, got {got!r}")
+
+
 def load_again(address: tuple[str, int], name: str) -> None:
     connection = Connection(address)
     connection.send(http_request(f"/v2/repository/models/{name}/load", b""))
@@ -102,19 +145,31 @@ def measure(asked: argparse.Namespace) -> dict[str, Any]:
     name = predictor.metadata.name
     made = exchanges(predictor, f"/v2/models/{name}/infer", asked.seed)
     ours: list[str | Path] = [Path(sys.executable).with_name("isocharge"), "serve", "http"]
-    loads, warm = 0, 0
-    with running([*ours, "--models", folder.parents[1], "--port", str(address[1])], address) as process:
+    over_grpc = round(GRPC_SHARE * asked.requests / GRPC_CLIENTS)
+    over_http = asked.requests - GRPC_CLIENTS * over_grpc
+    loads, warm, grpc_address = 0, 0, ("127.0.0.1", free_port())
+    ports = ["--port", str(address[1]), "--grpc-port", str(grpc_address[1])]
+    with running([*ours, "--models", folder.parents[1], *ports], address) as process:
         begin = time.perf_counter()
-        for answers in soak(address, made, asked.requests):
-            if answers % RELOAD_EVERY == 0:
+        clients = [GrpcClient(grpc_address, Predictor(folder), over_grpc, number) for number in range(GRPC_CLIENTS)]
+        for client in clients:
+            client.start()
+        for answers in soak(address, made, over_http):
+            if answers * RELOADS // over_http > loads:
                 load_again(address, name)
                 loads += 1
-            if not warm and answers >= asked.requests / 20:
+            if not warm and answers >= over_http / 20:
                 load_again(address, name)
                 warm = resident_bytes(process.pid)
+        for client in clients:
+            client.join()
+            if client.failure is not None:
+                raise client.failure
         seconds, end = time.perf_counter() - begin, resident_bytes(process.pid)
     return {
         "requests": asked.requests,
+        "over_grpc": GRPC_CLIENTS * over_grpc,
+        "clients": HTTP_CLIENTS + GRPC_CLIENTS,
         "answers_equal": "all, bit for bit",
         "loads_meanwhile": loads,
         "seconds": round(seconds, 1),

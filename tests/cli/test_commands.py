@@ -43,6 +43,7 @@ SUBCOMMANDS = [
     ("train",),
     ("train", "fit"),
     ("train", "report"),
+    ("train", "calibrate"),
     ("serve",),
     ("serve", "predict"),
     ("serve", "stream"),

@@ -11,6 +11,8 @@ import typer
 
 from isocharge.cli.demo.command import demo_command
 from isocharge.cli.serve.app import serve_app
+from isocharge.cli.shared.standard_streams import open_closed_streams
+from isocharge.cli.shared.terminal import say
 from isocharge.cli.simulate.app import simulate_app
 from isocharge.cli.train.app import train_app
 from isocharge.errors import InputError, IsochargeError
@@ -31,8 +33,9 @@ app.add_typer(serve_app, name="serve")
 def main() -> None:
     """Run the command line; the one place that maps errors to exit codes. SIGTERM ends a command as Ctrl-C does."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    open_closed_streams()
     try:
         app()
     except (IsochargeError, OSError, MemoryError) as error:
-        typer.echo(f"{type(error).__name__}: {error}", err=True)
+        say(f"{type(error).__name__}: {error}")
         sys.exit(2 if isinstance(error, InputError) else 1)

@@ -19,6 +19,8 @@ from isocharge.serve.live.device import Device
 from isocharge.serve.live.device_file import device_from_table, load_device
 from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
 from isocharge.serve.live.port_check import Examination, examine
+from isocharge.serve.live.reading_stream import ReadingStream
+from isocharge.serve.live.steady_press import PressWatch, SteadyPress, SteadyRule
 from isocharge.serve.live.stream import Policy, TouchStream, stream
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import Model, check_golden, load_model, write_model
@@ -69,11 +71,15 @@ __all__ = [
     "Port",
     "PredictionRecord",
     "Predictor",
+    "PressWatch",
+    "ReadingStream",
     "RecordedClock",
     "Recorder",
     "Recording",
     "Script",
     "SequenceGaps",
+    "SteadyPress",
+    "SteadyRule",
     "Tare",
     "TareRule",
     "TextParser",

@@ -197,7 +197,7 @@ def test_warming_is_subtracted_where_the_misfit_shows_it(four, monkeypatch):
     film, predictor = four
     press = film.charge_pC(np.array([2.0]), np.array([1.0]), np.array([0.5]))[0]
     path = TouchStream(predictor, device_from_table({"tare": {"frames": 10}, "common_mode": {}}, "test"))
-    monkeypatch.setattr(path, "_misfit", lambda q: np.abs(q - press).max(axis=1))
+    monkeypatch.setattr(path._readings, "_misfit", lambda q: np.abs(q - press).max(axis=1))
     rows = [np.zeros(4)] * 15 + [press + 40.0 * k / 200 for k in range(400)] + [np.full(4, 80.0)] * 5
     records = [record for frame in frames(rows) for record in path.feed(chunk(frame))]
     assert "thermal" not in records[20].flags

@@ -17,7 +17,8 @@ MODELS = Path(__file__).parents[3] / "models"
 NAMES = model_names(MODELS)
 
 
-RELEASED = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial")
+FILMS = ("four-25um-biaxial-films", "three-25um-biaxial-films", "four-25um-uniaxial-films")
+RELEASED = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial", *FILMS)
 LARGEST = 1_000_000
 
 
@@ -66,7 +67,14 @@ def test_triton_reads_its_configuration(model):
 
 
 def test_it_is_small(model):
-    assert sum(path.stat().st_size for path in model.folder.rglob("*") if path.is_file()) < LARGEST
+    sizes = {path.name: path.stat().st_size for path in model.folder.rglob("*") if path.is_file()}
+    assert sizes.pop("films.npz", 0) <= LARGEST
+    assert sum(sizes.values()) < LARGEST
+
+
+@pytest.mark.parametrize("name", FILMS)
+def test_models_for_all_films_have_their_file(name):
+    assert (find_model(MODELS / name) / "films.npz").is_file()
 
 
 def test_golden_vectors_are_reproduced(model):

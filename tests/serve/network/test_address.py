@@ -1,5 +1,7 @@
 """Where a server listens and whom it lets in: addresses, Unix sockets, tokens, certificate files."""
 
+import datetime
+import os
 import socket
 import stat
 
@@ -100,3 +102,64 @@ def test_other_machines_need_a_token(host):
 @pytest.mark.parametrize("address", [Address(), Address("127.0.0.2"), Address("::1"), Address("localhost")])
 def test_this_machine_needs_none(address):
     check_exposure(address, token=False, insecure=False)
+
+
+def test_a_file_in_the_place_of_the_socket_stays(handler, tmp_path):
+    path = tmp_path / "touch.sock"
+    server = HttpServer(App(handler), Address(uds=path), limits=handler.limits)
+    path.unlink()
+    path.write_text("mine")
+    server.close()
+    assert path.read_text() == "mine"
+
+
+def test_another_server_s_socket_stays(handler, tmp_path):
+    path = tmp_path / "touch.sock"
+    first = HttpServer(App(handler), Address(uds=path), limits=handler.limits)
+    path.rename(tmp_path / "old.sock")  # so that the new one cannot get its number
+    second = HttpServer(App(handler), Address(uds=path), limits=handler.limits)
+    first.close()
+    assert path.is_socket()
+    second.close()
+    assert not path.exists()
+
+
+def test_a_link_that_leads_nowhere(tmp_path):
+    path = tmp_path / "touch.sock"
+    path.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(ListenError, match="found a symbolic link that leads nowhere"):
+        Address(uds=path).listen(1)
+    assert path.is_symlink()
+
+
+@pytest.mark.parametrize(("days", "said"), [((-9, -1), "expired"), ((1, 9), "not yet valid")])
+def test_a_certificate_out_of_date(tmp_path, days, said):
+    now = datetime.datetime.now(datetime.UTC)
+    begin, end = (now + datetime.timedelta(days=day) for day in days)
+    issued = trustme.CA().issue_cert("127.0.0.1", not_before=begin, not_after=end)
+    issued.private_key_and_cert_chain_pem.write_to_path(tmp_path / "both.pem")
+    with pytest.raises(InputError, match=rf"both\.pem: expected a certificate that is valid today.*{said}.*renew it"):
+        Tls(tmp_path / "both.pem").context()
+
+
+@pytest.mark.timeout(20)
+def test_a_certificate_that_is_a_pipe(tmp_path):
+    os.mkfifo(tmp_path / "cert.pem")
+    with pytest.raises(InputError, match="not a regular file"):
+        Tls(tmp_path / "cert.pem").context()
+
+
+@pytest.mark.parametrize("scheme", ["Bearer", "bearer", "BEARER", "bEaReR"])
+def test_the_scheme_has_no_case(scheme):
+    token = Token("sesame")
+    token.check(f"{scheme} sesame".encode())
+    token.check(f"{scheme}  sesame".encode())
+    for wrong in ("Sesame", "sesam", "", "sesame "):
+        with pytest.raises(TokenError):
+            token.check(f"{scheme} {wrong}".encode())
+
+
+@pytest.mark.parametrize("header", [b"sesame", b"Basic sesame", b"Bearersesame", b"Bearer", b" Bearer sesame", b""])
+def test_other_schemes_do_not_count(header):
+    with pytest.raises(TokenError):
+        Token("sesame").check(header)

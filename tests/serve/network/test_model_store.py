@@ -1,17 +1,26 @@
 """What serves, what is refused, and how one takes the other's place while requests are under way."""
 
 import json
+import os
+import re
+import resource
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from threading import Event
 
 import numpy as np
+import onnx
 import pytest
+from onnx import helper, numpy_helper
 
 from isocharge.errors import ModelError, ModelNotFound
 from isocharge.files import sha256_of
+from isocharge.serve.network import model_store
 from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.infer import InferRequest, infer
+from isocharge.serve.network.protocol.page import page
 
 
 @pytest.fixture
@@ -187,3 +196,131 @@ def test_swaps_neither_drop_nor_mix_answers(film, store, folder):
             seen += asked.result()
     assert len(seen) > 100
     assert len(set(seen)) == 2  # both numbers of the one model, or both of the other
+
+
+def a_failing_graph(version):
+    """A graph that declares the right shapes and cannot be run on the golden charges."""
+    model = onnx.load_from_string((version / "model.onnx").read_bytes())
+    model.graph.initializer.append(numpy_helper.from_array(np.array([99], dtype=np.int64), "row 99"))
+    node = next(node for node in model.graph.node if "contact" in node.output)
+    node.output[0] = "inner"
+    model.graph.node.append(helper.make_node("Gather", ["inner", "row 99"], ["one row"], axis=0))
+    model.graph.node.append(helper.make_node("Mul", ["inner", "one row"], ["contact"]))
+    put_in_place(version, model.SerializeToString())
+
+
+def put_in_place(version, graph):
+    """Another graph, with a checksum that fits."""
+    (version / "model.onnx").write_bytes(graph)
+    content = json.loads((version / "golden.json").read_text())
+    (version / "golden.json").write_text(json.dumps(content | {"sha256": sha256_of(graph)}))
+
+
+def unequal_lengths(version):
+    content = json.loads((version / "golden.json").read_text())
+    content["outputs"]["contact"].pop()
+    (version / "golden.json").write_text(json.dumps(content))
+
+
+def a_pipe(name):
+    def spoil(version):
+        (version / name).unlink()
+        os.mkfifo(version / name)
+
+    return spoil
+
+
+def sparse(name):
+    """Six gigabytes of which the disk has nothing."""
+
+    def spoil(version):
+        with (version / name).open("r+b") as file:
+            file.truncate(6 << 30)
+
+    return spoil
+
+
+BROKEN = {
+    "nested": (lambda version: (version / "golden.json").write_text("[" * 100_000), "expected JSON"),
+    "deep": (lambda version: (version / "golden.json").write_text("[" * 900 + "]" * 900), "nested in more than"),
+    "unequal": (unequal_lengths, r"expected answers of shape \(8, 3\), got \(7, 3\)"),
+    "pipe": (a_pipe("model.onnx"), "cannot be read .not a regular file"),
+    "golden pipe": (a_pipe("golden.json"), "cannot be read .not a regular file"),
+    "sparse": (sparse("model.onnx"), "cannot be read .larger than"),
+    "golden sparse": (sparse("golden.json"), "cannot be read .larger than"),
+    "graph": (a_failing_graph, "the model's graph fails when it is run"),
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+@pytest.mark.timeout(20)
+def test_a_broken_folder_takes_no_other_with_it(film, tmp_path, how):
+    """At the start, and when it is loaded while others serve."""
+    spoil, said = BROKEN[how]
+    film.write(tmp_path)
+    film.write(tmp_path, name="other")
+    store = open_model_store(tmp_path)
+    spoil(tmp_path / "other/1")
+    with pytest.raises(ModelError, match=said):
+        store.load("other")
+    assert store.get("other")  # with its old files
+    store = open_model_store(tmp_path)
+    assert [loaded.metadata.name for loaded in store.all()] == ["linear"]
+    assert re.search(said, store.refusals()[0])
+
+
+def test_what_nobody_thought_of_takes_no_other_with_it(film, tmp_path, monkeypatch, caplog):
+    film.write(tmp_path)
+    film.write(tmp_path, name="other")
+    load = model_store.load_model
+
+    def fail(folder):
+        if folder.parent.name == "other":
+            raise ZeroDivisionError("a secret")
+        return load(folder)
+
+    monkeypatch.setattr(model_store, "load_model", fail)
+    store = open_model_store(tmp_path)
+    assert "cannot be checked (ZeroDivisionError)" in store.refusals()[0]
+    assert "a secret" in caplog.text
+
+
+def test_names_that_no_model_has(film, tmp_path):
+    """They would stand in pages and messages: the model is refused, and its folder's name escaped."""
+    film.write(tmp_path)
+    name = '"><svg onload=alert(1)>'
+    folder = tmp_path / name / "1"
+    shutil.copytree(tmp_path / "linear/1", folder)
+    model = onnx.load_from_string((folder / "model.onnx").read_bytes())
+    next(prop for prop in model.metadata_props if prop.key == "name").value = json.dumps(name)
+    put_in_place(folder, model.SerializeToString())
+    store = open_model_store(tmp_path)
+    assert [loaded.metadata.name for loaded in store.all()] == ["linear"]
+    assert "<svg" not in page(store)
+    assert "&lt;svg" in page(store)
+
+
+def test_a_name_in_a_link_is_quoted(store):
+    """Should one get through all the same."""
+    loaded = store.get("linear", "2")
+    spoilt = replace(loaded, metadata=replace(loaded.metadata, name='"><svg onload=alert(1)>'))
+    store._entries = {"linear": replace(store._entries["linear"], versions={2: spoilt})}
+    assert "<svg" not in page(store)
+
+
+def test_a_load_without_descriptors_is_refused(film, tmp_path):
+    """The machine's shortage is an answer below 500, and over when it is over."""
+    film.write(tmp_path)
+    handler = Handler(open_model_store(tmp_path))
+    paths = ("/v2/repository/models/linear/load", "/v2/repository/index")
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
+        posts = [handler.answer("POST", path, [], b"") for path in paths]
+        gets = [handler.answer("GET", path, [], b"") for path in ("/", "/v2", "/openapi.json")]
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert [answer.status for answer in posts] == [400, 400]
+    assert b"Too many open files" in posts[0].body
+    assert [answer.status for answer in gets] == [200, 200, 200]
+    assert handler.answer("POST", paths[0], [], b"").status == 200

@@ -102,3 +102,46 @@ def test_line_of_foreign_json_is_damaged(recorded, line):
     recorded.write_text("\n".join([first, line, *lines]))
     with pytest.raises(RecordingError, match="line 2: damaged"):
         list(Recording(recorded).events())
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "[" * 100_000,
+        '{"isocharge_recording": 1, "model": 5, "policy": "every", "device": {}}',
+        '{"isocharge_recording": 1, "model": "m/1", "policy": ["every"], "device": {}}',
+        '{"isocharge_recording": 1, "model": "m/1", "policy": "some", "device": {}}',
+        '{"isocharge_recording": 1, "model": "m/1", "policy": "every", "device": []}',
+        '{"isocharge_recording": [], "model": "m/1", "policy": "every", "device": {}}',
+        '{"isocharge_recording": 1, "model": "m/1", "policy": "every", "device": ' + '{"a":' * 900 + "1" + "}" * 901,
+        "x" * 3_000_000,
+    ],
+)
+def test_headers_of_the_wrong_types(tmp_path, header):
+    path = tmp_path / "touch.rec"
+    path.write_text(header + "\n")
+    with pytest.raises(RecordingError, match="expected a recording of") as caught:
+        Recording(path)
+    assert len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "[" * 100_000,
+        '{"chunk": [1e9, 5, 0.0, 7]}',
+        '{"chunk": [1e9, 5, NaN, "YWJj"]}',
+        '{"chunk": [1e300, 5, 0.0, "YWJj"]}',
+        '{"chunk": [1e9, 11111111111111111111111, 0.0, "YWJj"]}',
+        '{"chunk": [true, 5, 0.0, "YWJj"]}',
+        '{"timestamp": 1, "latency_us": 1e300}',
+        '{"timestamp": 1, "latency_us": "1_0"}',
+        '{"chunk": [1e9, 5, 0.0, "' + "A" * 3_000_000 + '"]}',
+    ],
+)
+def test_lines_that_no_recorder_writes(recorded, line):
+    head, *rest = recorded.read_text().splitlines()
+    recorded.write_text("\n".join([head, line, *rest]) + "\n")
+    with pytest.raises(RecordingError, match="line 2: damaged") as caught:
+        list(Recording(recorded).events())
+    assert len(str(caught.value)) < 600

@@ -175,3 +175,10 @@ def test_probes_are_needed():
         Sweep().over(())
     with pytest.raises(SceneError, match="samples: expected at least one for each of 3 probes, got 2"):
         Sweep(samples=2, sampling="grid").over(PROBES)
+
+
+@pytest.mark.parametrize("force_range", [(0.0, 0.0), (0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (1.0, np.inf), (np.nan, 1.0)])
+def test_forces_that_cannot_be(force_range):
+    """Said before a logarithm is taken of them."""
+    with pytest.raises(SceneError, match="force: expected 0 < smallest <= largest force"):
+        Sweep(force_range=force_range)

@@ -2,8 +2,10 @@
 
 import errno
 import hashlib
+import io
 import json
 import shutil
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -314,3 +316,48 @@ def test_existing_folder_is_kept(tmp_path):
         write_dataset(tmp_path / "presses", SENSOR, [samples()], ABOUT)
     assert (tmp_path / "presses" / "mine.txt").read_text() == "mine"
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def packed(data: bytes) -> bytes:
+    """An npz file whose columns are these bytes."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
+        for name in COLUMNS:
+            file.writestr(f"{name}.npy", data)
+    return buffer.getvalue()
+
+
+def npy(shape: str, dtype: str = "<f8", data: bytes = b"") -> bytes:
+    head = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + data
+
+
+SHARDS = {
+    "empty": b"",
+    "garbage": b"garbage",
+    "end of a zip": packed(b"")[-22:],
+    "no arrays": packed(b""),
+    "one number": packed(npy("()", data=bytes(8))),
+    "a trillion numbers": packed(npy("(1000000000000,)")),
+    "numbers without width": packed(npy("(99999999999999999999,)", "|V0")),
+    "zeros for ever": packed(npy("(25000000,)", data=bytes(200_000_000))),
+    "an object": packed(npy("(1,)", "|O", b"cos\nsystem\n(S'true'\ntR.")),
+}
+
+
+@pytest.mark.parametrize("how", SHARDS)
+def test_anything_in_a_shard_whose_checksum_fits(dataset, how):
+    data = SHARDS[how]
+    (dataset / "shard-00000.npz").write_bytes(data)
+    edit(dataset, lambda manifest: manifest["shards"][0].update(sha256=hashlib.sha256(data).hexdigest()))
+    with pytest.raises(DatasetError, match=r"shard-00000\.npz: (not a shard with the columns|expected columns)"):
+        read_dataset(dataset)
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"format_version": ' + "[" * 500, '{"format_version": 1' + "0" * 5000]
+)
+def test_a_manifest_that_is_nested_deeply(dataset, text):
+    (dataset / "manifest.json").write_text(text)
+    with pytest.raises(DatasetError, match=r"manifest\.json: not a manifest of a dataset"):
+        read_dataset(dataset)

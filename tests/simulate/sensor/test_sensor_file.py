@@ -4,6 +4,7 @@ import copy
 import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -456,3 +457,15 @@ def test_file_that_is_not_text(tmp_path):
 def test_value_that_is_no_table_is_refused(table):
     with pytest.raises(SensorError, match=r"^sensor: expected a table, got "):
         sensor_from_dict(table)
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("count", [65, 1000, 200_000])
+def test_too_many_electrodes_are_refused_at_once(tmp_path, count):
+    path = tmp_path / "sensor.toml"
+    good = (resources.files("isocharge.simulate") / "sensors/three-25um-biaxial.toml").read_text("utf-8")
+    head, tail = good.split("side_mm = 3.0\n")
+    path.write_text(head + "side_mm = 3.0\n" + "".join(f"e{k} = [0, 0]\n" for k in range(count)) + tail)
+    with pytest.raises(SensorError, match=r"larger than|at most 64") as caught:
+        load_sensor(path)
+    assert len(str(caught.value)) < 500

@@ -19,7 +19,7 @@ MODELS = Path(__file__).parents[3] / "models"
 
 TINY = FilmsConfig(
     hidden=(24, 24), misfit_hidden=(16, 16), films=48, presses=32, watched=8, steps=300, misfit_films=3,
-    misfit_charges=64, misfit_steps=40, batch_films=16, batch_presses=32,
+    misfit_charges=24, near_films=4, misfit_steps=40, batch_films=16, batch_presses=32,
 )  # fmt: skip
 
 

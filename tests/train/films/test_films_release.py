@@ -7,6 +7,7 @@ from isocharge.errors import OutputExists
 from isocharge.serve import Predictor, check_golden, load_model
 from isocharge.train import read_films, train_films
 from isocharge.train.films import fit as films_fit
+from isocharge.train.films import misfit_films
 from isocharge.train.films import release as films_release
 from isocharge.train.films.films_file import FILE
 from isocharge.train.films.measure import films_errors, fresh_films
@@ -27,6 +28,7 @@ def solved(films, monkeypatch):
 
     monkeypatch.setattr(films_fit, "FilmFamily", Solved)
     monkeypatch.setattr(films_release, "fresh_films", lambda model: fresh_films(model, 4, 32))
+    monkeypatch.setattr(misfit_films, "CANDIDATES", 64)
 
 
 @pytest.mark.usefixtures("solved")
@@ -53,14 +55,14 @@ def test_a_tiny_training_end_to_end(films, tiny, tmp_path):
 
 @pytest.mark.usefixtures("solved")
 def test_a_stopped_run_goes_on_with_the_same_weights(films, tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
+    monkeypatch.setattr(checkpoint, "EVERY_S", 0.1)
     straight = train_films(films.prior, tmp_path / "straight", tiny)
 
     class Stop(Exception):
         pass
 
     def stop(done, _, text):
-        if "contact: " in text and done > films_fit.FAMILY_STEPS + films_fit.PRESSES_STEPS + 150:
+        if "contact: " in text and done >= films_fit.FAMILY_STEPS + films_fit.PRESSES_STEPS + 200:
             raise Stop
 
     with pytest.raises(Stop):
@@ -77,15 +79,16 @@ def test_an_existing_version_is_refused_before_any_work(films, tiny, tmp_path):
         train_films(films.prior, tmp_path / "tiny", tiny)
 
 
-def test_the_film_that_is_assumed_has_the_lower_error(films):
+def test_the_film_that_is_assumed_has_the_lower_error(films, monkeypatch):
     """`model.onnx` is folded for the film that errs least over all films when none is told."""
     drawn = fresh_films(films, 6, 64)
+    monkeypatch.setattr(films_release, "fresh_films", lambda _: drawn)
     measured = films_release._Measured.of(films)
     chosen, rival = (
         films_errors(films, drawn, parameters)["position_rms_mm"]
         for parameters in (measured.parameters, films.prior.described)
     )
-    assert chosen <= rival * 1.1
+    assert chosen < rival
     assert measured.known["position_rms_mm"] < 0.5 * measured.unknown["position_rms_mm"]
 
 

@@ -17,6 +17,7 @@ with require("train"):
     from isocharge.train.calibration.films_for import SensorFilms, films_for
     from isocharge.train.calibration.folder import read_earlier, write_calibration
     from isocharge.train.calibration.next_press import ProposedPress, next_presses
+    from isocharge.train.calibration.session import BenchSession
     from isocharge.train.films.config import FilmsConfig
     from isocharge.train.films.films_file import read_films
     from isocharge.train.films.films_model import FilmsModel, write_film_model
@@ -29,6 +30,7 @@ with require("train"):
 
 __all__ = [
     "BayesLimit",
+    "BenchSession",
     "Calibration",
     "CalibrationScene",
     "EarlierFilm",

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.serve.options import DeviceOption, ModelsOption, board_of
-from isocharge.cli.shared.options import JsonOption
+from isocharge.cli.serve.options import ModelsOption
+from isocharge.cli.shared.options import DeviceOption, JsonOption, board_of
 
 if TYPE_CHECKING:
     from isocharge.serve import Examination

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from isocharge.cli.shared.standard_streams import announce
 from isocharge.cli.shared.terminal import say
 from isocharge.errors import InputError
 from isocharge.extras import require
@@ -90,6 +91,8 @@ def http_command(
     from isocharge.serve.network.tls import Tls
     from isocharge.serve.network.token import Token
 
+    if token is None:
+        token = os.environ.get("ISOCHARGE_TOKEN")  # the option takes an empty variable for none
     address = Address(host, port, uds)
     check_exposure(address if grpc_port is None else Address(host), token=token is not None, insecure=insecure)
     if tls_key is not None and tls_cert is None:
@@ -111,7 +114,7 @@ def http_command(
     with suppress(KeyboardInterrupt), closing(server), _grpc(handler, host, grpc_port, secret, tls) as grpc_url:
         say("serving " + ", ".join(served.metadata.label for served in store.all()) + "; Ctrl-C stops")
         for url in filter(None, (server.url, grpc_url)):
-            print(url, flush=True)
+            announce(url)
         server.run()
 
 

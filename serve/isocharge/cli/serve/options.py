@@ -2,12 +2,9 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-
-if TYPE_CHECKING:
-    from isocharge.serve import Device
 
 ModelsOption = Annotated[
     Path | None,
@@ -15,13 +12,6 @@ ModelsOption = Annotated[
         "--models",
         metavar="DIR",
         help="Folder in which a model's name is looked up before the usual places. (default: none)",
-    ),
-]
-
-DeviceOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--device", metavar="FILE", help="Description of the board that sends the charges, TOML. (default: none)"
     ),
 ]
 
@@ -53,11 +43,3 @@ UdpOption = Annotated[
         help="Also send each record as JSON in a UDP packet, as to PlotJuggler. (default: no)",
     ),
 ]
-
-
-def board_of(path: Path | None) -> "Device":
-    """The board that a device file describes; without one, any board."""
-    from isocharge.serve import load_device
-    from isocharge.serve.live.device import ANY_BOARD
-
-    return load_device(path) if path else ANY_BOARD

@@ -1,8 +1,9 @@
 """`isocharge serve predict`: charges from a file to contacts."""
 
 import sys
-from collections.abc import Iterable
-from io import BytesIO, TextIOWrapper
+from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +14,7 @@ from isocharge.cli.shared.options import ModelArgument
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import say
 from isocharge.errors import InputError
+from isocharge.files import bounded_lines
 
 
 def predict_command(
@@ -38,7 +40,7 @@ def predict_command(
 
     predictor = Predictor(model, models=models)
     where = "stdin" if file == "-" else file
-    charge_pC = read_charges(_text(file), predictor.metadata.electrodes, where, say)
+    charge_pC = read_charges(_lines(file), predictor.metadata.electrodes, where, say)
     with until_stopped():
         if json:
             _print_lines(record.to_json() for record in table_records(charge_pC, predictor))
@@ -47,13 +49,17 @@ def predict_command(
             sys.stdout.flush()
 
 
-def _text(file: str) -> TextIOWrapper:
-    """A file, or stdin for `-`, as text for the csv module, without a byte order mark."""
+def _lines(file: str) -> Iterator[str]:
+    """Lines of a file, or of stdin for `-`, for the csv module, without a byte order mark."""
     try:
-        data = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
+        with nullcontext(sys.stdin.buffer) if file == "-" else Path(file).open("rb") as data:
+            text = TextIOWrapper(data, encoding="utf-8-sig", newline="")
+            try:
+                yield from bounded_lines(text)
+            finally:
+                text.detach()  # or it closes stdin
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); expected a CSV file, or - for stdin") from error
-    return TextIOWrapper(BytesIO(data), encoding="utf-8-sig", newline="")
 
 
 def _print_lines(lines: Iterable[str]) -> None:

@@ -1,6 +1,5 @@
 """Where the records of `serve stream` and `serve replay` go, and the summary at the end."""
 
-import sys
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
@@ -32,32 +31,35 @@ def write_records(records: "Iterable[tuple[PredictionRecord, str]]", write: Line
             latencies.append(record.latency_us)
 
 
-def record_writer(stack: ExitStack, output: Output, udp: str | None, electrodes: tuple[str, ...]) -> Lines:
-    """The function that writes each record: to stdout at once, and to the network."""
+def record_writer(
+    stack: ExitStack, output: Output, udp: str | None, electrodes: tuple[str, ...], put: Callable[[str], object]
+) -> Lines:
+    """The function that gives each record to `put` as a line, and sends it to the network."""
     from isocharge.serve import UdpSink, csv_header, csv_line
 
     sink = stack.enter_context(UdpSink(udp)) if udp else None
     if output is Output.csv:
-        print(csv_header(electrodes), flush=True)
+        put(csv_header(electrodes) + "\n")
 
     def write(record: "PredictionRecord", line: str) -> None:
         if sink:
             sink.send(line)
         if output is not Output.none:
-            sys.stdout.write((line if output is Output.json else csv_line(record, electrodes)) + "\n")
-            sys.stdout.flush()
+            put((line if output is Output.json else csv_line(record, electrodes)) + "\n")
 
     return write
 
 
-def summary(touch: "TouchStream", latencies: deque[float]) -> str:
-    """Counts of frames and faults, and percentiles of the latency."""
+def summary(touch: "TouchStream", latencies: deque[float], unwritten: int = 0) -> str:
+    """Counts of frames and faults, of records that stdout did not take in time, and percentiles of the latency."""
     frames, gaps, stream = touch.parser.counts, touch.gaps, touch.counts
     text = (
         f"{frames.frames} frames, {gaps.lost} lost, {gaps.repeated} repeated, {gaps.restarts} restarts; "
         f"{frames.crc_errors} CRC errors, {frames.malformed} malformed, {frames.bytes_dropped} bytes dropped, "
         f"{frames.resyncs} resynchronisations; {stream.outages} reconnects, {stream.skipped} skipped"
     )
+    if unwritten:
+        text += f"; {unwritten} records not written, the oldest: the reader of stdout was too slow"
     if not latencies:
         return text
     import numpy as np

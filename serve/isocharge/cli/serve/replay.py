@@ -9,6 +9,7 @@ import typer
 
 from isocharge.cli.serve.options import ModelsOption, Output, OutputOption, UdpOption
 from isocharge.cli.serve.record_output import LATENCIES, record_writer, summary, write_records
+from isocharge.cli.shared.standard_streams import stdout_writer
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import say
 
@@ -40,6 +41,6 @@ def replay_command(
     latencies: deque[float] = deque(maxlen=LATENCIES)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
-        write = record_writer(stack, output, udp, predictor.metadata.electrodes)
+        write = record_writer(stack, output, udp, predictor.metadata.electrodes, stdout_writer())
         write_records(replay(recording, path, clock, real_time=real_time), write, latencies)
     say(summary(path, latencies))

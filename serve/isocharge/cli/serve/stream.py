@@ -1,6 +1,5 @@
 """`isocharge serve stream`: prediction records from a port as they come."""
 
-import logging
 import signal
 import time
 from collections import deque
@@ -13,18 +12,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from isocharge.cli.serve.options import (
-    DeviceOption,
     ModelsOption,
     Output,
     OutputOption,
     PolicyName,
     UdpOption,
-    board_of,
 )
 from isocharge.cli.serve.record_output import LATENCIES, record_writer, summary, write_records
-from isocharge.cli.shared.options import ModelArgument
+from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
+from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
 from isocharge.cli.shared.stopping import until_stopped
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.terminal import log_to_stderr, say
 
 if TYPE_CHECKING:
     from isocharge.serve import Device
@@ -87,11 +85,13 @@ def stream_command(
     """Follow a sensor live: read its port, and print position (mm) and force (N) for every frame of charges.
 
     The first 100 frames (0.5 s at 200 Hz) are the tare, the charges at rest: leave the film alone meanwhile. The signal
-    SIGUSR1 starts a new tare. Ctrl-C stops.
+    SIGUSR1 starts a new tare. Ctrl-C stops. If the reader of stdout is too slow for a sensor, the oldest lines are
+    dropped and counted in the summary; --record gets everything.
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
     from isocharge.serve import Policy, Predictor, Recorder, TouchStream, open_source
+    from isocharge.serve.live.line_queue import LineQueue
     from isocharge.serve.live.recorded_stream import RecordedStream
 
     predictor, board = Predictor(model, models=models), _board(device, offset_limit_pC)
@@ -101,11 +101,13 @@ def stream_command(
     live = RecordedStream(path, recorder)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
-        stack.enter_context(_log_to_stderr())
+        stack.enter_context(log_to_stderr())
         source = stack.enter_context(open_source(_awaited(port, wait), baud=baud, reconnect=reconnect))
         stack.enter_context(_tare_on_signal(live))
         stack.enter_context(_alarm(seconds))
-        write = record_writer(stack, output, udp, predictor.metadata.electrodes)
+        lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
+        put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
+        write = record_writer(stack, output, udp, predictor.metadata.electrodes, put)
         if recorder:
             stack.enter_context(recorder)
         records = stack.enter_context(closing(live.follow(source)))  # closed before the recorder
@@ -113,7 +115,8 @@ def stream_command(
         try:
             write_records(islice(records, count), write, latencies)
         finally:
-            say(summary(path, latencies))
+            lines.close()
+            say(summary(path, latencies, lines.lost))
     if recorder is not None and recorder.failed:
         raise typer.Exit(1)
 
@@ -156,15 +159,3 @@ def _tare_on_signal(live: "RecordedStream") -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGUSR1, before)
-
-
-@contextmanager
-def _log_to_stderr() -> Iterator[None]:
-    """Print warnings of the live path for people."""
-    handler = logging.StreamHandler()
-    logger = logging.getLogger("isocharge.serve")
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)

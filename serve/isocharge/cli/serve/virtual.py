@@ -17,6 +17,7 @@ from isocharge.cli.shared.terminal import progress, say
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.default_scene import DEFAULT_FORCE_RANGE
 from isocharge.errors import InputError, OutputExists
+from isocharge.files import bounded_lines
 
 if TYPE_CHECKING:
     from isocharge.serve import Script
@@ -183,7 +184,8 @@ def _presses(script: Path | None, rate_Hz: float) -> "Script | None":
     if script is None:
         return None
     try:
-        return read_script(script.read_text("utf-8").splitlines(), rate_Hz, str(script))
+        with script.open(encoding="utf-8") as lines:
+            return read_script(bounded_lines(lines), rate_Hz, str(script))
     except OSError as error:
         raise InputError(f"--script {script}: cannot be read ({error.strerror})") from error
 

@@ -1,11 +1,15 @@
 """Arguments and options that stand in several commands, and the numbers that their texts hold."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from isocharge.errors import InputError
+from isocharge.number_text import number_of
+
+if TYPE_CHECKING:
+    from isocharge.serve import Device
 
 PROBE_HELP = (
     "Footprint, mm: circle:RADIUS, rectangle:WIDTHxHEIGHT, triangle:SIDE or polygon:X,Y;X,Y;...; @DEGREES at the end "
@@ -63,7 +67,22 @@ PictureOption = Annotated[
     ),
 ]
 
+DeviceOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--device", metavar="FILE", help="Description of the board that sends the charges, TOML. (default: none)"
+    ),
+]
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text. (default: text)")]
+
+
+def board_of(path: Path | None) -> "Device":
+    """The board that a device file describes; without one, any board."""
+    from isocharge.serve import load_device
+    from isocharge.serve.live.device import ANY_BOARD
+
+    return load_device(path) if path else ANY_BOARD
 
 
 def most_workers(workers: int | None) -> int:
@@ -76,7 +95,7 @@ def most_workers(workers: int | None) -> int:
 def position_of(text: str) -> tuple[float, float]:
     """Position (x, y), m, from `--at`."""
     try:
-        x, y = (float(part) * 1e-3 for part in text.split(","))
+        x, y = (number_of(part.strip()) * 1e-3 for part in text.split(","))
     except ValueError as error:
         raise InputError(f"--at: expected two numbers in mm like '3,-2', got {text!r}") from error
     return x, y
@@ -85,6 +104,6 @@ def position_of(text: str) -> tuple[float, float]:
 def radius_mm_of(text: str) -> float:
     """Radius, mm, from `--radius` where it is not `auto`."""
     try:
-        return float(text)
+        return number_of(text)
     except ValueError as error:
         raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error

@@ -1,10 +1,10 @@
 """How a command that runs until it is stopped ends well."""
 
-import os
 import signal
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from isocharge.cli.shared.standard_streams import forget
 
 
 @contextmanager
@@ -16,7 +16,6 @@ def until_stopped() -> Iterator[None]:
     except KeyboardInterrupt:
         pass
     except BrokenPipeError:
-        # What is still in stdout's buffer is thrown away, or Python would complain at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        forget(1)
     finally:
         signal.signal(signal.SIGTERM, before)

@@ -1,5 +1,6 @@
 """Messages and progress bars for people, on stderr; bars only if stderr is a terminal."""
 
+import logging
 import shlex
 import sys
 from collections.abc import Callable, Iterator
@@ -7,18 +8,35 @@ from contextlib import contextmanager
 
 import typer
 
+from isocharge.cli.shared.standard_streams import forget
+
 Advance = Callable[..., None]
 """`advance(done, total)` or `advance(done, total, note)`: moves a progress bar; the note stands behind it."""
 
 
 def say(message: str) -> None:
-    """Print a message for people on stderr."""
-    typer.echo(message, err=True)
+    """Print a message for people on stderr; if that is full or gone, the command goes on without."""
+    try:
+        typer.echo(message, err=True)
+    except OSError:
+        forget(2)
 
 
 def this_command() -> str:
     """The command line as it was given, for cards and reports that say how they were made."""
     return shlex.join(["isocharge", *sys.argv[1:]])
+
+
+@contextmanager
+def log_to_stderr() -> Iterator[None]:
+    """Print warnings of the live path for people."""
+    handler = logging.StreamHandler()
+    logger = logging.getLogger("isocharge.serve")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
 
 
 @contextmanager

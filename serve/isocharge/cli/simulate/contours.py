@@ -19,6 +19,7 @@ from isocharge.cli.shared.options import (
 )
 from isocharge.cli.shared.terminal import say
 from isocharge.errors import InputError
+from isocharge.number_text import number_of
 
 if TYPE_CHECKING:
     from isocharge.simulate import ContourField, DrawnContour, ForwardMap, Mapping, Sensor
@@ -106,7 +107,7 @@ def _charges_of_options(sensor: "Sensor", texts: list[str]) -> Charges:
     for text in texts:
         name, _, value = text.partition("=")
         try:
-            charge = 1e-12 * float(value)
+            charge = 1e-12 * number_of(value)
             if not isfinite(charge):
                 raise ValueError(value)
         except ValueError as error:

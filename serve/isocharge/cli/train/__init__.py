@@ -1,4 +1,4 @@
 """`isocharge train ...`: one file a command.
 
-May import: shared.
+May import: train.bench, shared.
 """

@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.shared.options import JsonOption, ProbeOption
+from isocharge.cli.shared.options import DeviceOption, FreshOption, JsonOption, ProbeOption
 from isocharge.cli.shared.terminal import say, this_command
+from isocharge.cli.train.bench.run import BenchPort, calibrate_at_port
 from isocharge.cli.train.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
 from isocharge.errors import InputError
 
 if TYPE_CHECKING:
     from isocharge.serve import MeasuredPresses
-    from isocharge.train import Calibration, ProposedPress, SensorFilms
+    from isocharge.train import Calibration, EarlierFilm, ProposedPress, SensorFilms
 
 
 def calibrate_command(
@@ -55,6 +56,43 @@ def calibrate_command(
         ),
     ] = None,
     models: ModelsOption = None,
+    port: Annotated[
+        str | None,
+        typer.Option(
+            "--port",
+            metavar="URL",
+            help="Take the presses at the bench, one after the other, from this port of the sensor: device path or "
+            "pyserial URL. (default: from PRESSES.csv)",
+        ),
+    ] = None,
+    device: DeviceOption = None,
+    baud: Annotated[
+        int, typer.Option("--baud", min=1, help="Speed of the port, bits per second; USB ports ignore it.")
+    ] = 115200,
+    yes: Annotated[
+        bool,
+        typer.Option("--yes", help="With --port: presses are where they are proposed; ask nothing. (default: ask)"),
+    ] = False,
+    script: Annotated[
+        Path | None,
+        typer.Option(
+            "--script",
+            metavar="FILE",
+            help="With --port: presses that a machine makes, in their order, CSV with x_mm, y_mm, force_N; nothing is "
+            "asked. (default: proposed presses)",
+        ),
+    ] = None,
+    until: Annotated[
+        float,
+        typer.Option(
+            "--until",
+            metavar="SHARE",
+            min=0.0,
+            help="With --port: position error left by the film at which it is enough, a share of what noise alone "
+            "leaves; 0 for never.",
+        ),
+    ] = 0.5,
+    fresh: FreshOption = False,
     json: JsonOption = False,
 ) -> None:
     """Calibrate a film: find its parameters from measured presses, and write a model that is right about it.
@@ -62,23 +100,26 @@ def calibrate_command(
     Three presses help much, ten are good; of each, the place, the force, or both are known. --next says where to press,
     also before the first press. What the presses cannot tell is said.
 
+    With --port it proposes a press, takes it when it is steady, asks whether it was there, and says how well the film
+    is known by now. Every press is on disk at once: the same command goes on with a session that was stopped.
+
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
-    if file is None and not next_count:
-        raise InputError("expected PRESSES.csv, or --next K for presses to begin with, got neither")
-    if file is None and output is not None:
-        raise InputError("--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out")
+    _check_usage(file, output, next_count, port, at_bench=yes or script is not None or fresh or device is not None)
     from isocharge.simulate import load_sensor, parse_probe
     from isocharge.train import films_for
 
     chosen = films_for(load_sensor(sensor), parse_probe(probe), models)
     calibration = None
-    if file is not None:
+    if port is not None and output is not None:
+        bench = BenchPort(port, device, baud, yes, script, until, fresh)
+        std = position_std_mm, force_std
+        calibration = calibrate_at_port(bench, chosen, _before(chosen, earlier), output, std, json_lines=json)
+    elif file is not None:
         names = chosen.films.prior.sensor.electrode_names
-        presses = read_presses_of(file, names, position_std_mm, force_std)
-        calibration = _calibrated(presses, chosen, earlier)
-        if output is not None:
-            _write(output, calibration, chosen)
+        calibration = _calibrated(read_presses_of(file, names, position_std_mm, force_std), chosen, earlier)
+    if calibration is not None and output is not None:
+        _write(output, calibration, chosen, ends_session=port is not None)
     proposed = _proposed(chosen, calibration, next_count, position_std_mm, force_std, earlier)
     if json:
         typer.echo(json_module.dumps(_table(calibration, proposed), allow_nan=False))
@@ -92,17 +133,42 @@ def calibrate_command(
         )
 
 
+def _check_usage(file: Path | None, output: Path | None, next_count: int, port: str | None, *, at_bench: bool) -> None:
+    """Refuse arguments that contradict each other, before anything is loaded."""
+    if port is not None and (file is not None or next_count):
+        raise InputError(
+            "--port: presses come from the port and are proposed one by one; leave out PRESSES.csv, --next"
+        )
+    if port is not None and output is None:
+        raise InputError("--port: expected --output FOLDER for the presses and the model, got none")
+    if port is None and at_bench:
+        raise InputError("--yes, --script, --fresh and --device belong to --port; give the port of the sensor")
+    if port is None and file is None and not next_count:
+        raise InputError("expected PRESSES.csv, --port URL, or --next K for presses to begin with, got none of them")
+    if port is None and file is None and output is not None:
+        raise InputError("--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out")
+
+
+def _before(chosen: "SensorFilms", earlier: Path | None) -> "EarlierFilm":
+    """What is known of the film before the presses."""
+    from isocharge.train import read_earlier
+
+    return read_earlier(earlier, chosen.scene) if earlier else chosen.described
+
+
 def _calibrated(presses: "MeasuredPresses", chosen: "SensorFilms", earlier: Path | None) -> "Calibration":
-    from isocharge.train import calibrate, read_earlier
+    from isocharge.train import calibrate
 
-    before = read_earlier(earlier, chosen.scene) if earlier else chosen.described
-    return calibrate(presses, chosen.scene, before, warn=lambda message: say(f"caution: {message}"))
+    return calibrate(presses, chosen.scene, _before(chosen, earlier), warn=lambda message: say(f"caution: {message}"))
 
 
-def _write(output: Path, calibration: "Calibration", chosen: "SensorFilms") -> None:
+def _write(output: Path, calibration: "Calibration", chosen: "SensorFilms", *, ends_session: bool) -> None:
     from isocharge.train import write_calibration
+    from isocharge.train.calibration.folder import end_session
 
     version = write_calibration(output, calibration, chosen.films, this_command())
+    if ends_session:
+        end_session(output)
     say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
 
 
@@ -114,7 +180,7 @@ def _proposed(
     force_std: float,
     earlier: Path | None,
 ) -> "list[ProposedPress]":
-    from isocharge.train import next_presses, read_earlier
+    from isocharge.train import next_presses
 
     if not count:
         return []
@@ -122,7 +188,7 @@ def _proposed(
     if calibration is not None:
         parameters, covariance = calibration.posterior.parameters, calibration.posterior.covariance
     else:
-        before = read_earlier(earlier, scene) if earlier else chosen.described
+        before = _before(chosen, earlier)
         parameters, covariance = before.parameters, before.covariance
     return next_presses(
         scene.charges,

@@ -7,13 +7,15 @@
 | Teleplot (github.com/nesnes/teleplot) | `>A:1627551892437:801.2§pC` (time in ms and unit are optional) |
 | JSON object or list | `{"seq": 12, "A": 801.2}` |
 
-Blank lines and lines that begin with # hold no values. A number is what Python's `float` reads, without underscores.
+Blank lines and lines that begin with # hold no values. A number is what `isocharge.number_text` reads.
 """
 
 import json
 import re
 from enum import StrEnum
 from typing import Any, NamedTuple
+
+from isocharge.number_text import number_of
 
 SEQ = "seq"
 """Name under which a device sends the number of a frame."""
@@ -23,6 +25,9 @@ TIMES_US = {"t_us": 1.0, "t_ms": 1e3, "t_s": 1e6}
 
 TELEPLOT_TIME = "t_ms"
 """Name of the clock in Teleplot's lines."""
+
+DEEPEST_LEVEL = 3
+"""Levels of a JSON object in which numbers are looked for."""
 
 _CELL = re.compile(r"\s*[,;\t]\s*|\s+")
 
@@ -80,16 +85,10 @@ def parse_line(data: bytes) -> Line:
     return _pairs(text) if ":" in text or "=" in text else _csv(text)
 
 
-def _number(text: str) -> float:
-    if "_" in text:
-        raise ValueError(f"expected a number, got {text!r}")
-    return float(text)
-
-
 def _csv(text: str) -> Line:
     cells = _CELL.split(text.rstrip(",; \t"))
     try:
-        return Line(Notation.csv, (), tuple(map(_number, cells)))
+        return Line(Notation.csv, (), tuple(map(number_of, cells)))
     except ValueError:
         if all(map(_NAME.fullmatch, cells)) and len(set(cells)) == len(cells):
             return Line(Notation.header, tuple(cells))
@@ -102,7 +101,7 @@ def _pairs(text: str) -> Line:
         match = _PAIR.match(text, at)
         if match is None or match[1] in pairs:
             raise ValueError(f"expected name:value, got {text[at:]!r}")
-        pairs[match[1]] = _number(match[2])
+        pairs[match[1]] = number_of(match[2])
         at = match.end()
     return Line(Notation.pairs, tuple(pairs), tuple(pairs.values()))
 
@@ -118,8 +117,8 @@ def _teleplot(text: str) -> Line:
     *stamp, value = values.rstrip("; ").rpartition(";")[2].partition("§")[0].split(":")
     if len(stamp) > 1:
         raise ValueError(f"expected >name:time:value, got {text!r}")
-    pairs = {TELEPLOT_TIME: _number(stamp[0])} if stamp else {}
-    pairs[name.strip()] = _number(value)
+    pairs = {TELEPLOT_TIME: number_of(stamp[0])} if stamp else {}
+    pairs[name.strip()] = number_of(value)
     return Line(Notation.teleplot, tuple(pairs), tuple(pairs.values()))
 
 
@@ -136,14 +135,15 @@ def _json(text: str) -> Line:
     return Line(Notation.json, tuple(numbers), tuple(numbers.values()))
 
 
-def _numbers(name: str, content: Any) -> list[tuple[str, float]]:
-    """Every number of a JSON value by the path to it, `charge.A` or `charge.0`, at most two levels deep."""
+def _numbers(name: str, content: Any, level: int = 0) -> list[tuple[str, float]]:
+    """Every number of a JSON value by the path to it, `charge.A` or `charge.0.re`, at most three levels deep."""
     if _is_number(content):
         return [(name, content)]
-    if name.count(".") >= 2 or not isinstance(content, dict | list):
+    if level >= DEEPEST_LEVEL or not isinstance(content, dict | list):
         return []
     items = content.items() if isinstance(content, dict) else enumerate(content)
-    return [pair for key, value in items for pair in _numbers(f"{name}.{key}" if name else str(key), value)]
+    paths = ((f"{name}.{key}" if level else str(key), value) for key, value in items)
+    return [pair for path, value in paths for pair in _numbers(path, value, level + 1)]
 
 
 def _is_number(value: Any) -> bool:

@@ -17,15 +17,15 @@ class ChannelPicker:
     or `charge.A`); without such names by their order, if their number is that of the electrodes.
     """
 
-    def __init__(self, electrodes: tuple[str, ...], channels: Mapping[str, str], model: str) -> None:
+    def __init__(self, electrodes: tuple[str, ...], channels: Mapping[str, str], reader: str) -> None:
         """Set up the look-up.
 
         Args:
-            electrodes: Names of the electrodes, in the order of the model.
+            electrodes: Names of the electrodes, in the order of the charges.
             channels: Electrode to the channel's name; empty where nothing is known.
-            model: The model's label, for messages.
+            reader: Who expects these electrodes, for messages: "model three/1".
         """
-        self._electrodes, self._channels, self._model = electrodes, channels, model
+        self._electrodes, self._channels, self._reader = electrodes, channels, reader
         self._names: tuple[str, ...] | None = None
         self._width = -1
         self._order: tuple[int, ...] = ()
@@ -51,7 +51,7 @@ class ChannelPicker:
         if not self._channels and len(frame.values) == len(self._electrodes):
             return tuple(range(len(frame.values)))
         raise ChargeError(
-            f"model {self._model} expects {len(self._electrodes)} charges {self._electrodes}, frame {frame.seq} has "
+            f"{self._reader} expects {len(self._electrodes)} charges {self._electrodes}, frame {frame.seq} has "
             f"{len(frame.values)} {frame.names}; choose the model of this sensor, or say in the device file which is "
             "which: [channels] " + ", ".join(f'{name} = "..."' for name in self._electrodes)
         )

@@ -1,4 +1,4 @@
-"""Chunks of bytes in, prediction records out: parser, clock, signal chain and predictor put in order."""
+"""Chunks of bytes in, prediction records out: the stream of readings, each with the answer of a model."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -6,21 +6,15 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from isocharge.arrays import Array, Reals
-from isocharge.errors import PortError
-from isocharge.serve.flags import RECONNECTED
-from isocharge.serve.frames.frame import SATURATED_BIT, Frame, Parser
+from isocharge.serve.frames.frame import Parser
 from isocharge.serve.frames.sequence import SequenceGaps
-from isocharge.serve.live.channels import ChannelPicker
 from isocharge.serve.live.device import ANY_BOARD, Device
+from isocharge.serve.live.reading_stream import ReadingStream
 from isocharge.serve.live.record_builder import RecordBuilder
-from isocharge.serve.port.device_clock import DeviceClock, ReadingTime
 from isocharge.serve.port.serial_port import Chunk
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
-from isocharge.serve.signal_chain.chain import Chain, ChainState, Reading, advance
-
-BYTES_TO_RECOGNISE = 8192
-"""Bytes without one intact frame after which a stream counts as no frames at all."""
+from isocharge.serve.signal_chain.chain import Chain
 
 
 class Policy(StrEnum):
@@ -107,23 +101,25 @@ class TouchStream:
         Raises:
             DeviceError: If the device file has other electrodes than the model.
         """
-        electrodes = predictor.metadata.electrodes
-        self.parser = parser or device.parser()
-        self.gaps = gaps or SequenceGaps()
-        self.clock = DeviceClock()
+        self._readings = ReadingStream(
+            predictor.metadata.electrodes,
+            device,
+            chain=chain,
+            parser=parser,
+            gaps=gaps,
+            misfit=self._misfit,
+            reader=f"model {predictor.metadata.label}",
+        )
+        self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
         self.counts = StreamCounts()
-        self._chain = chain or device.chain(electrodes)
-        self._picker = ChannelPicker(electrodes, device.channels, predictor.metadata.label)
         self._records = RecordBuilder.of(predictor)
-        self._state = ChainState.start(len(electrodes))
         self._policy = policy
         self._now_ns = now_ns
         self._predictor = predictor
-        self._pending_flags: tuple[str, ...] = ()
 
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
-        self._state = self._state.without_tare()
+        self._readings.tare()
 
     def feed(self, chunk: Chunk) -> Iterator[PredictionRecord]:
         """The records of the frames that end in this chunk.
@@ -131,21 +127,17 @@ class TouchStream:
         Raises:
             As `stream`.
         """
-        if chunk.outage_s > 0.0:
-            self._reconnect()
-        frames = self.parser.feed(chunk.data)
+        self.counts.outages += chunk.outage_s > 0.0
+        frames = self._readings.frames(chunk)
         last = len(frames) - 1
         for number, frame in enumerate(frames):
-            reading, time_of_reading = self._advance(frame, chunk)
+            reading, time_of_reading = self._readings.advance(frame, chunk)
             if self._policy is Policy.latest and number < last:
                 self.counts.skipped += 1
                 continue
             self.counts.records += 1
             yield self._records.record(chunk, frame, reading, time_of_reading, self._now_ns)
-        if frames:
-            self.clock.arrived(chunk.timestamp)
-        else:
-            _check_recognised(self.parser)
+        self._readings.arrived(frames, chunk)
 
     def finish(self) -> None:
         """End the stream, as at the end of a file.
@@ -153,43 +145,8 @@ class TouchStream:
         Raises:
             PortError: If there was not one intact frame.
         """
-        _check_recognised(self.parser, allowed=-1)
-
-    def _reconnect(self) -> None:
-        """Start over after an outage: frames are missing, and the film may have been touched meanwhile."""
-        self.counts.outages += 1
-        self.parser.forget()
-        self.gaps.forget()
-        self.clock.forget()
-        self.tare()
-        self._pending_flags = (RECONNECTED,)
-
-    def _advance(self, frame: Frame, chunk: Chunk) -> tuple[Reading, ReadingTime]:
-        """Take a frame through clock and chain."""
-        time_of_reading = self.clock.read(frame.t_us, self.parser.t_us_modulus, chunk.timestamp)
-        flags = self._pending_flags + self.gaps.update(frame.seq, self.parser.seq_modulus)
-        self._pending_flags = ()
-        self._state, reading = advance(
-            self._chain,
-            self._state,
-            self._picker.pick(frame),
-            time_of_reading.clock_s,
-            time_of_reading.step_s,
-            limited=bool(frame.flags & SATURATED_BIT),
-            misfit=self._misfit,
-            flags=flags,
-        )
-        return reading, time_of_reading
+        self._readings.finish()
 
     def _misfit(self, charge_pC: Array) -> Reals:
         """The model's misfit, shape (n,), for charges of shape (n, electrodes), pC."""
         return self._predictor.predict_batch(charge_pC).misfit
-
-
-def _check_recognised(parser: Parser, allowed: int = BYTES_TO_RECOGNISE) -> None:
-    counts = parser.counts
-    if counts.frames == 0 and counts.bytes_dropped > allowed:
-        raise PortError(
-            f"no intact frame among the first {counts.bytes_dropped} bytes ({counts.crc_errors} with a wrong CRC, "
-            f"{counts.malformed} of another form); {parser.format}: check baud rate and device"
-        )

@@ -7,7 +7,6 @@ the same answers: |a - b| <= 1e-5 max(|b|, floor).
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnxruntime as ort
@@ -16,6 +15,7 @@ from isocharge.arrays import Singles
 from isocharge.errors import ModelError
 from isocharge.files import sha256_of
 from isocharge.serve.model.session import INPUT, OUTPUTS, run
+from isocharge.tables import Table, read_json
 
 RELATIVE = 1e-5
 """Largest difference of two answers, relative to max(|answer|, floor), dimensionless."""
@@ -82,24 +82,38 @@ def read_golden(path: Path) -> Golden:
     Raises:
         ModelError: If it is missing or damaged.
     """
+    if not path.exists():
+        raise ModelError(f"{path}: missing; a model comes with its golden.json: copy the whole folder")
     try:
-        return _from_json(json.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError as error:
-        raise ModelError(f"{path}: missing; a model comes with its golden.json: copy the whole folder") from error
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ModelError(
-            f"{path}: damaged ({type(error).__name__}: {error}); copy or export the model again"
-        ) from error
+        return _of_table(Table(read_json(path, "golden vectors", ModelError), str(path), ModelError))
+    except ModelError as error:
+        raise ModelError(f"{error}; the file is damaged: copy or export the model again") from error
 
 
-def _from_json(content: dict[str, Any]) -> Golden:
+def _of_table(file: Table) -> Golden:
+    """Golden vectors of any number of electrodes; that there is an answer to each press is checked with the model."""
+    inputs, outputs, tolerance = file.table("inputs"), file.table("outputs"), file.table("tolerance")
+    charges = inputs.sequence(INPUT, of="rows of charges")
+    if not charges or not isinstance(charges[0], list):
+        inputs.refuse(INPUT, "n rows of charges with n > 0")
     return Golden(
-        sha256=str(content["sha256"]),
-        charge_pC=np.array(content["inputs"][INPUT], dtype=np.float32),
-        outputs={name: np.array(content["outputs"][name], dtype=np.float32) for name in OUTPUTS},
-        relative=float(content["tolerance"]["relative"]),
-        floors={name: tuple(content["tolerance"]["floor"][name]) for name in OUTPUTS},
+        sha256=file.text("sha256"),
+        charge_pC=_rows(inputs, INPUT, len(charges[0])),
+        outputs={name: _rows(outputs, name, columns) for name, columns in OUTPUTS.items()},
+        relative=tolerance.number("relative", least=0.0),
+        floors={
+            name: tolerance.table("floor").numbers(name, count=columns, of=f"a list of {columns} numbers")
+            for name, columns in OUTPUTS.items()
+        },
     )
+
+
+def _rows(table: Table, name: str, width: int) -> Singles:
+    """An array of shape (n, width); what float32 cannot hold is infinite, and equals no answer."""
+    rows = table.sequence(name, of="rows")
+    numbers = [table.as_numbers(name, row, count=width, of=f"rows of {width} numbers") for row in rows]
+    with np.errstate(over="ignore"):
+        return np.array(numbers, dtype=np.float64).reshape(-1, width).astype(np.float32)
 
 
 def check_answers(golden: Golden, answers: dict[str, Singles], where: str) -> None:
@@ -116,9 +130,11 @@ def check_answers(golden: Golden, answers: dict[str, Singles], where: str) -> No
     for name, expected in golden.outputs.items():
         got = answers[name].astype(np.float64)
         allowed = golden.relative * np.maximum(np.abs(expected), golden.floors[name])
-        excess = np.abs(got - expected) / allowed
+        with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 where nothing is allowed: no agreement
+            excess = np.abs(got - expected) / allowed
         if not (excess <= 1.0).all():
-            row, column = np.unravel_index(np.argmax(excess), excess.shape)
+            worst = np.argmax(np.where(np.isnan(excess), np.inf, excess))
+            row, column = np.unravel_index(worst, excess.shape)
             raise ModelError(
                 f"{where}: {name}[{row}, {column}] is {got[row, column]:.9g}, golden.json says "
                 f"{expected[row, column]:.9g} +- {allowed[row, column]:.1g}; copy or export the model again"

@@ -6,12 +6,16 @@ that x and y refer to.
 """
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 from isocharge.errors import ModelError
-from isocharge.tables import Table, shown
+from isocharge.tables import Table, parse_json, shown
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+"""Pattern of model names: safe in paths, URLs, pages and config.pbtxt."""
 
 FORMAT_VERSION = 1
 """Version of the metadata."""
@@ -101,10 +105,8 @@ def _table(props: Mapping[str, str], names: tuple[str, ...], where: str) -> Tabl
     """The values of those of these fields that `props` has."""
     values: dict[str, Any] = {}
     for name in names:
-        try:
-            values |= {name: json.loads(props[name])} if name in props else {}
-        except (ValueError, RecursionError) as error:
-            raise ModelError(f"{where}: metadata: {name}: expected JSON, got {shown(props[name])} ({error})") from error
+        if name in props:
+            values[name] = parse_json(props[name], f"{where}: metadata: {name}", ModelError)
     return Table(values, f"{where}: metadata", ModelError)
 
 
@@ -113,7 +115,7 @@ def _fields(table: Table) -> dict[str, Any]:
     sensor, errors = table.table("sensor"), table.table("errors")
     sensor.text("name")
     return {
-        "name": table.text("name"),
+        "name": _name(table),
         "version": table.whole("version", least=1),
         "sensor": dict(sensor.values),
         "electrodes": _electrodes(table),
@@ -125,6 +127,13 @@ def _fields(table: Table) -> dict[str, Any]:
         "errors": {name: errors.number(name) for name in errors},
         "made_with": dict(table.table("made_with").values),
     }
+
+
+def _name(table: Table) -> str:
+    name = table.text("name")
+    if not NAME.fullmatch(name):
+        table.refuse("name", "letters, digits, '-', '_' and '.'")
+    return name
 
 
 def _texts(table: Table, key: str) -> tuple[str, ...]:

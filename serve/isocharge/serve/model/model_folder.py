@@ -9,7 +9,6 @@ A version appears whole or not at all: it is written under a temporary name, rea
 renamed.
 """
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,15 +18,12 @@ import onnxruntime as ort
 from numpy.typing import ArrayLike
 
 from isocharge.errors import ModelError, OutputExists
-from isocharge.files import new_folder, refuse_existing, sha256_of, write_whole
+from isocharge.files import new_folder, read_whole, refuse_existing, sha256_of, write_whole
 from isocharge.serve.model.charges import as_batch
 from isocharge.serve.model.golden import Golden, check_answers, make_golden, read_golden
-from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.session import check_interface, open_session, run
+from isocharge.serve.model.metadata import NAME, ModelMetadata
+from isocharge.serve.model.session import check_interface, check_rows, open_session, run
 from isocharge.serve.model.triton_config import triton_config
-
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-"""Pattern of model names: safe in paths, URLs and config.pbtxt."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,7 @@ def load_model(folder: Path) -> Model:
 
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_whole(path)
     except OSError as error:
         raise ModelError(f"{path}: cannot be read ({error.strerror}); copy or export the model again") from error
 
@@ -81,6 +77,7 @@ def _check_fits(golden: Golden, metadata: ModelMetadata, folder: Path) -> None:
             f"{folder / 'golden.json'}: expected charges of shape (n, {len(metadata.electrodes)}) with n > 0, "
             f"got {shape}; copy or export the model again"
         )
+    check_rows(golden.outputs, len(golden.charge_pC), str(folder / "golden.json"))
 
 
 def check_golden(model: Model) -> None:
@@ -89,7 +86,13 @@ def check_golden(model: Model) -> None:
     Raises:
         ModelError: If an answer differs from that in golden.json.
     """
-    check_answers(model.golden, run(model.session, model.golden.charge_pC), str(model.folder / "model.onnx"))
+    where, charge_pC = str(model.folder / "model.onnx"), model.golden.charge_pC
+    try:
+        answers = run(model.session, charge_pC)
+    except ModelError as error:
+        raise ModelError(f"{where}: {error}") from error
+    check_rows(answers, len(charge_pC), where)
+    check_answers(model.golden, answers, where)
 
 
 def write_model(

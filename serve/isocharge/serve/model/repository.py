@@ -11,7 +11,8 @@ from pathlib import Path
 
 from isocharge.errors import ModelError
 
-VERSION = re.compile("[1-9][0-9]*")
+VERSION = re.compile("[1-9][0-9]{0,17}")
+"""Pattern of version folders: whole numbers of 63 bits."""
 
 
 def find_model(model: str | Path, models: Path | None = None) -> Path:
@@ -51,9 +52,7 @@ def repositories(models: Path | None = None) -> list[Path]:
 
 def model_names(root: Path) -> list[str]:
     """Names of the models in a repository."""
-    if not root.is_dir():
-        return []
-    return sorted(folder.name for folder in root.iterdir() if folder.is_dir() and _versions(folder))
+    return sorted(folder.name for folder in _folders_in(root) if _versions(folder))
 
 
 def _shipped() -> Path:
@@ -78,9 +77,19 @@ def version_folders(folder: Path) -> dict[int, Path]:
 
 
 def _versions(folder: Path) -> list[int]:
-    if not folder.is_dir():
-        return []
-    return [int(entry.name) for entry in folder.iterdir() if entry.is_dir() and VERSION.fullmatch(entry.name)]
+    return [int(entry.name) for entry in _folders_in(folder) if VERSION.fullmatch(entry.name)]
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    """The folders in a folder; none if it is none.
+
+    Raises:
+        ModelError: If it cannot be listed.
+    """
+    try:
+        return [entry for entry in folder.iterdir() if entry.is_dir()] if folder.is_dir() else []
+    except OSError as error:
+        raise ModelError(f"{folder}: cannot be listed ({error.strerror}); try again, or correct its rights") from error
 
 
 def _not_found(model: str | Path, roots: list[Path], is_path: bool) -> str:

@@ -4,12 +4,13 @@ A network of this size takes microseconds. A second thread costs more than it sa
 between runs, burns most of a core at 100 Hz.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import onnxruntime as ort
 
 from isocharge.arrays import Singles
 from isocharge.errors import ModelError
+from isocharge.tables import cut
 
 INPUT = "charge_pC"
 """Name of the input."""
@@ -29,7 +30,7 @@ def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
     except Exception as error:  # onnxruntime's exceptions have no common base of their own
         raise ModelError(
             f"{where}: onnxruntime {ort.__version__} cannot read these {len(onnx_model)} bytes as a model "
-            f"({error}); copy or export it again"
+            f"({cut(str(error))}); copy or export it again"
         ) from error
 
 
@@ -43,9 +44,35 @@ def _options() -> ort.SessionOptions:
     return options
 
 
-def run(session: ort.InferenceSession, charge_pC: Singles) -> dict[str, Singles]:
-    """Every output by name, shape (n, width), from charges of shape (n, electrodes), pC."""
-    return dict(zip(OUTPUTS, session.run(list(OUTPUTS), {INPUT: charge_pC}), strict=True))
+def run(session: ort.InferenceSession, charge_pC: Singles, names: Sequence[str] = tuple(OUTPUTS)) -> dict[str, Singles]:
+    """Outputs by name, shape (n, width), from charges of shape (n, electrodes), pC.
+
+    Raises:
+        ModelError: If the graph cannot be run on them: it is not the model of these charges.
+    """
+    try:
+        return dict(zip(names, session.run(names, {INPUT: charge_pC}), strict=True))
+    except Exception as error:  # onnxruntime's exceptions have no common base of their own
+        raise run_error(error) from error
+
+
+def run_error(error: Exception) -> ModelError:
+    """The error of a graph that was read, and fails when it is run."""
+    return ModelError(f"the model's graph fails when it is run ({cut(str(error))}); copy or export it again")
+
+
+def check_rows(outputs: Mapping[str, Singles], count: int, where: str) -> None:
+    """Check what a graph really answered: its file may declare other shapes.
+
+    Raises:
+        ModelError: If an output has not a row for each of `count` presses.
+    """
+    for name, rows in outputs.items():
+        if rows.shape != (count, OUTPUTS[name]):
+            raise ModelError(
+                f"{where}: {name}: expected answers of shape {(count, OUTPUTS[name])}, got {rows.shape}; "
+                "copy or export the model again"
+            )
 
 
 def check_interface(session: ort.InferenceSession, electrodes: int, where: str) -> None:

@@ -19,6 +19,10 @@ ADVICE = {
 """Reason and advice for each error of the system."""
 
 
+File = tuple[int, int, int]
+"""Device, inode and mode of a file."""
+
+
 @dataclass(frozen=True)
 class Address:
     """Where to listen.
@@ -52,9 +56,19 @@ class Address:
             why = ADVICE.get(error.errno or 0, error.strerror or str(error))
             raise ListenError(f"cannot listen on {self.uds or f'{self.host}:{self.port}'}: {why}") from error
 
-    def release(self) -> None:
-        """Remove what a Unix socket leaves behind."""
-        if self.uds:
+    def file(self) -> File | None:
+        """What tells the file of a Unix socket from another one under its path; None where there is no file."""
+        if self.uds is None:
+            return None
+        try:
+            state = self.uds.lstat()
+        except OSError:
+            return None
+        return state.st_dev, state.st_ino, state.st_mode
+
+    def release(self, file: File | None) -> None:
+        """Remove what a Unix socket leaves behind, if it is still the `file` that was made for it."""
+        if self.uds and file is not None and self.file() == file:
             self.uds.unlink(missing_ok=True)
 
     def url(self, listening: socket.socket, *, secure: bool) -> str:
@@ -123,6 +137,11 @@ def _remove_stale(path: Path) -> None:
         ListenError: If the path is something else, or a server listens there.
     """
     if not path.exists():
+        if path.is_symlink():
+            raise ListenError(
+                f"{path}: expected nothing or a left-over socket, found a symbolic link that leads nowhere; "
+                "remove it or choose another path"
+            )
         return
     if not stat.S_ISSOCK(path.stat().st_mode):
         raise ListenError(f"{path}: expected nothing or a left-over socket, found a file; choose another path")

@@ -6,6 +6,7 @@ new sessions and then changes one reference: a request that has begun finishes w
 files are refused goes on with the old ones.
 """
 
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -18,6 +19,8 @@ from isocharge.serve.model.model_folder import Model, check_golden, load_model
 from isocharge.serve.model.repository import model_names, repositories, version_folders
 from isocharge.serve.network.statistics import Statistics
 from isocharge.serve.prediction.bound_press import BoundPress
+
+log = logging.getLogger(__name__)
 
 UNLOADED = "unloaded"
 """The reason that the index gives for a model that a client unloaded."""
@@ -183,11 +186,19 @@ def _load_versions(name: str, folder: Path, old: Mapping[int, LoadedVersion]) ->
     for version, path in version_folders(folder).items():
         try:
             versions[version] = _load_version(name, version, path)
-        except ModelError as error:
-            refused[version] = str(error)
+        except Exception as error:  # a folder may be broken in any way, and must take no other model with it
+            refused[version] = _reason(path, error)
             if version in old:
                 versions[version] = old[version]
     return ModelVersions(versions, refused)
+
+
+def _reason(folder: Path, error: Exception) -> str:
+    """Why a version is refused; an error that isocharge did not raise on purpose goes into the log, too."""
+    if isinstance(error, ModelError):
+        return str(error)
+    log.error("%s: the model cannot be checked", folder, exc_info=error)
+    return f"{folder}: cannot be checked ({type(error).__name__}); copy or export the model again"
 
 
 def _load_version(name: str, version: int, folder: Path) -> LoadedVersion:

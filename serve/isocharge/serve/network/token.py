@@ -23,9 +23,13 @@ class Token:
     def check(self, authorization: bytes) -> None:
         """Check the value of an Authorization header, empty if there was none.
 
+        The name of the scheme has no case (RFC 9110, 11.1).
+
         Raises:
             TokenError: If it does not carry the token.
         """
-        if not hmac.compare_digest(authorization, self._expected):
+        scheme, _, token = authorization.partition(b" ")
+        given = b"Bearer " + token.lstrip(b" ") if scheme.lower() == b"bearer" else authorization
+        if not hmac.compare_digest(given, self._expected):
             sent = "a wrong one" if authorization else "none"
             raise TokenError(f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {sent}")

@@ -21,14 +21,24 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from isocharge.errors import OutputError, RecordingError
-from isocharge.files import refuse_existing
+from isocharge.files import bounded_lines, refuse_existing
 from isocharge.serve.port.serial_port import Chunk
+from isocharge.tables import Table, cut, is_whole, parse_json
 
 VERSION = 1
 """Version of the file's format."""
 
 KIND = "isocharge_recording"
 """Key of the version in the first line: what makes a file a recording."""
+
+POLICIES = ("every", "latest")
+"""Which frames get a record."""
+
+LONGEST_ENTRY = 1 << 20
+"""Longest line, characters: a chunk of 64 KiB in base64 is a tenth of it."""
+
+LONGEST_US, LATEST_S = 1e12, 1e11
+"""Largest latency that counts as one, us: eleven days; and latest time, unix seconds: the year 5138."""
 
 log = logging.getLogger(__name__)
 
@@ -128,12 +138,14 @@ class Recording:
         """
         self._path = path
         try:
-            with path.open(encoding="utf-8") as file:
-                header = json.loads(file.readline())
-            self.model, self.policy, self.device = (header[key] for key in ("model", "policy", "device"))
-            version = header[KIND]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise RecordingError(f"{path}: expected a recording of `serve stream --record` ({error!r})") from error
+            header = _header(path)
+            version = header.whole(KIND)
+            self.model, self.policy = header.text("model"), header.choice("policy", POLICIES)
+            self.device = dict(header.table("device").values)
+        except (OSError, ValueError) as error:
+            raise RecordingError(
+                f"{path}: expected a recording of `serve stream --record` ({cut(str(error))})"
+            ) from error
         if version != VERSION:
             raise RecordingError(f"{path}: recording version {version} is not supported (this version reads {VERSION})")
 
@@ -158,30 +170,45 @@ class Recording:
 
     def _entries(self) -> Iterator[Chunk | float | None]:
         """The content of each line, as `_entry` gives it."""
-        with self._path.open(encoding="utf-8", errors="replace") as file:
-            next(file)
-            for number, line in enumerate(file, start=2):
-                if not line.endswith("\n"):
-                    return  # the power failed while it was written
-                try:
-                    entry = _entry(json.loads(line))
-                except (ArithmeticError, KeyError, TypeError, ValueError) as error:
-                    raise RecordingError(f"{self._path}, line {number}: damaged ({error})") from error
-                yield entry
+        number = 1
+        try:
+            with self._path.open(encoding="utf-8", errors="replace") as file:
+                for line in bounded_lines(file, LONGEST_ENTRY):
+                    if not line.endswith("\n"):
+                        return  # the power failed while it was written
+                    if number > 1:
+                        yield _entry(Table(parse_json(line, "entry", RecordingError), "", RecordingError))
+                    number += 1
+        except (OSError, ValueError) as error:
+            raise RecordingError(f"{self._path}, line {number}: damaged ({cut(str(error))})") from error
 
 
-def _entry(content: dict[str, Any]) -> Chunk | float | None:
+def _header(path: Path) -> Table:
+    """The first line of a recording."""
+    if not path.is_file():
+        raise RecordingError("there is no file of that name")
+    with path.open(encoding="utf-8") as file:
+        line = next(bounded_lines(file, LONGEST_ENTRY), "")
+    return Table(parse_json(line, "first line", RecordingError), "first line", RecordingError)
+
+
+def _entry(content: Table) -> Chunk | float | None:
     """A chunk, the latency of a record (us), or None for a request for a new tare.
 
     Raises:
-        ArithmeticError, KeyError, TypeError, ValueError: If it is none of these.
+        RecordingError, ValueError: If it is none of these.
     """
     if "timestamp" in content:
-        return float(content["latency_us"])
+        return content.number("latency_us", least=-LONGEST_US, most=LONGEST_US)
     if "tare" in content:
         return None
-    timestamp, clock_ns, outage_s, data = content["chunk"]
-    return Chunk(base64.b64decode(data, validate=True), float(timestamp), int(clock_ns), float(outage_s))
+    *times, data = content.sequence("chunk", of="timestamp, clock, outage and bytes")
+    timestamp, _, outage_s = content.as_numbers("chunk", times, count=3, of="three numbers and bytes")
+    if not isinstance(data, str):
+        content.refuse("chunk", "three numbers and bytes in base64")
+    if not (abs(timestamp) <= LATEST_S and outage_s >= 0.0 and is_whole(times[1])):
+        content.refuse("chunk", "a time of this age, nanoseconds and an outage")
+    return Chunk(base64.b64decode(data, validate=True), timestamp, times[1], outage_s)
 
 
 class RecordedClock:

@@ -53,12 +53,15 @@ class Port:
     Attributes:
         url: Device path or pyserial URL.
         outages: Times that it came back.
+        is_live: Bytes come whether they are read or not, and are lost if they are not.
 
     Example:
         >>> with Port("/dev/ttyACM0") as port:  # doctest: +SKIP
         ...     for chunk in port:
         ...         print(chunk.data)
     """
+
+    is_live = True
 
     def __init__(self, url: str, *, baud: int = 115200, silence_s: float = 5.0, reconnect: bool = False) -> None:
         """Describe a port; it is opened on entering the context.

@@ -21,9 +21,10 @@ Chunks = contextlib.AbstractContextManager["Port | FileSource"]
 
 
 class FileSource:
-    """Chunks of a file, a pipe or stdin, up to its end."""
+    """Chunks of a file, a pipe or stdin, up to its end; they wait until somebody reads them."""
 
     outages = 0
+    is_live = False
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor

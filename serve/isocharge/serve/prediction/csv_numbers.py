@@ -5,13 +5,13 @@ at most an exponent: `1_0`, `nan` and `inf`, which Python reads, are none.
 """
 
 import csv
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import NoReturn, TextIO
+from typing import NoReturn
 
 import numpy as np
 
 from isocharge.errors import InputError
+from isocharge.number_text import number_of
 from isocharge.tables import shown
 
 MOST_COLUMNS = 1_000
@@ -23,15 +23,8 @@ LONGEST_LINE = 100_000
 LARGEST = float(np.finfo(np.float32).max)
 """Largest number of a cell: that of the models' tensors."""
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-
 _SEPARATORS = {";": "tr ',;' '.,'", "\t": r"tr '\t' ','"}
 """Other separators of spreadsheets, and the command that turns such a file into CSV with decimal points."""
-
-
-def bounded_lines(file: TextIO) -> Iterator[str]:
-    """Lines of a file, one that is too long cut where `CsvNumbers` refuses it."""
-    return iter(lambda: file.readline(LONGEST_LINE + 1), "")
 
 
 def ignored_words(where: str, names: Sequence[str]) -> str:
@@ -101,9 +94,10 @@ class CsvNumbers:
         text = cell.strip()
         if not text:
             return np.nan
-        value = float(text) if _NUMBER.fullmatch(text) else np.nan
+        value = _number_or_nan(text)
         if not abs(value) <= LARGEST:
-            comma = "; write a decimal point" if _NUMBER.fullmatch(text.replace(",", ".", 1)) and "," in text else ""
+            point = _number_or_nan(text.replace(",", ".", 1))
+            comma = "; write a decimal point" if "," in text and abs(point) <= LARGEST else ""
             got = f"expected {kind}, got {shown(cell)}{comma}"
             raise self.error(f"{self.where}, line {line}, column {shown(name)}: {got}")
         return value
@@ -125,7 +119,7 @@ class CsvNumbers:
             for row in reader:
                 if any(cell.strip() for cell in row):
                     yield reader.line_num, row
-        except (csv.Error, UnicodeDecodeError) as cause:
+        except (csv.Error, ValueError) as cause:  # ValueError: no UTF-8, or a line that is too long to be held
             where = f"{self.where}, line {reader.line_num + 1}"
             raise self.error(f"{where}: not CSV text in UTF-8 ({cause})") from cause
 
@@ -136,6 +130,13 @@ class CsvNumbers:
                 raise self.error(f"{self.where}, line {number}: expected at most {LONGEST_LINE:,} characters, got more")
             comment = line.lstrip().startswith("#") and line.partition(",")[0].strip() not in names
             yield "\n" if comment else line
+
+
+def _number_or_nan(text: str) -> float:
+    try:
+        return number_of(text)
+    except ValueError:
+        return np.nan
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -17,8 +17,8 @@ import numpy as np
 
 from isocharge.arrays import Array, Booleans, Integers
 from isocharge.errors import PressError
-from isocharge.files import write_whole
-from isocharge.serve.prediction.csv_numbers import CsvNumbers, bounded_lines
+from isocharge.files import bounded_lines, write_whole
+from isocharge.serve.prediction.csv_numbers import CsvNumbers
 from isocharge.serve.prediction.table import CHARGE
 from isocharge.tables import is_number, shown
 

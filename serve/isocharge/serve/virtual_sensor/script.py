@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from isocharge.arrays import Array, Booleans
 from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import SceneError
+from isocharge.number_text import number_of
 
 REST_S = 1.0
 """Rest at the start of a script, s: time for a tare."""
@@ -22,6 +23,10 @@ PAUSE_S = (0.6, 1.2)
 
 RAMP_S = 0.15
 """Time in which the force rises from the smallest to that of the press, or falls back, s."""
+
+
+MOST_FRAMES = 2_000_000
+"""Longest script from a file, frames: nearly three hours at 200 Hz."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +75,17 @@ def read_script(lines: Iterable[str], rate_Hz: float, where: str) -> Script:
     """
     names = ("seconds", "x_mm", "y_mm", "force_N")
     try:
-        rows = [[float(row[name]) for name in names] for row in csv.DictReader(lines)]
-    except (KeyError, TypeError, ValueError) as error:
+        rows = [[number_of(row[name]) for name in names] for row in csv.DictReader(lines)]
+    except (csv.Error, KeyError, TypeError, ValueError) as error:
         raise SceneError(f"{where}: expected numbers in the columns {', '.join(names)} ({error})") from error
     seconds, x_mm, y_mm, force_N = np.array(rows).reshape(-1, 4).T
     if not (len(rows) > 1 and np.isfinite(rows).all() and (np.diff(seconds) > 0).all() and force_N.min() >= 0):
         raise SceneError(f"{where}: expected two rows or more, growing seconds and forces from 0, got {rows!r:.200}")
+    if not (seconds[-1] - seconds[0]) * rate_Hz <= MOST_FRAMES:
+        raise SceneError(
+            f"{where}: expected at most {MOST_FRAMES} frames, got {seconds[-1] - seconds[0]:g} s at {rate_Hz:g} Hz; "
+            "shorten the script, it is repeated"
+        )
     t = np.arange(seconds[0], seconds[-1], 1.0 / rate_Hz)
     x, y, force = (np.interp(t, seconds, values) for values in (x_mm, y_mm, force_N))
     return Script(np.where(force > 0, x, np.nan), np.where(force > 0, y, np.nan), force, rate_Hz)

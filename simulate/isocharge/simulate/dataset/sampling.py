@@ -80,6 +80,9 @@ class Sweep:
         if not 1 <= self.samples <= MOST_SAMPLES:
             bound = "at least 1" if self.samples < 1 else f"at most {MOST_SAMPLES}"
             raise SceneError(f"samples: expected {bound}, got {self.samples}")
+        low, high = self.force_range
+        if not 0.0 < low <= high < np.inf:
+            raise SceneError(f"force: expected 0 < smallest <= largest force in N, got {low:g} and {high:g}")
         if self.orientation not in get_args(Orientation):
             raise SceneError(f"orientation: expected 'fixed' or 'random', got {self.orientation!r}")
         if self.sampling not in get_args(Sampling):

@@ -10,6 +10,7 @@ format; it has no solver and no seed.
 
 import io
 import json
+import math
 import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -21,12 +22,19 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import DatasetError, SensorError
-from isocharge.files import new_folder, sha256_of, write_whole
+from isocharge.files import new_folder, read_whole, sha256_of, write_whole
 from isocharge.simulate.dataset.card import COLUMNS, data_card
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
+from isocharge.tables import MOST_JSON_BYTES, Table, cut, parse_json, shown
 
 FORMAT_VERSION = 1
+
+MOST_SHARD_BYTES = 1 << 26
+"""Largest shard, and largest column in it once unpacked, bytes: a sweep's have a twentieth."""
+
+LONGEST_HEAD = 4096
+"""Longest description of an array in a shard, bytes."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +118,10 @@ def pack_shard(number: int, samples: Samples, sensor: Sensor) -> tuple[str, byte
     _check_samples(samples, len(sensor.electrodes), name)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **samples.columns())
-    return name, buffer.getvalue()
+    data = buffer.getvalue()
+    if len(data) > MOST_SHARD_BYTES:
+        raise DatasetError(f"{name}: expected at most {MOST_SHARD_BYTES} bytes, got {len(data)}; make smaller shards")
+    return name, data
 
 
 def shard_name(number: int) -> str:
@@ -143,8 +154,9 @@ def write_manifest(
 
 def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
     shapes = {name: column.shape for name, column in samples.columns().items()}
-    expected = {name: (len(samples),) for name in COLUMNS} | {"charge_pC": (len(samples), n_electrode)}
-    if shapes != expected or len(samples) == 0:
+    count = len(samples) if samples.x_mm.ndim else 0
+    expected = dict.fromkeys(COLUMNS, (count,)) | {"charge_pC": (count, n_electrode)}
+    if shapes != expected or count == 0:
         raise DatasetError(f"{where}: expected columns of shapes {expected}, at least one sample, got {shapes}")
     for name, column in samples.columns().items():
         kinds = "U" if name == "probe" else "fiu"
@@ -172,26 +184,21 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
     expected = sensor
     manifest, checksum = _read_manifest(folder)
     try:
-        sensor = sensor_from_dict(manifest["sensor"], f"{folder}/manifest.json")
+        sensor = sensor_from_dict(manifest.table("sensor").values, f"{folder}/manifest.json")
         if expected is not None and expected != sensor:
             raise DatasetError(
                 f"{folder}/manifest.json: expected the sensor {expected.name!r}, got {_differs(sensor, expected)}; use "
                 "its own dataset, or make one"
             )
-        if manifest["electrodes"] != list(sensor.electrode_names):
-            raise DatasetError(
-                f"{folder}/manifest.json: expected the sensor's electrodes in its order, "
-                f"{list(sensor.electrode_names)}, got {manifest['electrodes']}"
-            )
-        shards = [_read_shard(folder, entry, sensor) for entry in manifest["shards"]]
-    except (KeyError, TypeError) as error:
-        raise DatasetError(f"{folder}/manifest.json: key {error} is missing or of another type") from error
+        if manifest.get("electrodes") != list(sensor.electrode_names):
+            manifest.refuse("electrodes", f"the sensor's electrodes in its order, {list(sensor.electrode_names)}")
+        shards = [_read_shard(folder, entry, sensor) for entry in manifest.tables("shards")]
     except SensorError as error:
         raise DatasetError(str(error)) from error
     if not shards:
         raise DatasetError(f"{folder}/manifest.json: lists no shards")
     joined = {name: np.concatenate([getattr(shard, name) for shard in shards]) for name in COLUMNS}
-    return Dataset(sensor, Samples(**joined), manifest, checksum)
+    return Dataset(sensor, Samples(**joined), dict(manifest.values), checksum)
 
 
 def _differs(sensor: Sensor, expected: Sensor) -> str:
@@ -203,41 +210,70 @@ def _differs(sensor: Sensor, expected: Sensor) -> str:
     return f"one of that name with another {', '.join(keys)}"
 
 
-def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
+def _read_manifest(folder: Path) -> tuple[Table, str]:
     path = folder / "manifest.json"
     if not path.is_file():
         raise DatasetError(
             f"{folder} is not a dataset: it has no manifest.json; make one with 'isocharge simulate sweep'"
         )
-    data = path.read_bytes()
+    data = _bytes_of(path, MOST_JSON_BYTES)
     try:
-        manifest = json.loads(data)
-        version = manifest["format_version"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{path}: not a manifest of a dataset: {error!r}") from error
+        manifest = Table(parse_json(data, "", DatasetError), "", DatasetError)
+        version = manifest.get("format_version")
+    except DatasetError as error:
+        raise DatasetError(f"{path}: not a manifest of a dataset: {error}") from error
+    manifest.where = str(path)
     if version != FORMAT_VERSION:
         raise DatasetError(
-            f"{path}: format version {version} is not supported (this version reads {FORMAT_VERSION}); "
+            f"{path}: format version {shown(version)} is not supported (this version reads {FORMAT_VERSION}); "
             f"make the dataset again or upgrade isocharge"
         )
     return manifest, sha256_of(data)
 
 
-def _read_shard(folder: Path, entry: dict[str, Any], sensor: Sensor) -> Samples:
-    path = folder / Path(entry["file"]).name
+def _bytes_of(path: Path, most: int) -> bytes:
+    try:
+        return read_whole(path, most)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror}); make the dataset again") from error
+
+
+def _read_shard(folder: Path, entry: Table, sensor: Sensor) -> Samples:
+    path = folder / Path(entry.text("file")).name
     if not path.is_file():
         raise DatasetError(f"{path}: the manifest lists this shard, but the file is missing; make the dataset again")
-    data = path.read_bytes()
-    checksum = sha256_of(data)
-    if checksum != entry["sha256"]:
+    data = _bytes_of(path, MOST_SHARD_BYTES)
+    checksum, expected = sha256_of(data), entry.text("sha256")
+    if checksum != expected:
         raise DatasetError(
-            f"{path} is damaged: expected sha256 {entry['sha256'][:12]}..., got {checksum[:12]}...; make the dataset "
-            "again"
+            f"{path} is damaged: expected sha256 {expected[:12]}..., got {checksum[:12]}...; make the dataset again"
         )
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            samples = Samples(**{name: arrays[name] for name in COLUMNS})
-    except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
-        raise DatasetError(f"{path}: not a shard with the columns {', '.join(COLUMNS)}: {error}") from error
+    samples = _unpacked(data, str(path))
     _check_samples(samples, len(sensor.electrodes), str(path))
     return samples
+
+
+def _unpacked(data: bytes, where: str) -> Samples:
+    """The columns in the bytes of a shard; nothing in them is executed."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as packed:
+            return Samples(**{name: _column(packed, name) for name in COLUMNS})
+    except Exception as error:  # zipfile, zlib and NumPy raise what they like
+        said = cut(str(error) or type(error).__name__)
+        raise DatasetError(f"{where}: not a shard with the columns {', '.join(COLUMNS)}: {said}") from error
+
+
+def _column(packed: zipfile.ZipFile, name: str) -> np.ndarray:
+    """An array of an npz file, not larger than it says, and not larger than a shard may be."""
+    size = packed.getinfo(f"{name}.npy").file_size
+    if size > MOST_SHARD_BYTES:
+        raise ValueError(f"{name} unpacks to more than {MOST_SHARD_BYTES} bytes")
+    with packed.open(f"{name}.npy") as file:
+        head = io.BytesIO(file.read(LONGEST_HEAD))
+    version = np.lib.format.read_magic(head)
+    read_head = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_head(head, max_header_size=LONGEST_HEAD)
+    if math.prod(shape) * dtype.itemsize > size or not all(0 <= n <= size for n in shape):
+        raise ValueError(f"{name}: shape {shape} of {dtype} does not fit into {size} bytes")
+    with packed.open(f"{name}.npy") as file:
+        return np.lib.format.read_array(file, allow_pickle=False, max_header_size=LONGEST_HEAD)

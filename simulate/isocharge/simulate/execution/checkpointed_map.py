@@ -39,8 +39,14 @@ class CheckpointedMap:
             yield result
 
     def _load(self, name: str) -> Array | None:
-        data = self._run.load(name)
-        return None if data is None else np.load(io.BytesIO(data), allow_pickle=False)
+        return self._run.load_as(name, _array)
+
+
+def _array(data: bytes) -> Array:
+    array = np.load(io.BytesIO(data), allow_pickle=False)
+    if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
+        raise ValueError(f"expected an array of numbers, got {type(array).__name__}")
+    return array
 
 
 def _npy(array: Array) -> bytes:

@@ -9,6 +9,9 @@ from isocharge.errors import SensorError
 from isocharge.simulate.numerics.polygon import area_of, is_convex
 from isocharge.simulate.sensor.film import Film
 
+MOST_CORNERS = 256
+"""Largest number of corners of an electrode."""
+
 
 @dataclass(frozen=True)
 class Electrode:
@@ -65,6 +68,10 @@ class Calibration:
 
 
 def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration) -> None:
+    if len(electrode.corners) > MOST_CORNERS:
+        raise SensorError(
+            f"electrode {electrode.name!r}: expected at most {MOST_CORNERS} corners, got {len(electrode.corners)}"
+        )
     corners = np.array(electrode.corners)
     if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
         raise SensorError(

@@ -15,6 +15,7 @@ import numpy as np
 from isocharge.arrays import Array, Complexes
 from isocharge.errors import SceneError
 from isocharge.simulate.numerics.polygon import area_of, centroid_of, is_convex
+from isocharge.tables import cut
 
 NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 
@@ -174,8 +175,8 @@ def parse_probe(text: str) -> Probe:
     match = NOTATION.fullmatch(text.strip())
     if match is None:
         raise SceneError(
-            f"probe {text!r}: expected 'circle:R', 'rectangle:WxH', 'triangle:S' or 'polygon:X,Y;X,Y;X,Y' in mm, each "
-            "optionally turned as in 'triangle:4.0@30' (degrees)"
+            f"probe {cut(text)!r}: expected 'circle:R', 'rectangle:WxH', 'triangle:S' or 'polygon:X,Y;X,Y;X,Y' in mm, "
+            "each optionally turned as in 'triangle:4.0@30' (degrees)"
         )
     angle = float(np.deg2rad(float(match["angle"] or 0.0)))
     if match["circle"]:
@@ -185,6 +186,8 @@ def parse_probe(text: str) -> Probe:
     if match["triangle"]:
         return Polygon.triangle(float(match["side"]) * 1e-3, angle)
     corners = np.array([[float(value) for value in corner.split(",")] for corner in match["corners"].split(";")])
+    if not np.isfinite(corners).all():
+        raise SceneError(f"probe {cut(text)!r}: expected finite corners")
     return Polygon.of(corners * 1e-3, angle)
 
 

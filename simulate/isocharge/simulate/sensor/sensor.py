@@ -13,8 +13,15 @@ from isocharge.errors import SensorError
 from isocharge.simulate.numerics.polygon import overlap
 from isocharge.simulate.sensor.electrode import Calibration, Electrode, _check_electrode
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
+from isocharge.tables import cut, shown
 
 Readout = Literal["area", "edge"]
+
+LONGEST_NAME = 100
+"""Longest name of an electrode, characters."""
+
+MOST_ELECTRODES = 64
+"""Largest number of electrodes on a film; each is checked against all others."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +41,14 @@ class Sensor:
             if value not in options:
                 raise SensorError(f"expected one of {options}, got {value!r}")
         names = self.electrode_names
+        if len(names) > MOST_ELECTRODES:
+            raise SensorError(f"electrodes: expected at most {MOST_ELECTRODES}, got {len(names)}")
         if len(set(names)) < len(names) or not all(names) or "side_mm" in names:
-            raise SensorError(f"electrodes: expected different names, none empty or 'side_mm', got {names}")
+            raise SensorError(f"electrodes: expected different names, none empty or 'side_mm', got {cut(str(names))}")
+        if max(map(len, names), default=0) > LONGEST_NAME:
+            raise SensorError(f"electrodes: expected names of at most {LONGEST_NAME} characters, got {cut(str(names))}")
         if not all(np.isfinite(gain) and gain > 0.0 for gain in self.calibration.gain.values()):
-            raise SensorError(f"calibration gain: expected positive numbers, got {self.calibration.gain}")
+            raise SensorError(f"calibration gain: expected positive numbers, got {shown(self.calibration.gain)}")
         if not self.electrodes:
             raise SensorError("electrodes: expected at least one, got none")
         for electrode in self.electrodes:
@@ -50,7 +61,9 @@ class Sensor:
                     raise SensorError(f"electrodes {first.name!r} and {second.name!r} overlap; move one of them")
         unknown = set(self.calibration.gain) - set(self.electrode_names)
         if unknown:
-            raise SensorError(f"calibration gain: no electrode named {sorted(unknown)}, have {self.electrode_names}")
+            raise SensorError(
+                f"calibration gain: no electrode named {shown(sorted(unknown))}, have {cut(str(self.electrode_names))}"
+            )
 
     @property
     def electrode_names(self) -> tuple[str, ...]:

@@ -15,6 +15,9 @@ from isocharge.simulate.sensor.sensor import Readout, Sensor
 from isocharge.tables import Table, parse_toml, read_toml
 from isocharge.toml_text import to_toml
 
+FARTHEST_MM = 1e6
+"""Largest coordinate of a point, mm."""
+
 SECTIONS = ("name", "readout", "surface", "film", "piezo", "electrodes", "calibration")
 
 
@@ -168,12 +171,16 @@ def _electrode(table: Table, name: str) -> Electrode:
         corners = polygon.sequence("polygon_mm", of="[x, y]")
         return Electrode(name, tuple(_metres(polygon, "polygon_mm", corner) for corner in corners))
     side = table.number("side_mm", above=0.0)
+    if side > FARTHEST_MM:
+        table.refuse("side_mm", f"at most {FARTHEST_MM:g}")
     return Electrode.of_square(name, _metres(table, name, table.get(name)), side * 1e-3)
 
 
 def _metres(table: Table, key: str, point_mm: object) -> tuple[float, float]:
     """A point of the plane, m."""
     x_mm, y_mm = table.as_numbers(key, point_mm, count=2, of="[x, y] in mm")
+    if max(abs(x_mm), abs(y_mm)) > FARTHEST_MM:
+        table.refuse(key, f"[x, y] in mm, each at most {FARTHEST_MM:g}", point_mm)
     return 1e-3 * x_mm, 1e-3 * y_mm
 
 

@@ -103,10 +103,9 @@ class Calibration:
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
-        """What the presses say of the film, by name."""
-        return quantities(
-            self.scene.charges.prior, self.posterior.parameters, self.posterior.covariance, self.before.covariance
-        )
+        """What is known of the film, by name, beside what its description alone says."""
+        described = np.eye(len(self.scene.charges.prior.names))
+        return quantities(self.scene.charges.prior, self.posterior.parameters, self.posterior.covariance, described)
 
     @cached_property
     def sensitivity(self) -> ContactSensitivity:

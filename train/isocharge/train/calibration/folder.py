@@ -7,6 +7,7 @@
     FOLDER/<version>/presses.csv   the presses
     FOLDER/<version>/calibration.png
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    of the last version
+    FOLDER/presses.part.csv        presses of a session at the bench that is not over
 
 A further calibration in the same folder is its next version: a server that watches it takes it with a reload, and
 nothing is lost.
@@ -21,12 +22,13 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import ModelError, PressError
-from isocharge.files import write_whole
+from isocharge.files import read_whole, write_whole
 from isocharge.json_values import plain_values
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.repository import version_folders
-from isocharge.serve.prediction.measured_presses import write_presses
+from isocharge.serve.prediction.measured_presses import MeasuredPresses, write_presses
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
+from isocharge.tables import parse_json
 from isocharge.train.calibration.calibrate import Calibration, CalibrationScene, EarlierFilm, loosened
 from isocharge.train.calibration.card import calibration_card
 from isocharge.train.calibration.picture import calibration_picture
@@ -35,6 +37,9 @@ from isocharge.train.films.films_model import FilmsModel, write_film_model
 RESULT, SENSOR, PRESSES, PICTURE = "calibration.json", "sensor.toml", "presses.csv", "calibration.png"
 """Names of the files."""
 
+SESSION = "presses.part.csv"
+"""Name of the file with the presses of a session that is not over."""
+
 DOTS_PER_INCH = 90
 """Of the picture: readable, and some 150 kB."""
 
@@ -42,6 +47,28 @@ DOTS_PER_INCH = 90
 def next_version(folder: Path) -> int:
     """Number of the version that a calibration in this folder gets: one more than the last."""
     return max(version_folders(folder), default=0) + 1
+
+
+def check_calibration_folder(folder: Path) -> None:
+    """Raise ModelError if a calibration cannot go into this folder, because it holds something else."""
+    if not folder.exists() or (folder / RESULT).is_file():
+        return
+    if not folder.is_dir() or {path.name for path in folder.iterdir() if not path.name.startswith(".")} - {SESSION}:
+        raise ModelError(f"{folder}: expected a new folder or one of an earlier calibration; choose another --output")
+
+
+def save_session(folder: Path, presses: MeasuredPresses) -> None:
+    """Write the presses of a session into its folder, all of them anew; without presses the file goes."""
+    if len(presses):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_presses(folder / SESSION, presses)
+    else:
+        end_session(folder)
+
+
+def end_session(folder: Path) -> None:
+    """Remove the presses of a session whose calibration is written: the version folder has them."""
+    (folder / SESSION).unlink(missing_ok=True)
 
 
 def write_calibration(folder: Path, calibration: Calibration, films: FilmsModel, command: str = "") -> Path:
@@ -60,8 +87,7 @@ def write_calibration(folder: Path, calibration: Calibration, films: FilmsModel,
         ModelError: If the folder holds something else.
         OutputError: If the file system refuses.
     """
-    if folder.exists() and not (folder / RESULT).is_file():
-        raise ModelError(f"{folder}: expected a new folder or one of an earlier calibration; choose another --output")
+    check_calibration_folder(folder)
     further = {
         RESULT: json.dumps(plain_values(calibration.to_dict()), indent=1, allow_nan=False).encode(),
         SENSOR: sensor_to_toml(calibration.film[0]).encode(),
@@ -120,7 +146,7 @@ def read_earlier(folder: Path, scene: CalibrationScene) -> EarlierFilm:
     """
     path = folder / RESULT
     try:
-        table: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        table: dict[str, Any] = parse_json(read_whole(path), str(path), PressError)
         names, prior = tuple(table["parameters"]), scene.charges.prior
         if names != prior.names or table["sensor"] != prior.sensor.name:
             raise PressError(

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.arrays import Array
+from isocharge.errors import PressError
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.train.calibration.contact_error import ContactSensitivity
@@ -25,6 +26,9 @@ FORCES = (0.15, 0.45, 0.95)
 
 ROUND_MM, ROUND_N = 0.5, 0.05
 """Proposed presses lie on this grid, so that a person can make them."""
+
+AVOIDED_MM = 1.0
+"""Distance from a place to avoid within which nothing is proposed, mm."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,11 @@ class ProposedPress:
     force_N: float
     position_mm: float
     force_percent: float
+
+    @property
+    def contact(self) -> Array:
+        """(x_mm, y_mm, force_N), shape (3,)."""
+        return np.array([self.x_mm, self.y_mm, self.force_N])
 
 
 def information_of(
@@ -83,6 +92,7 @@ def next_presses(
     *,
     position_std_mm: float = 0.1,
     force_std: float = 0.01,
+    avoid_mm: Array | None = None,
 ) -> list[ProposedPress]:
     """The presses to make next, best first.
 
@@ -95,11 +105,15 @@ def next_presses(
         covariance: Of the parameters over their prior standard deviations; the prior's before the first press.
         position_std_mm: How well the presses' places will be known, mm.
         force_std: How well their forces will be known, share.
+        avoid_mm: Places that cannot be pressed, shape (n, 2), mm; nothing within `AVOIDED_MM` of them is proposed.
+
+    Raises:
+        PressError: If every place is to be avoided.
     """
     parameters = charges.prior.mean if parameters is None else parameters
     covariance = np.eye(parameters.size) if covariance is None else covariance
     sensitivity = ContactSensitivity.at(charges, parameters, domain, noise)
-    cost, candidates = sensitivity.cost(), _candidates(domain)
+    cost, candidates = sensitivity.cost(), _candidates(domain, np.empty((0, 2)) if avoid_mm is None else avoid_mm)
     offered = information_of(charges, parameters, candidates, noise, position_std_mm, force_std)
     proposed, information = [], np.linalg.inv(covariance)
     for _ in range(count):
@@ -112,10 +126,14 @@ def next_presses(
     return proposed
 
 
-def _candidates(domain: ContactDomain) -> Array:
+def _candidates(domain: ContactDomain, avoid_mm: Array) -> Array:
     """Presses to compare, on a grid that a person can set, shape (n, 3)."""
     at, (low, high) = domain.radius_mm * sunflower(PLACES), domain.force_range_N
     places = np.unique(np.round(np.column_stack([at.real, at.imag]) / ROUND_MM) * ROUND_MM, axis=0)
     places = places[np.hypot(*places.T) <= domain.radius_mm]
+    distance_mm = np.hypot(*np.moveaxis(places[:, None] - avoid_mm, 2, 0))
+    places = places[(distance_mm > AVOIDED_MM).all(axis=1)]
+    if not len(places):
+        raise PressError(f"no place within {domain.radius_mm:.3g} mm of the centre is left to press; skip fewer")
     forces = np.maximum(np.round(low * (high / low) ** np.array(FORCES) / ROUND_N) * ROUND_N, ROUND_N)
     return np.array([(x, y, force) for x, y in places for force in np.unique(np.clip(forces, low, high))])

@@ -16,6 +16,9 @@ from isocharge.train.calibration.contact_error import ContactError
 LEVELS_MM = (0.02, 5.0)
 """Errors at the ends of the colours, mm."""
 
+TICKS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+"""Errors that the colour bar names, mm."""
+
 ASSUMED, FITTED = "#b9c4cf", "#3a7ca5"
 """Colours of what was assumed before the presses and of what they say."""
 
@@ -31,7 +34,9 @@ def calibration_picture(calibration: Calibration) -> Figure:
         shades = _draw_error(axes, calibration, error)
         axes.set_title(f"{title}: {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)")
     _draw_presses(after, calibration)
-    figure.colorbar(shades, ax=[before, after], label="position error by not knowing the film (rms), mm", format="%g")
+    figure.colorbar(
+        shades, ax=[before, after], label="position error by not knowing the film (rms), mm", ticks=TICKS, format="%g"
+    )
     _draw_quantities(identified, calibration)
     _draw_misses(misses, calibration)
     figure.suptitle(f"calibration of {calibration.film[0].name}", fontsize=13)
@@ -86,7 +91,7 @@ def _draw_quantities(axes: Any, calibration: Calibration) -> None:
     axes.set(yticks=row, yticklabels=[quantity.name for quantity in quantities], xlim=(-4.0, 4.0))
     axes.set(xlabel="from what was assumed, in its standard deviations", title="what the presses tell")
     axes.tick_params(axis="y", labelsize=8)
-    axes.legend(fontsize=8, loc="lower left")
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3)
 
 
 def _draw_misses(axes: Any, calibration: Calibration) -> None:

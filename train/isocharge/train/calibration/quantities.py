@@ -18,6 +18,9 @@ from isocharge.simulate.sensor.film_prior import FilmPrior
 IDENTIFIED = 0.5
 """Standard deviation after the presses over that before, below which a quantity counts as told, dimensionless."""
 
+PERCENT = ", over the described one"
+"""How quantities are given whose size is described, but not known."""
+
 NORMAL_95 = 1.959964
 """Half width of a 95 % interval in standard deviations."""
 
@@ -97,25 +100,24 @@ def _rows(prior: FilmPrior) -> Mapping[str, tuple[str, float, Array]]:
         return values
 
     mean_gain = {f"gain__{name}": 1.0 / len(electrodes) for name in electrodes}
-    percent = "over the described one, %"
     table = {
         "pretension_MPa": ("pretension", 0.0, row(pretension=1e-6)),
         "response_percent": (
-            f"charge of a press on the slack film, E^(1/3) h^(-2/3) sqrt(d31 d32) gain, {percent}",
+            f"charge of a press on the slack film, E^(1/3) h^(-2/3) sqrt(d31 d32) gain{PERCENT}, %",
             0.0,
             100.0 * row(young=1.0 / 3.0, thickness=-2.0 / 3.0, d31=0.5, d32=0.5, **mean_gain),
         ),
         "charge_scale_percent": (
-            f"product of Young's modulus, sqrt(d31 d32) and mean gain, {percent}",
+            f"product of Young's modulus, sqrt(d31 d32) and mean gain{PERCENT}, %",
             0.0,
             100.0 * row(young=1.0, d31=0.5, d32=0.5, **mean_gain),
         ),
         "stiffness_percent": (
-            f"Young's modulus times thickness, {percent}",
+            f"Young's modulus times thickness{PERCENT}, %",
             0.0,
             100.0 * row(young=1.0, thickness=1.0),
         ),
-        "anisotropy_percent": (f"ratio of d31 to d32, {percent}", 0.0, 100.0 * row(d31=1.0, d32=-1.0)),
+        "anisotropy_percent": (f"ratio of d31 to d32{PERCENT}, %", 0.0, 100.0 * row(d31=1.0, d32=-1.0)),
         "shift_x_mm": ("shift of the electrodes along x", 1e3 * calibration.shift[0], row(shift_x=1e3)),
         "shift_y_mm": ("shift of the electrodes along y", 1e3 * calibration.shift[1], row(shift_y=1e3)),
         "rotation_deg": (
@@ -136,7 +138,7 @@ def _rows(prior: FilmPrior) -> Mapping[str, tuple[str, float, Array]]:
         "d32_percent": ("d32 by itself", row(d32=1.0)),
         "mean_gain_percent": ("mean gain by itself", row(**mean_gain)),
     }
-    table |= {name: (f"{meaning}, {percent}", 0.0, 100.0 * weights) for name, (meaning, weights) in alone.items()}
+    table |= {name: (f"{meaning}{PERCENT}, %", 0.0, 100.0 * weights) for name, (meaning, weights) in alone.items()}
     return table
 
 
@@ -148,7 +150,7 @@ def in_words(table: Mapping[str, Quantity]) -> tuple[str, ...]:
     if unknown:
         sentences.append(
             "These presses cannot tell "
-            + ", ".join(quantity.meaning.removesuffix(", over the described one, %") for quantity in unknown)
+            + ", ".join(quantity.meaning.removesuffix(", %").removesuffix(PERCENT) for quantity in unknown)
             + "; what is given for them is hardly more than what was assumed before."
         )
     if not table["young_percent"].identified and table["response_percent"].identified:

@@ -21,6 +21,7 @@ class FilmsConfig:
         steps: Optimiser steps of the contact network.
         misfit_films: Films that the misfit network learns from.
         misfit_charges: Charges of each.
+        near_films: Films whose good presses it learns from, as many presses on each as above.
         misfit_steps: Optimiser steps of the misfit network.
         batch_films: Films in a step.
         batch_presses: Presses of each.
@@ -39,6 +40,7 @@ class FilmsConfig:
     steps: int = 22_000
     misfit_films: int = 320
     misfit_charges: int = 160
+    near_films: int = 768
     misfit_steps: int = 9_000
     batch_films: int = 32
     batch_presses: int = 64

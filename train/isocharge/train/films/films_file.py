@@ -25,6 +25,7 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import InputError, ModelError
+from isocharge.files import read_whole
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread
@@ -83,7 +84,7 @@ def read_films(version_folder: Path) -> FilmsModel:
     """
     path = version_folder / FILE
     try:
-        data = path.read_bytes()
+        data = read_whole(path)
     except FileNotFoundError as error:
         raise ModelError(
             f"{path}: missing; expected the version folder of a model for all films, as `isocharge train fit --films` "

@@ -21,7 +21,7 @@ from isocharge.train.films.contact_stage import ContactStage
 from isocharge.train.films.film_presses import FilmPresses, draw_film_presses
 from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.films.inputs import FilmInputs
-from isocharge.train.films.misfit_films import MisfitStage, draw_misfit_films
+from isocharge.train.films.misfit_films import MisfitStage, NearPresses, draw_misfit_films, draw_near_films
 from isocharge.train.training.checkpoint import Checkpoint
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fit import WARM_UP, threads_and_seed
@@ -29,14 +29,14 @@ from isocharge.train.training.fit import WARM_UP, threads_and_seed
 BEYOND = 1.5e-3
 """How far the family reaches beyond the domain, m: a calibration moves presses whose place is not exactly known."""
 
-FORCES_BEYOND = 1.2
-"""The same for forces, a factor."""
+FORCES_BEYOND = (0.8, 1.2)
+"""The same for forces: factors of the smallest and the largest."""
 
 LARGEST_GRADIENT = 5.0
 """Norm to which gradients are cut: films whose map nearly folds pull hard."""
 
-FAMILY_STEPS, PRESSES_STEPS, MISFIT_STEPS = 15_000, 8_000, 12_000
-"""Steps of training that take about as long as the solves, the presses, and the examples of misfit: for progress."""
+FAMILY_STEPS, PRESSES_STEPS, MISFIT_STEPS, NEAR_STEPS = 15_000, 8_000, 12_000, 2_000
+"""Steps of training that take about as long as solves, presses, examples of misfit, and good presses: for progress."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class _FilmsTraining:
         self.prior, self.config, self.map_jobs = prior, config, map_jobs
         self.checkpoint, self.progress, self.done = checkpoint, progress, 0
         self.domain = ContactDomain(float(f"{1e3 * config.radius:.9g}"), config.force_range)
-        self.total = FAMILY_STEPS + PRESSES_STEPS + config.steps + MISFIT_STEPS + config.misfit_steps
+        self.total = FAMILY_STEPS + PRESSES_STEPS + config.steps + MISFIT_STEPS + NEAR_STEPS + config.misfit_steps
 
     def run(self) -> FilmsFit:
         family = FilmFamily.from_arrays(self._part("family", FAMILY_STEPS, "solving films", self._family))
@@ -108,7 +108,8 @@ class _FilmsTraining:
         inputs = FilmInputs.fit(FilmScaling(self.prior, self.domain), FilmPresses.from_arrays(presses))
         contact = self._contact(inputs, FilmPresses.from_arrays(presses))
         examples = self._part("examples", MISFIT_STEPS, "nearest contacts", lambda call: self._examples(family, call))
-        misfit = self._misfit(inputs, examples)
+        near = self._part("near", NEAR_STEPS, "good presses", lambda call: self._near(family, call))
+        misfit = self._misfit(inputs, examples, near)
         return FilmsFit(inputs, family, contact, misfit, self.config)
 
     def _part(self, name: str, steps: int, stage: str, work: Any) -> Any:
@@ -135,7 +136,7 @@ class _FilmsTraining:
 
     def _family(self, advance: Progress) -> dict[str, Any]:
         low, high = self.config.force_range
-        forces = (low / FORCES_BEYOND, high * FORCES_BEYOND)
+        forces = (low * FORCES_BEYOND[0], high * FORCES_BEYOND[1])
         radius = self.config.radius + BEYOND
         return FilmFamily.build(self.prior, radius, forces, map_jobs=self.map_jobs, progress=advance).to_arrays()
 
@@ -154,6 +155,20 @@ class _FilmsTraining:
             config.misfit_charges, config.seed, map_jobs=self.map_jobs, progress=advance,
         )  # fmt: skip
 
+    def _near(self, family: FilmFamily, advance: Progress) -> dict[str, np.ndarray]:
+        config = self.config
+        return draw_near_films(
+            self.prior,
+            family,
+            self.domain,
+            misfit_noise(noise_model(config.noise)),
+            config.near_films,
+            config.presses,
+            config.seed,
+            map_jobs=self.map_jobs,
+            progress=advance,
+        )
+
     def _network(self, inputs: FilmInputs, hidden: tuple[int, ...], outputs: int) -> ConditionalPerceptron:
         return ConditionalPerceptron(inputs.mean.size, hidden, outputs, inputs.scaling.standard[0].size)
 
@@ -168,10 +183,13 @@ class _FilmsTraining:
         self._descend(task)
         return part.to_arrays()
 
-    def _misfit(self, inputs: FilmInputs, examples: dict[str, np.ndarray]) -> dict[str, Array]:
+    def _misfit(
+        self, inputs: FilmInputs, examples: dict[str, np.ndarray], near: dict[str, np.ndarray]
+    ) -> dict[str, Array]:
         config = self.config
         part: ConditionalPerceptron = self._network(inputs, config.misfit_hidden, inputs.mean.size)
-        stage = MisfitStage.of(part, inputs, examples, (config.batch_films, config.batch_presses))
+        good = NearPresses.of(inputs, near, misfit_noise(noise_model(config.noise)))
+        stage = MisfitStage.of(part, good, examples, (config.batch_films, config.batch_presses))
         task = TrainingStage("misfit", part, stage.loss, stage.score, config.misfit_steps, 0, LARGEST_GRADIENT)
         self._descend(task)
         return part.to_arrays()

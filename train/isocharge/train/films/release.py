@@ -129,12 +129,14 @@ class _Measured:
     def of(cls, films: FilmsModel) -> "_Measured":
         """The film with the lower error on fresh films of: the described one, and the mean of the prior."""
         drawn: FreshFilms = fresh_films(films)
-        choices = [(films.prior.described, "as described"), (films.prior.mean, "the mean of all")]
+        choices = [(films.prior.described, "as described"), (films.prior.mean, "in the middle of all")]
         tried = [(dict(films_errors(films, drawn, parameters)), parameters, word) for parameters, word in choices]
         unknown, parameters, word = min(tried, key=lambda entry: entry[0]["position_rms_mm"])
-        text = f"the film {word}, with a pretension of {1e-6 * parameters[0]:g} MPa"
-        for errors, _, rival in tried:
-            text += f"\n({rival}: {errors['position_rms_mm']:g} mm rms over all films)"
+        others = ", ".join(f"{rival}: {errors['position_rms_mm']:g} mm" for errors, _, rival in tried if rival != word)
+        text = (
+            f"the film {word}, with a pretension of {1e-6 * parameters[0]:g} MPa.\nThat film errs least over all films "
+            f"({unknown['position_rms_mm']:g} mm rms; {others})"
+        )
         presses = fresh_presses(films, parameters, PRESSES)
         exact = measure_errors(films.fold(parameters).predict, presses, films.noise)
         return cls(parameters, text, dict(films_errors(films, drawn)), unknown, dict(exact))

@@ -1,15 +1,20 @@
 """The methods of `inference.GRPCInferenceService`, on the models of the HTTP handler."""
 
-from collections.abc import Callable, Iterator
+import asyncio
+from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any
 
 import grpc
+import grpc.aio
 from google.protobuf.json_format import ParseDict
+from google.protobuf.message import DecodeError
 
 from isocharge.errors import ModelNotFound, RequestError
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE
+from isocharge.serve.network.grpc.open_calls import OpenCalls
 from isocharge.serve.network.grpc.tensors import read_infer, write_answer
+from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler, describe
 from isocharge.serve.network.protocol.infer import answer_inference
 from isocharge.serve.network.protocol.status import client_message, grpc_status
@@ -17,6 +22,12 @@ from isocharge.serve.network.token import Token
 
 OPEN = ("ServerLive", "ServerReady")
 """Methods that need no token."""
+
+BLOCKING = ("RepositoryModelLoad", "RepositoryModelUnload")
+"""Methods that may take longer than others should wait: they are answered in other threads."""
+
+STREAM = "ModelStreamInfer"
+"""The method of many messages."""
 
 
 class Service:
@@ -76,36 +87,77 @@ class Service:
             return {"error_message": client_message(error)}
 
 
-def handlers(service: Service, token: Token | None) -> grpc.GenericRpcHandler:
-    """The service as grpcio takes it."""
-    methods = {name: _method(name, getattr(service, name), token) for name in METHODS}
-    return grpc.method_handlers_generic_handler(SERVICE, methods)
+def handlers(service: Service, limits: ServerLimits, token: Token | None) -> grpc.GenericRpcHandler:
+    """The service as grpcio takes it.
+
+    What a client sends is a stream to grpcio also where it is one message, which comes as the same bytes: so the token
+    is checked, and the bounds hold, before a message comes, and whether one comes at all.
+    """
+    calls = OpenCalls(limits.connections)
+    return grpc.method_handlers_generic_handler(
+        SERVICE, {name: _method(name, getattr(service, name), calls, limits, token) for name in METHODS}
+    )
 
 
-def _method(name: str, answer: Callable[[Any], Any], token: Token | None) -> grpc.RpcMethodHandler:
+def _method(
+    name: str, answer: Callable[[Any], Any], calls: OpenCalls, limits: ServerLimits, token: Token | None
+) -> grpc.RpcMethodHandler:
     request_type, response_type = METHODS[name]
-    secret = None if name in OPEN else token
-    codec = {"request_deserializer": request_type.FromString, "response_serializer": response_type.SerializeToString}
 
-    def answer_one(request: Any, context: grpc.ServicerContext) -> Any:
+    def answer_bytes(data: bytes) -> bytes:
+        return _message(answer(_read(request_type, data)), response_type).SerializeToString()  # type: ignore[no-any-return]
+
+    async def answer_one(context: grpc.aio.ServicerContext) -> bytes:
+        data = await _next(context, calls, limits.header_seconds)
+        if data is grpc.aio.EOF:
+            raise RequestError(f"{name}: expected a message, got none")
+        return await asyncio.to_thread(answer_bytes, data) if name in BLOCKING else answer_bytes(data)
+
+    async def answer_each(context: grpc.aio.ServicerContext) -> None:
+        seconds = limits.header_seconds
+        while (data := await _next(context, calls, seconds)) is not grpc.aio.EOF:
+            async with asyncio.timeout(limits.body_seconds):
+                await context.write(answer_bytes(data))
+            seconds = limits.idle_seconds
+
+    converse: Callable[[grpc.aio.ServicerContext], Awaitable[Any]] = answer_each if name == STREAM else answer_one
+
+    async def handle(_: object, context: grpc.aio.ServicerContext) -> Any:
         try:
-            _check(secret, context)
-            return _message(answer(request), response_type)
+            with calls.one_more():
+                if token is not None and name not in OPEN:
+                    token.check(_authorization(context))
+                return await converse(context)
+        except TimeoutError:
+            status, message = "DEADLINE_EXCEEDED", "the call waited too long for its client, or others needed its place"
         except Exception as error:  # the one place where an error becomes an answer
-            return context.abort(grpc.StatusCode[grpc_status(error)], client_message(error))
+            status, message = grpc_status(error), client_message(error)
+        return await context.abort(grpc.StatusCode[status], message)
 
-    def answer_each(requests: Iterator[Any], context: grpc.ServicerContext) -> Iterator[Any]:
-        yield from (answer_one(request, context) for request in requests)
-
-    if name == "ModelStreamInfer":
-        return grpc.stream_stream_rpc_method_handler(answer_each, **codec)
-    return grpc.unary_unary_rpc_method_handler(answer_one, **codec)
+    if name == STREAM:
+        return grpc.stream_stream_rpc_method_handler(handle)
+    return grpc.stream_unary_rpc_method_handler(handle)
 
 
-def _check(token: Token | None, context: grpc.ServicerContext) -> None:
-    if token is not None:
-        sent = dict(context.invocation_metadata()).get("authorization", "")
-        token.check(sent.encode() if isinstance(sent, str) else sent)
+async def _next(context: grpc.aio.ServicerContext, calls: OpenCalls, seconds: float) -> Any:
+    """The next message of a call, or grpc.aio.EOF."""
+    async with calls.waiting(seconds):
+        return await context.read()
+
+
+def _read(request_type: type[Any], data: bytes) -> Any:
+    try:
+        return request_type.FromString(data)
+    except DecodeError as error:
+        raise RequestError(
+            f"expected a {request_type.DESCRIPTOR.name}, got {len(data)} bytes of another kind"
+        ) from error
+
+
+def _authorization(context: grpc.aio.ServicerContext) -> bytes:
+    """The value of the metadata `authorization`, empty if there is none."""
+    sent = dict(context.invocation_metadata() or ()).get("authorization", "")
+    return sent.encode() if isinstance(sent, str) else bytes(sent)
 
 
 def _message(fields: Any, response: type[Any]) -> Any:

@@ -7,10 +7,14 @@ only what may take long, and what follows it on the same connection, goes throug
 uvicorn also bounds neither headers nor the time they take. A timer for each request would cost as much as parsing it,
 so a connection only notes the deadline of its next step, and the server looks through the connections now and then
 (`close_overdue`).
+
+A client may send thousands of requests at once, and the server has one thread for all connections: what arrives is
+parsed in slices, and after `TURN_SECONDS` it is the turn of other connections.
 """
 
 import asyncio
 import math
+import time
 import urllib.parse
 from collections.abc import Iterable
 from enum import Enum
@@ -28,6 +32,12 @@ from isocharge.serve.network.protocol.response import error_response, refusal
 
 UNSENT_BYTES = 1 << 22
 """Answers that may wait for a client that sends requests and reads none, bytes; then the connection is closed."""
+
+SLICE_BYTES = 4096
+"""Bytes that are parsed at a time; nearly every request is shorter."""
+
+TURN_SECONDS = 250e-6
+"""Time after which a connection that has more to parse lets others go first, s."""
 
 LINGER_SECONDS = 2.0
 """Time that a refused client may go on sending, s: if the connection closed at once, it might never read why."""
@@ -51,40 +61,128 @@ class BoundedProtocol(HttpToolsProtocol):
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
         self.deadline = math.inf  # the loop's time, s
+        self.has_asked = False  # whether a request was ever complete
         self._phase = self._timed = Phase.IDLE
         self._chunk = self._fed = 0  # bytes of this piece, and of all since the request began
-        self._body = bytearray()
-        self._is_last = self._is_refused = False
+        self._body, self._unparsed = bytearray(), bytearray()
+        self._turn: asyncio.Handle | None = None
+        self._starts_in_chunk = True  # whether this piece begins with a request
+        self._is_last = self._is_refused = self._is_half_closed = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept a connection, or refuse it if there are too many."""
         super().connection_made(transport)
         self._allow(self.limits.header_seconds)
-        if len(self.connections) > self.limits.connections:
+        if len(self.connections) > self.limits.connections and not self._make_room():
             self._refuse(refusal(503, f"all {self.limits.connections} connections are taken; try again later"))
 
+    def _make_room(self) -> bool:
+        """End the connection that has waited longest without one complete request; False if each has had one."""
+        connections: set[Any] = self.connections
+        silent = [other for other in connections if other is not self and not other.has_asked]
+        if not silent:
+            return False
+        oldest = min(silent, key=lambda other: other.deadline)
+        connections.discard(oldest)
+        oldest.transport.abort()
+        return True
+
     def data_received(self, data: bytes) -> None:
-        """Parse; a request that is then still incomplete is measured and timed."""
+        """Parse at once what is short and may be answered now; the rest in slices, in turns with other connections."""
         if self._is_refused or self.transport.is_closing():
             return
+        cycle = self.cycle  # the tests of `_may_answer` stand here: a call takes longer than they do
+        may_answer = (cycle is None or cycle.response_complete) and not self.flow.write_paused
+        if may_answer and not self._unparsed and len(data) <= SLICE_BYTES:
+            self._parse(data)
+            return
+        self._unparsed += data
+        if self._turn is None:
+            self._take_turn()
+
+    def eof_received(self) -> bool:  # type: ignore[override]
+        """The client sends no more; what it has asked for is still answered, where the transport can do that."""
+        self._is_half_closed = bool(self._unparsed) or not self._has_answered()
+        return self._is_half_closed and self.transport.can_write_eof()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection is over, and what it sent is forgotten."""
+        self._unparsed.clear()
+        super().connection_lost(exc)
+
+    def _may_answer(self) -> bool:
+        """Whether an answer could go out now: the one before is complete, and the client reads."""
+        return self._has_answered() and not self.flow.write_paused
+
+    def _has_answered(self) -> bool:
+        return self.cycle is None or bool(self.cycle.response_complete)
+
+    def _take_turn(self) -> None:
+        """Parse slices for as long as a turn lasts."""
+        self._turn, end = None, time.perf_counter() + TURN_SECONDS
+        while self._unparsed and self._may_answer() and not (self._is_refused or self.transport.is_closing()):
+            if time.perf_counter() > end:
+                self._turn = self.loop.call_soon(self._take_turn)
+                break
+            piece = bytes(self._unparsed[:SLICE_BYTES])
+            del self._unparsed[:SLICE_BYTES]
+            self._parse(piece)
+        self._go_on_reading()
+
+    def _go_on_reading(self) -> None:
+        """Read more once everything is parsed; a client that sends no more has had its last answer then."""
+        if self.transport.is_closing():
+            return
+        if self._unparsed and not self._is_refused:
+            self.flow.pause_reading()
+        elif not self.flow.write_paused:
+            self.flow.resume_reading()
+            if self._is_half_closed and self._has_answered():
+                self.transport.close()
+
+    def _parse(self, data: bytes) -> None:
+        """Parse a piece; a request that is then still incomplete is measured and timed."""
         self._chunk = len(data)
         self._fed += self._chunk
-        super().data_received(data)
+        self._starts_in_chunk = self._phase is Phase.IDLE or self._phase is Phase.ANSWER
+        try:
+            self.parser.feed_data(data)
+        except httptools.HttpParserUpgrade as upgrade:
+            self._parse_without_upgrade(data[upgrade.args[0] :])
+        except httptools.HttpParserError:
+            self._refuse(refusal(400, "Invalid HTTP request received."))
         if self._phase is Phase.HEADERS or self._phase is Phase.BODY:
             self._measure_incomplete()
 
+    def _parse_without_upgrade(self, rest: bytes) -> None:
+        """Parse a request that asks for another protocol as if it had not, with a new parser: HTTP lets a server do so.
+
+        The old parser has taken everything after the headers for that protocol.
+        """
+        method = self.parser.get_method()
+        if method == b"CONNECT":
+            self._refuse(refusal(400, "CONNECT: this server opens no tunnels"))
+            return
+        self.parser, self._phase = httptools.HttpRequestParser(self), Phase.IDLE
+        self.parser.set_dangerous_leniencies(lenient_data_after_close=True)  # as uvicorn does
+        lines = [b"%s %s HTTP/1.1" % (method, self.url)]
+        lines += [b"%s: %s" % (name, _plain_connection(name, value)) for name, value in self.headers]
+        self._parse(b"\r\n".join(line for line in lines if not line.startswith(b"upgrade:")) + b"\r\n\r\n" + rest)
+
     def on_message_begin(self) -> None:
-        """A request begins, somewhere in this piece of data."""
-        self._phase, self._fed = Phase.HEADERS, self._chunk
+        """A request begins, somewhere in this piece of data; of what is before it in the piece, it knows nothing."""
+        self._phase, self._fed = Phase.HEADERS, self._chunk if self._starts_in_chunk else 0
+        self._starts_in_chunk = False
         self.url, self.headers, self._body = b"", [], bytearray()
         self.expect_100_continue = False
 
     def on_headers_complete(self) -> None:
         """The headers are complete; they are measured if enough bytes arrived for them to be too long."""
         self._phase = Phase.BODY
-        if self._fed > self.limits.header_bytes and self._header_bytes() > self.limits.header_bytes:
+        longest = self._fed + SLICE_BYTES  # with the piece in which the request began, if that began with another
+        if longest > self.limits.header_bytes and self._header_bytes() > self.limits.header_bytes:
             self._refuse_headers()
-        elif self.expect_100_continue:
+        elif self.expect_100_continue and not self.parser.should_upgrade():
             self.transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
     def on_body(self, body: bytes) -> None:
@@ -99,9 +197,9 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def on_message_complete(self) -> None:
         """The request is complete: answer it, unless it was refused."""
-        if self._is_refused or self.transport.is_closing():
-            return
-        self._phase = Phase.ANSWER
+        if self._is_refused or self.transport.is_closing() or self.parser.should_upgrade():
+            return  # refused, or to be parsed again
+        self._phase, self.has_asked = Phase.ANSWER, True
         path = _path(self.url)
         if self.direct.blocks(path) or not (self.cycle is None or self.cycle.response_complete):
             self._allow(math.inf)
@@ -116,11 +214,11 @@ class BoundedProtocol(HttpToolsProtocol):
         self.server_state.total_requests += 1
         if self.transport.is_closing():
             return
-        self.flow.resume_reading()
         if self.pipeline:
             self._start_asgi_task(*self.pipeline.pop())
         else:
             self._wait_for_request()
+            self._take_turn()
 
     def pause_writing(self) -> None:
         """The client does not read its answer; it has `body_seconds` to go on."""
@@ -131,8 +229,9 @@ class BoundedProtocol(HttpToolsProtocol):
     def resume_writing(self) -> None:
         """The client has read what was waiting."""
         super().resume_writing()
-        self.flow.resume_reading()
         self._allow(self.limits.idle_seconds)
+        if self._turn is None:
+            self._take_turn()
 
     def send_400_response(self, msg: str) -> None:
         """Refuse what is not HTTP."""
@@ -200,6 +299,7 @@ class BoundedProtocol(HttpToolsProtocol):
         if self._is_refused or self.transport.is_closing():
             return
         self._is_refused = True
+        self._unparsed.clear()
         self.transport.write(_text_of(response, is_last=True))
         if self.transport.can_write_eof():
             self.transport.write_eof()
@@ -215,6 +315,13 @@ def _text_of(response: Response, *, is_last: bool, with_body: bool = True) -> by
         parts += (name, b": ", value, b"\r\n")
     parts += (b"connection: close\r\n\r\n" if is_last else b"\r\n", response.body if with_body else b"")
     return b"".join(parts)
+
+
+def _plain_connection(name: bytes, value: bytes) -> bytes:
+    """The value of a header; of `Connection` without the option `upgrade`."""
+    if name != b"connection":
+        return value
+    return b", ".join(option for option in map(bytes.strip, value.split(b",")) if option.lower() != b"upgrade")
 
 
 @lru_cache(64)

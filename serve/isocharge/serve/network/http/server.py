@@ -2,12 +2,17 @@
 
 import asyncio
 import logging
+import socket
+import ssl
+from functools import partial
+from typing import Any
 
 import uvicorn
 
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http.app import App
 from isocharge.serve.network.http.connection import bounded, close_overdue
+from isocharge.serve.network.http.tls_listener import TlsListener
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.tls import Tls
 
@@ -19,7 +24,21 @@ BACKLOG = 2048
 
 
 class _Uvicorn(uvicorn.Server):
-    """uvicorn, looking after overdue connections while it waits."""
+    """uvicorn, looking after overdue connections while it waits, and with our listener in front of TLS."""
+
+    def __init__(self, config: uvicorn.Config, limits: ServerLimits, context: ssl.SSLContext | None) -> None:
+        super().__init__(config)
+        self._limits, self._context = limits, context
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup([] if self._context else sockets)
+        if self._context is not None:
+            make_protocol: Any = self.config.http_protocol_class
+            protocol = partial(make_protocol, self.config, self.server_state, self.lifespan.state)
+            connections = self.server_state.connections
+            for listening in sockets or ():
+                listener: Any = TlsListener(listening, self._context, self._limits, protocol, connections)
+                self.servers.append(listener)
 
     async def on_tick(self, counter: int) -> bool:
         close_overdue(self.server_state.connections, asyncio.get_running_loop().time())
@@ -49,10 +68,10 @@ class HttpServer:
             date_header=False,
             proxy_headers=False,
             timeout_graceful_shutdown=GRACE_SECONDS,
-            ssl_context_factory=(lambda *_: context) if context else None,
         )
-        self._server, self._address = _Uvicorn(config), address
+        self._server, self._address = _Uvicorn(config, limits, context), address
         self._socket = address.listen(BACKLOG)
+        self._file = address.file()
         self.url = address.url(self._socket, secure=tls is not None)
 
     def run(self) -> None:
@@ -67,4 +86,4 @@ class HttpServer:
     def close(self) -> None:
         """Listen no more."""
         self._socket.close()
-        self._address.release()
+        self._address.release(self._file)

@@ -1,5 +1,6 @@
 """What the server says about itself and its models, as JSON objects; gRPC has messages of the same fields."""
 
+from functools import lru_cache
 from importlib.metadata import version
 from typing import Any
 
@@ -24,7 +25,13 @@ NO_LOAD_PARAMETERS = "load: parameters are not supported; put the files into the
 
 def server_metadata() -> dict[str, Any]:
     """Name, version and extensions."""
-    return {"name": "isocharge", "version": version("isocharge"), "extensions": list(EXTENSIONS)}
+    return {"name": "isocharge", "version": _version(), "extensions": list(EXTENSIONS)}
+
+
+@lru_cache(1)
+def _version() -> str:
+    """The package's version; to read it opens files, which a server with many connections may not have left."""
+    return version("isocharge")
 
 
 def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:

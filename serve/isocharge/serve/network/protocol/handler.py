@@ -16,7 +16,7 @@ from isocharge.serve.network.protocol.answer import write_answer
 from isocharge.serve.network.protocol.encoding import compress, decompress
 from isocharge.serve.network.protocol.infer import answer_inference
 from isocharge.serve.network.protocol.openapi import openapi
-from isocharge.serve.network.protocol.page import page
+from isocharge.serve.network.protocol.page import PAGE_HEADERS, page
 from isocharge.serve.network.protocol.request import read_infer, read_object
 from isocharge.serve.network.protocol.response import Response, error_response, json_response, response_of
 
@@ -148,7 +148,9 @@ class Handler:
         return json_response({})
 
     def _page(self, _: Request) -> Response:
-        return response_of(200, b"text/html; charset=utf-8", page(self.store).encode())
+        response = response_of(200, b"text/html; charset=utf-8", page(self.store).encode())
+        response.headers.extend(PAGE_HEADERS)
+        return response
 
 
 def _infer_response(body: bytes, json_length: int | None, accepted: bytes) -> Response:

@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from isocharge.arrays import Singles
-from isocharge.serve.model.session import INPUT, OUTPUTS
+from isocharge.serve.model.session import OUTPUTS, check_rows, run, run_error
 from isocharge.serve.network.model_store import LoadedVersion
 from isocharge.serve.prediction.bound_press import BoundPress
 
@@ -56,19 +56,27 @@ class InferAnswer(NamedTuple):
 
 
 def infer(loaded: LoadedVersion, request: InferRequest) -> InferAnswer:
-    """Run the model; may be called from any thread."""
+    """Run the model; may be called from any thread.
+
+    Raises:
+        ModelError: If its graph fails.
+    """
     charges, names = request.charge_pC, request.outputs
     if len(charges) == 1:
         outputs = _one_press(loaded.press(), charges[0], names)
     else:
-        outputs = dict(zip(names, loaded.model.session.run(names, {INPUT: charges}), strict=True))
+        outputs = run(loaded.model.session, charges, names)
+        check_rows(outputs, len(charges), loaded.metadata.label)
     return InferAnswer(loaded.metadata.name, loaded.version, request.id, outputs, request.binary)
 
 
 def _one_press(press: BoundPress, charge_pC: Singles, names: tuple[str, ...]) -> dict[str, Singles]:
     """Outputs of shape (1, width) from bound memory, which is faster than a plain run."""
     row = np.empty((1, WIDTH), np.float32)
-    press.run_into(charge_pC, row[0])
+    try:
+        press.run_into(charge_pC, row[0])
+    except Exception as error:  # onnxruntime's exceptions have no common base of their own
+        raise run_error(error) from error
     return {name: row[:, COLUMNS[name]] for name in names}
 
 

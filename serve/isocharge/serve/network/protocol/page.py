@@ -1,7 +1,16 @@
-"""The page for people: the models with their cards, and an example of a request to each."""
+"""The page for people: the models with their cards, and an example of a request to each.
 
+Names, cards and reasons come from files: they are escaped, and the page's headers forbid a browser to run or load
+anything, should one of them get through.
+"""
+
+import base64
+import hashlib
+from functools import lru_cache
 from html import escape
+from urllib.parse import quote
 
+from isocharge.files import read_whole
 from isocharge.serve.model.model_folder import Model
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol.describe import server_metadata
@@ -23,6 +32,25 @@ details h2 { font-size: 1.05rem; margin: 1.2rem 0 .4rem }
 .refused { border-left: 4px solid #c2410c; padding-left: 1rem }
 @media (prefers-color-scheme: dark) { a { color: #7fb0ff } }
 """
+
+
+_STYLE_HASH = base64.b64encode(hashlib.sha256(STYLE.encode()).digest())
+
+PAGE_HEADERS = (
+    (
+        b"content-security-policy",
+        b"default-src 'none'; style-src 'sha256-%s'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        % _STYLE_HASH,
+    ),
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+)
+"""Headers of every page: its one style, known by its hash, and nothing else."""
+
+LONGEST_CARD = 1 << 18
+"""Longest card that the page shows, bytes."""
 
 
 def page(store: ModelStore) -> str:
@@ -49,7 +77,7 @@ def _article(loaded: LoadedVersion) -> str:
         "probes": ", ".join(metadata.probes),
     }
     rows = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts.items())
-    path = f"v2/models/{metadata.name}/versions/{metadata.version}"
+    path = f"v2/models/{quote(metadata.name, safe='')}/versions/{metadata.version}"
     return f"""<article><h2>{escape(metadata.name)} <span class="quiet">version {metadata.version}</span></h2>
 <dl>{rows}</dl><pre>{escape(_example(loaded, path))}</pre>
 <p><a href="{path}">metadata</a> · <a href="{path}/config">configuration</a> · <a href="{path}/stats">statistics</a></p>
@@ -67,9 +95,14 @@ def _example(loaded: LoadedVersion, path: str) -> str:
 def _card(model: Model) -> str:
     """The card in the model's folder as HTML; HTML in it stays text."""
     try:
-        text = (model.folder / "card.md").read_text("utf-8")
-    except (OSError, UnicodeDecodeError):
-        return "<p>This model has no card.</p>"
+        return _as_html(read_whole(model.folder / "card.md", LONGEST_CARD).decode("utf-8"))
+    except (OSError, UnicodeDecodeError, ImportError):  # of the import too: no descriptors may be left
+        return "<p>This model has no card that can be shown.</p>"
+
+
+@lru_cache(64)
+def _as_html(card: str) -> str:
+    """Markdown as HTML, remembered: it takes longer than all the rest of the page."""
     from markdown_it import MarkdownIt  # takes 0.1 s, which a server's start need not
 
-    return str(MarkdownIt("commonmark", {"html": False}).enable("table").render(text))
+    return str(MarkdownIt("commonmark", {"html": False}).enable("table").render(card))

@@ -161,12 +161,18 @@ def _examined(values: Any, head: Head, electrodes: tuple[str, ...]) -> Singles:
     except (ValueError, OverflowError) as error:
         raise RequestError(f"input {INPUT!r}: expected a list of numbers, or rows of them ({error})") from error
     rows, columns = head.shape
-    if numbers.dtype.kind not in "fiu" or numbers.shape not in ((rows * columns,), head.shape):
+    fits = numbers.dtype.kind in "fiu" and numbers.shape in ((rows * columns,), head.shape)
+    if not fits or _has_booleans(values):
         raise RequestError(
             f"input {INPUT!r}: expected numbers for the shape {list(head.shape)}, flat or in rows, "
-            f"got {numbers.dtype} of shape {list(numbers.shape)}"
+            f"got {numbers.dtype if not fits else 'true or false'} of shape {list(numbers.shape)}"
         )
     return as_singles(numbers.reshape(head.shape), electrodes)
+
+
+def _has_booleans(values: list[Any]) -> bool:
+    """Whether a list, or a list of lists, has true or false in it, which arrays take for 1 and 0."""
+    return any(type(value) is bool or (type(value) is list and any(type(q) is bool for q in value)) for value in values)
 
 
 def check_outputs(names: Sequence[Any]) -> tuple[str, ...]:

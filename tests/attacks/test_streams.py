@@ -1,0 +1,151 @@
+"""Frames of every format with faults in them: a parser takes any bytes in any pieces, and what comes out is a frame."""
+
+import json
+import math
+import struct
+
+import pytest
+
+from isocharge.serve import (
+    AutoParser,
+    BinaryParser,
+    Chunk,
+    Frame,
+    Predictor,
+    TextParser,
+    TouchStream,
+    device_from_table,
+    encode_frame,
+    encode_text,
+)
+from isocharge.serve.frames.layout_parser import DescribedParser
+
+FRAMES = [Frame(seq, 5000 * seq, (800.0 + seq, 700.0 - seq, 900.5), 0, ("A", "B", "C")) for seq in range(6)]
+
+DESCRIBED = {
+    "format": "described",
+    "sync": "A5 5A",
+    "length": 20,
+    "byte_order": "little",
+    "fields": [
+        {"name": "seq", "type": "u16"},
+        {"name": "t_us", "type": "u32"},
+        {"name": "A", "type": "i16", "scale": 0.1},
+        {"name": "B", "type": "f32"},
+        {"name": "C", "type": "i32"},
+    ],
+    "checksum": "crc-16/ccitt-false",
+}
+
+
+def text(notation):
+    return b"".join(encode_text(frame, notation) for frame in FRAMES)
+
+
+def described_layout():
+    return device_from_table({"frames": DESCRIBED}, "attack").layout
+
+
+def formats():
+    layout = described_layout()
+    yield "binary", BinaryParser, b"".join(map(encode_frame, FRAMES))
+    yield "described", lambda: DescribedParser(layout), b"".join(map(layout.encode, FRAMES))
+    for notation in ("csv", "pairs", "teleplot", "json"):
+        yield notation, TextParser, text(notation)
+    nested = b"".join(
+        json.dumps({"seq": k, "charge": {"A": 1.5, "B": [2, 3], "": {"": 4}}}).encode() + b"\n" for k in range(6)
+    )
+    yield "nested json", TextParser, nested
+    yield "recognised", AutoParser, b"".join(map(encode_frame, FRAMES[:3])) + text("csv")
+
+
+FORMATS = {name: (make, data) for name, make, data in formats()}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_frames_with_faults(name, attack, faults):
+    make_parser, good = FORMATS[name]
+    mutated, _ = faults
+
+    def read(pieces):
+        parser, size = make_parser(), 0
+        for piece in pieces:
+            size += len(piece)
+            for frame in parser.feed(piece):
+                assert frame.seq is None or isinstance(frame.seq, int)
+                assert all(isinstance(value, float) for value in frame.values)
+        parser.forget()
+        assert parser.counts.bytes_dropped <= size
+
+    def pieces(rng):
+        data = mutated(rng, good)
+        cut = rng.randrange(len(data) + 1)
+        return data[:cut], data[cut:]
+
+    attack(f"frames {name}", read, pieces, 90_000)
+
+
+def test_bombs(attack):
+    """Endless lines, deep objects, numbers without end: nothing is gathered that is too long to be a frame."""
+    bombs = (
+        lambda n: b"[" * n,
+        lambda n: b'{"":' * n,
+        lambda n: b'{"a":' * n + b"1" + b"}" * n + b"\n",
+        lambda n: b"1" * n + b"\n",
+        lambda n: b"1," * n + b"\n",
+        lambda n: b"A:1," * n + b"\n",
+        lambda n: b">" * n + b"\n",
+        lambda n: b" " * n + b"\n",
+        lambda n: b"\xff" * n,
+        lambda n: b"\xa5\x5a" * n,
+        lambda n: b"\xa5" * n,
+    )
+
+    def read(data):
+        for make_parser, _ in FORMATS.values():
+            parser = make_parser()
+            parser.feed(data)
+            parser.forget()
+
+    attack("frames bombs", read, lambda rng: rng.choice(bombs)(rng.choice((600, 700, 900, 5000, 50_000))), 2_000)
+
+
+WILD = (0.0, -0.0, 1e-45, 3.4e38, -3.4e38, math.inf, -math.inf, math.nan, 1e30, 100.0, 800.0)
+
+
+def test_frames_that_are_intact_and_absurd(attack):
+    """Whatever numbers a board sends, the whole path gives records that are JSON, or refuses."""
+    predictor = Predictor("three-25um-biaxial")
+    devices = [
+        device_from_table(table, "attack")
+        for table in ({}, {"leak": {"tau_s": 10.0}, "hum": {}, "tare": {"frames": 3}}, {"tare": {"on": False}})
+    ]
+
+    def values(rng):
+        return [
+            struct.unpack("<f", rng.randbytes(4))[0]
+            if rng.random() < 0.3
+            else rng.choice(WILD) * rng.choice((1, 1, 0.5))
+            for _ in range(3)
+        ]
+
+    def frames(rng):
+        clocks = (0, 1, 1 << 31, (1 << 32) - 1, rng.randrange(1 << 32))
+        sent = [Frame(rng.randrange(1 << 16), rng.choice(clocks), tuple(clipped(values(rng)))) for _ in range(8)]
+        return rng.choice(devices), b"".join(map(encode_frame, sent))
+
+    def read(case):
+        device, data = case
+        path = TouchStream(predictor, device)
+        for record in path.feed(Chunk(data, 1e9, 0)):
+            json.loads(record.to_json(), parse_constant=lambda name: pytest.fail(name))
+
+    attack("frames absurd", read, frames, 8_000)
+
+
+def clipped(values):
+    """As float32 has them: infinite where they are too large."""
+    return (
+        value if not abs(value) > 3.4e38 else math.copysign(math.inf, value) if value == value else value
+        for value in values
+    )

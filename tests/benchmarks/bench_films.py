@@ -1,0 +1,131 @@
+"""One network for all films: against networks trained on single films, and its time beside today's released model.
+
+    python tests/benchmarks/bench_films.py [--model NAME] [--films 4] [--seed 1] [--rounds 30] [--json]
+
+Each film is drawn from the prior, swept with solves of its own (no family of films in it) and trained on alone, as
+`train fit` does, half a minute each. Both networks answer the same noisy charges of presses that neither was trained
+on. Asked: an rms of at most 1.06 times that of the single network, a prediction in at most 1.05 times the time of the
+released model of the same sensor, folding under 1 s. `--train FOLDER` times the training, too, from nothing.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from bench_predictor import machine, microseconds
+
+from isocharge.serve import Predictor, find_model
+from isocharge.simulate import Sweep, read_dataset, run_sweep
+from isocharge.simulate.execution.workers import cores, local_workers
+from isocharge.simulate.numerics.statistics import rms
+from isocharge.train import FilmsConfig, FilmsModel, FitConfig, fit_network, read_films, train_films, write_film_model
+from isocharge.train.data.noise import with_noise
+from isocharge.train.data.presses import position_error
+from isocharge.train.release.release import predict_with
+
+SAMPLES = 24_000
+CALLS = 2000
+
+
+def one_film(films: FilmsModel, parameters: np.ndarray, seed: int) -> dict[str, Any]:
+    """Errors of both networks on the same presses of one film, each told or trained on that film."""
+    sensor, probe = films.prior.film(parameters)
+    with TemporaryDirectory() as folder:
+        sweep = Sweep(1e-3 * films.domain.radius_mm, films.domain.force_range_N, SAMPLES)
+        single = fit_network(read_dataset(run_sweep(Path(folder) / "presses", sensor, (probe,), sweep)), FitConfig())
+    presses, rng = single.held, np.random.default_rng(seed)
+    charge_pC = with_noise(presses.charge_pC, films.noise, rng)
+    answers = {"all films": films.fold(parameters).predict(charge_pC)[0], "alone": predict_with(single)(charge_pC)[0]}
+    position = {name: rms(position_error(contact, presses.contact)) for name, contact in answers.items()}
+    force = {name: 100.0 * rms(c[:, 2] / presses.contact[:, 2] - 1.0) for name, c in answers.items()}
+    return {
+        "pretension_MPa": 1e-6 * float(parameters[0]),
+        "radius_mm": single.network.domain.radius_mm,
+        "presses": len(presses),
+        "position_rms_mm": position,
+        "force_rms_percent": force,
+        "position_ratio": position["all films"] / position["alone"],
+        "force_ratio": force["all films"] / force["alone"],
+    }
+
+
+def prediction_times(model: str, rival: str, rounds: int) -> dict[str, float]:
+    """Median time of one prediction, us, in interleaved rounds."""
+    calls: dict[str, Callable[[], object]] = {}
+    for name in (model, rival):
+        predictor = Predictor(find_model(name))
+        charges = [300.0 + 10.0 * k for k in range(len(predictor.metadata.electrodes))]
+        calls[name] = lambda predictor=predictor, charges=charges: predictor.predict(charges)
+    durations: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            durations[name].append(float(np.median(microseconds(call, CALLS))))
+    medians = {name: float(np.median(values)) for name, values in durations.items()}
+    return {**medians, "ratio": medians[model] / medians[rival]}
+
+
+def folding_time(films: FilmsModel, parameters: np.ndarray) -> float:
+    """From parameters to a served model on disk, s: the best of three."""
+    times = []
+    with TemporaryDirectory() as folder:
+        for number in range(3):
+            begin = time.perf_counter()
+            write_film_model(films, parameters, Path(folder) / "mine", card="", version=number + 1)
+            times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def training_time(films: FilmsModel, folder: Path) -> float:
+    """From nothing to a released folder, s, in a process for each core."""
+    config, begin = FilmsConfig(radius=1e-3 * films.domain.radius_mm), time.perf_counter()
+    with local_workers(cores()) as workers:
+        train_films(films.prior, folder, config, map_jobs=workers.in_order)
+    return time.perf_counter() - begin
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--model", default="four-25um-biaxial-films")
+    parser.add_argument("--films", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--rounds", type=int, default=30)
+    parser.add_argument("--train", type=Path, metavar="FOLDER")
+    parser.add_argument("--json", action="store_true")
+    chosen = parser.parse_args()
+    films = read_films(find_model(chosen.model))
+    drawn = films.prior.draw(np.random.default_rng(chosen.seed), chosen.films)
+    record: dict[str, Any] = {
+        "machine": machine(),
+        "model": chosen.model,
+        "seed": chosen.seed,
+        "prediction_us": prediction_times(chosen.model, films.prior.sensor.name, chosen.rounds),
+        "folding_s": folding_time(films, drawn[0]),
+        "films": [one_film(films, parameters, chosen.seed) for parameters in drawn],
+    }
+    if chosen.train:
+        record["training_s"] = training_time(films, chosen.train)
+    print(json.dumps(record, indent=1) if chosen.json else summary(record))
+
+
+def summary(record: dict[str, Any]) -> str:
+    """The record as lines for people."""
+    lines = [
+        f"{film['pretension_MPa']:.2f} MPa: {film['position_rms_mm']['all films']:.4f} mm told the film, "
+        f"{film['position_rms_mm']['alone']:.4f} mm trained on it ({film['position_ratio']:.3f}); force "
+        f"{film['force_rms_percent']['all films']:.3f} and {film['force_rms_percent']['alone']:.3f} % "
+        f"({film['force_ratio']:.3f})"
+        for film in record["films"]
+    ]
+    times = ", ".join(f"{name} {value:.3f}" for name, value in record["prediction_us"].items())
+    training = [f"training: {record['training_s']:.0f} s"] if "training_s" in record else []
+    return "\n".join([*lines, f"prediction, us: {times}", f"folding: {record['folding_s']:.2f} s", *training])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""Steady presses: taken when the charges have settled, at the true charge; refused with the reason otherwise."""
+
+import math
+import re
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from isocharge.serve.flags import RECONNECTED, SATURATED, TARE
+from isocharge.serve.live import steady_press
+from isocharge.serve.live.reading_stream import TimedReading
+from isocharge.serve.live.steady_press import Phase, PressWatch
+from isocharge.serve.port.device_clock import ReadingTime
+from isocharge.serve.signal_chain.chain import Reading
+from isocharge.serve.signal_chain.tare import Tare
+
+RATE_HZ = 200.0
+PRESS = np.array([800.0, 400.0, 300.0, 500.0])
+NAMES = ("A", "B", "C", "D")
+
+
+def readings(charge_pC, *, noise_pC=1.0, flags=None):
+    """Readings of charges (n, 4), in contact where the first is above 20 pC."""
+    tare, rng = Tare(np.zeros(4), np.full(4, noise_pC), 100), np.random.default_rng(1)
+    for k, clean in enumerate(charge_pC):
+        noisy = clean + np.hypot(noise_pC, 0.002 * clean) * rng.standard_normal(4)
+        contact = clean[0] > 20.0
+        words = flags(k) if flags else ()
+        reading = Reading(noisy, None if TARE in words else noisy, tare, contact and TARE not in words, words)
+        yield TimedReading(reading, ReadingTime(1e9 + k / RATE_HZ, round(1e6 * k / RATE_HZ), 1.0 / RATE_HZ))
+
+
+def watched(*parts, **options):
+    watch = PressWatch(NAMES)
+    return [watch.feed(reading) for reading in readings(np.concatenate(parts), **options)]
+
+
+def rest(seconds, level=0.0):
+    return np.full((round(seconds * RATE_HZ), 4), level)
+
+
+def held(seconds, change=lambda _: 1.0, press=PRESS):
+    return np.array([press * change(k / RATE_HZ) for k in range(round(seconds * RATE_HZ))])
+
+
+def events(seen):
+    """Phases in their order, without repeats."""
+    phases = [one.phase.value for one in seen]
+    return [phases[0], *(after for before, after in pairwise(phases) if after != before)]
+
+
+def test_a_press_is_taken_once_and_the_next_one_after_a_lift():
+    seen = watched(rest(1), held(2), rest(1), held(2, press=PRESS / 2), rest(1))
+    assert events(seen) == ["waiting", "settling", "taken", "lift"] * 2 + ["waiting"]
+    for press, clean in zip([one.press for one in seen if one.press], (PRESS, PRESS / 2), strict=True):
+        standard_error = np.hypot(1.0, 0.002 * clean) * math.sqrt(1 / press.frames + 1 / 50)
+        assert (np.abs(press.charge_pC - clean) < 4 * standard_error).all()
+        np.testing.assert_allclose(press.scatter_pC, np.hypot(1.0, 0.002 * clean), rtol=0.35)
+        assert press.held_s < 0.8
+        assert press.frames == pytest.approx(100, abs=2)
+
+
+def test_what_was_there_before_the_touch_is_no_touch_charge():
+    """The amplifier has drifted by 9 pC since the tare: below the touch threshold, and in the press too."""
+    (press,) = [one.press for one in watched(rest(1, 9.0), held(2) + 9.0, rest(1, 9.0)) if one.press]
+    np.testing.assert_allclose(press.charge_pC, PRESS, atol=1.5)
+
+
+def test_a_press_that_settles_late_is_taken_late():
+    """The force comes in with a time constant of 0.4 s: the mean may be off by the drift that is allowed, 0.5 %."""
+    (seen,) = [one for one in watched(rest(1), held(6, lambda t: 1 - math.exp(-t / 0.4))) if one.press]
+    assert seen.held_s > 1.5
+    np.testing.assert_allclose(seen.press.charge_pC, PRESS, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda t: math.exp(-t / 10.0), r"fall by (9\.\d|10) % per second on all .* \[leak\] tau_s = (9\.\d|10) "),
+        (lambda t: 0.5 + 0.05 * t, "rise by .* % per second: hold the force"),
+        (lambda t: np.array([1 + 0.03 * t, 1 - 0.03 * t, 1.0, 1.0]), "the press moves"),
+        (lambda t: 1.0 + 0.1 * math.sin(40.0 * t), "the charge of A shakes by"),
+    ],
+)
+def test_a_press_that_creeps_moves_or_shakes_is_refused(change, reason):
+    seen = watched(rest(1), held(9, change), rest(1))
+    assert events(seen) == ["waiting", "settling", "refused", "lift", "waiting"]
+    (refused,) = [one for one in seen if one.phase is Phase.refused]
+    assert refused.reason.startswith("not steady within 8 s: ")
+    assert re.search(reason, refused.reason), refused.reason
+
+
+def test_a_trembling_hand_is_taken():
+    """1 % of the charge at 9 Hz; the mean is right all the same."""
+    (press,) = [one.press for one in watched(rest(1), held(4, lambda t: 1 + 0.014 * math.sin(56.0 * t))) if one.press]
+    np.testing.assert_allclose(press.charge_pC, PRESS, rtol=0.005)
+
+
+def test_a_press_without_a_rest_before_it_is_refused():
+    """What was there before the touch is not known: a charge without it may be wrong by any amount."""
+    seen = watched(rest(1), held(2), rest(0.05), held(2), rest(1))
+    assert events(seen) == ["waiting", "settling", "taken", "lift", "waiting", "settling", "refused", "lift", "waiting"]
+    assert "too soon" in next(one.reason for one in seen if one.phase is Phase.refused)
+
+
+def test_a_short_press_is_refused_and_a_blip_is_nothing():
+    seen = watched(rest(1), held(0.3), rest(1), held(0.05), rest(1))
+    assert [one.reason for one in seen if one.phase is Phase.refused] == [
+        "released after 0.3 s, before it was steady: hold it longer"
+    ]
+    assert not [one for one in seen if one.press]
+
+
+def test_saturation_is_refused_until_the_next_press():
+    seen = watched(rest(1), held(2), rest(1), held(2), flags=lambda k: (SATURATED,) * (k == 220))
+    assert events(seen) == ["waiting", "settling", "refused", "lift", "waiting", "settling", "taken", "lift"]
+    assert [one.reason for one in seen if one.phase is Phase.refused] == [
+        "an amplifier is at its limit: press less hard"
+    ]
+
+
+def test_a_lost_port_ends_the_press():
+    """The film is tared again; a press that was under way is not taken, nor is the rest of it."""
+    words = lambda k: ((RECONNECTED,) if k == 220 else ()) + ((TARE,) if k < 50 or 220 <= k < 320 else ())  # noqa: E731
+    seen = watched(rest(1), held(0.5), rest(1), held(2), flags=words)
+    assert events(seen) == [
+        "taring",
+        "waiting",
+        "settling",
+        "refused",
+        "taring",
+        "waiting",
+        "settling",
+        "taken",
+        "lift",
+    ]
+    assert "the port was away" in next(one.reason for one in seen if one.phase is Phase.refused)
+
+
+def test_an_armed_watch_takes_no_press_that_has_begun():
+    watch, seen = PressWatch(NAMES), []
+    for k, reading in enumerate(readings(np.concatenate([rest(1), held(2), rest(1), held(2)]))):
+        if k == 240:
+            watch.arm()
+        seen.append(watch.feed(reading))
+    assert events(seen) == ["waiting", "settling", "lift", "waiting", "settling", "taken", "lift"]
+
+
+def test_frames_of_a_fast_board_are_looked_at_ten_times_a_window(monkeypatch):
+    calls = []
+    monkeypatch.setattr(steady_press, "unsteadiness", lambda *_: calls.append(1) or "no")
+    watched(rest(1), held(2.0))
+    assert len(calls) == pytest.approx(10 * 1.5 / 0.5, abs=2)

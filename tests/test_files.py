@@ -1,0 +1,132 @@
+"""Files that are read whole, lines that are read one by one, parts of runs: bounded, whatever they hold."""
+
+import io
+import json
+import os
+import time
+
+import numpy as np
+import pytest
+
+from isocharge.errors import InputError, OutputExists
+from isocharge.files import bounded_lines, read_whole, sha256_of
+from isocharge.number_text import number_of
+from isocharge.resumable_run import resume_folder
+from isocharge.simulate.execution.checkpointed_map import CheckpointedMap
+from isocharge.tables import DEEPEST, MOST_JSON_BYTES, MOST_TOML_BYTES, parse_json, parse_toml, read_json, read_toml
+from isocharge.train.training.checkpoint import Checkpoint
+
+
+def test_a_file_is_read_whole(tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"12345")
+    assert read_whole(path) == b"12345"
+    assert read_whole(path, 5) == b"12345"
+    with pytest.raises(OSError, match="larger than 4 bytes"):
+        read_whole(path, 4)
+
+
+@pytest.mark.timeout(20)
+def test_what_is_no_file_is_not_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path, "/dev/zero"):
+        with pytest.raises(OSError, match="not a regular file"):
+            read_whole(path)
+
+
+def test_a_sparse_file_costs_nothing(tmp_path):
+    with (tmp_path / "file").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(OSError, match="larger than"):
+        read_whole(tmp_path / "file")
+
+
+def test_lines_are_bounded():
+    assert list(bounded_lines(io.StringIO("a\nbc\nd"), 3)) == ["a\n", "bc\n", "d"]
+    with pytest.raises(ValueError, match="longer than 2 characters"):
+        list(bounded_lines(io.StringIO("a\nbc\n"), 2))
+
+
+@pytest.mark.parametrize("text", ["1_0", "1_000.5", "\u0663", "\uff11\uff12", "", "a", "0x10", "1,5"])
+def test_what_is_no_number(text):
+    with pytest.raises(ValueError, match=r"number|float"):
+        number_of(text)
+
+
+@pytest.mark.parametrize("text", ["10", " 1e3 ", "-.5", "+7."])
+def test_what_is_a_number(text):
+    assert number_of(text) == float(text)
+
+
+DEEP = {
+    "arrays": "a = " + "[" * 5000 + "]" * 5000,
+    "tables": "a = " + "{a = " * 5000 + "1" + "}" * 5000,
+    "a key": "a." * 50_000 + "a = 1",
+    "a quoted key": '"\\"".' * 20_000 + "a = 1",
+    "a key in a table": "[" + "'a'." * 50_000 + "a]",
+    "a key with blanks": "a . " * 50_000 + "a = 1",
+    "just too deep": "a = " + "[" * (DEEPEST + 1) + "]" * (DEEPEST + 1),
+}
+
+
+@pytest.mark.parametrize("how", DEEP)
+def test_deep_toml_is_refused_at_once(how):
+    began = time.perf_counter()
+    with pytest.raises(InputError, match=r"^f: not a TOML file") as caught:
+        parse_toml(DEEP[how], "f", InputError)
+    assert time.perf_counter() - began < 1.0
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "[" * 900 + "]" * 900, "9" * 5000, "[1", b"\xff"])
+def test_json_that_is_none_or_deep(text):
+    with pytest.raises(InputError, match=r"^f: expected JSON") as caught:
+        parse_json(text, "f", InputError)
+    assert len(str(caught.value)) < 600
+
+
+def test_what_is_not_too_deep():
+    text = "[" * DEEPEST + "]" * DEEPEST
+    assert parse_json(text, "f", InputError) == json.loads(text)
+    dots = "a = [" + "0.5, " * 1000 + "0.5]\n# 1.2.3.4\nb = '" + ". " * 100 + "'\n"
+    assert parse_toml(dots, "f", InputError)["b"] == ". " * 100
+
+
+@pytest.mark.parametrize(("read", "most"), [(read_toml, MOST_TOML_BYTES), (read_json, MOST_JSON_BYTES)])
+def test_settings_are_bounded(tmp_path, read, most):
+    path = tmp_path / "file"
+    path.write_bytes(b" " * (most + 1))
+    with pytest.raises(InputError, match="larger than"):
+        read(path, "a file", InputError)
+
+
+GARBAGE = [b"", b"garbage", b"\x93NUMPY\x01\x00", b"PK\x03\x04", b"\x80\x02."]
+
+
+@pytest.mark.parametrize("data", GARBAGE)
+def test_a_part_that_is_garbage_is_computed_again(tmp_path, data):
+    """Its checksum fits: somebody else wrote it."""
+    warnings = []
+    with resume_folder(tmp_path / "target", {"a": 1}, warn=warnings.append) as run:
+        run.save("solve-00-0000.npy", data)
+        results = list(CheckpointedMap(run, "solve", map)(lambda job: np.full(2, job), [1.0, 2.0]))
+        np.testing.assert_array_equal(results, [[1.0, 1.0], [2.0, 2.0]])
+        run.save("weights", data)
+        assert Checkpoint(run).load("weights") is None
+    assert ["computed again" in warning for warning in warnings] == [True, True]
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "", "\xff", '{"a": ' * 500])
+def test_a_run_whose_settings_are_garbage_is_left_alone(tmp_path, text):
+    draft = tmp_path / "target.part"
+    draft.mkdir()
+    (draft / "run.json").write_text(text, encoding="latin-1")
+    with (
+        pytest.raises(OutputExists, match=r"holds no run\.json"),
+        resume_folder(tmp_path / "target", {}),
+    ):
+        pass
+
+
+def test_checksums_are_those_of_everybody():
+    assert sha256_of(b"") == "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
