@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
 from isocharge.cli.shared.options import DeviceOption, FreshOption, JsonOption, ProbeOption
 from isocharge.cli.shared.terminal import say, this_command
 from isocharge.cli.train.bench.run import BenchPort, calibrate_at_port
-from isocharge.cli.train.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
 from isocharge.errors import InputError
 
 if TYPE_CHECKING:

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from isocharge.cli.shared.forward_maps import sweep_radius
-from isocharge.cli.shared.options import PROBE_HELP, ConfigOption, FreshOption, RadiusOption, radius_mm_of
-from isocharge.cli.shared.terminal import progress, say, this_command
-from isocharge.cli.train.measured_presses import (
+from isocharge.cli.shared.measured_presses import (
     ForceStdOption,
     ModelsOption,
     PositionStdOption,
     films_or_none,
     read_presses_of,
 )
+from isocharge.cli.shared.options import PROBE_HELP, ConfigOption, FreshOption, RadiusOption, radius_mm_of
+from isocharge.cli.shared.terminal import progress, say, this_command
 from isocharge.default_scene import DEFAULT_RADIUS
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing

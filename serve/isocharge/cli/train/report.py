@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from isocharge.cli.shared.measured_presses import read_presses_of
 from isocharge.cli.shared.options import NewFolderOption, ProbeOption
 from isocharge.cli.shared.terminal import progress, say, this_command
-from isocharge.cli.train.measured_presses import read_presses_of
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing
 

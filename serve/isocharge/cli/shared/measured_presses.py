@@ -1,4 +1,4 @@
-"""What the commands of `train` share about CSV files of measured presses: options, reading, and the film's network."""
+"""CSV files of measured presses in commands: options, reading, and the network for all films of their sensor."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
