@@ -6,21 +6,32 @@ import numpy as np
 import pytest
 
 from isocharge.errors import DatasetError
-from isocharge.simulate import ChargeFunction, Circle, Sweep, load_sensor, noise_model, read_dataset, run_sweep
-from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network
+from isocharge.simulate import (
+    ChargeFunction,
+    Circle,
+    Sweep,
+    load_sensor,
+    noise_model,
+    read_dataset,
+    run_sweep,
+    sensor_from_dict,
+    sensor_to_dict,
+)
+from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network, train_model
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.fold_free import FieldModel, fold_free_domain
+from isocharge.train.data.fold_free import FieldModel, fold_free_domain, probable_fold_mm
 
 TINY = FitConfig(NetworkConfig((8, 8), (8, 8)), TrainingConfig(steps=5, misfit_steps=5, misfit_charges=1_000))
 
 
-def field_of(charges, radius=8.0):
+def field_of(charges, radius=8.0, noise=0.0):
     rng = np.random.default_rng(0)
     reach, angle = radius * np.sqrt(rng.uniform(size=6000)), rng.uniform(-np.pi, np.pi, 6000)
     contact = np.stack([reach * np.cos(angle), reach * np.sin(angle), np.exp(rng.uniform(-3, 0.7, 6000))], axis=1)
     domain = ContactDomain(radius, (np.exp(-3.0), np.exp(0.7)))
     charge = charges(*contact.T)
+    charge = charge * np.exp(noise * rng.standard_normal(charge.shape))
     return ChargeField.fit(domain, contact[:5000], charge[:5000], (contact[5000:], charge[5000:]))
 
 
@@ -33,6 +44,42 @@ def test_a_fold_at_a_known_place(fold):
 
     domain = fold_free_domain(field_of(charges), noise_model("reference"))
     assert domain.radius_mm == pytest.approx(min(fold, 8.0), abs=0.11)
+
+
+@pytest.mark.parametrize(("fold", "seen"), [(2.0, True), (5.0, True), (30.0, False)])
+def test_noisy_charges_show_a_fold_but_not_for_certain(fold, seen):
+    """Measured charges, 0.3 % of noise: the same map, whose fold is reported and not cut off."""
+
+    def charges(x, y, force):
+        return force[:, None] ** 0.7 * np.exp(np.stack([0 * x, 0.1 * (x - x**2 / (2 * fold)), 0.1 * y], axis=1))
+
+    field, reference = field_of(charges, noise=3e-3), noise_model("reference")
+    assert fold_free_domain(field, reference).radius_mm == 8.0
+    probable = probable_fold_mm(field, reference)
+    assert probable == (pytest.approx(fold, abs=0.5) if seen else np.inf)
+
+
+def centre_electrode(samples, folder, noisy):
+    """Presses on three electrodes, one of them at the centre, where the map folds at once (0.2 mm by `identify`)."""
+    table = sensor_to_dict(load_sensor("three-25um-biaxial"))
+    table["electrodes"] = {"side_mm": 3.0, "A": [0.0, 0.0], "B": [8.66, 5.0], "C": [-8.66, 5.0]}
+    sensor = sensor_from_dict(table)
+    swept = read_dataset(run_sweep(folder, sensor, (Circle(1e-3),), Sweep(samples=samples)))
+    if not noisy:
+        return swept
+    charge = 1e12 * noise_model("reference").add(1e-12 * swept.samples.charge_pC, np.random.default_rng(2))
+    return replace(swept, samples=replace(swept.samples, charge_pC=charge), manifest={})
+
+
+@pytest.mark.parametrize("noisy", [False, True], ids=["simulated", "measured"])
+def test_training_across_a_fold_is_in_card_and_metadata(tmp_path, noisy):
+    said = []
+    dataset = centre_electrode(2_000, tmp_path / "presses", noisy)
+    release = train_model(dataset, tmp_path / "models" / "centre", TINY, warn=said.append)
+    (caution,) = said
+    assert "seems to fold about 0." in caution or "seems to fold about 1." in caution
+    assert release.metadata.made_with["cautions"] == [caution]
+    assert f"- {caution}." in (release.folder / "card.md").read_text("utf-8")
 
 
 def test_the_derivatives_are_those_of_the_charges(fit):

@@ -134,7 +134,7 @@ def test_a_model_of_another_layout(tmp_path, presses):
 def test_presses_that_the_model_does_not_know(tmp_path, presses):
     dataset = read_dataset(presses)
     stronger = replace(dataset.samples, force_N=2.0 * dataset.samples.force_N)
-    wider = replace(dataset, samples=stronger, manifest={})
+    wider = replace(dataset, samples=stronger, manifest={"solver": dataset.manifest["solver"]})
     with pytest.raises(ModelError, match=r"knows forces from 0.05 to 2 N, the dataset reaches from 0.1001 to 3.996 N"):
         write_report(tmp_path / "out", [(wider, MODEL)], QUICK)
 

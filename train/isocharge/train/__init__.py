@@ -24,6 +24,7 @@ with require("train"):
     from isocharge.train.films.release import train_films
     from isocharge.train.release.evaluate import measure_errors
     from isocharge.train.release.release import Release, train_model
+    from isocharge.train.rig.train_rig import Rig, train_rig
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
     from isocharge.train.training.fit import Fit, fit_network
 
@@ -40,6 +41,7 @@ __all__ = [
     "NetworkConfig",
     "ProposedPress",
     "Release",
+    "Rig",
     "Scene",
     "SensorFilms",
     "TrainingConfig",
@@ -55,6 +57,7 @@ __all__ = [
     "read_films",
     "train_films",
     "train_model",
+    "train_rig",
     "write_calibration",
     "write_film_model",
 ]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
 from isocharge.cli.shared.options import DeviceOption, FreshOption, JsonOption, ProbeOption
 from isocharge.cli.shared.terminal import say, this_command
 from isocharge.cli.train.bench.run import BenchPort, calibrate_at_port
@@ -40,20 +41,8 @@ def calibrate_command(
         ),
     ] = None,
     probe: ProbeOption = "circle:1.0",
-    position_std_mm: Annotated[
-        float,
-        typer.Option(
-            "--position-std", metavar="MM", help="Standard deviation of known x and y, mm, where the file has none."
-        ),
-    ] = 0.1,
-    force_std: Annotated[
-        float,
-        typer.Option(
-            "--force-std",
-            metavar="SHARE",
-            help="Standard deviation of known forces, a share of the force in N, where the file has none.",
-        ),
-    ] = 0.01,
+    position_std_mm: PositionStdOption = 0.1,
+    force_std: ForceStdOption = 0.01,
     next_count: Annotated[
         int,
         typer.Option("--next", metavar="K", min=0, max=100, help="Propose this many presses that would tell most."),
@@ -66,10 +55,7 @@ def calibrate_command(
             help="Start from the calibration in this folder, allowing for drift since then. (default: the sensor file)",
         ),
     ] = None,
-    models: Annotated[
-        Path | None,
-        typer.Option("--models", metavar="DIR", help="Folder of models to search first. (default: the usual folders)"),
-    ] = None,
+    models: ModelsOption = None,
     port: Annotated[
         str | None,
         typer.Option(
@@ -130,7 +116,8 @@ def calibrate_command(
         std = position_std_mm, force_std
         calibration = calibrate_at_port(bench, chosen, _before(chosen, earlier), output, std, json_lines=json)
     elif file is not None:
-        calibration = _calibrated(_read(file, chosen, position_std_mm, force_std), chosen, earlier)
+        names = chosen.films.prior.sensor.electrode_names
+        calibration = _calibrated(read_presses_of(file, names, position_std_mm, force_std), chosen, earlier)
     if calibration is not None and output is not None:
         _write(output, calibration, chosen, ends_session=port is not None)
     proposed = _proposed(chosen, calibration, next_count, position_std_mm, force_std, earlier)
@@ -167,17 +154,6 @@ def _before(chosen: "SensorFilms", earlier: Path | None) -> "EarlierFilm":
     from isocharge.train import read_earlier
 
     return read_earlier(earlier, chosen.scene) if earlier else chosen.described
-
-
-def _read(file: Path, chosen: "SensorFilms", position_std_mm: float, force_std: float) -> "MeasuredPresses":
-    from isocharge.serve import read_presses
-    from isocharge.serve.prediction.csv_numbers import ignored_words
-
-    names = chosen.films.prior.sensor.electrode_names
-    presses = read_presses(file, names, position_std_mm=position_std_mm, force_std=force_std)
-    if presses.ignored:
-        say(ignored_words(str(file), presses.ignored))
-    return presses
 
 
 def _calibrated(presses: "MeasuredPresses", chosen: "SensorFilms", earlier: Path | None) -> "Calibration":

@@ -9,6 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from isocharge.cli.shared.forward_maps import sweep_radius
+from isocharge.cli.shared.measured_presses import (
+    ForceStdOption,
+    ModelsOption,
+    PositionStdOption,
+    films_or_none,
+    read_presses_of,
+)
 from isocharge.cli.shared.options import PROBE_HELP, ConfigOption, FreshOption, RadiusOption, radius_mm_of
 from isocharge.cli.shared.terminal import progress, say, this_command
 from isocharge.default_scene import DEFAULT_RADIUS
@@ -30,15 +37,19 @@ def fit_command(
     ],
     dataset: Annotated[
         Path | None,
-        typer.Argument(metavar="DATASET", help="Dataset folder of `isocharge simulate sweep`. (default: --sensor)"),
+        typer.Argument(
+            metavar="DATASET|PRESSES.csv",
+            help="Dataset folder of `isocharge simulate sweep` or of measured presses; or with --sensor a CSV file of "
+            "50 measured presses or more: x_mm, y_mm, force_N and the electrodes' names (pC). (default: --sensor)",
+        ),
     ] = None,
     sensor: Annotated[
         str | None,
         typer.Option(
             "--sensor",
             metavar="SENSOR",
-            help="Simulate 24,000 presses on this sensor instead, from 0.05 to 2 N; a built-in name or a TOML file. "
-            "(default: DATASET)",
+            help="The sensor of PRESSES.csv; without a file, 24,000 presses are simulated on it, from 0.05 to 2 N; a "
+            "built-in name or a TOML file. (default: DATASET's)",
         ),
     ] = None,
     probe: Annotated[
@@ -56,6 +67,9 @@ def fit_command(
             "calibrate`; some 20 minutes on 2 cores. (default: the film as described)",
         ),
     ] = False,
+    position_std_mm: PositionStdOption = 0.1,
+    force_std: ForceStdOption = 0.01,
+    models: ModelsOption = None,
     config: ConfigOption = None,
     version: Annotated[int, typer.Option("--version", min=1, help="Version of the model: the folder in NAME.")] = 1,
     fresh: FreshOption = False,
@@ -65,21 +79,31 @@ def fit_command(
 ) -> None:
     """Train a network on charges, measure its errors, and write a model folder: ONNX file, card, golden vectors.
 
-    The presses come from DATASET, or are simulated first: --probe and --radius say how, and belong to --sensor. With
-    --films the sensor's film is not taken as described: pretension, stiffness, coefficients, gains and the place of the
-    electrodes are drawn as they spread between films, and the folder also gets films.npz, the network for all of them.
+    The presses come from DATASET, or are simulated first: --probe and --radius say how, and belong to --sensor.
+
+    From measured presses the film is calibrated, what is then still wrong everywhere is corrected, and a fifth is held
+    out: the errors are of those presses as measured.
+
+    With --films the sensor's film is not taken as described: pretension, stiffness, coefficients, gains and the place
+    of the electrodes are drawn as they spread between films, and the folder also gets films.npz, the network for all of
+    them.
 
     A run that was stopped or killed leaves models/NAME/VERSION.part; the same command goes on from there and makes the
     same model.
 
     Example: isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
+
+    Example: isocharge train fit presses.csv --sensor four-25um-biaxial -o models/rig
     """
-    if (dataset is None) == (sensor is None):
-        raise InputError(f"expected either a DATASET folder or --sensor SENSOR, got {'both' if dataset else 'neither'}")
+    measured = dataset is not None and not dataset.is_dir()
+    _check_source(dataset, sensor, measured)
     refuse_existing(output / str(version))
     if films:
         _refuse_with_films(dataset, config)
         train = _train_films(str(sensor), probe or ["circle:1.0"], radius)
+    elif dataset and measured:
+        stds = position_std_mm, force_std
+        train = _train_on_measured(dataset, str(sensor), probe or ["circle:1.0"], radius, stds, models, config)
     else:
         train = _train_on_presses(dataset, sensor, probe or ["circle:1.0"], radius, config)
     try:
@@ -101,6 +125,39 @@ def fit_command(
     say(_summary(release))
 
 
+def _check_source(dataset: Path | None, sensor: str | None, measured: bool) -> None:
+    if measured and dataset and not dataset.exists():
+        raise InputError(f"{dataset}: expected a dataset folder, or a CSV file of measured presses; there is neither")
+    if measured and sensor is None:
+        raise InputError(f"{dataset}: a file of measured presses needs --sensor SENSOR, which says what was pressed")
+    if not measured and (dataset is None) == (sensor is None):
+        raise InputError(f"expected either a DATASET folder or --sensor SENSOR, got {'both' if dataset else 'neither'}")
+
+
+def _train_on_measured(
+    file: Path,
+    sensor: str,
+    probes: list[str],
+    radius: str,
+    stds: tuple[float, float],
+    models: Path | None,
+    config: Path | None,
+) -> "Callable[..., Release]":
+    """Trains on a file of measured presses."""
+    from isocharge.simulate import load_sensor, parse_probe
+    from isocharge.train import Rig, load_config, train_rig
+
+    if radius == "auto":
+        raise InputError("--radius: expected a number of mm with measured presses, got auto")
+    if len(probes) != 1:
+        raise InputError(f"--probe: expected the one that made the presses, got {', '.join(probes)}")
+    described = load_sensor(sensor)
+    presses = read_presses_of(file, described.electrode_names, *stds)
+    rig = Rig(presses, described, parse_probe(probes[0]), 1e-3 * radius_mm_of(radius))
+    settings = load_config(config) if config else None
+    return partial(train_rig, rig, films_or_none(sensor, probes[0], models), config=settings)
+
+
 def _train_on_presses(
     dataset: Path | None, sensor: str | None, probes: list[str], radius: str, config: Path | None
 ) -> "Callable[..., Release]":
@@ -114,7 +171,7 @@ def _train_on_presses(
 
 def _refuse_with_films(dataset: Path | None, config: Path | None) -> None:
     if dataset:
-        raise InputError("--films: expected --sensor SENSOR, got a DATASET, which is of one film")
+        raise InputError("--films: expected --sensor SENSOR alone, got presses, which are of one film")
     if config:
         raise InputError("--films: expected no --config: its settings are for one film; leave it out")
 
@@ -164,8 +221,10 @@ def _simulate(sensor: str, probes: list[str], radius: str) -> "Dataset":
 
 def _summary(release: "Release") -> str:
     errors = release.metadata.errors
+    measured = errors.get("measured_presses")
+    presses = f"on {measured:.0f} measured presses that training never saw, " if measured else ""
     return (
-        f"{release.folder}: position error {errors['position_median_mm']:g} mm median, "
+        f"{release.folder}: {presses}position error {errors['position_median_mm']:g} mm median, "
         f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "
         f"force {errors['force_rms_percent']:g} % rms"
     )

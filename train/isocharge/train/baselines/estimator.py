@@ -38,6 +38,7 @@ class FittingTask:
         seed: Of noise and subsets.
         copies: Noisy copies of the training presses that noise-aware methods learn from.
         quick: Fewer candidates and smaller methods, to try things out.
+        measured: Whether the charges were measured: they have their noise, and none is added.
     """
 
     train: LabelledPresses
@@ -47,15 +48,20 @@ class FittingTask:
     seed: int = 0
     copies: int = 5
     quick: bool = False
+    measured: bool = False
 
     def noisy_train(self, copies: int) -> LabelledPresses:
-        """`copies` of the training presses, each with fresh noise on the charges."""
+        """`copies` of the training presses, each with fresh noise on the charges; measured ones once, as they are."""
+        if self.measured:
+            return self.train
         charge = [noisy_charges(self.train, self.noise, self.seed + FIRST_COPY + copy) for copy in range(copies)]
         return LabelledPresses(np.tile(self.train.contact, (copies, 1)), np.concatenate(charge))
 
     @cached_property
     def noisy_validation(self) -> LabelledPresses:
         """The validation presses with noise on the charges."""
+        if self.measured:
+            return self.validation
         charge = noisy_charges(self.validation, self.noise, self.seed + VALIDATION_COPY)
         return LabelledPresses(self.validation.contact, charge)
 

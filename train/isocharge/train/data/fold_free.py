@@ -14,7 +14,14 @@ from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import ContactDomain
 
 SURE = 3e-4
-"""Largest error of the fitted charges, relative, for which folds are looked for: a poor fit has folds of its own."""
+"""Largest error of the fitted charges, relative, for which a fold is certain: a poor fit has folds of its own."""
+
+SMOOTH = 2e-3
+"""Largest error of a poor fit to charges without noise, relative."""
+
+CREDIBLE_SMOOTH, CREDIBLE_NOISY = 0.95, 0.8
+"""Share of the radius within which a fold of a poor fit is believed: its own folds lie at the rim, where presses hold
+it from one side only, and noise moves them inwards."""
 
 RIM = 0.98
 """Searched radius over the domain's, dimensionless: at the very rim no press holds the slopes from outside."""
@@ -57,10 +64,23 @@ class FieldModel:
 
 
 def fold_free_domain(field: ChargeField, noise: NoiseModel) -> ContactDomain:
-    """The field's domain up to the nearest fold; all of it without folds, or where the fit is too poor to say."""
-    if field.error > SURE:
-        return field.domain
+    """The field's domain up to the nearest fold; all of it without folds, or where the fit is too poor."""
+    fold_mm = np.inf if field.error > SURE else _fold_mm(field, noise)
+    return ContactDomain(min(fold_mm, field.domain.radius_mm), field.domain.force_range_N)
+
+
+def probable_fold_mm(field: ChargeField, noise: NoiseModel) -> float:
+    """Distance of a fold that a fit shows which is too poor to be certain of it, mm; infinite if there is none.
+
+    Measured charges have more noise than `SURE`, and few presses fit an electrode within the working area poorly.
+    """
+    if field.error <= SURE:
+        return np.inf
+    credible = CREDIBLE_SMOOTH if field.error < SMOOTH else CREDIBLE_NOISY
+    fold_mm = _fold_mm(field, noise)
+    return fold_mm if fold_mm < credible * field.domain.radius_mm else np.inf
+
+
+def _fold_mm(field: ChargeField, noise: NoiseModel) -> float:
     area = working_area(FieldModel(field), noise, twins=False)
-    if not np.isfinite(area.fold_radius):
-        return field.domain
-    return ContactDomain(float(f"{1e3 * area.unfolded:.6g}"), field.domain.force_range_N)
+    return float(f"{1e3 * area.unfolded:.6g}") if np.isfinite(area.fold_radius) else np.inf

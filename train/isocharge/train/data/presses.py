@@ -12,6 +12,9 @@ from isocharge.train.data.domain import ContactDomain
 FEWEST = 500
 """Presses below which a fit makes no sense."""
 
+FEWEST_POSITIONS = 50
+"""The same for positions."""
+
 
 @dataclass(frozen=True)
 class LabelledPresses:
@@ -66,19 +69,23 @@ def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tupl
     return presses[~held], presses[held]
 
 
-def presses_of(dataset: Dataset) -> LabelledPresses:
+def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
     """A dataset's presses, checked.
+
+    Args:
+        dataset: The dataset.
+        fewest: Presses that it must have at least.
 
     Raises:
         DatasetError: If the dataset has too few presses or positions, fewer than three electrodes, or numbers that are
             not finite or charges that are not positive.
     """
     presses = LabelledPresses.of(dataset.samples)
-    _check(presses)
+    _check(presses, fewest)
     return presses
 
 
-def _check(presses: LabelledPresses) -> None:
+def _check(presses: LabelledPresses, fewest: int) -> None:
     finite = np.isfinite(presses.charge_pC).all(axis=1) & np.isfinite(presses.contact).all(axis=1)
     if not finite.all():
         row = int(np.argmin(finite))
@@ -87,9 +94,10 @@ def _check(presses: LabelledPresses) -> None:
             f"{presses.charge_pC[row].tolist()} pC"
         )
     positions = len(np.unique(np.round(presses.contact[:, :2], 3), axis=0))
-    if len(presses) < FEWEST or positions < 50:
+    if len(presses) < fewest or positions < min(fewest, FEWEST_POSITIONS):
         raise DatasetError(
-            f"expected at least {FEWEST} presses at 50 positions, got {len(presses)} at {positions}; sweep more samples"
+            f"expected at least {fewest} presses at {min(fewest, FEWEST_POSITIONS)} positions, got {len(presses)} at "
+            f"{positions}; sweep or measure more (from 50 measured presses on, train on a CSV file with --sensor)"
         )
     if presses.charge_pC.shape[1] < 3:
         raise DatasetError(

@@ -5,13 +5,19 @@ from collections.abc import Mapping
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.data.noise import misfit_noise
+from isocharge.train.release.measured import HELD_PRESSES, MeasuredTest
 from isocharge.train.training.fit import Fit
 
 
-def model_card(metadata: ModelMetadata, fit: Fit) -> str:
-    """The text of `card.md`."""
-    sections = [_interface(metadata, fit), _errors(metadata.errors, len(fit.held)), _misfit(metadata, fit), LIMITS]
-    return "\n".join([*sections, _command(metadata)])
+def model_card(metadata: ModelMetadata, fit: Fit, test: MeasuredTest | None = None) -> str:
+    """The text of `card.md`; `test` has the measured presses that the errors are of, if they are."""
+    if test is None:
+        errors, truth = _errors(metadata.errors, len(fit.held)), SIMULATED_TRUTH
+    else:
+        errors, truth = test.origin + _measured_errors(metadata.errors), MEASURED_TRUTH
+    cautions = "".join(f"- {caution}.\n" for caution in fit.cautions)
+    limits = f"## Limits\n\n{truth}{cautions}{LIMITS}"
+    return "\n".join([_interface(metadata, fit), errors, _misfit(metadata, fit, test), limits, _command(metadata)])
 
 
 def _interface(metadata: ModelMetadata, fit: Fit) -> str:
@@ -51,20 +57,47 @@ Forces log-uniform, positions uniform over the working area.
 """
 
 
-def _misfit(metadata: ModelMetadata, fit: Fit) -> str:
+def _measured_errors(errors: Mapping[str, float]) -> str:
+    return f"""## Errors on {errors[HELD_PRESSES]:.0f} measured presses that training never saw
+
+The presses as they were measured: no noise was added, and what the rig does not know of places and forces is in the
+errors.
+
+| error | on measured presses |
+|---|---|
+| position, median | {errors["position_median_mm"]:g} mm |
+| position, rms | {errors["position_rms_mm"]:g} mm |
+| position, 95 % | {errors["position_p95_mm"]:g} mm |
+| force, median | {errors["force_median_percent"]:g} % |
+| force, rms | {errors["force_rms_percent"]:g} % |
+| coverage of the 68 % intervals | {100 * errors["coverage_68"]:.3g} % |
+| coverage of the 95 % intervals | {100 * errors["coverage_95"]:.3g} % |
+"""
+
+
+def _misfit(metadata: ModelMetadata, fit: Fit, test: MeasuredTest | None) -> str:
     errors = metadata.errors
+    good = "measured presses" if fit.measured else "good presses" if test is None else "simulated good presses"
+    rare = f",\n0.1 % exceed {errors['misfit_p999']:g}" if "misfit_p999" in errors else ""
     return f"""\
 The misfit is the distance, in units of the noise{_unit(fit)}, of the charges from the nearest single contact that the
-model knows; a network gives it, learned from exact searches. 1 % of good presses exceed {errors["misfit_p99"]:g},
-0.1 % exceed {errors["misfit_p999"]:g}.
+model knows; a network gives it, learned from exact searches. 1 % of {good} exceed {errors["misfit_p99"]:g}{rare}.
 {_what_misfit_sees(metadata)}
 """
 
 
-LIMITS = """## Limits
-
+SIMULATED_TRUTH = """\
 - The truth behind these figures is the simulator, not a film. On a real film, pretension and gains that
   nobody has measured matter more.
+"""
+
+MEASURED_TRUTH = """\
+- The model was fitted to measurements of one film. The errors are those of that film and its rig on the day of the
+  measurement; another film, or this one after months, can differ by far more. `isocharge serve check` says so from a
+  few presses.
+"""
+
+LIMITS = """\
 - One press at a time. Outside the working area and forces the answer is finite and wrong; the misfit is then large in
   many cases, not in all.
 - The deviations hold for the noise named above; gains that are off by 1 % add more than all of it.

@@ -7,6 +7,7 @@ model.
 import copy
 import platform
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -26,11 +27,13 @@ from isocharge.simulate.dataset.shards import Dataset
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.noise import misfit_noise
+from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.release.card import model_card
 from isocharge.train.release.evaluate import Predict, measure_errors
 from isocharge.train.release.export import export_onnx
 from isocharge.train.release.folding import fold_network
 from isocharge.train.release.graph_check import check_graph, disk_polygon
+from isocharge.train.release.measured import MeasuredTest, measured_alarm, measured_errors
 from isocharge.train.training.checkpoint import Checkpoint
 from isocharge.train.training.config import FitConfig
 from isocharge.train.training.fit import Fit, fit_network
@@ -57,18 +60,21 @@ def train_model(
     command: str = "",
     version: int = 1,
     fresh: bool = False,
+    test: MeasuredTest | None = None,
     progress: StageProgress | None = None,
     warn: Warn = warnings.warn,
 ) -> Release:
     """Train a model on a dataset and write it. Killed and called again with the same arguments, it goes on.
 
     Args:
-        dataset: Clean charges.
+        dataset: Clean charges, or measured ones.
         folder: The model's folder, `models/NAME`; the name is the model's.
         config: Sizes, steps, seed; the defaults if absent.
         command: How to make this model again, for the card.
         version: Number of the version folder.
         fresh: Throw away what an earlier run left.
+        test: Measured presses to measure the errors on; those held out of a measured dataset if absent, and for a
+            simulated one its held-out presses with noise.
         progress: Called with steps done, all steps, and a text with the loss and errors.
         warn: Called where the map folds, and about damaged parts of an earlier run.
 
@@ -84,10 +90,12 @@ def train_model(
     config = config or FitConfig()
     with resume_parts(folder / str(version), _identity(dataset, config), fresh=fresh, warn=warn) as draft:
         fit = fit_network(dataset, config, progress, checkpoint=Checkpoint(draft), warn=warn)
-        about = _metadata(fit, dataset, folder.resolve().name, version, command)
+        test = test or (MeasuredTest(fit.held) if fit.measured else None)
+        about = _metadata(fit, dataset, folder.resolve().name, version, command, test)
         graph = export_onnx(fold_network(fit.network), about.to_props())
         golden = check_graph(graph, _in_double(fit), fit.held, misfit_noise(noise_model(fit.config.training.noise)))
-        written = write_model(folder, graph, about, golden, model_card(about, fit))
+        further = test.further if test else {}
+        written = write_model(folder, graph, about, golden, model_card(about, fit, test), further)
     return Release(written, about)
 
 
@@ -125,7 +133,23 @@ def _in_double(fit: Fit) -> Predict:
     return predict
 
 
-def _metadata(fit: Fit, dataset: Dataset, name: str, version: int, command: str) -> ModelMetadata:
+def _errors(fit: Fit, dataset: Dataset, test: MeasuredTest | None) -> Mapping[str, float]:
+    """Errors on measured presses where there are some; the misfit's alarm then comes from the presses trained on."""
+    predict = predict_with(fit)
+    if fit.measured:
+        inside = np.hypot(dataset.samples.x_mm, dataset.samples.y_mm) <= fit.network.domain.radius_mm
+        alarm = measured_alarm(predict, LabelledPresses.of(dataset.samples)[inside])
+        return {**measured_errors(predict, (test or MeasuredTest(fit.held)).held), **alarm}
+    simulated = measure_errors(predict, fit.held, noise_model(fit.config.training.noise))
+    if test is None:
+        return simulated
+    alarms = {name: value for name, value in simulated.items() if name.startswith(("misfit_", "found_"))}
+    return {**measured_errors(predict, test.held), **alarms}
+
+
+def _metadata(
+    fit: Fit, dataset: Dataset, name: str, version: int, command: str, test: MeasuredTest | None
+) -> ModelMetadata:
     noise = noise_model(fit.config.training.noise)
     packages = {package.__name__: package.__version__ for package in (np, onnx, onnxruntime, torch)}
     return ModelMetadata(
@@ -138,12 +162,14 @@ def _metadata(fit: Fit, dataset: Dataset, name: str, version: int, command: str)
         force_range_N=fit.network.domain.force_range_N,
         noise=noise.to_dict(),
         dataset_sha256=dataset.sha256,
-        errors=measure_errors(predict_with(fit), fit.held, noise),
+        errors=_errors(fit, dataset, test),
         made_with={
             "command": command,
             "config": fit.config.to_dict(),
             "isocharge": metadata.version("isocharge"),
             "python": platform.python_version(),
             **packages,
+            **({"cautions": list(fit.cautions)} if fit.cautions else {}),
+            **(test.made_with if test else {}),
         },
     )

@@ -24,12 +24,22 @@ from isocharge.train.baselines import (
     polynomial,
     table,
 )
-from isocharge.train.data.presses import domain_of
+from isocharge.train.data.measured import check_enough, held_out, is_measured
+from isocharge.train.data.presses import LabelledPresses, domain_of
 from isocharge.train.report import effects, maps, pictures
 from isocharge.train.report.bench import EvaluationScene, press_on
 from isocharge.train.report.limits import BAYES, CRAMER_RAO, ErrorBounds, error_bounds
 from isocharge.train.report.measures import MethodRecord, Plot, rounded
-from isocharge.train.report.methods import EvaluationPresses, Method, all_methods, fit_all, records_of, task_of, timed
+from isocharge.train.report.methods import (
+    EvaluationPresses,
+    Method,
+    all_methods,
+    fit_all,
+    fit_those_that_can,
+    records_of,
+    task_of,
+    timed,
+)
 from isocharge.train.report.page import page
 from isocharge.train.report.settings import Settings
 from isocharge.train.report.speed import AXES, speed_plot
@@ -92,6 +102,9 @@ def write_report(
         OutputExists: If the folder exists.
         DatasetError: If a dataset cannot teach the methods.
         ModelError: If a model is for another layout or knows less than its dataset.
+        PressError: If there are too few measured presses.
+
+    A measured dataset (`is_measured`) is judged by its own presses: a fifth is held out and scored as measured.
     """
     settings = settings or Settings()
     prepared = [_Subject.of(dataset, model, settings) for dataset, model in subjects]
@@ -126,23 +139,35 @@ def _stems(subjects: "list[_Subject]") -> "list[tuple[str, _Subject]]":
 
 @dataclass(frozen=True)
 class _Subject:
-    """One dataset and its model."""
+    """One dataset and its model; of measured presses, `held` are the test presses, and `dataset` the others."""
 
     dataset: Dataset
     released: ReleasedModel
     task: FittingTask
     bench: EvaluationScene
     settings: Settings
+    held: LabelledPresses | None = None
 
     @classmethod
     def of(cls, dataset: Dataset, model: Path, settings: Settings) -> "_Subject":
         released = ReleasedModel(model)
+        if is_measured(dataset):
+            return cls._of_measured(dataset, released, settings)
         dataset = _known_to(released.predictor.metadata, dataset)
         if len(dataset.samples) > settings.learn_from:
             dataset = replace(dataset, samples=_rows(dataset.samples, np.arange(settings.learn_from)))
         bench = EvaluationScene.of(dataset, settings.presses, settings.seed)
         task = task_of(dataset, bench, settings)
         return cls(dataset, released, task, bench, settings)
+
+    @classmethod
+    def _of_measured(cls, dataset: Dataset, released: ReleasedModel, settings: Settings) -> "_Subject":
+        dataset = _measured_known_to(released.predictor.metadata, dataset)
+        presses = LabelledPresses.of(dataset.samples)
+        held = held_out(presses.contact)
+        bench = EvaluationScene.of(dataset, settings.presses, settings.seed)
+        others = replace(dataset, samples=_rows(dataset.samples, np.flatnonzero(~held)[: settings.learn_from]))
+        return cls(others, released, task_of(others, bench, settings), bench, settings, presses[held])
 
     @property
     def steps(self) -> int:
@@ -152,6 +177,8 @@ class _Subject:
 
     def measure(self, folder: Path, stem: str, steps: Steps) -> dict[str, Any]:
         """Everything about this dataset: its section of the record, its pictures written."""
+        if self.held is not None:
+            return self._measured(folder, stem, EvaluationPresses.measured(self.held), steps)
         settings, bench = self.settings, self.bench
         steps("solving the film for limits and contours")
         forward_maps = bench.forward_maps(further=1.0, settings=SolveSettings(accuracy=settings.accuracy))
@@ -166,6 +193,41 @@ class _Subject:
         section["pictures"] = _draw(folder, stem, section, self._draws(test), bench, settings, steps)
         return section
 
+    def _measured(self, folder: Path, stem: str, test: EvaluationPresses, steps: Steps) -> dict[str, Any]:
+        """The same of measured presses, as they are: what needs a simulator is left out."""
+        estimators = all_methods(self.dataset, None, self.settings)
+        methods, refused = fit_those_that_can(estimators, self.released, self.task, test, steps)
+        records = records_of(timed(methods, test, self.settings, steps), test, None)
+        section = {
+            **self._about(test),
+            "limits": {"bayes": None, "cramer_rao": None},
+            "methods": records,
+            "verdict": verdict(records),
+            "left_out": refused,
+        }
+        drawings = _speed_drawings(section, {}, self.settings)
+        return section | {"pictures": pictures.draw_all(folder, stem, drawings, steps)}
+
+    def _about(self, test: EvaluationPresses) -> dict[str, Any]:
+        """Sensor, contacts, noise, numbers of presses, model."""
+        bench = self.bench
+        return {
+            "sensor": bench.sensor.name,
+            "measured": self.held is not None,
+            "electrodes": list(bench.sensor.electrode_names),
+            "probes": [probe.notation for probe in bench.probes],
+            "radius_mm": bench.domain.radius_mm,
+            "force_N": list(bench.domain.force_range_N),
+            "noise": bench.noise.to_dict(),
+            "dataset_sha256": self.dataset.sha256,
+            "presses": {
+                "train": len(self.task.train),
+                "validation": len(self.task.validation),
+                "test": len(test.presses),
+            },
+            "model": _model_record(self.released),
+        }
+
     def _section(
         self, test: EvaluationPresses, limits: ErrorBounds, methods: list[Method], steps: Steps
     ) -> dict[str, Any]:
@@ -175,15 +237,7 @@ class _Subject:
         threshold = effects.threshold_of(self.released, test.presses, bench, self.settings.draws)
         cases = effects.cases(bench, test.presses, self.settings, steps)
         return {
-            "sensor": bench.sensor.name,
-            "electrodes": list(bench.sensor.electrode_names),
-            "probes": [probe.notation for probe in bench.probes],
-            "radius_mm": bench.domain.radius_mm,
-            "force_N": list(bench.domain.force_range_N),
-            "noise": bench.noise.to_dict(),
-            "dataset_sha256": self.dataset.sha256,
-            "presses": {"train": len(self.task.train), "validation": len(self.task.validation), "test": len(truth)},
-            "model": _model_record(self.released),
+            **self._about(test),
             "limits": limits.record(truth),
             "methods": records,
             "verdict": verdict(records),
@@ -255,6 +309,27 @@ def _model_record(released: ReleasedModel) -> dict[str, Any]:
     }
 
 
+def _measured_known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
+    """Measured presses with positive charges within the model's working area and forces.
+
+    Raises:
+        ModelError: If the model has other electrodes.
+        PressError: If too few remain.
+    """
+    if model.electrodes != dataset.sensor.electrode_names:
+        raise ModelError(
+            f"model {model.label}: expected the electrodes {dataset.sensor.electrode_names} of the presses, got "
+            f"{model.electrodes}; choose their own model with --model, or train one"
+        )
+    samples, (low, high) = dataset.samples, model.force_range_N
+    inside = (np.hypot(samples.x_mm, samples.y_mm) <= inner_radius(model.working_area_mm) * SLACK) & (
+        (samples.force_N * SLACK >= low) & (samples.force_N <= high * SLACK)
+    )
+    rows = np.flatnonzero(inside & (samples.charge_pC > 0.0).all(axis=1))
+    check_enough(len(rows), len(samples), dataset.sensor.name)
+    return replace(dataset, samples=_rows(samples, rows), manifest={})
+
+
 def _compared(methods: list[Method]) -> list[Fitted]:
     """One form of each method that the effects are shown for; its last is the plain one."""
     last = {method.fitted.name: method.fitted for method in methods}
@@ -282,11 +357,8 @@ def _draw(
     known = {BAYES: section["limits"]["bayes"], CRAMER_RAO: section["limits"]["cramer_rao"]}
     limits = {name: limit["position_rms_mm"] for name, limit in known.items() if limit}
 
-    def speed(plot: Plot) -> Callable[[], Any]:
-        return lambda: speed_plot(section["methods"], plot, limits, settings.batch)
-
     drawings: dict[str, Callable[[], Any]] = {
-        **{plot: speed(plot) for plot in AXES},
+        **_speed_drawings(section, limits, settings),
         "maps": lambda: pictures.error_maps(bench.sensor, bench.domain, draws),
         "force": lambda: pictures.against_force(section["by_force"], released.name),
         "calibration": lambda: pictures.calibration(section["calibration"]),
@@ -294,3 +366,12 @@ def _draw(
         "effects": lambda: pictures.mismatch_effect(section["cases"], released.name, released.errors.position_rms_mm),
     }
     return pictures.draw_all(folder, stem, drawings, steps)
+
+
+def _speed_drawings(
+    section: dict[str, Any], limits: dict[str, float], settings: Settings
+) -> dict[str, Callable[[], Any]]:
+    def speed(plot: Plot) -> Callable[[], Any]:
+        return lambda: speed_plot(section["methods"], plot, limits, settings.batch)
+
+    return {plot: speed(plot) for plot in AXES}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.arrays import Array
+from isocharge.errors import DatasetError, TrainingError
 from isocharge.progress import Announce
 from isocharge.simulate import Dataset, ForwardMap
 from isocharge.train.baselines import (
@@ -26,6 +27,7 @@ from isocharge.train.baselines import (
     Triangulate,
 )
 from isocharge.train.baselines.linear_band import BAND_N
+from isocharge.train.data.measured import is_measured
 from isocharge.train.data.noise import noisy_charges
 from isocharge.train.data.presses import LabelledPresses, presses_of, split_by_position
 from isocharge.train.report.bench import EvaluationScene
@@ -38,6 +40,10 @@ TIMED = 64
 
 TEST_NOISE = 4242
 """Seed of the noise on the test presses, relative to the bench's."""
+
+
+FEWEST_LEARNT = 30
+"""Measured presses that methods are fitted to at least, once the test presses are held out."""
 
 
 @dataclass(frozen=True)
@@ -89,18 +95,28 @@ class EvaluationPresses:
         """With one draw of the bench's noise."""
         return cls(presses, noisy_charges(presses, bench.noise, bench.seed + TEST_NOISE))
 
+    @classmethod
+    def measured(cls, presses: LabelledPresses) -> "EvaluationPresses":
+        """Measured presses, as they are."""
+        return cls(presses, presses.charge_pC)
+
 
 def task_of(dataset: Dataset, bench: EvaluationScene, settings: Settings) -> FittingTask:
     """What the methods are fitted for."""
-    train, validation = split_by_position(presses_of(dataset), settings.hold_out, settings.seed)
-    return FittingTask(train, validation, bench.domain, bench.noise, settings.seed, quick=settings.quick)
+    measured = is_measured(dataset)
+    presses = presses_of(dataset, FEWEST_LEARNT) if measured else presses_of(dataset)
+    train, validation = split_by_position(presses, settings.hold_out, settings.seed)
+    return FittingTask(
+        train, validation, bench.domain, bench.noise, settings.seed, quick=settings.quick, measured=measured
+    )
 
 
-def all_methods(dataset: Dataset, forward_map: ForwardMap, settings: Settings) -> list[tuple[str, Estimator]]:
-    """Every method with its kind."""
+def all_methods(dataset: Dataset, forward_map: ForwardMap | None, settings: Settings) -> list[tuple[str, Estimator]]:
+    """Every method with its kind; without a forward map those that need none."""
     networks = [Network(dataset, hidden, settings.steps, settings.hold_out) for hidden in settings.sizes]
+    simulated: list[tuple[str, Estimator]] = [("paper", Triangulate(forward_map))] if forward_map else []
     return [
-        ("paper", Triangulate(forward_map)),
+        *simulated,
         ("paper", LinearBand()),
         ("paper", NearestEntry()),
         ("paper", InterpolatedTable()),
@@ -130,6 +146,23 @@ def fit_all(
         seconds = time.perf_counter() - begin
         methods += [Method(form, kind, answers(form, test), seconds) for form in forms]
     return methods
+
+
+def fit_those_that_can(
+    estimators: list[tuple[str, Estimator]],
+    released: ReleasedModel,
+    task: FittingTask,
+    test: EvaluationPresses,
+    progress: Announce,
+) -> tuple[list[Method], dict[str, str]]:
+    """As `fit_all`, of few measured presses: methods that they cannot teach are left out, by name with the reason."""
+    methods, refused = fit_all([], released, task, test, progress), {}
+    for kind, estimator in estimators:
+        try:
+            methods += fit_all([(kind, estimator)], released, task, test, progress)[2:]
+        except (DatasetError, TrainingError) as error:
+            refused[estimator.name] = str(error)
+    return methods, refused
 
 
 def answers(fitted: Fitted, test: EvaluationPresses) -> Array:

@@ -45,10 +45,13 @@ def _summary(section: dict[str, Any]) -> Iterator[str]:
 
 
 def _section(section: dict[str, Any], settings: dict[str, Any]) -> Iterator[str]:
-    low, high = section["force_N"]
-    presses, noise = section["presses"], section["noise"]
     yield f"## {section['sensor']}"
     yield ""
+    if section["measured"]:
+        yield from _measured(section, settings)
+        return
+    low, high = section["force_N"]
+    presses, noise = section["presses"], section["noise"]
     yield (
         f"Presses of {', '.join(section['probes'])} within {section['radius_mm']:g} mm, {low:g} to {high:g} N (uniform "
         f"over the disk, log-uniform in force), noise `{noise['name']}` ({noise['white_pC']:g} pC and "
@@ -63,6 +66,31 @@ def _section(section: dict[str, Any], settings: dict[str, Any]) -> Iterator[str]
     yield from _where(section)
     yield from _calibration(section)
     yield from _effects(section)
+    yield from _choices(section["methods"])
+
+
+def _measured(section: dict[str, Any], settings: dict[str, Any]) -> Iterator[str]:
+    low, high = section["force_N"]
+    presses = section["presses"]
+    yield (
+        f"Measured presses of {', '.join(section['probes'])} within {section['radius_mm']:.3g} mm, {low:.3g} to "
+        f"{high:.3g} N. The methods learnt from {presses['train']} of them, chose their hyperparameters by "
+        f"{presses['validation']} others, and are measured on {presses['test']} more, as they were measured: no noise "
+        "is added, no simulator says what would be right, and the errors hold what the rig does not know of places and "
+        "forces. One process, one thread."
+    )
+    yield ""
+    yield (
+        "Left out, because it needs a simulator of this very film: the least possible error (Bayes, Cramér-Rao), "
+        "triangulation, and films, probes and noise other than those of the presses."
+    )
+    yield ""
+    yield from _table(section["methods"], section["limits"])
+    yield ""
+    yield from _plots(section, settings)
+    for name, reason in section["left_out"].items():
+        yield f"- {name}: left out; {reason}."
+    yield ""
     yield from _choices(section["methods"])
 
 

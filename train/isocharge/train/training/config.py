@@ -59,7 +59,8 @@ class TrainingConfig:
         batch: Samples per step.
         learning_rate: Largest rate of the schedule (Adam's; Muon's is a multiple).
         patience: Steps without a better network after which a stage ends early with the best one.
-        hold_out: Share of the positions held out for measuring errors; half as many are watched while it trains.
+        hold_out: Share of the positions held out for measuring errors; half as many are watched while it trains. Of
+            measured presses a fifth is held out always, the same for every command.
         noise: Level of the noise model that is added afresh in every step.
         seed: Of weights, batches, noise and split.
         threads: CPU threads; one is nearly as fast as two at this size and does not suffer when the cores are busy.

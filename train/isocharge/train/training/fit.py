@@ -25,7 +25,8 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.fold_free import SMALLEST_SHARE, fold_free_domain
+from isocharge.train.data.fold_free import SMALLEST_SHARE, fold_free_domain, probable_fold_mm
+from isocharge.train.data.measured import held_out, is_measured
 from isocharge.train.data.misfit_charges import MisfitExamples, draw_misfit_examples
 from isocharge.train.data.noise import misfit_noise, noisy_charges
 from isocharge.train.data.presses import LabelledPresses, domain_of, presses_of, split_by_position
@@ -50,6 +51,8 @@ class Fit:
         held: Presses held out for measuring errors.
         config: What it was trained with.
         asked: The domain of the dataset; larger than the network's where the map folds.
+        measured: Whether the presses were measured, so that their charges have noise already.
+        cautions: What the user of the model should know, a sentence each.
     """
 
     network: InverseNetwork
@@ -57,6 +60,8 @@ class Fit:
     held: LabelledPresses
     config: FitConfig
     asked: ContactDomain
+    measured: bool = False
+    cautions: tuple[str, ...] = ()
 
 
 def fit_network(
@@ -70,7 +75,8 @@ def fit_network(
     """Train on a dataset.
 
     Args:
-        dataset: Clean charges; noise is added here.
+        dataset: Clean charges, to which noise is added here; or measured ones, to which it is added as well while
+            training, against learning them by heart, and not to those held out.
         config: Sizes, steps, seed.
         progress: Called with steps done, all steps, and a text with the loss and errors on watched presses.
         checkpoint: Keeps the state, so that a stopped run goes on.
@@ -81,13 +87,15 @@ def fit_network(
         DatasetError: If the dataset cannot train an inverse.
         TrainingError: If the loss is not finite.
     """
-    training = config.training
+    training, cautions = config.training, list[str]()
     noise_model(training.noise)  # an unknown level is said before the work
     asked, presses = domain_of(dataset), presses_of(dataset)
     _check_electrodes(dataset, config)
     with threads_and_seed(training.threads, training.seed):
-        domain, presses = _without_folds(asked, presses, training, warn)
-        trainable, held = split_by_position(presses, training.hold_out, training.seed)
+        domain, presses = _without_folds(asked, presses, training, cautions.append)
+        for caution in cautions:
+            warn(caution)
+        trainable, held = _split(presses, training, is_measured(dataset))
         train, watched = split_by_position(trainable, WATCHED * training.hold_out, training.seed + 1)
         field = _field(domain, train, watched)
         network = InverseNetwork(
@@ -95,7 +103,17 @@ def fit_network(
         )
         _Training(network, field, train, watched, training, checkpoint or Checkpoint(), progress).run()
     network.eval()
-    return Fit(network, field, held, config, asked)
+    return Fit(network, field, held, config, asked, is_measured(dataset), tuple(cautions))
+
+
+def _split(
+    presses: LabelledPresses, training: TrainingConfig, measured: bool
+) -> tuple[LabelledPresses, LabelledPresses]:
+    """Presses to train on, and those held out."""
+    if not measured:
+        return split_by_position(presses, training.hold_out, training.seed)
+    held = held_out(presses.contact)
+    return presses[~held], presses[held]
 
 
 def _field(domain: ContactDomain, train: LabelledPresses, watched: LabelledPresses) -> ChargeField:
@@ -114,10 +132,18 @@ def _check_electrodes(dataset: Dataset, config: FitConfig) -> None:
 def _without_folds(
     asked: ContactDomain, presses: LabelledPresses, training: TrainingConfig, warn: Warn
 ) -> tuple[ContactDomain, LabelledPresses]:
-    """The largest disk in which the map does not fold, and the presses in it."""
+    """The largest disk in which the map certainly does not fold, and the presses in it."""
     field = _field(asked, *split_by_position(presses, training.hold_out, training.seed))
-    domain = fold_free_domain(field, misfit_noise(noise_model(training.noise)))
+    noise = misfit_noise(noise_model(training.noise))
+    domain = fold_free_domain(field, noise)
     if domain == asked:
+        if np.isfinite(fold_mm := probable_fold_mm(field, noise)):
+            warn(
+                f"the map from contacts to charges seems to fold about {fold_mm:.2g} mm from the centre, where two "
+                f"contacts give the same charges; the presses cannot tell it for certain, and the model is trained "
+                f"across it, up to {asked.radius_mm:g} mm; see 'isocharge simulate identify', then ask for a smaller "
+                "radius or add an electrode"
+            )
         return asked, presses
     if domain.radius_mm < SMALLEST_SHARE * asked.radius_mm:
         raise DatasetError(

@@ -1,0 +1,185 @@
+"""A smooth correction of a film's charges by measured presses: what calibrated physics cannot explain.
+
+The logarithms of the charges are corrected by polynomials in x, y and ln F,
+
+    ln Q_e = ln Q_e(map) + sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= degree, m <= 2,
+
+by generalised least squares: noise of the charges, and what the rig does not know of place and force, through the map's
+slopes. The coefficients have a Gaussian prior about zero, narrower for higher terms, so that the correction fades where
+nothing asks for it. Degree and width of the prior are chosen by presses left out in turn (cross-validation); if the
+gain is not beyond chance, there is no correction.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from scipy.linalg import cho_factor, cho_solve
+
+from isocharge.arrays import Array, Integers
+
+DEGREES = (1, 2, 3, 4, 6)
+"""Degrees that are tried."""
+
+FORCE_DEGREE = 2
+"""Largest degree in ln F."""
+
+STDS = (0.01, 0.03, 0.1, 0.3)
+"""Standard deviations of a constant correction that are tried, in ln Q."""
+
+FADING = 0.5
+"""Ratio of the standard deviations of terms of successive degrees: corrections are smooth."""
+
+FOLDS = 5
+"""Parts that are left out in turn."""
+
+CHANCE = 2.0
+"""Gain over no correction in its own standard errors, below which it is taken for chance."""
+
+CHUNK = 2048
+"""Presses whose equations are held at once."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What a map leaves unexplained of measured presses.
+
+    Attributes:
+        contact: As the rig read them, (x_mm, y_mm, force_N), shape (n, 3).
+        log_ratio: ln(measured charge / charge of the map), shape (n, n_electrode).
+        covariance: Of the log ratios by noise and rig, shape (n, n_electrode, n_electrode).
+    """
+
+    contact: Array
+    log_ratio: Array
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.contact)
+
+    def __getitem__(self, rows: Integers) -> "Residuals":
+        return Residuals(self.contact[rows], self.log_ratio[rows], self.covariance[rows])
+
+    def chi2(self, correction: Array) -> Array:
+        """Squares of what a correction (n, n_electrode) leaves, over its covariance, shape (n,)."""
+        left = (self.log_ratio - correction)[:, :, None]
+        squares: Array = (left * np.linalg.solve(self.covariance, left)).sum(axis=(1, 2))
+        return squares
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Factors on charges, beyond the presses as at the nearest of them.
+
+    Attributes:
+        radius_mm: Largest distance of a press.
+        force_range_N: Smallest and largest force of the presses.
+        degree: Largest degree.
+        std: Standard deviation of the prior.
+        coefficients: Shape (n_term, n_electrode).
+        freedom: Effective number of coefficients: the prior holds the others.
+    """
+
+    radius_mm: float
+    force_range_N: tuple[float, float]
+    degree: int
+    std: float
+    coefficients: Array
+    freedom: float
+
+    @property
+    def nothing(self) -> bool:
+        """Whether nothing is corrected."""
+        return not self.coefficients.any()
+
+    def log_factor(self, contact: Array) -> Array:
+        """What is added to ln Q at contacts (x_mm, y_mm, force_N), shape (n, 3): (n, n_electrode)."""
+        logs: Array = _terms(contact, self.radius_mm, self.force_range_N, self.degree) @ self.coefficients
+        return logs
+
+
+def fit_correction(residuals: Residuals, seed: int = 0) -> Correction:
+    """The correction that predicts presses left out in turn best; none if that is chance.
+
+    Args:
+        residuals: Of at least `FOLDS` presses.
+        seed: Of the parts.
+    """
+    part = np.random.default_rng(seed).permutation(np.arange(len(residuals)) % FOLDS)
+    without = residuals.chi2(np.zeros_like(residuals.log_ratio))
+    tried = [(score.sum(), degree, std, score) for degree in DEGREES for std, score in _scores(residuals, part, degree)]
+    _, degree, std, score = min(tried, key=lambda entry: entry[:3])
+    gain = without - score
+    if gain.mean() <= CHANCE * gain.std() / np.sqrt(len(gain)):
+        none = np.zeros((len(_degrees(1)), residuals.log_ratio.shape[1]))
+        return Correction(*_reach(residuals.contact), 1, 0.0, none, 0.0)
+    normal, moment = _equations(residuals, residuals, degree)
+    freedom = float(np.trace(cho_solve(cho_factor(normal + _prior(len(moment), degree, std)), normal)))
+    return Correction(*_reach(residuals.contact), degree, std, _solve(normal, moment, degree, std), freedom)
+
+
+def _reach(contact: Array) -> tuple[float, tuple[float, float]]:
+    force = contact[:, 2]
+    return float(np.hypot(contact[:, 0], contact[:, 1]).max()), (float(force.min()), float(force.max()))
+
+
+def _scores(residuals: Residuals, part: Integers, degree: int) -> Iterator[tuple[float, Array]]:
+    """Squared misses of the presses, each predicted by the parts that it is not in, for every width of the prior."""
+    parts = [_equations(residuals[np.flatnonzero(part == k)], residuals, degree) for k in range(FOLDS)]
+    normal, moment = (sum(entry[k] for entry in parts) for k in range(2))
+    for std in STDS:
+        predicted = np.empty_like(residuals.log_ratio)
+        for number, (own_normal, own_moment) in enumerate(parts):
+            coefficients = _solve(normal - own_normal, moment - own_moment, degree, std)
+            rows = part == number
+            predicted[rows] = _terms(residuals.contact[rows], *_reach(residuals.contact), degree) @ coefficients
+        yield std, residuals.chi2(predicted)
+
+
+def _equations(some: Residuals, all_of_them: Residuals, degree: int) -> tuple[Array, Array]:
+    """Normal matrix and moments of some presses: shapes (n_term n_electrode,) twice and once."""
+    reach = _reach(all_of_them.contact)
+    size = len(_degrees(degree)) * some.log_ratio.shape[1]
+    normal, moment = np.zeros((size, size)), np.zeros(size)
+    for start in range(0, len(some), CHUNK):
+        rows = slice(start, start + CHUNK)
+        terms = _terms(some.contact[rows], *reach, degree)
+        whiten = np.linalg.inv(np.linalg.cholesky(some.covariance[rows]))
+        design = (terms[:, None, :, None] * whiten[:, :, None, :]).reshape(-1, size)
+        normal += design.T @ design
+        moment += design.T @ np.einsum("nge,ne->ng", whiten, some.log_ratio[rows]).ravel()
+    return normal, moment
+
+
+def _solve(normal: Array, moment: Array, degree: int, std: float) -> Array:
+    """Coefficients, shape (n_term, n_electrode)."""
+    solution: Array = cho_solve(cho_factor(normal + _prior(len(moment), degree, std)), moment)
+    return solution.reshape(len(_degrees(degree)), -1)
+
+
+def _prior(size: int, degree: int, std: float) -> Array:
+    """Inverse covariance of the coefficients, shape (size, size)."""
+    degrees = _degrees(degree)
+    widths = std * FADING ** degrees.sum(axis=1)
+    inverse: Array = np.diag(np.repeat(widths**-2.0, size // len(degrees)))
+    return inverse
+
+
+def _degrees(degree: int) -> Integers:
+    """Degrees of the terms in x, y and ln F, shape (n_term, 3)."""
+    grid = np.indices((degree + 1, degree + 1, min(degree, FORCE_DEGREE) + 1)).reshape(3, -1).T
+    chosen: Integers = grid[grid.sum(axis=1) <= degree]
+    return chosen
+
+
+def _terms(contact: Array, radius_mm: float, force_range_N: tuple[float, float], degree: int) -> Array:
+    """Values of the terms, shape (n, n_term); beyond the presses those of the nearest contact among them."""
+    low, high = np.log(force_range_N)
+    inward = np.maximum(np.hypot(contact[:, 0], contact[:, 1]), radius_mm)
+    log_force = np.clip(np.log(contact[:, 2]), low, high)
+    unit = (contact[:, 0] / inward, contact[:, 1] / inward, (2.0 * log_force - low - high) / max(high - low, 0.1))
+    values = [chebyshev.chebvander(axis, degree) for axis in unit]
+    of = _degrees(degree)
+    terms: Array = values[0][:, of[:, 0]] * values[1][:, of[:, 1]] * values[2][:, of[:, 2]]
+    return terms
