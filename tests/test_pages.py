@@ -132,7 +132,7 @@ def test_figures_of_the_released_models_are_their_cards():
 
 def test_figures_of_the_models_for_all_films_are_their_cards():
     rows = re.findall(
-        r"^\| \[?`(\S+)`\S* \| (?:any film, within )?(\S+) mm \| (\S+) mm \| (\S+) % \| (\S+) mm \| (\S+) % \|",
+        r"^\| \[?`([\w-]+)`\S* \| (\S+) mm \| (\S+) mm, (\S+) % \| (\S+) mm, (\S+) % \|",
         PAGES["models/README.md"] + PAGES["train/docs/films.md"],
         re.M,
     )
