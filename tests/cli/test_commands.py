@@ -319,7 +319,7 @@ BAD = [
     (
         ("simulate", "sweep", SENSOR, "--force", "2", "1", "-o", "OUT"),
         2,
-        "SceneError: force range: expected 0 < MIN <= MAX",
+        "SceneError: force: expected 0 < smallest <= largest",
     ),
     (("simulate", "sweep", SENSOR, "--radius", "44.5", "-o", "OUT"), 2, "leave the film of radius 45 mm"),
     (

@@ -6,7 +6,7 @@ import pytest
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["presses", "--films"], "--films: expected --sensor SENSOR, got a DATASET"),
+        (["presses", "--films"], "--films: expected --sensor SENSOR alone, got presses"),
         (
             ["--sensor", "four-25um-biaxial", "--films", "--radius", "auto"],
             "--films: expected --radius in mm, got auto",

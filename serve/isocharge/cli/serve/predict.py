@@ -57,7 +57,8 @@ def _lines(file: str) -> Iterator[str]:
             try:
                 yield from bounded_lines(text)
             finally:
-                text.detach()  # or it closes stdin
+                if not text.closed:
+                    text.detach()  # or it closes stdin
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); expected a CSV file, or - for stdin") from error
 

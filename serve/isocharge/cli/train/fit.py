@@ -96,10 +96,11 @@ def fit_command(
     Example: isocharge train fit presses.csv --sensor four-25um-biaxial -o models/rig
     """
     measured = dataset is not None and not dataset.is_dir()
+    if films:
+        _refuse_with_films(dataset, config)
     _check_source(dataset, sensor, measured)
     refuse_existing(output / str(version))
     if films:
-        _refuse_with_films(dataset, config)
         train = _train_films(str(sensor), probe or ["circle:1.0"], radius)
     elif dataset and measured:
         stds = position_std_mm, force_std

@@ -119,6 +119,8 @@ class CsvNumbers:
             for row in reader:
                 if any(cell.strip() for cell in row):
                     yield reader.line_num, row
+        except InputError:  # of whoever gives the lines
+            raise
         except (csv.Error, ValueError) as cause:  # ValueError: no UTF-8, or a line that is too long to be held
             where = f"{self.where}, line {reader.line_num + 1}"
             raise self.error(f"{where}: not CSV text in UTF-8 ({cause})") from cause
