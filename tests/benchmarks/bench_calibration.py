@@ -82,7 +82,8 @@ def gains_only(chosen: SensorFilms, presses: MeasuredPresses) -> np.ndarray:
     """The described film with the gains that fit the presses best."""
     parameters = chosen.described.parameters.copy()
     expected = chosen.scene.charges.charge_pC(parameters, presses.contact)
-    parameters[-expected.shape[1] :] += np.median(np.log(presses.charge_pC / expected), axis=0)
+    ratio = np.maximum(presses.charge_pC, 1.0) / np.maximum(expected, 1.0)
+    parameters[-expected.shape[1] :] += np.median(np.log(ratio), axis=0)
     return parameters
 
 
