@@ -192,17 +192,17 @@ def test_existing_folder_is_refused_before_any_work(tmp_path):
 @pytest.mark.parametrize(
     ("sweep", "message"),
     [
-        (Sweep(radius=44.5e-3), "leave the film of radius 45 mm"),
-        (Sweep(radius=-1e-3), "radius: expected a positive number"),
-        (Sweep(radius=float("nan")), "radius: expected a positive number"),
-        (Sweep(force_range=(-0.1, 1.0)), "force range: expected 0 < MIN"),
-        (Sweep(force_range=(1.0, float("inf"))), "force range: expected 0 < MIN"),
+        ({"radius": 44.5e-3}, "leave the film of radius 45 mm"),
+        ({"radius": -1e-3}, "radius: expected a positive number"),
+        ({"radius": float("nan")}, "radius: expected a positive number"),
+        ({"force_range": (-0.1, 1.0)}, "force: expected 0 < smallest"),
+        ({"force_range": (1.0, float("inf"))}, "force: expected 0 < smallest"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # drawn before they are looked at
 def test_impossible_sweeps_leave_nothing(tmp_path, sweep, message):
     with pytest.raises(SceneError, match=message):
-        run_sweep(tmp_path / "new" / "presses", SENSOR, (Circle(1e-3),), sweep)
+        run_sweep(tmp_path / "new" / "presses", SENSOR, (Circle(1e-3),), Sweep(**sweep))
     assert list(tmp_path.iterdir()) == []
 
 

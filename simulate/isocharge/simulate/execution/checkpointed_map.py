@@ -44,8 +44,8 @@ class CheckpointedMap:
 
 def _array(data: bytes) -> Array:
     array = np.load(io.BytesIO(data), allow_pickle=False)
-    if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
-        raise ValueError(f"expected an array of numbers, got {type(array).__name__}")
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        raise ValueError(f"expected an array of numbers, got {getattr(array, 'dtype', 'an archive')}")
     return array
 
 

@@ -16,7 +16,10 @@ from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.train.calibration.film_charges import FilmCharges
 
 DEAD_SHARE = 0.02
-"""Largest charge of a channel over the median of all others, below which it counts as dead."""
+"""Typical charge of a channel over that of the others, below which it counts as dead; less where films give less."""
+
+REVERSED_SHARE = 0.3
+"""Typical charge of a channel over that of the others, above which a negative one is reversed."""
 
 REVERSED = 0.8
 """Share of negative charges above which a channel counts as reversed."""
@@ -69,7 +72,7 @@ def check_before(presses: MeasuredPresses, charges: FilmCharges) -> None:
         PressError: If a place is off the film, places are in metres, or a channel is dead or has the wrong sign.
     """
     _check_places(presses, charges)
-    _check_channels(presses)
+    _check_channels(presses, charges)
 
 
 def _check_places(presses: MeasuredPresses, charges: FilmCharges) -> None:
@@ -92,23 +95,44 @@ def _check_places(presses: MeasuredPresses, charges: FilmCharges) -> None:
         )
 
 
-def _check_channels(presses: MeasuredPresses) -> None:
+def _check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
     typical = np.array([_median(np.abs(column)) for column in presses.charge_pC.T])
+    expected = _smallest_shares(presses, charges)
     for number, name in enumerate(presses.electrodes):
         others = _median(np.delete(typical, number))
         if np.isnan(typical[number]):
             raise PressError(f"electrode {name!r}: no press has a charge of it; a calibration needs all electrodes")
-        if typical[number] < DEAD_SHARE * others:
+        if typical[number] < DEAD_SHARE * min(expected[number], 1.0) * others:
             raise PressError(
                 f"electrode {name!r} is dead: half of its charges are below {typical[number]:.3g} pC where those of "
                 f"the others are {others:.3g} pC; check the channel, its cable and its amplifier"
             )
         known = presses.charge_pC[~np.isnan(presses.charge_pC[:, number]), number]
-        if known.size >= FEWEST_TO_TELL and np.mean(known < 0.0) > REVERSED:  # light presses on taut films give some
+        large = typical[number] > REVERSED_SHARE * others  # weak ones may be negative, on taut uniaxial films
+        if known.size >= FEWEST_TO_TELL and np.mean(known < 0.0) > REVERSED and large:
             raise PressError(
                 f"electrode {name!r}: {np.sum(known < 0.0)} of its {known.size} charges are negative; a press gives a "
                 "positive charge: exchange its wires or its sign"
             )
+
+
+def _smallest_shares(presses: MeasuredPresses, charges: FilmCharges) -> Array:
+    """Typical charge of each channel over that of the others, the smallest that films of some pretension give."""
+    placed = np.isfinite(presses.contact).all(axis=1)
+    shares = []
+    for share in PRETENSIONS if placed.any() else ():
+        typical = np.median(np.abs(_expected(charges, presses.contact[placed], share)), axis=0)
+        others = np.array([np.median(np.delete(typical, number)) for number in range(typical.size)])
+        shares.append(typical / others)
+    smallest: Array = np.min(shares, axis=0) if shares else np.ones(len(presses.electrodes))
+    return smallest
+
+
+def _expected(charges: FilmCharges, contact: Array, share: float) -> Array:
+    """Charges of contacts, (n, n_electrode), pC, on the prior's mean film with a share of its largest pretension."""
+    parameters = charges.prior.mean.copy()
+    parameters[0] = share * charges.prior.spread.pretension
+    return charges.charge_pC(parameters, charges.into_domain(contact))
 
 
 def _median(values: Array) -> float:
@@ -143,9 +167,7 @@ def _misfit(charges: FilmCharges, contact: Array, charge_pC: Array) -> float:
         return np.inf
     misfits = []
     for share in PRETENSIONS:
-        parameters = charges.prior.mean.copy()
-        parameters[0] = share * charges.prior.spread.pretension
-        expected = charges.charge_pC(parameters, charges.into_domain(contact))
+        expected = _expected(charges, contact, share)
         logs = np.log(np.maximum(charge_pC, 1e-3)) - np.log(np.maximum(expected, 1e-3))
         common = np.nanmedian(logs)
         misfits.append(np.nanmean(np.minimum((logs - common) ** 2, 4.0)) / SCATTER**2 + (common / OFFSET) ** 2)
