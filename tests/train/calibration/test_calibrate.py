@@ -101,6 +101,14 @@ def test_a_file_written_wrongly_is_refused_with_the_reason(scene, name):
         quietly(presses_of(contact, charge, presses.electrodes), scene)
 
 
+@pytest.mark.parametrize("seed", [41, 42, 43])
+def test_four_presses_with_swapped_columns_find_no_strange_film(scene, seed):
+    """So few that a film may explain most of them: still refused."""
+    _, presses = rig(scene.charges, 4, seed=seed)
+    with pytest.raises(PressError, match="no film of 'four-25um-biaxial' explains these 4"):
+        quietly(presses_of(presses.contact, presses.charge_pC[:, [1, 0, 2, 3]], presses.electrodes), scene)
+
+
 def test_another_layout_is_refused(scene):
     other = films_for(load_sensor("four-25um-uniaxial"), Circle(1e-3)).scene
     _, presses = rig(other.charges, 12, seed=8)

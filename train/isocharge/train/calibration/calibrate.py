@@ -18,7 +18,7 @@ from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity
 from isocharge.train.calibration.contacts import RigData
-from isocharge.train.calibration.diagnosis import check_before, explain, outside, without
+from isocharge.train.calibration.diagnosis import check_before, explain, find_mistakes, outside, without
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_fit import FilmPosterior, fit_film
 from isocharge.train.calibration.quantities import Quantity, in_words, quantities
@@ -35,6 +35,9 @@ UNCERTAIN = 0.01
 
 STRAINED = 1e-7
 """Chance of a film as far from the described one as this, below which the presses are taken for wrongly written."""
+
+ODD = 1e-3
+"""The same, below which presses are tried as what they may be by mistake."""
 
 FEW = 3
 """Fewer presses than this leave large errors: said, not refused."""
@@ -237,8 +240,10 @@ def _refuse_unexplained(
     deviation = (posterior.parameters - before.parameters) / charges.prior.std
     strain = float(deviation @ np.linalg.solve(before.covariance, deviation))
     unexplained = freedom > 0.0 and total / freedom > FAR_OFF and chi2_distribution.sf(total, freedom) < UNEXPLAINED
-    strained = chi2_distribution.sf(strain, deviation.size) < STRAINED
-    if unexplained or strained:
+    chance = chi2_distribution.sf(strain, deviation.size)
+    suspicious = posterior.bad.any() or chance < ODD  # a few presses written wrongly may still find a strange film
+    odd = suspicious and bool(find_mistakes(presses, charges))
+    if unexplained or chance < STRAINED or odd:
         raise explain(presses, charges, float(np.sqrt(max(total / max(freedom, 1.0), strain / deviation.size))))
 
 
