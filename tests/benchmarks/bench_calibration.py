@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 from bench_predictor import machine
-from matplotlib.ticker import NullFormatter, ScalarFormatter
+from matplotlib.ticker import FormatStrFormatter, NullFormatter, ScalarFormatter
 
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle, ForwardMap, load_sensor
@@ -304,8 +304,8 @@ def picture(tables: dict[str, dict[str, Any]], path: Path) -> None:
     rows = figure.subplots(2, len(tables), sharex=True, squeeze=False)
     styles = {
         "gains only": ("gains_only", "#c07a2c", "s"),
-        "network tuned on the presses alone": ("fine_tuned", "#8a5aa8", "^"),
-        "Gauss-Newton on the calibrated map": ("gauss_newton", "#5a9a5a", "x"),
+        "network tuned on the presses alone, some films": ("fine_tuned", "#8a5aa8", "^"),
+        "Gauss-Newton on the calibrated map, some films": ("gauss_newton", "#5a9a5a", "x"),
     }
     for column, (sensor, table) in enumerate(tables.items()):
         for axis, (axes, unit) in enumerate(zip(rows[:, column], ("mm", "percent"), strict=True)):
@@ -324,13 +324,14 @@ def picture(tables: dict[str, dict[str, Any]], path: Path) -> None:
             axes.set(xscale="log", yscale="log", xticks=COUNTS)
             axes.xaxis.set_major_formatter(ScalarFormatter())
             axes.xaxis.set_minor_formatter(NullFormatter())
+            axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
             axes.grid(alpha=0.3)
         rows[0, column].set(title=sensor)
         rows[1, column].set(xlabel="presses")
     rows[0, 0].set(ylabel="position error (rms), mm")
     rows[1, 0].set(ylabel="force error (rms), %")
     handles, labels = rows[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(tables), fontsize=8)
     figure.savefig(path, dpi=100)
 
 
