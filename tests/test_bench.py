@@ -19,6 +19,8 @@ from isocharge.train import BenchSession, films_for
 
 RATE_HZ = 200.0
 NAMES = ("A", "B", "C", "D")
+TARE_S = 1.5
+"""Time before a machine presses where it was asked to, s: the tare takes one."""
 
 
 class Rig(threading.Thread):
@@ -63,6 +65,7 @@ class RiggedScreen(Screen):
             if len(self.rig.pressed) == self.most:
                 os.write(self.keyboard, b"q\n")
             else:
+                time.sleep(TARE_S)  # as a person does: the film is tared before the first press
                 self.rig.orders.put(np.array([float(press[2]), float(press[3]), float(press[1])]))
         if sentence == QUESTION:
             os.write(self.keyboard, b"\n")
