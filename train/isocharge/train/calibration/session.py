@@ -14,6 +14,7 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import PressError
+from isocharge.number_text import number_of
 from isocharge.serve.prediction.measured_presses import FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.train.calibration.calibrate import (
     FEW,
@@ -33,7 +34,6 @@ ENOUGH = 0.5
 Save = Callable[[MeasuredPresses], None]
 """Puts the presses of a session on disk."""
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _UNDO = re.compile(r"(?:u|undo)\s*(\d*)", re.IGNORECASE)
 
 EXPECTED_ANSWER = (
@@ -95,9 +95,13 @@ def read_answer(text: str) -> Answer:
 def _value(cell: str, text: str) -> float:
     if cell in ("", "?"):
         return np.nan
-    if not _NUMBER.fullmatch(cell) or not math.isfinite(float(cell)):
+    try:
+        value = number_of(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
         raise PressError(f"expected a number with a decimal point, or ?, got {cell!r:.30} in {text!r:.60}")
-    return float(cell)
+    return value
 
 
 class BenchSession:
