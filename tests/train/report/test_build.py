@@ -11,8 +11,8 @@ import pytest
 from isocharge.cli import main
 from isocharge.errors import DatasetError, ModelError, OutputExists
 from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, run_sweep, write_dataset
+from isocharge.train.data.domain import inner_radius
 from isocharge.train.report import QUICK, write_report
-from isocharge.train.report.build import inner_radius
 
 ROOT = Path(__file__).parents[3]
 MODEL = ROOT / "models" / "three-25um-biaxial" / "1"

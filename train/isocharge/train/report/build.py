@@ -24,6 +24,7 @@ from isocharge.train.baselines import (
     polynomial,
     table,
 )
+from isocharge.train.data.domain import inner_radius
 from isocharge.train.data.measured import check_enough, held_out, is_measured
 from isocharge.train.data.presses import LabelledPresses, domain_of
 from isocharge.train.report import effects, maps, pictures
@@ -288,14 +289,6 @@ def _known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
 
 SLACK = 1.0 + 1e-6
 """By how much a range may be passed: rounding."""
-
-
-def inner_radius(polygon_mm: Sequence[tuple[float, float]]) -> float:
-    """Radius of the largest disk about the origin in a convex polygon, mm, to 0.001 mm."""
-    corners = np.array(polygon_mm)
-    along = np.roll(corners, -1, axis=0) - corners
-    distances = np.abs(along[:, 0] * corners[:, 1] - along[:, 1] * corners[:, 0]) / np.hypot(*along.T)
-    return round(float(distances.min()), 3)
 
 
 def _model_record(released: ReleasedModel) -> dict[str, Any]:
