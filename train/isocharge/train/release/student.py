@@ -30,7 +30,9 @@ MOST_PARAMETERS = 6_000
 
 def student_config(weights: str = "float32") -> FitConfig:
     """Settings of a student; `weights` is its form, "float32" or "int8"."""
-    return FitConfig(NetworkConfig((34, 34), (30, 30), weights=weights), TrainingConfig(steps=16_000))
+    return FitConfig(
+        NetworkConfig((30, 30), (34, 34), weights=weights), TrainingConfig(steps=16_000, misfit_steps=24_000)
+    )
 
 
 @dataclass(frozen=True)
