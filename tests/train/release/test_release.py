@@ -23,7 +23,11 @@ QUICK = FitConfig(
 )
 MODELS = Path(__file__).parents[3] / "models"
 LOW, HIGH, RADIUS = 0.05, 2.0, 8.0
-LARGEST = {"three-25um-biaxial-films": (0.4, 0.36, 1.0)}  # three charges tell less of a film of 1.5 MPa
+LARGEST = {
+    "three-25um-biaxial-films": (0.10, 0.4, 0.36, 1.0),  # three charges tell less of a film of 1.5 MPa
+    "three-25um-biaxial-12mm": (0.14, 0.25, 0.18, 0.8),  # and less of a wide area
+}
+"""By model: median and rms of the position, 95 % of clean ones, mm, and rms of the force, %."""
 
 
 @pytest.fixture(scope="module")
@@ -127,8 +131,8 @@ def known_presses(known, count, seed):
 
 def test_the_released_models_reach_what_they_should(known, touch):
     errors = measure_errors(predict(touch), presses(*known_presses(known, 6000, 77)), noise_model("reference"), seed=5)
-    assert errors["position_median_mm"] <= 0.10
-    largest_rms, largest_clean, percent = LARGEST.get(touch.metadata.name, (0.20, 0.18, 0.8))
+    largest_median, largest_rms, largest_clean, percent = LARGEST.get(touch.metadata.name, (0.10, 0.20, 0.18, 0.8))
+    assert errors["position_median_mm"] <= largest_median
     assert errors["position_rms_mm"] <= largest_rms
     assert errors["clean_position_p95_mm"] <= largest_clean
     assert errors["force_rms_percent"] <= percent
