@@ -199,7 +199,7 @@ def test_four_electrodes_have_one_check_to_spare(known, touch):
     truth = presses(*known_presses(known, 6000, 4))
     truth = truth[np.hypot(*truth.contact[:, :2].T) < 0.9 * known[1]]
     charge = 1e12 * noise_model("reference").add(1e-12 * truth.charge_pC, np.random.default_rng(3))
-    good, off = touch.predict_batch(charge).misfit, 0.3 if touch.metadata.name.endswith("-student") else 0.15
+    good, off = touch.predict_batch(charge).misfit, 0.4 if touch.metadata.name.endswith("-student") else 0.15
     for share in (0.5, 0.9, 0.95, 0.99):
         assert np.quantile(good, share) == pytest.approx(halfnorm.ppf(share), rel=off)
 
