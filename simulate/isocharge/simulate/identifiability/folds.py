@@ -114,7 +114,8 @@ class _FoldSearch:
     def _bisected(self, first: Array, second: Array) -> Array:
         """Middles of those segments, between whose ends the map turns over, that still do at a length of FINEST."""
         points = [np.empty((0, 2))]
-        start, end = self.scaled(first), self.scaled(second)
+        if len(first):
+            start, end = self.scaled(first), self.scaled(second)
         while len(first):
             middle = 0.5 * (first + second)
             short = np.hypot(*(second - first).T) <= FINEST
@@ -133,7 +134,7 @@ class _FoldSearch:
         weakest = singular_values(scaled.reshape(-1, *scaled.shape[2:]))[:, -1].reshape(scaled.shape[:2])
         lowest = _local_minima(weakest)
         step = np.maximum(rings.distance[0], rings.distance * 2.0 * np.pi / scaled.shape[1])
-        ring, _ = np.nonzero(lowest)
+        ring, _ = np.nonzero(lowest)  # not empty: the lowest value of all is one
         points = self._downhill(rings.position[lowest], weakest[lowest], step[ring])
         around = self.scaled((points[:, None] + 0.5 * FINEST * COMPASS).reshape(-1, 2))
         around = around.reshape(len(points), 8, *around.shape[1:])
