@@ -72,7 +72,7 @@ class WorkingArea:
         if np.isfinite(self.fold_radius):
             parts.append(_fold_sentence(self.fold_radius, self.electrodes))
         if len(self.twins):
-            parts.append(_pair_sentence(self.twins))
+            parts.append(self.twins.words)
         if self.why == "searched":
             parts.append(f"The search ended at {_in_millimetres(self.searched)}.")
         return " ".join(parts)
@@ -150,15 +150,6 @@ def _fold_sentence(radius: float, electrodes: int) -> str:
     return (
         f"The map folds {1e3 * radius:.1f} mm from the centre: contacts on both sides of {sides} give the same "
         "charges, and no method can tell them apart."
-    )
-
-
-def _pair_sentence(twins: AmbiguousPairs) -> str:
-    (x, y, force), (other_x, other_y, other_force) = twins.first[0], twins.second[0]
-    return (
-        f"Contacts far apart can have the same charges: {force:.3g} N at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm and "
-        f"{other_force:.3g} N at ({1e3 * other_x:.1f}, {1e3 * other_y:.1f}) mm are alike within "
-        f"{twins.distance[0]:.1f} standard deviations."
     )
 
 
