@@ -123,6 +123,22 @@ def test_a_fold_smaller_than_the_grid_is_found():
     assert np.hypot(*(1e3 * points - at).T).max() < 2.0 * width
 
 
+def test_a_weak_spot_between_the_rings_ends_the_area():
+    """Within 0.03 mm of a point between the rings' places the first charge hardly changes: 20 times the error."""
+    at, width = 3.025 * np.array([np.cos(np.pi / 180.0), np.sin(np.pi / 180.0)]), 0.03
+
+    def flat(x, y):
+        return x - 0.95 * (x - at[0]) * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2.0 * width**2))
+
+    spot, even = (linear_charges(shape, lambda _, y: y) for shape in (flat, lambda x, _: x))
+    error = 1e-3
+    assert working_area(even, REFERENCE, twins=False, error=error).why == "searched"
+    working = working_area(spot, REFERENCE, twins=False, error=error)
+    assert working.why == "error"
+    assert working.error_radius == pytest.approx(3.025e-3, abs=3e-5)
+    assert not len(working.folds)
+
+
 def test_four_charges_lose_rank_at_a_point():
     """The cross-cap (u^2, u v, v) loses rank at u = v = 0 and nowhere else (Whitney 1944)."""
     model = linear_charges(lambda x, _: (x - 1) ** 2, lambda x, y: (x - 1) * (y + 2), lambda _, y: y)
