@@ -27,6 +27,7 @@ with require("simulate"):
     from isocharge.simulate.forward.forward_map import ForwardMap
     from isocharge.simulate.forward.readout import contact_charge, pretension_charge, thermal_charge, touch_charge
     from isocharge.simulate.identifiability.cramer_rao import CramerRao, limits_at
+    from isocharge.simulate.identifiability.layout_assessment import LayoutAssessment, assess_layout
     from isocharge.simulate.identifiability.working_area import WorkingArea, working_area
     from isocharge.simulate.measuring_chain.amplifier import Amplifier, Measurement
     from isocharge.simulate.measuring_chain.noise import NoiseModel
@@ -71,6 +72,7 @@ __all__ = [
     "FilmSpread",
     "Fix",
     "ForwardMap",
+    "LayoutAssessment",
     "Mapping",
     "Measurement",
     "Meeting",
@@ -87,6 +89,7 @@ __all__ = [
     "Theory",
     "Triangulation",
     "WorkingArea",
+    "assess_layout",
     "built_in_sensors",
     "contact_charge",
     "draw_contour",

@@ -4,6 +4,7 @@ A map without folds may still give two distant contacts the same charges, as a s
 The search for such pairs covers the whole film at once.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,18 @@ class AmbiguousPairs:
         """No pair."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
+    @classmethod
+    def joined(cls, pairs: Sequence["AmbiguousPairs"]) -> "AmbiguousPairs":
+        """All pairs of several searches."""
+        every = [cls.none(), *pairs]
+        joined = cls(
+            np.concatenate([each.first for each in every]),
+            np.concatenate([each.second for each in every]),
+            np.concatenate([each.distance for each in every]),
+        )
+        order = np.argsort(joined.reach, kind="stable")
+        return cls(joined.first[order], joined.second[order], joined.distance[order])
+
     def __len__(self) -> int:
         return len(self.first)
 
@@ -83,9 +96,7 @@ def find_ambiguous_pairs(model: ChargeModel, noise: NoiseModel, force: float, pl
     second, distance = nearest_contact(model, noise, charge[pairs], start)
     far = np.hypot(*(second - first[pairs])[:, :2].T) > apart[pairs]
     ambiguous = np.flatnonzero(far & (distance < INDISTINGUISHABLE_SIGMAS))
-    unordered = AmbiguousPairs(first[pairs[ambiguous]], second[ambiguous], distance[ambiguous])
-    order = np.argsort(unordered.reach, kind="stable")
-    return AmbiguousPairs(unordered.first[order], unordered.second[order], unordered.distance[order])
+    return AmbiguousPairs.joined([AmbiguousPairs(first[pairs[ambiguous]], second[ambiguous], distance[ambiguous])])
 
 
 def _candidates(

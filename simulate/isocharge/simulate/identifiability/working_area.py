@@ -6,8 +6,9 @@ from typing import Literal
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.forward.charge_model import ChargeModel
+from isocharge.simulate.forward.charge_model import ChargeModel, electrode_count
 from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.checks import check_determined
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.ambiguities import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
@@ -32,14 +33,16 @@ class WorkingArea:
         radius: Radius of the disk, m, rounded down to 0.1 mm; 0 if there is none.
         why: What bounds it: "fold", "twins" (an ambiguous pair), "error", or "searched" if none of these lies within
             the search radius. Near a fold the error grows without bounds, so "error" comes before "fold".
-        fold_radius: Distance from the centre of the nearest fold, m; infinite if there is none.
+        fold_radius: Distance from the centre of the nearest fold, m; infinite if there is none. With more than three
+            electrodes a fold is a point where the map loses rank.
         twin_radius: Radius of the smallest disk that holds two contacts with the same charges, m; infinite if none.
         error_radius: Radius within which the position error is at most `error` at every force, m.
         error: Allowed Cramer-Rao position error (root mean square), m.
         searched: Radius of the search, m.
         force_range: Smallest and largest force, N.
-        folds: Positions on fold lines, shape (n, 2), m.
+        folds: Positions on fold lines, or where rank is lost, shape (n, 2), m.
         twins: Pairs of contacts with the same charges.
+        electrodes: Number of electrodes.
     """
 
     radius: float
@@ -52,6 +55,7 @@ class WorkingArea:
     force_range: tuple[float, float]
     folds: Array
     twins: AmbiguousPairs
+    electrodes: int
 
     @property
     def unfolded(self) -> float:
@@ -66,10 +70,7 @@ class WorkingArea:
         if self.error_radius < min(self.searched, self.fold_radius, self.twin_radius):
             parts.append(f"Farther out the position error exceeds {_in_millimetres(self.error)} at {low:g} N.")
         if np.isfinite(self.fold_radius):
-            parts.append(
-                f"The map folds {1e3 * self.fold_radius:.1f} mm from the centre: contacts on both sides of the fold "
-                "give the same charges, and no method can tell them apart."
-            )
+            parts.append(_fold_sentence(self.fold_radius, self.electrodes))
         if len(self.twins):
             parts.append(_pair_sentence(self.twins))
         if self.why == "searched":
@@ -94,8 +95,13 @@ def working_area(
         noise: Noise of the readings, with white noise above zero.
         error: Allowed Cramer-Rao position error, m, at every force.
         twins: Whether to search for contacts far apart with the same charges, too.
+
+    Raises:
+        SceneError: If there are fewer than three charges.
     """
     model = ChargeSpline.of(charges) if isinstance(charges, ForwardMap) else charges
+    electrodes = electrode_count(model)
+    check_determined(electrodes)
     rings = Rings.spread(model.radius)
     low, high = model.force_range
     forces = sorted({low, float(np.sqrt(low * high)), high})
@@ -122,6 +128,7 @@ def working_area(
         model.force_range,
         folds,
         pairs,
+        electrodes,
     )
 
 
@@ -136,6 +143,14 @@ def _within(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel, e
         return 0.0
     logs = np.log(worst[first - 1 : first + 1])
     return float(np.interp(np.log(error), logs, rings.distance[first - 1 : first + 1]))
+
+
+def _fold_sentence(radius: float, electrodes: int) -> str:
+    sides = "the fold" if electrodes == 3 else "the points where it loses rank"
+    return (
+        f"The map folds {1e3 * radius:.1f} mm from the centre: contacts on both sides of {sides} give the same "
+        "charges, and no method can tell them apart."
+    )
 
 
 def _pair_sentence(twins: AmbiguousPairs) -> str:
