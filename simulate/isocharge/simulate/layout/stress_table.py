@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.arrays import Array, Complexes, Integers
-from isocharge.simulate.design.cubic import cubic_weights
-from isocharge.simulate.design.scene import DesignScene
+from isocharge.simulate.numerics.cubic import cubic_weights
+from isocharge.simulate.layout.scene import DesignScene
 from isocharge.simulate.mesh.conformal_map import automorphism_onto
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Surface

@@ -16,8 +16,8 @@ import numpy as np
 
 from isocharge.arrays import Array, Complexes, Integers
 from isocharge.progress import Progress
-from isocharge.simulate.design.scene import DesignScene
-from isocharge.simulate.design.stress_table import (
+from isocharge.simulate.layout.scene import DesignScene
+from isocharge.simulate.layout.stress_table import (
     PressedTable,
     SolveJob,
     StressTable,

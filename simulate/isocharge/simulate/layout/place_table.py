@@ -14,9 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.arrays import Array, Booleans, Integers
-from isocharge.simulate.design.cubic import cubic_weights
-from isocharge.simulate.design.square_charges import COLUMNS, SquareCharges
+from isocharge.simulate.numerics.cubic import cubic_weights
+from isocharge.progress import Progress
+from isocharge.simulate.layout.square_charges import COLUMNS, SquareCharges
 from isocharge.simulate.execution.checkpointed_map import JobMap
+from isocharge.simulate.forward.solve_family import report_each
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 SCALE, STEP = 1.5e-3, 0.16
@@ -25,6 +27,9 @@ distance."""
 
 BEYOND = 4e-3
 """Places as far outside the film are not tabulated, m: no square lies there."""
+
+BATCH = 8
+"""Presses that one job tabulates."""
 
 SIZES = 3
 """Number of sides that are tabulated where the size may vary."""
@@ -35,21 +40,25 @@ SIDE_STEP = 1e-6
 
 @dataclass(frozen=True)
 class TableJob:
-    """Rows of squares on the grid of one press: `press` (x, y), m, and the sides, m."""
+    """Some presses, (x, y), shape (n_press, 2), the sides, and the grid of places about a press along x and y, all m."""
 
     charges: SquareCharges
-    press: tuple[float, float]
-    sides: tuple[float, ...]
+    presses: Array
+    sides: Array
     axis: Array
 
 
-def tabulate(job: TableJob) -> Array:
-    """Rows, shape (n, n, n_side, 7), of squares at press + (axis[i], axis[j])."""
-    x, y = np.meshgrid(job.press[0] + job.axis, job.press[1] + job.axis, indexing="ij")
-    rows = np.zeros((*x.shape, len(job.sides), len(COLUMNS)))
+def tabulate(job: TableJob) -> np.ndarray:
+    """Rows, shape (n_press, n, n, n_side, 7), single precision, of squares at press + (axis[i], axis[j])."""
+    return np.stack([_tabulate_press(job, press) for press in job.presses])
+
+
+def _tabulate_press(job: TableJob, press: Array) -> np.ndarray:
+    x, y = np.meshgrid(press[0] + job.axis, press[1] + job.axis, indexing="ij")
+    rows = np.zeros((*x.shape, len(job.sides), len(COLUMNS)), dtype=np.float32)
     on_film = np.hypot(x, y) < job.charges.scene.film.radius + BEYOND
     centres = np.stack([x[on_film], y[on_film]], axis=1)
-    pressed, first = job.charges.under(np.array([job.press])), np.zeros(len(centres), dtype=np.intp)
+    pressed, first = job.charges.under(press[None]), np.zeros(len(centres), dtype=np.intp)
     for number, side in enumerate(job.sides):
         rows[on_film, number] = pressed.rows(first, centres, np.full(len(centres), side))
     return rows
@@ -85,6 +94,7 @@ class PlaceTable:
         side: tuple[float, float],
         *,
         map_jobs: JobMap = map,
+        progress: Progress | None = None,
     ) -> "PlaceTable":
         """Tabulate presses, shape (n, 2), m, for sides from the first to the second of `side`, m."""
         isotropic = charges.piezo.d31 == charges.piezo.d32
@@ -97,8 +107,8 @@ class PlaceTable:
         reach = charges.scene.film.radius + charges.scene.radius
         count = int(np.ceil(np.arcsinh(reach / SCALE) / STEP)) + 1
         axis = SCALE * np.sinh(STEP * np.arange(-count, count + 1))
-        jobs = [TableJob(charges, (float(x), float(y)), tuple(sides.tolist()), axis) for x, y in origin]
-        values = np.stack([np.asarray(rows, dtype=np.float32) for rows in map_jobs(tabulate, jobs)])
+        jobs = [TableJob(charges, origin[i : i + BATCH], sides, axis) for i in range(0, len(origin), BATCH)]
+        values = np.concatenate(list(report_each(map_jobs(tabulate, jobs), len(jobs), progress)))
         return cls(presses, table.ravel(), sign, swapped, origin, sides, values)
 
     def rows(self, centre: Array, side: float) -> tuple[Array, Array]:

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from isocharge.arrays import Array
-from isocharge.simulate.design.objective import Objective
-from isocharge.simulate.design.placing import MILLIMETRE
+from isocharge.simulate.layout.objective import Objective
+from isocharge.simulate.layout.placing import MILLIMETRE
 
 TRIES = 16
 """Random layouts of which the best is the start of a descent."""

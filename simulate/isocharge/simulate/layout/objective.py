@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.design.place_table import PlaceTable
-from isocharge.simulate.design.placing import MILLIMETRE, Parameters, Rules
-from isocharge.simulate.design.position_error import ErrorModel
+from isocharge.simulate.layout.place_table import PlaceTable
+from isocharge.simulate.layout.placing import MILLIMETRE, Parameters, Rules
+from isocharge.simulate.layout.position_error import ErrorModel
 
 PENALTY = 20.0
 """Weight of a squared violation, 1/mm^2, against the logarithm of the error."""

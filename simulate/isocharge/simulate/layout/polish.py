@@ -15,9 +15,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from isocharge.arrays import Array
-from isocharge.simulate.design.placing import MILLIMETRE, Parameters, Rules
-from isocharge.simulate.design.position_error import ErrorModel
-from isocharge.simulate.design.square_charges import PressedSquares, SquareCharges
+from isocharge.simulate.layout.placing import MILLIMETRE, Parameters, Rules
+from isocharge.simulate.layout.position_error import ErrorModel
+from isocharge.simulate.layout.square_charges import PressedSquares, SquareCharges
 
 ROUNDS, STEPS = 8, 25
 """Largest number of rounds, and of quadratic programs in each."""
@@ -40,14 +40,12 @@ class FineGrid:
         charges: Rows of any square.
         presses: Shape (n_press, 2), m.
         stay: Rows of the electrodes that stay, shape (n_press, n_stay, 7).
-        weight: Of each press in the goal, shape (n_press,).
         reference: Error that counts as one, m.
     """
 
     charges: SquareCharges
     presses: Array
     stay: Array
-    weight: Array
     reference: float
 
     def errors(self, model: ErrorModel, centres: Array, sides: Array) -> Array:
@@ -133,6 +131,20 @@ class Polish:
         above = np.concatenate([-self.parameters.back(by_layout) * MILLIMETRE, np.ones((len(logs), 1))], axis=1)
         below = np.concatenate([-self.parameters.back(by_rule), np.zeros((len(broken), 1))], axis=1)
         return np.concatenate([variables[-1] - logs, -broken / MILLIMETRE]), np.concatenate([above, below])
+
+
+@dataclass(frozen=True)
+class PolishJob:
+    """The last steps from one local optimum: free numbers, m."""
+
+    polish: Polish
+    free: Array
+
+
+def run_polish(job: PolishJob) -> Array:
+    """The worst error over its reference, then the free numbers, m."""
+    free = job.polish.run(job.free)
+    return np.concatenate([[job.polish.worst(free)], free])
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.design.scene import Nuisances
+from isocharge.simulate.layout.scene import Nuisances
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 PRIOR = (0.05, 0.05, 10.0)
@@ -60,6 +60,12 @@ class ErrorModel:
         by_rows[:, :, self.used] = -2.0 * weight[:, :, None] * ab * self.scale
         by_rows[:, :, 0] = -(ab * a).sum(axis=2) * slope
         return squared, by_rows
+
+    def displacement(self, rows: Array) -> Array:
+        """How a change of the charges moves the estimated position: shape (n_press, 2, n_electrode), m/C."""
+        a, weight, _, inverse = self._information(rows)
+        moved: Array = PRIOR[0] * np.matmul(inverse[:, :2], (a * weight[:, :, None]).swapaxes(1, 2))
+        return moved
 
     def _information(self, rows: Array) -> tuple[Array, Array, Array, Array]:
         """A in units of the scale, W, dW/dQ and the inverse of the information in these units."""
