@@ -21,7 +21,6 @@ from isocharge.simulate.layout.place_table import PlaceTable
 from isocharge.simulate.layout.placing import Parameters
 from isocharge.simulate.layout.polish import FineGrid, Polish, PolishJob, run_polish
 from isocharge.simulate.layout.position_error import ErrorModel
-from isocharge.simulate.layout.scene import Nuisances
 from isocharge.simulate.layout.square_charges import SquareCharges, solve_square_charges
 from isocharge.simulate.layout.task import DesignTask
 from isocharge.simulate.numerics.disk import lattice, square_grid
@@ -286,10 +285,3 @@ def _stage(progress: StageProgress | None, stage: str) -> Any:
 def _report(progress: StageProgress | None, done: int, total: int, stage: str) -> None:
     if progress:
         progress(done, total, stage)
-
-
-LEVELS = {
-    "noise_alone": Nuisances.none(),
-    "probe_and_pretension_unknown": Nuisances.probe_and_pretension(),
-}
-"""Nuisances for which errors are stated, beside those of the task."""

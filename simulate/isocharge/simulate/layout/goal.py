@@ -41,13 +41,15 @@ class Goal:
         if text in ("worst", "rms"):
             return cls(text, np.empty((0, 2)), np.empty(0))
         if not Path(text).is_file():
-            raise InputError(f"goal {text!r}: expected 'worst', 'rms' or a CSV file with the columns {', '.join(HEADER)}")
+            raise InputError(
+                f"goal {text!r}: expected 'worst', 'rms' or a CSV file with the columns {', '.join(HEADER)}"
+            )
         table = _read_map(Path(text))
         return cls(Path(text).name, table[:, :2] * 1e-3, table[:, 2])
 
     @property
     def kind(self) -> str:
-        """"worst", or "rms" of errors that may be weighted."""
+        """ "worst", or "rms" of errors that may be weighted."""
         return "worst" if self.name == "worst" else "rms"
 
     def weigh(self, presses: Array) -> Array:

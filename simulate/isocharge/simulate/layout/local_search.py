@@ -20,7 +20,7 @@ STEPS = 60
 """Largest number of steps for each power."""
 
 FARTHEST = 15e-3
-"""Random places reach this far beyond the presses, m: charges of electrodes farther out hardly change with the press."""
+"""Random places reach this far beyond the presses, m: charges of electrodes farther out change little."""
 
 
 @dataclass(frozen=True)

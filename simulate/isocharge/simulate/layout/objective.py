@@ -37,7 +37,7 @@ class Condition:
 class Objective:
     """The logarithm of a layout's error over all conditions, with penalties for broken rules.
 
-    The mean of the errors' powers is their root mean square for the power 2, and near the worst of them for a large one.
+    The mean of the errors' powers is their root mean square for the power 2, and near the worst one for a large power.
 
     Attributes:
         conditions: The scenes.

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.arrays import Array, Booleans, Integers
-from isocharge.simulate.numerics.cubic import cubic_weights
 from isocharge.progress import Progress
-from isocharge.simulate.layout.square_charges import COLUMNS, SquareCharges
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.solve_family import report_each
+from isocharge.simulate.layout.square_charges import COLUMNS, SquareCharges
+from isocharge.simulate.numerics.cubic import cubic_weights
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 SCALE, STEP = 1.5e-3, 0.16
@@ -40,7 +40,7 @@ SIDE_STEP = 1e-6
 
 @dataclass(frozen=True)
 class TableJob:
-    """Some presses, (x, y), shape (n_press, 2), the sides, and the grid of places about a press along x and y, all m."""
+    """Some presses (x, y), shape (n_press, 2), the sides, and the grid of places about a press along x and y; m."""
 
     charges: SquareCharges
     presses: Array

@@ -102,9 +102,7 @@ class Rules:
         return parts
 
 
-def _apart(
-    i: int, count: int, away: Array, half: Array | float, gap: float, by_side: float
-) -> tuple[float, Array]:
+def _apart(i: int, count: int, away: Array, half: Array | float, gap: float, by_side: float) -> tuple[float, Array]:
     """By how much two boxes are nearer than `gap`: the distance is the larger one along x and y, or between corners.
 
     Args:

@@ -5,8 +5,8 @@ The columns of a row are the charge, its derivatives by the x, y and ln F of the
 deviation of each nuisance of the scene: radius of the probe, profile of its pressure, pretension.
 
 The pressure of a rigid flat punch has a larger second moment about its centre than a uniform one, R^2 2/3 instead of
-R^2 / 2, and that is what reaches beyond the footprint. The load is moved outwards by that much: a disk of radius R gives
-way to rings between R and a smaller radius b, and to first order charges follow the load.
+R^2 / 2, and that is what reaches beyond the footprint. The load is moved outwards by that much: a disk of radius R
+gives way to rings between R and a smaller radius b, and to first order charges follow the load.
 """
 
 from collections.abc import Callable
@@ -16,6 +16,9 @@ import numpy as np
 
 from isocharge.arrays import Array, Complexes, Integers
 from isocharge.progress import Progress
+from isocharge.simulate.execution.checkpointed_map import JobMap
+from isocharge.simulate.forward.readout import electrode_rule
+from isocharge.simulate.forward.solve_family import report_each
 from isocharge.simulate.layout.scene import DesignScene
 from isocharge.simulate.layout.stress_table import (
     PressedTable,
@@ -25,9 +28,6 @@ from isocharge.simulate.layout.stress_table import (
     settings_for,
     solve_job,
 )
-from isocharge.simulate.execution.checkpointed_map import JobMap
-from isocharge.simulate.forward.readout import electrode_rule
-from isocharge.simulate.forward.solve_family import report_each
 from isocharge.simulate.mechanics.stress import turn_stress
 from isocharge.simulate.mechanics.theory import theory_for
 from isocharge.simulate.numerics.quadrature import gauss_line
@@ -164,9 +164,7 @@ class PressedSquares:
     def _by_distance(self, number: Integers, centres: Array, sides: Array, rule: Rule) -> Array:
         """Rows of pairs, each with as many points as its distance needs."""
         unit = np.sqrt(0.5) * sides + self.source.scene.probe.radius
-        level = np.searchsorted(
-            [reach for reach, _ in RULES], np.hypot(*(centres - self.presses[number]).T) / unit
-        )
+        level = np.searchsorted([reach for reach, _ in RULES], np.hypot(*(centres - self.presses[number]).T) / unit)
         rows = np.empty((len(number), len(COLUMNS)))
         for rank, (_, count) in enumerate(RULES):
             points, shares = rule(count)

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.arrays import Array, Complexes, Integers
-from isocharge.simulate.numerics.cubic import cubic_weights
 from isocharge.simulate.layout.scene import DesignScene
 from isocharge.simulate.mesh.conformal_map import automorphism_onto
+from isocharge.simulate.numerics.cubic import cubic_weights
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.solver.equilibrium import Equilibrium
@@ -140,9 +140,7 @@ class StressTable:
         """The table for presses at some distances, shape (n,), m, above 0; without derivatives the stress alone."""
         nodes, weights = self.distance, barycentric_weights(self.distance)
         step = STEP * self.film_radius
-        by_value, ahead, behind = (
-            lagrange_values(nodes, weights, distance + sign * step) for sign in (0.0, 1.0, -1.0)
-        )
+        by_value, ahead, behind = (lagrange_values(nodes, weights, distance + sign * step) for sign in (0.0, 1.0, -1.0))
         values = self.values if derivatives else self.values[..., :1, :]
         channels = [_contract(by_value, values)]
         if derivatives:
@@ -165,9 +163,7 @@ class StressTable:
         by_distance = (z**2 - 1.0) / (away * (1.0 - c * z)) * by_c / a
         log_rho, inside = np.log(rho), logs.real <= np.log(rho)
         share = np.exp(np.minimum(logs.real - log_rho, 0.0))
-        row = np.where(
-            inside, share * (INSIDE - 1), INSIDE + (1.0 - logs.real / log_rho) * (OUTSIDE - 1)
-        )
+        row = np.where(inside, share * (INSIDE - 1), INSIDE + (1.0 - logs.real / log_rho) * (OUTSIDE - 1))
         chain = []
         for change, grown in ((by_z, 0.0), (1j * by_z, 0.0), (by_distance, by_rho / a)):
             within = share * (change.real - grown) * (INSIDE - 1)
@@ -223,7 +219,7 @@ class PressedTable:
 
 
 def _contract(weights: Array, values: np.ndarray) -> np.ndarray:
-    """Weighted sums over the solved distances, in single precision: (n, n_distance) and (n_distance, ...) to (n, ...)."""
+    """Sums over the solved distances with weights (n, n_distance), in single precision: shape (n, ...)."""
     flat = values.reshape(len(values), -1).astype(np.float32)
     return (weights.astype(np.float32) @ flat).reshape(len(weights), *values.shape[1:])
 

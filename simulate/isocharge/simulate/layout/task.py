@@ -184,7 +184,9 @@ class DesignTask:
         if not (self.probes and self.forces):
             raise InputError("expected at least one probe and one force")
         if not self.noise.white > 0.0:
-            raise InputError(f"noise {self.noise.name!r}: expected white noise above 0: without it errors have no limit")
+            raise InputError(
+                f"noise {self.noise.name!r}: expected white noise above 0: without it errors have no limit"
+            )
 
     def _check_electrodes(self) -> None:
         if self.electrodes < 3:
