@@ -15,6 +15,11 @@ pre { background: #f3f5f7; padding: 1rem; overflow-x: auto; }
 .layout svg { width: 30rem; }
 """
 
+LEADS = (
+    "Leads collect charge like electrodes where both sides of the film carry them: let the leads of the two sides not "
+    "lie over each other."
+)
+
 LEVELS = {
     "noise_alone": "everything known",
     "probe_and_pretension_unknown": "probe radius and pretension unknown",
@@ -53,8 +58,7 @@ def design_page(numbers: Mapping[str, Any], toml: str, svg: str, leads: str, pic
 {figures}
 <h2>Layout</h2>
 <p>Electrodes seen from the side that is touched, to scale, with a ruler of 50 mm.
-{escape(leads[:1].upper() + leads[1:])}. Leads collect charge like electrodes where both sides of the film carry them: let the leads of the two sides not lie
-over each other.</p>
+{escape(leads[:1].upper() + leads[1:])}. {LEADS}</p>
 <div class="layout">{drawing}</div>
 <h2>Places</h2>
 {_places(numbers)}

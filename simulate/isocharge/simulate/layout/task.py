@@ -26,7 +26,7 @@ MOST_ELECTRODES = 8
 SIDE = 3e-3
 """Side of new squares where the sensor has none, m."""
 
-TRIES = 40
+TRIES = 12
 """Random layouts from which one that keeps to the rules is looked for before the search."""
 
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
