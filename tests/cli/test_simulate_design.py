@@ -20,7 +20,7 @@ def _small(monkeypatch):
     search = design_module.run_design
 
     def rough(task, **choices):
-        return search(task, starts=2, presses=50, **choices)
+        return search(task, presses=50, **choices)
 
     monkeypatch.setattr(design_module, "run_design", rough)
 
@@ -28,7 +28,22 @@ def _small(monkeypatch):
 @pytest.mark.usefixtures("_small")
 def test_a_design_is_a_folder_that_other_commands_read(command, tmp_path):
     folder = tmp_path / "mine"
-    words = (*DESIGN, "3", "--radius", "4", "--keep", "A", "--known", "--workers", "1", "--json", "-o", folder)
+    words = (
+        *DESIGN,
+        "3",
+        "--radius",
+        "4",
+        "--keep",
+        "A",
+        "--known",
+        "--starts",
+        "2",
+        "--workers",
+        "1",
+        "--json",
+        "-o",
+        folder,
+    )
     code, out, err = command(*words)
     assert code == 0, err
     numbers = json.loads(out)

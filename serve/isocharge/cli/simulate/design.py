@@ -4,6 +4,7 @@ import json as json_module
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -53,8 +54,9 @@ def design_command(
         ),
     ] = "worst",
     keep: Annotated[
-        str, typer.Option("--keep", metavar="NAMES", help="Electrodes of SENSOR that stay, like A,B. (default: none)")
-    ] = "",
+        str | None,
+        typer.Option("--keep", metavar="NAMES", help="Electrodes of SENSOR that stay, like A,B. (default: none)"),
+    ] = None,
     probe: Annotated[
         list[str] | None,
         typer.Option("--probe", metavar="SHAPE", help="Round footprint, mm. May be repeated. (default: circle:1.0)"),
@@ -103,7 +105,11 @@ def design_command(
     ] = None,
     symmetry: Annotated[
         str,
-        typer.Option("--symmetry", metavar="NAME", help="none, mirror (in the drawn direction), or 2-fold to 8-fold."),
+        typer.Option(
+            "--symmetry",
+            metavar="NAME",
+            help="Symmetry of the new squares: none, mirror (in the drawn direction), or 2-fold to 8-fold.",
+        ),
     ] = "none",
     trade_off: Annotated[
         bool,
@@ -114,6 +120,12 @@ def design_command(
         ),
     ] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the search; the same seed, the same design.")] = 0,
+    starts: Annotated[
+        int,
+        typer.Option(
+            "--starts", min=1, help="Descents from random layouts; more find better layouts of many electrodes."
+        ),
+    ] = 24,
     workers: WorkersOption = None,
     cluster: Annotated[
         str | None,
@@ -146,7 +158,7 @@ def design_command(
         electrodes,
         1e-3 * radius,
         Goal.of(goal),
-        tuple(name for name in keep.split(",") if name),
+        tuple(name.strip() for name in (keep or "").split(",") if name.strip()),
         tuple(parse_probe(text) for text in probe or ["circle:1.0"]),
         tuple(force or [1.0]),
         tuple(1e6 * value for value in pretension or []),
@@ -162,7 +174,7 @@ def design_command(
     task.check()
     try:
         with _workers(workers, cluster) as pool, progress("designing") as advance:
-            numbers = _run(_Request(task, output, trade_off, fresh), pool, advance)
+            numbers = _run(_Request(task, output, starts, trade_off, fresh), pool, advance)
     except KeyboardInterrupt:
         if (part := output.with_name(f"{output.name}.part")).exists():
             say(f"stopped; what is done is kept in {part}, and the same command goes on from there")
@@ -176,7 +188,8 @@ class _Request:
     """What is to be written, and where."""
 
     task: "DesignTask"
-    output: Any
+    output: Path
+    starts: int
     trade_off: bool
     fresh: bool
 
@@ -196,11 +209,12 @@ def _run(request: _Request, pool: "Workers", advance: Callable[..., None]) -> di
         "sensor": sensor_to_dict(task.sensor),
         "task": task.to_dict(),
         "weights": task.goal.weights.tolist(),
+        "starts": request.starts,
         "trade_off": request.trade_off,
     }
     with resume_folder(request.output, identity, fresh=request.fresh, warn=say) as run:
         map_jobs = CheckpointedMap(run, "search", pool.in_order)
-        design = run_design(task, map_jobs=map_jobs, progress=advance)
+        design = run_design(task, map_jobs=map_jobs, progress=advance, starts=request.starts)
         trade = (
             trade_off(task, map_jobs=CheckpointedMap(run, "trade-off", pool.in_order), progress=advance)
             if request.trade_off

@@ -160,11 +160,11 @@ def _back(before: Integers, last: int) -> list[int]:
 
 def _straighten(points: Array, usable: Booleans, x: Array) -> Array:
     """The same way with as few corners as the free cells allow."""
-    kept, at = [0], 0
+    corners, at = [0], 0
     while at < len(points) - 1:
         at = next(i for i in range(len(points) - 1, at, -1) if i == at + 1 or _clear(points[at], points[i], usable, x))
-        kept.append(at)
-    return points[kept]
+        corners.append(at)
+    return points[corners]
 
 
 def _clear(start: Array, end: Array, usable: Booleans, x: Array) -> bool:

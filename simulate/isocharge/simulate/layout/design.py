@@ -232,12 +232,12 @@ class Search:
             for number in range(max(1, min(JOBS, starts // len(kinds)))):
                 jobs.append(Descents(objective, self.task.goal.kind, (self.task.seed, kind, number), count))
                 owner.append(parameters)
-        found, best = [], np.inf
+        optima, best = [], np.inf
         for done, (parameters, rows) in enumerate(zip(owner, map_jobs(descend, jobs), strict=True), start=1):
             best = min(best, float(np.exp(rows[:, 0].min())))
-            found.append((parameters, rows))
+            optima.append((parameters, rows))
             _report(progress, done, len(jobs), stage if len(conditions) > 1 else f"{stage}: {1e3 * best:.3f} mm")
-        return found
+        return optima
 
     def polished(
         self, optima: list[tuple[Parameters, Array]], map_jobs: JobMap, progress: StageProgress | None

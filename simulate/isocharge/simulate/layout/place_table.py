@@ -134,8 +134,8 @@ class PlaceTable:
              ((by_i[0], by_j[0]), (by_i[1] * chain[:, :1], by_j[0]), (by_i[0], by_j[1] * chain[:, 1:]))],
             axis=1,
         )  # fmt: skip
-        found = np.matmul(weights.astype(np.float32), block).astype(float)
-        sized = found.reshape(len(node), 3, len(self.sides), len(COLUMNS))
+        taken = np.matmul(weights.astype(np.float32), block).astype(float)
+        sized = taken.reshape(len(node), 3, len(self.sides), len(COLUMNS))
         by_side = self._by_side(side)
         first = np.einsum("kdsc,s->kdc", sized, by_side[0])
         grown = np.einsum("ksc,s->kc", sized[:, 0], by_side[1])
