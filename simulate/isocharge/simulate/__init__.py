@@ -12,6 +12,7 @@ Five lines give the charges of one press.
 from isocharge.extras import require
 
 with require("simulate"):
+    from isocharge.simulate.artwork.leads import Leads, route
     from isocharge.simulate.contours.charge_curves import Curves, Mapping
     from isocharge.simulate.contours.field_contours import Contour, ContourField
     from isocharge.simulate.contours.fix import Fix, Meeting
@@ -29,6 +30,9 @@ with require("simulate"):
     from isocharge.simulate.identifiability.cramer_rao import CramerRao, limits_at
     from isocharge.simulate.identifiability.layout_assessment import LayoutAssessment, assess_layout
     from isocharge.simulate.identifiability.working_area import WorkingArea, working_area
+    from isocharge.simulate.layout.design import Design, design, run_design
+    from isocharge.simulate.layout.scene import Nuisances
+    from isocharge.simulate.layout.task import DesignTask
     from isocharge.simulate.measuring_chain.amplifier import Amplifier, Measurement
     from isocharge.simulate.measuring_chain.noise import NoiseModel
     from isocharge.simulate.measuring_chain.noise_file import load_amplifier, noise_model
@@ -62,6 +66,8 @@ __all__ = [
     "CramerRao",
     "Curves",
     "Dataset",
+    "Design",
+    "DesignTask",
     "DrawnContour",
     "DrawnTriangulation",
     "Electrode",
@@ -73,10 +79,12 @@ __all__ = [
     "Fix",
     "ForwardMap",
     "LayoutAssessment",
+    "Leads",
     "Mapping",
     "Measurement",
     "Meeting",
     "NoiseModel",
+    "Nuisances",
     "Piezo",
     "Polygon",
     "Probe",
@@ -92,6 +100,7 @@ __all__ = [
     "assess_layout",
     "built_in_sensors",
     "contact_charge",
+    "design",
     "draw_contour",
     "limits_at",
     "load_amplifier",
@@ -101,6 +110,8 @@ __all__ = [
     "press",
     "pretension_charge",
     "read_dataset",
+    "route",
+    "run_design",
     "run_sweep",
     "sensor_from_dict",
     "sensor_to_dict",
