@@ -171,7 +171,9 @@ def sentence(content):
 
 def test_sentences_with_their_checksum():
     parser = TextParser()
-    frames = feed(*(sentence(f"PZT,{k},801.2,-799.5") for k in range(4)), sentence("PZT,9,1,2")[:-1] + "g", parser=parser)
+    frames = feed(
+        *(sentence(f"PZT,{k},801.2,-799.5") for k in range(4)), sentence("PZT,9,1,2")[:-1] + "g", parser=parser
+    )
     assert [frame.values for frame in frames] == [(k, 801.2, -799.5) for k in range(4)]
     assert feed(sentence("PZT,9,1,2").replace("9", "8"), "$PZT,9,1,2", parser=parser)[0].values == (9, 1, 2)
     assert parser.counts.malformed == 2

@@ -279,7 +279,9 @@ def _letter(entry: Table) -> str:
 def _constants(entries: Sequence[Table], letters: Sequence[str], begin: int) -> list[tuple[int, bytes]]:
     """Positions and bytes of padding that has a value."""
     positions = accumulate((struct.calcsize(f"<{letter}") for letter in letters), initial=begin)
-    return [(at, _hexadecimal(entry, "value")) for entry, at in zip(entries, positions, strict=False) if "value" in entry]
+    return [
+        (at, _hexadecimal(entry, "value")) for entry, at in zip(entries, positions, strict=False) if "value" in entry
+    ]
 
 
 def _field(entry: Table) -> Field:

@@ -81,7 +81,9 @@ class DescribedParser:
         try:
             if any(data[at : at + len(constant)] != constant for at, constant in layout.constants):
                 raise ValueError("other constant bytes than the layout's")
-            frame = self._frame(layout.counts(data) if self._has_triples else layout.body.unpack_from(data, len(layout.sync)))
+            frame = self._frame(
+                layout.counts(data) if self._has_triples else layout.body.unpack_from(data, len(layout.sync))
+            )
         except (OverflowError, ValueError):  # a number or clock in floating point may be NaN or infinite
             self.counts.refuse(dropped)
             return None
