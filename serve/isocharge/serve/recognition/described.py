@@ -1,0 +1,178 @@
+"""Frames of fixed length, recognised: from windows to the section `[frames]` that describes them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC
+from isocharge.serve.recognition.check_search import Check, checks
+from isocharge.serve.recognition.clock_unit import clock_name
+from isocharge.serve.recognition.field_search import CONSTANT_SHARE, Part, Role, Split, number_values, split_frame
+from isocharge.serve.recognition.framing import Bytes, Windows, framings
+
+MOST_FRAMES = 600
+"""Frames that are examined."""
+
+PRICE_WITHOUT_CHECK = 4.0
+"""For frames without a checksum, bits: most have one."""
+
+NO_CHECK = Check(0, 0, "none", 0, "little")
+
+
+def described_frames(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False) -> dict[str, Any] | None:
+    """The section `[frames]` of a device file for frames of fixed length; None if the bytes are none.
+
+    Args:
+        chunks: The bytes as they came.
+        seconds: Time in which they came, s; the unit of a clock follows from it.
+        are_datagrams: Whether each chunk is a datagram.
+    """
+    best: Way | None = None
+    for windows in framings(chunks, are_datagrams=are_datagrams):
+        if best is not None and windows.framing != best.windows.framing:
+            break
+        ways = (way for way in _ways(windows, _rate_Hz(windows, chunks, seconds)) if way.has_channels)
+        best = min((way for way in (best, *ways) if way is not None), key=lambda way: way.price_per_byte, default=None)
+        if best is not None and windows.framing != DATAGRAM:
+            break
+    return None if best is None else _table(best, _rate_Hz(best.windows, chunks, seconds))
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to read windows.
+
+    Attributes:
+        windows: The frames.
+        check: The checksum, and where a frame begins.
+        split: Its parts.
+        price: Bits.
+    """
+
+    windows: Windows
+    check: Check
+    split: Split
+    price: float
+
+    @property
+    def price_per_byte(self) -> float:
+        """Bits for each byte: lengths of frames are compared by it."""
+        return self.price / self.windows.length
+
+    @property
+    def has_channels(self) -> bool:
+        """Whether anything in the frames may be a charge."""
+        return any(part.role is Role.channel for part in self.split.parts)
+
+
+def _rate_Hz(windows: Windows, chunks: Sequence[bytes], seconds: float) -> float:
+    """Frames per second of a whole stream."""
+    share = min(1.0, len(windows.stream) / max(1, sum(map(len, chunks)))) if windows.framing in (SYNC, DATAGRAM) else 1.0
+    frames = len(windows.stream) / windows.length if windows.framing in (SYNC, DATAGRAM) else len(windows.starts)
+    return frames / (seconds * share)
+
+
+def _ways(windows: Windows, rate_Hz: float) -> Iterator[Way]:
+    """Every begin and checksum that the frames may have."""
+    needs_sync = windows.framing == SYNC
+    turns = [turn for turn in windows.turns if not needs_sync or _is_constant(windows.rows(turn)[:, 0])]
+    has_check = False
+    for turn in turns:
+        rows = windows.rows(turn)[:MOST_FRAMES]
+        for check in checks(rows, turn):
+            split = split_frame(rows, windows.length - check.size, rate_Hz, needs_sync=needs_sync)
+            if split is not None:
+                has_check = True
+                yield Way(windows, check, split, split.price)
+    for turn in turns if not has_check else ():
+        split = split_frame(windows.rows(turn)[:MOST_FRAMES], windows.length, rate_Hz, needs_sync=needs_sync)
+        if split is not None:
+            yield Way(windows, replace(NO_CHECK, turn=turn), split, split.price + PRICE_WITHOUT_CHECK)
+
+
+def _is_constant(column: Bytes) -> bool:
+    return bool(len(column)) and float(np.bincount(column).max()) >= CONSTANT_SHARE * len(column)
+
+
+def _table(way: Way, rate_Hz: float) -> dict[str, Any]:
+    windows, check, split = way.windows, way.check, way.split
+    rows = windows.rows(check.turn)[:MOST_FRAMES]
+    sync = sum(part.size for part in split.parts if part.role is Role.sync)
+    table: dict[str, Any] = {"format": "described"}
+    table |= {} if windows.framing == SYNC else {"framing": windows.framing}
+    if sync:
+        usual = [int(np.bincount(column).argmax()) for column in rows[:, :sync].T]
+        table["sync"] = bytes(usual).hex(" ").upper()
+    table |= {"length": windows.length, "byte_order": split.order}
+    if check.size:
+        table |= check.table
+    if table.get("checksum_order") == split.order:
+        del table["checksum_order"]
+    return table | {"fields": _fields(rows, split, rate_Hz)}
+
+
+def _fields(rows: Bytes, split: Split, rate_Hz: float) -> list[dict[str, Any]]:
+    """The fields of a device file; neighbouring bytes without meaning are one padding."""
+    fields: list[dict[str, Any]] = []
+    taken: set[Role] = set()
+    number = 0
+    for part in split.parts:
+        role = part.role
+        if role is Role.sync:
+            continue
+        entry: dict[str, Any] | None = None
+        if role is Role.seq and role not in taken:
+            entry = {"name": "seq", "type": f"u{8 * part.size}"}
+        elif role is Role.clock and role not in taken:
+            entry = _clock(rows, part, split.order, rate_Hz)
+        elif role is Role.channel:
+            number += 1
+            entry = {"name": f"ch{number}", "type": _kind(rows, part, split)}
+        taken.add(role)
+        if entry is not None:
+            fields.append(entry)
+        elif fields and fields[-1]["type"] == "pad":
+            fields[-1]["count"] = fields[-1].get("count", 1) + part.size
+        else:
+            fields.append({"type": "pad"} | ({"count": part.size} if part.size > 1 else {}))
+    return fields
+
+
+def _clock(rows: Bytes, part: Part, order: str, rate_Hz: float) -> dict[str, Any] | None:
+    values = number_values(rows, part, order)
+    if part.is_float:
+        step = float(np.median(np.diff(values.astype(float))))
+    else:
+        step = float(np.median(np.diff(values.astype(np.int64)) % (1 << 8 * part.size)))
+    name, scale = clock_name(step * rate_Hz)
+    kind = f"f{8 * part.size}" if part.is_float else f"u{8 * part.size}"
+    return {"name": name, "type": kind} | ({"scale": scale} if scale != 1.0 else {})
+
+
+def _kind(rows: Bytes, part: Part, split: Split) -> str:
+    """The type of a channel; whether it has a sign is decided with all channels of its size."""
+    if part.is_float:
+        return f"f{8 * part.size}"
+    alike = [other for other in split.parts if other.role is Role.channel and other.size == part.size and not other.is_float]
+    votes = [_sign_vote(number_values(rows, other, split.order), 8 * part.size) for other in alike]
+    return f"{'i' if sum(votes) > 0 else 'u'}{8 * part.size}"
+
+
+def _sign_vote(values: Any, bits: int) -> int:
+    """1 for a signed channel, -1 for an unsigned one, 0 for one that does not say.
+
+    The wrong reading jumps where the right one passes zero or the middle of its range. Without a jump, the one is right
+    whose rest is farther from both its limits.
+    """
+    counts = values.astype(np.int64)
+    middle = 1 << (bits - 1)
+    signed = np.where(counts >= middle, counts - 2 * middle, counts)
+    spans = int(np.ptp(signed)), int(np.ptp(counts))
+    if not spans[1]:
+        return 0
+    if spans[0] != spans[1]:
+        return 1 if spans[0] < spans[1] else -1
+    rest = float(np.median(counts))
+    return -1 if middle / 2 < rest < 3 * middle / 2 else 1
