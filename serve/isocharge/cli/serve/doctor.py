@@ -43,7 +43,7 @@ def doctor_command(
     from json import dumps
 
     from isocharge.serve import Predictor, examine
-    from isocharge.serve.live.port_check import BAUDS
+    from isocharge.serve.examination.port_check import BAUDS
 
     electrodes = Predictor(model, models=models).metadata.electrodes if model else ()
     bauds, board = (baud,) if baud else BAUDS, board_of(device)

@@ -50,7 +50,7 @@ class ChannelPicker:
     def _look_up(self, frame: Frame) -> tuple[int, ...]:
         if self._channels:
             return tuple(self._position(electrode, frame) for electrode in self._electrodes)
-        positions = {_electrode(name): position for position, name in enumerate(frame.names)}
+        positions = {electrode_of(name): position for position, name in enumerate(frame.names)}
         if set(self._electrodes) <= set(positions):
             return tuple(positions[name] for name in self._electrodes)
         if len(frame.values) == len(self._electrodes):
@@ -74,8 +74,8 @@ class ChannelPicker:
 
 
 def channel_names(frame: Frame) -> tuple[str, ...]:
-    """Names of the channels as `[channels]` takes them; ch1, ch2, ... where the board gives none."""
-    return frame.names or tuple(f"ch{number}" for number in range(1, len(frame.values) + 1))
+    """Names of the channels as `[channels]` takes them; their numbers from 1 on where the board gives none."""
+    return frame.names or tuple(map(str, range(1, len(frame.values) + 1)))
 
 
 def position_of(name: str, frame: Frame) -> int | None:
@@ -87,6 +87,6 @@ def position_of(name: str, frame: Frame) -> int | None:
     return number - 1 if 1 <= number <= len(frame.values) else None
 
 
-def _electrode(name: str) -> str:
+def electrode_of(name: str) -> str:
     """`A` of `A`, `A_pC`, `charge.A` and `charge_raw_pC.A`."""
     return name.rpartition(".")[2].removesuffix("_pC")

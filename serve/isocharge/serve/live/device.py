@@ -45,7 +45,7 @@ class ByElectrode:
             DeviceError: If the numbers are those of other electrodes.
         """
         numbers = self.value if isinstance(self.value, Mapping) else dict.fromkeys(electrodes, self.value)
-        if set(numbers) != set(electrodes):
+        if not set(numbers) >= set(electrodes) or (len(electrodes) > 1 and set(numbers) != set(electrodes)):
             raise DeviceError(
                 f"{self.name}: expected a number, or one for each of the electrodes {electrodes}, got {self.value}"
             )
@@ -95,6 +95,11 @@ class GainSettings:
     per_unit: ByElectrode
     feedback_pF: ByElectrode | None = None
     offset: ByElectrode | None = None
+
+    def knows(self, electrode: str) -> bool:
+        """Whether there are numbers for an electrode."""
+        settings = (self.per_unit, self.feedback_pF, self.offset)
+        return all(item is None or not isinstance(item.value, Mapping) or electrode in item.value for item in settings)
 
     def pC_per_unit(self, electrodes: tuple[str, ...]) -> Array:
         """Charge of one unit with its sign, shape (electrodes,), pC.

@@ -31,11 +31,17 @@ class Request:
 
 
 class Asker:
-    """Sends a request whenever it is due, and takes its echo out of what comes."""
+    """Says when a request is due, and takes its echo out of what comes."""
 
     def __init__(self, request: Request, now_s: Callable[[], float] = time.monotonic) -> None:
         self._request, self._now_s = request, now_s
+        self._requests = self._echoes = 0
         self.forget()
+
+    @property
+    def echo_share(self) -> float:
+        """Share of the requests that came back, dimensionless, whether they are taken out or not."""
+        return self._echoes / max(1, self._requests)
 
     def forget(self) -> None:
         """The line was opened anew: ask at once."""
@@ -53,7 +59,8 @@ class Asker:
     def asked(self) -> bytes:
         """The bytes to send now."""
         self._asked_s = self._now_s()
-        self._echo = self._request.data if self._request.echo else b""
+        self._requests += 1
+        self._echo = self._request.data
         return self._request.data
 
     def heard(self, data: bytes) -> bytes:
@@ -65,4 +72,5 @@ class Asker:
             self._echo = b""
             return data
         self._echo = self._echo[common:]
-        return data[common:]
+        self._echoes += not self._echo
+        return data[common:] if self._request.echo else data

@@ -131,6 +131,11 @@ class Port:
             self._serial.close()
         self._serial = self._descriptor = None
 
+    @property
+    def echo_share(self) -> float:
+        """Share of the requests that the line brought back, dimensionless; 0 for a board that sends unasked."""
+        return self._asker.echo_share if self._asker else 0.0
+
     def __iter__(self) -> Iterator[Chunk]:
         """Chunks as they arrive.
 
@@ -149,6 +154,16 @@ class Port:
                 self.outages += 1
             yield Chunk(data, time.time(), time.perf_counter_ns(), outage_s)
             outage_s = 0.0
+
+    def read(self, timeout_s: float) -> Chunk | None:
+        """The bytes that come within a time, s; None if none do.
+
+        Raises:
+            PortLost: If the port goes away.
+            PortError: If the port is not open.
+        """
+        data = self._read_until(time.monotonic() + timeout_s)
+        return Chunk(data, time.time(), time.perf_counter_ns()) if data else None
 
     def _come_back(self, reason: PortLost) -> bytes:
         """Open the port again and again until bytes come: these bytes."""
@@ -172,14 +187,7 @@ class Port:
         Raises:
             PortLost: If the port went away, or nothing came in time.
         """
-        if self._serial is None:
-            raise PortError(f"{self.url}: not open; use `with Port(...) as port`")
-        try:
-            data = self._ask_and_read(self._asker) if self._asker else self._read_in_time(self._silence_s)
-        except (OSError, termios.error) as error:  # pyserial lets both through; termios.error is not an OSError
-            raise PortLost(
-                f"{self.url}: went away while it was read ({error}); check the plug and the cable"
-            ) from error
+        data = self._read_until(None)
         if not data:
             raise PortLost(
                 f"{self.url}: no data for {self._silence_s:g} s; check that the board is powered and sends, "
@@ -187,15 +195,27 @@ class Port:
             )
         return data
 
-    def _ask_and_read(self, asker: Asker) -> bytes:
+    def _read_until(self, end_s: float | None) -> bytes:
+        """The bytes that come until a time on `time.monotonic`; None for as long as silence may last."""
+        if self._serial is None:
+            raise PortError(f"{self.url}: not open; use `with Port(...) as port`")
+        timeout_s = self._silence_s if end_s is None else max(0.0, end_s - time.monotonic())
+        try:
+            return self._ask_and_read(self._asker, timeout_s) if self._asker else self._read_in_time(timeout_s)
+        except (OSError, termios.error) as error:  # pyserial lets both through; termios.error is not an OSError
+            raise PortLost(
+                f"{self.url}: went away while it was read ({error}); check the plug and the cable"
+            ) from error
+
+    def _ask_and_read(self, asker: Asker, timeout_s: float) -> bytes:
         """Ask whenever it is time, until an answer comes."""
         assert self._serial is not None
-        end_s = time.monotonic() + self._silence_s
+        end_s = time.monotonic() + timeout_s
         while time.monotonic() < end_s:
             if not (wait_s := asker.wait_s()):
                 self._serial.write(asker.asked())
                 wait_s = asker.wait_s()
-            if answer := asker.heard(self._read_in_time(min(wait_s, self._silence_s))):
+            if answer := asker.heard(self._read_in_time(min(wait_s, max(0.0, end_s - time.monotonic())))):
                 return answer
         return b""
 

@@ -69,7 +69,9 @@ class Way:
 
 def _rate_Hz(windows: Windows, chunks: Sequence[bytes], seconds: float) -> float:
     """Frames per second of a whole stream."""
-    share = min(1.0, len(windows.stream) / max(1, sum(map(len, chunks)))) if windows.framing in (SYNC, DATAGRAM) else 1.0
+    share = (
+        min(1.0, len(windows.stream) / max(1, sum(map(len, chunks)))) if windows.framing in (SYNC, DATAGRAM) else 1.0
+    )
     frames = len(windows.stream) / windows.length if windows.framing in (SYNC, DATAGRAM) else len(windows.starts)
     return frames / (seconds * share)
 
@@ -155,7 +157,9 @@ def _kind(rows: Bytes, part: Part, split: Split) -> str:
     """The type of a channel; whether it has a sign is decided with all channels of its size."""
     if part.is_float:
         return f"f{8 * part.size}"
-    alike = [other for other in split.parts if other.role is Role.channel and other.size == part.size and not other.is_float]
+    alike = [
+        other for other in split.parts if other.role is Role.channel and other.size == part.size and not other.is_float
+    ]
     votes = [_sign_vote(number_values(rows, other, split.order), 8 * part.size) for other in alike]
     return f"{'i' if sum(votes) > 0 else 'u'}{8 * part.size}"
 

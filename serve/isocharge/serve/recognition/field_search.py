@@ -131,7 +131,9 @@ def _split(rows: Bytes, end: int, order: str, rate_Hz: float, needs_sync: bool) 
             total = price + prices[last.at + last.size]
             if total < prices[at]:
                 prices[at], nexts[at] = total, parts
-    begin, price = min(_begins(rows, constant, needs_sync), key=lambda begin: begin[1] + prices[begin[0]], default=(0, np.inf))
+    begin, price = min(
+        _begins(rows, constant, needs_sync), key=lambda begin: begin[1] + prices[begin[0]], default=(0, np.inf)
+    )
     if not np.isfinite(price + prices[begin]):
         return None
     parts, at = [Part(Role.sync, 0, begin)] if begin else [], begin
@@ -205,7 +207,9 @@ def _float_at(rows: Bytes, part: Part, order: str, rate_Hz: float) -> Iterator[P
     yield max(1.0, bits - FLOAT_BONUS[part.size]), part
 
 
-def _options(columns: list[list[Priced]], at: int, end: int, constant: Series) -> Iterator[tuple[float, tuple[Part, ...]]]:
+def _options(
+    columns: list[list[Priced]], at: int, end: int, constant: Series
+) -> Iterator[tuple[float, tuple[Part, ...]]]:
     """Every part, or row of channels, that may begin at a byte, with its price."""
     yield (PRICE_OF_CONSTANT if constant[at] else PRICE_OF_NOISE), (Part(Role.pad, at, 1),)
     for bits, part in columns[at]:

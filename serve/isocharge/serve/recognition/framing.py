@@ -7,6 +7,7 @@ of the stream. Where within a frame that pair stands is not known yet.
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,17 +83,14 @@ def _stuffed(name: str, stuffing: Stuffing, data: bytes) -> Windows | None:
     pieces = [piece for piece in data.split(stuffing.delimiter)[1:-1] if piece]
     if len(pieces) < FEWEST or sum(map(len, pieces)) < COVERED_SHARE * len(data):
         return None
-    decoded = []
+    decoded, escaped = [], 0
     for piece in pieces:
-        try:
+        with suppress(ValueError):
             decoded.append(stuffing.decode(piece))
-        except ValueError:
-            continue
-    if name != "cobs" and not any(len(frame) < len(piece) for frame, piece in zip(decoded, pieces, strict=False)):
-        return None  # nothing was escaped: a byte that every frame happens to end with
+            escaped += len(decoded[-1]) < len(piece)
     length, count = Counter(map(len, decoded)).most_common(1)[0] if decoded else (0, 0)
-    if count < STUFFED_SHARE * len(pieces) or not SHORTEST <= length <= LONGEST:
-        return None
+    if count < STUFFED_SHARE * len(pieces) or not SHORTEST <= length <= LONGEST or not escaped:
+        return None  # without an escape it is a byte that every frame happens to end with
     return _windows(name, [piece for piece in decoded if len(piece) == length])
 
 

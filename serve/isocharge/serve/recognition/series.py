@@ -74,12 +74,17 @@ def bits_of_floats(values: Series, integers: Series, mantissa: int) -> float | N
 
 
 def rest_of(values: Series) -> float:
-    """The level at which a channel rests: the median of its values."""
-    return float(np.median(values))
+    """The level at which a channel rests: the median of its values; 0 without a finite one."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else 0.0
 
 
 def noise_of(values: Series) -> float:
-    """Standard deviation of a channel, from the median size of its steps, which presses hardly change."""
-    if len(values) < 2:
+    """Standard deviation of a channel, from the median size of its steps, which presses hardly change.
+
+    Coarse counts that stand still most of the time have a median step of 0; their mean step decides.
+    """
+    step = np.abs(np.diff(values[np.isfinite(values)].astype(float)))
+    if not len(step):
         return 0.0
-    return float(np.median(np.abs(np.diff(values.astype(float))))) / (0.6745 * np.sqrt(2.0))
+    return float(np.median(step) / (0.6745 * np.sqrt(2.0)) or step.mean() * np.sqrt(np.pi) / 2.0)
