@@ -1,5 +1,5 @@
-"""The port check: baud rate and format, rate, good and bad frames, the health of each channel, the device file that fits
-the board, and what is missing to get a touch.
+"""The port check: baud rate and format, rate, good and bad frames, the health of each channel, a device file that fits,
+and what is missing to get a touch.
 """
 
 from collections.abc import Iterator, Mapping
@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
 from isocharge.serve.examination.capture import Capture, read_frames
 from isocharge.serve.examination.channel_health import MAINS_HZ, ChannelHealth, channel_health
 from isocharge.serve.examination.listening import BAUDS, Heard, listen
@@ -160,22 +159,13 @@ def _channels(capture: Capture, device: Device, used: Mapping[str, int]) -> Iter
     if not capture.frames:
         return
     values, times_s = capture.values()
+    last = capture.frames[-1]
+    electrodes = {position_of(channel, last): electrode for electrode, channel in device.channels.items()}
     for name, position in used.items():
-        electrode = next(
-            (key for key, channel in device.channels.items() if position_of(channel, capture.frames[-1]) == position),
-            name,
-        )
+        column = values[:, position]
         with np.errstate(over="ignore"):
-            charge_pC = _in_pC(values[:, position], electrode, device)
+            charge_pC = device.gain.charge_pC(electrodes.get(position, name), column) if device.gain else column
         yield channel_health(name, charge_pC, times_s, capture.rate_Hz)
-
-
-def _in_pC(column: Array, electrode: str, device: Device) -> Array:
-    """A channel after offset and gain; as it came where the device file has none for it."""
-    if device.gain is None or not device.gain.knows(electrode):
-        return column
-    factor, zero = device.gain.pC_per_unit((electrode,)), device.gain.zero((electrode,))
-    return (column if zero is None else column - zero[0]) * factor[0]
 
 
 def _missing(
@@ -194,7 +184,10 @@ def _missing(
     if capture.gaps.lost:
         yield f"{capture.gaps.lost} frames lost: a slower rate, or a faster link"
     if electrodes and len(channels) != len(electrodes) and not set(device.channels) >= set(electrodes):
-        yield f"{_alive_words(capture, proposal)}, but the model has the electrodes {electrodes}: [channels] in a device file"
+        yield (
+            f"{_alive_words(capture, proposal)}, but the model has the electrodes {electrodes}: another model "
+            "(--model), or [channels] in a device file"
+        )
     if proposal.needs_gain:
         yield _gain_words(proposal)
         yield from (
@@ -213,8 +206,15 @@ def _missing(
 def _gain_words(proposal: Proposal) -> str:
     """What the user has to say about the amplifier."""
     if proposal.unit == "V":
-        return "the amplifier's feedback capacitance, if these are volts: --V-per-unit 1 --feedback-pF NUMBER; --pC-per-unit if not"
+        return (
+            "the amplifier's feedback capacitance, if these are volts: --V-per-unit 1 --feedback-pF NUMBER; or the "
+            "charge of one unit, pC: --pC-per-unit NUMBER (1 if these are pC)"
+        )
     return "the charge of one count, pC: --pC-per-unit NUMBER, with a minus where the amplifier inverts (1 if these are pC)"
+
+
+def _dead_words(channel: ChannelHealth) -> str:
+    return f"life on channel {channel.name}: every value is {channel.offset_pC:g}"
 
 
 def _alive_words(capture: Capture, proposal: Proposal) -> str:
@@ -231,10 +231,11 @@ def _missing_in_channels(channels: tuple[ChannelHealth, ...], rule: TareRule) ->
         if abs(channel.offset_pC or 0.0) > rule.offset_limit_pC:
             yield (
                 f"rest near zero on channel {channel.name}: {channel.offset_pC:.4g} pC, a tare takes "
-                f"{rule.offset_limit_pC:g} (is something lying on the film? does the amplifier rest there? then [gain] offset)"
+                f"{rule.offset_limit_pC:g} (is something lying on the film? does the amplifier rest there? then [gain] "
+                "offset)"
             )
         if channel.span_pC == 0.0:
-            yield f"life on channel {channel.name}: every value is {channel.offset_pC:g}"
+            yield _dead_words(channel)
         if abs(drift := channel.drift_pC_per_s or 0.0) > DRIFT_LIMIT_PC_PER_S:
             yield f"a steady channel {channel.name}: it drifts by {drift:.2g} pC/s"
         for frequency, hum in zip(MAINS_HZ, channel.hum_pC, strict=True):

@@ -67,8 +67,8 @@ class ChannelPicker:
         position = position_of(name, frame)
         if position is None:
             raise ChargeError(
-                f"{self._where}: [channels] {electrode} = {dumps(cut(name))}: no channel is called that; the frames have "
-                f"{cut(', '.join(channel_names(frame)))}, or 1 to {len(frame.values)} in their order"
+                f"{self._where}: [channels] {electrode} = {dumps(cut(name))}: no channel is called that; the frames "
+                f"have {cut(', '.join(channel_names(frame)))}, or 1 to {len(frame.values)} in their order"
             )
         return position
 

@@ -45,11 +45,15 @@ class ByElectrode:
             DeviceError: If the numbers are those of other electrodes.
         """
         numbers = self.value if isinstance(self.value, Mapping) else dict.fromkeys(electrodes, self.value)
-        if not set(numbers) >= set(electrodes) or (len(electrodes) > 1 and set(numbers) != set(electrodes)):
+        if set(numbers) != set(electrodes):
             raise DeviceError(
                 f"{self.name}: expected a number, or one for each of the electrodes {electrodes}, got {self.value}"
             )
         return np.array([numbers[name] for name in electrodes], dtype=float)
+
+    def of(self, electrode: str, default: float) -> float:
+        """The setting of one electrode; the default if there is none for it."""
+        return self.value.get(electrode, default) if isinstance(self.value, Mapping) else self.value
 
 
 @dataclass(frozen=True)
@@ -96,11 +100,6 @@ class GainSettings:
     feedback_pF: ByElectrode | None = None
     offset: ByElectrode | None = None
 
-    def knows(self, electrode: str) -> bool:
-        """Whether there are numbers for an electrode."""
-        settings = (self.per_unit, self.feedback_pF, self.offset)
-        return all(item is None or not isinstance(item.value, Mapping) or electrode in item.value for item in settings)
-
     def pC_per_unit(self, electrodes: tuple[str, ...]) -> Array:
         """Charge of one unit with its sign, shape (electrodes,), pC.
 
@@ -109,6 +108,13 @@ class GainSettings:
         """
         per_unit = self.per_unit.array(electrodes)
         return per_unit if self.feedback_pF is None else per_unit * self.feedback_pF.array(electrodes)
+
+    def charge_pC(self, electrode: str, values: Array) -> Array:
+        """Values of one electrode, of any shape, as charges, pC; as they are where there is no setting for it."""
+        factor = self.per_unit.of(electrode, 1.0)
+        if self.feedback_pF is not None:
+            factor *= self.feedback_pF.of(electrode, 1.0)
+        return (values - (self.offset.of(electrode, 0.0) if self.offset else 0.0)) * factor
 
     def zero(self, electrodes: tuple[str, ...]) -> Array | None:
         """What is subtracted before the gain, shape (electrodes,), in the board's unit; None for nothing.

@@ -117,7 +117,7 @@ class ReadingStream:
         offsets = ", ".join(
             f"{name} = {value:.10g}" for name, value in zip(self._electrodes, values.tolist(), strict=True)
         )
-        return f"the board shows {{{offsets}}}: if that is its rest, say so in a device file: [gain] offset = {{{offsets}}}"
+        return f"if the board rests there without a touch, say so in a device file: [gain] offset = {{{offsets}}}"
 
     def arrived(self, frames: list[Frame], chunk: Chunk) -> None:
         """A chunk is over: its arrival sets the clock; bytes that are no frames are refused.

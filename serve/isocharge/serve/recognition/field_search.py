@@ -1,8 +1,8 @@
 """Which bytes of a frame are its sync, its number, its clock and its channels.
 
 Every way to part the bytes into fields has a price: the bits that the steps of its values need, and something for each
-field, so that of two ways that explain the bytes alike the simpler one is cheaper, above all channels of one type side by
-side. Bytes at the end of a long number and those of noise cost the same, so the price of a field decides there. The
+field, so that of two ways that explain the bytes alike the simpler one is cheaper, above all channels of one type side
+by side. Bytes at the end of a long number and those of noise cost the same, so the price of a field decides there. The
 cheapest way is computed from the end of the frame to its begin.
 """
 
@@ -27,7 +27,7 @@ SIZES = (1, 2, 3, 4)
 """Sizes of integers, bytes."""
 
 FLOATS = {4: ("f4", "i4", 24), 8: ("f8", "i8", 53)}
-"""Floating-point values by their size: NumPy's letters for them and for integers of their size, bits of the fraction."""
+"""Floating-point values by size: NumPy's letters for them and for integers of that size, bits of the fraction."""
 
 CONSTANT_SHARE = 0.9
 """Share of frames in which a constant byte has its value, dimensionless: some may be damaged."""

@@ -1,8 +1,8 @@
 """Where frames begin and how long they are: bytes to windows of one length.
 
 A stuffed stream is parted by its delimiter. Otherwise some bytes of every frame are the same, and come again after the
-length of a frame: of all pairs of bytes the one is taken whose most frequent distance to its next occurrence covers most
-of the stream. Where within a frame that pair stands is not known yet.
+length of a frame: of all pairs of bytes the one is taken whose most frequent distance to its next occurrence covers
+most of the stream. Where within a frame that pair stands is not known yet.
 """
 
 from collections import Counter
