@@ -1,6 +1,7 @@
 """`isocharge serve doctor`: what is on a port, as text or as JSON, and the device file that fits it."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,7 +11,7 @@ import typer
 from isocharge.cli.serve.options import ModelsOption, WaitOption, awaited
 from isocharge.cli.shared.options import DeviceOption, JsonOption, board_of
 from isocharge.cli.shared.terminal import say
-from isocharge.errors import InputError
+from isocharge.errors import InputError, IsochargeError
 from isocharge.number_text import number_of
 
 if TYPE_CHECKING:
@@ -105,10 +106,25 @@ def doctor_command(
         request=_request(request, request_Hz),
     )
     print(dumps(asdict(examination)) if json else "\n".join(report_lines(examination)))
+    alive = len(examination.channels)
+    if examination.good and len(electrodes) > alive:
+        say(f"models of {alive} electrodes: {', '.join(_models_of(alive, models)) or 'none'}; choose one with --model")
     if examination.good and write is not None:
         _write(write, examination)
     if not examination.good:
         raise typer.Exit(1)
+
+
+def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
+    """Names of the models with as many electrodes; those that cannot be read are left out."""
+    from isocharge.serve import Predictor
+    from isocharge.serve.model.repository import model_names, repositories
+
+    names = dict.fromkeys(name for root in repositories(models) for name in model_names(root))
+    for name in names:
+        with suppress(IsochargeError):
+            if len(Predictor(name, models=models).metadata.electrodes) == electrodes:
+                yield name
 
 
 def _setting(key: str, text: str) -> Any:

@@ -26,7 +26,7 @@ def device_text(examination: Examination) -> str:
     gain = examination.device.get("gain")
     lines = TO_FILL_IN.get(examination.unit, ())
     if gain is not None:
-        text += to_toml({"gain": gain})
+        text += "\n" + to_toml({"gain": gain})
     elif lines:
         text += "\n[gain]\n"
     return text + "".join(f"{line}\n" for line in lines)

@@ -210,7 +210,7 @@ def _gain_words(proposal: Proposal) -> str:
             "the amplifier's feedback capacitance, if these are volts: --V-per-unit 1 --feedback-pF NUMBER; or the "
             "charge of one unit, pC: --pC-per-unit NUMBER (1 if these are pC)"
         )
-    return "the charge of one count, pC: --pC-per-unit NUMBER, with a minus where the amplifier inverts (1 if these are pC)"
+    return "the charge of one count, pC: --pC-per-unit NUMBER, negative where the amplifier inverts (1 if these are pC)"
 
 
 def _dead_words(channel: ChannelHealth) -> str:

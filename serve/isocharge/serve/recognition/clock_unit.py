@@ -3,7 +3,7 @@
 UNITS_HZ = {"t_s": 1.0, "t_ms": 1e3, "t_us": 1e6}
 """Ticks per second of a clock by the name of its field, Hz."""
 
-USUAL_HZ = (100.0, 1e4, 1e5, 1024.0, 32768.0, 31250.0, 62500.0, 250e3, 500e3, 2e6, 4e6, 8e6, 16e6)
+USUAL_HZ = (100.0, 1e4, 1e5, 1024.0, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6)
 """Other rates at which clocks of boards tick, Hz."""
 
 TOLERANCE = 0.06

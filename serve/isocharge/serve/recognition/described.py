@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -9,14 +10,26 @@ import numpy as np
 from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC
 from isocharge.serve.recognition.check_search import Check, checks
 from isocharge.serve.recognition.clock_unit import clock_name
-from isocharge.serve.recognition.field_search import CONSTANT_SHARE, Part, Role, Split, number_values, split_frame
+from isocharge.serve.recognition.field_search import (
+    CONSTANT_SHARE,
+    PRICE_OF_NOISE,
+    Part,
+    Role,
+    Split,
+    number_values,
+    split_frame,
+)
 from isocharge.serve.recognition.framing import Bytes, Windows, framings
+from isocharge.serve.recognition.series import clock_step, steps
 
 MOST_FRAMES = 600
 """Frames that are examined."""
 
 PRICE_WITHOUT_CHECK = 4.0
 """For frames without a checksum, bits: most have one."""
+
+BONUS_OF_CHECK = 1.0
+"""For each byte of a checksum, bits: the low byte of a sum is a sum, too."""
 
 NO_CHECK = Check(0, 0, "none", 0, "little")
 
@@ -29,15 +42,12 @@ def described_frames(chunks: Sequence[bytes], seconds: float, *, are_datagrams: 
         seconds: Time in which they came, s; the unit of a clock follows from it.
         are_datagrams: Whether each chunk is a datagram.
     """
-    best: Way | None = None
-    for windows in framings(chunks, are_datagrams=are_datagrams):
-        if best is not None and windows.framing != best.windows.framing:
-            break
-        ways = (way for way in _ways(windows, _rate_Hz(windows, chunks, seconds)) if way.has_channels)
-        best = min((way for way in (best, *ways) if way is not None), key=lambda way: way.price_per_byte, default=None)
-        if best is not None and windows.framing != DATAGRAM:
-            break
-    return None if best is None else _table(best, _rate_Hz(best.windows, chunks, seconds))
+    for _, group in groupby(framings(chunks, are_datagrams=are_datagrams), key=lambda windows: windows.framing):
+        ways = (way for windows in group for way in _ways(windows, _rate_Hz(windows, chunks, seconds)))
+        best = min((way for way in ways if way.has_channels), key=lambda way: way.price_per_byte, default=None)
+        if best is not None:
+            return _table(best, _rate_Hz(best.windows, chunks, seconds))
+    return None
 
 
 @dataclass(frozen=True)
@@ -58,8 +68,10 @@ class Way:
 
     @property
     def price_per_byte(self) -> float:
-        """Bits for each byte: lengths of frames are compared by it."""
-        return self.price / self.windows.length
+        """Bits for each byte of the stream, those too that are in no frame: lengths of frames are compared by it."""
+        windows = self.windows
+        covered = min(1.0, len(windows.starts) * windows.length / len(windows.stream))
+        return covered * self.price / windows.length + (1.0 - covered) * PRICE_OF_NOISE
 
     @property
     def has_channels(self) -> bool:
@@ -84,10 +96,16 @@ def _ways(windows: Windows, rate_Hz: float) -> Iterator[Way]:
     for turn in turns:
         rows = windows.rows(turn)[:MOST_FRAMES]
         for check in checks(rows, turn):
-            split = split_frame(rows, windows.length - check.size, rate_Hz, needs_sync=needs_sync)
+            split = split_frame(
+                rows,
+                windows.length - check.size,
+                rate_Hz,
+                needs_sync=needs_sync,
+                order=check.order if check.size > 1 else None,
+            )
             if split is not None:
                 has_check = True
-                yield Way(windows, check, split, split.price)
+                yield Way(windows, check, split, split.price - BONUS_OF_CHECK * check.size)
     for turn in turns if not has_check else ():
         split = split_frame(windows.rows(turn)[:MOST_FRAMES], windows.length, rate_Hz, needs_sync=needs_sync)
         if split is not None:
@@ -144,11 +162,9 @@ def _fields(rows: Bytes, split: Split, rate_Hz: float) -> list[dict[str, Any]]:
 
 def _clock(rows: Bytes, part: Part, order: str, rate_Hz: float) -> dict[str, Any] | None:
     values = number_values(rows, part, order)
-    if part.is_float:
-        step = float(np.median(np.diff(values.astype(float))))
-    else:
-        step = float(np.median(np.diff(values.astype(np.int64)) % (1 << 8 * part.size)))
-    name, scale = clock_name(step * rate_Hz)
+    step = np.diff(values.astype(float)) if part.is_float else steps(values, 8 * part.size)
+    ticks = clock_step(step) or 1.0
+    name, scale = clock_name(ticks * rate_Hz)
     kind = f"f{8 * part.size}" if part.is_float else f"u{8 * part.size}"
     return {"name": name, "type": kind} | ({"scale": scale} if scale != 1.0 else {})
 

@@ -18,7 +18,7 @@ from isocharge.serve.recognition.series import (
     Series,
     bits_of_floats,
     bits_of_steps,
-    is_clock,
+    clock_step,
     is_counter,
     steps,
 )
@@ -29,7 +29,7 @@ SIZES = (1, 2, 3, 4)
 FLOATS = {4: ("f4", "i4", 24), 8: ("f8", "i8", 53)}
 """Floating-point values by size: NumPy's letters for them and for integers of that size, bits of the fraction."""
 
-CONSTANT_SHARE = 0.9
+CONSTANT_SHARE = 0.98
 """Share of frames in which a constant byte has its value, dimensionless: some may be damaged."""
 
 LONGEST_SYNC = 6
@@ -44,14 +44,32 @@ PRICE_OF_FIELD, PRICE_OF_CHANNEL = 1.5, 0.15
 PRICE_OF_COUNTER, PRICE_OF_WIDTH = 0.4, 0.05
 """For a number or clock, less for each byte of it, bits: wide ones are likelier than constant bytes beside them."""
 
-PRICE_OF_CONSTANT, PRICE_OF_NOISE = 0.4, 7.3
+PRICE_OF_CONSTANT, PRICE_OF_NOISE = 0.4, 8.3
 """For a byte without meaning, bits: a constant one, and another."""
 
+PRICE_OF_DEAD = 1.0
+"""For a channel that never varies, bits: more often it is a part of its neighbour."""
+
+PRICE_OF_LEVEL = 0.03
+"""For each bit of the level of a channel, bits: of two readings that vary alike the one nearer zero is likelier."""
+
+PRICE_OF_OLD_COUNTER = 1.0
+"""For a number or clock of four bytes whose high ones are constant and not 0: they may be something else, bits."""
+
+PRICE_OF_ODD_SIZE = 2.0
+"""For a clock of three bytes, bits."""
+
 PRICE_OF_SHORT_SYNC, PRICE_OF_DULL_SYNC = 1.2, 0.7
-"""For a sync of one byte, and for each byte 00 or FF in it, which are often a part of a number, bits."""
+"""For a sync of one byte, and for each of `DULL` in it, bits."""
+
+DULL = (0x00, 0x80, 0xFF)
+"""Bytes that are often the high ones of a number, and seldom of a sync."""
 
 PRICE_OF_ODD_CLOCK = 8.0
 """For a clock that ticks at no usual rate, bits."""
+
+PRICE_OF_OTHER_ORDER = 0.3
+"""For fields of another byte order than that of the checksum, bits."""
 
 FLOAT_BONUS = {4: 2.0, 8: 6.0}
 """By the size of a floating-point value, bits: few other bytes are plausible ones."""
@@ -107,7 +125,7 @@ def number_values(rows: Bytes, part: Part, order: str) -> Series:
     return values
 
 
-def split_frame(rows: Bytes, end: int, rate_Hz: float, *, needs_sync: bool) -> Split | None:
+def split_frame(rows: Bytes, end: int, rate_Hz: float, *, needs_sync: bool, order: str | None = None) -> Split | None:
     """The cheapest way to part frames, of both byte orders.
 
     Args:
@@ -115,9 +133,13 @@ def split_frame(rows: Bytes, end: int, rate_Hz: float, *, needs_sync: bool) -> S
         end: Bytes before the checksum.
         rate_Hz: Frames per second, Hz; a clock is expected to tick at a usual rate.
         needs_sync: Whether a frame has to begin with a constant byte.
+        order: The byte order of the checksum: that of the fields if nothing speaks against it.
     """
     splits = [_split(rows, end, order, rate_Hz, needs_sync) for order in ("little", "big")]
-    return min((split for split in splits if split is not None), key=lambda split: split.price, default=None)
+    prices = {
+        split: split.price + PRICE_OF_OTHER_ORDER * (order not in (None, split.order)) for split in splits if split
+    }
+    return min(prices, key=lambda split: prices[split], default=None)
 
 
 def _split(rows: Bytes, end: int, order: str, rate_Hz: float, needs_sync: bool) -> Split | None:
@@ -151,12 +173,13 @@ def _usual(rows: Bytes) -> Bytes:
 def _begins(rows: Bytes, constant: Series, needs_sync: bool) -> Iterator[tuple[int, float]]:
     """(length of a sync, its price)."""
     if not needs_sync:
-        yield 0, 0.5
+        yield 0, 0.0
+        return
     price = 0.0
     for size, (is_constant, byte) in enumerate(zip(constant, _usual(rows).tolist(), strict=False), start=1):
         if not is_constant or size > LONGEST_SYNC:
             return
-        price += PRICE_OF_DULL_SYNC * (byte in (0x00, 0xFF))
+        price += PRICE_OF_DULL_SYNC * (byte in DULL)
         yield size, price + PRICE_OF_SHORT_SYNC * (size == 1)
 
 
@@ -169,13 +192,16 @@ def _fields_at(rows: Bytes, at: int, end: int, order: str, rate_Hz: float, const
     for size in SIZES:
         if at + size > end:
             break
-        step = steps(number_values(rows, Part(Role.channel, at, size), order), 8 * size)
+        values = number_values(rows, Part(Role.channel, at, size), order)
+        step = steps(values, 8 * size)
         is_constant = bool(constant[at : at + size].all())
+        old = PRICE_OF_OLD_COUNTER * (size == 4 and int(values.min()) >> 16 == int(values.max()) >> 16 != 0)
         if is_counter(step) and size != 3:
-            fields.append((PRICE_OF_COUNTER - PRICE_OF_WIDTH * size, Part(Role.seq, at, size)))
-        elif is_clock(step) and size > 1:
-            fields.append((_price_of_clock(step, rate_Hz) - PRICE_OF_WIDTH * size, Part(Role.clock, at, size)))
-        bits = 0.0 if is_constant else bits_of_steps(step)
+            fields.append((PRICE_OF_COUNTER - PRICE_OF_WIDTH * size + old, Part(Role.seq, at, size)))
+        elif size > 1 and (ticks := clock_step(step)) is not None:
+            price = _price_of_clock(step, ticks * rate_Hz) - PRICE_OF_WIDTH * size + PRICE_OF_ODD_SIZE * (size == 3)
+            fields.append((price + old, Part(Role.clock, at, size)))
+        bits = PRICE_OF_DEAD if is_constant else bits_of_steps(step) + _price_of_level(values, 8 * size)
         if bits <= 8 * size - FULL_RANGE_BITS:
             fields.append((bits, Part(Role.channel, at, size)))
     for size in FLOATS:
@@ -184,11 +210,16 @@ def _fields_at(rows: Bytes, at: int, end: int, order: str, rate_Hz: float, const
     return fields
 
 
-def _price_of_clock(step: Series, rate_Hz: float) -> float:
+def _price_of_level(values: Series, bits: int) -> float:
+    """Something for the distance of a channel from zero, of integers with a sign, without, or offset by half."""
+    level, half = float(np.median(values.astype(float))), float(1 << (bits - 1))
+    return PRICE_OF_LEVEL * float(np.log2(1.0 + min(level, abs(level - half), 2.0 * half - level)))
+
+
+def _price_of_clock(step: Series, ticks_Hz: float) -> float:
     """The bits that the jitter of a clock needs, and something if it ticks as no other does."""
-    median = float(np.median(step))
-    price = PRICE_OF_COUNTER + bits_of_steps(step - median)
-    return price + PRICE_OF_ODD_CLOCK * (not is_usual(median * rate_Hz))
+    price = PRICE_OF_COUNTER + bits_of_steps(step - float(np.median(step)))
+    return price + PRICE_OF_ODD_CLOCK * (not is_usual(ticks_Hz))
 
 
 def _float_at(rows: Bytes, part: Part, order: str, rate_Hz: float) -> Iterator[Priced]:
@@ -199,10 +230,10 @@ def _float_at(rows: Bytes, part: Part, order: str, rate_Hz: float) -> Iterator[P
     if bits is None:
         return
     if not np.ptp(values.astype(float)):
-        yield (PRICE_OF_CONSTANT * part.size if not values.any() else 0.3), part
+        yield PRICE_OF_DEAD, part
         return
-    step = np.diff(values.astype(float))
-    if is_clock(step) and is_usual(float(np.median(step)) * rate_Hz):
+    ticks = clock_step(np.diff(values.astype(float)))
+    if ticks is not None and is_usual(ticks * rate_Hz):
         yield PRICE_OF_COUNTER, Part(Role.clock, part.at, part.size, is_float=True)
     yield max(1.0, bits - FLOAT_BONUS[part.size]), part
 
@@ -216,11 +247,11 @@ def _options(
         if part.role is not Role.channel:
             yield bits, (part,)
             continue
-        row, total, varies = [part], bits, bits > 0.0
+        row, total, varies = [part], bits, bits != PRICE_OF_DEAD
         if varies:
             yield bits + PRICE_OF_FIELD, (part,)
         while len(row) < MOST_CHANNELS and (beside := _beside(columns, row[-1], end)) is not None:
-            total, varies = total + beside[0], varies or beside[0] > 0.0
+            total, varies = total + beside[0], varies or beside[0] != PRICE_OF_DEAD
             row.append(beside[1])
             if varies:
                 yield total + PRICE_OF_FIELD + PRICE_OF_CHANNEL * len(row), tuple(row)

@@ -83,15 +83,21 @@ def _stuffed(name: str, stuffing: Stuffing, data: bytes) -> Windows | None:
     pieces = [piece for piece in data.split(stuffing.delimiter)[1:-1] if piece]
     if len(pieces) < FEWEST or sum(map(len, pieces)) < COVERED_SHARE * len(data):
         return None
-    decoded, escaped = [], 0
+    decoded = []
     for piece in pieces:
         with suppress(ValueError):
             decoded.append(stuffing.decode(piece))
-            escaped += len(decoded[-1]) < len(piece)
-    length, count = Counter(map(len, decoded)).most_common(1)[0] if decoded else (0, 0)
-    if count < STUFFED_SHARE * len(pieces) or not SHORTEST <= length <= LONGEST or not escaped:
-        return None  # without an escape it is a byte that every frame happens to end with
+    length, count = _most_common_length(decoded)
+    if count < STUFFED_SHARE * len(pieces) or not SHORTEST <= length <= LONGEST:
+        return None
+    if name != "cobs" and count <= _most_common_length(pieces)[1]:
+        return None  # without the stuffing they fit better: a byte with which every frame happens to begin or end
     return _windows(name, [piece for piece in decoded if len(piece) == length])
+
+
+def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
+    """The most frequent length, and how often it occurs."""
+    return Counter(map(len, pieces)).most_common(1)[0] if pieces else (0, 0)
 
 
 def _synchronised(data: bytes) -> Iterator[Windows]:

@@ -23,6 +23,10 @@ PLAUSIBLE = (1e-7, 1e8)
 """Smallest and largest magnitude of a plausible floating-point value other than 0."""
 
 
+LEAST_NOISE = 1e-5
+"""Smallest step of a floating-point value that varies, in its magnitude, dimensionless: converters have 20 bits."""
+
+
 def steps(values: Series, bits: int) -> Series:
     """Steps of an unsigned counter of some bits, taken over its wraps, shape (n - 1,), int64; up to half its range."""
     modulus = 1 << bits
@@ -37,14 +41,13 @@ def is_counter(step: Series) -> bool:
     return len(step) >= FEWEST - 1 and float(np.mean(step == 1)) >= COUNTING_SHARE
 
 
-def is_clock(step: Series) -> bool:
-    """Whether values go on by steps of about one size."""
-    if len(step) < FEWEST - 1:
-        return False
-    median = float(np.median(step))
+def clock_step(step: Series) -> float | None:
+    """The mean step of a clock, without those over lost frames; None if values do not go on by steps of one size."""
+    if len(step) < FEWEST - 1 or not (median := float(np.median(step))) > 0:
+        return None
     low, high = CLOCK_SPREAD
     usual = (step >= low * median) & (step <= high * median)
-    return median > 0 and float(np.mean(usual)) >= COUNTING_SHARE and float(np.mean(step > 0)) >= COUNTING_SHARE
+    return float(step[usual].mean()) if float(np.mean(usual)) >= COUNTING_SHARE else None
 
 
 def bits_of_steps(step: Series) -> float:
@@ -69,8 +72,12 @@ def bits_of_floats(values: Series, integers: Series, mantissa: int) -> float | N
             return None
     used = int(np.bitwise_or.reduce(integers)) & ((1 << mantissa) - 1)
     zeros = min(mantissa - 1, (used & -used).bit_length() - 1 if used else mantissa)  # values that came from few bits
-    quantum = float(magnitude.max()) * 2.0 ** (zeros - mantissa) or 1.0
-    return bits_of_steps(np.diff(values.astype(float)) / quantum)
+    typical = float(np.median(magnitude)) or float(magnitude.max())
+    quantum = typical * 2.0 ** (zeros - mantissa) or 1.0
+    step = np.diff(values.astype(float))
+    if step.any() and float(np.abs(step).mean()) < LEAST_NOISE * typical:
+        return None
+    return bits_of_steps(step / quantum)
 
 
 def rest_of(values: Series) -> float:

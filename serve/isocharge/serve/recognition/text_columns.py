@@ -10,7 +10,7 @@ from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_lines import SEQ
 from isocharge.serve.recognition.clock_unit import text_clock_name
 from isocharge.serve.recognition.framing import FEWEST
-from isocharge.serve.recognition.series import Series, is_clock, is_counter
+from isocharge.serve.recognition.series import Series, clock_step, is_counter
 
 
 def text_frames(chunks: Sequence[bytes], seconds: float) -> tuple[dict[str, Any], float] | None:
@@ -51,7 +51,8 @@ def _meanings(frames: Sequence[Frame], rate_Hz: float) -> dict[str, int]:
 
 
 def _clock(step: Series, rate_Hz: float) -> str | None:
-    return text_clock_name(float(np.median(step)) * rate_Hz) if is_clock(step) else None
+    ticks = clock_step(step)
+    return None if ticks is None else text_clock_name(ticks * rate_Hz)
 
 
 def _table(frame: Frame, meanings: dict[str, int]) -> dict[str, Any]:
