@@ -18,7 +18,8 @@ from isocharge.serve import (
     encode_frame,
     encode_text,
 )
-from isocharge.serve.frames.layout_parser import DescribedParser
+from isocharge.serve.frames.cobs import cobs_encode
+from isocharge.serve.frames.layout_parser import DescribedParser, described_parser
 
 FRAMES = [Frame(seq, 5000 * seq, (800.0 + seq, 700.0 - seq, 900.5), 0, ("A", "B", "C")) for seq in range(6)]
 
@@ -46,12 +47,32 @@ def described_layout():
     return device_from_table({"frames": DESCRIBED}, "attack").layout
 
 
+def stuffed(framing):
+    """Frames of 24 bits with a constant byte, stuffed as the framing wants it."""
+    fields = [{"name": "seq", "type": "u8"}, {"type": "pad", "value": "0C"}]
+    fields += [{"name": name, "type": "i24"} for name in "ABC"]
+    table = {"format": "described", "framing": framing, "length": 12, "checksum": "crc-8", "fields": fields}
+    layout = device_from_table({"frames": table}, "attack").layout
+    escapes = {
+        "cobs": lambda data: cobs_encode(data) + b"\0",
+        "slip": lambda data: data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0",
+        "hdlc": lambda data: data.replace(b"}", b"}]").replace(b"~", b"}^") + b"~",
+        "datagram": lambda data: data,
+    }
+    return lambda: described_parser(layout), b"".join(escapes[framing](layout.encode(frame)) for frame in FRAMES)
+
+
 def formats():
     layout = described_layout()
     yield "binary", BinaryParser, b"".join(map(encode_frame, FRAMES))
     yield "described", lambda: DescribedParser(layout), b"".join(map(layout.encode, FRAMES))
+    for framing in ("cobs", "slip", "hdlc", "datagram"):
+        yield f"described {framing}", *stuffed(framing)
     for notation in ("csv", "pairs", "teleplot", "json"):
         yield notation, TextParser, text(notation)
+    yield "sentences", TextParser, b"".join(b"$PZT,%d,1.5,2.5*%02X\r\n" % (k, 0x4F ^ k) for k in range(6))
+    clocks = b"".join(b"n:%d,ms:%d,A:1.5\n" % (k % 3, 65534 + k & 0xFFFF) for k in range(9))
+    yield "other names", lambda: TextParser(meanings={"n": "seq", "ms": "t_ms"}), clocks
     nested = b"".join(
         json.dumps({"seq": k, "charge": {"A": 1.5, "B": [2, 3], "": {"": 4}}}).encode() + b"\n" for k in range(6)
     )

@@ -110,7 +110,7 @@ class StuffedParser(DescribedParser):
 
     def feed(self, data: bytes) -> list[Frame]:
         """The frames that end within `data`; the bytes after the last delimiter wait for the next call."""
-        pieces = [piece for piece in self._pieces.feed(data) if piece]  # an empty one is an idle line
+        pieces = (piece for piece in self._pieces.feed(data) if piece)  # an empty one is an idle line
         return [frame for piece in pieces if (frame := self._take(piece)) is not None]
 
     def forget(self) -> None:
