@@ -6,7 +6,7 @@
 | name:value, several in a line or one | `A:801.2,B:799.5,C:803.3` |
 | Teleplot (github.com/nesnes/teleplot) | `>A:1627551892437:801.2§pC` (time in ms and unit are optional) |
 | JSON object or list | `{"seq": 12, "A": 801.2}` |
-| sentence in the manner of NMEA 0183, checksum or not | `$PZT,801.2,799.5,803.3*7D` |
+| sentence in the manner of NMEA 0183, checksum or not | `$PZT,801.2,799.5,803.3*5D` |
 
 Blank lines and lines that begin with # hold no values. A number is what `isocharge.number_text` reads.
 """

@@ -65,8 +65,9 @@ class Asker:
 
     def heard(self, data: bytes) -> bytes:
         """What of the bytes that came is not the echo of the request."""
-        if data:
-            self._heard_s = self._now_s()
+        if not data:
+            return b""
+        self._heard_s = self._now_s()
         common = min(len(data), len(self._echo))
         if not common or data[:common] != self._echo[:common]:
             self._echo = b""

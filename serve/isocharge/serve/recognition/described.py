@@ -22,7 +22,7 @@ from isocharge.serve.recognition.field_search import (
 from isocharge.serve.recognition.framing import Bytes, Windows, framings
 from isocharge.serve.recognition.series import clock_step, steps
 
-MOST_FRAMES = 600
+MOST_FRAMES = 300
 """Frames that are examined."""
 
 PRICE_WITHOUT_CHECK = 4.0
