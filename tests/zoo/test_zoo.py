@@ -75,17 +75,17 @@ def teleplot(k, q):
     return "".join(f">q{n}:{2.5 * k:.1f}:{x:.3f}§pC\n" for n, x in enumerate(q)).encode()
 
 
-def arduino_plotter(k, q):
-    """Fixed lines for the scale, as the serial plotter wants them; k is not sent."""
+def arduino_plotter(_, q):
+    """Fixed lines for the scale, as the serial plotter wants them."""
     return ("Min:-1500,Max:1500," + ",".join(f"S{n}:{x:.3f}" for n, x in enumerate(q)) + "\r\n").encode()
 
 
-def answer(k, q):
+def answer(_, q):
     """A line on request."""
     return ("\t".join(f"{x:.3f}" for x in q) + "\r\n").encode()
 
 
-def modbus_reply(k, q):
+def modbus_reply(_, q):
     """The answer of a Modbus slave: big-endian registers, the checksum little-endian."""
     data = struct.pack(">BBB4h", 17, 4, 8, *counts(q, 0.0625))
     return data + struct.pack("<H", modbus(data))

@@ -4,6 +4,7 @@ import os
 import socket
 import threading
 import tty
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -56,7 +57,7 @@ def test_the_echo_is_taken_out_however_it_is_cut(request_bytes, answer, cuts):
     asker.asked()
     stream = request_bytes + answer
     at = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
-    assert b"".join(asker.heard(stream[a:b]) for a, b in zip(at, at[1:], strict=False)) == answer
+    assert b"".join(asker.heard(stream[a:b]) for a, b in pairwise(at)) == answer
     assert asker.echo_share == 1.0
 
 

@@ -55,7 +55,7 @@ class Gain:
 
 
 def _largest(setting: Any) -> float:
-    return max(map(abs, setting.values() if isinstance(setting, Mapping) else [setting]))
+    return max(abs(float(value)) for value in (setting.values() if isinstance(setting, Mapping) else [setting]))
 
 
 @dataclass(frozen=True)
@@ -146,13 +146,13 @@ def _chosen(capture: Capture, values: Array, electrodes: tuple[str, ...]) -> dic
 
 def _alive(values: Array) -> list[int]:
     """Positions of the channels that vary as the others do; all of them where nothing varies."""
-    finite = np.isfinite(values).all(axis=0)
-    spans = np.where(finite, np.ptp(np.where(np.isfinite(values), values, 0.0), axis=0), 0.0)
-    noise = np.array([noise_of(column) if good else 0.0 for column, good in zip(values.T, finite, strict=True)])
-    if not spans.any():
-        return list(range(values.shape[1]))
-    usual = np.median(noise[spans > 0])
-    return [k for k in range(values.shape[1]) if spans[k] > 0 and noise[k] >= QUIET_SHARE * usual]
+    columns = [column if np.isfinite(column).all() else np.zeros(1) for column in values.T]
+    varying = [k for k, column in enumerate(columns) if np.ptp(column) > 0.0]
+    if not varying:
+        return list(range(len(columns)))
+    noise = {k: noise_of(columns[k]) for k in varying}
+    usual = float(np.median(list(noise.values())))
+    return [k for k in varying if noise[k] >= QUIET_SHARE * usual]
 
 
 def _most_alike(values: Array, alive: list[int], count: int) -> list[int]:

@@ -145,8 +145,9 @@ class FrameLayout:
         return [self._of_three(field, number) for field, number in zip(self.fields, numbers, strict=True)]
 
     def _of_three(self, field: Field, number: Any) -> Any:
-        order = "big" if self.byte_order == "big" else "little"
-        return int.from_bytes(number, order, signed=field.kind == "i24") if field.is_triple else number
+        if not field.is_triple:
+            return number
+        return int.from_bytes(number, "big" if self.byte_order == "big" else "little", signed=field.kind == "i24")
 
     def encode(self, frame: Frame) -> bytes:
         """The bytes of a frame without stuffing; its values go into the channels in their order.

@@ -237,6 +237,7 @@ class Port:
 
     def _read_by_pyserial(self, timeout_s: float) -> bytes:
         assert self._serial is not None
+        assert not isinstance(self._serial, UdpSocket)
         if timeout_s != self._silence_s:  # to set it costs pyserial a system call
             self._serial.timeout = timeout_s
         first: bytes = self._serial.read(1)
@@ -245,6 +246,8 @@ class Port:
 
 def _ask_for_low_latency(port: "serial.SerialBase | UdpSocket") -> None:
     """Turn off the 16 ms for which USB adapters collect bytes; a port without that mode raises an error of its own."""
+    if isinstance(port, UdpSocket):
+        return
     try:
         port.set_low_latency_mode(True)
     except (AttributeError, NotImplementedError, OSError, ValueError):
@@ -252,7 +255,9 @@ def _ask_for_low_latency(port: "serial.SerialBase | UdpSocket") -> None:
 
 
 def _descriptor(port: "serial.SerialBase | UdpSocket") -> int | None:
-    """The file descriptor; None for ports that exist only inside pyserial."""
+    """The file descriptor; None for ports that exist only inside pyserial, and for datagrams, which are not cut."""
+    if isinstance(port, UdpSocket):
+        return None
     try:
         return int(port.fileno())
     except (AttributeError, io.UnsupportedOperation):

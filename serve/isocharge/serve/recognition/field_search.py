@@ -144,8 +144,8 @@ def split_frame(rows: Bytes, end: int, rate_Hz: float, *, needs_sync: bool, orde
 
 def _split(rows: Bytes, end: int, order: str, rate_Hz: float, needs_sync: bool) -> Split | None:
     constant = (rows[:, :end] == _usual(rows[:, :end])).mean(axis=0) >= CONSTANT_SHARE
-    prices, nexts = np.full(end + 1, np.inf), [()] * (end + 1)  # type: list[tuple[Part, ...]]
-    prices[end] = 0.0
+    prices: list[float] = [np.inf] * end + [0.0]
+    nexts: list[tuple[Part, ...]] = [()] * end
     columns = [_fields_at(rows, at, end, order, rate_Hz, constant) for at in range(end)]
     for at in range(end - 1, -1, -1):
         for price, parts in _options(columns, at, end, constant):
@@ -153,16 +153,15 @@ def _split(rows: Bytes, end: int, order: str, rate_Hz: float, needs_sync: bool) 
             total = price + prices[last.at + last.size]
             if total < prices[at]:
                 prices[at], nexts[at] = total, parts
-    begin, price = min(
-        _begins(rows, constant, needs_sync), key=lambda begin: begin[1] + prices[begin[0]], default=(0, np.inf)
-    )
+    begins = _begins(rows, constant, needs_sync)
+    begin, price = min(begins, key=lambda begin: begin[1] + prices[begin[0]], default=(0, np.inf))
     if not np.isfinite(price + prices[begin]):
         return None
-    parts, at = [Part(Role.sync, 0, begin)] if begin else [], begin
+    chain, at = [Part(Role.sync, 0, begin)] if begin else [], begin
     while at < end:
-        parts += nexts[at]
-        at = parts[-1].at + parts[-1].size
-    return Split(float(price + prices[begin]), tuple(parts), order)
+        chain += nexts[at]
+        at = chain[-1].at + chain[-1].size
+    return Split(float(price + prices[begin]), tuple(chain), order)
 
 
 def _usual(rows: Bytes) -> Bytes:

@@ -59,7 +59,8 @@ class Windows:
         """The bytes of the windows from `turn` on, shape (frames, length + extra)."""
         size = self.length + extra
         starts = self.starts[self.starts + turn + size <= len(self.stream)] + turn
-        return self.stream[starts[:, None] + np.arange(size)]
+        rows: Bytes = self.stream[starts[:, None] + np.arange(size)]
+        return rows
 
 
 def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Windows]:
