@@ -175,7 +175,7 @@ def diagnosed(command, tmp_path, plug_in, board):
         plugged = plug_in(board(kind.encode, np.array(PRESSES[kind.model]), kind.line, **kind.options))
         path = tmp_path / name
         code, out, err = command(
-            "serve", "doctor", "--port", plugged.url, "--seconds", "1", "--model", kind.model, "--write", path, *words
+            "serve", "doctor", "--port", plugged.url, "--seconds", "0.8", "--model", kind.model, "--write", path, *words
         )
         assert code == 0, out + err
         return plugged, path, out
@@ -185,8 +185,8 @@ def diagnosed(command, tmp_path, plug_in, board):
 
 def touch(command, plugged, path, model):
     """The mean of position (mm) and force (N) over the end of a press, and all records."""
-    plugged.press_in(1.2)
-    code, out, err = command("serve", "stream", model, "--port", plugged.url, "--device", path, "--count", "700")
+    plugged.press_in(0.8)
+    code, out, err = command("serve", "stream", model, "--port", plugged.url, "--device", path, "--count", "500")
     assert code == 0, err
     records = [json.loads(line) for line in out.splitlines()]
     pressed = [record for record in records if record["contact"]][20:]
@@ -208,7 +208,7 @@ def test_a_board_gets_to_a_right_touch(name, diagnosed, command):
     assert (np.diff(clock) > 0).all()
 
 
-@pytest.mark.parametrize("name", [name for name, kind in ZOO.items() if kind.asks])
+@pytest.mark.parametrize("name", ["offset binary", "CSV counts, dead inputs", "volts"])
 def test_what_cannot_be_seen_is_asked_for(name, diagnosed, command):
     """Raw counts are never called pC, and a file without their charge is refused, not guessed."""
     kind = ZOO[name]

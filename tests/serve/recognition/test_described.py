@@ -56,7 +56,9 @@ class RandomBoard:
         bits = 0 if self.kind == "f32" else int(self.kind[1:])
         noise = rng.uniform(0.1, 1.0) if not bits else 10 ** rng.uniform(0.8, {16: 2.0}.get(bits, 3.8))
         zero = 1 << (bits - 1) if self.kind[0] == "u" else 0
-        self.values = zero + rng.uniform(-40, 40, self.electrodes) * noise + rng.normal(0, noise, (FRAMES, self.electrodes))
+        self.values = (
+            zero + rng.uniform(-40, 40, self.electrodes) * noise + rng.normal(0, noise, (FRAMES, self.electrodes))
+        )
         self.values = np.round(self.values) if bits else self.values.astype(np.float32)
         self.first, self.uptime = int(rng.integers(60_000)), int(rng.integers(1 << 32))
         self.data = b"".join(map(self.frame, range(FRAMES)))[int(rng.integers(9)) :]
