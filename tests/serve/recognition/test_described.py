@@ -169,7 +169,7 @@ def test_a_cyclic_check_without_a_name_is_described():
         (lambda k, q: f"{(5 * k) % 65536};{q};7", {}),
         (lambda k, q: f'{{"i": {k}, "at": {1.7e9 + k / 500:.4f}, "x": {q}}}', {"seq": "i", "t_s": "at"}),
         (lambda k, q: f"micros:{2000 * k},q:{q}", {"t_us": "micros"}),
-        (lambda k, q: f"A:{q},B:{q + 0.5}", {}),
+        (lambda _, q: f"A:{q},B:{q + 0.5}", {}),
     ],
 )
 def test_number_and_clock_in_text(lines, expected):

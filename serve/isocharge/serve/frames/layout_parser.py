@@ -79,7 +79,7 @@ class DescribedParser:
             self.counts.refuse(dropped, damaged=True)
             return None
         try:
-            if any(data[at : at + len(constant)] != constant for at, constant in layout.constants):
+            if layout.constants and any(not data.startswith(constant, at) for at, constant in layout.constants):
                 raise ValueError("other constant bytes than the layout's")
             frame = self._frame(
                 layout.counts(data) if self._has_triples else layout.body.unpack_from(data, len(layout.sync))

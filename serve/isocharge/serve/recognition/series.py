@@ -32,7 +32,8 @@ def steps(values: Series, bits: int) -> Series:
     modulus = 1 << bits
     if bits == 64:
         return np.diff(values.astype(np.uint64)).astype(np.int64)
-    wrapped: Series = np.diff(values.astype(np.int64)) & np.int64(modulus - 1)
+    difference: Series = np.diff(values.astype(np.int64))
+    wrapped = difference % modulus
     return np.where(wrapped >= modulus // 2, wrapped - modulus, wrapped)
 
 
