@@ -11,7 +11,7 @@ import numpy as np
 from isocharge.serve.examination.capture import Capture, read_frames
 from isocharge.serve.examination.channel_health import MAINS_HZ, ChannelHealth, channel_health
 from isocharge.serve.examination.listening import BAUDS, Heard, listen
-from isocharge.serve.examination.proposal import Gain, Proposal, propose
+from isocharge.serve.examination.proposal import Gain, Proposal, propose, unit_of
 from isocharge.serve.live.channels import position_of
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.live.device_file import device_from_table
@@ -98,12 +98,23 @@ def examine(
     """
     heard = listen(url, bauds, seconds, request or device.frames.request, lambda part: _is_clear(part, device))
     if device is not ANY_BOARD:
-        return _examination(heard, device, Proposal(dict(device.table), "pC", electrodes), is_proposed=False)
+        return _examination(heard, device, Proposal(dict(device.table), _unit(heard, device), electrodes))
     proposal = propose(heard, "board", electrodes, Gain(gain or {}))
     if proposal is None:
-        return _examination(heard, device, Proposal({}, "pC", electrodes), is_proposed=True)
+        return _examination(heard, device, Proposal({}, "pC", electrodes))
     table = {key: value for key, value in proposal.table.items() if not (key == "gain" and proposal.needs_gain)}
-    return _examination(heard, device_from_table(table, "board"), proposal, is_proposed=True)
+    proposed = device_from_table(table, "board")
+    if proposed.gain is not None:
+        proposed.gain.pC_per_unit(proposal.electrodes)  # refuses numbers for other electrodes
+    return _examination(heard, proposed, proposal)
+
+
+def _unit(heard: Heard, device: Device) -> str:
+    """The unit of the channels behind the gain of a device."""
+    capture = read_frames(heard, device)
+    if device.gain is not None or not capture.frames:
+        return "pC"
+    return unit_of(capture.parser.format, capture.names, capture.values()[0])
 
 
 def _is_clear(heard: Heard, device: Device) -> bool:
@@ -117,7 +128,7 @@ def _is_clear(heard: Heard, device: Device) -> bool:
     )
 
 
-def _examination(heard: Heard, device: Device, proposal: Proposal, *, is_proposed: bool) -> Examination:
+def _examination(heard: Heard, device: Device, proposal: Proposal) -> Examination:
     capture = read_frames(heard, device)
     used = _used(capture, device)
     channels = tuple(_channels(capture, device, used))
@@ -141,7 +152,7 @@ def _examination(heard: Heard, device: Device, proposal: Proposal, *, is_propose
         channels=channels,
         unused=unused,
         missing=tuple(missing),
-        device=proposal.table if capture.frames or not is_proposed else {},
+        device=proposal.table,
     )
 
 
@@ -177,7 +188,10 @@ def _missing(
         yield "not one byte came: check power and cable, and whether the board sends unasked (if not: --request)"
         return
     if not capture.frames:
-        yield "bytes come, but no frames: another baud rate (--baud), or a format for a device file (--device)"
+        yield (
+            "bytes come, but no frames: another baud rate (--baud), or a format for a device file (--device); a board "
+            "without noise shows its channels only while the film is touched"
+        )
         return
     if capture.share < CLEAN_SHARE:
         yield f"{1 - capture.share:.1%} of the bytes are no good frames: a bad cable, or a rate that is a little off"

@@ -12,6 +12,7 @@ import numpy as np
 from isocharge.arrays import Array
 from isocharge.serve.examination.capture import Capture, read_frames
 from isocharge.serve.examination.listening import Heard
+from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.live.channels import electrode_of
 from isocharge.serve.live.device_file import device_from_table
 from isocharge.serve.recognition.recognise import recognise
@@ -29,6 +30,9 @@ BITS = range(8, 32)
 
 REST_SIGMAS = 20.0
 """A rest that is farther from zero than this is an offset, in standard deviations of the noise."""
+
+LARGEST_STILL_PC = 20.0
+"""Largest whole number that never changes and is taken for a charge, pC."""
 
 LARGEST_V, LARGEST_NOISE_V = 12.0, 0.02
 """Largest value and noise of a board that sends volts, V: charges of a film have more noise, in pC."""
@@ -101,7 +105,7 @@ def propose(heard: Heard, name: str, electrodes: tuple[str, ...], gain: Gain) ->
     if not capture.frames:
         return None
     values, _ = capture.values()
-    unit = "pC" if gain.settings else _unit(frames, capture.names, values)
+    unit = "pC" if gain.settings else unit_of(capture.parser.format, capture.names, values)
     chosen = _chosen(capture, values, electrodes)
     table: dict[str, Any] = {"name": name, "frames": frames}
     if chosen:
@@ -113,12 +117,22 @@ def propose(heard: Heard, name: str, electrodes: tuple[str, ...], gain: Gain) ->
     return Proposal(table, unit, electrodes or tuple(chosen), unused, bool(chosen))
 
 
-def _unit(frames: Mapping[str, Any], names: Sequence[str], values: Array) -> str:
-    """The unit of the values where nothing is known of the gain: numbers with a fraction are taken as pC."""
-    if frames["format"] == "binary" or all(channel.endswith("_pC") for channel in names):
+def unit_of(format_name: str, names: Sequence[str], values: Array) -> str:
+    """The unit of the values where nothing is known of the gain: numbers with a fraction are taken as pC.
+
+    Args:
+        format_name: The format of the frames, for people; our binary frames hold pC.
+        names: Of the channels.
+        values: Shape (n, channels).
+
+    Returns:
+        "pC", "counts" or "V".
+    """
+    if format_name == BinaryParser.format or all(channel.endswith("_pC") for channel in names):
         return "pC"
     finite = values[np.isfinite(values).all(axis=1)]
-    if not len(finite) or not np.ptp(finite, axis=0).any():
+    varies = bool(len(finite)) and bool(np.ptp(finite, axis=0).any())
+    if not varies and not np.abs(finite).max(initial=0.0) > LARGEST_STILL_PC:
         return "pC"
     if bool((finite == np.round(finite)).all()):
         return "counts"

@@ -12,7 +12,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from isocharge.serve.recognition.clock_unit import is_usual
+from isocharge.serve.recognition.clock_unit import clock_name, is_usual
 from isocharge.serve.recognition.framing import Bytes
 from isocharge.serve.recognition.series import (
     Series,
@@ -64,6 +64,9 @@ PRICE_OF_SHORT_SYNC, PRICE_OF_DULL_SYNC = 1.2, 0.7
 
 DULL = (0x00, 0x80, 0xFF)
 """Bytes that are often the high ones of a number, and seldom of a sync."""
+
+CLOCK_RESOLUTION = 1e-3
+"""Finest jitter of a floating-point clock that counts, in its step."""
 
 PRICE_OF_ODD_CLOCK = 8.0
 """For a clock that ticks at no usual rate, bits."""
@@ -231,9 +234,11 @@ def _float_at(rows: Bytes, part: Part, order: str, rate_Hz: float) -> Iterator[P
     if not np.ptp(values.astype(float)):
         yield PRICE_OF_DEAD, part
         return
-    ticks = clock_step(np.diff(values.astype(float)))
-    if ticks is not None and is_usual(ticks * rate_Hz):
-        yield PRICE_OF_COUNTER, Part(Role.clock, part.at, part.size, is_float=True)
+    step = np.diff(values.astype(float))
+    ticks = clock_step(step)
+    if ticks is not None and clock_name(ticks * rate_Hz)[1] == 1.0:
+        price = PRICE_OF_COUNTER + bits_of_steps((step - ticks) / (CLOCK_RESOLUTION * ticks))
+        yield price, Part(Role.clock, part.at, part.size, is_float=True)
     yield max(1.0, bits - FLOAT_BONUS[part.size]), part
 
 
