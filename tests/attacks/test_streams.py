@@ -20,6 +20,7 @@ from isocharge.serve import (
 )
 from isocharge.serve.frames.cobs import cobs_encode
 from isocharge.serve.frames.layout_parser import DescribedParser, described_parser
+from isocharge.serve.recognition.recognise import recognise
 
 FRAMES = [Frame(seq, 5000 * seq, (800.0 + seq, 700.0 - seq, 900.5), 0, ("A", "B", "C")) for seq in range(6)]
 
@@ -104,6 +105,25 @@ def test_frames_with_faults(name, attack, faults):
         return data[:cut], data[cut:]
 
     attack(f"frames {name}", read, pieces, 90_000)
+
+
+def test_recognition_of_frames_with_faults(attack, faults):
+    """Whatever a board sends, what is recognised of it is a device file, or nothing."""
+    mutated, _ = faults
+    goods = [data for _, data in FORMATS.values()]
+
+    def read(chunks):
+        table = recognise(chunks, 1.0, are_datagrams=len(chunks) > 1)
+        if table is not None:
+            parser = device_from_table({"frames": table}, "attack").parser()
+            for chunk in chunks:
+                parser.feed(chunk)
+
+    def chunks(rng):
+        data = mutated(rng, rng.choice(goods) * rng.choice((1, 3, 10)))
+        return [data] if rng.random() < 0.7 else [data[at : at + 40] for at in range(0, len(data), 40)]
+
+    attack("recognition", read, chunks, 4_000)
 
 
 def test_bombs(attack):

@@ -177,3 +177,15 @@ def test_number_and_clock_in_text(lines, expected):
     rng = np.random.default_rng(0)
     text = "\n" + "\n".join(lines(k, round(rng.normal(5.0, 0.3), 3)) for k in range(400)) + "\n"
     assert recognise([text.encode()], 0.8) == {"format": "text"} | expected
+
+
+def test_the_header_of_a_csv_is_written_down():
+    """A board sends it once, at its start: who comes later reads the columns by the device file."""
+    rng = np.random.default_rng(0)
+    lines = [f"{k},{2 * k},{rng.normal(5.0, 0.3):.3f},{rng.normal(5.0, 0.3):.3f}" for k in range(400)]
+    text = "\n".join(["n,millis,north,south", *lines]) + "\n"
+    table = recognise([text.encode()], 0.8)
+    assert table == {"format": "text", "columns": ["seq", "t_ms", "north", "south"]}
+    parser = device_from_table({"frames": table, "channels": {"A": "south"}}, "test").parser()
+    (*_, last) = parser.feed("\n".join(["", *lines[200:], ""]).encode())
+    assert (last.seq, last.t_us, last.names) == (399, 798_000, ("north", "south"))

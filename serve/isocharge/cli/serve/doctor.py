@@ -60,11 +60,15 @@ def doctor_command(
     ] = None,
     V_per_unit: Annotated[
         str | None,
-        typer.Option("--V-per-unit", metavar=GAIN_METAVAR, help="Voltage of one unit, V; with --feedback-pF."),
+        typer.Option(
+            "--V-per-unit", metavar=GAIN_METAVAR, help="Voltage of one unit, V; with --feedback-pF. (default: none)"
+        ),
     ] = None,
     feedback_pF: Annotated[
         str | None,
-        typer.Option("--feedback-pF", metavar=GAIN_METAVAR, help="Feedback capacitance of the amplifiers, pF."),
+        typer.Option(
+            "--feedback-pF", metavar=GAIN_METAVAR, help="Feedback capacitance of the amplifiers, pF. (default: none)"
+        ),
     ] = None,
     request: Annotated[
         str | None,
@@ -75,7 +79,7 @@ def doctor_command(
         ),
     ] = None,
     request_Hz: Annotated[
-        float, typer.Option("--request-Hz", min=0.1, max=1e5, help="Requests per second, at most.")
+        float, typer.Option("--request-Hz", min=0.1, max=1e5, help="Rate of the requests, at most, Hz.")
     ] = 100.0,
     json: JsonOption = False,
 ) -> None:
@@ -183,7 +187,8 @@ def report_lines(examination: "Examination") -> Iterator[str]:
         yield _HEAD.replace("pC", {"counts": "ct", "V": " V"}.get(examination.unit, "pC"))
     for channel in examination.channels:
         figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
-        columns = zip(figures, (12, 11, 12, 10, 10), (2, 3, 2, 2, 2), strict=True)
+        digits = (5, 6, 5, 5, 5) if examination.unit == "V" else (2, 3, 2, 2, 2)
+        columns = zip(figures, (12, 11, 12, 10, 10), digits, strict=True)
         yield f"{channel.name:8.8s}" + "".join(_column(*column) for column in columns)
     yield "missing to get a touch: nothing" if not examination.missing else "missing to get a touch:"
     yield from (f"- {sentence}" for sentence in examination.missing)

@@ -212,4 +212,5 @@ def _offset(column: Array) -> float | int:
 
 def _rounded(rest: float) -> float | int:
     """A rest to six digits; whole if it is large."""
-    return round(rest) if abs(rest) >= 1000.0 else float(f"{rest:.6g}")
+    value = float(f"{rest:.6g}")
+    return round(rest) if abs(rest) >= 1000.0 or value.is_integer() else value

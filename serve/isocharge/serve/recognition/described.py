@@ -25,6 +25,9 @@ from isocharge.serve.recognition.series import clock_step, steps
 MOST_FRAMES = 300
 """Frames that are examined."""
 
+MOST_BEGINS = 6
+"""Bytes at each end of a run of constant bytes at which a frame may begin."""
+
 PRICE_WITHOUT_CHECK = 4.0
 """For frames without a checksum, bits: most have one."""
 
@@ -91,7 +94,7 @@ def _rate_Hz(windows: Windows, chunks: Sequence[bytes], seconds: float) -> float
 def _ways(windows: Windows, rate_Hz: float) -> Iterator[Way]:
     """Every begin and checksum that the frames may have."""
     needs_sync = windows.framing == SYNC
-    turns = [turn for turn in windows.turns if not needs_sync or _is_constant(windows.rows(turn)[:, 0])]
+    turns = _turns(windows) if needs_sync else windows.turns
     has_check = False
     for turn in turns:
         rows = windows.rows(turn)[:MOST_FRAMES]
@@ -112,8 +115,21 @@ def _ways(windows: Windows, rate_Hz: float) -> Iterator[Way]:
             yield Way(windows, replace(NO_CHECK, turn=turn), split, split.price + PRICE_WITHOUT_CHECK)
 
 
-def _is_constant(column: Bytes) -> bool:
-    return bool(len(column)) and float(np.bincount(column).max()) >= CONSTANT_SHARE * len(column)
+def _turns(windows: Windows) -> list[int]:
+    """Where a frame may begin: at a constant byte, near the begin or the end of its run of such bytes."""
+    rows = windows.rows()
+    constant = [float(np.bincount(column).max()) >= CONSTANT_SHARE * len(column) for column in rows.T]
+    if all(constant) or not len(rows):
+        return []
+    length, first = len(constant), constant.index(False)
+    turns, run = [], []
+    for turn in (*range(first, length), *range(first + 1)):  # once round, from a byte that varies
+        if constant[turn]:
+            run.append(turn)
+            continue
+        turns += run[:MOST_BEGINS] + run[MOST_BEGINS:][-MOST_BEGINS:]
+        run = []
+    return turns
 
 
 def _table(way: Way, rate_Hz: float) -> dict[str, Any]:

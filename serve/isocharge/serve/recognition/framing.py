@@ -18,7 +18,7 @@ from isocharge.serve.frames.stuffing import STUFFINGS, Stuffing
 
 Bytes = NDArray[np.uint8]
 
-SHORTEST, LONGEST = 4, 512
+SHORTEST, LONGEST = 4, 256
 """Shortest and longest frame that is looked for, bytes."""
 
 FEWEST = 5

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.frames.text import TextParser
-from isocharge.serve.frames.text_lines import SEQ
+from isocharge.serve.frames.text import Layout, TextParser
+from isocharge.serve.frames.text_lines import SEQ, Notation
 from isocharge.serve.recognition.clock_unit import text_clock_name
 from isocharge.serve.recognition.framing import FEWEST
 from isocharge.serve.recognition.series import Series, clock_step, is_counter
@@ -30,7 +30,7 @@ def text_frames(chunks: Sequence[bytes], seconds: float) -> tuple[dict[str, Any]
         return None
     meanings = _meanings(frames, len(frames) / seconds)
     share = 1.0 - parser.counts.bytes_dropped / max(1, sum(map(len, chunks)))
-    return {"format": "text"} | _table(frames[-1], meanings), share
+    return {"format": "text"} | _table(parser.layout, frames[-1], meanings), share
 
 
 def _meanings(frames: Sequence[Frame], rate_Hz: float) -> dict[str, int]:
@@ -55,8 +55,16 @@ def _clock(step: Series, rate_Hz: float) -> str | None:
     return None if ticks is None else text_clock_name(ticks * rate_Hz)
 
 
-def _table(frame: Frame, meanings: dict[str, int]) -> dict[str, Any]:
-    """The keys of a device file; columns without names get names, once one of them has a meaning."""
+def _table(layout: Layout, frame: Frame, meanings: dict[str, int]) -> dict[str, Any]:
+    """The keys of a device file; columns without names get names, once one of them has a meaning.
+
+    The header of a CSV is written down: who comes later will not see it.
+    """
+    if layout.notation is Notation.csv and layout.names:
+        columns = list(layout.names)
+        for key, position in meanings.items():
+            columns[layout.channels[position]] = key
+        return {"columns": columns}
     if frame.names:
         return {key: frame.names[position] for key, position in meanings.items()}
     if not meanings:
