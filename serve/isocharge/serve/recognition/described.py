@@ -19,7 +19,7 @@ from isocharge.serve.recognition.field_search import (
     number_values,
     split_frame,
 )
-from isocharge.serve.recognition.framing import Bytes, Windows, framings
+from isocharge.serve.recognition.framing import MOST_BYTES, Bytes, Windows, framings
 from isocharge.serve.recognition.series import clock_step, steps
 
 MOST_FRAMES = 300
@@ -46,16 +46,20 @@ def described_frames(chunks: Sequence[bytes], seconds: float, *, are_datagrams: 
         are_datagrams: Whether each chunk is a datagram.
     """
     for _, group in groupby(framings(chunks, are_datagrams=are_datagrams), key=lambda windows: windows.framing):
-        ways = (way for windows in group for way in _ways(windows, _rate_Hz(windows, chunks, seconds)))
-        best = min((way for way in ways if way.has_channels), key=lambda way: way.price_per_byte, default=None)
+        readings = (reading for windows in group for reading in _readings(windows, _rate_Hz(windows, chunks, seconds)))
+        best = min(
+            (reading for reading in readings if reading.has_channels),
+            key=lambda reading: reading.price_per_byte,
+            default=None,
+        )
         if best is not None:
             return _table(best, _rate_Hz(best.windows, chunks, seconds))
     return None
 
 
 @dataclass(frozen=True)
-class Way:
-    """A way to read windows.
+class Reading:
+    """One of the readings that windows allow.
 
     Attributes:
         windows: The frames.
@@ -83,15 +87,14 @@ class Way:
 
 
 def _rate_Hz(windows: Windows, chunks: Sequence[bytes], seconds: float) -> float:
-    """Frames per second of a whole stream."""
-    share = (
-        min(1.0, len(windows.stream) / max(1, sum(map(len, chunks)))) if windows.framing in (SYNC, DATAGRAM) else 1.0
-    )
-    frames = len(windows.stream) / windows.length if windows.framing in (SYNC, DATAGRAM) else len(windows.starts)
-    return frames / (seconds * share)
+    """Frames per second of a whole stream, of which the windows may be the first part."""
+    size = sum(map(len, chunks))
+    if windows.framing in (SYNC, DATAGRAM):
+        return size / windows.length / seconds
+    return len(windows.starts) / (seconds * min(1.0, MOST_BYTES / size))
 
 
-def _ways(windows: Windows, rate_Hz: float) -> Iterator[Way]:
+def _readings(windows: Windows, rate_Hz: float) -> Iterator[Reading]:
     """Every begin and checksum that the frames may have."""
     needs_sync = windows.framing == SYNC
     turns = _turns(windows) if needs_sync else windows.turns
@@ -108,18 +111,18 @@ def _ways(windows: Windows, rate_Hz: float) -> Iterator[Way]:
             )
             if split is not None:
                 has_check = True
-                yield Way(windows, check, split, split.price - BONUS_OF_CHECK * check.size)
+                yield Reading(windows, check, split, split.price - BONUS_OF_CHECK * check.size)
     for turn in turns if not has_check else ():
         split = split_frame(windows.rows(turn)[:MOST_FRAMES], windows.length, rate_Hz, needs_sync=needs_sync)
         if split is not None:
-            yield Way(windows, replace(NO_CHECK, turn=turn), split, split.price + PRICE_WITHOUT_CHECK)
+            yield Reading(windows, replace(NO_CHECK, turn=turn), split, split.price + PRICE_WITHOUT_CHECK)
 
 
 def _turns(windows: Windows) -> list[int]:
     """Where a frame may begin: at a constant byte, near the begin or the end of its run of such bytes."""
     rows = windows.rows()
-    constant = [float(np.bincount(column).max()) >= CONSTANT_SHARE * len(column) for column in rows.T]
-    if all(constant) or not len(rows):
+    constant = [float(np.bincount(column, minlength=1).max()) >= CONSTANT_SHARE * len(column) for column in rows.T]
+    if all(constant):
         return []
     length, first = len(constant), constant.index(False)
     turns, run = [], []
@@ -132,8 +135,8 @@ def _turns(windows: Windows) -> list[int]:
     return turns
 
 
-def _table(way: Way, rate_Hz: float) -> dict[str, Any]:
-    windows, check, split = way.windows, way.check, way.split
+def _table(reading: Reading, rate_Hz: float) -> dict[str, Any]:
+    windows, check, split = reading.windows, reading.check, reading.split
     rows = windows.rows(check.turn)[:MOST_FRAMES]
     sync = sum(part.size for part in split.parts if part.role is Role.sync)
     table: dict[str, Any] = {"format": "described"}
