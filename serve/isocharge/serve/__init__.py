@@ -30,8 +30,9 @@ from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
 from isocharge.serve.port.serial_port import Chunk, Port
 from isocharge.serve.port.source import open_source
 from isocharge.serve.prediction.check import Check, check_presses
+from isocharge.serve.prediction.contact import Contact, Contacts
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, read_presses, write_presses
-from isocharge.serve.prediction.predictor import Contact, Contacts, Predictor
+from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
 from isocharge.serve.prediction.validity import Domain

@@ -5,6 +5,7 @@
 | `tare` | no tare yet, so no contact either |
 | `outside` | the position is outside the working area, or the force outside the range, that the model was trained for |
 | `misfit` | the charges fit no single contact: misfit above 5, and above what one good press in a thousand has |
+| `beyond` | the force is more than three times the largest, or the misfit above 100: the numbers mean nothing |
 | `gap` | frames are missing before this one |
 | `repeat` | this frame has the number of the one before |
 | `restart` | the frame numbers went back: the device was restarted |
@@ -19,6 +20,7 @@
 TARE = "tare"
 OUTSIDE = "outside"
 MISFIT = "misfit"
+BEYOND = "beyond"
 GAP = "gap"
 REPEAT = "repeat"
 RESTART = "restart"

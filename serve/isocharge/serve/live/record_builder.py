@@ -30,7 +30,7 @@ class RecordBuilder:
     def of(cls, predictor: Predictor) -> "RecordBuilder":
         """The builder for a model."""
         metadata = predictor.metadata
-        return cls(predictor, Domain.of(metadata), metadata.electrodes, metadata.label, metadata.frame_id)
+        return cls(predictor, predictor.domain, metadata.electrodes, metadata.label, metadata.frame_id)
 
     def record(
         self, chunk: Chunk, frame: Frame, reading: Reading, when: ReadingTime, now_ns: Callable[[], int]

@@ -14,8 +14,9 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import ChargeError
+from isocharge.serve.prediction.contact import Contacts
 from isocharge.serve.prediction.csv_numbers import CsvNumbers, ignored_words
-from isocharge.serve.prediction.predictor import Contacts, Predictor
+from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.prediction.validity import Domain
 
@@ -60,12 +61,22 @@ def read_charges(
     return np.frombuffer(charges, dtype=np.float64).reshape(-1, len(electrodes))
 
 
-def write_contacts(contacts: Contacts, out: TextIO) -> None:
-    """Write contacts as CSV, a row for each press, columns as in `Contact`, numbers to six decimals."""
+def write_contacts(contacts: Contacts, out: TextIO, domain: Domain | None = None) -> None:
+    """Write contacts as CSV, a row for each press, columns as in `Contact`, numbers to six decimals.
+
+    Args:
+        contacts: The contacts.
+        out: Receives the text.
+        domain: Where their model may be trusted: adds a column `flags`, words with blanks between.
+    """
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(Contacts._fields)
+    writer.writerow(Contacts._fields + ("flags",) * (domain is not None))
     for block in blocks(np.column_stack(contacts)):
-        writer.writerows([f"{value:.6f}" for value in row] for row in block.tolist())
+        cells = [[f"{value:.6f}" for value in row] for row in block.tolist()]
+        if domain is not None:
+            for row, flags in zip(cells, domain.batch_flags(Contacts(*block.T)), strict=True):
+                row.append(" ".join(flags))
+        writer.writerows(cells)
 
 
 def blocks(rows: Array) -> Iterator[Array]:
@@ -86,7 +97,7 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
 
 def _block_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
     metadata, contacts = predictor.metadata, predictor.predict_batch(charge_pC)
-    flags = Domain.of(metadata).batch_flags(contacts)
+    flags = predictor.domain.batch_flags(contacts)
     for charges, contact, its_flags in zip(charge_pC.tolist(), np.column_stack(contacts).tolist(), flags, strict=True):
         yield PredictionRecord(
             timestamp=None,

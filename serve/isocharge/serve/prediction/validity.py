@@ -1,4 +1,4 @@
-"""The flags `outside` and `misfit`: the check of contacts against the domain that a model was trained for."""
+"""The flags `outside`, `misfit` and `beyond`: the check of contacts against the domain that a model was trained for."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,12 +6,15 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.arrays import Array, Booleans, Reals
-from isocharge.serve.flags import MISFIT, OUTSIDE
+from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.prediction.predictor import Contact, Contacts
+from isocharge.serve.prediction.contact import Contact, Contacts
 
 MISFIT_LIMIT = 5.0
 """Smallest limit of the misfit, in standard deviations; a model may state a larger one, that of 0.1 % of presses."""
+
+BEYOND_FORCE, BEYOND_MISFIT = 3.0, 100.0
+"""Multiple of the largest force, and misfit in standard deviations, from which the answer is no measurement at all."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,11 @@ class Domain:
         limit = max(MISFIT_LIMIT, metadata.errors.get("misfit_p999", MISFIT_LIMIT))
         return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit)
 
+    @property
+    def beyond_N(self) -> float:
+        """Force above which an answer is no measurement, N."""
+        return BEYOND_FORCE * self.force_range_N[1]
+
     @cached_property
     def safe_mm2(self) -> float:
         """Squared radius of the largest disk about the origin inside the area, mm^2; 0 if the origin is outside."""
@@ -45,7 +53,7 @@ class Domain:
         return float(nearest) if inside_polygon(zero, zero, self.corners_mm)[0] else 0.0
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
-        """The flags of one contact."""
+        """The flags of one contact, a quarter of a microsecond where there are none."""
         low, high = self.force_range_N
         inside = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm < self.safe_mm2
         if inside and low <= contact.force_N <= high and contact.misfit <= self.misfit_limit:
@@ -58,9 +66,12 @@ class Domain:
         outside = ~inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm)
         outside |= (contacts.force_N < low) | (contacts.force_N > high)
         misfit = contacts.misfit > self.misfit_limit
+        beyond = (contacts.force_N > self.beyond_N) | (contacts.misfit > BEYOND_MISFIT)
+        if not (outside | misfit | beyond).any():
+            return [()] * len(outside)
         return [
-            (OUTSIDE,) * is_outside + (MISFIT,) * is_misfit
-            for is_outside, is_misfit in zip(outside.tolist(), misfit.tolist(), strict=True)
+            (OUTSIDE,) * is_outside + (MISFIT,) * is_misfit + (BEYOND,) * is_beyond
+            for is_outside, is_misfit, is_beyond in zip(outside.tolist(), misfit.tolist(), beyond.tolist(), strict=True)
         ]
 
 
