@@ -7,6 +7,8 @@
 The packages follow the way of a frame; `serve/README.md` shows them.
 """
 
+from typing import TYPE_CHECKING
+
 from isocharge.serve.frames.autodetect import AutoParser
 from isocharge.serve.frames.binary import BinaryParser, encode_frame
 from isocharge.serve.frames.frame import Frame, FrameCounts, Parser
@@ -44,6 +46,7 @@ from isocharge.serve.signal_chain.tare import Tare, TareRule
 from isocharge.serve.virtual_sensor.faults import Faults
 from isocharge.serve.virtual_sensor.script import Script, read_script, wander
 from isocharge.serve.virtual_sensor.sensor import Truth, VirtualSensor
+from isocharge.versions import version_attribute
 
 __all__ = [
     "AutoParser",
@@ -112,3 +115,7 @@ __all__ = [
     "write_model",
     "write_presses",
 ]
+
+__version__: str
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for a text
+    __getattr__ = version_attribute(__name__)
