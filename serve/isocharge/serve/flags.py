@@ -4,8 +4,8 @@
 |---|---|
 | `tare` | no tare yet, so no contact either |
 | `outside` | the position is outside the working area, or the force outside the range, that the model was trained for |
+| `beyond` | more than three times as far or as hard as the model knows: the numbers are no measurement |
 | `misfit` | the charges fit no single contact: misfit above 5, and above what one good press in a thousand has |
-| `beyond` | the force is more than three times the largest, or the misfit above 100: the numbers mean nothing |
 | `gap` | frames are missing before this one |
 | `repeat` | this frame has the number of the one before |
 | `restart` | the frame numbers went back: the device was restarted |
@@ -19,8 +19,8 @@
 
 TARE = "tare"
 OUTSIDE = "outside"
-MISFIT = "misfit"
 BEYOND = "beyond"
+MISFIT = "misfit"
 GAP = "gap"
 REPEAT = "repeat"
 RESTART = "restart"

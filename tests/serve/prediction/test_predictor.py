@@ -207,7 +207,7 @@ def test_what_is_no_measurement_is_said_once(models, film, caplog):
     assert predictor.flags(contact) == ("outside", "beyond")
     predictor.predict([9e9, 9e9, 9e9])
     (message,) = caplog.messages
-    assert re.match(r"linear/1: \[9000000000.0, .* pC are like no press .*: 1.125e\+07 N, misfit 0 are no meas", message)
+    assert re.match(r"linear/1: \[9000000000.0, .* pC are far from any press .* mm, 1.125e\+07 N is no", message)
 
 
 @pytest.mark.parametrize(

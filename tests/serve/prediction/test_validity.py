@@ -36,8 +36,10 @@ def test_inside_polygon_of_a_notched_square(closed):
         ({"misfit": 99.0, "y_mm": -9.0}, ("outside", "misfit")),
         ({"force_N": 5.9}, ("outside",)),
         ({"force_N": 6.1}, ("outside", "beyond")),
-        ({"misfit": 101.0}, ("misfit", "beyond")),
-        ({"force_N": 55_088.0, "misfit": 826.0}, ("outside", "misfit", "beyond")),
+        ({"x_mm": 14.0, "y_mm": -19.0}, ("outside",)),
+        ({"x_mm": 15.0, "y_mm": -20.0}, ("outside", "beyond")),
+        ({"x_mm": 3e38, "force_N": 0.0}, ("outside", "beyond")),
+        ({"force_N": 55_088.0, "misfit": 826.0}, ("outside", "beyond", "misfit")),
     ],
 )
 def test_flags_of_a_contact(film, changes, flags):

@@ -1,10 +1,12 @@
 """`isocharge serve stream`: prediction records from a port as they come."""
 
+import os
 import signal
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,10 +25,13 @@ from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
 from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import log_to_stderr, say
+from isocharge.errors import InputError
 
 if TYPE_CHECKING:
-    from isocharge.serve import Device
-    from isocharge.serve.live.recorded_stream import RecordedStream
+    from isocharge.serve import Device, Predictor
+
+LONGEST_NAME = 100
+"""Characters of a film's name."""
 
 
 def stream_command(
@@ -49,6 +54,15 @@ def stream_command(
             "--record",
             metavar="FILE",
             help="Also write raw bytes and records for `isocharge serve replay`. (default: no)",
+        ),
+    ] = None,
+    name: Annotated[
+        str | None,
+        typer.Option(
+            "--name",
+            metavar="TEXT",
+            help="Name of this film, the `frame_id` of its records: tells two films on one computer apart. "
+            "(default: name of the model's sensor)",
         ),
     ] = None,
     policy: Annotated[
@@ -85,8 +99,9 @@ def stream_command(
     """Follow a sensor live: read its port, and print position (mm) and force (N) for every frame of charges.
 
     The first 100 frames (0.5 s at 200 Hz) are the tare, the charges at rest: leave the film alone meanwhile. The signal
-    SIGUSR1 starts a new tare. Ctrl-C stops. If the reader of stdout is too slow for a sensor, the oldest lines are
-    dropped and counted in the summary; --record gets everything.
+    SIGUSR1 starts a new tare; SIGHUP takes the latest version of MODEL, without losing a frame. Ctrl-C stops. If the
+    reader of stdout is too slow for a sensor, the oldest lines are dropped and counted in the summary; --record gets
+    everything.
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
@@ -95,15 +110,17 @@ def stream_command(
     from isocharge.serve.live.recorded_stream import RecordedStream
 
     predictor, board = Predictor(model, models=models), _board(device, offset_limit_pC)
-    path = TouchStream(predictor, board, policy=Policy(policy.value))
+    path = TouchStream(predictor, board, policy=Policy(policy.value), frame_id=_checked_name(name))
     latencies: deque[float] = deque(maxlen=LATENCIES)
-    recorder = Recorder(record, predictor.metadata.label, policy.value, board.table) if record else None
+    recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name or "") if record else None
     live = RecordedStream(path, recorder)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         stack.enter_context(log_to_stderr())
         source = stack.enter_context(open_source(_awaited(port, wait), baud=baud, reconnect=reconnect))
-        stack.enter_context(_tare_on_signal(live))
+        stack.enter_context(_on_signal("SIGUSR1", live.request_tare))
+        renew = partial(live.request_model, partial(_load, model, models))
+        stack.enter_context(_on_signal("SIGHUP", _unless_hung_up(renew)))
         stack.enter_context(_alarm(seconds))
         lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
         put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
@@ -152,10 +169,41 @@ def _alarm(seconds: float | None) -> Iterator[None]:
 
 
 @contextmanager
-def _tare_on_signal(live: "RecordedStream") -> Iterator[None]:
-    """SIGUSR1 asks for a new tare."""
-    before = signal.signal(signal.SIGUSR1, lambda *_: live.request_tare())
+def _on_signal(name: str, act: Callable[[], object]) -> Iterator[None]:
+    """Act when a signal comes; Windows has none of those that are used."""
+    number = getattr(signal, name, None)
+    if number is None:
+        yield
+        return
+    before = signal.signal(number, lambda *_: act())
     try:
         yield
     finally:
-        signal.signal(signal.SIGUSR1, before)
+        signal.signal(number, before)
+
+
+def _unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
+    """Act, or stop as at Ctrl-C where the signal says that the terminal of this command was closed."""
+    terminals = [number for number in (0, 1, 2) if os.isatty(number)]
+
+    def act_or_stop() -> None:
+        if not all(map(os.isatty, terminals)):
+            raise KeyboardInterrupt
+        act()
+
+    return act_or_stop
+
+
+def _load(model: str, models: Path | None) -> "Predictor":
+    """The latest version of a model; it must answer on this machine as where it was trained."""
+    from isocharge.serve import Predictor, check_golden, find_model, load_model
+
+    folder = find_model(model, models)
+    check_golden(load_model(folder))
+    return Predictor(folder)
+
+
+def _checked_name(name: str | None) -> str | None:
+    if name is not None and not (0 < len(name) <= LONGEST_NAME and name.isprintable()):
+        raise InputError(f"--name: expected 1 to {LONGEST_NAME} printable characters, got {name[:LONGEST_NAME]!r}")
+    return name

@@ -23,7 +23,7 @@ from isocharge.serve.model.repository import find_model
 from isocharge.serve.model.session import OUTPUTS, run
 from isocharge.serve.prediction.bound_press import BoundPress
 from isocharge.serve.prediction.contact import Contact, Contacts
-from isocharge.serve.prediction.validity import BEYOND_MISFIT, Domain
+from isocharge.serve.prediction.validity import Domain
 from isocharge.tables import shown
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,8 @@ class Predictor:
         self._session = loaded.session
         self._domain = Domain.of(loaded.metadata)
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
-        self._most_N, self._warned = self._domain.beyond_N, False
+        self._far_mm2, self._far_N = self._domain.far
+        self._warned = False
         _check_shared(self._press, loaded)
 
     @property
@@ -88,12 +89,13 @@ class Predictor:
             self._press.write(*as_press(charge_pC, self._metadata.electrodes))
         self._press.run()
         contact = Contact(*self._press.read())
-        if contact.force_N > self._most_N or contact.misfit > BEYOND_MISFIT:
+        x_mm, y_mm, force_N, *_ = contact
+        if force_N > self._far_N or x_mm * x_mm + y_mm * y_mm > self._far_mm2:
             self._warn(charge_pC, contact)
         return contact
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
-        """The reasons not to trust a contact of this model: `outside`, `misfit`, `beyond`; none if empty.
+        """The reasons not to trust a contact of this model: `outside`, `beyond`, `misfit`; none if empty.
 
         Three charges and three unknowns: with three electrodes, a wrong charge mostly looks like another press, and
         only one that leads out of the working area or the forces is seen.
@@ -149,10 +151,9 @@ class Predictor:
     def _summary(self) -> Iterator[tuple[str, str]]:
         """What the model takes and where it may be trusted."""
         low, high = self._domain.force_range_N
-        reach = np.linalg.norm(self._domain.corners_mm, axis=1).max()
         yield "sensor", self._metadata.frame_id
         yield "charges", f"{' '.join(self._metadata.electrodes)} (pC)"
-        yield "positions", f"up to {reach:.3g} mm"
+        yield "positions", f"up to {self._domain.reach_mm:.3g} mm"
         yield "forces", f"{low:.3g} to {high:.3g} N"
 
     def _warn(self, charge_pC: object, contact: Contact) -> None:
@@ -160,12 +161,11 @@ class Predictor:
         if not self._warned:
             self._warned = True
             log.warning(
-                "%s: %s pC are like no press that the model knows: %.6g N, misfit %.3g are no measurement; check unit, "
-                "gain and tare. Predictor.flags says so of each contact, this line only once",
+                "%s: %s pC are far from any press that the model knows, and (%.2f, %.2f) mm, %.6g N is no measurement; "
+                "check unit, gain and tare. Predictor.flags says so of each contact, this line only once",
                 self._metadata.label,
                 shown(charge_pC),
-                contact.force_N,
-                contact.misfit,
+                *contact[:3],
             )
 
 

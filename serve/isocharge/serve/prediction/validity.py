@@ -13,8 +13,8 @@ from isocharge.serve.prediction.contact import Contact, Contacts
 MISFIT_LIMIT = 5.0
 """Smallest limit of the misfit, in standard deviations; a model may state a larger one, that of 0.1 % of presses."""
 
-BEYOND_FORCE, BEYOND_MISFIT = 3.0, 100.0
-"""Multiple of the largest force, and misfit in standard deviations, from which the answer is no measurement at all."""
+FAR = 3.0
+"""Multiple of the largest force, and of the working area's reach, beyond which an answer is no measurement."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,15 @@ class Domain:
         limit = max(MISFIT_LIMIT, metadata.errors.get("misfit_p999", MISFIT_LIMIT))
         return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit)
 
-    @property
-    def beyond_N(self) -> float:
-        """Force above which an answer is no measurement, N."""
-        return BEYOND_FORCE * self.force_range_N[1]
+    @cached_property
+    def reach_mm(self) -> float:
+        """Distance of the working area's farthest corner from the origin, mm."""
+        return float(np.linalg.norm(self.corners_mm, axis=1).max())
+
+    @cached_property
+    def far(self) -> tuple[float, float]:
+        """Squared distance from the origin, mm^2, and force, N, beyond which an answer is no measurement."""
+        return (FAR * self.reach_mm) ** 2, FAR * self.force_range_N[1]
 
     @cached_property
     def safe_mm2(self) -> float:
@@ -66,12 +71,14 @@ class Domain:
         outside = ~inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm)
         outside |= (contacts.force_N < low) | (contacts.force_N > high)
         misfit = contacts.misfit > self.misfit_limit
-        beyond = (contacts.force_N > self.beyond_N) | (contacts.misfit > BEYOND_MISFIT)
-        if not (outside | misfit | beyond).any():
+        far_mm2, far_N = self.far
+        with np.errstate(over="ignore"):  # infinity is far, too
+            beyond = (contacts.x_mm**2 + contacts.y_mm**2 > far_mm2) | (contacts.force_N > far_N)
+        if not (outside | misfit).any():
             return [()] * len(outside)
         return [
-            (OUTSIDE,) * is_outside + (MISFIT,) * is_misfit + (BEYOND,) * is_beyond
-            for is_outside, is_misfit, is_beyond in zip(outside.tolist(), misfit.tolist(), beyond.tolist(), strict=True)
+            (OUTSIDE,) * is_outside + (BEYOND,) * is_beyond + (MISFIT,) * is_misfit
+            for is_outside, is_beyond, is_misfit in zip(outside.tolist(), beyond.tolist(), misfit.tolist(), strict=True)
         ]
 
 
