@@ -1,11 +1,8 @@
 """`isocharge serve stream`: prediction records from a port as they come."""
 
-import os
-import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -23,7 +20,7 @@ from isocharge.cli.serve.options import (
 from isocharge.cli.serve.record_output import LATENCIES, record_writer, summary, write_records
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
 from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
-from isocharge.cli.shared.stopping import until_stopped
+from isocharge.cli.shared.stopping import on_signal, stop_after, unless_hung_up, until_stopped
 from isocharge.cli.shared.terminal import log_to_stderr, say
 from isocharge.errors import InputError
 
@@ -118,10 +115,10 @@ def stream_command(
         stack.enter_context(until_stopped())
         stack.enter_context(log_to_stderr())
         source = stack.enter_context(open_source(_awaited(port, wait), baud=baud, reconnect=reconnect))
-        stack.enter_context(_on_signal("SIGUSR1", live.request_tare))
+        stack.enter_context(on_signal("SIGUSR1", live.request_tare))
         renew = partial(live.request_model, partial(_load, model, models))
-        stack.enter_context(_on_signal("SIGHUP", _unless_hung_up(renew)))
-        stack.enter_context(_alarm(seconds))
+        stack.enter_context(on_signal("SIGHUP", unless_hung_up(renew)))
+        stack.enter_context(stop_after(seconds))
         lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
         put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
         write = record_writer(stack, output, udp, predictor.metadata.electrodes, put)
@@ -151,47 +148,6 @@ def _awaited(port: str, wait: float) -> str:
     while "://" not in port and port != "-" and not Path(port).exists() and time.monotonic() < end:
         time.sleep(0.05)
     return port
-
-
-@contextmanager
-def _alarm(seconds: float | None) -> Iterator[None]:
-    """As if Ctrl-C were pressed after some time, also where nothing comes from the port."""
-    if seconds is None:
-        yield
-        return
-    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-
-
-@contextmanager
-def _on_signal(name: str, act: Callable[[], object]) -> Iterator[None]:
-    """Act when a signal comes; Windows has none of those that are used."""
-    number = getattr(signal, name, None)
-    if number is None:
-        yield
-        return
-    before = signal.signal(number, lambda *_: act())
-    try:
-        yield
-    finally:
-        signal.signal(number, before)
-
-
-def _unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
-    """Act, or stop as at Ctrl-C where the signal says that the terminal of this command was closed."""
-    terminals = [number for number in (0, 1, 2) if os.isatty(number)]
-
-    def act_or_stop() -> None:
-        if not all(map(os.isatty, terminals)):
-            raise KeyboardInterrupt
-        act()
-
-    return act_or_stop
 
 
 def _load(model: str, models: Path | None) -> "Predictor":

@@ -41,6 +41,9 @@ LONGEST_ENTRY = 1 << 20
 LONGEST_US, LATEST_S = 1e12, 1e11
 """Largest latency that counts as one, us: eleven days; and latest time, unix seconds: the year 5138."""
 
+WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+"""To open a new file, without changing line ends on Windows."""
+
 log = logging.getLogger(__name__)
 
 
@@ -79,7 +82,7 @@ class Recorder:
         """
         refuse_existing(self.path)
         try:
-            self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+            self._descriptor = os.open(self.path, WRITE_FLAGS, 0o666)
         except OSError as error:
             raise OutputError(f"{self.path} cannot be written: {error.strerror}; choose another file") from error
         self._write(json.dumps(self._header))

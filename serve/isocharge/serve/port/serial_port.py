@@ -5,17 +5,15 @@ Any URL that pyserial knows will do: `/dev/ttyACM0`, a pseudo-terminal, `socket:
 outage says how long it was.
 """
 
+import importlib
 import io
 import logging
 import os
 import select
-import termios
 import time
 from collections.abc import Iterator
 from types import TracebackType
-from typing import NamedTuple, Self
-
-import serial
+from typing import Any, NamedTuple, Self
 
 from isocharge.errors import PortError, PortLost
 
@@ -29,6 +27,19 @@ MOST_BYTES = 65536
 """Largest chunk, bytes."""
 
 log = logging.getLogger(__name__)
+
+
+def _terminal_errors() -> tuple[type[Exception], ...]:
+    """What pyserial lets through besides OSError; empty on systems without POSIX terminals."""
+    try:
+        return (importlib.import_module("termios").error,)
+    except ImportError:
+        return ()
+
+
+TERMINAL_ERRORS = _terminal_errors()
+HAS_POSIX_PORTS = bool(TERMINAL_ERRORS)
+"""Whether ports are file descriptors for which `select` can wait; where not, pyserial reads them."""
 
 
 class Chunk(NamedTuple):
@@ -77,7 +88,7 @@ class Port:
         self._baud = baud
         self._silence_s = silence_s
         self._reconnect = reconnect
-        self._serial: serial.SerialBase | None = None
+        self._serial: Any = None
         self._descriptor: int | None = None
 
     def __enter__(self) -> Self:
@@ -87,9 +98,10 @@ class Port:
             PortError: If it cannot be opened.
         """
         try:
+            serial = importlib.import_module("serial")  # late: who only predicts does not wait for it
             self._serial = serial.serial_for_url(self.url, baudrate=self._baud, timeout=self._silence_s, exclusive=True)
             self._serial.reset_input_buffer()  # a tty drops them by itself, a socket does not
-        except (OSError, ValueError, termios.error) as error:
+        except (OSError, ValueError, *TERMINAL_ERRORS) as error:
             self._close()
             raise PortError(
                 f"{self.url}: cannot be opened at {self._baud} baud ({error}); check the cable and the name, that no "
@@ -155,7 +167,7 @@ class Port:
             raise PortError(f"{self.url}: not open; use `with Port(...) as port`")
         try:
             data = self._read_directly() if self._descriptor is not None else self._read_by_pyserial()
-        except (OSError, termios.error) as error:  # pyserial lets both through; termios.error is not an OSError
+        except (OSError, *TERMINAL_ERRORS) as error:
             raise PortLost(
                 f"{self.url}: went away while it was read ({error}); check the plug and the cable"
             ) from error
@@ -177,12 +189,11 @@ class Port:
         return data
 
     def _read_by_pyserial(self) -> bytes:
-        assert self._serial is not None
         first: bytes = self._serial.read(1)
         return first + self._serial.read(self._serial.in_waiting) if first else first
 
 
-def _ask_for_low_latency(port: serial.SerialBase) -> None:
+def _ask_for_low_latency(port: Any) -> None:
     """Turn off the 16 ms for which USB adapters collect bytes; a port without that mode raises an error of its own."""
     try:
         port.set_low_latency_mode(True)
@@ -190,9 +201,9 @@ def _ask_for_low_latency(port: serial.SerialBase) -> None:
         return
 
 
-def _descriptor(port: serial.SerialBase) -> int | None:
-    """The file descriptor; None for ports that exist only inside pyserial."""
+def _descriptor(port: Any) -> int | None:
+    """The file descriptor; None for ports that exist only inside pyserial, and on Windows for all."""
     try:
-        return int(port.fileno())
+        return int(port.fileno()) if HAS_POSIX_PORTS else None
     except (AttributeError, io.UnsupportedOperation):
         return None
