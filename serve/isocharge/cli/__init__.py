@@ -14,7 +14,7 @@ from isocharge.cli.demo.command import demo_command
 from isocharge.cli.serve.app import serve_app
 from isocharge.cli.shared.plain_numbers import plain_numbers
 from isocharge.cli.shared.standard_streams import open_closed_streams
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.terminal import cautions_to_stderr, say
 from isocharge.cli.simulate.app import simulate_app
 from isocharge.cli.train.app import train_app
 from isocharge.errors import InputError, IsochargeError
@@ -52,7 +52,8 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     open_closed_streams()
     try:
-        plain_numbers(typer.main.get_command(app))()
+        with cautions_to_stderr():
+            plain_numbers(typer.main.get_command(app))()
     except (IsochargeError, OSError, MemoryError) as error:
         say(f"{type(error).__name__}: {error}")
         sys.exit(2 if isinstance(error, InputError) else 1)
