@@ -39,7 +39,7 @@ class Predictor:
         >>> touch = Predictor("three-25um-biaxial")
         >>> contact = touch.predict([942.9, 910.4, 690.8])
         >>> contact
-        Contact(x_mm=2.990 +- 0.030, ...)
+        Contact(x_mm=2.990 +- 0.045, y_mm=-1.994 +- 0.031, force_N=1.0027 +- 0.0021, misfit=0.025)
         >>> touch.flags(contact)  # a reason for each doubt
         ()
     """
@@ -89,7 +89,7 @@ class Predictor:
             self._press.write(*as_press(charge_pC, self._metadata.electrodes))
         self._press.run()
         contact = Contact(*self._press.read())
-        x_mm, y_mm, force_N, *_ = contact
+        x_mm, y_mm, force_N, _, _, _, _ = contact
         if force_N > self._far_N or x_mm * x_mm + y_mm * y_mm > self._far_mm2:
             self._warn(charge_pC, contact)
         return contact
