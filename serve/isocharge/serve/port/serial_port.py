@@ -37,9 +37,12 @@ def _terminal_errors() -> tuple[type[Exception], ...]:
         return ()
 
 
-TERMINAL_ERRORS = _terminal_errors()
-HAS_POSIX_PORTS = bool(TERMINAL_ERRORS)
+HAS_POSIX_PORTS = bool(_terminal_errors())
 """Whether ports are file descriptors for which `select` can wait; where not, pyserial reads them."""
+
+READ_ERRORS: tuple[type[Exception], ...] = (OSError, *_terminal_errors())
+OPEN_ERRORS: tuple[type[Exception], ...] = (ValueError, *READ_ERRORS)
+"""What opening a port raises besides errors of ours."""
 
 
 class Chunk(NamedTuple):
@@ -101,7 +104,7 @@ class Port:
             serial = importlib.import_module("serial")  # late: who only predicts does not wait for it
             self._serial = serial.serial_for_url(self.url, baudrate=self._baud, timeout=self._silence_s, exclusive=True)
             self._serial.reset_input_buffer()  # a tty drops them by itself, a socket does not
-        except (OSError, ValueError, *TERMINAL_ERRORS) as error:
+        except OPEN_ERRORS as error:
             self._close()
             raise PortError(
                 f"{self.url}: cannot be opened at {self._baud} baud ({error}); check the cable and the name, that no "
@@ -167,7 +170,7 @@ class Port:
             raise PortError(f"{self.url}: not open; use `with Port(...) as port`")
         try:
             data = self._read_directly() if self._descriptor is not None else self._read_by_pyserial()
-        except (OSError, *TERMINAL_ERRORS) as error:
+        except READ_ERRORS as error:
             raise PortLost(
                 f"{self.url}: went away while it was read ({error}); check the plug and the cable"
             ) from error
