@@ -20,7 +20,7 @@ from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.prediction.validity import Domain
 
-BLOCK = 16384
+BLOCK = 4096
 """Rows that are worked on at a time."""
 
 CHARGE = "a charge in pC"
@@ -72,11 +72,10 @@ def write_contacts(contacts: Contacts, out: TextIO, domain: Domain | None = None
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(Contacts._fields + ("flags",) * (domain is not None))
     for block in blocks(np.column_stack(contacts)):
-        cells = [[f"{value:.6f}" for value in row] for row in block.tolist()]
-        if domain is not None:
-            for row, flags in zip(cells, domain.batch_flags(Contacts(*block.T)), strict=True):
-                row.append(" ".join(flags))
-        writer.writerows(cells)
+        words = (
+            [()] * len(block) if domain is None else [(" ".join(f),) for f in domain.batch_flags(Contacts(*block.T))]
+        )
+        writer.writerows((*map("{:.6f}".format, row), *flags) for row, flags in zip(block.tolist(), words, strict=True))
 
 
 def blocks(rows: Array) -> Iterator[Array]:
