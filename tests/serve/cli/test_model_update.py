@@ -86,9 +86,14 @@ def of_another_sensor(make_film, repository):
     shutil.copytree(other, repository / "linear" / "2")
 
 
+def not_there(film, repository):  # noqa: ARG001
+    shutil.rmtree(repository / "linear")
+
+
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
+        (not_there, "ModelError: no model 'linear'"),
         (damaged, "model.onnx: expected sha256"),
         (answering_otherwise, "golden"),
         (

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
-from isocharge.errors import IsochargeError
 from isocharge.serve.live.stream import TouchStream
 from isocharge.serve.port.recording import NewModel, RecordedClock, Recorder, Recording
 from isocharge.serve.port.serial_port import Chunk
@@ -77,8 +76,9 @@ class RecordedStream:
             self._use(self._loading)
             self._loading = None
         if self._load_requested and self._loading is None:
+            load, self._load_requested = self._load_requested, None
             loader = ThreadPoolExecutor(1, "model")
-            self._loading, self._load_requested = loader.submit(self._load_requested), None
+            self._loading = loader.submit(load)
             loader.shutdown(wait=False)
 
     def _use(self, loaded: "Future[Predictor]") -> None:
@@ -86,8 +86,8 @@ class RecordedStream:
         try:
             predictor = loaded.result()
             self._stream.use(predictor)
-        except (IsochargeError, OSError, MemoryError) as error:
-            log.error("%s serves on, because the new model is refused: %s", before, error)
+        except Exception as error:  # whatever is wrong with a new model, the old one serves
+            log.error("%s serves on, because the new model is refused: %s: %s", before, type(error).__name__, error)
             return
         if self._recorder is not None:
             self._recorder.model(predictor.metadata.label)
