@@ -38,12 +38,11 @@ SLOW = {"recordings.md", "virtual_sensor.md"}
 """Pages whose commands simulate a film each time; those of the README, which do the same, run always."""
 
 
-def examples(language):
-    """Every example of a language, with its page as id."""
-    for page, text in PAGES.items():
-        for number, block in enumerate(re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)):
-            slow = [pytest.mark.slow] if page in SLOW and language == "sh" else []
-            yield pytest.param(block, id=f"{page}-{number}", marks=slow)
+EXAMPLE_PAGES = ["serve/README.md", *(f"serve/docs/{name}" for name in PAGES if name != "README.md")]
+
+
+def is_slow(example):
+    return Path(example.page).name in SLOW and example.language == "sh"
 
 
 def test_frame_example():
@@ -54,20 +53,29 @@ def test_frame_example():
     assert cobs_decode(after[:-1]) == before
 
 
-@pytest.mark.parametrize("example", [*examples("python")])
-def test_python_example_prints_what_it_says(example, start_http, run_example, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    if "127.0.0.1:8000" in example:
-        example = example.replace("127.0.0.1:8000", start_http(Handler(open_model_store())).url.removeprefix("http://"))
-    run_example(example, "serve")
+@pytest.fixture(scope="module")
+def desks(tmp_path_factory):
+    """A folder for each page, with the presses that its reader has already."""
+    folders = {page: tmp_path_factory.mktemp("desk") for page in EXAMPLE_PAGES}
+    (folders["serve/README.md"] / "presses.csv").write_text("A,B,C\n850,840,846\n")
+    return folders
 
 
-@pytest.mark.parametrize("example", [*examples("sh")])
-def test_commands_run_line_by_line(example, tmp_path, run_commands):
-    if "curl" in example and shutil.which("curl") is None:
+def test_an_example_does_what_it_says(page_example, desks, installed, start_http, run_example, run_commands):
+    """In the order of the page, in the install that it names; Python prints what the comments say."""
+    text, folder, environment = page_example.text, desks[page_example.page], installed(*page_example.extras)
+    if page_example.language == "python":
+        if "127.0.0.1:8000" in text:
+            text = text.replace("127.0.0.1:8000", start_http(Handler(open_model_store())).url.removeprefix("http://"))
+        run_example(text, folder, environment)
+        return
+    if "curl" in text and shutil.which("curl") is None:
         pytest.skip("the example uses curl")
-    (tmp_path / "presses.csv").write_text("A,B,C\n850,840,846\n")
-    printed = run_commands(on_free_ports(example), tmp_path, timeout=120)
+    check_commands(text, folder, run_commands(on_free_ports(text), folder, environment, timeout=120))
+
+
+def check_commands(example, folder, printed):
+    """What the commands of some examples must have printed."""
     if "curl" in example:
         outputs = json.loads(printed[printed.index("{") :])["outputs"]
         assert outputs[0]["data"] == pytest.approx([3.0, -2.0, 1.0], abs=0.02)
@@ -75,8 +83,8 @@ def test_commands_run_line_by_line(example, tmp_path, run_commands):
         assert f"```text\n{printed}```" in PAGES["measured_presses.md"]
     if "doctor" in example:
         assert "binary frames of isocharge" in printed
-        assert (tmp_path / "again.jsonl").read_text() == (tmp_path / "touch.jsonl").read_text()
-        assert len((tmp_path / "touch.jsonl").read_text().splitlines()) > 300
+        assert (folder / "again.jsonl").read_text() == (folder / "touch.jsonl").read_text()
+        assert len((folder / "touch.jsonl").read_text().splitlines()) > 300
 
 
 def on_free_ports(example):

@@ -9,7 +9,10 @@ Five lines give the charges of one press.
     charge = touch_charge(sensor, equilibrium)  # C, in the order of sensor.electrode_names
 """
 
+from typing import TYPE_CHECKING
+
 from isocharge.extras import require
+from isocharge.versions import version_attribute
 
 with require("simulate"):
     from isocharge.simulate.artwork.leads import Leads, route
@@ -126,3 +129,7 @@ __all__ = [
     "write_sensor",
     "write_sweep",
 ]
+
+__version__: str
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for a text
+    __getattr__ = version_attribute(__name__)

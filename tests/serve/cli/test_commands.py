@@ -57,9 +57,16 @@ def test_help_has_an_example(command):
 def test_predict_to_csv(presses, models):
     result = run("predict", "linear", presses, "--models", models)
     lines = result.stdout.splitlines()
-    assert lines[0] == "x_mm,y_mm,force_N,x_std_mm,y_std_mm,force_std_N,misfit"
-    np.testing.assert_allclose(np.loadtxt(lines[1:], delimiter=",")[:, :3], [[1, 0.5, 1], [-2, 3, 0.25]], atol=5e-6)
+    assert lines[0] == "x_mm,y_mm,force_N,x_std_mm,y_std_mm,force_std_N,misfit,flags"
+    contacts = np.loadtxt(lines[1:], delimiter=",", usecols=(0, 1, 2))
+    np.testing.assert_allclose(contacts, [[1, 0.5, 1], [-2, 3, 0.25]], atol=5e-6)
     assert (result.exit_code, result.stderr) == (0, "")
+
+
+def test_predict_to_csv_tells_what_not_to_trust(models):
+    text = "A,B,C\n800,800,800\n9e9,9e9,9e9\n2000,2000,2000\n2700,-9,2700\n"
+    rows = list(csv.DictReader(run("predict", "linear", "-", "--models", models, stdin=text).stdout.splitlines()))
+    assert [row["flags"] for row in rows] == ["", "outside beyond", "outside", "outside misfit"]
 
 
 def test_predict_to_records(presses, models):

@@ -9,7 +9,10 @@ A few lines make a model from a dataset.
     print(release.metadata.errors)
 """
 
+from typing import TYPE_CHECKING
+
 from isocharge.extras import require
+from isocharge.versions import version_attribute
 
 with require("train"):
     from isocharge.train.bayes.limit import BayesLimit, Scene, bayes_estimate, bayes_limit
@@ -65,3 +68,7 @@ __all__ = [
     "write_calibration",
     "write_film_model",
 ]
+
+__version__: str
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for a text
+    __getattr__ = version_attribute(__name__)

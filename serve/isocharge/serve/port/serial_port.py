@@ -6,17 +6,15 @@ request, a port that goes away or falls silent is opened again until it is back;
 how long it was. A board that has to be asked is asked.
 """
 
+import importlib
 import io
 import logging
 import os
 import select
-import termios
 import time
 from collections.abc import Iterator
 from types import TracebackType
-from typing import NamedTuple, Self
-
-import serial
+from typing import Any, NamedTuple, Self
 
 from isocharge.errors import PortError, PortLost
 from isocharge.serve.port.request import Asker, Request
@@ -32,6 +30,22 @@ MOST_BYTES = 65536
 """Largest chunk, bytes."""
 
 log = logging.getLogger(__name__)
+
+
+def _terminal_errors() -> tuple[type[Exception], ...]:
+    """What pyserial lets through besides OSError; empty on systems without POSIX terminals."""
+    try:
+        return (importlib.import_module("termios").error,)
+    except ImportError:
+        return ()
+
+
+HAS_POSIX_PORTS = bool(_terminal_errors())
+"""Whether ports are file descriptors for which `select` can wait; where not, pyserial reads them."""
+
+READ_ERRORS: tuple[type[Exception], ...] = (OSError, *_terminal_errors())
+OPEN_ERRORS: tuple[type[Exception], ...] = (ValueError, *READ_ERRORS)
+"""What opening a port raises besides errors of ours."""
 
 
 class Chunk(NamedTuple):
@@ -90,7 +104,7 @@ class Port:
         self._silence_s = silence_s
         self._reconnect = reconnect
         self._asker = Asker(request) if request else None
-        self._serial: serial.SerialBase | UdpSocket | None = None
+        self._serial: Any = None
         self._descriptor: int | None = None
 
     def __enter__(self) -> Self:
@@ -102,7 +116,7 @@ class Port:
         try:
             self._serial = self._opened()
             self._serial.reset_input_buffer()  # a tty drops them by itself, a socket does not
-        except (OSError, ValueError, termios.error) as error:
+        except OPEN_ERRORS as error:
             self._close()
             raise PortError(
                 f"{self.url}: cannot be opened at {self._baud} baud ({error}); check the cable and the name, that no "
@@ -114,10 +128,11 @@ class Port:
             self._asker.forget()
         return self
 
-    def _opened(self) -> "serial.SerialBase | UdpSocket":
+    def _opened(self) -> Any:
         if self.url.startswith(SCHEME):
             return UdpSocket(self.url, self._silence_s)
         url = self.url.replace("tcp://", "socket://", 1) if self.url.startswith("tcp://") else self.url
+        serial = importlib.import_module("serial")  # late: who only predicts does not wait for it
         return serial.serial_for_url(url, baudrate=self._baud, timeout=self._silence_s, exclusive=True)
 
     def __exit__(
@@ -202,7 +217,7 @@ class Port:
         timeout_s = self._silence_s if end_s is None else max(0.0, end_s - time.monotonic())
         try:
             return self._ask_and_read(self._asker, timeout_s) if self._asker else self._read_in_time(timeout_s)
-        except (OSError, termios.error) as error:  # pyserial lets both through; termios.error is not an OSError
+        except READ_ERRORS as error:
             raise PortLost(
                 f"{self.url}: went away while it was read ({error}); check the plug and the cable"
             ) from error
@@ -236,15 +251,13 @@ class Port:
         return data
 
     def _read_by_pyserial(self, timeout_s: float) -> bytes:
-        assert self._serial is not None
-        assert not isinstance(self._serial, UdpSocket)
         if timeout_s != self._silence_s:  # to set it costs pyserial a system call
             self._serial.timeout = timeout_s
         first: bytes = self._serial.read(1)
         return first + self._serial.read(self._serial.in_waiting) if first else first
 
 
-def _ask_for_low_latency(port: "serial.SerialBase | UdpSocket") -> None:
+def _ask_for_low_latency(port: Any) -> None:
     """Turn off the 16 ms for which USB adapters collect bytes; a port without that mode raises an error of its own."""
     if isinstance(port, UdpSocket):
         return
@@ -254,11 +267,11 @@ def _ask_for_low_latency(port: "serial.SerialBase | UdpSocket") -> None:
         return
 
 
-def _descriptor(port: "serial.SerialBase | UdpSocket") -> int | None:
-    """The file descriptor; None for ports that exist only inside pyserial, and for datagrams, which are not cut."""
+def _descriptor(port: Any) -> int | None:
+    """The file descriptor; None for ports that exist only inside pyserial, for datagrams, and on Windows for all."""
     if isinstance(port, UdpSocket):
         return None
     try:
-        return int(port.fileno())
+        return int(port.fileno()) if HAS_POSIX_PORTS else None
     except (AttributeError, io.UnsupportedOperation):
         return None
