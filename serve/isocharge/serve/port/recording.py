@@ -4,6 +4,7 @@
     {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
     {"timestamp": ..., ...}                       the records of that chunk, as they went out
     {"tare": true}                                a request for a new tare
+    {"marker": [timestamp, "text"]}               a moment that somebody noted
 
 Everything in a replay is recomputed except `latency_us`, which is copied from the recording because it belongs to the
 original run. So the same model gives the same records, bit for bit. Whole lines are written at once; a line that a full
@@ -40,7 +41,22 @@ LONGEST_ENTRY = 1 << 20
 LONGEST_US, LATEST_S = 1e12, 1e11
 """Largest latency that counts as one, us: eleven days; and latest time, unix seconds: the year 5138."""
 
+LONGEST_MARKER = 1000
+"""Characters of a marker's text."""
+
 log = logging.getLogger(__name__)
+
+
+class Marker(NamedTuple):
+    """A moment that somebody noted.
+
+    Attributes:
+        timestamp: Unix seconds.
+        text: May be empty.
+    """
+
+    timestamp: float
+    text: str
 
 
 class Recorder:
@@ -85,6 +101,10 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close the file."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
         os.close(self._descriptor)
 
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
@@ -96,6 +116,10 @@ class Recorder:
     def tare(self) -> None:
         """Write a request for a new tare."""
         self._write('{"tare": true}')
+
+    def mark(self, marker: Marker) -> None:
+        """Write a marker."""
+        self._write(json.dumps({"marker": list(marker)}))
 
     def _write(self, lines: str) -> None:
         """Write whole lines or none."""
@@ -155,20 +179,25 @@ class Recording:
         Raises:
             RecordingError: If a line other than the last one is damaged.
         """
-        chunk, latencies_us = None, []
+        return (event for event in self.events_and_markers() if isinstance(event, Event))
+
+    def events_and_markers(self) -> Iterator[Event | Marker]:
+        """As `events`, with the markers between them."""
+        chunk: Chunk | None = None
+        latencies_us: list[float] = []
         for entry in self._entries():
             if isinstance(entry, float):
                 latencies_us.append(entry)
                 continue
             if chunk is not None:
                 yield Event(chunk, tuple(latencies_us))
-            chunk, latencies_us = entry, []
+            chunk, latencies_us = entry if isinstance(entry, Chunk) else None, []
             if chunk is None:
-                yield Event(None)
+                yield entry if isinstance(entry, Marker) else Event(None)
         if chunk is not None:
             yield Event(chunk, tuple(latencies_us))
 
-    def _entries(self) -> Iterator[Chunk | float | None]:
+    def _entries(self) -> Iterator[Chunk | Marker | float | None]:
         """The content of each line, as `_entry` gives it."""
         number = 1
         try:
@@ -192,8 +221,8 @@ def _header(path: Path) -> Table:
     return Table(parse_json(line, "first line", RecordingError), "first line", RecordingError)
 
 
-def _entry(content: Table) -> Chunk | float | None:
-    """A chunk, the latency of a record (us), or None for a request for a new tare.
+def _entry(content: Table) -> Chunk | Marker | float | None:
+    """A chunk, a marker, the latency of a record (us), or None for a request for a new tare.
 
     Raises:
         RecordingError, ValueError: If it is none of these.
@@ -202,6 +231,8 @@ def _entry(content: Table) -> Chunk | float | None:
         return content.number("latency_us", least=-LONGEST_US, most=LONGEST_US)
     if "tare" in content:
         return None
+    if "marker" in content:
+        return _marker(content)
     *times, data = content.sequence("chunk", of="timestamp, clock, outage and bytes")
     timestamp, _, outage_s = content.as_numbers("chunk", times, count=3, of="three numbers and bytes")
     if not isinstance(data, str):
@@ -209,6 +240,14 @@ def _entry(content: Table) -> Chunk | float | None:
     if not (abs(timestamp) <= LATEST_S and outage_s >= 0.0 and is_whole(times[1])):
         content.refuse("chunk", "a time of this age, nanoseconds and an outage")
     return Chunk(base64.b64decode(data, validate=True), timestamp, times[1], outage_s)
+
+
+def _marker(content: Table) -> Marker:
+    timestamp, *texts = content.sequence("marker", of="timestamp and text")
+    (moment,) = content.as_numbers("marker", [timestamp], count=1, of="a time and a text")
+    if len(texts) != 1 or not isinstance(texts[0], str) or len(texts[0]) > LONGEST_MARKER or abs(moment) > LATEST_S:
+        content.refuse("marker", f"a time of this age and a text of at most {LONGEST_MARKER} characters")
+    return Marker(moment, texts[0])
 
 
 class RecordedClock:

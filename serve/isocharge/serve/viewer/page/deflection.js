@@ -1,0 +1,78 @@
+// The deflected film: a table of the simulator, interpolated over force and place; isocharge/deflection_field.py has the format.
+
+const NEAREST_RIM = 0.95;
+
+export class Deflection {
+  constructor(table) {
+    Object.assign(this, { radius: table.film.radius_mm, probe: table.probe_radius_mm, rings: table.rings, angles: table.angles });
+    [this.forces, this.distances] = [table.force_N, table.distance_mm];
+    const bytes = Uint8Array.from(atob(table.deflection), (c) => c.charCodeAt(0));
+    this.shares = new Uint16Array(bytes.buffer);
+    this.step = table.scale_mm / 65535;
+    this.size = this.rings.length * this.angles;
+    this.sheet = new Float32Array(this.size);
+    this.force = 0;
+    this.c = 0;
+    this.turn = 0;
+    this.largest = table.scale_mm;
+  }
+
+  /** Bring the film under a press; force 0 lets it go flat. */
+  press(x, y, force) {
+    const distance = Math.min(Math.hypot(x, y), this.distances.at(-1)), rim = NEAREST_RIM;
+    const p = Math.min(distance / this.radius, rim), r = this.probe / this.radius;
+    this.c = Math.tanh(0.5 * (Math.atanh(p + r) + Math.atanh(p - r)));
+    this.turn = Math.atan2(y, x);
+    this.force = force;
+    if (force <= 0) { this.sheet.fill(0); return; }
+    const [d, dShare] = place(this.distances, distance), [f, fShare, factor] = this.placeForce(force);
+    const base = (f * this.distances.length + d) * this.size, nextForce = this.forces.length > 1 ? this.distances.length * this.size : 0;
+    const nextDistance = this.distances.length > 1 ? this.size : 0;
+    for (let k = 0; k < this.size; k++) {
+      const at = base + k;
+      const low = this.shares[at] * (1 - dShare) + this.shares[at + nextDistance] * dShare;
+      const high = this.shares[at + nextForce] * (1 - dShare) + this.shares[at + nextForce + nextDistance] * dShare;
+      this.sheet[k] = factor * this.step * (low * (1 - fShare) + high * fShare);
+    }
+  }
+
+  /** Between forces by their logarithm; beyond them as a membrane, by the cube root. */
+  placeForce(force) {
+    const [low, high] = [this.forces[0], this.forces.at(-1)], inside = Math.min(Math.max(force, low), high);
+    return [...place(this.forces.map(Math.log), Math.log(inside)), Math.cbrt(force / inside)];
+  }
+
+  /** Place of a node of the sheet, mm; angle 0 to 2 (angles - 1), the second half mirrors the first. */
+  node(ring, angle) {
+    const half = this.angles - 1, phi = angle * Math.PI / half, s = this.rings[ring];
+    const [re, im] = [s * Math.cos(phi), s * Math.sin(phi)], { c } = this;
+    const [a, b] = [1 + c * re, c * im], norm = a * a + b * b;
+    const [u, v] = [((re + c) * a + im * b) / norm, (im * a - (re + c) * b) / norm];
+    const [cos, sin] = [Math.cos(this.turn), Math.sin(this.turn)];
+    const w = this.sheet[ring * this.angles + (angle <= half ? angle : 2 * half - angle)];
+    return [this.radius * (u * cos - v * sin), this.radius * (u * sin + v * cos), w];
+  }
+
+  /** Deflection at a place, mm. */
+  at(x, y) {
+    if (this.force <= 0) return 0;
+    const [cos, sin] = [Math.cos(this.turn), Math.sin(this.turn)], { c } = this;
+    const [u, v] = [(x * cos + y * sin) / this.radius, (-x * sin + y * cos) / this.radius];
+    const [a, b] = [1 - c * u, -c * v], norm = a * a + b * b;
+    const re = ((u - c) * a + v * b) / norm, im = (v * a - (u - c) * b) / norm;
+    const [i, iShare] = place(this.rings, Math.min(Math.hypot(re, im), 1));
+    const [j, jShare] = place2(Math.abs(Math.atan2(im, re)) / Math.PI * (this.angles - 1), this.angles);
+    const w = (ring, angle) => this.sheet[ring * this.angles + angle];
+    return (w(i, j) * (1 - jShare) + w(i, j + 1) * jShare) * (1 - iShare) + (w(i + 1, j) * (1 - jShare) + w(i + 1, j + 1) * jShare) * iShare;
+  }
+}
+
+/** The interval of increasing values in which a value lies, and its share of it. */
+function place(values, value) {
+  if (values.length < 2) return [0, 0];
+  let k = 0;
+  while (k < values.length - 2 && values[k + 1] <= value) k++;
+  return [k, Math.min(Math.max((value - values[k]) / (values[k + 1] - values[k]), 0), 1)];
+}
+
+function place2(value, count) { const k = Math.min(Math.floor(value), count - 2); return [k, value - k]; }
