@@ -6,7 +6,8 @@ automorphism carries rings about the origin onto rings about the probe,
     z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
 
 p the distance of the probe and r its radius, in film radii. On these rings the deflection is smooth, and a few hundred
-numbers hold it. simulate writes the file, serve shows what is in it.
+numbers hold it. Between two forces, the deflection over the cube root of the force is interpolated over the logarithm
+of the force: that of a membrane is constant. simulate writes the file, serve shows what is in it.
 """
 
 import base64
@@ -14,6 +15,7 @@ import binascii
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +114,7 @@ def read_deflection_field(path: Path) -> DeflectionField:
     )
     shape = (len(forces), len(distances), len(rings), table.whole("angles", least=2))
     for key, values in (("force_N", forces), ("distance_mm", distances), ("rings", rings)):
-        if not values or any(a >= b for a, b in zip(values, values[1:], strict=False)):
+        if not values or any(a >= b for a, b in pairwise(values)):
             table.refuse(key, "increasing numbers")
     return DeflectionField(
         {key: film.number(key) for key in FILM_KEYS},

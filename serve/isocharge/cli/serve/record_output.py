@@ -50,6 +50,16 @@ def record_writer(
     return write
 
 
+def also_shown(write: Lines, show: "Callable[[PredictionRecord], None]") -> Lines:
+    """Write a record, and hand it to the page."""
+
+    def both(record: "PredictionRecord", line: str) -> None:
+        write(record, line)
+        show(record)
+
+    return both
+
+
 def summary(touch: "TouchStream", latencies: deque[float], unwritten: int = 0) -> str:
     """Counts of frames and faults, of records that stdout did not take in time, and percentiles of the latency."""
     totals, stream = touch.totals(), touch.counts

@@ -3,7 +3,7 @@
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
 from pathlib import Path
@@ -18,7 +18,7 @@ from isocharge.cli.serve.options import (
     PolicyName,
     UdpOption,
 )
-from isocharge.cli.serve.record_output import LATENCIES, Lines, record_writer, summary, write_records
+from isocharge.cli.serve.record_output import LATENCIES, also_shown, record_writer, summary, write_records
 from isocharge.cli.shared.live_page import (
     PORT,
     InsecureOption,
@@ -39,10 +39,10 @@ from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import log_to_stderr, say
 
 if TYPE_CHECKING:
-    from isocharge.serve import Device, PredictionRecord, Predictor
+    from isocharge.serve import Device, Predictor
+    from isocharge.serve.live.recorded_stream import RecordedStream
     from isocharge.serve.viewer.link import ReaderEnd
     from isocharge.serve.viewer.server import PageSettings
-    from isocharge.serve.live.recorded_stream import RecordedStream
 
 
 def stream_command(
@@ -138,7 +138,7 @@ def stream_command(
         if page is not None:
             header = (predictor.metadata.label, policy.value, board.table)
             stack.enter_context(answering(PageRequests(page, live, header, recorder is not None)))
-            write = _also_shown(write, page_feed(page, path, live, predictor.metadata.electrodes).put)
+            write = also_shown(write, page_feed(page, path, live, predictor.metadata.electrodes).put)
         if recorder:
             stack.enter_context(recorder)
         records = stack.enter_context(closing(live.follow(source)))  # closed before the recorder
@@ -158,16 +158,6 @@ def _page(settings: "PageSettings", model: Path, predictor: "Predictor") -> "Ite
     with one_page(predictor.metadata.name, predictor.metadata, model, settings) as (link, url):
         say(f"live page: {url}")
         yield link
-
-
-def _also_shown(write: Lines, show: "Callable[[PredictionRecord], None]") -> Lines:
-    """Write a record, and hand it to the page."""
-
-    def both(record: "PredictionRecord", line: str) -> None:
-        write(record, line)
-        show(record)
-
-    return both
 
 
 def _board(device: Path | None, offset_limit_pC: float | None) -> "Device":

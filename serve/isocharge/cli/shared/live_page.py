@@ -99,8 +99,7 @@ def film_link(name: str, metadata: "ModelMetadata", model: Path) -> "tuple[Reade
     """
     with require("http"):
         from isocharge.serve.viewer.server import FilmLink
-    from isocharge.serve.viewer.description import describe_film
-    from isocharge.serve.viewer.field_file import find_field
+    from isocharge.serve.viewer.description import describe_film, find_field
     from isocharge.serve.viewer.link import make_link
 
     reader, page = make_link()

@@ -1,5 +1,6 @@
 """Many samples as few: what a browser can show of them."""
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,6 @@ def _shown_of_runs(samples: Samples, edges: np.ndarray) -> np.ndarray:
     touching = (samples["flags"] & CONTACT_BIT) != 0
     force = np.where(touching, np.nan_to_num(samples["force_N"], nan=0.0), -1.0)
     last = edges[1:] - 1
-    hardest = np.array([start + int(force[start:stop].argmax()) for start, stop in zip(edges, edges[1:], strict=False)])
+    hardest = np.array([start + int(force[start:stop].argmax()) for start, stop in pairwise(edges)])
     missed_tap = ~touching[last] & touching[hardest]
     return np.where(missed_tap, hardest, last)

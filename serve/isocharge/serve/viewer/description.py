@@ -1,16 +1,40 @@
-"""What the page has to know about a film before the first sample: geometry, electrodes, model, bounds.
+"""What the page has to know about a film before the first sample: geometry, electrodes, model, deflection field.
 
-A model carries its sensor whole, as the simulator wrote it. What is missing there is not drawn.
+A model carries its sensor whole, as the simulator wrote it. What is missing there is not drawn. The deflection field
+lies beside the model, or is shipped for the films of the released ones.
 """
 
 import json
 import math
+from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Any
 
-from isocharge.deflection_field import DeflectionField
+from isocharge.deflection_field import DeflectionField, read_deflection_field
 from isocharge.errors import InputError
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.tables import Table
+
+FILE = "deflection.json"
+"""Name of the field in a model's version folder; `isocharge simulate deflection` writes one."""
+
+
+def find_field(model: Path, metadata: ModelMetadata) -> DeflectionField | None:
+    """The field of the film for which a model was trained; None if there is none.
+
+    Args:
+        model: Version folder.
+        metadata: Of the model.
+
+    Raises:
+        InputError: If the file in the model's folder is damaged.
+    """
+    if (model / FILE).is_file():
+        return read_deflection_field(model / FILE)
+    film = metadata.sensor.get("film")
+    with as_file(files("isocharge.serve.viewer") / "fields") as folder:
+        fields = map(read_deflection_field, sorted(folder.glob("*.json")))
+        return next((field for field in fields if field.fits(film)), None)
 
 
 def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | None) -> dict[str, Any]:

@@ -35,7 +35,7 @@ FEWEST, MOST = 8, 600
 BACKFILL_S = 10.0
 """How far back a new viewer sees, s: the length of the traces."""
 
-MARKERS = 50
+MARKERS = 200
 """Markers that the page shows, the latest."""
 
 STATE_S = 0.5
@@ -156,9 +156,7 @@ class Viewer:
         self._next[film.number] = stop
         self._sent += 1
         shown = coalesce(film.tape.samples(start, stop), MOST if begins else most)
-        return samples_message(
-            film.number, self._sent, now_s, shown, self._missed[film.number], begin_anew=begins
-        )
+        return samples_message(film.number, self._sent, now_s, shown, self._missed[film.number], begin_anew=begins)
 
     def _stop(self, film: Film) -> int:
         """Number of the first sample that is not to be shown yet."""

@@ -29,15 +29,17 @@ class ReaderEnd:
     Attributes:
         dropped: Samples for which there was no room.
         is_open: Whether the page's process was there at the last attempt.
+        waits: Whether to wait for room.
     """
 
     samples: Connection
     messages: socket.socket
     dropped: int = 0
     is_open: bool = True
+    waits: bool = False
 
     def put(self, sample: bytes) -> None:
-        """Hand over a sample, or drop it: never waits, unless `wait` was called."""
+        """Hand over a sample, or drop it: does not wait, unless `wait` was called."""
         try:
             os.write(self.samples.fileno(), sample)
         except BlockingIOError:
@@ -46,13 +48,14 @@ class ReaderEnd:
             self.is_open = False
 
     def wait(self) -> None:
-        """From now on `put` waits for room: for a recording, of which nothing must be missing."""
+        """Wait for room from now on: for a recording, of which nothing must be missing."""
         os.set_blocking(self.samples.fileno(), True)
+        self.waits = True
 
     def tell(self, **content: Any) -> bool:
         """Send a message; False where there was no room for it."""
         try:
-            self.messages.send(json.dumps(content).encode(), socket.MSG_DONTWAIT)
+            self.messages.send(json.dumps(content).encode(), 0 if self.waits else socket.MSG_DONTWAIT)
         except OSError:
             return False
         return True
@@ -64,6 +67,11 @@ class ReaderEnd:
         except OSError:
             return None
         return json.loads(data) if data else None
+
+    def close_here(self) -> None:
+        """Close this process's copy of an end that another process has."""
+        self.messages.close()
+        self.samples.close()
 
     def close(self) -> None:
         """Close this end, and wake who waits in `request`."""

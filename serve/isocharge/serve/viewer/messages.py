@@ -1,9 +1,9 @@
 """What goes over the WebSocket: samples to the page in binary, states as JSON, and what the page asks for.
 
 A binary message to the page, little-endian: kind (u8, 1), film (u8), number of samples (u16), number of the message
-(u32), time of sending (unix seconds, f64), records that this page has missed for good (u32), options (u32, bit 0: forget
-what was shown before); then the samples, see `isocharge.serve.viewer.sample`. The page confirms what it has drawn: the
-number of the message (u32), as a binary message of its own.
+(u32), time of sending (unix seconds, f64), records that this page has missed for good (u32), options (u32, bit 0:
+forget what was shown before); then the samples, see `isocharge.serve.viewer.sample`. The page confirms what it has
+drawn: the number of the message (u32), as a binary message of its own.
 """
 
 import struct

@@ -17,7 +17,7 @@ export class Deflection {
     this.largest = table.scale_mm;
   }
 
-  /** Bring the film under a press; force 0 lets it go flat. */
+  /** Bring the film under a press; without force it is flat. */
   press(x, y, force) {
     const distance = Math.min(Math.hypot(x, y), this.distances.at(-1)), rim = NEAREST_RIM;
     const p = Math.min(distance / this.radius, rim), r = this.probe / this.radius;
@@ -25,21 +25,17 @@ export class Deflection {
     this.turn = Math.atan2(y, x);
     this.force = force;
     if (force <= 0) { this.sheet.fill(0); return; }
-    const [d, dShare] = place(this.distances, distance), [f, fShare, factor] = this.placeForce(force);
+    const [d, dShare] = place(this.distances, distance), [f, low, high] = this.placeForce(force);
     const base = (f * this.distances.length + d) * this.size, nextForce = this.forces.length > 1 ? this.distances.length * this.size : 0;
-    const nextDistance = this.distances.length > 1 ? this.size : 0;
-    for (let k = 0; k < this.size; k++) {
-      const at = base + k;
-      const low = this.shares[at] * (1 - dShare) + this.shares[at + nextDistance] * dShare;
-      const high = this.shares[at + nextForce] * (1 - dShare) + this.shares[at + nextForce + nextDistance] * dShare;
-      this.sheet[k] = factor * this.step * (low * (1 - fShare) + high * fShare);
-    }
+    const nextDistance = this.distances.length > 1 ? this.size : 0, at = (k) => this.shares[k] * (1 - dShare) + this.shares[k + nextDistance] * dShare;
+    for (let k = base; k < base + this.size; k++) this.sheet[k - base] = this.step * (low * at(k) + high * at(k + nextForce));
   }
 
-  /** Between forces by their logarithm; beyond them as a membrane, by the cube root. */
+  /** The two forces between which a force lies, with their weights: a membrane deflects as the cube root of the force. */
   placeForce(force) {
-    const [low, high] = [this.forces[0], this.forces.at(-1)], inside = Math.min(Math.max(force, low), high);
-    return [...place(this.forces.map(Math.log), Math.log(inside)), Math.cbrt(force / inside)];
+    const inside = Math.min(Math.max(force, this.forces[0]), this.forces.at(-1));
+    const [f, share] = place(this.forces.map(Math.log), Math.log(inside)), next = Math.min(f + 1, this.forces.length - 1);
+    return [f, (1 - share) * Math.cbrt(force / this.forces[f]), share * Math.cbrt(force / this.forces[next])];
   }
 
   /** Place of a node of the sheet, mm; angle 0 to 2 (angles - 1), the second half mirrors the first. */

@@ -5,19 +5,20 @@ import { Plan } from "./plan.js";
 import { Relief } from "./relief.js";
 import { Traces } from "./traces.js";
 
-const SILENT_MS = 1500, FLAG_MS = 2500, NOTE_S = 12, SEEN_IN_VERDICT = new Set(["tare", "misfit", "outside", "invalid"]);
+const SILENT_MS = 1500, SPOKEN_MS = 150, FLAG_MS = 2500, NOTE_S = 12, SEEN_IN_VERDICT = new Set(["tare", "misfit", "outside", "invalid"]);
 const COUNTERS = { frames: "frames", lost: "lost", repeated: "repeated", restarts: "restarts of the board", crc_errors: "wrong checksums",
   malformed: "malformed", bytes_dropped: "bytes dropped", resyncs: "resynchronised", reconnects: "reconnected", not_shown: "not shown here" };
 
 export class FilmView {
   constructor(number, description, session, act) {
-    Object.assign(this, { number, description, act, isReplay: session.is_replay, state: {}, isPaused: false, missed: 0, arrivedMs: -Infinity, recent: new Map() });
+    Object.assign(this, { number, description, act, isReplay: session.is_replay, state: {}, isPaused: false, missed: 0, arrivedMs: -Infinity, spokenMs: 0, recent: new Map() });
     this.words = new Map(session.flags.map(({ word, bit, says }) => [word, { bit, says }]));
     this.root = document.getElementById("film").content.firstElementChild.cloneNode(true);
     this.history = new History(description.electrodes.length, this.isReplay);
     this.find = (selector) => this.root.querySelector(selector);
     this.find(".name").textContent = description.name;
-    this.find(".model").textContent = description.model;
+    const version = description.model.startsWith(`${description.name}/`);
+    this.find(".model").textContent = version ? `version ${description.model.slice(description.name.length + 1)}` : description.model;
     this.root.addEventListener("click", (event) => { const button = event.target.closest("[data-do]"); if (button) act(button.dataset.do, this); });
     if (this.isReplay) for (const button of this.root.querySelectorAll("[data-do]")) button.hidden = button.dataset.do !== "pause";
     this.latencies = [];
@@ -74,17 +75,19 @@ export class FilmView {
     if (heavy.traces && this.isNew) this.traces.draw();
     if (this.isNew) { this.showValues(sample, kind); this.noteAge(sample, nowMs); }
     this.isNew = heavy.traces ? false : this.isNew;
+    if (kind !== this.drawnKind && nowMs - this.spokenMs > SPOKEN_MS) this.showSlow(nowMs);
     this.drawnKind = kind;
   }
 
   /** Twice a second: words and counters. */
   showSlow(nowMs) {
     const kind = this.kind(nowMs);
+    this.spokenMs = nowMs;
     const verdict = this.find(".verdict"), words = {
       contact: "touch", none: this.history.latest ? "no touch" : "waiting for the first frame", tare: "taring: leave the film alone",
-      outside: "touch outside the area or the range that the model knows: place and force are guesses",
+      outside: "outside the area or the forces that the model knows: place and force are guesses",
       misfit: "no single contact fits these charges: two touches, or another film? The place means little",
-      silent: Number.isFinite(this.arrivedMs) ? "no frame comes: is the sensor plugged in?" : "waiting for the first frame", ended: "the stream has ended",
+      silent: Number.isFinite(this.arrivedMs) ? "no frame comes: is the sensor plugged in?" : "waiting for the first frame", ended: this.state.reason ?? "the stream has ended",
     }[kind];
     verdict.dataset.kind = kind;
     setText(verdict.querySelector(".text"), words);
@@ -96,7 +99,7 @@ export class FilmView {
     const sure = kind === "contact" || kind === "outside" || kind === "misfit", put = (name, value, std, digits) => {
       const place = this.find(`.values .${name}`);
       setText(place.querySelector("b"), sure && value !== null ? signed(value, digits) : name === "force" && kind === "none" && sample ? signed(0, digits) : "–");
-      setText(place.querySelector(".std"), sure && std !== null ? `± ${std.toFixed(digits)}` : "");
+      setText(place.querySelector(".std"), sure && std !== null ? `± ${Number(std.toFixed(digits)) ? std.toFixed(digits) : `under ${10 ** -digits}`}` : "");
     };
     put("force", sample?.force ?? null, sample?.forceStd ?? null, 3);
     put("x", sample?.x ?? null, sample?.xStd ?? null, 2);

@@ -6,8 +6,8 @@ import { FilmView, percentile, setText } from "./film.js";
 import { onTheme } from "./theme.js";
 import { Timeline } from "./timeline.js";
 
-const SLOW_MS = 500, COSTLY_MS = 7;
-const page = { films: [], chosen: 0, timeline: null, isPaused: false, unconfirmed: null, pictures: 0, cost: 0, ages: [], starts: [] };
+const SLOW_MS = 500, PACE_MS = 20, RAREST = 8, LONGEST_MS = 80;
+const page = { films: [], chosen: 0, timeline: null, isPaused: false, unconfirmed: null, pictures: 0, cost: 0, pace: 16, every: 1, ages: [], starts: [] };
 const connection = new Connection({ session, samples, message, state, door });
 const nowMs = () => performance.now();
 
@@ -93,16 +93,30 @@ function key(event) {
   event.preventDefault();
 }
 
-let slowMs = 0;
+let slowMs = 0, beganMs = 0, heavyMs = 0;
 function picture() {
   requestAnimationFrame(picture);
-  const began = nowMs(), parity = page.pictures++ % 2 === 0, isCostly = page.cost > COSTLY_MS;
+  const began = nowMs(), number = page.pictures++;
   page.starts.push(began);
   if (page.starts.length > 240) page.starts.splice(0, 120);
-  if (!page.isPaused) for (const film of page.films) film.draw(began, { traces: parity, relief: !isCostly || !parity });
+  page.pace += 0.05 * (Math.min(began - beganMs, 200) - page.pace);
+  beganMs = began;
+  const isDue = began - heavyMs > LONGEST_MS, heavy = {
+    traces: isDue || number % Math.max(page.every, 2) === 0, relief: isDue || number % page.every === page.every >> 1,
+  };
+  if (heavy.traces) heavyMs = began;
+  if (!page.isPaused) for (const film of page.films) film.draw(began, heavy);
   if (page.unconfirmed !== null) noteAge();
-  if (began - slowMs > SLOW_MS) { slowMs = began; if (!page.isPaused) for (const film of page.films) film.showSlow(began); }
-  page.cost = 0.9 * page.cost + 0.1 * (nowMs() - began);
+  if (began - slowMs > SLOW_MS) showSlow(began);
+  page.cost += 0.1 * (nowMs() - began - page.cost);
+}
+
+/** Words and counters; and where pictures come too seldom, the costly parts are drawn for fewer of them. */
+function showSlow(began) {
+  slowMs = began;
+  if (page.pace > PACE_MS && page.every < RAREST) page.every *= 2;
+  else if (page.pace < 0.9 * PACE_MS && page.every > 1) page.every /= 2;
+  if (!page.isPaused) for (const film of page.films) film.showSlow(began);
 }
 
 /** What was drawn is confirmed, which asks for more; its age, where both clocks are the same machine's, is for tests. */

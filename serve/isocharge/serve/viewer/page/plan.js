@@ -2,13 +2,13 @@
 
 import { DASHES, fit, theme } from "./theme.js";
 
-const TRAIL_S = 1.6, LENS_MM = 1.0, SIGMAS_95 = 2.448;
+const TRAIL_S = 1.6, LENS_MM = 1.0, SIGMAS_95 = 2.448, LENS_PX = 52;
 
 export class Plan {
   constructor(canvas, film) {
     [this.canvas, this.film] = [canvas, film];
     const corners = [...film.working_area_mm, ...Object.values(film.outlines_mm).flat()];
-    this.reach = 1.12 * Math.max(...corners.map(([x, y]) => Math.hypot(x, y)));
+    this.reach = 1.16 * Math.max(...corners.map(([x, y]) => Math.hypot(x, y)));
     this.largest = film.force_range_N[1];
     this.base = document.createElement("canvas");
     this.isStale = true;
@@ -64,10 +64,10 @@ export class Plan {
   }
 
   drawScale(g, px) {
-    const x = this.reach - 14 * px - 5, y = -this.reach + 18 * px;
+    const x = -this.reach + 16 * px, y = this.reach - 18 * px;
     g.strokeStyle = theme.ink; g.lineWidth = 2 * px; segment(g, x, y, x + 5, y);
     segment(g, x, y - 3 * px, x, y + 3 * px); segment(g, x + 5, y - 3 * px, x + 5, y + 3 * px);
-    this.text(g, "5 mm", x + 2.5, y + 10 * px, 12 * px, theme.ink, "center");
+    this.text(g, "5 mm", x + 2.5, y - 11 * px, 12 * px, theme.ink, "center");
   }
 
   /** The whole film, small, in the corner: where this view is on it. */
@@ -126,7 +126,7 @@ export class Plan {
 
   /** The millimetre around the touch, enlarged, with the ellipse in which it lies 95 times of 100. */
   drawLens(g, sample, trail, px) {
-    const size = 46 * px, x = this.reach - size - 10 * px, y = this.reach - size - 10 * px, scale = size / LENS_MM;
+    const size = LENS_PX * px, [x, y] = this.lensPlace(size, px), scale = size / LENS_MM;
     g.save();
     g.fillStyle = theme.card; g.strokeStyle = theme.quiet; g.lineWidth = 1.2 * px;
     circle(g, x, y, size); g.fill(); g.stroke(); g.clip();
@@ -139,8 +139,16 @@ export class Plan {
     circle(g, x, y, 3 * px); g.fill();
     g.restore();
     g.strokeStyle = theme.ink; g.lineWidth = 1.5 * px;
-    segment(g, x - 0.25 * scale, y - size - 8 * px, x + 0.25 * scale, y - size - 8 * px);
-    this.text(g, "0.5 mm", x, y - size - 18 * px, 11 * px, theme.ink, "center");
+    const below = y - 0.62 * size;
+    segment(g, x - 0.25 * scale, below, x + 0.25 * scale, below);
+    this.text(g, "0.5 mm", x, below - 9 * px, 10 * px, theme.ink, "center");
+  }
+
+  /** The corner in which the lens hides no electrode. */
+  lensPlace(size, px) {
+    const far = this.reach - size - 10 * px, corners = [[far, -far], [far, far], [-far, far]];
+    const hides = ([x, y]) => Object.values(this.film.outlines_mm).flat().some(([u, v]) => Math.hypot(u - x, v - y) < size + 4 * px);
+    return corners.find((corner) => !hides(corner)) ?? corners[0];
   }
 
   drawWord(g, word) {

@@ -16,14 +16,14 @@ void main() {
   float contour = lit * smoothstep(0.44, 0.5, abs(fract(d * 8.0) - 0.5)) * step(0.02, d);
   gl_FragColor = vec4(colour * shade * (1.0 - 0.10 * contour), 1.0);
 }`;
-const STRETCH = 5, FLAT_ANGLES = 17, FLAT_RINGS = [0, 0.25, 0.5, 0.75, 1];
+const STRETCH = 4, FLAT_ANGLES = 17, FLAT_RINGS = [0, 0.25, 0.5, 0.75, 1];
 
 export class Relief {
   constructor(canvas, caption, film) {
     Object.assign(this, { canvas, caption, film, yaw: -0.55, pitch: 0.62, isStale: true });
     this.radius = film.radius_mm ?? 45;
     this.deflection = film.deflection ? new Deflection(film.deflection) : null;
-    this.gl = canvas.getContext("webgl", { antialias: true, alpha: true });
+    [this.gl, this.finest] = isDrawnByProcessor() ? [canvas.getContext("webgl", { antialias: false }), 1] : [canvas.getContext("webgl", { antialias: true }), 1.5];
     if (!this.gl) { canvas.hidden = true; caption.textContent = "This browser has no WebGL: no 3D view."; return; }
     this.prepare();
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
@@ -82,7 +82,7 @@ export class Relief {
     if (!this.gl || this.gl.isContextLost()) return;
     const touch = sample?.contact && sample.x !== null && kind !== "misfit" ? sample : null;
     const key = touch ? `${touch.x.toFixed(2)} ${touch.y.toFixed(2)} ${touch.force.toFixed(3)} ${kind}` : "";
-    if (!fit(this.canvas, 1.5) && !this.isStale && key === this.key) return;
+    if (!fit(this.canvas, this.finest) && !this.isStale && key === this.key) return;
     [this.key, this.isStale] = [key, false];
     const { gl } = this;
     this.deflection?.press(touch?.x ?? 0, touch?.y ?? 0, touch ? Math.max(touch.force, 0) : 0);
@@ -184,6 +184,14 @@ export class Relief {
       : "No deflection field for this film: the place alone. isocharge simulate deflection computes one.";
     if (this.caption.textContent !== words) this.caption.textContent = words;
   }
+}
+
+/** Whether WebGL is drawn without a graphics card: then smooth edges cost more than they are worth. */
+function isDrawnByProcessor() {
+  const probe = document.createElement("canvas").getContext("webgl"), names = probe?.getExtension("WEBGL_debug_renderer_info");
+  const name = names ? probe.getParameter(names.UNMASKED_RENDERER_WEBGL) : "";
+  probe?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software/i.test(name);
 }
 
 function closed(points) { return [...points, points[0]]; }

@@ -29,7 +29,7 @@ export class Traces {
   plot(name, series, least = null) {
     const grid = { stroke: theme.line, width: 1 }, axis = { stroke: theme.quiet, grid, ticks: grid, font: "11px system-ui, sans-serif" };
     return new uPlot({
-      width: this.width(name), height: HEIGHT, legend: { show: false }, cursor: { sync: { key: "time" }, points: { size: 6 } }, padding: [8, 6, 0, 0],
+      width: this.width(name), height: HEIGHT, legend: { show: false }, cursor: { sync: { key: "time" }, points: { size: 6 } }, padding: [8, 16, 0, 0],
       scales: { x: { time: false, range: () => [this.end - WINDOW_S, this.end] }, y: { range: (_, low, high) => range(low, high, least) } },
       axes: [{ ...axis, size: 26, values: (_, marks) => marks.map((mark) => this.word(mark)) }, { ...axis, size: 46 }],
       series: [{}, ...series.map((line) => ({ ...line, points: { show: false }, spanGaps: false }))],
@@ -41,7 +41,7 @@ export class Traces {
 
   /** A time on the axis: of the clock, or since a recording began. */
   word(seconds) {
-    if (this.history.isReplay) return `${seconds.toFixed(0)} s`;
+    if (this.history.isReplay) return seconds < 0 ? "" : `${seconds.toFixed(0)} s`;
     return new Date((seconds + this.history.origin) * 1000).toLocaleTimeString([], { minute: "2-digit", second: "2-digit" });
   }
 
