@@ -109,12 +109,12 @@ def read_deflection_field(path: Path) -> DeflectionField:
         raise InputError(f"{path}: deflection field {version} is not supported (this version reads {VERSION})")
     film = table.table("film")
     forces, distances, rings = (
-        tuple(table.as_numbers(key, values := table.sequence(key), count=len(values), of="numbers"))
+        table.as_numbers(key, table.sequence(key), count=len(table.sequence(key)), of="numbers")
         for key in ("force_N", "distance_mm", "rings")
     )
     shape = (len(forces), len(distances), len(rings), table.whole("angles", least=2))
-    for key, values in (("force_N", forces), ("distance_mm", distances), ("rings", rings)):
-        if not values or any(a >= b for a, b in pairwise(values)):
+    for key, numbers in (("force_N", forces), ("distance_mm", distances), ("rings", rings)):
+        if not numbers or any(a >= b for a, b in pairwise(numbers)):
             table.refuse(key, "increasing numbers")
     return DeflectionField(
         {key: film.number(key) for key in FILM_KEYS},

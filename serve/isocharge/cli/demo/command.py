@@ -72,7 +72,7 @@ def demo_command(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the training data and of the live presses.")] = 0,
     config: ConfigOption = None,
-    live: Annotated[
+    live_page: Annotated[
         bool,
         typer.Option(
             "--live", help="Only follow a virtual sensor, with the released model, on a page that opens in the browser."
@@ -90,7 +90,7 @@ def demo_command(
 
     Example: isocharge demo -o first-light
     """
-    if live:
+    if live_page:
         show_live_film(SENSOR, RATE_HZ, seed, live_port, seconds, browser)
         return
     from isocharge.files import new_folder

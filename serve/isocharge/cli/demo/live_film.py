@@ -38,14 +38,15 @@ def show_live_film(
         forward_map = ForwardMap.build(load_sensor(sensor), Circle(1e-3), progress=advance)
     touch = TouchStream(predictor)
     live = RecordedStream(touch)
-    header = (predictor.metadata.label, Policy.every.value, {})
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         stack.enter_context(log_to_stderr())
         link, url = stack.enter_context(one_page(sensor, predictor.metadata, find_model(sensor), settings))
         board = stack.enter_context(virtual_sensor(forward_map, "reference", seed, rate_Hz))
         port = stack.enter_context(Port(board.url))
-        stack.enter_context(answering(PageRequests(link, live, header, False)))
+        stack.enter_context(
+            answering(PageRequests(link, live, (predictor.metadata.label, Policy.every.value, {}), False))
+        )
         say(f"live page: {url}; Ctrl-C stops")
         if in_browser:
             open_in_browser(url)

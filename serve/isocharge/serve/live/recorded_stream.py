@@ -110,7 +110,7 @@ def replay(
     clock: RecordedClock,
     *,
     real_time: bool = False,
-    on_marker: Callable[[Marker], None] = lambda _: None,
+    on_marker: Callable[[Marker], object] = lambda _: None,
 ) -> Iterator[tuple[PredictionRecord, str]]:
     """The records of a recording, each with its line of JSON; as many for each chunk as were taken then.
 

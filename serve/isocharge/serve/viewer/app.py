@@ -55,7 +55,7 @@ class PageApp:
                 return self._files[path]
             self._access.check(dict(headers))
             return self._session()
-        except IsochargeError as error:
+        except Exception as error:  # whatever it is, one request fails and the log says why
             return error_response(error)
 
     def _session(self) -> Response:

@@ -24,7 +24,7 @@ def coalesce(samples: Samples, most: int) -> Samples:
     if len(samples) <= most:
         return samples
     edges = np.linspace(0, len(samples), most + 1).astype(int)
-    shown = samples[_shown_of_runs(samples, edges)]
+    shown: Samples = samples[_shown_of_runs(samples, edges)]
     starts = edges[:-1]
     contact = shown["flags"] & CONTACT_BIT
     shown["flags"] = np.bitwise_or.reduceat(samples["flags"], starts) & ~np.uint32(CONTACT_BIT) | contact

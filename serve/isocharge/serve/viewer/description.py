@@ -54,7 +54,7 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
         "electrodes": list(metadata.electrodes),
         "outlines_mm": _outlines_mm(sensor, metadata.electrodes),
         "radius_mm": film.get("radius_mm") if isinstance(film, dict) else None,
-        "working_area_mm": [list(corner) for corner in metadata.working_area_mm],
+        "working_area_mm": [[float(x), float(y)] for x, y in metadata.working_area_mm],
         "force_range_N": list(metadata.force_range_N),
         "probes": list(metadata.probes),
         "deflection": None if field is None else field.to_json(),

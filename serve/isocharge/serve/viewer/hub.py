@@ -64,6 +64,12 @@ class Film:
     state: dict[str, Any] = field(default_factory=dict)
     version: int = 0
 
+    def close(self) -> None:
+        """Close the link and the file of a recording."""
+        self.link.close_here()
+        if isinstance(self.tape, RecordedTape):
+            self.tape.close()
+
     def drain(self) -> None:
         """Take what the reader has sent."""
         if not self.link.is_open:
@@ -199,6 +205,11 @@ class Hub:
     def viewers(self) -> int:
         """How many there are."""
         return len(self._viewers)
+
+    def close(self) -> None:
+        """Close all films."""
+        for film in self.films:
+            film.close()
 
     def join(self) -> Viewer:
         """A new viewer."""

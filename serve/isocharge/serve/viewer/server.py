@@ -104,13 +104,9 @@ def run_page(films: Sequence[FilmLink], settings: PageSettings, announce: Any = 
     access = Access(None if settings.token is None else Token(settings.token), settings.address.host)
     limits = ServerLimits(connections=CONNECTIONS)
     server = HttpServer(
-        PageApp(hub, access),
-        settings.address,
-        limits=limits,
-        tls=settings.tls,
-        websocket=bounded_websocket(limits),
+        PageApp(hub, access), settings.address, limits=limits, tls=settings.tls, websocket=bounded_websocket(limits)
     )
-    with closing(server):
+    with closing(server), closing(hub):
         if announce is not None:
             announce(server.url)
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:

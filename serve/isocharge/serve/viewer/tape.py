@@ -70,6 +70,10 @@ class RecordedTape:
         self._piece_s = 0.01
         self._force_N: list[float] = []
 
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
     def append(self, samples: Samples) -> None:
         """Add samples."""
         if not len(samples):

@@ -30,7 +30,7 @@ def deflection_field(
     force_N: tuple[float, ...] = FORCES_N,
     *,
     distances: int = DISTANCES,
-    progress: Progress = lambda done, total: None,
+    progress: Progress | None = None,
 ) -> DeflectionField:
     """Solve the film under presses of several forces at several distances from its centre.
 
@@ -53,9 +53,15 @@ def deflection_field(
         for row, force in enumerate(force_N):
             solved = press(film, probe, (1e-3 * distance, 0.0), force, start=solved)
             deflection_mm[row, column] = _on_rings(solved, distance, rings)
-            progress(column * len(force_N) + row + 1, len(force_N) * distances)
+            if progress is not None:
+                progress(column * len(force_N) + row + 1, len(force_N) * distances)
     return DeflectionField(
-        _constants(film), 1e3 * probe.radius, force_N, tuple(distance_mm), tuple(rings), deflection_mm
+        film=_constants(film),
+        probe_radius_mm=1e3 * probe.radius,
+        force_N=force_N,
+        distance_mm=tuple(distance_mm.tolist()),
+        rings=tuple(rings.tolist()),
+        deflection_mm=deflection_mm,
     )
 
 
