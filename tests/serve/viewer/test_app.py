@@ -286,9 +286,9 @@ def test_the_end_of_the_stream_ends_the_page(start_page, viewer):
         viewer(page, talk)
 
 
-@pytest.mark.parametrize(("path", "method", "status"), [("/etc/passwd", "GET", 404), ("/../app.py", "GET", 404)])
-def test_other_paths(page, path, method, status):
-    with pytest.raises(urllib.error.HTTPError, match=str(status)):
+@pytest.mark.parametrize("path", ["/etc/passwd", "/../app.py", "/vendor", "/v2", "/live"])
+def test_other_paths(page, path):
+    with pytest.raises(urllib.error.HTTPError, match="404"):
         page.get(path)
 
 

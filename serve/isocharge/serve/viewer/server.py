@@ -25,7 +25,7 @@ from isocharge.serve.viewer.app import PageApp
 from isocharge.serve.viewer.hub import Hub, make_film
 from isocharge.serve.viewer.link import PageEnd
 
-NICE = 5
+NICE = 10
 """How much later than the reader the page's process gets its turn where both want the same core."""
 
 START_S, STOP_S = 60.0, 5.0

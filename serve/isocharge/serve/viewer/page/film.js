@@ -19,7 +19,7 @@ export class FilmView {
     this.find(".name").textContent = description.name;
     const version = description.model.startsWith(`${description.name}/`);
     this.find(".model").textContent = version ? `version ${description.model.slice(description.name.length + 1)}` : description.model;
-    this.root.addEventListener("click", (event) => { const button = event.target.closest("[data-do]"); if (button) act(button.dataset.do, this); });
+    this.root.addEventListener("click", (event) => { const button = event.target.closest("[data-do]"); if (button) { act(button.dataset.do, this); if (event.detail) button.blur(); } });
     if (this.isReplay) for (const button of this.root.querySelectorAll("[data-do]")) button.hidden = button.dataset.do !== "pause";
     this.latencies = [];
     this.ages = [];
