@@ -2,12 +2,14 @@
 
 import asyncio
 import json
+import os
 import re
 import signal
 import socket
 import struct
 import time
 import urllib.request
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -61,8 +63,9 @@ async def follow(url, until, ask=()):
             else:
                 rows.append(np.frombuffer(data, FORM.dtype, offset=HEADER.size))
                 await client.send(struct.pack("<I", HEADER.unpack_from(data)[3]))
-            if until(np.concatenate(rows) if rows else np.zeros(0, FORM.dtype), state):
-                return np.concatenate(rows), state
+            seen = np.concatenate([np.zeros(0, FORM.dtype), *rows])
+            if until(seen, state):
+                return seen, state
     raise AssertionError((state, len(rows)))
 
 
@@ -181,3 +184,31 @@ def test_others_are_let_in_on_purpose_only(models, command):
     )
     assert code == 2
     assert "--token" in err
+
+
+def test_a_film_without_a_sensor_says_why(models, tmp_path, start_command):
+    streams = tmp_path / "one.toml"
+    streams.write_text('[[stream]]\nmodel = "linear"\nport = "nowhere"\n')
+    process = start_command("serve", "live", streams, "--models", models, "--live-port", 0)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert "nowhere: cannot be opened" in err
+    assert "Traceback" not in err
+
+
+def test_the_stream_goes_on_without_its_page(sensor, models, start_command):
+    process = start_command(
+        *("serve", "stream", "linear", "--models", models, "--port", sensor.url, "--live", "--live-port", 0),
+        *("--count", 1000),
+    )
+    url_in(process)
+    (page,) = (
+        each.split()[0]
+        for each in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        if "resource_tracker" not in Path(f"/proc/{each}/cmdline").read_text()
+    )
+    os.kill(int(page), signal.SIGKILL)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 0, err
+    assert len(out.splitlines()) == 1000
+    assert "goes on without it" in err

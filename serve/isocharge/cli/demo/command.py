@@ -75,7 +75,9 @@ def demo_command(
     live_page: Annotated[
         bool,
         typer.Option(
-            "--live", help="Only follow a virtual sensor, with the released model, on a page that opens in the browser."
+            "--live",
+            help="Only follow a virtual sensor, with the released model, on a page that opens in the browser. "
+            "(default: all of it)",
         ),
     ] = False,
     live_port: LivePortOption = PORT,

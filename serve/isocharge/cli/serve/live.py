@@ -1,9 +1,11 @@
 """`isocharge serve live`: several sensors on one page."""
 
 import signal
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from multiprocessing import get_context
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -68,12 +70,16 @@ def live_command(
         reader, film = film_link(stream.name, load_model(version).metadata, version)
         films.append(film)
         readers.append((stream, models, reader))
-    with until_stopped(), _reading(readers):
+    with until_stopped(), _reading(readers) as processes:
         run_page(films, settings, lambda url: say(f"live page: {url}; Ctrl-C stops"))
+    if any(process.exitcode == 1 for process in processes):
+        raise typer.Exit(1)
 
 
 @contextmanager
-def _reading(readers: "Sequence[tuple[StreamSettings, Path | None, ReaderEnd]]") -> Iterator[None]:
+def _reading(
+    readers: "Sequence[tuple[StreamSettings, Path | None, ReaderEnd]]",
+) -> Iterator[list[SpawnProcess]]:
     """A process for each stream, while the block runs."""
     context = get_context("spawn")
     processes = [context.Process(target=read_port, args=reader, daemon=True) for reader in readers]
@@ -82,7 +88,7 @@ def _reading(readers: "Sequence[tuple[StreamSettings, Path | None, ReaderEnd]]")
             process.start()
         for _, _, end in readers:
             end.close_here()
-        yield
+        yield processes
     finally:
         for process in processes:
             if process.pid is not None:
@@ -100,6 +106,7 @@ def read_port(stream: "StreamSettings", models: Path | None, link: "ReaderEnd") 
         except (IsochargeError, OSError) as error:
             say(f"{stream.name}: {type(error).__name__}: {error}")
             link.tell(reason=str(error))
+            sys.exit(1)
 
 
 def _follow(stream: "StreamSettings", models: Path | None, link: "ReaderEnd") -> None:

@@ -46,7 +46,10 @@ def replay_command(
     udp: UdpOption = None,
     live_page: Annotated[
         bool,
-        typer.Option("--live", help="Play it on a page for browsers, with a time line; its address is said on stderr."),
+        typer.Option(
+            "--live",
+            help="Play it on a page for browsers, with a time line; its address is said on stderr. (default: no)",
+        ),
     ] = False,
     live_port: LivePortOption = PORT,
     live_host: LiveHostOption = "127.0.0.1",

@@ -98,7 +98,10 @@ def stream_command(
         ),
     ] = None,
     live_page: Annotated[
-        bool, typer.Option("--live", help="Show the film on a page for browsers; its address is said on stderr.")
+        bool,
+        typer.Option(
+            "--live", help="Show the film on a page for browsers; its address is said on stderr. (default: no)"
+        ),
     ] = False,
     live_port: LivePortOption = PORT,
     live_host: LiveHostOption = "127.0.0.1",

@@ -5,9 +5,10 @@ import os
 import threading
 import time
 import webbrowser
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from isocharge.serve.model.metadata import ModelMetadata
     from isocharge.serve.viewer.link import Message, ReaderEnd
     from isocharge.serve.viewer.server import FilmLink, PageSettings
+
+RATE_RECORDS = 400
+"""Records, the latest, over which the rate is taken."""
 
 STATE_S = 0.25
 """Time between two messages with the counters, s."""
@@ -132,20 +136,22 @@ class PageFeed:
     pack: "Callable[[PredictionRecord], bytes]"
     touch: "TouchStream"
     live: "RecordedStream | None" = None
-    _state_s: float = 0.0
-    _records: int = 0
+    _told_s: float = 0.0
+    _times: deque[float] = field(default_factory=lambda: deque(maxlen=RATE_RECORDS))
 
     def put(self, record: "PredictionRecord") -> None:
-        """Hand over a record; never waits."""
+        """Hand over a record; does not wait."""
+        was_open, now_s = self.link.is_open, time.monotonic()
         self.link.put(self.pack(record))
-        self._records += 1
-        now_s = time.monotonic()
-        if now_s - self._state_s > STATE_S:
-            self._tell_state(record, now_s)
+        self._times.append(now_s)
+        if was_open and not self.link.is_open:
+            say("the process of the live page has ended; the stream goes on without it")
+        if now_s - self._told_s > STATE_S:
+            self._told_s = now_s
+            self._tell_state(record, now_s - self._times[0])
 
-    def _tell_state(self, record: "PredictionRecord", now_s: float) -> None:
-        rate_Hz = self._records / (now_s - self._state_s) if self._state_s else None
-        self._records, self._state_s = 0, now_s
+    def _tell_state(self, record: "PredictionRecord", elapsed_s: float) -> None:
+        rate_Hz = (len(self._times) - 1) / elapsed_s if len(self._times) > 1 and elapsed_s > 0.0 else None
         recorder = self.live.recorder if self.live else None
         self.link.tell(
             counters=self.touch.totals()._asdict()

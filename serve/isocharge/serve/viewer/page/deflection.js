@@ -38,15 +38,15 @@ export class Deflection {
     return [f, (1 - share) * Math.cbrt(force / this.forces[f]), share * Math.cbrt(force / this.forces[next])];
   }
 
-  /** Place of a node of the sheet, mm; angle 0 to 2 (angles - 1), the second half mirrors the first. */
+  /** Place on a ring, mm; angle 0 to 2 (angles - 1), between the table's too, the second half mirrors the first. */
   node(ring, angle) {
     const half = this.angles - 1, phi = angle * Math.PI / half, s = this.rings[ring];
     const [re, im] = [s * Math.cos(phi), s * Math.sin(phi)], { c } = this;
     const [a, b] = [1 + c * re, c * im], norm = a * a + b * b;
     const [u, v] = [((re + c) * a + im * b) / norm, (im * a - (re + c) * b) / norm];
     const [cos, sin] = [Math.cos(this.turn), Math.sin(this.turn)];
-    const w = this.sheet[ring * this.angles + (angle <= half ? angle : 2 * half - angle)];
-    return [this.radius * (u * cos - v * sin), this.radius * (u * sin + v * cos), w];
+    const [j, share] = place2(angle <= half ? angle : 2 * half - angle, this.angles), w = this.sheet.subarray(ring * this.angles + j);
+    return [this.radius * (u * cos - v * sin), this.radius * (u * sin + v * cos), w[0] * (1 - share) + w[1] * share];
   }
 
   /** Deflection at a place, mm. */

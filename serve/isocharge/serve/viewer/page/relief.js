@@ -16,7 +16,7 @@ void main() {
   float contour = lit * smoothstep(0.44, 0.5, abs(fract(d * 8.0) - 0.5)) * step(0.02, d);
   gl_FragColor = vec4(colour * shade * (1.0 - 0.10 * contour), 1.0);
 }`;
-const STRETCH = 4, FLAT_ANGLES = 17, FLAT_RINGS = [0, 0.25, 0.5, 0.75, 1];
+const STRETCH = 4, FINER = 3, FLAT_ANGLES = 17, FLAT_RINGS = [0, 0.25, 0.5, 0.75, 1];
 
 export class Relief {
   constructor(canvas, caption, film) {
@@ -51,7 +51,7 @@ export class Relief {
 
   layOutSheet() {
     const { gl } = this, d = this.deflection;
-    [this.rings, this.around] = d ? [d.rings.length, 2 * (d.angles - 1)] : [FLAT_RINGS.length, 2 * (FLAT_ANGLES - 1)];
+    [this.rings, this.around] = d ? [d.rings.length, 2 * FINER * (d.angles - 1)] : [FLAT_RINGS.length, 2 * (FLAT_ANGLES - 1)];
     this.nodes = new Float32Array(this.rings * this.around * 7);
     const triangles = [];
     for (let i = 0; i + 1 < this.rings; i++) for (let j = 0; j < this.around; j++) {
@@ -116,7 +116,7 @@ export class Relief {
   drawSheet() {
     const { gl, nodes, rings, around, deflection } = this, places = [];
     for (let i = 0; i < rings; i++) for (let j = 0; j < around; j++) {
-      if (deflection) { const [x, y, w] = deflection.node(i, j); places.push([x, y, -STRETCH * w]); } else {
+      if (deflection) { const [x, y, w] = deflection.node(i, j / FINER); places.push([x, y, -STRETCH * w]); } else {
         const phi = 2 * Math.PI * j / around, s = FLAT_RINGS[i] * this.radius; places.push([s * Math.cos(phi), s * Math.sin(phi), 0]);
       }
     }

@@ -63,7 +63,7 @@ export class Traces {
     if (name === "misfit") {
       const y = plot.valToPos(MISFIT_LIMIT, "y", true);
       g.strokeStyle = theme.warn; g.setLineDash([5 * pixel, 4 * pixel]); stroke(g, left, y, left + width, y);
-      g.fillStyle = theme.warn; g.font = `${11 * pixel}px system-ui, sans-serif`; g.textAlign = "right";
+      g.fillStyle = theme.warn; g.font = `${11 * pixel}px system-ui, sans-serif`; g.textAlign = "right"; g.textBaseline = "bottom";
       g.fillText("no single contact above", left + width - 4 * pixel, y - 4 * pixel);
     }
     g.strokeStyle = theme.ink; g.setLineDash([2 * pixel, 2 * pixel]);
