@@ -15,7 +15,6 @@ import json
 import multiprocessing
 import os
 import re
-import signal
 import struct
 import subprocess
 import sys
@@ -134,7 +133,7 @@ def one_round(port, viewers, seconds, folder, number, live, in_browser):
     ages = [age for result in results for age in (result.recv() if result.poll(20) else [])]
     for each in watching:
         each.join()
-    process.send_signal(signal.SIGINT)
+    process.terminate()
     process.communicate(timeout=30)
     latencies = np.array([us for event in Recording(path).events() for us in event.latencies_us])
     lines = (json.loads(line) for line in path.open() if line.startswith('{"timestamp"'))

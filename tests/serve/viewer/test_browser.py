@@ -27,15 +27,15 @@ PRESSES = [
 DRAWN = """() => {
   const film = isocharge.page.films[0], plan = film.plan, canvas = plan.canvas;
   const g = canvas.getContext("2d"), { data } = g.getImageData(0, 0, canvas.width, canvas.height);
-  const lens = canvas.width - 130 * canvas.width / canvas.clientWidth;
+  const lens = plan.lens ?? { x: 1e9, y: 1e9, size: 0 }, mm = plan.pixel, css = canvas.width / canvas.clientWidth;
   let [count, x, y, left, right, top, bottom] = [0, 0, 0, Infinity, 0, Infinity, 0];
   for (let j = 0; j < canvas.height; j++) for (let i = 0; i < canvas.width; i++) {
     const at = 4 * (j * canvas.width + i);
-    if (data[at] < 150 || data[at + 2] > 90 || data[at + 1] > 150 || (i > lens && j > lens)) continue;
+    if (data[at] < 150 || data[at + 2] > 90 || data[at + 1] > 150) continue;
+    if (Math.hypot((i - canvas.width / 2) * mm - lens.x, (canvas.height / 2 - j) * mm - lens.y) < 1.05 * lens.size) continue;
     count++; x += i; y += j;
     [left, right, top, bottom] = [Math.min(left, i), Math.max(right, i), Math.min(top, j), Math.max(bottom, j)];
   }
-  const mm = plan.pixel, css = canvas.width / canvas.clientWidth;
   return { kind: film.drawnKind, count,
     x: (x / count + 0.5 - canvas.width / 2) * mm, y: (canvas.height / 2 - y / count - 0.5) * mm,
     width: (right - left + 1) / css, height: (bottom - top + 1) / css, shown: [".x b", ".y b", ".force b"].map(

@@ -126,7 +126,8 @@ export class Plan {
 
   /** The millimetre around the touch, enlarged, with the ellipse in which it lies 95 times of 100. */
   drawLens(g, sample, trail, px) {
-    const size = LENS_PX * px, [x, y] = this.lensPlace(size, px), scale = size / LENS_MM;
+    const size = LENS_PX * px, [x, y] = this.lensPlace(size, px, sample), scale = size / LENS_MM;
+    this.lens = { x, y, size };
     g.save();
     g.fillStyle = theme.card; g.strokeStyle = theme.quiet; g.lineWidth = 1.2 * px;
     circle(g, x, y, size); g.fill(); g.stroke(); g.clip();
@@ -144,10 +145,10 @@ export class Plan {
     this.text(g, "0.5 mm", x, below - 9 * px, 10 * px, theme.ink, "center");
   }
 
-  /** The corner in which the lens hides no electrode. */
-  lensPlace(size, px) {
-    const far = this.reach - size - 10 * px, corners = [[far, -far], [far, far], [-far, far]];
-    const hides = ([x, y]) => Object.values(this.film.outlines_mm).flat().some(([u, v]) => Math.hypot(u - x, v - y) < size + 4 * px);
+  /** The corner in which the lens hides neither touch nor electrode. */
+  lensPlace(size, px, touch) {
+    const far = this.reach - size - 10 * px, corners = [[far, -far], [far, far], [-far, far]], edges = Object.values(this.film.outlines_mm).flat();
+    const hides = ([x, y]) => Math.hypot(touch.x - x, touch.y - y) < size + 24 * px || edges.some(([u, v]) => Math.hypot(u - x, v - y) < size + 4 * px);
     return corners.find((corner) => !hides(corner)) ?? corners[0];
   }
 
