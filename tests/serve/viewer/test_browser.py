@@ -32,7 +32,8 @@ DRAWN = """() => {
   for (let j = 0; j < canvas.height; j++) for (let i = 0; i < canvas.width; i++) {
     const at = 4 * (j * canvas.width + i);
     if (data[at] < 150 || data[at + 2] > 90 || data[at + 1] > 150) continue;
-    if (Math.hypot((i - canvas.width / 2) * mm - lens.x, (canvas.height / 2 - j) * mm - lens.y) < 1.05 * lens.size) continue;
+    const [u, v] = [(i - canvas.width / 2) * mm, (canvas.height / 2 - j) * mm];
+    if (Math.hypot(u - lens.x, v - lens.y) < 1.05 * lens.size) continue;
     count++; x += i; y += j;
     [left, right, top, bottom] = [Math.min(left, i), Math.max(right, i), Math.min(top, j), Math.max(bottom, j)];
   }
