@@ -39,6 +39,7 @@ bench: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_stream.py
 	$(BIN)/python tests/benchmarks/bench_touch.py
 	$(BIN)/python tests/benchmarks/bench_http.py
+	$(BIN)/python tests/benchmarks/bench_live.py
 
 # A million requests; some minutes.
 soak: $(VENV)/installed

@@ -86,6 +86,10 @@ class TokenError(IsochargeError, PermissionError):
     """A request does not carry the server's token."""
 
 
+class OriginError(IsochargeError, PermissionError):
+    """A request comes from a page of another site."""
+
+
 class ListenError(IsochargeError, OSError):
     """The server cannot listen where it was asked to."""
 

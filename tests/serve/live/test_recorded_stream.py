@@ -9,6 +9,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from isocharge.errors import RecordingError
 from isocharge.serve import (
     Chunk,
     Frame,
@@ -24,6 +25,7 @@ from isocharge.serve import (
     load_model,
 )
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
+from isocharge.serve.port.recording import Marker
 
 DEVICE = {"tare": {"frames": 10}, "leak": {"tau_s": 10.0}, "hum": {"frequency_Hz": 50.0}}
 
@@ -151,3 +153,43 @@ def test_latest_gives_a_record_for_the_newest_frame_of_a_chunk(predictor):
     assert (stream.counts.records, stream.counts.skipped) == (1, 9)
     every = TouchStream(predictor)
     assert [record.seq for record in islice(every.feed(Chunk(data, 0.0, 0)), 20)] == list(range(10))
+
+
+def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, tmp_path):
+    """Begun and ended on request, with a marker: its replay gives its records, and the totals go on."""
+    path, device = tmp_path / "later.rec", device_from_table(DEVICE, "test")
+    stream, pieces = TouchStream(predictor, device), chunks(film)
+    live, lines = RecordedStream(stream), []
+
+    def asking():
+        for number, chunk in enumerate(pieces):
+            if number == 20:
+                live.request_recording(Recorder(path, predictor.metadata.label, "every", DEVICE).__enter__())
+            if number == 30:
+                live.request_marker(Marker(1e9, "now"))
+            if number == 60:
+                live.request_recording(None)
+            yield chunk
+
+    for _, line in live.follow(asking()):
+        if live.recorder is not None:
+            lines.append(line)
+    assert len(lines) > 20
+    assert stream.totals().frames == 78  # outage and beginning cut a frame in two each
+    clock, markers = RecordedClock(), []
+    again = TouchStream(predictor, device, now_ns=clock)
+    replayed = [line for _, line in replay(Recording(path), again, clock, on_marker=markers.append)]
+    assert replayed == lines
+    assert markers == [Marker(1e9, "now")]
+    assert list(Recording(path).events()) == [
+        moment for moment in Recording(path).events_and_markers() if not isinstance(moment, Marker)
+    ]
+
+
+@pytest.mark.parametrize("marker", ['["x", "y"]', "[1.0]", "[1.0, 2]", '[1e300, "y"]', "1", f'[1.0, "{"x" * 2000}"]'])
+def test_a_damaged_marker_says_why(film, predictor, tmp_path, marker):
+    path = tmp_path / "touch.rec"
+    record(path, film, predictor)
+    path.write_text(path.read_text() + f'{{"marker": {marker}}}\n')
+    with pytest.raises(RecordingError, match="marker"):
+        list(Recording(path).events())

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from isocharge.cli.demo.live_film import show_live_film
+from isocharge.cli.shared.live_page import PORT, LivePortOption
 from isocharge.cli.shared.options import ConfigOption
 from isocharge.cli.shared.terminal import progress, say, this_command
 from isocharge.cli.shared.virtual_sensor import check_pseudo_terminals, virtual_sensor
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
 
 SENSOR, SAMPLES, RATE_HZ = "three-25um-biaxial", 24_000, 200.0
 """Sensor of the demo, presses that it is trained on, and frames per second of its live part, Hz."""
+
+LIVE_S = 20.0
+"""Duration of the live part, s."""
 
 SHOWN_PRESS = ((3e-3, -2e-3), 1.0)
 """Position (m) and force (N) of the press whose film is drawn."""
@@ -57,18 +62,40 @@ def demo_command(
         ),
     ] = None,
     seconds: Annotated[
-        float, typer.Option("--seconds", min=3.0, max=3600.0, help="Duration of the live part, s.")
-    ] = 20.0,
+        float | None,
+        typer.Option(
+            "--seconds",
+            min=3.0,
+            max=1e6,
+            help="Duration of the live part, s. (default: 20; with --live until Ctrl-C)",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the training data and of the live presses.")] = 0,
     config: ConfigOption = None,
+    live_page: Annotated[
+        bool,
+        typer.Option(
+            "--live",
+            help="Only follow a virtual sensor, with the released model, on a page that opens in the browser. "
+            "(default: all of it)",
+        ),
+    ] = False,
+    live_port: LivePortOption = PORT,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="With --live: open the page, or only say its address.")
+    ] = True,
 ) -> None:
     """Show what isocharge does: simulate a film, train a model, follow a virtual sensor live, and draw the results.
 
-    Takes about two minutes. Writes dataset, model and one page of pictures (mm, N, pC) into a new folder.
+    Takes about two minutes. Writes dataset, model and one page of pictures (mm, N, pC) into a new folder. --live takes
+    some seconds, and trains and writes nothing.
 
     Example: isocharge demo -o first-light
     """
     check_pseudo_terminals()
+    if live_page:
+        show_live_film(SENSOR, RATE_HZ, seed, live_port, seconds, browser)
+        return
     from isocharge.files import new_folder
     from isocharge.serve import Predictor
     from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, solve_maps, write_sweep
@@ -95,7 +122,7 @@ def demo_command(
         with clock.step(
             "serve", f"a virtual sensor sends {RATE_HZ:g} frames/s over a pseudo-terminal, the model answers live"
         ):
-            live = _follow_live(forward_map, Predictor(release.folder), seconds, seed)
+            live = _follow_live(forward_map, Predictor(release.folder), seconds or LIVE_S, seed)
             say(f"   {live.frames} frames, {live.lost} lost, {live.repeated} repeated")
         with clock.step("show", "one page of pictures"), progress("drawing") as advance:
             error_mm, force_error = _measure_and_draw(forward_map, release, live, sweep, draft / "demo.png")

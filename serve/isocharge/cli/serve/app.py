@@ -5,6 +5,7 @@ import typer
 from isocharge.cli.serve.check import check_command
 from isocharge.cli.serve.doctor import doctor_command
 from isocharge.cli.serve.http import http_command
+from isocharge.cli.serve.live import live_command
 from isocharge.cli.serve.predict import predict_command
 from isocharge.cli.serve.replay import replay_command
 from isocharge.cli.serve.stream import stream_command
@@ -17,6 +18,7 @@ serve_app = typer.Typer(
 serve_app.command("predict")(predict_command)
 serve_app.command("check")(check_command)
 serve_app.command("stream")(stream_command)
+serve_app.command("live")(live_command)
 serve_app.command("replay")(replay_command)
 serve_app.command("doctor")(doctor_command)
 serve_app.command("virtual")(virtual_command)

@@ -50,13 +50,23 @@ def record_writer(
     return write
 
 
+def also_shown(write: Lines, show: "Callable[[PredictionRecord], None]") -> Lines:
+    """Write a record, and hand it to the page."""
+
+    def both(record: "PredictionRecord", line: str) -> None:
+        write(record, line)
+        show(record)
+
+    return both
+
+
 def summary(touch: "TouchStream", latencies: deque[float], unwritten: int = 0) -> str:
     """Counts of frames and faults, of records that stdout did not take in time, and percentiles of the latency."""
-    frames, gaps, stream = touch.parser.counts, touch.gaps, touch.counts
+    totals, stream = touch.totals(), touch.counts
     text = (
-        f"{frames.frames} frames, {gaps.lost} lost, {gaps.repeated} repeated, {gaps.restarts} restarts; "
-        f"{frames.crc_errors} CRC errors, {frames.malformed} malformed, {frames.bytes_dropped} bytes dropped, "
-        f"{frames.resyncs} resynchronisations; {stream.outages} reconnects, {stream.skipped} skipped"
+        f"{totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated, {totals.restarts} restarts; "
+        f"{totals.crc_errors} CRC errors, {totals.malformed} malformed, {totals.bytes_dropped} bytes dropped, "
+        f"{totals.resyncs} resynchronisations; {stream.outages} reconnects, {stream.skipped} skipped"
     )
     if unwritten:
         text += f"; {unwritten} records not written, the oldest: the reader of stdout was too slow"

@@ -1,7 +1,8 @@
 """`isocharge serve stream`: prediction records from a port as they come."""
 
 from collections import deque
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -18,7 +19,21 @@ from isocharge.cli.serve.options import (
     WaitOption,
     awaited,
 )
-from isocharge.cli.serve.record_output import LATENCIES, record_writer, summary, write_records
+from isocharge.cli.serve.record_output import LATENCIES, also_shown, record_writer, summary, write_records
+from isocharge.cli.shared.live_page import (
+    PORT,
+    InsecureOption,
+    LiveHostOption,
+    LivePortOption,
+    LiveTokenOption,
+    PageRequests,
+    TlsCertOption,
+    TlsKeyOption,
+    answering,
+    one_page,
+    page_feed,
+    page_settings,
+)
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
 from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
 from isocharge.cli.shared.stopping import on_signal, stop_after, unless_hung_up, until_stopped
@@ -27,6 +42,8 @@ from isocharge.errors import InputError
 
 if TYPE_CHECKING:
     from isocharge.serve import Device, Predictor
+    from isocharge.serve.viewer.link import ReaderEnd
+    from isocharge.serve.viewer.server import PageSettings
 
 LONGEST_NAME = 100
 """Characters of a film's name."""
@@ -91,6 +108,18 @@ def stream_command(
             help="Largest charge at rest that the tare accepts, pC. (default: 100, or as --device says)",
         ),
     ] = None,
+    live_page: Annotated[
+        bool,
+        typer.Option(
+            "--live", help="Show the film on a page for browsers; its address is said on stderr. (default: no)"
+        ),
+    ] = False,
+    live_port: LivePortOption = PORT,
+    live_host: LiveHostOption = "127.0.0.1",
+    live_token: LiveTokenOption = None,
+    insecure: InsecureOption = False,
+    tls_cert: TlsCertOption = None,
+    tls_key: TlsKeyOption = None,
 ) -> None:
     """Follow a sensor live: read its port, and print position (mm) and force (N) for every frame of charges.
 
@@ -101,10 +130,11 @@ def stream_command(
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
-    from isocharge.serve import Policy, Predictor, Recorder, TouchStream, open_source
+    from isocharge.serve import Policy, Predictor, Recorder, TouchStream, find_model, open_source
     from isocharge.serve.live.line_queue import LineQueue
     from isocharge.serve.live.recorded_stream import RecordedStream
 
+    settings = page_settings(live_host, live_port, live_token, insecure, tls_cert, tls_key) if live_page else None
     predictor, board = Predictor(model, models=models), _board(device, offset_limit_pC)
     path = TouchStream(predictor, board, policy=Policy(policy.value), frame_id=_checked_name(name))
     latencies: deque[float] = deque(maxlen=LATENCIES)
@@ -113,6 +143,7 @@ def stream_command(
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         stack.enter_context(log_to_stderr())
+        page = None if settings is None else stack.enter_context(_page(settings, find_model(model, models), predictor))
         request = board.frames.request
         source = stack.enter_context(open_source(awaited(port, wait), baud=baud, reconnect=reconnect, request=request))
         stack.enter_context(on_signal("SIGUSR1", live.request_tare))
@@ -122,6 +153,10 @@ def stream_command(
         lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
         put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
         write = record_writer(stack, output, udp, predictor.metadata.electrodes, put)
+        if page is not None:
+            header = (policy.value, board.table, name or "")
+            stack.enter_context(answering(PageRequests(page, live, header, recorder is not None)))
+            write = also_shown(write, page_feed(page, path, live, predictor.metadata.electrodes).put)
         if recorder:
             stack.enter_context(recorder)
         records = stack.enter_context(closing(live.follow(source)))  # closed before the recorder
@@ -133,6 +168,14 @@ def stream_command(
             say(summary(path, latencies, lines.lost))
     if recorder is not None and recorder.failed:
         raise typer.Exit(1)
+
+
+@contextmanager
+def _page(settings: "PageSettings", model: Path, predictor: "Predictor") -> "Iterator[ReaderEnd]":
+    """The page of this stream; says where it is."""
+    with one_page(predictor.metadata.name, predictor.metadata, model, settings) as (link, url):
+        say(f"live page: {url}")
+        yield link
 
 
 def _board(device: Path | None, offset_limit_pC: float | None) -> "Device":

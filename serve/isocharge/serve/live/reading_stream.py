@@ -61,6 +61,7 @@ class ReadingStream:
         self.parser = parser or device.parser()
         self.gaps = gaps or SequenceGaps()
         self.clock = DeviceClock()
+        self._device, self._electrodes = device, electrodes
         self._chain = chain or device.chain(electrodes)
         self._picker = ChannelPicker(electrodes, device.channels, reader, device.where)
         self._electrodes = electrodes
@@ -71,6 +72,12 @@ class ReadingStream:
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
         self._state = self._state.without_tare()
+
+    def restart(self) -> None:
+        """Begin as a new stream does: format, frame numbers, clock, tare and all counters are forgotten."""
+        self.parser, self.gaps, self.clock = self._device.parser(), SequenceGaps(), DeviceClock()
+        self._state = ChainState.start(len(self._electrodes))
+        self._pending_flags = ()
 
     def feed(self, chunk: Chunk) -> Iterator[TimedReading]:
         """The readings of the frames that end in this chunk.

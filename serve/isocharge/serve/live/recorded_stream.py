@@ -6,11 +6,13 @@ same records, bit for bit.
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 
 from isocharge.serve.live.stream import TouchStream
-from isocharge.serve.port.recording import NewModel, RecordedClock, Recorder, Recording
+from isocharge.serve.port.recording import Marker, NewModel, RecordedClock, Recorder, Recording
 from isocharge.serve.port.serial_port import Chunk
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
@@ -21,7 +23,10 @@ log = logging.getLogger(__name__)
 
 
 class RecordedStream:
-    """Records of a touch stream, which go into a recording if there is one; belongs to one thread."""
+    """Records of a touch stream, which go into a recording if there is one; belongs to one thread.
+
+    What is requested, from any thread, is done before the next chunk.
+    """
 
     def __init__(self, stream: TouchStream, recorder: Recorder | None = None) -> None:
         """Put stream and recording together.
@@ -31,13 +36,38 @@ class RecordedStream:
             recorder: Open while `follow` runs; None for no recording.
         """
         self._stream, self._recorder = stream, recorder
-        self._tare_requested = False
+        self._borrowed = recorder  # whoever opened it closes it
+        self._requests: deque[Callable[[], None]] = deque()
         self._load_requested: Load | None = None
         self._loading: Future[Predictor] | None = None
 
+    @property
+    def predictor(self) -> Predictor:
+        """The model of the next record."""
+        return self._stream.predictor
+
+    @property
+    def recorder(self) -> Recorder | None:
+        """The recording that is under way."""
+        return self._recorder
+
     def request_tare(self) -> None:
-        """Tare again before the next chunk; may be called from a signal handler."""
-        self._tare_requested = True
+        """Tare again; may be called from a signal handler."""
+        self._requests.append(self._tare)
+
+    def request_recording(self, recorder: Recorder | None) -> None:
+        """End the recording that is under way; begin another one.
+
+        A recording begins with a new stream, tare included: its replay has nothing but its bytes to go by.
+
+        Args:
+            recorder: Open; it is closed at the end. None for no recording.
+        """
+        self._requests.append(partial(self._record, recorder))
+
+    def request_marker(self, marker: Marker) -> None:
+        """Note a moment in the recording, if there is one."""
+        self._requests.append(partial(self._mark, marker))
 
     def request_model(self, load: Load) -> None:
         """Load a model meanwhile, and go on with it from the first chunk after that; may be called as `request_tare`.
@@ -55,20 +85,43 @@ class RecordedStream:
         Raises:
             As `isocharge.serve.live.stream.stream`.
         """
-        for chunk in chunks:
-            if self._load_requested or self._loading:
-                self._take_model()
-            if self._tare_requested:
-                self._tare()
-            lines: list[str] = []
-            try:
-                for record in self._stream.feed(chunk):
-                    lines.append(record.to_json())
-                    yield record, lines[-1]
-            finally:
-                if self._recorder is not None:
-                    self._recorder.chunk(chunk, lines)
-        self._stream.finish()
+        try:
+            for chunk in chunks:
+                if self._load_requested or self._loading:
+                    self._take_model()
+                while self._requests:
+                    self._requests.popleft()()
+                yield from self._records(chunk)
+            self._stream.finish()
+        finally:
+            self._end_recording()
+
+    def _records(self, chunk: Chunk) -> Iterator[tuple[PredictionRecord, str]]:
+        lines: list[str] = []
+        try:
+            for record in self._stream.feed(chunk):
+                lines.append(record.to_json())
+                yield record, lines[-1]
+        finally:
+            if self._recorder is not None:
+                self._recorder.chunk(chunk, lines)
+
+    def _record(self, recorder: Recorder | None) -> None:
+        self._end_recording()
+        self._recorder = recorder
+        if recorder is not None:
+            self._stream.restart()
+            if recorder.model_label != self.predictor.metadata.label:  # it was taken since the request
+                recorder.model(self.predictor.metadata.label)
+
+    def _end_recording(self) -> None:
+        recorder, self._recorder = self._recorder, None
+        if recorder is not None and recorder is not self._borrowed:
+            recorder.close()
+
+    def _mark(self, marker: Marker) -> None:
+        if self._recorder is not None:
+            self._recorder.mark(marker)
 
     def _take_model(self) -> None:
         """Use the model whose loading is done; begin to load the next one."""
@@ -94,7 +147,6 @@ class RecordedStream:
         log.warning("%s serves from now on, after %s", predictor.metadata.label, before)
 
     def _tare(self) -> None:
-        self._tare_requested = False
         self._stream.tare()
         if self._recorder is not None:
             self._recorder.tare()
@@ -107,6 +159,7 @@ def replay(
     *,
     real_time: bool = False,
     load: Callable[[str], Predictor] | None = None,
+    on_marker: Callable[[Marker], object] = lambda _: None,
 ) -> Iterator[tuple[PredictionRecord, str]]:
     """The records of a recording, each with its line of JSON; as many for each chunk as were taken then.
 
@@ -116,13 +169,17 @@ def replay(
         clock: The clock of the replay.
         real_time: Whether to wait as long between two chunks as it took then.
         load: Gives the model of a label, where the recording went on with another one; None stays with the first.
+        on_marker: Called with each marker, between the records before and after it.
 
     Raises:
         RecordingError: If a line other than the last one is damaged.
         ModelError: If a model of the recording cannot be loaded.
     """
     delay_s: float | None = None
-    for event in recording.events():
+    for event in recording.events_and_markers():
+        if isinstance(event, Marker):
+            on_marker(event)
+            continue
         if isinstance(event, NewModel):
             if load is not None:
                 stream.use(load(event.label))

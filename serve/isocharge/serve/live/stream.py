@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 from isocharge.arrays import Array, Reals
 from isocharge.errors import ModelError
@@ -42,6 +43,19 @@ class StreamCounts:
     records: int = 0
     skipped: int = 0
     outages: int = 0
+
+
+class StreamTotals(NamedTuple):
+    """Everything that a stream has counted since it began, restarts included; see `FrameCounts` and `SequenceGaps`."""
+
+    frames: int = 0
+    lost: int = 0
+    repeated: int = 0
+    restarts: int = 0
+    crc_errors: int = 0
+    malformed: int = 0
+    bytes_dropped: int = 0
+    resyncs: int = 0
 
 
 def stream(
@@ -119,6 +133,7 @@ class TouchStream:
         )
         self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
         self.counts = StreamCounts()
+        self._before_restart = StreamTotals()
         self._policy, self._now_ns, self._frame_id = policy, now_ns, frame_id
         self._predictor, self._records = predictor, RecordBuilder.of(predictor, frame_id)
 
@@ -144,6 +159,27 @@ class TouchStream:
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
         self._readings.tare()
+
+    def restart(self) -> None:
+        """Begin as a new stream does, so that what follows can be repeated from its bytes alone; `totals` go on."""
+        self._before_restart = self.totals()
+        self._readings.restart()
+        self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
+
+    def totals(self) -> StreamTotals:
+        """What was counted since the stream began."""
+        frames, gaps = self.parser.counts, self.gaps
+        counted = StreamTotals(
+            frames.frames,
+            gaps.lost,
+            gaps.repeated,
+            gaps.restarts,
+            frames.crc_errors,
+            frames.malformed,
+            frames.bytes_dropped,
+            frames.resyncs,
+        )
+        return StreamTotals(*map(sum, zip(self._before_restart, counted, strict=True)))
 
     def feed(self, chunk: Chunk) -> Iterator[PredictionRecord]:
         """The records of the frames that end in this chunk.

@@ -87,6 +87,15 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+def is_address(host: str) -> bool:
+    """Whether a host is an IP address and no name."""
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
 def check_exposure(address: Address, *, token: bool, insecure: bool) -> None:
     """Refuse to serve others than this machine by accident.
 

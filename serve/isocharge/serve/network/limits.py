@@ -18,6 +18,7 @@ class ServerLimits:
         body_seconds: Time from there to the end of the body; and again until the client has taken the answer.
         idle_seconds: Time between requests.
         connections: Connections that are open at a time.
+        message_bytes: Size of a client's message over a WebSocket.
     """
 
     batch: int = MAX_BATCH
@@ -27,6 +28,7 @@ class ServerLimits:
     body_seconds: float = 30.0
     idle_seconds: float = IDLE_SECONDS
     connections: int = CONNECTIONS
+    message_bytes: int = 1 << 12
 
     def check_body(self, size: int) -> None:
         """Check the size of a body, or of as much of it as has arrived.

@@ -5,6 +5,7 @@
     {"timestamp": ..., ...}                       the records of that chunk, as they went out
     {"tare": true}                                a request for a new tare
     {"use": "three/2"}                            the model of all that follows
+    {"marker": [timestamp, "text"]}               a moment that somebody noted
 
 Everything in a replay is recomputed except `latency_us`, which is copied from the recording because it belongs to the
 original run. So the same model gives the same records, bit for bit. Whole lines are written at once; a line that a full
@@ -44,7 +45,22 @@ LONGEST_US, LATEST_S = 1e12, 1e11
 WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 """To open a new file, without changing line ends on Windows."""
 
+LONGEST_MARKER = 1000
+"""Characters of a marker's text."""
+
 log = logging.getLogger(__name__)
+
+
+class Marker(NamedTuple):
+    """A moment that somebody noted.
+
+    Attributes:
+        timestamp: Unix seconds.
+        text: May be empty.
+    """
+
+    timestamp: float
+    text: str
 
 
 class Recorder:
@@ -52,6 +68,7 @@ class Recorder:
 
     Attributes:
         path: The file.
+        model_label: `name/version` of the model at its begin.
         failed: Whether writing has stopped because the disk is full. What was written before is whole.
     """
 
@@ -65,7 +82,7 @@ class Recorder:
             device: Content of the device file.
             name: The film's own name in the records; empty for that of the model's sensor.
         """
-        self.path = path
+        self.path, self.model_label = path, model
         self.failed = False
         self._header = {KIND: VERSION, "model": model, "policy": policy, "device": dict(device)}
         if name:
@@ -92,6 +109,10 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close the file."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
         os.close(self._descriptor)
 
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
@@ -107,6 +128,10 @@ class Recorder:
     def model(self, label: str) -> None:
         """Write the label, `name/version`, of the model of all that follows."""
         self._write(json.dumps({"use": label}))
+
+    def mark(self, marker: Marker) -> None:
+        """Write a marker."""
+        self._write(json.dumps({"marker": list(marker)}))
 
     def _write(self, lines: str) -> None:
         """Write whole lines or none."""
@@ -174,7 +199,12 @@ class Recording:
         Raises:
             RecordingError: If a line other than the last one is damaged.
         """
-        chunk, latencies_us = None, []
+        return (event for event in self.events_and_markers() if not isinstance(event, Marker))
+
+    def events_and_markers(self) -> Iterator[Event | Marker | NewModel]:
+        """As `events`, with the markers between them."""
+        chunk: Chunk | None = None
+        latencies_us: list[float] = []
         for entry in self._entries():
             if isinstance(entry, float):
                 latencies_us.append(entry)
@@ -183,11 +213,11 @@ class Recording:
                 yield Event(chunk, tuple(latencies_us))
             chunk, latencies_us = entry if isinstance(entry, Chunk) else None, []
             if chunk is None:
-                yield entry if isinstance(entry, NewModel) else Event(None)
+                yield entry if isinstance(entry, Marker | NewModel) else Event(None)
         if chunk is not None:
             yield Event(chunk, tuple(latencies_us))
 
-    def _entries(self) -> Iterator[Chunk | float | NewModel | None]:
+    def _entries(self) -> Iterator[Chunk | Marker | float | NewModel | None]:
         """The content of each line, as `_entry` gives it."""
         number = 1
         try:
@@ -211,8 +241,8 @@ def _header(path: Path) -> Table:
     return Table(parse_json(line, "first line", RecordingError), "first line", RecordingError)
 
 
-def _entry(content: Table) -> Chunk | float | NewModel | None:
-    """A chunk, the latency of a record (us), a new model, or None for a request for a new tare.
+def _entry(content: Table) -> Chunk | Marker | float | NewModel | None:
+    """A chunk, a marker, the latency of a record (us), a new model, or None for a request for a new tare.
 
     Raises:
         RecordingError, ValueError: If it is none of these.
@@ -223,6 +253,8 @@ def _entry(content: Table) -> Chunk | float | NewModel | None:
         return None
     if "use" in content:
         return NewModel(content.text("use"))
+    if "marker" in content:
+        return _marker(content)
     *times, data = content.sequence("chunk", of="timestamp, clock, outage and bytes")
     timestamp, _, outage_s = content.as_numbers("chunk", times, count=3, of="three numbers and bytes")
     if not isinstance(data, str):
@@ -230,6 +262,14 @@ def _entry(content: Table) -> Chunk | float | NewModel | None:
     if not (abs(timestamp) <= LATEST_S and outage_s >= 0.0 and is_whole(times[1])):
         content.refuse("chunk", "a time of this age, nanoseconds and an outage")
     return Chunk(base64.b64decode(data, validate=True), timestamp, times[1], outage_s)
+
+
+def _marker(content: Table) -> Marker:
+    timestamp, *texts = content.sequence("marker", of="timestamp and text")
+    (moment,) = content.as_numbers("marker", [timestamp], count=1, of="a time and a text")
+    if len(texts) != 1 or not isinstance(texts[0], str) or len(texts[0]) > LONGEST_MARKER or abs(moment) > LATEST_S:
+        content.refuse("marker", f"a time of this age and a text of at most {LONGEST_MARKER} characters")
+    return Marker(moment, texts[0])
 
 
 class RecordedClock:

@@ -1,20 +1,13 @@
 """The protocol's handler as an ASGI application: reads a bounded body, checks the token, sends one answer."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, MutableMapping
-from typing import Any
 
 from isocharge.errors import TokenError, TooLarge
+from isocharge.serve.network.http.answerer import Message, Receive, Send
 from isocharge.serve.network.protocol import Handler, Response
 from isocharge.serve.network.protocol.handler import Headers
 from isocharge.serve.network.protocol.response import error_response
 from isocharge.serve.network.token import Token
-
-Message = MutableMapping[str, Any]
-
-Receive = Callable[[], Awaitable[Message]]
-
-Send = Callable[[Message], Awaitable[None]]
 
 OPEN = ("/v2/health/live", "/v2/health/ready")
 """Paths that need no token: programs that start and watch servers have none."""
@@ -27,6 +20,10 @@ class App:
         """Without a token, everybody is answered."""
         self._handler, self._token = handler, token
         self.blocks = handler.blocks
+
+    def has_websocket(self, _path: str) -> bool:
+        """There is none."""
+        return False
 
     def answer(self, method: str, path: str, headers: Headers, body: bytes) -> Response:
         """Answer one request, as `Handler.answer` does, if it carries the token."""

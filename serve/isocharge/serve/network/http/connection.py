@@ -25,7 +25,7 @@ import httptools
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
 from isocharge.errors import TooLarge
-from isocharge.serve.network.http.app import App
+from isocharge.serve.network.http.answerer import Answerer
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Response
 from isocharge.serve.network.protocol.response import error_response, refusal
@@ -55,7 +55,7 @@ class Phase(Enum):
 class BoundedProtocol(HttpToolsProtocol):
     """One connection; subclasses carry application and limits, because uvicorn makes protocols from their class."""
 
-    direct: App
+    direct: Answerer
     limits = ServerLimits()
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
@@ -148,11 +148,36 @@ class BoundedProtocol(HttpToolsProtocol):
         try:
             self.parser.feed_data(data)
         except httptools.HttpParserUpgrade as upgrade:
-            self._parse_without_upgrade(data[upgrade.args[0] :])
+            rest = data[upgrade.args[0] :]
+            if self._should_upgrade():
+                self._go_on_as_websocket(rest)
+            else:
+                self._parse_without_upgrade(rest)
         except httptools.HttpParserError:
             self._refuse(refusal(400, "Invalid HTTP request received."))
         if self._phase is Phase.HEADERS or self._phase is Phase.BODY:
             self._measure_incomplete()
+
+    def _should_upgrade(self) -> bool:
+        """Whether a WebSocket is asked for, and this server has one under the path."""
+        return not self._is_refused and super()._should_upgrade() and self.direct.has_websocket(_path(self.url))
+
+    def _go_on_as_websocket(self, rest: bytes) -> None:
+        """Hand the connection over with its request; uvicorn's own method needs the request as ASGI, which is not made.
+
+        Args:
+            rest: Bytes that came after the headers.
+        """
+        self.connections.discard(self)
+        lines = [b"%s %s HTTP/1.1" % (self.parser.get_method(), self.url)]
+        lines += [b"%s: %s" % header for header in self.headers]
+        make: Any = self.ws_protocol_class
+        protocol = make(config=self.config, server_state=self.server_state, app_state=self.app_state)
+        protocol.connection_made(self.transport)
+        self.transport.set_protocol(protocol)
+        rest += bytes(self._unparsed)
+        self._unparsed.clear()
+        protocol.data_received(b"\r\n".join(lines) + b"\r\n\r\n" + rest)
 
     def _parse_without_upgrade(self, rest: bytes) -> None:
         """Parse a request that asks for another protocol as if it had not, with a new parser: HTTP lets a server do so.
@@ -331,7 +356,7 @@ def _path(url: bytes) -> str:
     return urllib.parse.unquote_to_bytes(path).decode("utf-8", "replace")
 
 
-def bounded(app: App, limits: ServerLimits) -> type[BoundedProtocol]:
+def bounded(app: Answerer, limits: ServerLimits) -> type[BoundedProtocol]:
     """The protocol with this application and these limits."""
     return type("BoundedProtocol", (BoundedProtocol,), {"direct": app, "limits": limits})
 

@@ -10,7 +10,7 @@ from typing import Any
 import uvicorn
 
 from isocharge.serve.network.address import Address
-from isocharge.serve.network.http.app import App
+from isocharge.serve.network.http.answerer import Answerer
 from isocharge.serve.network.http.connection import bounded, close_overdue
 from isocharge.serve.network.http.tls_listener import TlsListener
 from isocharge.serve.network.limits import ServerLimits
@@ -48,8 +48,23 @@ class _Uvicorn(uvicorn.Server):
 class HttpServer:
     """A server that listens from its construction until `close`, and answers while `run` runs."""
 
-    def __init__(self, app: App, address: Address, *, limits: ServerLimits, tls: Tls | None = None) -> None:
+    def __init__(
+        self,
+        app: Answerer,
+        address: Address,
+        *,
+        limits: ServerLimits,
+        tls: Tls | None = None,
+        websocket: type[asyncio.Protocol] | None = None,
+    ) -> None:
         """Listen.
+
+        Args:
+            app: Answers the requests.
+            address: Where to listen.
+            limits: Bounds of requests and connections.
+            tls: Certificate and key; None for no TLS.
+            websocket: The protocol of the WebSockets that the application has, `bounded_websocket(limits)`.
 
         Raises:
             InputError: If a TLS file cannot be used.
@@ -60,7 +75,9 @@ class HttpServer:
             app,
             loop="uvloop",
             http=bounded(app, limits),
-            ws="none",
+            ws=websocket or "none",
+            ws_max_size=limits.message_bytes,
+            ws_per_message_deflate=False,
             lifespan="off",
             log_config=None,
             access_log=False,
@@ -76,8 +93,13 @@ class HttpServer:
 
     def run(self) -> None:
         """Answer until SIGTERM, SIGINT or `stop`; then finish the requests that have begun."""
-        logging.getLogger("uvicorn").setLevel(logging.CRITICAL)  # mistakes of clients are answered, not logged
+        _log_no_clients()
         self._server.run([self._socket])
+
+    async def serve(self) -> None:
+        """As `run`, in a loop that does other things, too."""
+        _log_no_clients()
+        await self._server.serve([self._socket])
 
     def stop(self) -> None:
         """Tell `run` to finish; from any thread."""
@@ -87,3 +109,7 @@ class HttpServer:
         """Listen no more."""
         self._socket.close()
         self._address.release(self._file)
+
+
+def _log_no_clients() -> None:
+    logging.getLogger("uvicorn").setLevel(logging.CRITICAL)  # mistakes of clients are answered, not logged

@@ -6,6 +6,7 @@ from isocharge.errors import (
     InputError,
     IsochargeError,
     ModelNotFound,
+    OriginError,
     TokenError,
     TooLarge,
     TooMany,
@@ -24,6 +25,7 @@ _STATUS: tuple[tuple[type[Exception], int, str], ...] = (
     (TooMany, 429, "RESOURCE_EXHAUSTED"),
     (UnknownEncoding, 415, "INVALID_ARGUMENT"),
     (TokenError, 401, "UNAUTHENTICATED"),
+    (OriginError, 403, "PERMISSION_DENIED"),
     (InputError, 400, "INVALID_ARGUMENT"),
 )
 """Error, HTTP status, gRPC status; the first class that fits counts."""

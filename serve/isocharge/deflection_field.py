@@ -1,0 +1,139 @@
+"""How a round film deflects under a round probe: a small table over force and distance from the centre, and its file.
+
+The film is round and its elasticity isotropic, so a press beside the centre is a press on the x axis, turned. A disk
+automorphism carries rings about the origin onto rings about the probe,
+
+    z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
+
+p the distance of the probe and r its radius, in film radii. On these rings the deflection is smooth, and a few hundred
+numbers hold it. Between two forces, the deflection over the cube root of the force is interpolated over the logarithm
+of the force: that of a membrane is constant. simulate writes the file, serve shows what is in it.
+"""
+
+import base64
+import binascii
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isocharge.arrays import Array, Complexes
+from isocharge.errors import InputError
+from isocharge.tables import Table, read_json
+
+VERSION = 1
+"""Version of the file's format."""
+
+FILM_KEYS = ("radius_mm", "thickness_um", "young_GPa", "poisson", "pretension_MPa")
+"""What of a film decides how it deflects."""
+
+STEPS = (1 << 16) - 1
+"""Steps into which the largest deflection is divided."""
+
+MOST_NUMBERS = 1 << 18
+"""Largest table."""
+
+
+@dataclass(frozen=True)
+class DeflectionField:
+    """Deflection of one film under one probe.
+
+    Attributes:
+        film: Values of `FILM_KEYS`.
+        probe_radius_mm: Radius of the round probe, mm.
+        force_N: Forces, increasing, N.
+        distance_mm: Distances of the probe from the centre, increasing from 0, mm.
+        rings: Radii of the rings about the probe before the automorphism, from 0 to 1, in film radii.
+        deflection_mm: Shape (forces, distances, rings, angles), mm, positive the way the probe pushes; the angles go
+            from 0, outwards, to pi; the other half mirrors it.
+    """
+
+    film: Mapping[str, float]
+    probe_radius_mm: float
+    force_N: tuple[float, ...]
+    distance_mm: tuple[float, ...]
+    rings: tuple[float, ...]
+    deflection_mm: Array
+
+    def fits(self, film: Any) -> bool:
+        """Whether a film, as a sensor file describes it, is the one of this field."""
+        if not isinstance(film, Mapping):
+            return False
+        given = {key: film.get(key, 0.0 if key == "pretension_MPa" else None) for key in FILM_KEYS}
+        return all(is_close(given[key], self.film[key]) for key in FILM_KEYS)
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of the file."""
+        scale_mm = float(np.max(self.deflection_mm)) or 1.0
+        steps = np.round(np.clip(self.deflection_mm / scale_mm, 0.0, 1.0) * STEPS).astype("<u2")
+        return {
+            "isocharge_deflection": VERSION,
+            "film": dict(self.film),
+            "probe_radius_mm": self.probe_radius_mm,
+            "force_N": list(self.force_N),
+            "distance_mm": list(self.distance_mm),
+            "rings": [round(ring, 6) for ring in self.rings],
+            "angles": int(self.deflection_mm.shape[3]),
+            "scale_mm": scale_mm,
+            "deflection": base64.b64encode(steps.tobytes()).decode(),
+        }
+
+
+def is_close(given: object, value: float) -> bool:
+    """Whether a value is a number, and this one."""
+    return isinstance(given, int | float) and math.isclose(given, value, rel_tol=1e-6, abs_tol=1e-12)
+
+
+def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, rings: Array, angles: int) -> Complexes:
+    """Points x + i y of a field's rings under a probe on the x axis, mm, shape (rings, angles)."""
+    p, r = distance_mm / radius_mm, probe_radius_mm / radius_mm
+    c = math.tanh(0.5 * (math.atanh(p + r) + math.atanh(p - r)))
+    z = rings[:, None] * np.exp(1j * np.linspace(0.0, math.pi, angles))
+    placed: Complexes = radius_mm * (z + c) / (1.0 + c * z)
+    return placed
+
+
+def read_deflection_field(path: Path) -> DeflectionField:
+    """Read the file.
+
+    Raises:
+        InputError: If it cannot be read, or is no field of this version.
+    """
+    table = Table(read_json(path, "a deflection field", InputError), str(path), InputError)
+    version = table.whole("isocharge_deflection")
+    if version != VERSION:
+        raise InputError(f"{path}: deflection field {version} is not supported (this version reads {VERSION})")
+    film = table.table("film")
+    forces, distances, rings = (
+        table.as_numbers(key, table.sequence(key), count=len(table.sequence(key)), of="numbers")
+        for key in ("force_N", "distance_mm", "rings")
+    )
+    shape = (len(forces), len(distances), len(rings), table.whole("angles", least=2))
+    for key, numbers in (("force_N", forces), ("distance_mm", distances), ("rings", rings)):
+        if not numbers or any(a >= b for a, b in pairwise(numbers)):
+            table.refuse(key, "increasing numbers")
+    return DeflectionField(
+        {key: film.number(key) for key in FILM_KEYS},
+        table.number("probe_radius_mm", above=0.0),
+        forces,
+        distances,
+        rings,
+        _decoded(table, shape) * table.number("scale_mm", above=0.0),
+    )
+
+
+def _decoded(table: Table, shape: tuple[int, int, int, int]) -> Array:
+    """The numbers as shares of the largest."""
+    try:
+        data = base64.b64decode(table.get("deflection"), validate=True)
+    except (TypeError, ValueError, binascii.Error):
+        table.refuse("deflection", "numbers of 16 bits in base64")
+    count = math.prod(shape)
+    if count > MOST_NUMBERS or len(data) != 2 * count:
+        table.refuse("deflection", f"{count} numbers of 16 bits in base64, {MOST_NUMBERS} at most", len(data))
+    shares: Array = np.frombuffer(data, "<u2").reshape(shape) / STEPS
+    return shares

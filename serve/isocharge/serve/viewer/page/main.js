@@ -1,0 +1,146 @@
+// The page: connects, hands samples to the films, draws, and takes keys and buttons.
+
+import { Connection } from "./connection.js";
+import { decode } from "./decode.js";
+import { FilmView, percentile, setText } from "./film.js";
+import { onTheme } from "./theme.js";
+import { Timeline } from "./timeline.js";
+
+const SLOW_MS = 500, PACE_MS = 20, RAREST = 8, LONGEST_MS = 80;
+const page = { films: [], chosen: 0, timeline: null, isPaused: false, unconfirmed: null, pictures: 0, cost: 0, pace: 16, every: 1, ages: [], starts: [] };
+const connection = new Connection({ session, samples, message, state, door });
+const nowMs = () => performance.now();
+
+function session(content, isNew) {
+  document.getElementById("door").hidden = true;
+  if (!isNew) return;
+  const place = document.getElementById("films");
+  page.films = content.films.map((description, number) => new FilmView(number, description, content, act));
+  place.replaceChildren(...page.films.map((film) => film.root));
+  place.classList.toggle("several", page.films.length > 1);
+  for (const film of page.films) { film.start(); film.root.addEventListener("pointerdown", () => choose(film.number)); }
+  choose(0);
+  if (content.is_replay && !page.timeline) page.timeline = new Timeline(document.getElementById("timeline"), (request) => connection.request(request));
+  if (page.isPaused) pause(false);
+  document.title = `${content.films.map((film) => film.name).join(", ")} · isocharge ${content.is_replay ? "replay" : "live"}`;
+}
+
+function samples(buffer) {
+  const message = decode(buffer, (film) => page.films[film]?.description.electrodes.length);
+  if (!message) return;
+  page.unconfirmed = message.number;
+  page.films[message.film].take(message, nowMs());
+  if (page.timeline && message.samples.length) page.timeline.at(message.samples.at(-1).t);
+}
+
+function message({ film, state: changed, play, error }) {
+  if (changed && page.films[film]) { page.films[film].update(changed); page.timeline?.update(changed); }
+  if (play) page.timeline?.play(play);
+  if (error) setText(page.films[page.chosen].find(".note"), error);
+}
+
+function state(kind, words) {
+  const shown = kind === "live" && page.isPaused ? ["paused", "paused"] : kind === "live" && page.timeline ? ["live", "replay"] : [kind, words];
+  const pill = document.getElementById("link");
+  page.link = [kind, words];
+  pill.dataset.state = shown[0];
+  setText(pill.querySelector(".text"), shown[1]);
+}
+
+function door(reason) {
+  const form = document.getElementById("door");
+  form.hidden = false;
+  setText(form.querySelector(".reason"), reason);
+  form.querySelector("input").focus();
+  state("waiting", "a token, please");
+}
+
+function act(what, film) {
+  if (what === "pause") return page.timeline ? page.timeline.toggle() : pause(!page.isPaused);
+  if (what === "tare") return connection.request({ do: "tare", film: film.number });
+  if (what === "record") return connection.request({ do: "record", film: film.number, on: !film.state.recording });
+  if (what === "marker") return connection.request({ do: "marker", film: film.number });
+  return undefined;
+}
+
+function pause(isPaused) {
+  page.isPaused = isPaused;
+  for (const button of document.querySelectorAll("[data-do=pause]")) {
+    button.setAttribute("aria-pressed", String(isPaused));
+    button.firstChild.textContent = isPaused ? "Go on " : "Pause ";
+  }
+  state(...page.link);
+}
+
+function choose(number) {
+  if (!page.films[number]) return;
+  page.chosen = number;
+  page.films.forEach((film, k) => film.root.classList.toggle("chosen", k === number));
+}
+
+function key(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input:not([type=range]), select, dialog[open]")) return;
+  const film = page.films[page.chosen], name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  if (name === " " && event.target.closest("button, summary")) return;
+  const live = page.timeline === null, action = {
+    t: live && (() => act("tare", film)), r: live && (() => act("record", film)), m: live && (() => act("marker", film)),
+    " ": () => act("pause", film), "?": () => document.getElementById("help").showModal(),
+    ArrowLeft: !live && (() => page.timeline.step(-1)), ArrowRight: !live && (() => page.timeline.step(1)),
+  }[name];
+  if (/^[1-9]$/.test(name)) choose(Number(name) - 1);
+  if (!action || !film) return;
+  action();
+  event.preventDefault();
+}
+
+let slowMs = 0, beganMs = 0, heavyMs = 0;
+function picture() {
+  requestAnimationFrame(picture);
+  const began = nowMs(), number = page.pictures++;
+  page.starts.push(began);
+  if (page.starts.length > 240) page.starts.splice(0, 120);
+  page.pace += 0.05 * (Math.min(began - beganMs, 200) - page.pace);
+  beganMs = began;
+  const isDue = began - heavyMs > LONGEST_MS, heavy = {
+    traces: isDue || number % Math.max(page.every, 2) === 0, relief: isDue || number % page.every === page.every >> 1,
+  };
+  if (heavy.traces) heavyMs = began;
+  if (!page.isPaused) for (const film of page.films) film.draw(began, heavy);
+  if (page.unconfirmed !== null) noteAge();
+  if (began - slowMs > SLOW_MS) showSlow(began);
+  page.cost += 0.1 * (nowMs() - began - page.cost);
+}
+
+/** Words and counters; and where pictures come too seldom, the costly parts are drawn for fewer of them. */
+function showSlow(began) {
+  slowMs = began;
+  if (page.pace > PACE_MS && page.every < RAREST) page.every *= 2;
+  else if (page.pace < 0.9 * PACE_MS && page.every > 1) page.every /= 2;
+  if (!page.isPaused) for (const film of page.films) film.showSlow(began);
+}
+
+/** What was drawn is confirmed, which asks for more; its age, where both clocks are the same machine's, is for tests. */
+function noteAge() {
+  connection.confirm(page.unconfirmed);
+  page.unconfirmed = null;
+  const latest = page.films[page.chosen]?.history.latest;
+  if (!latest || page.timeline) return;
+  const channel = new MessageChannel();
+  channel.port1.onmessage = () => {
+    page.ages.push(performance.timeOrigin + performance.now() - 1000 * latest.t);
+    if (page.ages.length > 1200) page.ages.splice(0, 600);
+  };
+  channel.port2.postMessage(null);
+}
+
+addEventListener("keydown", key);
+onTheme(() => { for (const film of page.films) film.refresh(); });
+addEventListener("resize", () => { for (const film of page.films) film.refresh(); page.timeline?.drawTrack(); });
+document.getElementById("help-button").addEventListener("click", () => document.getElementById("help").showModal());
+document.getElementById("door").addEventListener("submit", (event) => {
+  event.preventDefault();
+  connection.enter(event.target.querySelector("input").value);
+});
+globalThis.isocharge = { page, connection, percentile };
+connection.open();
+requestAnimationFrame(picture);

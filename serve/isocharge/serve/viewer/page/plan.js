@@ -1,0 +1,173 @@
+// The film from above, to scale: electrodes, working area, the touch with its trail, and a lens on its uncertainty.
+
+import { DASHES, fit, theme } from "./theme.js";
+
+const TRAIL_S = 1.6, LENS_MM = 1.0, SIGMAS_95 = 2.448, LENS_PX = 52;
+
+export class Plan {
+  constructor(canvas, film) {
+    [this.canvas, this.film] = [canvas, film];
+    const corners = [...film.working_area_mm, ...Object.values(film.outlines_mm).flat()];
+    this.reach = 1.16 * Math.max(...corners.map(([x, y]) => Math.hypot(x, y)));
+    this.largest = film.force_range_N[1];
+    this.base = document.createElement("canvas");
+    this.isStale = true;
+  }
+
+  /** Draw what does not move again: another theme. */
+  refresh() { this.isStale = true; }
+
+  /** @param view {{sample, kind, trail, now, word}} the latest sample, what it is, and contacts with their age */
+  draw(view) {
+    if (fit(this.canvas) || this.isStale) this.drawBase();
+    const g = this.canvas.getContext("2d");
+    g.setTransform(1, 0, 0, 1, 0, 0);
+    g.clearRect(0, 0, this.canvas.width, this.canvas.height);
+    g.drawImage(this.base, 0, 0);
+    this.toMillimetres(g);
+    this.drawTrail(g, view);
+    if (view.sample?.contact && view.sample.x !== null) this.drawTouch(g, view);
+    if (view.word) this.drawWord(g, view.word);
+  }
+
+  get pixel() { return 2 * this.reach / this.canvas.width; }
+
+  toMillimetres(g) {
+    const scale = 1 / this.pixel;
+    g.setTransform(scale, 0, 0, -scale, this.canvas.width / 2, this.canvas.height / 2);
+  }
+
+  get css() { return this.pixel * this.canvas.width / (this.canvas.clientWidth || 1); }
+
+  drawBase() {
+    [this.base.width, this.base.height, this.isStale] = [this.canvas.width, this.canvas.height, false];
+    const g = this.base.getContext("2d"), px = this.css, { film } = this;
+    this.toMillimetres(g);
+    g.lineJoin = "round";
+    if (film.radius_mm) { g.fillStyle = theme.film; circle(g, 0, 0, film.radius_mm); g.fill(); }
+    g.lineWidth = px; g.strokeStyle = theme.line;
+    for (let at = -50; at <= 50; at += 5) { segment(g, at, -50, at, 50); segment(g, -50, at, 50, at); }
+    g.fillStyle = theme.area; path(g, film.working_area_mm); g.fill();
+    g.setLineDash([4 * px, 4 * px]); g.lineWidth = 1.5 * px; g.strokeStyle = theme.accent; g.stroke(); g.setLineDash([]);
+    film.electrodes.forEach((name, k) => this.drawElectrode(g, name, k, px));
+    this.drawScale(g, px);
+    if (film.radius_mm) this.drawWhole(g, px);
+  }
+
+  drawElectrode(g, name, k, px) {
+    const outline = this.film.outlines_mm[name];
+    if (!outline) return;
+    g.fillStyle = theme[`c${k % 6}`] + "30"; g.strokeStyle = theme[`c${k % 6}`]; g.lineWidth = 2 * px;
+    path(g, outline); g.fill(); g.setLineDash(DASHES[k % 6].map((d) => d * px)); g.stroke(); g.setLineDash([]);
+    const x = mean(outline, 0), y = mean(outline, 1);
+    this.text(g, name, x, y, 15 * px, theme.ink, "center", "600");
+  }
+
+  drawScale(g, px) {
+    const x = -this.reach + 16 * px, y = this.reach - 18 * px;
+    g.strokeStyle = theme.ink; g.lineWidth = 2 * px; segment(g, x, y, x + 5, y);
+    segment(g, x, y - 3 * px, x, y + 3 * px); segment(g, x + 5, y - 3 * px, x + 5, y + 3 * px);
+    this.text(g, "5 mm", x + 2.5, y - 11 * px, 12 * px, theme.ink, "center");
+  }
+
+  /** The whole film, small, in the corner: where this view is on it. */
+  drawWhole(g, px) {
+    const size = 34 * px, scale = size / this.film.radius_mm, x = -this.reach + size + 10 * px, y = -this.reach + size + 10 * px;
+    g.save(); g.translate(x, y); g.scale(scale, scale);
+    const thin = px / scale;
+    g.fillStyle = theme.card; g.strokeStyle = theme.quiet; g.lineWidth = 1.2 * thin;
+    circle(g, 0, 0, this.film.radius_mm); g.fill(); g.stroke();
+    g.fillStyle = theme.quiet;
+    for (const outline of Object.values(this.film.outlines_mm)) { path(g, outline); g.fill(); }
+    g.strokeStyle = theme.accent; g.strokeRect(-this.reach, -this.reach, 2 * this.reach, 2 * this.reach);
+    g.restore();
+    this.text(g, `Ø ${2 * this.film.radius_mm} mm`, x + size + 6 * px, y - size + 6 * px, 11 * px, theme.quiet, "left");
+  }
+
+  radius(force) { return (5 + 15 * Math.sqrt(Math.min(Math.max(force, 0) / this.largest, 1.5))) * this.css; }
+
+  drawTrail(g, { trail, now }) {
+    g.lineCap = "round"; g.strokeStyle = theme.touch;
+    for (let k = 1; k < trail.length; k++) {
+      const a = trail[k - 1], b = trail[k], age = (now - b.t) / TRAIL_S;
+      if (age >= 1 || b.t - a.t > 0.15 || a.contact !== true) continue;
+      g.globalAlpha = 0.55 * (1 - age) ** 1.5;
+      g.lineWidth = Math.max(1.5 * this.css, 0.55 * this.radius(b.force) * (1 - age));
+      segment(g, a.x, a.y, b.x, b.y);
+    }
+    g.globalAlpha = 1;
+  }
+
+  drawTouch(g, { sample, kind, trail }) {
+    const px = this.css, r = this.radius(sample.force), { x, y } = this.inView(sample);
+    g.lineWidth = 2.5 * px;
+    if (kind === "contact") {
+      g.fillStyle = theme.touch; g.globalAlpha = 0.82; circle(g, x, y, r); g.fill(); g.globalAlpha = 1;
+      g.strokeStyle = theme.card; g.lineWidth = 1.5 * px; circle(g, x, y, r); g.stroke();
+    } else {
+      g.strokeStyle = theme.warn; g.setLineDash(kind === "outside" ? [5 * px, 4 * px] : []);
+      circle(g, x, y, Math.max(r, 9 * px)); g.stroke(); g.setLineDash([]);
+      if (kind === "misfit") { const d = 0.7 * Math.max(r, 9 * px); segment(g, x - d, y - d, x + d, y + d); segment(g, x - d, y + d, x + d, y - d); }
+    }
+    if (sample.xStd !== null) this.drawEllipse(g, x, y, sample, 1, kind === "contact" ? theme.ink : theme.warn, 1.4 * px);
+    if (sample.xStd !== null && kind !== "misfit") this.drawLens(g, sample, trail, px);
+  }
+
+  /** A place beyond the view is shown at its edge. */
+  inView({ x, y }) {
+    const most = this.reach - 12 * this.css, clip = (v) => Math.min(Math.max(v, -most), most);
+    return { x: clip(x), y: clip(y) };
+  }
+
+  drawEllipse(g, x, y, sample, scale, colour, width) {
+    g.strokeStyle = colour; g.lineWidth = width; g.beginPath();
+    g.ellipse(x, y, SIGMAS_95 * sample.xStd * scale, SIGMAS_95 * sample.yStd * scale, 0, 0, 2 * Math.PI); g.stroke();
+  }
+
+  /** The millimetre around the touch, enlarged, with the ellipse in which it lies 95 times of 100. */
+  drawLens(g, sample, trail, px) {
+    const size = LENS_PX * px, [x, y] = this.lensPlace(size, px, sample), scale = size / LENS_MM;
+    this.lens = { x, y, size };
+    g.save();
+    g.fillStyle = theme.card; g.strokeStyle = theme.quiet; g.lineWidth = 1.2 * px;
+    circle(g, x, y, size); g.fill(); g.stroke(); g.clip();
+    g.fillStyle = theme.touch;
+    for (const past of trail.slice(-80)) {
+      g.globalAlpha = 0.35; circle(g, x + (past.x - sample.x) * scale, y + (past.y - sample.y) * scale, 1.6 * px); g.fill();
+    }
+    g.globalAlpha = 1;
+    this.drawEllipse(g, x, y, sample, scale, theme.ink, 1.8 * px);
+    circle(g, x, y, 3 * px); g.fill();
+    g.restore();
+    g.strokeStyle = theme.ink; g.lineWidth = 1.5 * px;
+    const below = y - 0.62 * size;
+    segment(g, x - 0.25 * scale, below, x + 0.25 * scale, below);
+    this.text(g, "0.5 mm", x, below - 9 * px, 10 * px, theme.ink, "center");
+  }
+
+  /** The corner in which the lens hides neither touch nor electrode. */
+  lensPlace(size, px, touch) {
+    const far = this.reach - size - 10 * px, corners = [[far, -far], [far, far], [-far, far]], edges = Object.values(this.film.outlines_mm).flat();
+    const hides = ([x, y]) => Math.hypot(touch.x - x, touch.y - y) < size + 24 * px || edges.some(([u, v]) => Math.hypot(u - x, v - y) < size + 4 * px);
+    return corners.find((corner) => !hides(corner)) ?? corners[0];
+  }
+
+  drawWord(g, word) {
+    const px = this.css;
+    this.text(g, word, 0, this.reach - 20 * px, 14 * px, theme.quiet, "center");
+  }
+
+  text(g, words, x, y, size, colour, align, weight = "400") {
+    g.save(); g.translate(x, y); g.scale(this.pixel, -this.pixel);
+    g.font = `${weight} ${size / this.pixel}px system-ui, sans-serif`; g.fillStyle = colour; g.textAlign = align; g.textBaseline = "middle";
+    g.fillText(words, 0, 0); g.restore();
+  }
+}
+
+function mean(points, axis) { return points.reduce((sum, point) => sum + point[axis], 0) / points.length; }
+
+function circle(g, x, y, radius) { g.beginPath(); g.arc(x, y, radius, 0, 2 * Math.PI); }
+
+function segment(g, x0, y0, x1, y1) { g.beginPath(); g.moveTo(x0, y0); g.lineTo(x1, y1); g.stroke(); }
+
+function path(g, points) { g.beginPath(); for (const [x, y] of points) g.lineTo(x, y); g.closePath(); }

@@ -1,0 +1,133 @@
+"""The samples of a film by number: the latest ones of a live stream, or all of a recording."""
+
+import tempfile
+from bisect import bisect_right
+from typing import Any
+
+import numpy as np
+
+from isocharge.serve.viewer.coalesce import Samples
+
+LIVE_SAMPLES = 1 << 14
+"""Samples that are kept of a live stream: 16 s at 1 kHz; a browser that is farther behind misses some."""
+
+PIECES = 600
+"""Largest number of pieces in the overview of a recording."""
+
+
+class LiveTape:
+    """The latest samples of a stream without end, in bounded memory.
+
+    Attributes:
+        total: Samples that ever came.
+    """
+
+    def __init__(self, dtype: "np.dtype[Any]", most: int = LIVE_SAMPLES) -> None:
+        self.total = 0
+        self._ring: Samples = np.zeros(most, dtype)
+
+    @property
+    def oldest(self) -> int:
+        """Number of the oldest sample that is still there."""
+        return max(0, self.total - len(self._ring))
+
+    def append(self, samples: Samples) -> None:
+        """Add samples, and forget as many old ones as need be."""
+        latest = samples[-len(self._ring) :]
+        first = self.total + len(samples) - len(latest)
+        self._ring[np.arange(first, first + len(latest)) % len(self._ring)] = latest
+        self.total += len(samples)
+
+    def samples(self, start: int, stop: int) -> Samples:
+        """Samples by number, those from `start` to before `stop` that are still there."""
+        return self._ring[np.arange(max(start, self.oldest), stop) % len(self._ring)]
+
+    def index(self, timestamp: float) -> int:
+        """Number of the first sample after a time, unix seconds."""
+        return _first_after(self, timestamp)
+
+    def timestamp(self, number: int) -> float:
+        """Time of a sample, unix seconds."""
+        return float(self._ring[number % len(self._ring)]["timestamp"])
+
+
+class RecordedTape:
+    """All samples of a recording, in a nameless file: a day of them needs no memory. Times never go back.
+
+    Attributes:
+        total: Samples so far.
+        oldest: Number of the first one, 0.
+    """
+
+    oldest = 0
+
+    def __init__(self, dtype: "np.dtype[Any]") -> None:
+        self.total = 0
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115
+        self._dtype = dtype
+        self._map: Samples = np.zeros(0, dtype)
+        self._latest = 0.0
+        self._piece_s = 0.01
+        self._force_N: list[float] = []
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def append(self, samples: Samples) -> None:
+        """Add samples."""
+        if not len(samples):
+            return
+        samples = samples.copy()
+        times = np.maximum.accumulate(np.nan_to_num(samples["timestamp"], nan=0.0))
+        samples["timestamp"] = np.maximum(times, self._latest)
+        self._latest = float(samples["timestamp"][-1])
+        self._file.write(samples.tobytes())
+        self._file.flush()
+        self.total += len(samples)
+        self._note_forces(samples)
+
+    def samples(self, start: int, stop: int) -> Samples:
+        """Samples by number."""
+        return np.array(self._mapped()[max(start, 0) : stop])
+
+    def index(self, timestamp: float) -> int:
+        """Number of the first sample after a time, unix seconds."""
+        return _first_after(self, timestamp)
+
+    def timestamp(self, number: int) -> float:
+        """Time of a sample, unix seconds."""
+        return float(self._mapped()[number]["timestamp"])
+
+    def span(self) -> tuple[float, float]:
+        """Times of the first and the last sample, unix seconds; zeros if there is none."""
+        return (self.timestamp(0), self._latest) if self.total else (0.0, 0.0)
+
+    def overview(self) -> list[float]:
+        """Largest force in each of the equal pieces of the recording, N."""
+        return [round(force, 3) for force in self._force_N]
+
+    def _mapped(self) -> Samples:
+        if len(self._map) < self.total:
+            self._map = np.memmap(self._file, self._dtype, mode="r", shape=(self.total,))
+        return self._map
+
+    def _note_forces(self, samples: Samples) -> None:
+        """Keep the largest force of each piece; two pieces become one where there would be too many."""
+        elapsed_s = samples["timestamp"] - self.timestamp(0)
+        while elapsed_s[-1] >= PIECES * self._piece_s:
+            self._force_N = [max(self._force_N[k : k + 2]) for k in range(0, len(self._force_N), 2)]
+            self._piece_s *= 2.0
+        piece = (elapsed_s / self._piece_s).astype(int)
+        self._force_N += [0.0] * (int(piece[-1]) + 1 - len(self._force_N))
+        force_N = np.nan_to_num(samples["force_N"], nan=0.0)
+        starts = np.flatnonzero(np.diff(piece, prepend=-1))
+        for number, force in zip(piece[starts].tolist(), np.maximum.reduceat(force_N, starts).tolist(), strict=True):
+            self._force_N[number] = max(self._force_N[number], force)
+
+
+Tape = LiveTape | RecordedTape
+
+
+def _first_after(tape: Tape, timestamp: float) -> int:
+    return bisect_right(range(tape.total), timestamp, lo=tape.oldest, key=tape.timestamp)

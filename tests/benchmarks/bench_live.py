@@ -1,0 +1,204 @@
+"""The live page's price: what viewers cost the reader, and how old a picture is.
+
+A board of 1 kHz plays on a pseudo-terminal; `isocharge serve stream --live --record` follows it. Rounds without viewers
+and rounds with three (one of which stalls) take turns in one run; each stream is a process of its own, as is the board
+and the viewers. Reported: the reader's latency (last byte to record), the frames that the recording misses, the age of
+the newest sample when a viewer has it, and the memory of the processes. With --browser, headless Chromium is one of the
+viewers and says how old its pictures are and how many a second it draws.
+
+    python tests/benchmarks/bench_live.py --rounds 4 --seconds 10 [--browser] [--rate-Hz 1000]
+"""
+
+import argparse
+import asyncio
+import json
+import multiprocessing
+import os
+import re
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from websockets.asyncio.client import connect
+
+from isocharge.serve import Predictor, Recording, VirtualSensor, wander
+from isocharge.serve.viewer.messages import HEADER
+from isocharge.serve.viewer.sample import SampleFormat
+
+MODEL = "three-25um-biaxial"
+CHROMIUM = "/usr/bin/chromium"
+ARGUMENTS = [
+    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"),
+    *("--disable-component-update", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+]
+
+
+def charge_pC(x_mm, y_mm, force_N):
+    """A film of no great likeness: what matters here is that it is pressed."""
+    electrodes = np.array([[0.0, -10.0], [8.660254, 5.0], [-8.660254, 5.0]])
+    distance = np.hypot(x_mm[:, None] - electrodes[:, 0], y_mm[:, None] - electrodes[:, 1])
+    return 850.0 * force_N[:, None] ** (2 / 3) * 10.0 / (2.0 + 0.8 * distance)
+
+
+def play(rate_Hz, url, stop, counts):
+    """The board, in a process of its own."""
+    with VirtualSensor(charge_pC, wander(seed=1, seconds=30.0, rate_Hz=rate_Hz)) as sensor:
+        url.send(sensor.url)
+        stop.wait()
+        counts.send((sensor.sent, sensor.withheld))
+
+
+def watch(url, electrodes, stalls, seconds, results):
+    """A viewer by the stock client, in a process of its own: ages of the newest sample, s."""
+    results.send(asyncio.run(_watch(url, SampleFormat(electrodes), stalls, seconds)))
+
+
+async def _watch(url, form, stalls, seconds):
+    ages = []
+    async with connect(url.replace("http", "ws", 1) + "/live") as client:
+        if stalls:
+            client.transport.pause_reading()
+            await asyncio.sleep(seconds)
+            return ages
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            data = await client.recv()
+            if isinstance(data, bytes):
+                rows = np.frombuffer(data, form.dtype, offset=HEADER.size)
+                if len(rows):
+                    ages.append(time.time() - float(rows["timestamp"][-1]))
+                await asyncio.sleep(1 / 60)  # a picture
+                await client.send(struct.pack("<I", HEADER.unpack_from(data)[3]))
+    return ages
+
+
+def memory_kB(pid):
+    """Resident memory of a process and its children, kB."""
+    children = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True, check=False).stdout.split()
+    total = 0
+    for each in [str(pid), *children]:
+        text = Path(f"/proc/{each}/status").read_text()
+        total += int(re.search(r"VmRSS:\s+(\d+)", text)[1])
+    return total
+
+
+def browse(url, seconds):
+    """Chromium's view: ages of its pictures (ms), pictures a second, and memory of the page at start and end (MB)."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=[*ARGUMENTS, "--enable-precise-memory-info"])
+        page = browser.new_page(viewport={"width": 1280, "height": 820})
+        page.goto(url)
+        page.wait_for_timeout(3000)
+        memory = [page.evaluate("performance.memory.usedJSHeapSize")]
+        page.evaluate("isocharge.page.ages.length = 0")
+        ages, ends = [], time.monotonic() + seconds
+        rates = []
+        while time.monotonic() < ends:
+            page.wait_for_timeout(2000)
+            ages += page.evaluate("isocharge.page.ages.splice(0)")
+            rates.append(page.evaluate("(({starts: s}) => 1000 * (s.length - 1) / (s.at(-1) - s[0]))(isocharge.page)"))
+            memory.append(page.evaluate("performance.memory.usedJSHeapSize"))
+        browser.close()
+    return ages, rates, [size / 1e6 for size in memory]
+
+
+def one_round(port, viewers, seconds, folder, number, live, in_browser):
+    """Follow the port for a while: latencies (us), lost frames, ages (s), memory (kB, start and end), browser."""
+    path = folder / f"{number}.rec"
+    words = [sys.executable, "-m", "isocharge.cli", "serve", "stream", MODEL, "--port", port, "--output", "none"]
+    words += ["--record", str(path)] + (["--live", "--live-port", "0"] if live else [])
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
+    url = ""
+    while "taring" not in (line := process.stderr.readline()):
+        url = match[1] if (match := re.search(r"page: (\S+)", line)) else url
+        assert line
+    time.sleep(2.0)
+    memory, results, watching = [memory_kB(process.pid)], [], []
+    for k in range(viewers):
+        ours, theirs = multiprocessing.Pipe(duplex=False)
+        electrodes = Predictor(MODEL).metadata.electrodes
+        watching.append(multiprocessing.Process(target=watch, args=(url, electrodes, k == 0, seconds, theirs)))
+        watching[-1].start()
+        results.append(ours)
+    browsed = browse(url, seconds) if in_browser else None
+    if browsed is None:
+        time.sleep(seconds)
+    memory.append(memory_kB(process.pid))
+    ages = [age for result in results for age in (result.recv() if result.poll(20) else [])]
+    for each in watching:
+        each.join()
+    process.terminate()
+    process.communicate(timeout=30)
+    latencies = np.array([us for event in Recording(path).events() for us in event.latencies_us])
+    lines = (json.loads(line) for line in path.open() if line.startswith('{"timestamp"'))
+    seq = np.array([line["seq"] for line in lines])
+    return latencies, int(((np.diff(seq) - 1) % 65536).sum()), ages, memory, browsed
+
+
+def percentiles(values, scale=1.0):
+    return (
+        ", ".join(f"p{share} {scale * np.percentile(values, share):.1f}" for share in (50, 95, 99))
+        if len(values)
+        else "none"
+    )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--rate-Hz", type=float, default=1000.0)
+    parser.add_argument("--browser", action="store_true")
+    options = parser.parse_args()
+    context = multiprocessing.get_context("spawn")
+    (url, their_url), (counts, their_counts) = context.Pipe(duplex=False), context.Pipe(duplex=False)
+    stop = context.Event()
+    board = context.Process(target=play, args=(options.rate_Hz, their_url, stop, their_counts))
+    board.start()
+    port, p99 = url.recv(), {0: [], 3: []}
+    print(
+        f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {options.rate_Hz:g} Hz, {options.seconds:g} s a round"
+    )
+    with tempfile.TemporaryDirectory() as name:
+        for number in range(options.rounds):
+            for viewers in (0, 3) if number % 2 == 0 else (3, 0):
+                in_browser = options.browser and viewers > 0
+                latencies, lost, ages, memory, browsed = one_round(
+                    port,
+                    viewers - in_browser,
+                    options.seconds,
+                    Path(name),
+                    f"{number}-{viewers}",
+                    viewers > 0,
+                    in_browser,
+                )
+                p99[viewers].append(float(np.percentile(latencies, 99)))
+                print(
+                    f"round {number}, {viewers} viewers: latency us {percentiles(latencies)}; "
+                    f"{len(latencies)} records, {lost} lost; age ms {percentiles(ages, 1e3)}; memory MB "
+                    f"{' -> '.join(f'{size / 1e3:.1f}' for size in memory)}"
+                )
+                if browsed is not None:
+                    pictures, rates, heap = browsed
+                    print(
+                        f"  Chromium: age of a picture ms {percentiles(pictures)}; pictures/s "
+                        f"{np.median(rates):.1f}; heap MB {heap[0]:.1f} -> {heap[-1]:.1f}, most {max(heap):.1f}"
+                    )
+    ratios = np.array(p99[3]) / np.array(p99[0])
+    print(
+        f"p99 with three viewers over without: median {np.median(ratios):.2f}, {ratios.min():.2f} to {ratios.max():.2f}"
+    )
+    stop.set()
+    sent, withheld = counts.recv()
+    print(f"board: {sent} frames sent, {withheld} withheld while nobody followed")
+    board.join()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,135 @@
+"""The page's server in a thread, fed by hand."""
+
+import asyncio
+import json
+import struct
+import urllib.request
+from threading import Thread
+
+import pytest
+from websockets.asyncio.client import connect
+
+from isocharge.serve.network.address import Address
+from isocharge.serve.viewer.description import describe_film
+from isocharge.serve.viewer.link import make_link
+from isocharge.serve.viewer.messages import HEADER
+from isocharge.serve.viewer.sample import SampleFormat
+from isocharge.serve.viewer.server import FilmLink, PageSettings, run_page
+
+NAMES = ("A", "B", "C")
+
+
+class Page:
+    """A running page with one film or several.
+
+    Attributes:
+        readers: The readers' ends of the links.
+        url: Of the page.
+        form: Of the samples.
+    """
+
+    def __init__(self, metadata, films, **settings):
+        self.form = SampleFormat(NAMES)
+        ends = [make_link() for _ in range(films)]
+        self.readers = [reader for reader, _ in ends]
+        links = [FilmLink(page, describe_film(f"film {k}", metadata, None)) for k, (_, page) in enumerate(ends)]
+        self.url = ""
+        self._thread = Thread(target=run_page, args=(links, PageSettings(Address(), **settings), self._announce))
+        self._thread.start()
+        while not self.url and self._thread.is_alive():
+            pass
+
+    def _announce(self, url):
+        self.url = url
+
+    @property
+    def live(self):
+        return self.url.replace("http", "ws", 1) + "/live"
+
+    def get(self, path, **headers):
+        request = urllib.request.Request(self.url + path, headers=headers)
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            return answer.status, answer.headers, answer.read()
+
+    def stop(self):
+        for reader in self.readers:
+            reader.close()
+        self._thread.join(timeout=20)
+        assert not self._thread.is_alive()
+
+
+@pytest.fixture
+def start_page(film):
+    """Start pages; they are stopped when the test ends."""
+    started = []
+
+    def start(films=1, **settings):
+        started.append(Page(film.metadata(), films, **settings))
+        return started[-1]
+
+    yield start
+    for page in started:
+        page.stop()
+
+
+@pytest.fixture
+def page(start_page):
+    return start_page()
+
+
+class Client:
+    """The stock WebSocket client, with what a page does."""
+
+    def __init__(self, socket, form):
+        self.socket, self.form = socket, form
+        self.states, self.errors, self.plays = [], [], []
+
+    async def samples(self, confirm=True):
+        """The next message of samples: (header, rows); others are kept on the way."""
+        import numpy as np
+
+        while True:
+            data = await asyncio.wait_for(self.socket.recv(), 20)
+            if isinstance(data, bytes):
+                header = HEADER.unpack_from(data)
+                if confirm:
+                    await self.confirm(header[3])
+                return header, np.frombuffer(data, self.form.dtype, offset=HEADER.size)
+            self._note(json.loads(data))
+
+    async def text(self, key):
+        """Wait for a text message with a key."""
+        while True:
+            data = await asyncio.wait_for(self.socket.recv(), 20)
+            if isinstance(data, bytes):
+                await self.confirm(HEADER.unpack_from(data)[3])
+                continue
+            content = json.loads(data)
+            self._note(content)
+            if key in content:
+                return content[key]
+
+    async def confirm(self, number):
+        await self.socket.send(struct.pack("<I", number))
+
+    async def ask(self, **content):
+        await self.socket.send(json.dumps(content))
+
+    def _note(self, content):
+        for key, notes in (("state", self.states), ("error", self.errors), ("play", self.plays)):
+            if key in content:
+                notes.append(content[key])
+
+
+@pytest.fixture
+def viewer():
+    """Run a coroutine function with a client of a page."""
+
+    def run(page, talk, **options):
+        async def follow():
+            async with connect(page.live, subprotocols=["isocharge.live.1"], **options) as socket:
+                return await talk(Client(socket, page.form))
+
+        return asyncio.run(follow())
+
+    return run

@@ -1,0 +1,212 @@
+"""The page in headless Chromium, against a virtual sensor: what is drawn is where and as hard as it is pressed."""
+
+import contextlib
+import re
+import shutil
+import socket
+import time
+
+import numpy as np
+import pytest
+
+from isocharge.serve import Script, VirtualSensor
+
+pytestmark = pytest.mark.slow
+
+CHROMIUM = "/usr/bin/chromium"
+ARGUMENTS = [
+    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"),
+    *("--disable-component-update", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+]
+RATE_HZ, PRESS_S, PAUSE_S = 200.0, 1.5, 0.9
+PRESSES = [
+    *[(0.0, 0.0, 1.0), (6.0, 2.0, 0.5), (-5.0, 3.0, 2.0), (2.0, -6.0, 0.2), (-3.0, -4.0, 1.5)],
+    *[(4.0, 4.0, 0.3), (-6.5, -1.0, 0.8), (0.5, 5.5, 1.2), (5.0, -3.5, 0.1), (-1.0, 2.0, 0.6)],
+]
+
+DRAWN = """() => {
+  const film = isocharge.page.films[0], plan = film.plan, canvas = plan.canvas;
+  const g = canvas.getContext("2d"), { data } = g.getImageData(0, 0, canvas.width, canvas.height);
+  const lens = plan.lens ?? { x: 1e9, y: 1e9, size: 0 }, mm = plan.pixel, css = canvas.width / canvas.clientWidth;
+  let [count, x, y, left, right, top, bottom] = [0, 0, 0, Infinity, 0, Infinity, 0];
+  for (let j = 0; j < canvas.height; j++) for (let i = 0; i < canvas.width; i++) {
+    const at = 4 * (j * canvas.width + i);
+    if (data[at] < 150 || data[at + 2] > 90 || data[at + 1] > 150) continue;
+    const [u, v] = [(i - canvas.width / 2) * mm, (canvas.height / 2 - j) * mm];
+    if (Math.hypot(u - lens.x, v - lens.y) < 1.05 * lens.size) continue;
+    count++; x += i; y += j;
+    [left, right, top, bottom] = [Math.min(left, i), Math.max(right, i), Math.min(top, j), Math.max(bottom, j)];
+  }
+  return { kind: film.drawnKind, count,
+    x: (x / count + 0.5 - canvas.width / 2) * mm, y: (canvas.height / 2 - y / count - 0.5) * mm,
+    width: (right - left + 1) / css, height: (bottom - top + 1) / css, shown: [".x b", ".y b", ".force b"].map(
+      (name) => Number(film.find(name).textContent.replace("\\u2212", "-"))) };
+}"""
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    if shutil.which(CHROMIUM) is None:
+        pytest.skip(f"needs {CHROMIUM} (apt-get install chromium)")
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def presses(film):
+    """Ten presses that stand still, with pauses that are long enough for a tare, played again and again."""
+    pause, press = np.zeros(round(PAUSE_S * RATE_HZ)), np.ones(round(PRESS_S * RATE_HZ))
+    force_N = np.concatenate([np.concatenate([pause, force * press]) for _, _, force in PRESSES])
+    places = [
+        np.concatenate([np.concatenate([pause * np.nan, place[axis] * press]) for place in PRESSES]) for axis in (0, 1)
+    ]
+    with VirtualSensor(film.charge_pC, Script(*places, force_N, RATE_HZ)) as sensor:
+        yield sensor
+
+
+@pytest.fixture
+def free_port():
+    with contextlib.closing(socket.socket()) as place:
+        place.bind(("127.0.0.1", 0))
+        return place.getsockname()[1]
+
+
+@pytest.fixture
+def start_stream(presses, models, free_port, start_command, tmp_path, monkeypatch):
+    """Start `serve stream --live`, on the same port again and again."""
+    monkeypatch.chdir(tmp_path)
+
+    def start():
+        process = start_command(
+            *("serve", "stream", "linear", "--models", models, "--port", presses.url, "--output", "none"),
+            *("--live", "--live-port", free_port),
+        )
+        while "live page" not in (line := process.stderr.readline()):
+            assert line, "the page did not start"
+        return process
+
+    return start
+
+
+@pytest.fixture
+def open_page(chromium, free_port):
+    """Open the page in a new window; whatever it complains about fails the test."""
+    complaints, contexts = [], []
+
+    def start(width=1280, height=820, scheme="light"):
+        contexts.append(chromium.new_context(viewport={"width": width, "height": height}, color_scheme=scheme))
+        page = contexts[-1].new_page()
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+        page.goto(f"http://127.0.0.1:{free_port}/")
+        wait_for(page, "isocharge.page.films.length > 0 && isocharge.page.films[0].history.latest !== null")
+        return page
+
+    yield start
+    for context in contexts:
+        context.close()
+    assert [text for text in complaints if not re.search(r"ERR_CONNECTION|WebSocket|Failed to load", text)] == []
+
+
+def wait_for(page, expression, timeout_s=40.0):
+    """As `wait_for_function`, which the page's own policy forbids."""
+    end = time.monotonic() + timeout_s
+    while not page.evaluate(expression):
+        assert time.monotonic() < end, expression
+        page.wait_for_timeout(20)
+
+
+def test_ten_presses_appear_where_and_as_hard_as_they_are(start_stream, open_page):
+    start_stream()
+    page = open_page()
+    wait_for(page, "isocharge.page.films[0].drawnKind === 'none'")
+    radius_of = {}
+    end = time.monotonic() + 120.0
+    while len(radius_of) < len(PRESSES) and time.monotonic() < end:
+        drawn = page.evaluate(DRAWN)
+        if drawn["kind"] != "contact" or drawn["count"] < 50:
+            continue
+        x, y, force = drawn["shown"]
+        number = min(range(len(PRESSES)), key=lambda k: np.hypot(PRESSES[k][0] - x, PRESSES[k][1] - y))
+        px, py, pressed_N = PRESSES[number]
+        assert np.hypot(px - x, py - y) < 0.3
+        is_alone = abs(drawn["width"] - drawn["height"]) <= 2.0  # the trail of the press before has faded
+        if is_alone and np.hypot(px - drawn["x"], py - drawn["y"]) < 0.3 and abs(force - pressed_N) < 0.02:
+            radius_of[number] = 0.5 * drawn["width"]
+    assert sorted(radius_of) == list(range(len(PRESSES)))
+    for number, radius in radius_of.items():
+        assert radius == pytest.approx(5.0 + 15.0 * np.sqrt(PRESSES[number][2] / 2.0), abs=1.5), PRESSES[number]
+
+
+def test_tare_pause_record_and_marker(start_stream, open_page, tmp_path):
+    start_stream()
+    page = open_page()
+    wait_for(page, "isocharge.page.films[0].drawnKind === 'contact'")
+    page.get_by_role("button", name="Tare").click()
+    wait_for(page, "isocharge.page.films[0].drawnKind === 'tare'")
+    wait_for(page, "isocharge.page.films[0].drawnKind === 'contact'")
+
+    picture = "isocharge.page.films[0].find('.trace.force canvas').toDataURL()"
+    page.keyboard.press("Space")
+    wait_for(page, "document.querySelector('[data-do=pause]').getAttribute('aria-pressed') === 'true'")
+    before, end = page.evaluate(picture), page.evaluate("isocharge.page.films[0].history.end")
+    page.wait_for_timeout(1500)
+    assert page.evaluate(picture) == before
+    assert page.evaluate("isocharge.page.films[0].history.end") > end  # the stream does not pause
+    page.keyboard.press("Space")
+    wait_for(page, f"{picture} !== {before!r}")
+
+    page.get_by_role("button", name="Record").click()
+    wait_for(page, "isocharge.page.films[0].state.recording")
+    page.keyboard.press("m")
+    wait_for(page, "isocharge.page.films[0].history.markers.length === 1")
+    page.keyboard.press("r")
+    wait_for(page, "!isocharge.page.films[0].state.recording")
+    (path,) = tmp_path.glob("linear-1-*.rec")
+    assert '{"marker":' in path.read_text()
+
+    page.keyboard.press("?")
+    assert page.locator("dialog").is_visible()
+    page.keyboard.press("Escape")
+    assert not page.locator("dialog").is_visible()
+
+
+def test_nothing_that_breaks_breaks_the_page(start_stream, open_page):
+    process = start_stream()
+    page = open_page()
+    page.evaluate("""() => {
+      const { connection } = isocharge;
+      connection.socket.send("nonsense");
+      for (const size of [0, 3, 24, 500]) connection.on.samples(new ArrayBuffer(size));
+      connection.socket.onmessage({ data: "{" });
+      connection.socket.onmessage({ data: '{"film": 9, "state": {}}' });
+    }""")
+    wait_for(page, "document.querySelector('.note').textContent.includes('expected JSON')")
+    for ending in ("lost connection", "restart"):
+        if ending == "restart":
+            process.kill()
+            process.wait()
+        else:
+            page.evaluate("isocharge.connection.socket.close()")
+        wait_for(page, "document.getElementById('link').dataset.state === 'lost'")
+        if ending == "restart":
+            page.wait_for_timeout(1000)
+            start_stream()
+        wait_for(page, "document.getElementById('link').dataset.state === 'live'")
+        wait_for(page, "isocharge.page.films[0].drawnKind === 'contact'")
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 820), (390, 844), (820, 1180)])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_it_fits_every_screen(start_stream, open_page, width, height, scheme, tmp_path):
+    start_stream()
+    page = open_page(width, height, scheme)
+    wait_for(page, "isocharge.page.films[0].drawnKind === 'contact'")
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    plan = page.locator(".plan canvas").bounding_box()
+    assert plan["y"] + plan["height"] <= height  # the film is seen without scrolling
+    page.screenshot(path=tmp_path / "page.png")
+    assert (tmp_path / "page.png").stat().st_size > 20_000

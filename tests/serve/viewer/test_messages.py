@@ -1,0 +1,70 @@
+"""What a page asks for: the known requests are read, anything else is refused with a reason."""
+
+import json
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from isocharge.errors import RequestError
+from isocharge.serve.viewer.messages import LIVE_ACTIONS, REPLAY_ACTIONS, PageRequest, confirmed_number, parse_request
+
+ACTIONS = LIVE_ACTIONS + REPLAY_ACTIONS
+
+
+@pytest.mark.parametrize(
+    ("text", "request_"),
+    [
+        ('{"do": "tare"}', PageRequest("tare", 0)),
+        ('{"do": "record", "film": 1, "on": true}', PageRequest("record", 1, is_on=True)),
+        ('{"do": "marker", "text": "here"}', PageRequest("marker", 0, text="here")),
+        ('{"do": "seek", "value": 12.5}', PageRequest("seek", 0, value=12.5)),
+        ('{"do": "speed", "value": 24}', PageRequest("speed", 0, value=24.0)),
+    ],
+)
+def test_requests_are_read(text, request_):
+    assert parse_request(text, ACTIONS, 2) == request_
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"do": "shutdown"},
+        {"do": "tare", "film": 2},
+        {"do": "tare", "film": -1},
+        {"do": "tare", "film": 0.5},
+        {"do": "record"},
+        {"do": "record", "on": 1},
+        {"do": "marker", "text": "x" * 81},
+        {"do": "marker", "text": "a\nb"},
+        {"do": "seek", "value": -1},
+        {"do": "seek", "value": 1e99},
+        {"do": "speed", "value": 0},
+        {"do": "tare", "path": "/etc/passwd"},
+        [],
+        "tare",
+    ],
+)
+def test_other_requests_are_refused(content):
+    with pytest.raises(RequestError):
+        parse_request(json.dumps(content), ACTIONS, 2)
+
+
+def test_a_live_page_does_not_seek():
+    with pytest.raises(RequestError, match="one of tare, record, marker"):
+        parse_request('{"do": "seek", "value": 1}', LIVE_ACTIONS, 1)
+
+
+@given(st.text() | st.recursive(st.none() | st.text() | st.floats(), st.lists, max_leaves=5).map(json.dumps))
+@example("[" * 5000)
+@example('{"do": "seek", "value": NaN}')
+@example('{"do": "seek", "value": 1' + "0" * 4000 + "}")
+def test_no_text_breaks_it(text):
+    with pytest.raises(RequestError):
+        parse_request(text, ACTIONS, 1)
+
+
+def test_confirmations_have_four_bytes():
+    assert confirmed_number(b"\x01\x02\x00\x00") == 513
+    with pytest.raises(RequestError, match="four bytes"):
+        confirmed_number(b"\x01")

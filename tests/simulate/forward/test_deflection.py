@@ -1,0 +1,94 @@
+"""The table of deflections against the film, solved where the table has no entry; and its file."""
+
+import json
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+
+from isocharge.deflection_field import read_deflection_field
+from isocharge.errors import InputError
+from isocharge.simulate import Circle, load_sensor, press
+from isocharge.simulate.forward.deflection import deflection_field
+
+FILM, PROBE = load_sensor("three-25um-biaxial").film, Circle(1e-3)
+
+
+@pytest.fixture(scope="module")
+def field():
+    return deflection_field(FILM, PROBE, (0.2, 1.0), distances=3)
+
+
+def interpolated(field, x_mm, y_mm, distance_mm, force_N):
+    """Deflection under a press on the x axis, as the docstring of the file says."""
+    p, r = distance_mm / 45.0, 1.0 / 45.0
+    c = math.tanh(0.5 * (math.atanh(p + r) + math.atanh(p - r)))
+    place = (x_mm + 1j * y_mm) / 45.0
+    z = (place - c) / (1.0 - c * place)
+    scaled = field.deflection_mm / np.cbrt(field.force_N)[:, None, None, None]
+    axes = (np.log(field.force_N), field.distance_mm, field.rings, np.linspace(0.0, math.pi, scaled.shape[3]))
+    points = np.stack(
+        [np.full(len(z), math.log(force_N)), np.full(len(z), distance_mm), abs(z), abs(np.angle(z))], axis=1
+    )
+    return RegularGridInterpolator(axes, scaled)(points) * np.cbrt(force_N)
+
+
+@pytest.mark.parametrize(("distance_mm", "force_N"), [(0.0, 0.5), (5.0, 0.2), (11.0, 1.0)])
+def test_it_is_the_film_between_its_entries(field, distance_mm, force_N):
+    solved = press(FILM, PROBE, (1e-3 * distance_mm, 0.0), force_N)
+    rng = np.random.default_rng(1)
+    x_mm, y_mm = rng.uniform(-30, 30, 300), rng.uniform(-30, 30, 300)
+    x_mm[:100] = distance_mm + rng.normal(0, 2, 100)
+    y_mm[:100] = rng.normal(0, 2, 100)
+    expected = 1e3 * solved.deflection(1e-3 * np.stack([x_mm, y_mm], axis=1))
+    error = np.abs(interpolated(field, x_mm, y_mm, distance_mm, force_N) - expected)
+    assert error.max() < 0.02 * expected.max()
+
+
+def test_the_file_says_the_same(field, tmp_path):
+    path = tmp_path / "deflection.json"
+    path.write_text(json.dumps(field.to_json()))
+    read = read_deflection_field(path)
+    assert np.abs(read.deflection_mm - field.deflection_mm).max() < 1e-4 * field.deflection_mm.max()
+    assert read.fits({"radius_mm": 45, "thickness_um": 25.0, "young_GPa": 3.0, "poisson": 0.34})
+    assert not read.fits({"radius_mm": 45.0, "thickness_um": 110.0, "young_GPa": 3.0, "poisson": 0.34})
+    assert not read.fits({"radius_mm": "45"})
+    assert not read.fits(None)
+    assert all(a < b for a, b in pairwise(read.rings))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"isocharge_deflection": 2}, "not supported"),
+        ({"film": {"radius_mm": 45.0}}, "is missing"),
+        ({"force_N": [1.0, 0.2]}, "increasing"),
+        ({"rings": []}, "increasing"),
+        ({"angles": 1}, "angles"),
+        ({"angles": 10**9}, "at most"),
+        ({"deflection": "no base64"}, "base64"),
+        ({"deflection": "AAAA"}, "base64"),
+        ({"deflection": 5}, "base64"),
+        ({"scale_mm": -1.0}, "scale_mm"),
+    ],
+)
+def test_a_damaged_file_says_why(field, tmp_path, changes, reason):
+    path = tmp_path / "deflection.json"
+    path.write_text(json.dumps(field.to_json() | changes))
+    with pytest.raises(InputError, match=reason):
+        read_deflection_field(path)
+
+
+def test_the_command_writes_one(command, tmp_path):
+    path = tmp_path / "deflection.json"
+    code, _, err = command("simulate", "deflection", "three-25um-biaxial", "-o", path)
+    assert code == 0, err
+    assert read_deflection_field(path).fits({"radius_mm": 45, "thickness_um": 25, "young_GPa": 3, "poisson": 0.34})
+    assert command("simulate", "deflection", "three-25um-biaxial", "-o", path)[0] == 1
+    code, _, err = command(
+        "simulate", "deflection", "three-25um-biaxial", "-o", tmp_path / "x", "--probe", "triangle:4"
+    )
+    assert code == 2
+    assert "round one" in err
