@@ -13,6 +13,7 @@ PACKAGES = {
     "http": HTTP,
     "grpc": HTTP | {"grpc", "google"},
     "cluster": frozenset({"dask", "distributed"}),
+    "record": frozenset({"mcap", "lz4", "zstandard"}),
 }
 """Import names that come with an extra of pyproject.toml."""
 

@@ -12,13 +12,23 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from isocharge.cli.serve.options import (
+    McapOption,
+    McapRecords,
+    McapRecordsOption,
     ModelsOption,
     Output,
     OutputOption,
     PolicyName,
     UdpOption,
 )
-from isocharge.cli.serve.record_output import LATENCIES, record_writer, summary, write_records
+from isocharge.cli.serve.record_output import (
+    LATENCIES,
+    McapOutput,
+    record_writer,
+    summary,
+    with_lines,
+    write_records,
+)
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
 from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
 from isocharge.cli.shared.stopping import until_stopped
@@ -51,6 +61,8 @@ def stream_command(
             help="Also write raw bytes and records for `isocharge serve replay`. (default: no)",
         ),
     ] = None,
+    mcap: McapOption = None,
+    mcap_records: McapRecordsOption = McapRecords.json,
     policy: Annotated[
         PolicyName,
         typer.Option(
@@ -108,6 +120,11 @@ def stream_command(
         lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
         put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
         write = record_writer(stack, output, udp, predictor.metadata.electrodes, put)
+        mcap_output = (
+            McapOutput(mcap, predictor.metadata.electrodes, mcap_records, source.is_live) if mcap is not None else None
+        )
+        if mcap_output:
+            write = with_lines(write, stack.enter_context(mcap_output).put)
         if recorder:
             stack.enter_context(recorder)
         records = stack.enter_context(closing(live.follow(source)))  # closed before the recorder
@@ -117,7 +134,7 @@ def stream_command(
         finally:
             lines.close()
             say(summary(path, latencies, lines.lost))
-    if recorder is not None and recorder.failed:
+    if (recorder and recorder.failed) or (mcap_output and not mcap_output.is_whole):
         raise typer.Exit(1)
 
 
