@@ -114,6 +114,13 @@ def changes(values):
     return [value for value, _ in groupby(values)]
 
 
+def test_a_doubt_without_a_movement_is_on_the_path():
+    rest = dict.fromkeys(FIELDS, 0.1) | {"charge_pC": None, "charge_raw_pC": None}
+    flags = [[], [], ["misfit"], ["misfit"], [], ["gap"]]
+    path = collect([rest | {"timestamp": 0.1 * k, "flags": words} for k, words in enumerate(flags)]).path
+    assert [(round(point.time, 6), point.doubtful) for point in path] == [(0.0, False), (0.2, True), (0.4, False)]
+
+
 def test_a_slow_spiral_keeps_its_shape(monkeypatch):
     """Many times more contacts than points: the points that are left are near every contact."""
     monkeypatch.setattr(module, "MOST_POINTS", 300)
