@@ -20,7 +20,7 @@ from isocharge.serve.network.protocol import Handler
 SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
 
-SLOW = {"recordings.md", "virtual_sensor.md"}
+SLOW = {"mcap.md", "recordings.md", "virtual_sensor.md"}
 """Pages whose commands simulate a film each time; those of the README, which do the same, run always."""
 
 

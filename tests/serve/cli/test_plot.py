@@ -30,7 +30,6 @@ def figure_of(monkeypatch):
 
 
 def test_a_recording_is_drawn(command, recorded, models, tmp_path, monkeypatch):
-    monkeypatch.setattr("isocharge.serve.export.traces.MOST_GROUPS", 32)
     figures, picture = figure_of(monkeypatch), tmp_path / "touch.png"
     code, out, err = command("serve", "plot", recorded, "--models", models, "-o", picture)
     assert (code, out) == (0, "")
@@ -49,6 +48,18 @@ def test_a_recording_is_drawn(command, recorded, models, tmp_path, monkeypatch):
     assert [text.get_text() for text in flags.get_yticklabels()] == sorted({f for r in records for f in r["flags"]})
     places = film.collections[-2].get_offsets()
     assert np.abs(places - [2.0, 1.0]).max() < 0.2
+
+
+def test_a_long_recording_is_drawn_as_bands(command, recorded, models, tmp_path, monkeypatch):
+    monkeypatch.setattr("isocharge.serve.export.traces.MOST_GROUPS", 32)
+    figures, records = figure_of(monkeypatch), []
+    assert command("serve", "plot", recorded, "--models", models, "-o", tmp_path / "touch.png")[0] == 0
+    records = [json.loads(line) for line in recorded.read_text().splitlines() if '"timestamp"' in line]
+    bands = {band.get_label(): band for axes in figures[0].axes for band in axes.collections}
+    force, charge = (bands[name].get_paths()[0].vertices[:, 1] for name in ("force", "C"))
+    assert len(force) < 150
+    assert (force.min(), force.max()) == (0.0, max(record["force_N"] for record in records))
+    assert charge.max() == max(r["charge_pC"]["C"] for r in records if r["charge_pC"])
 
 
 def test_the_film_of_a_released_model(command, recorded, tmp_path, monkeypatch):
@@ -111,5 +122,5 @@ def test_lines_break_where_nothing_came(command, recorded, models, tmp_path, mon
     assert command("serve", "plot", recorded, "--models", models, "-o", tmp_path / "touch.png")[0] == 0
     force = next(line for axes in figures[0].axes for line in axes.lines if line.get_label() == "force")
     time = force.get_xdata()
-    assert np.isnan(time).sum() == 2  # once for the smallest, once for the largest value of a group
+    assert np.isnan(time).sum() == 1
     assert np.nanmax(np.diff(time[~np.isnan(time)])) > 50.0  # minutes

@@ -27,6 +27,9 @@ MOST_POINTS = 20_000
 STEP_MM = 0.01
 """Distance at which contacts of a short path lie apart, mm: less than a sensor resolves."""
 
+LARGEST_STEP_MM = 1e3
+"""Distance above which points are not thinned further by it, mm."""
+
 MOST_ELECTRODES, MOST_FLAGS = 64, 62
 """Largest number of electrodes, as of a model, and of different words in `flags`."""
 
@@ -72,6 +75,7 @@ class Traces:
         charge_pC: Envelope of the touch charge by electrode.
         flags: Groups in which a flag occurs, by its word, shape (n,).
         path: Contacts that lie apart.
+        step_mm: Distance in x or y at which they do, mm.
     """
 
     records: int
@@ -82,6 +86,7 @@ class Traces:
     charge_pC: dict[str, Envelope]
     flags: dict[str, np.ndarray]
     path: tuple[Point, ...]
+    step_mm: float
 
 
 class TraceCollector:
@@ -145,6 +150,7 @@ class TraceCollector:
             dict(zip(self._electrodes, envelopes[len(names) :], strict=True)),
             {word: self._group_marks >> bit & 1 == 1 for word, bit in self._words.items()},
             tuple(self._path.points),
+            self._path.step_mm,
         )
 
     def _word(self, word: str) -> int:
@@ -184,7 +190,7 @@ class _Path:
 
     def __init__(self) -> None:
         self.points: list[Point] = []
-        self._step = STEP_MM
+        self.step_mm = STEP_MM
         self._press, self._touches = 0, False
 
     def add(self, time: float, contact: list[float], std: list[float], doubtful: bool) -> None:
@@ -195,17 +201,19 @@ class _Path:
         if not touches:
             return
         point = Point(time, x, y, force, std[0], std[1], self._press, doubtful)
-        if not self.points or _apart(self.points[-1], point, self._step):
+        if not self.points or _apart(self.points[-1], point, self.step_mm):
             self.points.append(point)
         if len(self.points) > MOST_POINTS:
             self._thin()
 
     def _thin(self) -> None:
-        self._step *= 2.0
-        points, self.points = self.points, []
-        for point in points:
-            if not self.points or _apart(self.points[-1], point, self._step):
-                self.points.append(point)
+        """Double the step until half of the points are enough; where only doubts part them, take every second."""
+        while len(self.points) > MOST_POINTS // 2 and self.step_mm < LARGEST_STEP_MM:
+            self.step_mm *= 2.0
+            points, self.points = self.points, []
+            for point in points:
+                if not self.points or _apart(self.points[-1], point, self.step_mm):
+                    self.points.append(point)
         if len(self.points) > MOST_POINTS // 2:
             self.points = self.points[::2]
 

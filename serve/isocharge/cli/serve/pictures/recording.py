@@ -24,7 +24,15 @@ STYLES = ("-", "--", "-.", ":")
 BAND = 2.0
 """Half width of the bands and half axes of the ellipses, standard deviations."""
 
+BAND_OPACITY = 0.5
+"""Opacity of the bands of long recordings, which lie on each other."""
+
 MOST_ELLIPSES = 60
+
+LONGEST_LINE = 4.0
+"""Longest line between neighbours on the path, in steps at which they lie apart; and SHORT_MM in any case."""
+
+SHORT_MM = 0.5
 
 UNITS = ((7200.0, 3600.0, "h"), (600.0, 60.0, "min"), (0.0, 1.0, "s"))
 """From which length, s, a unit of time is used, and its seconds."""
@@ -85,11 +93,12 @@ def _unit(length_s: float) -> tuple[float, str]:
 
 @dataclass(frozen=True)
 class _Clock:
-    """Where lines of envelopes go: twice the middle of each group, and the place of breaks."""
+    """Where envelopes go: the middle of each group, the places of breaks, and whether a group is one record."""
 
     time: Array
     breaks: np.ndarray
     edges: tuple[Array, Array]
+    single: bool
 
     @classmethod
     def of(cls, traces: Traces, seconds: float) -> "_Clock":
@@ -97,16 +106,22 @@ class _Clock:
         pause = traces.start[1:] - traces.end[:-1]
         usual = float(np.median(np.diff(middle))) if len(middle) > 1 else 0.0
         breaks = np.flatnonzero(pause > max(BREAK_S, BREAK_GROUPS * usual)) + 1
-        return cls(np.insert(middle / seconds, breaks, np.nan), breaks, (traces.start / seconds, traces.end / seconds))
+        single = len(middle) == traces.records
+        return cls(
+            np.insert(middle / seconds, breaks, np.nan), breaks, (traces.start / seconds, traces.end / seconds), single
+        )
 
     def broken(self, values: Array) -> Array:
         """Values of the groups with NaN at the breaks."""
         return np.insert(values, self.breaks, np.nan)
 
     def line(self, axes: Any, envelope: Envelope, **style: Any) -> None:
-        """A line through the smallest and the largest value of each group."""
-        both = np.stack([self.broken(envelope.low), self.broken(envelope.high)], axis=1).ravel()
-        axes.plot(np.repeat(self.time, 2), both, **style)
+        """A line of single records, or a band from the smallest to the largest value of groups."""
+        low, high = self.broken(envelope.low), self.broken(envelope.high)
+        if self.single:
+            axes.plot(self.time, low, **style)
+            return
+        axes.fill_between(self.time, low, high, color=style["color"], alpha=BAND_OPACITY, lw=0.3, label=style["label"])
 
 
 def _draw_contact(axes: Any, traces: Traces, clock: _Clock, names: tuple[str, ...]) -> None:
@@ -167,7 +182,7 @@ def _draw_film(axes: Any, traces: Traces, scene: Scene, seconds: float, unit: st
     """The path on the film to scale, its colour the time."""
     reach = _draw_scene(axes, scene)
     if traces.path:
-        marks = _draw_path(axes, traces.path, seconds)
+        marks = _draw_path(axes, traces.path, traces.step_mm, seconds)
         axes.figure.colorbar(marks, ax=axes, shrink=0.6, label=f"time, {unit}", location="bottom", pad=0.02)
         places = np.array([(point.x_mm, point.y_mm) for point in traces.path])
         reach = max(reach, 1.1 * float(np.abs(places).max()))
@@ -191,19 +206,20 @@ def _draw_scene(axes: Any, scene: Scene) -> float:
     return reach
 
 
-def _draw_path(axes: Any, path: tuple[Point, ...], seconds: float) -> Any:
+def _draw_path(axes: Any, path: tuple[Point, ...], step_mm: float, seconds: float) -> Any:
     """Lines between neighbours of one press, dots that grow with the force, rings of deviations, crosses of doubt."""
     time = np.array([point.time for point in path]) / seconds
     places = np.array([(point.x_mm, point.y_mm) for point in path])
     press = np.array([point.press for point in path])
     force = np.array([point.force_N for point in path])
     doubtful = np.array([point.doubtful for point in path])
-    same = press[1:] == press[:-1]
+    longest = max(SHORT_MM, LONGEST_LINE * step_mm)
+    same = (press[1:] == press[:-1]) & (np.hypot(*(places[1:] - places[:-1]).T) <= longest)
     lines = LineCollection(np.stack([places[:-1], places[1:]], axis=1)[same], cmap="viridis", lw=0.8, alpha=0.7)
     lines.set_array(time[1:][same])
     lines.set_clim(0.0, max(float(time[-1]), 1e-9))
     axes.add_collection(lines)
-    size = 4.0 + 40.0 * np.clip(force, 0.0, None) / max(float(force.max()), 1e-9)
+    size = 3.0 + 30.0 * np.clip(force, 0.0, None) / max(float(force.max()), 1e-9)
     limits: dict[str, Any] = {"cmap": "viridis", "vmin": 0.0, "vmax": max(float(time[-1]), 1e-9)}
     marks = axes.scatter(*places.T, c=time, s=size, lw=0.0, alpha=0.8, zorder=4, **limits)
     axes.scatter(*places[doubtful].T, c=FELT, marker="x", s=24, lw=0.9, zorder=5)
