@@ -123,7 +123,7 @@ class McapFile:
         with self._lock:
             try:
                 if not self.failed:
-                    self._writer.finish()
+                    self._writer.finish()  # type: ignore[no-untyped-call]
             finally:
                 self._file.close()
 
@@ -171,7 +171,7 @@ class McapFile:
                 )
         self.records += 1
         if self._now() - self._flushed >= FLUSH_S:
-            self._writer.flush()
+            self._writer.flush()  # type: ignore[no-untyped-call]
             self._flushed = self._now()
 
     def _record_channel(self) -> int:

@@ -79,7 +79,7 @@ def time_of(record: Mapping[str, Any]) -> int:
     Raises:
         InputError: If ROS 2 has no stamp for it.
     """
-    seconds = record["timestamp"]
+    seconds: float | None = record["timestamp"]
     if seconds is None or not 0.0 <= seconds < LATEST_S:
         raise InputError(
             f"timestamp {seconds!r}: expected unix seconds from 1970 to 2038, as ROS 2 holds them; set the clock of "

@@ -27,9 +27,6 @@ MOST_POINTS = 20_000
 STEP_MM = 0.01
 """Distance at which contacts of a short path lie apart, mm: less than a sensor resolves."""
 
-LARGEST_STEP_MM = 1e3
-"""Distance above which points are not thinned further by it, mm."""
-
 MOST_ELECTRODES, MOST_FLAGS = 64, 62
 """Largest number of electrodes, as of a model, and of different words in `flags`."""
 
@@ -44,7 +41,7 @@ DOUBTS = frozenset({"outside", "misfit", "saturated", "blind", "invalid"})
 
 
 class Point(NamedTuple):
-    """A contact on the path: time in s, position and deviations in mm, force in N, number of the press, any doubt."""
+    """A contact on the path: time in s, position and deviations in mm, force in N, number of the press."""
 
     time: float
     x_mm: float
@@ -53,7 +50,6 @@ class Point(NamedTuple):
     x_std_mm: float
     y_std_mm: float
     press: int
-    doubtful: bool
 
 
 class Envelope(NamedTuple):
@@ -74,8 +70,9 @@ class Traces:
         values: Envelope by field: CONTACT, `misfit`, and each of CONTACT with " - std" and " + std".
         charge_pC: Envelope of the touch charge by electrode.
         flags: Groups in which a flag occurs, by its word, shape (n,).
-        path: Contacts that lie apart.
+        path: Contacts that lie apart, in their order.
         step_mm: Distance in x or y at which they do, mm.
+        doubts: Those contacts with a flag of DOUBTS that lie apart.
     """
 
     records: int
@@ -87,6 +84,7 @@ class Traces:
     flags: dict[str, np.ndarray]
     path: tuple[Point, ...]
     step_mm: float
+    doubts: tuple[Point, ...]
 
 
 class TraceCollector:
@@ -109,7 +107,8 @@ class TraceCollector:
         self._marks: list[int] = []
         self._group_marks = np.empty(0, dtype=np.int64)
         self._words: dict[str, int] = {}
-        self._path = _Path()
+        self._press, self._touches = 0, False
+        self._path, self._doubts = _Path(), _Path()
 
     @property
     def _width(self) -> int:
@@ -131,7 +130,7 @@ class TraceCollector:
         self._block.append((time, *contact, *low, *high, _number(record, "misfit"), *charge))
         self._marks.append(sum(1 << self._word(word) for word in set(words)))
         self._records += 1
-        self._path.add(time, contact, std, not DOUBTS.isdisjoint(words))
+        self._follow(time, contact, std, not DOUBTS.isdisjoint(words))
         if len(self._block) == BLOCK:
             self._reduce()
 
@@ -151,7 +150,19 @@ class TraceCollector:
             {word: self._group_marks >> bit & 1 == 1 for word, bit in self._words.items()},
             tuple(self._path.points),
             self._path.step_mm,
+            tuple(self._doubts.points),
         )
+
+    def _follow(self, time: float, contact: list[float], std: list[float], doubtful: bool) -> None:
+        """Put a contact on the path, if there is one."""
+        touches = not math.isnan(contact[0] + contact[1])
+        self._press += touches and not self._touches
+        self._touches = touches
+        if touches:
+            point = Point(time, *contact, *std[:2], self._press)
+            self._path.add(point)
+            if doubtful:
+                self._doubts.add(point)
 
     def _word(self, word: str) -> int:
         """The bit of a flag."""
@@ -186,42 +197,34 @@ def _joined(groups: Array, marks: np.ndarray) -> tuple[Array, np.ndarray]:
 
 
 class _Path:
-    """Contacts that lie apart by a step, which doubles where there are too many."""
+    """Points that lie apart by a step, in mm; where there are too many, fewer that lie farther apart."""
 
     def __init__(self) -> None:
         self.points: list[Point] = []
         self.step_mm = STEP_MM
-        self._press, self._touches = 0, False
 
-    def add(self, time: float, contact: list[float], std: list[float], doubtful: bool) -> None:
-        x, y, force = contact
-        touches = not math.isnan(x + y)
-        self._press += touches and not self._touches
-        self._touches = touches
-        if not touches:
-            return
-        point = Point(time, x, y, force, std[0], std[1], self._press, doubtful)
+    def add(self, point: Point) -> None:
+        """Append a point that lies apart from the one before."""
         if not self.points or _apart(self.points[-1], point, self.step_mm):
             self.points.append(point)
         if len(self.points) > MOST_POINTS:
             self._thin()
 
     def _thin(self) -> None:
-        """Double the step until half of the points are enough; where only doubts part them, take every second."""
-        while len(self.points) > MOST_POINTS // 2 and self.step_mm < LARGEST_STEP_MM:
-            self.step_mm *= 2.0
-            points, self.points = self.points, []
-            for point in points:
-                if not self.points or _apart(self.points[-1], point, self.step_mm):
-                    self.points.append(point)
-        if len(self.points) > MOST_POINTS // 2:
-            self.points = self.points[::2]
+        """Double the step until half of the points are enough; take every second where that would leave too few."""
+        while len(self.points) > MOST_POINTS // 2:
+            apart: list[Point] = []
+            for point in self.points:
+                if not apart or _apart(apart[-1], point, 2.0 * self.step_mm):
+                    apart.append(point)
+            if len(apart) >= MOST_POINTS // 8:
+                self.points, self.step_mm = apart, 2.0 * self.step_mm
+            else:
+                self.points = self.points[::2]
 
 
-def _apart(before: Point, point: Point, step: float) -> bool:
-    """Whether a point is worth another mark: elsewhere, or in doubt where the one before was not."""
-    moved = abs(point.x_mm - before.x_mm) >= step or abs(point.y_mm - before.y_mm) >= step
-    return moved or point.doubtful != before.doubtful
+def _apart(before: Point, point: Point, step_mm: float) -> bool:
+    return abs(point.x_mm - before.x_mm) >= step_mm or abs(point.y_mm - before.y_mm) >= step_mm
 
 
 def _number(record: Table, name: str) -> float:

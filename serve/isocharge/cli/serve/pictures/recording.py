@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -65,7 +65,7 @@ def recording_picture(traces: Traces, scene: Scene, title: str) -> Figure:
         title: Name of file and model.
     """
     figure = new_figure(15.0, 8.6)
-    film, times = figure.subfigures(1, 2, width_ratios=(1.0, 1.35))
+    film, times = cast(np.ndarray, figure.subfigures(1, 2, width_ratios=(1.0, 1.35)))
     seconds, unit = _unit(float(traces.end[-1]))
     _draw_film(film.subplots(), traces, scene, seconds, unit)
     rows = max(1, sum(bool(groups.any()) for groups in traces.flags.values()))
@@ -183,6 +183,8 @@ def _draw_film(axes: Any, traces: Traces, scene: Scene, seconds: float, unit: st
     reach = _draw_scene(axes, scene)
     if traces.path:
         marks = _draw_path(axes, traces.path, traces.step_mm, seconds)
+        doubts = np.array([(point.x_mm, point.y_mm) for point in traces.doubts]).reshape(-1, 2)
+        axes.scatter(*doubts.T, c=FELT, marker="x", s=24, lw=0.9, zorder=5)
         axes.figure.colorbar(marks, ax=axes, shrink=0.6, label=f"time, {unit}", location="bottom", pad=0.02)
         places = np.array([(point.x_mm, point.y_mm) for point in traces.path])
         reach = max(reach, 1.1 * float(np.abs(places).max()))
@@ -207,12 +209,11 @@ def _draw_scene(axes: Any, scene: Scene) -> float:
 
 
 def _draw_path(axes: Any, path: tuple[Point, ...], step_mm: float, seconds: float) -> Any:
-    """Lines between neighbours of one press, dots that grow with the force, rings of deviations, crosses of doubt."""
+    """Lines between neighbours of one press, dots that grow with the force, rings of deviations."""
     time = np.array([point.time for point in path]) / seconds
     places = np.array([(point.x_mm, point.y_mm) for point in path])
     press = np.array([point.press for point in path])
     force = np.array([point.force_N for point in path])
-    doubtful = np.array([point.doubtful for point in path])
     longest = max(SHORT_MM, LONGEST_LINE * step_mm)
     same = (press[1:] == press[:-1]) & (np.hypot(*(places[1:] - places[:-1]).T) <= longest)
     lines = LineCollection(np.stack([places[:-1], places[1:]], axis=1)[same], cmap="viridis", lw=0.8, alpha=0.7)
@@ -222,7 +223,6 @@ def _draw_path(axes: Any, path: tuple[Point, ...], step_mm: float, seconds: floa
     size = 3.0 + 30.0 * np.clip(force, 0.0, None) / max(float(force.max()), 1e-9)
     limits: dict[str, Any] = {"cmap": "viridis", "vmin": 0.0, "vmax": max(float(time[-1]), 1e-9)}
     marks = axes.scatter(*places.T, c=time, s=size, lw=0.0, alpha=0.8, zorder=4, **limits)
-    axes.scatter(*places[doubtful].T, c=FELT, marker="x", s=24, lw=0.9, zorder=5)
     for number in np.unique(np.linspace(0, len(path) - 1, MOST_ELLIPSES).astype(int)).tolist():
         point = path[number]
         axes.add_patch(
