@@ -3,13 +3,14 @@
 import io
 import json
 import os
+import signal
 import time
 
 import numpy as np
 import pytest
 
-from isocharge.errors import InputError, OutputExists
-from isocharge.files import bounded_lines, read_whole, sha256_of
+from isocharge.errors import InputError, OutputError, OutputExists
+from isocharge.files import bounded_lines, new_file, read_whole, sha256_of
 from isocharge.number_text import number_of
 from isocharge.resumable_run import resume_folder
 from isocharge.simulate.execution.checkpointed_map import CheckpointedMap
@@ -39,6 +40,26 @@ def test_a_sparse_file_costs_nothing(tmp_path):
         file.truncate(1 << 40)
     with pytest.raises(OSError, match="larger than"):
         read_whole(tmp_path / "file")
+
+
+def fill(path, text, then=lambda: None):
+    with new_file(path) as draft:
+        draft.write_text(text)
+        then()
+
+
+def test_a_new_file_is_there_whole_or_not_at_all(tmp_path):
+    path, other = tmp_path / "file", tmp_path / "other"
+    fill(path, "whole", lambda: not path.exists() or pytest.fail("it has its name too early"))
+    with pytest.raises(OutputExists, match="already there"):
+        fill(path, "late")
+    with pytest.raises(KeyboardInterrupt):
+        fill(other, "half", lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(OutputExists, match="already there"):
+        fill(other, "late", lambda: other.write_text("faster"))
+    with pytest.raises(OutputError, match="third cannot be written"):
+        fill(tmp_path / "third", "half", lambda: (tmp_path / "no" / "file").touch())
+    assert {each.name: each.read_text() for each in tmp_path.iterdir()} == {"file": "whole", "other": "faster"}
 
 
 def test_lines_are_bounded():

@@ -14,6 +14,7 @@ PACKAGES = {
     "grpc": HTTP | {"grpc", "google"},
     "cluster": frozenset({"dask", "distributed"}),
     "design": SIMULATE | {"ezdxf"},
+    "record": frozenset({"mcap", "lz4", "zstandard"}),
 }
 """Import names that come with an extra of pyproject.toml."""
 

@@ -83,6 +83,33 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 @contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Fill a file under a temporary name and give it its own when the block ends well; on an error nothing remains.
+
+    Yields:
+        The temporary name, a sibling; the block creates the file.
+
+    Raises:
+        OutputExists: If `path` is already there, or another process creates it meanwhile.
+        OutputError: If the file system refuses.
+    """
+    refuse_existing(path)
+    draft = _draft_of(path)
+    try:
+        yield draft
+        sync_folder(draft)
+        refuse_existing(path)
+        draft.replace(path)
+        sync_folder(path.parent)
+    except OSError as error:
+        if isinstance(error, IsochargeError | BrokenPipeError):  # a pipe is no matter of this file
+            raise
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another output") from error
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+@contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """Fill a folder out of sight and give it its name when the block ends well; on an error nothing remains.
 
@@ -132,7 +159,10 @@ def _remove_empty(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make sure that renames in a folder survive a power cut; Windows opens no folders, and is left to itself."""
+    """Make sure that renames in a folder, or the content of a file, survive a power cut.
+
+    Windows opens no folders, and is left to itself.
+    """
     if not hasattr(os, "O_DIRECTORY"):
         return
     handle = os.open(folder, os.O_RDONLY)

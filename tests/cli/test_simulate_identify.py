@@ -12,7 +12,8 @@ UNIAXIAL = ("simulate", "identify", "three-25um-uniaxial", "--radius", "4", "--f
 
 
 def test_a_map_that_folds_is_told_drawn_and_written(command, tmp_path):
-    code, out, err = command(*UNIAXIAL, "--json", "-o", tmp_path / "out")
+    page = tmp_path / "map.html"
+    code, out, err = command(*UNIAXIAL, "--json", "-o", tmp_path / "out", "--html", page)
     assert code == 0
     numbers = json.loads(out)
     assert numbers == json.loads((tmp_path / "out" / "identify.json").read_text())
@@ -24,6 +25,12 @@ def test_a_map_that_folds_is_told_drawn_and_written(command, tmp_path):
     picture = imread(tmp_path / "out" / "identify.png")
     assert picture.shape[0] > 400
     assert picture.std() > 0.1
+
+    assert f"open {page} in a browser" in err
+    assert json.dumps(numbers["folds_mm"]) in page.read_text("utf-8")
+    code, out, err = command(*UNIAXIAL, "--html", page)  # before anything is solved
+    assert (code, out) == (1, "")
+    assert f"{page} is already there" in err
 
 
 @pytest.mark.slow

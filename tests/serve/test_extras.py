@@ -18,6 +18,8 @@ from isocharge.extras import require
         ("grpc", "grpc"),
         ("grpc", "google.protobuf"),
         ("grpc", "uvicorn"),
+        ("record", "mcap.writer"),
+        ("record", "zstandard"),
     ],
 )
 def test_missing_package_of_an_extra(extra, module):

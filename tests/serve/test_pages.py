@@ -34,7 +34,7 @@ from isocharge.serve.signal_chain.thermal import ThermalRule
 SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
 
-SLOW = {"recordings.md", "virtual_sensor.md", "live_page.md"}
+SLOW = {"mcap.md", "recordings.md", "virtual_sensor.md", "live_page.md"}
 """Pages whose commands simulate a film each time; those of the README, which do the same, run always."""
 
 

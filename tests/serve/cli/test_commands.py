@@ -48,7 +48,7 @@ def sensor(film):
         yield sensor
 
 
-@pytest.mark.parametrize("command", ["predict", "check", "stream", "virtual", "replay", "doctor"])
+@pytest.mark.parametrize("command", ["predict", "check", "stream", "virtual", "replay", "plot", "doctor"])
 def test_help_has_an_example(command):
     text = run(command, "--help").stdout
     assert f"Example: isocharge serve {command} " in " ".join(text.split())

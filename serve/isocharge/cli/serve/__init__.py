@@ -1,4 +1,4 @@
 """`isocharge serve ...`: one file a command.
 
-May import: shared.
+May import: serve.pictures, shared.
 """

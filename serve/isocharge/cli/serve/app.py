@@ -6,6 +6,7 @@ from isocharge.cli.serve.check import check_command
 from isocharge.cli.serve.doctor import doctor_command
 from isocharge.cli.serve.http import http_command
 from isocharge.cli.serve.live import live_command
+from isocharge.cli.serve.plot import plot_command
 from isocharge.cli.serve.predict import predict_command
 from isocharge.cli.serve.replay import replay_command
 from isocharge.cli.serve.stream import stream_command
@@ -20,6 +21,7 @@ serve_app.command("check")(check_command)
 serve_app.command("stream")(stream_command)
 serve_app.command("live")(live_command)
 serve_app.command("replay")(replay_command)
+serve_app.command("plot")(plot_command)
 serve_app.command("doctor")(doctor_command)
 serve_app.command("virtual")(virtual_command)
 serve_app.command("http")(http_command)

@@ -49,6 +49,32 @@ UdpOption = Annotated[
     ),
 ]
 
+McapOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--mcap",
+        metavar="FILE",
+        help="Also write the records into a new MCAP file, with wrench and pose as ROS 2 messages. (default: no)",
+    ),
+]
+
+
+class McapRecords(StrEnum):
+    """How an MCAP file holds the records themselves."""
+
+    json = "json"
+    ros2 = "ros2"
+
+
+McapRecordsOption = Annotated[
+    McapRecords,
+    typer.Option(
+        "--mcap-records",
+        help="Records in the MCAP file: JSON with its schema, as Foxglove, Lichtblick and PlotJuggler read it; or the "
+        "same text in ROS 2 messages, for `ros2 bag` and rosbags, which refuse a file with anything else.",
+    ),
+]
+
 
 def awaited(port: str, wait: float) -> str:
     """The port, as soon as there is something under its path, or when the time, s, is over."""

@@ -3,9 +3,11 @@
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from typing import TYPE_CHECKING
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
 
-from isocharge.cli.serve.options import Output
+from isocharge.cli.serve.options import McapRecords, Output
 from isocharge.cli.shared.terminal import say
 
 if TYPE_CHECKING:
@@ -50,14 +52,69 @@ def record_writer(
     return write
 
 
-def also_shown(write: Lines, show: "Callable[[PredictionRecord], None]") -> Lines:
-    """Write a record, and hand it to the page."""
+class McapOutput:
+    """Records on their way into an MCAP file, through a queue of their own; a context manager.
 
-    def both(record: "PredictionRecord", line: str) -> None:
-        write(record, line)
-        show(record)
+    Attributes:
+        put: Takes a record's line of JSON.
+    """
 
-    return both
+    def __init__(self, path: Path, electrodes: tuple[str, ...], records: McapRecords, is_live: bool) -> None:
+        """Describe the file; it is created on entering the context.
+
+        Args:
+            path: The new file.
+            electrodes: Names of the electrodes.
+            records: How the records are written.
+            is_live: Whether they come from a sensor, which must not wait for the disk.
+
+        Raises:
+            MissingExtra: If the extra `record` is not installed.
+        """
+        from isocharge.serve.export.mcap_file import McapFile, RecordEncoding
+        from isocharge.serve.live.line_queue import LineQueue
+
+        self._file = McapFile(path, electrodes, RecordEncoding(records.value))
+        self._queue = LineQueue(self._file.write_live)
+        self.put = self._queue.put if is_live else self._file.write_live
+        self._stack = ExitStack()
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every record was written."""
+        return not (self._file.failed or self._queue.lost)
+
+    def __enter__(self) -> Self:
+        """Create the file.
+
+        Raises:
+            OutputExists: If it is already there.
+            OutputError: If it cannot be created.
+        """
+        self._stack.enter_context(self._file)
+        self._stack.enter_context(self._queue)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Write what waits and close the file."""
+        try:
+            self._stack.__exit__(kind, error, trace)
+        except OSError as failure:
+            self._file.give_up(failure)
+        if self._queue.lost:
+            say(f"{self._file.path}: {self._queue.lost} records not written, the oldest: the disk was too slow")
+
+
+def in_turn(*writers: Lines) -> Lines:
+    """What hands each record, with its line of JSON, to one writer after the other."""
+
+    def write_all(record: "PredictionRecord", line: str) -> None:
+        for write in writers:
+            write(record, line)
+
+    return write_all
 
 
 def summary(touch: "TouchStream", latencies: deque[float], unwritten: int = 0) -> str:

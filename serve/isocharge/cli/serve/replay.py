@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.serve.options import ModelsOption, Output, OutputOption, UdpOption
-from isocharge.cli.serve.record_output import LATENCIES, also_shown, record_writer, summary, write_records
+from isocharge.cli.serve.options import (
+    McapOption,
+    McapRecords,
+    McapRecordsOption,
+    ModelsOption,
+    Output,
+    OutputOption,
+    UdpOption,
+)
+from isocharge.cli.serve.record_output import LATENCIES, Lines, in_turn, record_writer, summary, write_records
 from isocharge.cli.shared.live_page import (
     PORT,
     InsecureOption,
@@ -26,6 +34,7 @@ from isocharge.cli.shared.live_page import (
 from isocharge.cli.shared.standard_streams import stdout_writer
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import say
+from isocharge.files import new_file
 
 if TYPE_CHECKING:
     from isocharge.serve import Predictor
@@ -46,6 +55,8 @@ def replay_command(
     ] = False,
     output: OutputOption = Output.json,
     udp: UdpOption = None,
+    mcap: McapOption = None,
+    mcap_records: McapRecordsOption = McapRecords.json,
     live_page: Annotated[
         bool,
         typer.Option(
@@ -81,22 +92,27 @@ def replay_command(
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         write = record_writer(stack, output, udp, predictor.metadata.electrodes, stdout_writer())
+        if mcap is not None:
+            write = in_turn(_mcap_writer(stack, mcap, mcap_records, predictor.metadata.electrodes), write)
         if settings is None:
             write_records(replay(recording, path, clock, real_time=real_time, load=load), write, latencies)
         else:
             version = find_model(model or recording.model, models)
             link = stack.enter_context(_page(file.name, settings, version, predictor))
-            shown = also_shown(write, page_feed(link, path, None, predictor.metadata.electrodes).put)
+            feed = page_feed(link, path, None, predictor.metadata.electrodes)
 
             def mark(marker: "Marker") -> None:
                 link.tell(marker=[*marker])
 
             marked = replay(recording, path, clock, real_time=real_time, load=load, on_marker=mark)
-            write_records(marked, shown, latencies)
+            write_records(marked, in_turn(write, lambda record, _: feed.put(record)), latencies)
             link.tell(is_complete=True)
             while link.request() is not None:  # until the page's process ends, or Ctrl-C
                 pass
     say(summary(path, latencies))
+    if mcap is not None and not mcap.exists():
+        say(f"{mcap} was not written, because the replay was stopped before its end")
+        raise typer.Exit(1)
 
 
 @contextmanager
@@ -106,3 +122,12 @@ def _page(name: str, settings: "PageSettings", model: Path, predictor: "Predicto
         link.wait()
         say(f"replay page: {url}; Ctrl-C stops")
         yield link
+
+
+def _mcap_writer(stack: ExitStack, path: Path, records: McapRecords, electrodes: tuple[str, ...]) -> Lines:
+    """What writes a record into the MCAP file, which exists once all of them are in it."""
+    from isocharge.serve.export.mcap_file import McapFile, RecordEncoding
+
+    draft = stack.enter_context(new_file(path))
+    file = stack.enter_context(McapFile(draft, electrodes, RecordEncoding(records.value)))
+    return lambda _, line: file.write(line)

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from isocharge.cli.serve.options import (
+    McapOption,
+    McapRecords,
+    McapRecordsOption,
     ModelsOption,
     Output,
     OutputOption,
@@ -19,7 +22,14 @@ from isocharge.cli.serve.options import (
     WaitOption,
     awaited,
 )
-from isocharge.cli.serve.record_output import LATENCIES, also_shown, record_writer, summary, write_records
+from isocharge.cli.serve.record_output import (
+    LATENCIES,
+    McapOutput,
+    in_turn,
+    record_writer,
+    summary,
+    write_records,
+)
 from isocharge.cli.shared.live_page import (
     PORT,
     InsecureOption,
@@ -80,6 +90,8 @@ def stream_command(
             "(default: name of the model's sensor)",
         ),
     ] = None,
+    mcap: McapOption = None,
+    mcap_records: McapRecordsOption = McapRecords.json,
     policy: Annotated[
         PolicyName,
         typer.Option(
@@ -156,7 +168,14 @@ def stream_command(
         if page is not None:
             header = (policy.value, board.table, name or "")
             stack.enter_context(answering(PageRequests(page, live, header, recorder is not None)))
-            write = also_shown(write, page_feed(page, path, live, predictor.metadata.electrodes).put)
+            feed = page_feed(page, path, live, predictor.metadata.electrodes)
+            write = in_turn(write, lambda record, _: feed.put(record))
+        mcap_output = (
+            McapOutput(mcap, predictor.metadata.electrodes, mcap_records, source.is_live) if mcap is not None else None
+        )
+        if mcap_output:
+            put_line = stack.enter_context(mcap_output).put
+            write = in_turn(lambda _, line: put_line(line), write)
         if recorder:
             stack.enter_context(recorder)
         records = stack.enter_context(closing(live.follow(source)))  # closed before the recorder
@@ -166,7 +185,7 @@ def stream_command(
         finally:
             lines.close()
             say(summary(path, latencies, lines.lost))
-    if recorder is not None and recorder.failed:
+    if (recorder and recorder.failed) or (mcap_output and not mcap_output.is_whole):
         raise typer.Exit(1)
 
 

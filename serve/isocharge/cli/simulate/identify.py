@@ -60,6 +60,14 @@ def identify_command(
             help="New folder for map and numbers, or new .png file for the map alone. (default: neither)",
         ),
     ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(
+            "--html",
+            metavar="FILE",
+            help="New page for a browser: the map with a slider for the force, in one file. (default: no)",
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Say how well the charges determine a press: smallest errors over the film, ambiguities, working area.
@@ -73,8 +81,9 @@ def identify_command(
     from isocharge.simulate.forward.checks import check_determined
     from isocharge.simulate.identifiability.identification import identify
 
-    if output is not None:
-        refuse_existing(output)
+    for path in (output, html):
+        if path is not None:
+            refuse_existing(path)
     if size and probe and not probe[0].startswith("circle"):
         raise InputError(f"--size: expected a circle as first --probe, whose radius is its size, got {probe[0]!r}")
     if not (isfinite(error) and error > 0.0):
@@ -98,6 +107,8 @@ def identify_command(
     numbers["size"] = _size(maps[0], identifications[0]) if size else []
     if output is not None:
         _write(output, identifications[0], numbers)
+    if html is not None:
+        _write_page(html, identifications[0])
     typer.echo(json_module.dumps(numbers) if json else _table(numbers))
     say(identifications[0].area.words)
     for row in numbers["other_probes"]:
@@ -184,3 +195,10 @@ def _write(output: Path, identification: "Identification", numbers: dict[str, An
     with new_folder(output) as folder:
         (folder / PICTURE).write_bytes(picture)
         (folder / NUMBERS).write_bytes(json_module.dumps(numbers, indent=1).encode())
+
+
+def _write_page(path: Path, identification: "Identification") -> None:
+    from isocharge.simulate.pages.resolution_page import resolution_page
+
+    write_whole(path, resolution_page(identification).encode())
+    say(f"open {path} in a browser")

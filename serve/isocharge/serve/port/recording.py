@@ -17,13 +17,14 @@ import json
 import logging
 import os
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar
 
 from isocharge.errors import OutputError, RecordingError
 from isocharge.files import bounded_lines, refuse_existing
+from isocharge.progress import Progress
 from isocharge.serve.port.serial_port import Chunk
 from isocharge.tables import Table, cut, is_whole, parse_json
 
@@ -49,6 +50,9 @@ LONGEST_MARKER = 1000
 """Characters of a marker's text."""
 
 log = logging.getLogger(__name__)
+
+Entry = TypeVar("Entry")
+"""What a line is read as."""
 
 
 class Marker(NamedTuple):
@@ -217,17 +221,36 @@ class Recording:
         if chunk is not None:
             yield Event(chunk, tuple(latencies_us))
 
+    def for_each_record(self, take: Callable[[Table], None], progress: Progress | None = None) -> None:
+        """Call `take` with each record as it was written, in their order.
+
+        Args:
+            take: An InputError that it raises is raised again with file and line.
+            progress: Called now and then with the characters read until then, and the size of the file.
+
+        Raises:
+            RecordingError: If a line other than the last one is damaged, or `take` refuses its record.
+        """
+        for _ in self._parsed(lambda entry: take(entry) if "timestamp" in entry else None, progress):
+            pass
+
     def _entries(self) -> Iterator[Chunk | Marker | float | NewModel | None]:
         """The content of each line, as `_entry` gives it."""
-        number = 1
+        return self._parsed(_entry)
+
+    def _parsed(self, parse: Callable[[Table], Entry], progress: Progress | None = None) -> Iterator[Entry]:
+        """What `parse` makes of each line after the first."""
+        number, characters, size = 1, 0, self._path.stat().st_size
         try:
             with self._path.open(encoding="utf-8", errors="replace") as file:
                 for line in bounded_lines(file, LONGEST_ENTRY):
                     if not line.endswith("\n"):
                         return  # the power failed while it was written
                     if number > 1:
-                        yield _entry(Table(parse_json(line, "entry", RecordingError), "", RecordingError))
-                    number += 1
+                        yield parse(Table(parse_json(line, "entry", RecordingError), "", RecordingError))
+                    number, characters = number + 1, characters + len(line)
+                    if progress is not None and number % 1000 == 0:
+                        progress(min(characters, size), size)
         except (OSError, ValueError) as error:
             raise RecordingError(f"{self._path}, line {number}: damaged ({cut(str(error))})") from error
 

@@ -1,0 +1,58 @@
+"""A ROS 2 node that publishes the contacts of a sensor: `python ros2_node.py MODEL PORT`, where ROS 2 is sourced."""
+
+import sys
+
+import rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+
+from isocharge.serve import Port, Predictor, stream
+from isocharge.serve.export.ros_messages import DEFLECTION_STD, TURN_VARIANCE, time_of
+
+
+class TouchNode(Node):
+    def __init__(self):
+        super().__init__("isocharge")
+        self.wrench = self.create_publisher(WrenchStamped, "/isocharge/wrench", qos_profile_sensor_data)
+        self.pose = self.create_publisher(PoseWithCovarianceStamped, "/isocharge/pose", qos_profile_sensor_data)
+
+    def stamped(self, message, record):
+        message.header.frame_id = record.frame_id
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time_of({"timestamp": record.timestamp}), 10**9)
+        return message
+
+    def publish(self, record):
+        if record.force_N is None:  # the board sent something that is no number
+            return
+        x, y = 1e-3 * (record.x_mm or 0.0), 1e-3 * (record.y_mm or 0.0)
+        message = self.stamped(WrenchStamped(), record)
+        message.wrench.force.z = -record.force_N
+        message.wrench.torque.x, message.wrench.torque.y = -y * record.force_N, x * record.force_N
+        self.wrench.publish(message)
+        if record.contact:
+            message = self.stamped(PoseWithCovarianceStamped(), record)
+            message.pose.pose.position.x, message.pose.pose.position.y = x, y
+            variances = (1e-3 * record.x_std_mm) ** 2, (1e-3 * record.y_std_mm) ** 2, DEFLECTION_STD**2
+            message.pose.covariance[::7] = [*variances, TURN_VARIANCE, TURN_VARIANCE, TURN_VARIANCE]
+            self.pose.publish(message)
+
+
+def main(model, url):
+    rclpy.init()
+    node = TouchNode()
+    try:
+        with Port(url) as port:
+            for record in stream(port, Predictor(model)):
+                node.publish(record)
+                if not rclpy.ok():  # stopped from outside
+                    break
+    except KeyboardInterrupt:
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

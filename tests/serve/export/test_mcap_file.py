@@ -1,0 +1,348 @@
+"""MCAP files: read back by rosbags, which shares no code with the writer, and by the stock readers of MCAP."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+
+import jsonschema_rs
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.exceptions import EndOfFile
+from mcap.reader import NonSeekingReader, SeekingReader, make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+from rosbags.rosbag2 import Reader, storage_mcap
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.msg import get_types_from_msg
+
+from isocharge.errors import InputError, OutputError, OutputExists
+from isocharge.serve import PredictionRecord
+from isocharge.serve.export.mcap_file import McapFile, RecordEncoding
+from isocharge.serve.export.record_schema import record_schema
+from isocharge.serve.export.ros_messages import (
+    POSE,
+    POSE_DEFINITION,
+    STRING,
+    STRING_DEFINITION,
+    WRENCH,
+    WRENCH_DEFINITION,
+)
+from isocharge.serve.prediction.record import FIELDS
+
+ELECTRODES = ("A", "B", "C")
+ROS = get_typestore(Stores.ROS2_JAZZY)
+"""Definitions as ROS 2 ships them."""
+
+TIMES = st.floats(0.0, 2.0**31, exclude_max=True).filter(lambda t: round(t, 6) < 2.0**31)
+
+
+def numbers(low=-1e4, high=1e4):
+    return st.floats(low, high, allow_nan=False)
+
+
+@st.composite
+def records(draw):
+    """Records as a stream writes them: pressed, at rest, or of a reading that was no number."""
+    kind = draw(st.sampled_from(["contact", "rest", "invalid"]))
+    contact = dict.fromkeys(("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit"))
+    if kind == "rest":
+        contact["force_N"] = 0.0
+    if kind == "contact":
+        contact = {name: draw(numbers()) for name in contact}
+    charges = st.none() | st.fixed_dictionaries(dict.fromkeys(ELECTRODES, st.none() | numbers()))
+    return PredictionRecord(
+        timestamp=draw(TIMES),
+        t_device_us=draw(st.none() | st.integers(0, 1 << 62)),
+        seq=draw(st.none() | st.integers(0, 1 << 40)),
+        **contact,
+        contact=kind == "contact",
+        charge_pC=draw(charges),
+        charge_raw_pC=draw(charges),
+        tare_pC=draw(charges),
+        flags=draw(st.sampled_from([(), ("tare",), ("gap", "outside")])),
+        latency_us=draw(st.none() | numbers()),
+        model="linear/1",
+        frame_id=draw(st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1, max_size=20)),
+    )
+
+
+def press(number, **changes):
+    """A plain record."""
+    values = dict.fromkeys(FIELDS) | {
+        "timestamp": 1763600000.0 + 0.005 * number,
+        "x_mm": 3.0 + 1e-3 * number,
+        "y_mm": -2.0,
+        "force_N": 0.5,
+        "x_std_mm": 0.03,
+        "y_std_mm": 0.04,
+        "force_std_N": 0.002,
+        "misfit": 1.0,
+        "contact": True,
+        "flags": (),
+        "model": "linear/1",
+        "frame_id": "linear-film",
+        "charge_pC": {"A": 1.0, "B": None, "C": 2.0},
+    }
+    return PredictionRecord(**(values | changes))
+
+
+def write(path, lines, encoding=RecordEncoding.json):
+    with McapFile(path, ELECTRODES, encoding) as file:
+        for line in lines:
+            file.write(line)
+    return path
+
+
+@pytest.fixture
+def rosbags_knows_json(monkeypatch):
+    """rosbags 0.11 opens no file in which a schema has an encoding that it does not know, such as `jsonschema`."""
+    known = storage_mcap.get_msgdef
+
+    def get_msgdef(schema):
+        if schema is not None and schema.encoding == "jsonschema":
+            return MessageDefinition(MessageDefinitionFormat.NONE, "")
+        return known(schema)
+
+    monkeypatch.setattr(storage_mcap, "get_msgdef", get_msgdef)
+
+
+def read_with_rosbags(path):
+    """Messages by topic, each with its time."""
+    topics = {"/isocharge/record": [], "/isocharge/wrench": [], "/isocharge/pose": []}
+    with Reader(path) as reader:
+        for connection, time_ns, data in reader.messages(reader.connections):
+            is_json = connection.ext.serialization_format == "json"
+            message = bytes(data).decode() if is_json else ROS.deserialize_cdr(data, connection.msgtype)
+            topics[connection.topic].append((time_ns, message.data if connection.msgtype == STRING else message))
+    return topics
+
+
+def check_messages(topics, lines):
+    """Every message against the line of JSON that it comes from."""
+    expected = sorted(((round(json.loads(line)["timestamp"] * 1e6) * 1000, line) for line in lines), key=lambda x: x[0])
+    assert topics["/isocharge/record"] == expected
+    parsed = [(time_ns, json.loads(line)) for time_ns, line in expected]
+    forces = [(time_ns, record) for time_ns, record in parsed if record["force_N"] is not None]
+    for (time_ns, wrench), (expected_ns, record) in zip(topics["/isocharge/wrench"], forces, strict=True):
+        check_header(wrench.header, time_ns, expected_ns, record)
+        position = 1e-3 * np.array([record["x_mm"] or 0.0, record["y_mm"] or 0.0, 0.0])
+        force = np.array([0.0, 0.0, -record["force_N"]])
+        np.testing.assert_array_equal(vector(wrench.wrench.force), force)
+        np.testing.assert_allclose(vector(wrench.wrench.torque), np.cross(position, force), rtol=1e-15, atol=0.0)
+    places = [(time_ns, record) for time_ns, record in parsed if record["x_mm"] is not None]
+    for (time_ns, pose), (expected_ns, record) in zip(topics["/isocharge/pose"], places, strict=True):
+        check_header(pose.header, time_ns, expected_ns, record)
+        place, turn = pose.pose.pose.position, pose.pose.pose.orientation
+        np.testing.assert_allclose(1e3 * vector(place), [record["x_mm"], record["y_mm"], 0.0], rtol=1e-15, atol=0.0)
+        assert (*vector(turn), turn.w) == (0.0, 0.0, 0.0, 1.0)
+        covariance = pose.pose.covariance.reshape(6, 6)
+        std = [1e-3 * record["x_std_mm"], 1e-3 * record["y_std_mm"], 5e-3, *[np.pi / np.sqrt(3.0)] * 3]
+        np.testing.assert_allclose(covariance, np.diag(np.square(std)), rtol=1e-14)
+
+
+def check_header(header, time_ns, expected_ns, record):
+    assert header.stamp.sec * 10**9 + header.stamp.nanosec == time_ns == expected_ns
+    assert header.frame_id == record["frame_id"]
+
+
+def vector(value):
+    return np.array([value.x, value.y, value.z])
+
+
+@pytest.mark.parametrize("encoding", RecordEncoding)
+@pytest.mark.usefixtures("rosbags_knows_json")
+@settings(max_examples=30, deadline=None)
+@given(data=st.data())
+def test_rosbags_reads_every_message(tmp_path_factory, encoding, data):
+    lines = [record.to_json() for record in data.draw(st.lists(records(), max_size=20))]
+    path = write(tmp_path_factory.mktemp("bag") / "touch.mcap", lines, encoding)
+    topics = read_with_rosbags(path)
+    for messages in topics.values():
+        messages.sort(key=lambda message: message[0])  # messages of one time may come in any order
+    lines.sort(key=lambda line: round(json.loads(line)["timestamp"] * 1e6))
+    times = [json.loads(line)["timestamp"] for line in lines]
+    if len(set(times)) == len(times):
+        check_messages(topics, lines)
+    else:
+        assert sorted(line for _, line in topics["/isocharge/record"]) == sorted(lines)
+
+
+def test_stock_rosbags_reads_the_file_of_ros_messages(tmp_path):
+    """With nothing changed in it, and `ros2 bag` takes such a file, too: one encoding, the definitions of ROS."""
+    lines = [press(number).to_json() for number in range(500)]
+    check_messages(read_with_rosbags(write(tmp_path / "touch.mcap", lines, RecordEncoding.ros2)), lines)
+
+
+@pytest.mark.parametrize(
+    ("name", "definition"), [(WRENCH, WRENCH_DEFINITION), (POSE, POSE_DEFINITION), (STRING, STRING_DEFINITION)]
+)
+def test_definitions_are_those_of_ros(name, definition):
+    for kind, fields in get_types_from_msg(definition, name).items():
+        assert fields == ROS.fielddefs[kind], kind
+
+
+def test_readers_of_mcap_find_schemas_index_and_checksums(tmp_path):
+    """What Foxglove, Lichtblick and PlotJuggler need to open a file at any time in it."""
+    lines = [press(number).to_json() for number in range(5000)]
+    path = write(tmp_path / "touch.mcap", lines)
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        assert isinstance(reader, SeekingReader)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary.statistics.message_count == 15000
+        assert len(summary.chunk_indexes) > 1
+        assert all(len(chunk.message_index_offsets) == 3 for chunk in summary.chunk_indexes)
+        assert all(a.message_end_time <= b.message_start_time for a, b in pairwise(summary.chunk_indexes))
+        start = 1763600000 * 10**9
+        (schema, channel, message), *_ = reader.iter_messages("/isocharge/record", starting_at=start + 20 * 10**9)
+        assert message.data.decode() == lines[4000]
+        assert (message.log_time, message.publish_time) == (start + 20 * 10**9,) * 2
+        assert (schema.name, schema.encoding, channel.message_encoding) == (
+            "isocharge.PredictionRecord",
+            "jsonschema",
+            "json",
+        )
+        assert json.loads(schema.data) == record_schema(ELECTRODES)
+        pose = next(reader.iter_decoded_messages("/isocharge/pose")).decoded_message
+        assert (pose.pose.pose.position.x, pose.header.frame_id) == (3e-3, "linear-film")
+    with path.open("rb") as file:
+        assert sum(1 for _ in NonSeekingReader(file, validate_crcs=True).iter_messages()) == 15000
+
+
+@settings(max_examples=50, deadline=None)
+@given(record=records())
+def test_every_record_is_valid_under_its_schema(record):
+    schema = record_schema(ELECTRODES)
+    jsonschema_rs.Draft7Validator(schema).validate(json.loads(record.to_json()))
+
+
+def test_the_schema_refuses_what_is_no_record():
+    valid, record = jsonschema_rs.Draft7Validator(record_schema(ELECTRODES)).is_valid, json.loads(press(0).to_json())
+    assert valid(record)
+    for name in FIELDS:
+        assert not valid({key: value for key, value in record.items() if key != name}), name
+        assert not valid(record | {name: [1.0] if name != "contact" else None}), name
+
+
+def test_viewers_list_every_field_of_the_schema():
+    """Foxglove and Lichtblick take a topic's fields from `properties`, one plain type each."""
+
+    def check(schema):
+        assert schema["type"] == "object"
+        for field in schema["properties"].values():
+            assert field["type"] in ("boolean", "string", "number", "integer", "object", "array")
+            if field["type"] == "object":
+                check(field)
+
+    schema = record_schema(ELECTRODES)
+    check(schema)
+    assert set(schema["properties"]) == set(FIELDS)
+    assert set(schema["properties"]["tare_pC"]["properties"]) == set(ELECTRODES)
+
+
+def whole_messages(data):
+    """The records in a file that may have no end."""
+    messages = []
+    with suppress(EndOfFile):
+        messages.extend(StreamReader(BytesIO(data), validate_crcs=True).records)
+    return [each.data.decode() for each in messages if isinstance(each, Message) and each.data.startswith(b"{")]
+
+
+def test_a_process_that_is_killed_leaves_all_but_the_last_second(tmp_path):
+    path = tmp_path / "touch.mcap"
+    code = f"""
+import sys, time
+from pathlib import Path
+from isocharge.serve.export.mcap_file import McapFile
+with McapFile(Path({str(path)!r}), ("A", "B", "C")) as file:
+    for number, line in enumerate(sys.stdin):
+        file.write(line.rstrip())
+        print(number, flush=True)
+        time.sleep(0.02)
+"""
+    lines = [press(number).to_json() for number in range(140)]  # no more than a pipe holds
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdin.write("\n".join(lines).encode())
+        process.stdin.flush()
+        for reply in process.stdout:
+            if int(reply) == 120:
+                break
+        process.send_signal(signal.SIGKILL)
+    recovered = whole_messages(path.read_bytes())
+    assert recovered == lines[: len(recovered)]
+    assert len(recovered) > 40  # of 120 in 2.4 s
+
+
+def test_a_full_disk_ends_the_file_and_not_the_stream(tmp_path, monkeypatch, caplog):
+    path, os_write, room = tmp_path / "touch.mcap", os.write, [12000]
+
+    def write_until_full(descriptor, data):
+        if not room[0]:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        taken = os_write(descriptor, bytes(data)[: room[0]])
+        room[0] -= taken
+        return taken
+
+    monkeypatch.setattr("isocharge.serve.export.mcap_file.os.write", write_until_full)
+    clock, lines = iter(range(10**6)), [press(number, misfit=np.pi * number).to_json() for number in range(2000)]
+    with McapFile(path, ELECTRODES, now=lambda: next(clock) / 50.0) as file:
+        for line in lines:
+            file.write_live(line)
+    assert file.failed
+    assert [entry.getMessage() for entry in caplog.records] == [
+        f"{path}: stopped (No space left on device); what was written until now is whole, but without an index"
+    ]
+    recovered = whole_messages(path.read_bytes())
+    assert 20 < len(recovered) < 2000
+    assert recovered == lines[: len(recovered)]
+
+
+@pytest.mark.parametrize("timestamp", [None, -1.0, 2.0**31, 1e11])
+def test_times_that_ros_has_not(tmp_path, timestamp, caplog):
+    path, line = tmp_path / "touch.mcap", press(0, timestamp=timestamp).to_json()
+    with McapFile(path, ELECTRODES) as file:
+        with pytest.raises(InputError, match=r"timestamp .*: expected unix seconds from 1970 to 2038"):
+            file.write(line)
+        file.write(press(1).to_json())
+        file.write_live(line)
+        file.write_live(press(2).to_json())
+    assert file.failed
+    assert "expected unix seconds" in caplog.text
+    assert file.records == 1
+
+
+def test_nothing_is_overwritten(tmp_path):
+    path = tmp_path / "touch.mcap"
+    path.write_text("mine")
+    with pytest.raises(OutputExists, match="already there"), McapFile(path, ELECTRODES):
+        pass
+    assert path.read_text() == "mine"
+    with pytest.raises(OutputError, match="cannot be written: No such file"), McapFile(Path("/no/such/x"), ELECTRODES):
+        pass
+
+
+def test_an_empty_file_is_one(tmp_path):
+    path = write(tmp_path / "touch.mcap", [], RecordEncoding.ros2)
+    assert read_with_rosbags(path) == {"/isocharge/record": [], "/isocharge/wrench": [], "/isocharge/pose": []}
+
+
+def test_records_wait_no_longer_than_a_second(tmp_path):
+    """Seen from outside, while the file is written."""
+    path, now = tmp_path / "touch.mcap", [0.0]
+    with McapFile(path, ELECTRODES, now=lambda: now[0]) as file:
+        for number in range(40):
+            file.write(press(number).to_json())
+            now[0] += 0.1
+            assert number - len(whole_messages(path.read_bytes())) <= 10
