@@ -52,20 +52,19 @@ class GemmSource:
         return c_array(kind, f"{self.name}_weights_{number}", values)
 
     def _function(self) -> str:
+        """c is added last: it may be large, and each number added to it would be rounded as it is."""
         inputs, outputs = self.matrix.values.shape
-        added = "" if self.bias is not None else "const float *restrict c, "
-        start = f"{self.name}_bias[j]" if self.bias is not None else "c[j]"
+        added, c = ("", f"{self.name}_bias") if self.bias is not None else ("const float *restrict c, ", "c")
+        scale = f" * {self.name}_scale[j]" if self.matrix.scale is not None else ""
         lines = [
             f"/* {inputs} numbers x to {outputs} numbers y */",
             f"static void {self.name}(const float *restrict x, {added}float *restrict y)",
             "{",
-            *_loop(outputs, f"y[j] = {start if self.matrix.scale is None else '0.0f'};"),
+            *_loop(outputs, "y[j] = 0.0f;"),
         ]
         for number, block in enumerate(self._blocks):
             lines += _product(f"{self.name}_weights_{number}", block, cast=self.matrix.scale is not None)
-        if self.matrix.scale is not None:
-            lines += _loop(outputs, f"y[j] = y[j] * {self.name}_scale[j] + {start};")
-        return "\n".join([*lines, "}", ""])
+        return "\n".join([*lines, *_loop(outputs, f"y[j] = y[j]{scale} + {c}[j];"), "}", ""])
 
 
 def _product(weights: str, block: Block, *, cast: bool) -> list[str]:

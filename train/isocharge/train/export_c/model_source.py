@@ -53,14 +53,14 @@ def model_header(metadata: ModelMetadata, graph: Graph) -> str:
         sensor=c_string(metadata.frame_id),
         count=len(metadata.electrodes),
         names=", ".join(map(c_string, metadata.electrodes)),
-        fields=", ".join(map(c_string_plain, Contact._fields)),
+        fields=", ".join(map(plain_string, Contact._fields)),
         low=clip["low"],
         high=clip["high"],
         width=len(Contact._fields),
     )
 
 
-def c_string_plain(name: str) -> str:
+def plain_string(name: str) -> str:
     """A name of ours as a C string."""
     return f'"{name}"'
 
