@@ -35,7 +35,7 @@ def c_string(text: str) -> str:
 
 def c_comment(text: str) -> str:
     """A text that may stand in a comment: what could end it, or begin another, is left out."""
-    return "".join(sign if sign.isascii() and (sign.isalnum() or sign in " ._-,:()=") else "_" for sign in text)
+    return "".join(sign if sign.isascii() and (sign.isalnum() or sign in " ._-,:()=/") else "_" for sign in text)
 
 
 def c_array(kind: str, name: str, values: NDArray[Any]) -> str:

@@ -58,8 +58,8 @@ arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 -st
 def readme(metadata: ModelMetadata, device: Device, command: str) -> str:
     """The text of `README.md`."""
     return README.format(
-        label=c_comment(metadata.label),
-        command=c_comment(command) or "isocharge train export-c",
+        label=metadata.label,
+        command=" ".join(command.replace("`", "'").split()) or "isocharge train export-c",
         charges=", ".join(["800.0f"] * len(metadata.electrodes)),
         electrodes=c_comment(", ".join(metadata.electrodes)),
         board=c_comment(device.name),

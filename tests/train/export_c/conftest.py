@@ -18,11 +18,11 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 PARTS = ("isocharge_model.c", "isocharge_chain.c", "isocharge_frames.c")
 
 
-def compile_c(compiler, folder, output, *sources, options=("-O2",), libraries=("-lm",)):
+def compile_strictly(compiler, folder, output, *sources, options=("-O2",)):
     """Compile sources of an export strictly; skips if the compiler is not installed."""
     if shutil.which(compiler) is None:
         pytest.skip(f"{compiler} is not installed")
-    command = [compiler, *STRICT, *options, "-I", str(folder), "-o", str(output), *map(str, sources), *libraries]
+    command = [compiler, *STRICT, *options, "-I", str(folder), "-o", str(output), *map(str, sources), "-lm"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return output
@@ -78,15 +78,32 @@ class Exported:
         return t_s, dt_s
 
 
-def build(folder, model, electrodes, device=ANY_BOARD, options=("-O2",), compiler="gcc"):
-    """Export a model into a folder, unless it is there, and compile it."""
-    if not folder.exists():
-        export_c(model if isinstance(model, Path) else find_model(model), folder, device)
-    output = folder / f"lib{abs(hash((options, compiler)))}.so"
-    compile_c(
-        compiler, folder, output, HERE / "bridge.c", *PARTS, options=(*options, "-fPIC", "-shared"), libraries=("-lm",)
-    )
-    return Exported(ctypes.CDLL(str(output)), electrodes)
+@pytest.fixture(scope="session")
+def build(tmp_path_factory):
+    """Exports a model for a board and compiles it: `build(model, device, options)`."""
+
+    def build(model, device=ANY_BOARD, options=("-O2",), compiler="gcc"):
+        folder = export_c(find_model(model), tmp_path_factory.mktemp("c") / "export", device)
+        library = compile_strictly(
+            compiler, folder, folder / "bridge.so", HERE / "bridge.c", *PARTS, options=(*options, "-fPIC", "-shared")
+        )
+        electrodes = int((folder / "isocharge_model.h").read_text().split("ISOCHARGE_ELECTRODES ")[1].split()[0])
+        return Exported(ctypes.CDLL(str(library)), electrodes)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def compile_c():
+    """The function that compiles sources of an export strictly."""
+    return compile_strictly
+
+
+@pytest.fixture(scope="session")
+def exports(tmp_path_factory):
+    """Exports of a model with three and of one with four electrodes, for no special board."""
+    folder = tmp_path_factory.mktemp("exports")
+    return [export_c(find_model(name), folder / name) for name in ("three-25um-biaxial", "four-25um-biaxial-films")]
 
 
 def _of(array):
