@@ -34,6 +34,7 @@ class Exported:
 
     library: ctypes.CDLL
     electrodes: int
+    source: str
 
     def predict(self, charge_pC):
         """Contacts, shape (n, 7)."""
@@ -87,8 +88,9 @@ def build(tmp_path_factory):
         library = compile_strictly(
             compiler, folder, folder / "bridge.so", HERE / "bridge.c", *PARTS, options=(*options, "-fPIC", "-shared")
         )
-        electrodes = int((folder / "isocharge_model.h").read_text().split("ISOCHARGE_ELECTRODES ")[1].split()[0])
-        return Exported(ctypes.CDLL(str(library)), electrodes)
+        header, source = ((folder / f"isocharge_model.{kind}").read_text() for kind in ("h", "c"))
+        electrodes = int(header.split("ISOCHARGE_ELECTRODES ")[1].split()[0])
+        return Exported(ctypes.CDLL(str(library)), electrodes, source)
 
     return build
 
