@@ -1,4 +1,4 @@
-"""An export on emulated Cortex-M boards: answers, instructions per prediction, flash and RAM. No times: no chip is here.
+"""An export on emulated Cortex-M boards: answers, instructions per prediction, flash, RAM; no times without a chip.
 
     python tests/benchmarks/bench_cortex_m.py EXPORT [--json]
 

@@ -1,6 +1,7 @@
 """Other processors by emulation: the same answers, and what a Cortex-M counts in instructions, flash and RAM.
 
-Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm, gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user.
+Packages of Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm for the boards; for aarch64
+gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user.
 """
 
 import importlib.util
@@ -72,7 +73,7 @@ def test_aarch64_answers_the_golden_vectors(exports, compile_c, tmp_path):
         assert "0 wrong numbers" in done.stdout
 
 
-def test_the_chain_for_a_processor_without_double_needs_none(exports, tmp_path):
+def test_the_chain_for_a_processor_without_double_needs_none(tmp_path):
     """No routine that computes with doubles in software is called."""
     if shutil.which("arm-none-eabi-gcc") is None:
         pytest.skip("arm-none-eabi-gcc is not installed")

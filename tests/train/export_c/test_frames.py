@@ -18,7 +18,9 @@ FRAMES = st.builds(
     values=st.lists(SINGLE, max_size=255).map(tuple),
     flags=st.integers(0, 255),
 )
-PIECES = st.one_of(FRAMES.map(encode_frame), st.binary(max_size=40), st.just(b"\0"), st.binary(min_size=1050, max_size=1100))
+LONG = st.binary(min_size=1050, max_size=1100)
+PIECES = st.one_of(FRAMES.map(encode_frame), st.binary(max_size=40), st.just(b"\0"), LONG)
+DAMAGE = st.lists(st.tuples(st.integers(0, 3000), st.integers(0, 255)), max_size=3)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +28,7 @@ def exported(build):
     return build("three-25um-biaxial")
 
 
-@given(pieces=st.lists(PIECES, max_size=6), damage=st.lists(st.tuples(st.integers(0, 3000), st.integers(0, 255)), max_size=3))
+@given(pieces=st.lists(PIECES, max_size=6), damage=DAMAGE)
 @settings(max_examples=300, deadline=None)
 def test_any_bytes_give_the_frames_and_counters_of_ours(exported, pieces, damage):
     data = bytearray(b"".join(pieces) + b"\0")

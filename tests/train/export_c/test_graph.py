@@ -1,6 +1,7 @@
 """Which graphs are written as C, which are refused, and that blocks and int8 weights change no answer."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import onnx
@@ -21,8 +22,7 @@ from isocharge.train.release.folding import FoldedLayers, FoldedNetwork, PlainPe
 def perceptron(rng, *widths):
     """A perceptron of random weights."""
     layers = tuple(
-        (rng.standard_normal((a, b)) / np.sqrt(a), 0.3 * rng.standard_normal(b))
-        for a, b in zip(widths, widths[1:], strict=False)
+        (rng.standard_normal((a, b)) / np.sqrt(a), 0.3 * rng.standard_normal(b)) for a, b in pairwise(widths)
     )
     return PlainPerceptron(layers, 0.1 * rng.standard_normal((widths[0], widths[-1])))
 
@@ -79,7 +79,7 @@ def with_int8_weights(graph, *, by_column):
 
 
 def as_written(folder):
-    """A session that computes int8 weights as the graph says; by default onnxruntime rounds their inputs to int8, too."""
+    """A session that computes int8 weights as the graph says: by default onnxruntime rounds their inputs to int8."""
     options = ort.SessionOptions()
     options.add_session_config_entry("session.disable_quant_qdq", "1")
     return ort.InferenceSession(folder / "model.onnx", options, providers=["CPUExecutionProvider"])

@@ -128,7 +128,7 @@ def test_self_test_fails_if_a_weight_is_changed(exports, compile_c, tmp_path):
 
 
 def test_tanh_is_within_what_it_says(exports, compile_c, tmp_path):
-    """Against the library's tanh in double precision, on a million numbers from 1e-8 to 20, their negatives, and ends."""
+    """Against tanh in double precision, on a million numbers from 1e-8 to 20, their negatives, and ends."""
     functions = (exports[0] / "isocharge_model.c").read_text()
     begin, end = functions.index("/* tanh within 4e-7"), functions.index("/* A number within")
     (tmp_path / "tanh.c").write_text(

@@ -1,10 +1,5 @@
 """`isocharge train export-c`: a model, and the signal chain beside it, as C99."""
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
-
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, NewFolderOption, board_of
 from isocharge.cli.shared.terminal import say, this_command
 from isocharge.files import refuse_existing

@@ -8,7 +8,7 @@ import numpy as np
 from isocharge.serve import Contact
 from isocharge.serve.model.golden import Golden
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.session import OUTPUTS
+from isocharge.serve.model.session import INPUT, OUTPUTS
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, wrapped
 from isocharge.train.export_c.graph import Graph
 from isocharge.train.export_c.statements import NetworkSource
@@ -80,7 +80,7 @@ def model_source(metadata: ModelMetadata, graph: Graph) -> str:
             "",
             source_text("functions.c"),
             *network.definitions,
-            f"void isocharge_predict(const float charge_pC[ISOCHARGE_ELECTRODES], float contact[{len(Contact._fields)}])",
+            f"void isocharge_predict(const float {INPUT}[ISOCHARGE_ELECTRODES], float contact[{len(Contact._fields)}])",
             "{",
             indent(f"float {arrays};\n\n{body}", "    ", lambda line: bool(line.strip())),
             "}",

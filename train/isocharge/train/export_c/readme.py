@@ -23,8 +23,8 @@ float contact[7];  /* x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_std_N, misf
 isocharge_predict(charge_pC, contact);
 ```
 
-The function allocates nothing, keeps nothing, and may run on several threads at once. `-O3 -march=native` makes it twice
-as fast.
+The function allocates nothing, keeps nothing, and may run on several threads at once. On a host, `-O3 -march=native`
+makes it about twice as fast.
 
 | file | what it is |
 |---|---|

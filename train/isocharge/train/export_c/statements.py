@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from isocharge.serve.model.session import INPUT, OUTPUTS
+from isocharge.serve.model.session import OUTPUTS
 from isocharge.train.export_c.c_text import c_array, c_float
 from isocharge.train.export_c.gemm import GemmSource
 from isocharge.train.export_c.graph import Graph, Node
@@ -124,6 +124,3 @@ class _Operation:
 
 def _element(place: Place, index: str = "i") -> str:
     return f"{place.array}[{f'{place.offset} + ' if place.offset else ''}{index}]"
-
-
-assert INPUT == "charge_pC"  # the parameter of `isocharge_predict`, whose name is a contract
