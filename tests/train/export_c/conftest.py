@@ -15,7 +15,6 @@ from isocharge.train.export_c.folder import export_c
 
 HERE = Path(__file__).parent
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
-PARTS = ("isocharge_model.c", "isocharge_chain.c", "isocharge_frames.c")
 
 
 def compile_strictly(compiler, folder, output, *sources, options=("-O2",)):
@@ -81,12 +80,19 @@ class Exported:
 
 @pytest.fixture(scope="session")
 def build(tmp_path_factory):
-    """Exports a model for a board and compiles it: `build(model, device, options)`."""
+    """Exports a model for a board and compiles it: `build(model, device, options)`; the same network only once."""
+    networks = {}
 
     def build(model, device=ANY_BOARD, options=("-O2",), compiler="gcc"):
         folder = export_c(find_model(model), tmp_path_factory.mktemp("c") / "export", device)
+        if (model, compiler, options) not in networks:
+            words = (*options, "-fPIC", "-c")
+            networks[model, compiler, options] = compile_strictly(
+                compiler, folder, folder / "network.o", "isocharge_model.c", options=words
+            )
+        parts = (HERE / "bridge.c", "isocharge_chain.c", "isocharge_frames.c", networks[model, compiler, options])
         library = compile_strictly(
-            compiler, folder, folder / "bridge.so", HERE / "bridge.c", *PARTS, options=(*options, "-fPIC", "-shared")
+            compiler, folder, folder / "bridge.so", *parts, options=(*options, "-fPIC", "-shared")
         )
         header, source = ((folder / f"isocharge_model.{kind}").read_text() for kind in ("h", "c"))
         electrodes = int(header.split("ISOCHARGE_ELECTRODES ")[1].split()[0])
