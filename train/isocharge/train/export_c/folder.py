@@ -6,6 +6,7 @@ from isocharge.files import new_folder, refuse_existing, write_whole
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.model.model_folder import load_model
 from isocharge.train.export_c.device_header import device_header
+from isocharge.train.export_c.differences import with_differences
 from isocharge.train.export_c.graph import read_graph
 from isocharge.train.export_c.model_source import model_header, model_source, self_test, source_text
 from isocharge.train.export_c.readme import readme
@@ -56,7 +57,7 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
     """The texts of an export by their paths in its folder; the errors are those of `export_c`."""
     loaded = load_model(model)
     path = loaded.folder / "model.onnx"
-    graph = read_graph(path.read_bytes(), str(path))
+    graph = with_differences(read_graph(path.read_bytes(), str(path)))
     metadata = loaded.metadata
     copied = ("isocharge_chain.h", "isocharge_chain.c", "isocharge_frames.h", "isocharge_frames.c", "host_example.c")
     files = {

@@ -15,9 +15,13 @@ from onnx import helper, numpy_helper
 
 from isocharge.errors import ModelError
 from isocharge.serve.model.session import INPUT, OUTPUTS
+from isocharge.tables import cut
 
 UNARY = ("Log", "Exp", "Tanh", "Sinh")
 """Operators that turn each number of a row into another."""
+
+LARGEST_INT8 = 127
+"""The largest weight of a column in units of its scale, where weights are rounded to 8 bits."""
 
 FIRST_OPSET, LAST_OPSET = 13, 17
 """Versions of the operators between which those below mean the same."""
@@ -34,6 +38,19 @@ class Matrix:
 
     values: NDArray[Any]
     scale: NDArray[np.float32] | None = None
+
+    @classmethod
+    def of(cls, values: NDArray[np.float32]) -> "Matrix":
+        """Weights as int8 if they are whole multiples of a scale of each column, as those of `train distil --int8`."""
+        scale = np.abs(values).max(axis=0) / np.float32(LARGEST_INT8)
+        whole = np.round(values / np.where(scale > 0.0, scale, 1.0))
+        if np.allclose(whole * scale, values, rtol=2.0**-21, atol=0.0):  # as far as float32 can tell
+            return cls(whole.astype(np.int8), scale.astype(np.float32))
+        return cls(values)
+
+    def as_floats(self) -> NDArray[np.float32]:
+        """The weights themselves, shape (inputs, outputs)."""
+        return self.values if self.scale is None else self.values * self.scale
 
 
 @dataclass(frozen=True)
@@ -73,8 +90,9 @@ def read_graph(onnx_model: bytes, where: str) -> Graph:
     """
     try:
         model = onnx.load_model_from_string(onnx_model)
+        onnx.checker.check_model(model)
     except Exception as error:  # protobuf's exceptions have no base in onnx
-        raise ModelError(f"{where}: not an ONNX file ({error})") from error
+        raise ModelError(f"{where}: not a valid ONNX file ({cut(str(error))})") from error
     return _Reader(model, where).graph()
 
 
@@ -86,7 +104,6 @@ class _Reader:
         self._constants: dict[str, NDArray[Any]] = {
             tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer
         }
-        self._matrices: dict[str, Matrix] = {}
         self._widths: dict[str, int] = {}
         self._node = onnx.NodeProto()
 
@@ -96,21 +113,20 @@ class _Reader:
         if list(inputs) != [INPUT]:
             self._refuse(f"expected the one input {INPUT}, got {list(inputs)}")
         self._widths.update(inputs)
-        nodes = [node for proto in self._model.graph.node if (node := self._read(proto)) is not None]
+        nodes = tuple(map(self._read, self._model.graph.node))
         got = {name: self._widths.get(name) for name in OUTPUTS}
         if got != OUTPUTS:
             self._refuse(f"expected outputs of the widths {OUTPUTS}, got {got}")
-        return Graph(tuple(nodes), self._widths)
+        return Graph(nodes, self._widths)
 
     def _check_versions(self) -> None:
         versions = {entry.domain: entry.version for entry in self._model.opset_import}
         if set(versions) != {""} or not FIRST_OPSET <= versions[""] <= LAST_OPSET:
             self._refuse(f"expected ONNX operators of version {FIRST_OPSET} to {LAST_OPSET} alone, got {versions}")
 
-    def _read(self, proto: onnx.NodeProto) -> Node | None:
-        """A node; None for one that only prepares a constant."""
+    def _read(self, proto: onnx.NodeProto) -> Node:
         self._node = proto
-        readers: dict[str, Callable[[], Node | None]] = {
+        readers: dict[str, Callable[[], Node]] = {
             **dict.fromkeys(UNARY, self._unary),
             "Clip": self._clip,
             "Mul": self._mul,
@@ -118,7 +134,6 @@ class _Reader:
             "Split": self._split,
             "Concat": self._concat,
             "ReduceL2": self._length,
-            "DequantizeLinear": self._dequantize,
         }
         if proto.op_type not in readers:
             self._refuse(f"expected the operators {', '.join(readers)}, got {proto.op_type!r}")
@@ -142,15 +157,11 @@ class _Reader:
 
     def _gemm(self) -> Node:
         attributes = self._attributes({"alpha": 1.0, "beta": 1.0, "transA": 0, "transB": (0, 1)})
-        name = self._node.input[1]
-        matrix = self._matrices.get(name) or Matrix(self._floats(name))
-        if attributes["transB"]:
-            matrix = Matrix(matrix.values.T, matrix.scale)
-        if matrix.values.ndim != 2 or matrix.values.shape[0] != self._width(0):
-            self._refuse(f"expected weights of {self._width(0)} rows, got the shape {matrix.values.shape}")
-        outputs = matrix.values.shape[1]
-        if matrix.scale is not None and matrix.scale.shape != (outputs,):
-            self._refuse(f"expected a scale for each of {outputs} columns, got the shape {matrix.scale.shape}")
+        values = self._floats(self._node.input[1])
+        values = values.T if attributes["transB"] else values
+        if values.ndim != 2 or values.shape[0] != self._width(0):
+            self._refuse(f"expected weights of {self._width(0)} rows, got the shape {values.shape}")
+        matrix, outputs = Matrix.of(values), values.shape[1]
         if len(self._node.input) == 3 and self._node.input[2] in self._widths:
             if self._width(2) != outputs:
                 self._refuse(f"expected a row of {outputs} to add, got one of {self._width(2)}")
@@ -161,8 +172,9 @@ class _Reader:
 
     def _split(self) -> Node:
         attributes = self._attributes({"axis": (1, -1)}, required=True)
-        sizes = [int(size) for size in self._constants.get(self._node.input[1], np.zeros(0)).ravel()]
-        if sum(sizes) != self._width(0) or len(sizes) != len(self._node.output) or min(sizes) < 1:
+        name = self._node.input[1] if len(self._node.input) == 2 else ""
+        sizes = [int(size) for size in self._constants.get(name, np.zeros(0)).ravel()]
+        if sum(sizes) != self._width(0) or len(sizes) != len(self._node.output) or min(sizes, default=0) < 1:
             self._refuse(f"expected parts of a row of {self._width(0)}, got {sizes} (axis {attributes['axis']})")
         self._widths.update(zip(self._node.output, sizes, strict=True))
         return Node("Split", (self._row(0),), tuple(self._node.output))
@@ -175,19 +187,6 @@ class _Reader:
     def _length(self) -> Node:
         self._attributes({"axes": ([1], [-1]), "keepdims": 1}, required=True)
         return self._result((self._row(0),), 1)
-
-    def _dequantize(self) -> None:
-        """Weights of int8 with a scale for all or for each column; they stay int8 in C."""
-        axis = self._attributes({"axis": (1, -1)})["axis"]
-        values = self._constants.get(self._node.input[0])
-        if values is None or values.dtype != np.int8 or values.ndim != 2:
-            self._refuse(f"expected int8 weights of two dimensions, got {self._node.input[0]!r}")
-        zero = self._constants.get(self._node.input[2]) if len(self._node.input) == 3 else None
-        if zero is not None and zero.any():
-            self._refuse(f"expected weights whose zero is 0, got {zero}")
-        scale = self._constant(1, (), (values.shape[1],)).astype(np.float32)
-        assert axis in (1, -1)
-        self._matrices[self._node.output[0]] = Matrix(values, np.array(np.broadcast_to(scale, values.shape[1])))
 
     def _result(self, rows: tuple[str, ...], width: int, **constants: Any) -> Node:
         """The node with its one result."""

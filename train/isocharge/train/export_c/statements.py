@@ -7,6 +7,7 @@ import numpy as np
 
 from isocharge.serve.model.session import OUTPUTS
 from isocharge.train.export_c.c_text import c_array, c_float
+from isocharge.train.export_c.differences import LOG_DIFFERENCES
 from isocharge.train.export_c.gemm import GemmSource
 from isocharge.train.export_c.graph import Graph, Node
 from isocharge.train.export_c.workspace import Place, Workspace
@@ -42,6 +43,7 @@ class NetworkSource:
             "Split": lambda _: None,
             "Concat": source._concat,
             "ReduceL2": source._length,
+            LOG_DIFFERENCES: source._log_differences,
         }
         for node in graph.nodes:
             writers[node.operator](_Operation(node, graph, space))
@@ -86,6 +88,16 @@ class NetworkSource:
             f"{target} = 0.0f;",
             f"for (int i = 0; i < {width}; ++i)\n    {target} += {operation.element} * {operation.element};",
             f"{target} = sqrtf({target});",
+        ]
+
+    def _log_differences(self, operation: "_Operation") -> None:
+        """The first number last: the others need it, and the row may be in place."""
+        row, result = (operation.space.places[name] for name in (operation.node.inputs[0], operation.result))
+        first = _element(row, "0")
+        self.statements += [
+            f"for (int i = 1; i < {operation.graph.widths[operation.result]}; ++i)\n"
+            f"    {_element(result)} = log_ratio({_element(row)}, {first});",
+            f"{_element(result, '0')} = logf({first});",
         ]
 
     def _outputs(self, graph: Graph, space: Workspace) -> None:

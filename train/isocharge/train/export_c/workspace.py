@@ -8,9 +8,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from isocharge.serve.model.session import INPUT, OUTPUTS
+from isocharge.train.export_c.differences import LOG_DIFFERENCES
 from isocharge.train.export_c.graph import UNARY, Graph, Node
 
-IN_PLACE = (*UNARY, "Clip", "Mul")
+IN_PLACE = (*UNARY, "Clip", "Mul", LOG_DIFFERENCES)
 
 
 @dataclass(frozen=True)

@@ -27,3 +27,11 @@ static float clip(float x, float low, float high)
     x = x < low ? low : x;
     return x > high ? high : x;
 }
+
+/* ln(a / b) of two positive numbers; where they are close, their difference is exact, and so it has all its digits. */
+static float log_ratio(float a, float b)
+{
+    const float ratio = a / b;
+
+    return ratio > 0.5f && ratio < 2.0f ? log1pf((a - b) / b) : logf(ratio);
+}
