@@ -56,13 +56,22 @@ def test_frames_without_a_zero_are_cut_at_254_bytes(exported, n):
     assert exported.frames(encode_frame(frame))[0] == [(frame.seq, frame.t_us, 1, tuple(frame.values))]
 
 
+def test_a_block_of_254_bytes_may_end_a_frame(exported):
+    charges = bytearray(b"\1" * 4 * 124)
+    charges[9 + 4 * 124 + 2 - 255 - 9] = 0
+    frame = Frame(0x0101, 0x01010101, tuple(np.frombuffer(charges, np.float32).tolist()), 1)
+    assert b"\xff" in encode_frame(frame)[-256:-254]
+    assert exported.encode(frame.seq, frame.t_us, frame.flags, frame.values) == encode_frame(frame)
+
+
 def test_the_clock_wraps_and_restarts_as_ours(exported):
     rng = np.random.default_rng(0)
     t_us = (4_294_000_000 + np.cumsum(rng.integers(0, 20_000, 500))) % T_US_MODULUS
     t_us[300:] = (t_us[300:] - t_us[300] + 17) % T_US_MODULUS  # the board was reset
+    t_us[400:] = (t_us[400:] + (1 << 31) + 500_000) % T_US_MODULUS  # half its range ahead counts as back
     clock = DeviceClock()
     times = [clock.read(int(t), T_US_MODULUS, 0.0) for t in t_us]
     t_s, dt_s = exported.clock(t_us)
     np.testing.assert_allclose(t_s, [time.clock_s for time in times], rtol=1e-15)
     np.testing.assert_allclose(dt_s, [time.step_s for time in times], rtol=1e-15)
-    assert clock.restarts == 1
+    assert clock.restarts == 2
