@@ -41,7 +41,7 @@ class Matrix:
 
     @classmethod
     def of(cls, values: NDArray[np.float32]) -> "Matrix":
-        """Weights as int8 if they are whole multiples of a scale of each column, as those of `train distil --int8`."""
+        """Weights as int8 if they are whole multiples of a scale of each column: rounded to 8 bits in training."""
         scale = np.abs(values).max(axis=0) / np.float32(LARGEST_INT8)
         whole = np.round(values / np.where(scale > 0.0, scale, 1.0))
         if np.allclose(whole * scale, values, rtol=2.0**-21, atol=0.0):  # as far as float32 can tell
