@@ -105,6 +105,15 @@ def test_headers_are_for_cpp_too(compiler, exports, tmp_path):
     assert subprocess.run(words, cwd=tmp_path, check=False).returncode == 0
 
 
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("option", ["-O2", "-DISOCHARGE_CHAIN_FLOAT"])
+def test_all_stages_compile_strictly(compiler, option, compile_c, tmp_path):
+    table = {"gain": {"pC_per_unit": 2.0}, "saturation": {"limit_pC": 900.0}, "leak": {"tau_s": 5.0}}
+    board = device_from_table(table | {"hum": {}, "common_mode": {}}, "board")
+    export = export_c(find_model("four-25um-biaxial"), tmp_path / "c", board)
+    compile_c(compiler, export, tmp_path / "host", *EXAMPLE, options=(option,))
+
+
 @pytest.fixture(scope="module")
 def host(tmp_path_factory, compile_c):
     """The host example for a board with a leak, compiled with sanitizers, and its board."""
