@@ -42,6 +42,16 @@ def test_golden_vectors_agree_and_instructions_are_counted(board, bench, exports
         assert 0 < counted["instructions_per_frame_in_contact"] < 1_000
 
 
+@pytest.mark.parametrize("student", ["three-25um-biaxial-student", "four-25um-biaxial-student"])
+@pytest.mark.parametrize("board", ["mps2-an386", "mps2-an500"])
+def test_a_student_fits_a_small_board(student, board, bench, tmp_path):
+    counted = bench.measure(export_c(find_model(student), tmp_path / "c"), bench.BOARDS[board], tmp_path)
+    assert counted["golden_vectors_agree"]
+    assert counted["instructions_per_prediction"] <= 60_000
+    assert counted["flash_bytes"] <= 40_000
+    assert counted["ram_bytes"] <= 2_000
+
+
 def test_report_says_no_microseconds(bench, exports, capsys):
     bench.main([str(exports[0]), "--json"])
     report = json.loads(capsys.readouterr().out)

@@ -15,7 +15,13 @@ from isocharge.train.data.presses import LabelledPresses
 FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0])
 """mm and N, and the floor that golden vectors have for the misfit."""
 
-MODELS = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial-films")
+MODELS = (
+    "three-25um-biaxial",
+    "four-25um-biaxial",
+    "four-25um-uniaxial-films",
+    "three-25um-biaxial-student",
+    "four-25um-biaxial-student",
+)
 
 
 def answers(model, charge_pC):

@@ -2,6 +2,7 @@
 
 from collections import deque
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -37,10 +38,11 @@ def replay_command(
     recording, clock = Recording(file), RecordedClock()
     predictor = Predictor(model or recording.model, models=models)
     board = device_from_table(recording.device, str(file))
-    path = TouchStream(predictor, board, policy=Policy(recording.policy), now_ns=clock)
+    path = TouchStream(predictor, board, policy=Policy(recording.policy), now_ns=clock, frame_id=recording.name or None)
+    load = None if model else partial(Predictor, models=models)
     latencies: deque[float] = deque(maxlen=LATENCIES)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         write = record_writer(stack, output, udp, predictor.metadata.electrodes, stdout_writer())
-        write_records(replay(recording, path, clock, real_time=real_time), write, latencies)
+        write_records(replay(recording, path, clock, real_time=real_time, load=load), write, latencies)
     say(summary(path, latencies))
