@@ -135,8 +135,8 @@ def test_a_readme_links_every_page_of_its_folder(folder):
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_a_readme_names_every_command(folder):
     commands = {path.stem for path in (ROOT / "serve/isocharge/cli" / folder).glob("*.py")}
-    commands -= {"__init__", "app", "options", "record_output"}
-    assert set(re.findall(rf"\| `isocharge {folder} (\w+)` \|", PAGES[f"{folder}/README.md"])) == commands
+    commands = {name.replace("_", "-") for name in commands - {"__init__", "app", "options", "record_output"}}
+    assert set(re.findall(rf"\| `isocharge {folder} ([\w-]+)` \|", PAGES[f"{folder}/README.md"])) == commands
 
 
 def test_figures_of_the_released_models_are_their_cards():

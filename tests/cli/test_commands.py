@@ -44,6 +44,7 @@ SUBCOMMANDS = [
     ("train", "fit"),
     ("train", "report"),
     ("train", "calibrate"),
+    ("train", "export-c"),
     ("serve",),
     ("serve", "predict"),
     ("serve", "stream"),

@@ -1,0 +1,140 @@
+"""The signal chain in C against ours, frame by frame."""
+
+import numpy as np
+import pytest
+
+from isocharge.errors import DeviceError, TareError
+from isocharge.serve import Predictor
+from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
+from isocharge.serve.live.device_file import device_from_table
+from isocharge.serve.signal_chain.chain import ChainState, advance
+from isocharge.train.export_c.device_header import device_header
+
+BITS = {TARE: 1, SATURATED: 2, NEGATIVE: 4, THERMAL: 8, BLIND: 16, INVALID: 32}
+TARE_FAILED = 64
+WARMING = BITS[THERMAL] | BITS[BLIND]
+
+GAIN = {"A": 0.5, "B": -0.5, "C": 0.25, "D": 1.0}
+
+BOARDS = {
+    "any board": {},
+    "leak": {"leak": {"tau_s": {"A": 10.0, "B": 7.5, "C": 9.9, "D": 2.0}}},
+    "leak, not learned": {"leak": {"tau_s": 3.0, "learn": False}},
+    "gain and limit": {"gain": {"pC_per_unit": GAIN}, "saturation": {"limit_pC": 900.0}},
+    "hum": {"hum": {"frequency_Hz": 60.0, "settle_s": 0.3}, "leak": {"tau_s": 10.0}},
+    "no tare": {"tare": {"on": False}},
+    "no touch": {"touch": {"on": False}, "leak": {"tau_s": 10.0}},
+    "short tare": {"tare": {"frames": 7, "noise_limit_pC": 3.0}, "touch": {"sigmas": 4.0, "floor_pC": 5.0}},
+    "warming": {"common_mode": {}},
+    "warming and leak": {"common_mode": {"every_s": 0.02, "tell_pC": 3.0}, "leak": {"tau_s": 5.0}, "hum": {}},
+}
+
+
+def device(board):
+    return device_from_table(BOARDS[board], board)
+
+
+def recording(board, seed, electrodes=4, seconds=20.0):
+    """What a board sends: rest, presses, leak, hum, drift, noise, a limit, and values that are no charges.
+
+    Returns:
+        Values, shape (n, electrodes), times and steps, shape (n,), s, and marks of limited frames and of new tares.
+    """
+    rng = np.random.default_rng(seed)
+    n, rate_Hz = int(200 * seconds), 200.0
+    dt_s = rng.uniform(0.5, 1.5, n) / rate_Hz
+    dt_s[rng.random(n) < 0.01] *= 20.0  # frames were lost
+    dt_s[0] = 0.0
+    t_s = 5.0 + np.cumsum(dt_s)
+    shape = rng.uniform(0.6, 1.4, electrodes)
+    press = np.zeros(n)
+    for begin in np.cumsum(rng.integers(200, 700, 8)):
+        length = int(rng.integers(20, 400))
+        press[begin : begin + length] = rng.uniform(20.0, 1500.0)
+    charge = press[:, None] * shape + 0.3 * rng.standard_normal((n, electrodes)) + rng.uniform(-20.0, 20.0, electrodes)
+    charge += rng.uniform(0.0, 1.0) * np.sin(2 * np.pi * 60.0 * t_s)[:, None] + rng.uniform(-0.1, 0.1) * t_s[:, None]
+    charge += np.where(press > 0, 30.0, 0.0)[:, None] * rng.random()
+    charge[rng.choice(np.flatnonzero(press > 0), 3)] *= 40.0  # spikes are no peaks
+    gain = device(board).chain(("A", "B", "C", "D")[:electrodes]).gain_pC
+    values = charge if gain is None else charge / gain
+    for bad in (np.nan, np.inf, -np.inf, 3e9, 1e300):
+        values[rng.integers(0, n, 2), rng.integers(0, electrodes, 2)] = bad
+    return values, t_s, dt_s, rng.random(n) < 0.003, np.isin(np.arange(n), rng.integers(n // 2, n, 1))
+
+
+def ours(chain, values, t_s, dt_s, limited, tare, misfit):
+    """Readings of the chain in Python as arrays, as `Exported.chain` gives them."""
+    state, rows = ChainState.start(values.shape[1]), []
+    for value, t, dt, at_limit, again in zip(values, t_s, dt_s, limited, tare, strict=True):
+        state = state.without_tare() if again else state
+        state, reading = advance(chain, state, value, float(t), float(dt), limited=bool(at_limit), misfit=misfit)
+        zero = np.zeros_like(value)
+        rows.append(
+            (
+                zero if reading.charge_pC is None else reading.charge_pC,
+                zero if reading.tare is None else reading.tare.charge_pC,
+                reading.contact,
+                sum(BITS[word] for word in reading.flags),
+            )
+        )
+    return tuple(map(np.array, zip(*rows, strict=True)))
+
+
+@pytest.fixture(scope="module")
+def misfit():
+    predictor = Predictor("four-25um-biaxial")
+    return lambda charge_pC: predictor.predict_batch(charge_pC).misfit
+
+
+@pytest.mark.parametrize("board", BOARDS)
+def test_states_and_charges_are_ours_frame_by_frame(board, build, misfit):
+    exported, chain = build("four-25um-biaxial", device(board)), device(board).chain(("A", "B", "C", "D"))
+    for seed in range(2):
+        frames = recording(board, seed)
+        mine, theirs = ours(chain, *frames, misfit), exported.chain(*frames)
+        warming = chain.thermal is not None  # estimated with the network, so its rounding stands in it
+        np.testing.assert_array_equal(theirs[2], mine[2])
+        np.testing.assert_array_equal(theirs[3] & (127 - WARMING), mine[3] & (127 - WARMING))
+        assert np.mean(theirs[3] != mine[3]) <= (0.002 if warming else 0.0)
+        tolerance = 0.2 if warming else 1e-9
+        np.testing.assert_allclose(theirs[0], mine[0], rtol=0, atol=tolerance)
+        np.testing.assert_allclose(theirs[1], mine[1], rtol=0, atol=tolerance)
+        assert mine[2].mean() > 0.05  # something touched
+        assert np.count_nonzero(np.diff(mine[2].astype(int)) < 0) >= 3 or chain.touch is None
+
+
+@pytest.mark.parametrize("board", ["any board", "leak", "gain and limit", "hum"])
+def test_single_precision_is_within_a_twentieth_of_a_picocoulomb(board, build, misfit):
+    exported = build("four-25um-biaxial", device(board), options=("-O2", "-DISOCHARGE_CHAIN_FLOAT"))
+    values, t_s, dt_s, limited, tare = recording(board, seed=4)
+    values[np.abs(values) > 1e30] = np.inf
+    mine = ours(device(board).chain(("A", "B", "C", "D")), values, t_s, dt_s, limited, tare, misfit)
+    theirs = exported.chain(values, t_s, dt_s, limited, tare)
+    np.testing.assert_array_equal(theirs[2], mine[2])
+    np.testing.assert_array_equal(theirs[3], mine[3])
+    np.testing.assert_allclose(theirs[0], mine[0], rtol=0, atol=0.05)
+
+
+def test_a_film_that_is_never_quiet_is_said_at_the_same_frame(build):
+    table = {"tare": {"frames": 20, "patience": 50}}
+    board = device_from_table(table, "board")
+    values = 100.0 * np.random.default_rng(0).standard_normal((70, 3))
+    steps = np.full(70, 0.005)
+    with pytest.raises(TareError):
+        ours(board.chain(("A", "B", "C")), values, np.cumsum(steps), steps, np.zeros(70), np.zeros(70), None)
+    exported = build("three-25um-biaxial", board)
+    flags = exported.chain(values, np.cumsum(steps), steps)[3]
+    assert np.flatnonzero(flags & TARE_FAILED)[0] == 49
+    again = np.arange(70) == 10  # a second tare never gives up
+    flags = exported.chain(values, np.cumsum(steps), steps, tare=again)[3]
+    assert not (flags & TARE_FAILED).any()
+
+
+def test_a_tare_that_no_state_holds_is_refused():
+    with pytest.raises(DeviceError, match=r"board: tare.frames: expected a whole number from 1 to 10000.*got 50000"):
+        device_header(device_from_table({"tare": {"frames": 50_000}}, "board"), ("A", "B", "C"))
+
+
+def test_a_board_of_other_electrodes_is_refused():
+    with pytest.raises(DeviceError, match="expected a number, or one for each of the electrodes"):
+        device_header(device_from_table({"leak": {"tau_s": {"A": 1.0}}}, "board"), ("A", "B", "C"))

@@ -1,0 +1,256 @@
+"""The folder of an export: whole or absent, its README true, its examples right."""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from isocharge.errors import ModelError, OutputExists
+from isocharge.serve import (
+    BinaryParser,
+    Chunk,
+    Contact,
+    Port,
+    Predictor,
+    TouchStream,
+    device_from_table,
+    encode_frame,
+    find_model,
+    load_device,
+)
+from isocharge.serve.frames.frame import Frame
+from isocharge.train.export_c.folder import export_c
+
+HERE = Path(__file__).parent
+EXAMPLE = ("host_example.c", "isocharge_chain.c", "isocharge_frames.c", "isocharge_model.c")
+ONLY_PYTHON = {"gap", "repeat", "restart", "outside", "misfit"}
+"""Flags of a record that the example does not compute."""
+
+BOARD = """
+name = "bench board"
+[saturation]
+limit_pC = 4000.0
+[leak]
+tau_s = 10.0
+"""
+
+
+def test_command_writes_the_folder_once(command, tmp_path):
+    (tmp_path / "board.toml").write_text(BOARD)
+    words = ("train", "export-c", "three-25um-biaxial", "--device", tmp_path / "board.toml", "-o", tmp_path / "c")
+    code, out, err = command(*words)
+    assert (code, out) == (0, "")
+    assert "isocharge_model.c" in err
+    assert "#define ISOCHARGE_LEAK_TAU_S {10.0, 10.0, 10.0}" in (tmp_path / "c" / "isocharge_device.h").read_text()
+    code, _, err = command(*words)
+    assert code == 1
+    assert "is already there and is not overwritten" in err
+
+
+def test_no_folder_is_left_of_what_cannot_be_written(command, tmp_path):
+    damaged = tmp_path / "damaged"
+    shutil.copytree(find_model("three-25um-biaxial"), damaged)
+    data = bytearray((damaged / "model.onnx").read_bytes())
+    data[2000] ^= 1
+    (damaged / "model.onnx").write_bytes(data)
+    (tmp_path / "board.toml").write_text("[leak]\ntau_s = {X = 1.0}\n")
+    for words, message in [
+        ((damaged,), "expected sha256"),
+        (("no-such-model",), "no model 'no-such-model'"),
+        (("three-25um-biaxial", "--device", tmp_path / "board.toml"), "one for each of the electrodes"),
+        (("three-25um-biaxial", "--device", tmp_path / "missing.toml"), "cannot be read"),
+    ]:
+        code, _, err = command("train", "export-c", *words, "-o", tmp_path / "c")
+        assert (code, message in err) == (2, True), err
+        assert "Traceback" not in err
+        assert not (tmp_path / "c").exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["board.toml", "damaged"]
+
+
+def test_in_python_errors_are_ours(tmp_path):
+    with pytest.raises(ModelError):
+        export_c(tmp_path, tmp_path / "c")
+    with pytest.raises(OutputExists):
+        export_c(find_model("three-25um-biaxial"), tmp_path)
+
+
+def test_the_readme_says_what_works(exports, shell, tmp_path, compile_c):
+    """Its lines compile, its C compiles, and its table names every file."""
+    folder = Path(shutil.copytree(exports[0], tmp_path / "c"))
+    text = (folder / "README.md").read_text()
+    printed = "".join(shell(lines, cwd=folder) for lines in re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
+    assert "64 golden vectors, 0 wrong numbers" in printed
+    assert (folder / "host_example").exists()
+    (lines,) = re.findall(r"```c\n(.*?)```", text, re.DOTALL)
+    include, body = lines.split("\n\n")
+    (folder / "call.c").write_text(f"{include}\nint main(void)\n{{\n{body}return !(contact[2] > 0);\n}}\n")
+    program = compile_c("gcc", folder, folder / "call", "call.c", "isocharge_model.c")
+    assert subprocess.run([program], check=False).returncode == 0
+    for path in exports[0].iterdir():
+        assert path.stem in text or path.name == "README.md"
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_headers_are_for_cpp_too(compiler, exports, tmp_path):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is not installed")
+    (tmp_path / "all.cpp").write_text(
+        '#include "isocharge_chain.h"\n#include "isocharge_frames.h"\nint main() { return 0; }\n'
+    )
+    words = [compiler, "-Wall", "-Wextra", "-Werror", "-c", "-I", exports[1], "all.cpp"]
+    assert subprocess.run(words, cwd=tmp_path, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("option", ["-O2", "-DISOCHARGE_CHAIN_FLOAT"])
+def test_all_stages_compile_strictly(compiler, option, compile_c, tmp_path):
+    table = {"gain": {"pC_per_unit": 2.0}, "saturation": {"limit_pC": 900.0}, "leak": {"tau_s": 5.0}}
+    board = device_from_table(table | {"hum": {}, "common_mode": {}}, "board")
+    export = export_c(find_model("four-25um-biaxial"), tmp_path / "c", board)
+    compile_c(compiler, export, tmp_path / "host", *EXAMPLE, options=(option,))
+
+
+@pytest.fixture(scope="module")
+def host(tmp_path_factory, compile_c):
+    """The host example for a board with a leak, compiled with sanitizers, and its board."""
+    folder = tmp_path_factory.mktemp("host")
+    (folder / "board.toml").write_text(BOARD)
+    board = load_device(folder / "board.toml")
+    export = export_c(find_model("three-25um-biaxial"), folder / "c", board)
+    options = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    return compile_c("gcc", export, folder / "host", *EXAMPLE, options=options), board
+
+
+def played(program, path, *words):
+    """Exit code, records and stderr of the host example."""
+    done = subprocess.run([program, path, *map(str, words)], capture_output=True, text=True, check=False, timeout=60)
+    return done.returncode, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
+
+
+def check_records(records, expected):
+    """Lines of the host example against our records."""
+    assert len(records) == len(expected)
+    for theirs, mine in zip(records, expected, strict=True):
+        flags = [word for word in mine.flags if word not in ONLY_PYTHON]
+        assert (theirs["seq"], theirs["t_device_us"], theirs["contact"]) == (mine.seq, mine.t_device_us, mine.contact)
+        assert sorted(theirs["flags"]) == sorted(flags)
+        for name in Contact._fields:
+            value = getattr(mine, name)
+            assert theirs[name] == (None if value is None else pytest.approx(value, rel=1e-4, abs=1e-4))
+
+
+def test_a_recording_gives_our_records_frame_by_frame(host, start_command, tmp_path):
+    """Bytes of the virtual sensor with a leak, drift, lost frames and damaged bytes, in C and in Python."""
+    program, board = host
+    words = ("--noise", "bench", "--rate-Hz", "400", "--corrupt", "0.0005", "--lose", "0.01", "--force-max", "0.5")
+    sensor = start_command("serve", "virtual", "three-25um-biaxial", *words)
+    stream, data, expected = TouchStream(Predictor("three-25um-biaxial"), board), b"", []
+    with Port(sensor.stdout.readline().strip()) as port:
+        for chunk in port:
+            data += chunk.data
+            expected += stream.feed(chunk)
+            if len(expected) > 1000:
+                break
+    (tmp_path / "frames.bin").write_bytes(data)
+    code, records, err = played(program, tmp_path / "frames.bin")
+    assert (code, err) == (0, "")
+    check_records(records, expected)
+    assert sum(record["contact"] for record in records) > 100
+
+
+def test_host_example_follows_a_port(exports, compile_c, start_command, tmp_path):
+    """Contacts of the virtual sensor at the places of its script."""
+    steps = {0.0: 0.0, 0.8: 0.0, 0.801: 0.5, 1.4: 0.5, 1.401: 0.0}
+    steps |= {1.7: 0.0, 1.701: 1.0, 2.3: 1.0, 2.301: 0.0, 60.0: 0.0}
+    rows = [f"{t},{3.0 if t < 1.6 else -4.0},{-2.0 if t < 1.6 else 1.0},{force}" for t, force in steps.items()]
+    (tmp_path / "script.csv").write_text("\n".join(["seconds,x_mm,y_mm,force_N", *rows]) + "\n")
+    words = ("--noise", "clean", "--script", tmp_path / "script.csv")
+    program = compile_c("gcc", exports[0], tmp_path / "host", *EXAMPLE)
+    sensor = start_command("serve", "virtual", "three-25um-biaxial", *words)
+    code, records, err = played(program, sensor.stdout.readline().strip(), 480)
+    assert (code, err, len(records)) == (0, "", 480)
+    touching = [record for record in records if record["contact"] and record["force_N"] > 0.4]
+    first = [record for record in touching if record["x_mm"] > 0]
+    second = [record for record in touching if record["x_mm"] < 0]
+    for press, (x, y, force) in ((first, (3.0, -2.0, 0.5)), (second, (-4.0, 1.0, 1.0))):
+        assert len(press) > 80
+        middle = np.median([[record["x_mm"], record["y_mm"], record["force_N"]] for record in press], axis=0)
+        np.testing.assert_allclose(middle, [x, y, force], atol=0.3)
+
+
+def test_host_example_says_what_is_wrong(host, tmp_path):
+    program, _ = host
+    (tmp_path / "text").write_text("801.2,799.5,803.3\n" * 1000)
+    four = b"".join(encode_frame(Frame(k, 5000 * k, (1.0,) * 4)) for k in range(3))
+    (tmp_path / "four").write_bytes(four)
+    noisy = np.random.default_rng(0).normal(0.0, 100.0, (2500, 3))
+    (tmp_path / "noisy").write_bytes(b"".join(encode_frame(Frame(k, 5000 * k, tuple(q))) for k, q in enumerate(noisy)))
+    for name, message in [
+        ("text", "no intact frame came"),
+        ("four", "expected 3 charges, as the model three-25um-biaxial/1 has electrodes; frame 0 has 4"),
+        ("noisy", "cannot tare"),
+        ("missing", "No such file"),
+    ]:
+        code, _, err = played(program, tmp_path / name)
+        assert (code, message in err) == (1, True), err
+    assert played(program, tmp_path / "noisy", 1, 2)[0] == 2
+
+
+@pytest.fixture(scope="module")
+def sketch(exports, tmp_path_factory):
+    """Compiles the sketch with a host's Arduino: the program that reads pins and sends."""
+    if shutil.which("g++") is None:
+        pytest.skip("g++ is not installed")
+
+    def compile_sketch(*options):
+        folder = tmp_path_factory.mktemp("sketch")
+        export = exports[0] / "arduino" / "isocharge_sketch"
+        objects = []
+        for source in sorted(export.glob("*.c")):
+            objects.append(folder / f"{source.stem}.o")
+            subprocess.run(["gcc", "-std=c11", "-O2", "-c", source, "-o", objects[-1]], check=True)
+        ino = f'-DSKETCH="{export / "isocharge_sketch.ino"}"'
+        words = ["g++", "-Wall", "-Wextra", "-Werror", *options, ino, "-I", export, "-I", HERE / "board"]
+        subprocess.run([*words, HERE / "board" / "run_sketch.cpp", *objects, "-o", folder / "sketch"], check=True)
+        return folder / "sketch"
+
+    return compile_sketch
+
+
+@pytest.fixture(scope="module")
+def pins():
+    """What the pins read: rest, a press of some hundred counts, rest; shape (900, 3)."""
+    counts = np.random.default_rng(1).normal(20.0, 1.0, (900, 3))
+    counts[400:600] += [700.0, 750.0, 800.0]
+    return counts.astype(int)
+
+
+def run_sketch(program, pins):
+    lines = "".join(f"{5000 * (k + 1)} {' '.join(map(str, row))}\n" for k, row in enumerate(pins.tolist()))
+    return subprocess.run([program], input=lines.encode(), capture_output=True, check=True).stdout
+
+
+def expected_of(pins):
+    """Our records of the same readings."""
+    data = [encode_frame(Frame(k, 5000 * (k + 1), tuple(map(float, row)))) for k, row in enumerate(pins.tolist())]
+    return list(
+        TouchStream(Predictor("three-25um-biaxial"), device_from_table({}, "x")).feed(Chunk(b"".join(data), 0.0, 0))
+    )
+
+
+def test_sketch_prints_the_contacts(sketch, pins):
+    printed = run_sketch(sketch(), pins).decode()
+    forces = [float(value) for value in re.findall(r">force_N:(\S+)", printed)]
+    expected = [record.force_N for record in expected_of(pins) if record.contact]
+    assert len(expected) > 150
+    np.testing.assert_allclose(forces, expected, atol=1e-3)
+
+
+def test_sketch_sends_frames_that_we_read(sketch, pins):
+    frames = BinaryParser().feed(run_sketch(sketch("-DSEND_FRAMES=1"), pins))
+    assert [frame.values for frame in frames] == [tuple(map(float, row)) for row in pins.tolist()]
+    assert [frame.t_us for frame in frames[:2]] == [5000, 10000]

@@ -1,0 +1,13 @@
+"""A model as C99: the network as arrays and loops, and beside it the signal chain of a board.
+
+    isocharge_model.h/.c     isocharge_predict: charges in, the seven numbers of a Contact out
+    isocharge_chain.h/.c     the signal chain, with the numbers of the device file in isocharge_device.h
+    isocharge_frames.h/.c    our binary frame: bytes in, frames out
+    self_test.c              the golden vectors
+    host_example.c           a serial port in, contacts out
+    arduino/                 a sketch with copies of what it needs
+
+What is the same for every model lies in `sources/` as C; what a model or a board decides is generated.
+
+May import: nothing else of isocharge.train.
+"""

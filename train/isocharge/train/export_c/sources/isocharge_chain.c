@@ -1,0 +1,390 @@
+/* The signal chain; see isocharge_chain.h. Each stage is explained in isocharge.serve.signal_chain. */
+#include "isocharge_chain.h"
+
+#include <math.h>
+#include <string.h>
+
+#define N ISOCHARGE_ELECTRODES
+#define EACH(k) for (int k = 0; k < N; ++k)
+
+typedef isocharge_real real;
+
+#ifdef ISOCHARGE_CHAIN_FLOAT
+#define EXP expf
+#define SQRT sqrtf
+#define ABS fabsf
+#else
+#define EXP exp
+#define SQRT sqrt
+#define ABS fabs
+#endif
+
+static const real LARGEST = (real)ISOCHARGE_LARGEST;
+
+static real smaller(real a, real b) { return b < a ? b : a; }
+
+static real larger(real a, real b) { return b > a ? b : a; }
+
+#if ISOCHARGE_HUM || ISOCHARGE_LEAK
+static real within(real value, real limit) { return smaller(larger(value, -limit), limit); }
+#endif
+
+/* Forget everything that a tare decides. */
+static void forget_tare(isocharge_chain *chain)
+{
+#if ISOCHARGE_TARE_ON
+    chain->waiting = chain->next = chain->frames = 0;
+#endif
+    chain->tared = 0;
+#if ISOCHARGE_LEAK
+    chain->leak_running = 0;
+#endif
+    chain->contact = chain->below = chain->saturated = 0;
+    chain->peak_pC = chain->last_pC = chain->base_pC = 0;
+#if ISOCHARGE_THERMAL_ON
+    chain->drift_pC = chain->drift_pC2 = chain->waited_s = 0;
+    chain->blind = 0;
+#endif
+}
+
+void isocharge_chain_start(isocharge_chain *chain)
+{
+    memset(chain, 0, sizeof *chain);
+    EACH(k) chain->tare_pC[k] = chain->noise_pC[k] = 0;
+    chain->invalid_s = 0;
+#if ISOCHARGE_HUM
+    EACH(k) chain->hum_re[k] = chain->hum_im[k] = 0;
+    chain->turn_re = 1;
+    chain->turn_im = 0;
+#endif
+    forget_tare(chain);
+}
+
+void isocharge_chain_tare(isocharge_chain *chain)
+{
+    forget_tare(chain);
+#if ISOCHARGE_TARE_ON
+    chain->patient = 1;
+#endif
+#if ISOCHARGE_HUM
+    chain->hum_running = 0;
+#endif
+}
+
+#if ISOCHARGE_HUM
+/* Subtract the hum from charges, and learn it from their steps. */
+static void remove_hum(isocharge_chain *chain, const real raw_pC[N], real quiet_pC[N], double t_s, real dt_s)
+{
+    const double cycles = ISOCHARGE_HUM_HZ * t_s;
+    const double phase = 6.283185307179586 * (cycles - floor(cycles));
+    const real re = (real)cos(phase), im = (real)sin(phase);
+    const real step_re = re - chain->turn_re, step_im = im - chain->turn_im;
+    const real norm = step_re * step_re + step_im * step_im;
+
+    if (chain->hum_running && norm > (real)ISOCHARGE_HUM_LEAST_TURN) {
+        const real share = smaller(1, 2 * dt_s / (real)ISOCHARGE_HUM_SETTLE_S) / norm;
+        EACH(k)
+        {
+            const real change = raw_pC[k] - chain->hum_raw_pC[k];
+            const real known = chain->hum_re[k] * step_re - chain->hum_im[k] * step_im;
+            const real error = within(change - known, (real)ISOCHARGE_HUM_LIMIT_PC);
+
+            chain->hum_re[k] += error * share * step_re;
+            chain->hum_im[k] -= error * share * step_im;
+        }
+    }
+    chain->turn_re = re;
+    chain->turn_im = im;
+    chain->hum_running = 1;
+    EACH(k)
+    {
+        chain->hum_raw_pC[k] = raw_pC[k];
+        quiet_pC[k] = raw_pC[k] - (chain->hum_re[k] * re - chain->hum_im[k] * im);
+    }
+}
+#endif
+
+#if ISOCHARGE_TARE_ON
+/* Mean and noise of the waiting frames, the oldest first; whether nothing moves. */
+static int measure_tare(const isocharge_chain *chain, real mean_pC[N], real noise_pC[N])
+{
+    const long frames = ISOCHARGE_TARE_FRAMES;
+    int quiet = 1;
+
+    EACH(k)
+    {
+        real sum = 0, squares = 0;
+
+        for (long n = 0; n < frames; ++n)
+            sum += chain->waiting_pC[(chain->next + n) % frames][k];
+        mean_pC[k] = sum / (real)frames;
+        for (long n = 0; n < frames; ++n) {
+            const real apart = chain->waiting_pC[(chain->next + n) % frames][k] - mean_pC[k];
+            squares += apart * apart;
+        }
+        noise_pC[k] = SQRT(squares / (real)frames);
+        quiet = quiet && noise_pC[k] <= (real)ISOCHARGE_TARE_NOISE_LIMIT_PC &&
+                ABS(mean_pC[k]) <= (real)ISOCHARGE_TARE_OFFSET_LIMIT_PC;
+    }
+    return quiet;
+}
+#endif
+
+/* Tare on the latest frames as soon as they are enough and quiet; 0 if they were not for longer than one waits. */
+static int look_for_tare(isocharge_chain *chain, const real quiet_pC[N])
+{
+#if ISOCHARGE_TARE_ON
+    real mean_pC[N], noise_pC[N];
+
+    EACH(k) chain->waiting_pC[chain->next][k] = quiet_pC[k];
+    chain->next = (chain->next + 1) % ISOCHARGE_TARE_FRAMES;
+    if (chain->waiting < ISOCHARGE_TARE_FRAMES)
+        ++chain->waiting;
+    if (!chain->patient && chain->frames < ISOCHARGE_TARE_PATIENCE)
+        ++chain->frames;
+    if (chain->waiting < ISOCHARGE_TARE_FRAMES)
+        return 1;
+    if (!measure_tare(chain, mean_pC, noise_pC))
+        return chain->patient || ISOCHARGE_TARE_PATIENCE == 0 || chain->frames < ISOCHARGE_TARE_PATIENCE;
+    EACH(k)
+    {
+        chain->tare_pC[k] = mean_pC[k];
+        chain->noise_pC[k] = noise_pC[k];
+    }
+    chain->waiting = chain->next = 0;
+#else
+    EACH(k) chain->tare_pC[k] = chain->noise_pC[k] = 0;
+    (void)quiet_pC;
+#endif
+    chain->tared = 1;
+    return 1;
+}
+
+#if ISOCHARGE_LEAK
+/* Correct the inflow by the clipped surplus; after a while the candidate becomes the trusted inflow. */
+static void learn_inflow(isocharge_chain *chain, const real surplus_pC[N], real dt_s)
+{
+    const real learned_s = chain->learned_s + dt_s;
+    const real averaging_s = larger(smaller((real)ISOCHARGE_LEAK_SETTLE_S, learned_s), dt_s);
+
+    EACH(k)
+    {
+        const real sigmas = (real)ISOCHARGE_LEAK_CLIP_SIGMAS * (real)1.4142135623730951 * chain->noise_pC[k];
+        const real limit_pC = larger((real)ISOCHARGE_LEAK_CLIP_PC, sigmas);
+
+        chain->inflow[k] += within(surplus_pC[k], limit_pC) / averaging_s;
+    }
+    chain->learned_s = learned_s;
+    chain->candidate_age_s += dt_s;
+    if (chain->candidate_age_s < (real)ISOCHARGE_LEAK_LOOK_BACK_S)
+        return;
+    chain->candidate_age_s = 0;
+    EACH(k)
+    {
+        chain->trusted[k] = chain->candidate[k];
+        chain->candidate[k] = chain->inflow[k];
+    }
+}
+
+/* Undo the amplifier's decay: charges after the next frame. */
+static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s)
+{
+    static const real tau_s[N] = ISOCHARGE_LEAK_TAU_S;
+    const real relax = EXP(-dt_s / (real)ISOCHARGE_LEAK_RELAX_S);
+    real surplus_pC[N];
+
+    EACH(k)
+    {
+        const real innovation_pC = output_pC[k] - EXP(-dt_s / tau_s[k]) * chain->output_pC[k];
+
+        surplus_pC[k] = innovation_pC - chain->inflow[k] * dt_s;
+        chain->charge_pC[k] += surplus_pC[k];
+        chain->output_pC[k] = output_pC[k];
+    }
+    if (chain->contact) {
+        EACH(k) chain->inflow[k] = chain->candidate[k] = chain->trusted[k];
+        chain->candidate_age_s = 0;
+        chain->hold_s = (real)ISOCHARGE_LEAK_HOLD_OFF_S;
+        return;
+    }
+    EACH(k) chain->charge_pC[k] *= relax;
+    if (chain->hold_s > 0 || !ISOCHARGE_LEAK_LEARN)
+        chain->hold_s -= dt_s;
+    else
+        learn_inflow(chain, surplus_pC, dt_s);
+}
+
+static void start_leak(isocharge_chain *chain, const real output_pC[N])
+{
+    EACH(k)
+    {
+        chain->output_pC[k] = output_pC[k];
+        chain->charge_pC[k] = chain->inflow[k] = chain->trusted[k] = chain->candidate[k] = 0;
+    }
+    chain->candidate_age_s = chain->hold_s = 0;
+    chain->learned_s = 1;
+    chain->leak_running = 1;
+}
+#endif
+
+/* Contact with hysteresis, from the total charge. */
+static void update_contact(isocharge_chain *chain, real total_pC, real decay)
+{
+#if ISOCHARGE_TOUCH
+    real squares = 0, threshold;
+
+    EACH(k) squares += chain->noise_pC[k] * chain->noise_pC[k];
+    threshold = (real)ISOCHARGE_TOUCH_FLOOR_PC + (real)ISOCHARGE_TOUCH_SIGMAS * SQRT(squares);
+    chain->below = 0;
+    if (chain->contact) {
+        chain->peak_pC = larger(chain->peak_pC, smaller(total_pC, chain->last_pC));
+        if (total_pC < larger((real)ISOCHARGE_TOUCH_RELEASE_SHARE * chain->peak_pC, threshold / 2)) {
+            chain->contact = 0;
+            chain->peak_pC = 0;
+            chain->base_pC = total_pC;
+        }
+    } else {
+        chain->base_pC *= decay;
+        if (total_pC > chain->base_pC + threshold) {
+            chain->contact = 1;
+            chain->peak_pC = smaller(total_pC, chain->last_pC);
+            chain->base_pC = 0;
+        } else {
+            chain->base_pC = smaller(chain->base_pC, total_pC);
+            chain->below = total_pC < -threshold;
+        }
+    }
+    chain->last_pC = total_pC;
+#else
+    (void)total_pC;
+    (void)decay;
+    chain->contact = 1;
+#endif
+}
+
+#if ISOCHARGE_THERMAL_ON
+/* The common charge of a warming film, as far as this frame tells; returns its change. */
+static real track_thermal_drift(isocharge_chain *chain, const real charge_pC[N], real dt_s)
+{
+    real slope = 0, curvature = 0, estimate_pC2 = 0, predicted_pC2, change_pC, gain;
+
+    chain->waited_s += dt_s;
+    if (chain->waited_s < (real)ISOCHARGE_THERMAL_EVERY_S)
+        return 0;
+    predicted_pC2 = chain->drift_pC2 + (real)(ISOCHARGE_THERMAL_WANDER_PC * ISOCHARGE_THERMAL_WANDER_PC) * chain->waited_s;
+    chain->waited_s = 0;
+    for (int n = -2; n <= 2; ++n) { /* the parabola of the squared misfit by least squares */
+        float tried_pC[N], contact[7];
+        real square;
+
+        EACH(k) tried_pC[k] = (float)(charge_pC[k] - (real)(10 * n));
+        isocharge_predict(tried_pC, contact);
+        square = (real)contact[6] * (real)contact[6];
+        slope += (real)(10 * n) / 1000 * square;
+        curvature += (real)(100 * n * n - 200) / 140000 * square;
+    }
+    chain->blind = !(curvature > 0);
+    if (!chain->blind) {
+        estimate_pC2 = (real)(ISOCHARGE_THERMAL_NOISE * ISOCHARGE_THERMAL_NOISE) / curvature;
+        chain->blind = estimate_pC2 > (real)(ISOCHARGE_THERMAL_BLIND_PC * ISOCHARGE_THERMAL_BLIND_PC);
+    }
+    if (chain->blind)
+        return 0;
+    change_pC = smaller(larger(-slope / (2 * curvature), -20), 20);
+    gain = predicted_pC2 / (predicted_pC2 + estimate_pC2);
+    chain->drift_pC2 = (1 - gain) * predicted_pC2;
+    chain->drift_pC += gain * change_pC;
+    return gain * change_pC;
+}
+#endif
+
+/* The stages behind the tare. */
+static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real dt_s, int limited,
+                          isocharge_reading *reading)
+{
+    real output_pC[N], *charge_pC = reading->charge_pC, total_pC = 0, decay = 1;
+
+    EACH(k)
+    {
+        reading->tare_pC[k] = chain->tare_pC[k];
+        output_pC[k] = quiet_pC[k] - chain->tare_pC[k];
+    }
+#if ISOCHARGE_LEAK
+    if (chain->leak_running)
+        undo_leak(chain, output_pC, dt_s);
+    else
+        start_leak(chain, output_pC);
+    decay = EXP(-dt_s / (real)ISOCHARGE_LEAK_RELAX_S);
+    EACH(k) charge_pC[k] = chain->charge_pC[k];
+#else
+    EACH(k) charge_pC[k] = output_pC[k];
+#endif
+    EACH(k) total_pC += charge_pC[k];
+    update_contact(chain, total_pC, decay);
+    chain->saturated = limited || (chain->saturated && chain->contact);
+#if ISOCHARGE_THERMAL_ON
+    if (!chain->contact) {
+        chain->drift_pC = chain->drift_pC2 = chain->waited_s = 0;
+        chain->blind = 0;
+    } else if (!chain->saturated) {
+        const real change_pC = track_thermal_drift(chain, charge_pC, dt_s);
+        EACH(k)
+        {
+            charge_pC[k] -= change_pC;
+#if ISOCHARGE_LEAK
+            chain->charge_pC[k] -= change_pC;
+#else
+            chain->tare_pC[k] += change_pC;
+            reading->tare_pC[k] = chain->tare_pC[k];
+#endif
+        }
+    }
+    if (!chain->saturated && ABS(chain->drift_pC) >= (real)ISOCHARGE_THERMAL_TELL_PC)
+        reading->flags |= ISOCHARGE_THERMAL;
+    if (!chain->saturated && chain->blind)
+        reading->flags |= ISOCHARGE_BLIND;
+#else
+    (void)dt_s;
+#endif
+    reading->contact = chain->contact;
+    reading->flags |= (chain->saturated ? ISOCHARGE_SATURATED : 0u) | (chain->below ? ISOCHARGE_NEGATIVE : 0u);
+}
+
+void isocharge_chain_advance(isocharge_chain *chain, const isocharge_real value[ISOCHARGE_ELECTRODES], double t_s,
+                             isocharge_real dt_s, int limited, isocharge_reading *reading)
+{
+    static const real gain_pC[N] = ISOCHARGE_GAIN_PC;
+    real *raw_pC = reading->raw_pC, quiet_pC[N], squares = 0;
+
+    EACH(k)
+    {
+        squares += value[k] / LARGEST * (value[k] / LARGEST);
+        raw_pC[k] = value[k] * gain_pC[k];
+        reading->charge_pC[k] = reading->tare_pC[k] = 0;
+    }
+    reading->contact = 0;
+    reading->flags = 0;
+    if (!(squares <= 1)) {
+        chain->invalid_s += dt_s;
+        reading->flags = ISOCHARGE_INVALID;
+        return;
+    }
+    dt_s += chain->invalid_s;
+    chain->invalid_s = 0;
+#if ISOCHARGE_SATURATION
+    EACH(k) limited = limited || ABS(raw_pC[k]) >= (real)ISOCHARGE_LIMIT_PC;
+#endif
+#if ISOCHARGE_HUM
+    remove_hum(chain, raw_pC, quiet_pC, t_s, dt_s);
+#else
+    (void)t_s;
+    EACH(k) quiet_pC[k] = raw_pC[k];
+#endif
+    if (chain->tared) {
+        advance_tared(chain, quiet_pC, dt_s, limited, reading);
+        return;
+    }
+    reading->flags = ISOCHARGE_TARE | (limited ? ISOCHARGE_SATURATED : 0u);
+    if (!look_for_tare(chain, quiet_pC))
+        reading->flags |= ISOCHARGE_TARE_FAILED;
+}

@@ -1,0 +1,24 @@
+int main(void)
+{
+    static const char *const field[] = ISOCHARGE_CONTACT_FIELDS;
+    float contact[7], worst = 0.0f;
+    int row, column, wrong = 0;
+
+    for (row = 0; row < VECTORS; ++row) {
+        isocharge_predict(CHARGE_PC + row * ISOCHARGE_ELECTRODES, contact);
+        for (column = 0; column < 7; ++column) {
+            const float expected = CONTACT[row * 7 + column];
+            const float apart = fabsf(contact[column] - expected) / fmaxf(fabsf(expected), FLOOR[column]);
+
+            if (!(apart <= RELATIVE)) {
+                printf("vector %d: %s: expected %.9g, got %.9g\n", row, field[column], (double)expected,
+                       (double)contact[column]);
+                ++wrong;
+            }
+            worst = apart > worst ? apart : worst;
+        }
+    }
+    printf("%s: %d golden vectors, %d wrong numbers, largest difference %.1e of %.1e allowed\n", ISOCHARGE_MODEL,
+           VECTORS, wrong, (double)worst, (double)RELATIVE);
+    return wrong != 0;
+}
