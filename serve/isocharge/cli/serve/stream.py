@@ -51,7 +51,7 @@ from isocharge.cli.shared.terminal import log_to_stderr, say
 from isocharge.errors import InputError
 
 if TYPE_CHECKING:
-    from isocharge.serve import Device, Predictor
+    from isocharge.serve import Device, Predictor, TouchStream
     from isocharge.serve.viewer.link import ReaderEnd
     from isocharge.serve.viewer.server import PageSettings
 
@@ -155,7 +155,7 @@ def stream_command(
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         stack.enter_context(log_to_stderr())
-        page = None if settings is None else stack.enter_context(_page(settings, find_model(model, models), predictor))
+        page = None if settings is None else stack.enter_context(_page(settings, path, find_model(model, models)))
         request = board.frames.request
         source = stack.enter_context(open_source(awaited(port, wait), baud=baud, reconnect=reconnect, request=request))
         stack.enter_context(on_signal("SIGUSR1", live.request_tare))
@@ -190,9 +190,9 @@ def stream_command(
 
 
 @contextmanager
-def _page(settings: "PageSettings", model: Path, predictor: "Predictor") -> "Iterator[ReaderEnd]":
+def _page(settings: "PageSettings", touch: "TouchStream", model: Path) -> "Iterator[ReaderEnd]":
     """The page of this stream; says where it is."""
-    with one_page(predictor.metadata.name, predictor.metadata, model, settings) as (link, url):
+    with one_page(touch.frame_id, touch.predictor.metadata, model, settings) as (link, url):
         say(f"live page: {url}")
         yield link
 

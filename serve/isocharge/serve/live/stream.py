@@ -142,6 +142,11 @@ class TouchStream:
         """The model of the next record."""
         return self._predictor
 
+    @property
+    def frame_id(self) -> str:
+        """The film's name in the records."""
+        return self._frame_id or self._predictor.metadata.frame_id
+
     def use(self, predictor: Predictor) -> None:
         """Go on with another model of the same electrodes; tare and chain stay as they are.
 
