@@ -46,6 +46,7 @@ class InferAnswer(NamedTuple):
         name, version: The model that answered.
         id, binary: As in the request.
         outputs: By name, shape (n, width).
+        misfit: Misfit of each press, shape (n, 1); None if it was not computed, as nobody asked for it.
     """
 
     name: str
@@ -53,6 +54,7 @@ class InferAnswer(NamedTuple):
     id: str
     outputs: dict[str, Singles]
     binary: frozenset[str]
+    misfit: Singles | None = None
 
 
 def infer(loaded: LoadedVersion, request: InferRequest) -> InferAnswer:
@@ -63,21 +65,32 @@ def infer(loaded: LoadedVersion, request: InferRequest) -> InferAnswer:
     """
     charges, names = request.charge_pC, request.outputs
     if len(charges) == 1:
-        outputs = _one_press(loaded.press(), charges[0], names)
+        row = _one_press(loaded.press(), charges[0])
+        outputs, misfit = {name: row[:, COLUMNS[name]] for name in names}, row[:, COLUMNS["misfit"]]
     else:
         outputs = run(loaded.model.session, charges, names)
         check_rows(outputs, len(charges), loaded.metadata.label)
-    return InferAnswer(loaded.metadata.name, loaded.version, request.id, outputs, request.binary)
+        misfit = outputs.get("misfit")
+    return InferAnswer(loaded.metadata.name, loaded.version, request.id, outputs, request.binary, misfit)
 
 
-def _one_press(press: BoundPress, charge_pC: Singles, names: tuple[str, ...]) -> dict[str, Singles]:
-    """Outputs of shape (1, width) from bound memory, which is faster than a plain run."""
+def _one_press(press: BoundPress, charge_pC: Singles) -> Singles:
+    """All outputs, shape (1, WIDTH), from bound memory, which is faster than a plain run."""
     row = np.empty((1, WIDTH), np.float32)
     try:
         press.run_into(charge_pC, row[0])
     except Exception as error:  # onnxruntime's exceptions have no common base of their own
         raise run_error(error) from error
-    return {name: row[:, COLUMNS[name]] for name in names}
+    return row
+
+
+def misfit_alarms(misfit: Singles | None, limit: float) -> tuple[int, int]:
+    """Presses whose misfit was computed, and how many of them are above the limit; NaN counts as above."""
+    if misfit is None:
+        return 0, 0
+    if len(misfit) == 1:
+        return 1, int(not misfit.item() <= limit)
+    return len(misfit), len(misfit) - int(np.count_nonzero(misfit <= limit))
 
 
 def answer_inference(
@@ -104,5 +117,6 @@ def answer_inference(
     except Exception:
         loaded.statistics.failed(clock() - began)
         raise
-    loaded.statistics.succeeded(len(request.charge_pC), (was_read - began, ran - was_read, clock() - ran))
+    stages_ns = was_read - began, ran - was_read, clock() - ran
+    loaded.statistics.succeeded(len(request.charge_pC), stages_ns, *misfit_alarms(answer.misfit, loaded.misfit_limit))
     return written
