@@ -117,14 +117,12 @@ class ModelStore:
         return None if loaded is None else loaded.metadata.label
 
     def _why_not(self, name: str, version: str) -> str:
-        """Why a model does not serve, in a sentence."""
+        """Why a model does not serve, and what does."""
         entry = self._entries.get(name, NO_VERSIONS)
         reasons = dict.fromkeys(reason for v, reason in sorted(entry.refused.items()) if version in ("", str(v)))
         label = f"{name}/{version}" if version else name
-        if reasons:
-            return f"model {label!r:.200} does not serve: {'; '.join(reasons)}"
         serving = ", ".join(sorted(loaded.metadata.label for loaded in self.all())) or "no model"
-        return f"model {label!r:.200} is not found; serving: {serving}"
+        return "; ".join([f"model {label!r:.200} is not found", f"serving: {serving}", *reasons])
 
     def all(self) -> list[LoadedVersion]:
         """Every version that serves, by name and version."""
