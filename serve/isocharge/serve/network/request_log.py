@@ -54,7 +54,7 @@ class RequestLog(logging.Handler):
         """Set up the log.
 
         Args:
-            write: Takes a line with its line feed; called from any thread, and must not wait.
+            write: Takes a line, without a line feed; called from any thread, and must not wait.
             secret: What no message may say; `[secret]` stands in its place.
             now: The clock.
         """
@@ -92,7 +92,7 @@ class RequestLog(logging.Handler):
 
     def _line(self, level: str, **fields: Any) -> None:
         time = self._now().isoformat(timespec="microseconds")
-        self._write(orjson.dumps({"time": time, "level": level} | fields, default=str).decode() + "\n")
+        self._write(orjson.dumps({"time": time, "level": level} | fields, default=str).decode())
 
     def _cut(self, text: str) -> str:
         text = text.encode("utf-8", "replace").decode()

@@ -44,7 +44,7 @@ class App:
 
     def refused(self, response: Response, client: Client = None) -> None:
         """Count a refusal that did not come from here, as the request could not be read to its end."""
-        self._note("", response, 0, 0, client)
+        self._note(None, response, 0, 0, client)
 
     def _answer(self, method: str, path: str, headers: Headers, body: bytes) -> Response:
         if self._token is None:
@@ -57,9 +57,9 @@ class App:
             return self.handler.answer(method, path, headers, body, trusted=False)
         return self.handler.answer(method, path, headers, body)
 
-    def _note(self, path: str, response: Response, ns: int, bytes_in: int, client: Client) -> None:
+    def _note(self, path: str | None, response: Response, ns: int, bytes_in: int, client: Client) -> None:
         """Count a request, and write it into the log; without a path it could not be read."""
-        route, model = (self.handler.label(path), self.handler.model_label(path)) if path else ("none", None)
+        route, model = ("none", None) if path is None else (self.handler.label(path), self.handler.model_label(path))
         error: str | None = getattr(response, "error", None)
         sizes = bytes_in, len(response.body)
         self.handler.traffic.note(Exchange("http", route, response.status, model, error, ns, *sizes, client))
