@@ -315,6 +315,26 @@ def rows(durations: dict[str, np.ndarray], against: str) -> Iterator[dict[str, A
         }
 
 
+def counting_cost(address: Address, request: bytes, rounds: int, number: int) -> dict[str, np.ndarray]:
+    """Durations with the counters of `/metrics` and without, shape (rounds, number), us: one process, one connection.
+
+    The two take turns ten requests at a time; the first round only warms up.
+    """
+    connection, clock = Connection(address), time.perf_counter_ns
+    durations = {"off": np.empty((rounds + 1, number)), "on": np.empty((rounds + 1, number))}
+    for i in range((rounds + 1) * number // 10):
+        for switch in ("off", "on") if i % 2 else ("on", "off"):
+            connection.send(http_request(f"/counting/{switch}", b""))
+            connection.receive()
+            for j in range(10 * i, 10 * i + 10):
+                begin = clock()
+                connection.send(request)
+                connection.receive()
+                durations[switch].flat[j] = clock() - begin
+    connection.close()
+    return {f"counters {switch}": of[1:] / 1e3 for switch, of in durations.items()}
+
+
 def stock_client(address: tuple[str, int], name: str, charges: np.ndarray, count: int) -> dict[str, np.ndarray]:
     """Arrays in, arrays out through Triton's HTTP client, shape (1, count), us: its own coding included."""
     client = tritonclient.http.InferenceServerClient(f"{address[0]}:{address[1]}")
@@ -348,6 +368,9 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
                 rows(stock_client(address, path.split("/")[3], charges, asked.requests // 4), "JSON")
             ),
         }
+        switched = _start_script(stack, Path(sys.executable), "counted_app.py", find_model(asked.model) / "model.onnx")
+        cost = counting_cost(switched, one["isocharge"][1], 2 * asked.rounds, 10 * (asked.requests // 10))
+        tables["one press, what the counters of /metrics cost"] = list(rows(cost, "counters off"))
         # MLServer's queues drain between turns: each contender is measured alone, twice.
         counts = {name: [throughput(*target, asked.seconds) for _ in range(2)] for name, target in one.items()}
     ours = np.mean(counts["isocharge"])

@@ -87,7 +87,8 @@ def test_clients_cannot_invent_series(handler):
             app.answer(f"M{number}", path, [(b"authorization", name.encode())], name.encode())
     after = scrape(handler)
     assert len(after) - before <= 6
-    assert sum(v for key, v in after.items() if key[0] == "isocharge_requests_total") == 1500
+    requests = {key: count for key, count in after.items() if key[0] == "isocharge_requests_total"}
+    assert sum(count for key, count in requests.items() if ("route", "/metrics") not in key) == 1500
 
 
 def test_the_histogram_is_that_of_the_durations():

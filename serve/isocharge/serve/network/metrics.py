@@ -20,7 +20,7 @@ from prometheus_client.registry import Collector
 
 from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.statistics import LATENCY_NS, STAGES, Statistics
-from isocharge.serve.network.traffic import Traffic
+from isocharge.serve.network.traffic import Kind, Traffic
 
 CONTENT_TYPE = b"text/plain; version=0.0.4; charset=utf-8"
 """The format that every Prometheus reads, whatever it asks for."""
@@ -28,7 +28,13 @@ CONTENT_TYPE = b"text/plain; version=0.0.4; charset=utf-8"
 VERSION = ("model", "version")
 """Labels of what is counted for each version of a model."""
 
+INFERENCE = Kind("http", "/v2/models/{model}/infer", "200")
+"""What the models count instead of the handler."""
+
 BOUNDS = (*(f"{ns / 1e9:g}" for ns in LATENCY_NS), "+Inf")
+
+
+_Counters = dict[tuple[str, str], Statistics]
 
 
 class Metrics:
@@ -55,7 +61,9 @@ class _Families(Collector):
         counters = self._store.counters()
         versions = {"version": self._version, "onnxruntime": ort.__version__}
         yield InfoMetricFamily("isocharge", "Versions of the server.", versions)
-        yield from chain(_models(self._store), _traffic(self._traffic), _inferences(counters), _latencies(counters))
+        yield from chain(
+            _models(self._store), _traffic(self._traffic, counters), _inferences(counters), _latencies(counters)
+        )
 
 
 def _models(store: ModelStore) -> Iterable[Metric]:
@@ -69,11 +77,12 @@ def _models(store: ModelStore) -> Iterable[Metric]:
     return info, ready
 
 
-def _traffic(traffic: Traffic) -> Iterable[Metric]:
+def _traffic(traffic: Traffic, counters: _Counters) -> Iterable[Metric]:
     requests = CounterMetricFamily(
         "isocharge_requests", "Requests that were answered or refused.", labels=("transport", "route", "status")
     )
-    for kind, count in sorted(traffic.requests().items()):
+    answered = sum(of.answered - of.over_grpc for of in counters.values())
+    for kind, count in sorted((traffic.requests() | {INFERENCE: answered}).items()):
         requests.add_metric(kind, count)
     opened = GaugeMetricFamily("isocharge_open", "Open connections of HTTP, open calls of gRPC.", labels=("transport",))
     for transport, number in traffic.open.items():
@@ -81,9 +90,6 @@ def _traffic(traffic: Traffic) -> Iterable[Metric]:
     lost = CounterMetricFamily("isocharge_log_lines_lost", "Lines of the log that nobody took.")
     lost.add_metric((), traffic.lost_lines() if traffic.lost_lines else 0)
     return requests, opened, lost
-
-
-_Counters = dict[tuple[str, str], Statistics]
 
 
 def _inferences(counters: _Counters) -> Iterable[Metric]:

@@ -19,9 +19,10 @@ class Statistics:
 
     Attributes:
         presses: Rows that were answered.
-        checked: Those of them whose misfit was computed.
+        unchecked: Those of them whose misfit was not computed.
         alarms: Those of them whose misfit is above the limit of the model.
         answered, refused: Numbers of requests.
+        over_grpc: Those of the answered ones that came over gRPC, and not HTTP.
         latency: Answered requests by their time, those beyond the last of LATENCY_NS at the end.
         stages_ns: Time spent on the answered ones in each of STAGES.
         refused_ns: Time spent on the others.
@@ -29,9 +30,10 @@ class Statistics:
     """
 
     presses: int = 0
-    checked: int = 0
+    unchecked: int = 0
     alarms: int = 0
     answered: int = 0
+    over_grpc: int = 0
     refused: int = 0
     latency: list[int] = field(default_factory=lambda: [0] * (len(LATENCY_NS) + 1))
     stages_ns: list[int] = field(default_factory=lambda: [0] * len(STAGES))
@@ -39,26 +41,37 @@ class Statistics:
     last_ms: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock, compare=False)
 
-    def succeeded(self, presses: int, stages_ns: tuple[int, int, int], checked: int = 0, alarms: int = 0) -> None:
+    def succeeded(
+        self,
+        presses: int,
+        stages_ns: tuple[int, int, int],
+        unchecked: int = 0,
+        alarms: int = 0,
+        *,
+        over_grpc: bool = False,
+    ) -> None:
         """Count an answered request.
 
         Args:
             presses: Rows of it.
             stages_ns: Its time in each of STAGES.
-            checked: Rows whose misfit was computed.
+            unchecked: Rows whose misfit was not computed.
             alarms: Rows whose misfit is above the limit.
+            over_grpc: Whether it came over gRPC.
         """
         read, ran, written = stages_ns
-        spent = self.stages_ns
+        bucket, spent = bisect_left(LATENCY_NS, read + ran + written), self.stages_ns
         with self._lock:
             self.presses += presses
-            self.checked += checked
-            self.alarms += alarms
             self.answered += 1
-            self.latency[bisect_left(LATENCY_NS, read + ran + written)] += 1
+            self.latency[bucket] += 1
             spent[0] += read
             spent[1] += ran
             spent[2] += written
+            if unchecked or alarms or over_grpc:
+                self.unchecked += unchecked
+                self.alarms += alarms
+                self.over_grpc += over_grpc
             self.last_ms = time.time_ns() // 1_000_000
 
     def failed(self, ns: int) -> None:
@@ -66,6 +79,11 @@ class Statistics:
         with self._lock:
             self.refused += 1
             self.refused_ns += ns
+
+    @property
+    def checked(self) -> int:
+        """Presses whose misfit was computed."""
+        return self.presses - self.unchecked
 
     def snapshot(self) -> "Statistics":
         """A copy, all of whose counters belong to the same moment."""

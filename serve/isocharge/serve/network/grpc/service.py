@@ -89,7 +89,8 @@ class Service:
     def ModelInfer(self, request: Any) -> Any:
         loaded = self._store.get(request.model_name, request.model_version)
         read = partial(read_infer, request, loaded.metadata.electrodes, self._limits.batch)
-        return answer_inference(loaded, read, lambda answer: write_answer(answer, METHODS["ModelInfer"][1]()))
+        response = METHODS["ModelInfer"][1]
+        return answer_inference(loaded, read, lambda answer: write_answer(answer, response()), over_grpc=True)
 
     def ModelStreamInfer(self, request: Any) -> dict[str, Any]:
         """One answer for one request of a stream; an error is an answer too, and the stream goes on."""

@@ -31,38 +31,46 @@ class App:
         self.blocks = handler.blocks
 
     def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
-        """Answer one request, as `Handler.answer` does, if it carries the token; count it and log it."""
-        traffic = self.handler.traffic
-        if traffic.log is None:
-            response = self._answer(method, path, headers, body)
-            traffic.count("http", self.handler.label(path), response.status)
-            return response
-        began = time.perf_counter_ns()
-        response = self._answer(method, path, headers, body)
-        self._note(path, response, time.perf_counter_ns() - began, len(body), client)
-        return response
-
-    def refused(self, response: Response, client: Client = None) -> None:
-        """Count a refusal that did not come from here, as the request could not be read to its end."""
-        self._note(None, response, 0, 0, client)
-
-    def _answer(self, method: str, path: str, headers: Headers, body: bytes) -> Response:
-        if self._token is None:
-            return self.handler.answer(method, path, headers, body)
-        try:
-            self._token.check(dict(headers).get(b"authorization", b""))
-        except TokenError as error:
-            if path not in OPEN:
-                return error_response(error)
-            return self.handler.answer(method, path, headers, body, trusted=False)
+        """Answer one request, as `Handler.answer` does, if it carries the token; log it."""
+        if self.handler.traffic.log is not None:
+            return self._answer_logged(method, path, headers, body, client)
+        if self._token is not None:
+            return self._answer_to_token(self._token, method, path, headers, body)
         return self.handler.answer(method, path, headers, body)
 
-    def _note(self, path: str | None, response: Response, ns: int, bytes_in: int, client: Client) -> None:
-        """Count a request, and write it into the log; without a path it could not be read."""
+    def refused(self, response: Response, client: Client = None) -> None:
+        """Count and log a refusal that did not come from here, as the request could not be read to its end."""
+        self.handler.traffic.count("http", "none", response.status)
+        self._log(None, response, 0, 0, client)
+
+    def _answer_to_token(self, token: Token, method: str, path: str, headers: Headers, body: bytes) -> Response:
+        try:
+            token.check(dict(headers).get(b"authorization", b""))
+        except TokenError as error:
+            if path in OPEN:
+                return self.handler.answer(method, path, headers, body, trusted=False)
+            response = error_response(error)
+            self.handler.traffic.count("http", self.handler.label(path), response.status)
+            return response
+        return self.handler.answer(method, path, headers, body)
+
+    def _answer_logged(self, method: str, path: str, headers: Headers, body: bytes, client: Client) -> Response:
+        began = time.perf_counter_ns()
+        if self._token is None:
+            response = self.handler.answer(method, path, headers, body)
+        else:
+            response = self._answer_to_token(self._token, method, path, headers, body)
+        self._log(path, response, time.perf_counter_ns() - began, len(body), client)
+        return response
+
+    def _log(self, path: str | None, response: Response, ns: int, bytes_in: int, client: Client) -> None:
+        """Write a request into the log, if there is one; without a path it could not be read."""
+        log, sizes = self.handler.traffic.log, (bytes_in, len(response.body))
+        if log is None:
+            return
         route, model = ("none", None) if path is None else (self.handler.label(path), self.handler.model_label(path))
         error: str | None = getattr(response, "error", None)
-        sizes = bytes_in, len(response.body)
-        self.handler.traffic.note(Exchange("http", route, response.status, model, error, ns, *sizes, client))
+        log.exchange(Exchange("http", route, response.status, model, error, ns, *sizes, client))
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         """Answer one request, in another thread if that may take long."""

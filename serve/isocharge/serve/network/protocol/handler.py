@@ -46,7 +46,7 @@ Route = tuple[str, Callable[[Request], Response]]
 
 
 class Handler:
-    """Answers requests from the models of a store."""
+    """Answers requests from the models of a store, and counts them."""
 
     def __init__(self, store: ModelStore, limits: ServerLimits | None = None, traffic: Traffic | None = None) -> None:
         """`limits` bound body and batch, the others are for transports; they count in `traffic`, too."""
@@ -71,6 +71,7 @@ class Handler:
             "stats": ("GET", self._stats),
             "infer": ("POST", self._infer),
         }
+        self._inference = self._of_model["infer"]
         self._route = lru_cache(KNOWN_PATHS)(self._route_of)
         self.label = lru_cache(KNOWN_PATHS)(self._label_of)
         self._of_repository: dict[str, Route] = {"load": ("POST", self._load), "unload": ("POST", self._unload)}
@@ -100,9 +101,13 @@ class Handler:
             self.limits.check_body(len(body))
             if b"content-encoding" in fields:
                 body = decompress(body, fields[b"content-encoding"].lower(), self.limits.body_bytes)
-            return route[1](Request(fields, body, name, version, trusted))
+            response = route[1](Request(fields, body, name, version, trusted))
+            if route is self._inference:  # its model has counted it: a second counter would cost too much
+                return response
         except Exception as error:  # the one place where an error becomes an answer
-            return error_response(error)
+            response = error_response(error)
+        self.traffic.count("http", self.label(path), response.status)
+        return response
 
     def _route_of(self, path: str) -> tuple[Route, str, str]:
         """The route of a path, with the name and version of the model in it."""
