@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 
@@ -204,8 +205,11 @@ def test_a_call_that_its_client_cancels_is_counted(handler):
         next(call)
         call.cancel()
         gone.set()
-    over = {"transport": "grpc", "route": "ModelStreamInfer", "status": "CANCELLED"}
-    assert value(scrape(handler), "requests_total", **over) == 1
+        over = {"transport": "grpc", "route": "ModelStreamInfer", "status": "CANCELLED"}
+        deadline = time.monotonic() + 20.0
+        while (samples := scrape(handler)) and value(samples, "open", transport="grpc") and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert value(scrape(handler), "requests_total", **over) == 1
 
 
 def test_counters_do_not_fall_when_a_model_is_loaded_again(handler):
