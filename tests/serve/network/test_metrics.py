@@ -22,6 +22,7 @@ from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.statistics import LATENCY_NS, Statistics
 from isocharge.serve.network.token import Token
+from isocharge.serve.network.traffic import Kind
 from isocharge.serve.prediction.validity import Domain
 
 INFER = "/v2/models/linear/infer"
@@ -205,11 +206,11 @@ def test_a_call_that_its_client_cancels_is_counted(handler):
         next(call)
         call.cancel()
         gone.set()
-        over = {"transport": "grpc", "route": "ModelStreamInfer", "status": "CANCELLED"}
+        key = Kind("grpc", "ModelStreamInfer", "CANCELLED")
         deadline = time.monotonic() + 20.0
-        while (samples := scrape(handler)) and value(samples, "open", transport="grpc") and time.monotonic() < deadline:
+        while key not in handler.traffic.requests() and time.monotonic() < deadline:
             time.sleep(0.01)
-        assert value(scrape(handler), "requests_total", **over) == 1
+    assert value(scrape(handler), "requests_total", **key._asdict()) == 1
 
 
 def test_counters_do_not_fall_when_a_model_is_loaded_again(handler):
