@@ -1,17 +1,17 @@
-"""HTTP: ours against a bare route, an idiomatic FastAPI service and MLServer, tuned; all serve the same model file.
+"""HTTP: ours against a bare route, an idiomatic FastAPI service, Triton and MLServer; all serve the same model file.
 
     python tests/benchmarks/bench_http.py [--environments DIR] [--rounds 12] [--requests 400] [--seconds 4] [--json]
 
-FastAPI and MLServer get environments of their own in `--environments`, made once; one that cannot be installed or does
-not start is left out, and stderr says why. Client and servers share the cores; the client is a plain socket, the same
-for all. Latency: one request at a time over one open connection, contenders take
-turns within each round. Throughput: 32 connections, each with one request under way. Ratios come from the same rounds.
-A batch of 1024 is measured twice: bytes on a socket, and arrays in and out of Triton's stock client.
+FastAPI, Triton and MLServer get environments of their own in `--environments`, made once; one that cannot be installed
+or does not start is left out, and stderr says why. Client and servers share the cores; the client is a plain socket,
+the same for all. Latency: one request at a time over one open connection, contenders take turns within each round.
+Throughput: 32 connections, each with one request under way. Ratios come from the same rounds. A batch of 1024 is
+measured twice: bytes on a socket, and arrays in and out of Triton's stock client. Triton runs the model in Python, as
+its wheel has no backend for ONNX.
 """
 
 import argparse
 import json
-import os
 import select
 import signal
 import socket
@@ -33,7 +33,12 @@ from isocharge.serve import find_model, load_model
 from isocharge.serve.model.session import OUTPUTS
 
 HERE = Path(__file__).parent
-PACKAGES = {"fastapi": ["fastapi", "uvicorn[standard]", "onnxruntime"], "mlserver": ["mlserver", "onnxruntime"]}
+DEPLOY = HERE.parents[1] / "serve" / "deploy"
+PACKAGES = {
+    "fastapi": ["fastapi", "uvicorn[standard]", "onnxruntime"],
+    "triton": ["nvidia-pytriton", "onnxruntime"],
+    "mlserver": ["mlserver", "onnxruntime"],
+}
 CONNECTIONS = 32
 
 Address = tuple[str, int] | str
@@ -132,29 +137,6 @@ def python_of(name: str, environments: Path) -> Path:
     return folder / "bin/python"
 
 
-def mlserver_folder(folder: Path, port: int, model: Path) -> Path:
-    """Settings of MLServer, tuned: no worker processes, no metrics, no access log, no other protocols."""
-    settings = {
-        "host": "127.0.0.1",
-        "http_port": port,
-        "grpc_port": free_port(),
-        "metrics_endpoint": None,
-        "parallel_workers": 0,
-        "debug": False,
-        "use_structured_logging": False,
-        "logging_settings": None,
-    }
-    runtime = {
-        "name": "model",
-        "implementation": "mlserver_runtime.Runtime",
-        "parameters": {"uri": str(model), "version": "1"},
-    }
-    (folder / "settings.json").write_text(json.dumps(settings))
-    (folder / "model-settings.json").write_text(json.dumps(runtime))
-    (folder / "mlserver_runtime.py").write_text((HERE / "rivals/mlserver_runtime.py").read_text())
-    return folder
-
-
 @contextmanager
 def running(command: list[str | Path], address: Address, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """A server process, from its first accepted connection to the end of the block.
@@ -202,8 +184,8 @@ def start(stack: ExitStack, model: str, environments: Path | None) -> Contenders
     stack.enter_context(running([*ours, "--uds", uds], uds))
     bare = _start_script(stack, Path(sys.executable), "bare_app.py", folder / "model.onnx")
     contenders = {"isocharge": (tcp, path), "isocharge, Unix socket": (uds, path), "bare route": (bare, path)}
-    rivals = {"FastAPI": _start_fastapi, "MLServer tuned": _start_mlserver} if environments else {}
-    for name, start_rival in rivals.items():
+    rivals = {"FastAPI": _start_fastapi, "Triton": _start_triton, "MLServer tuned": _start_mlserver}
+    for name, start_rival in rivals.items() if environments else ():
         try:
             contenders[name] = start_rival(stack, environments, folder / "model.onnx", path)
         except NotStarted as error:
@@ -230,13 +212,20 @@ def _start_fastapi(stack: ExitStack, environments: Path, model: Path, path: str)
     return _start_script(stack, python_of("fastapi", environments), "fastapi_app.py", model), path
 
 
-def _start_mlserver(stack: ExitStack, environments: Path, model: Path, _path: str) -> tuple[Address, str]:
-    """MLServer, which runs in the folder of its settings."""
+def _start_triton(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
+    return _start_host(stack, python_of("triton", environments), "triton", model), path
+
+
+def _start_mlserver(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
+    return _start_host(stack, python_of("mlserver", environments), "mlserver", model), path
+
+
+def _start_host(stack: ExitStack, python: Path, host: str, model: Path) -> Address:
+    """Start a server of the folder `serve/deploy` on the models as they stand."""
     address = _local_address()
-    settings = mlserver_folder(_temporary_folder(stack), address[1], model)
-    command = [python_of("mlserver", environments).with_name("mlserver"), "start", settings]
-    stack.enter_context(running(command, address, cwd=settings, env=os.environ | {"PYTHONPATH": str(settings)}))
-    return address, "/v2/models/model/infer"
+    command = [python, DEPLOY / host / "start.py", model.parents[2], "--port", str(address[1])]
+    stack.enter_context(running(command, address))
+    return address
 
 
 def latencies(address: Address, request: bytes, count: int) -> np.ndarray:
