@@ -25,8 +25,8 @@ def ask(
     """Outputs by name for charges of shape (n, electrodes), pC."""
     tensor = triton.InferInput("charge_pC", list(charges.shape), "FP32")
     tensor.set_data_from_numpy(charges, binary_data=False)
-    wanted = [triton.InferRequestedOutput(name, binary_data=False) for name in outputs]
-    answer = client.infer(model, [tensor], outputs=wanted)
+    requested = [triton.InferRequestedOutput(name, binary_data=False) for name in outputs]
+    answer = client.infer(model, [tensor], outputs=requested)
     return {name: answer.as_numpy(name) for name in outputs}
 
 

@@ -33,10 +33,10 @@ def main() -> None:
     parser.add_argument("--port", type=int, default=8000, help="of HTTP")
     parser.add_argument("--grpc-port", type=int, help="of gRPC (default: no gRPC)")
     asked = parser.parse_args()
-    found = importlib.util.find_spec("pytriton")
-    if found is None or found.origin is None:
+    package = importlib.util.find_spec("pytriton")
+    if package is None or package.origin is None:
         sys.exit("this needs pytriton: pip install nvidia-pytriton onnxruntime, in an environment of its own")
-    pytriton = Path(found.origin).parent
+    pytriton = Path(package.origin).parent
     words = [
         str(pytriton / "tritonserver/bin/tritonserver"),
         f"--model-repository={asked.models.resolve()}",
