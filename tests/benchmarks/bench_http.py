@@ -268,6 +268,36 @@ def throughput(address: Address, request: bytes, seconds: float) -> float:
     return answers / (now - begin)
 
 
+def core_seconds(address: Address, path: str, charges: np.ndarray, seconds: float) -> Iterator[dict[str, Any]]:
+    """What one core of our server answers: requests over the processor time that they took, of `/metrics`."""
+    before = _metrics(address)
+    for of in (charges[:1], charges):
+        throughput(address, json_request(path, of), seconds)
+        after = _metrics(address)
+        spent = after["process_cpu_seconds_total"] - before["process_cpu_seconds_total"]
+        model = f'{{model="{path.split("/")[3]}",version="1"}}'
+        answered, presses = (
+            after[f"isocharge_{name}{model}"] - before[f"isocharge_{name}{model}"]
+            for name in ("inference_seconds_count", "presses_total")
+        )
+        yield {
+            "presses": len(of),
+            "cpu_us_per_answer": round(1e6 * spent / answered, 1),
+            "answers_per_core_s": round(answered / spent),
+            "presses_per_core_s": round(presses / spent),
+        }
+        before = after
+
+
+def _metrics(address: Address) -> dict[str, float]:
+    """Samples of `/metrics` by name and labels."""
+    connection = Connection(address)
+    connection.send(b"GET /metrics HTTP/1.1\r\n\r\n")
+    lines = connection.receive().decode().splitlines()
+    connection.close()
+    return {name: float(value) for name, _, value in (of.rpartition(" ") for of in lines if not of.startswith("#"))}
+
+
 def _answer_size(address: Address, request: bytes) -> int:
     """Bytes of a good answer, its headers included."""
     connection = Connection(address)
@@ -360,6 +390,7 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
         switched = _start_script(stack, Path(sys.executable), "counted_app.py", find_model(asked.model) / "model.onnx")
         cost = counting_cost(switched, one["isocharge"][1], 2 * asked.rounds, 10 * (asked.requests // 10))
         tables["one press, what the counters of /metrics cost"] = list(rows(cost, "counters off"))
+        tables["one core of the server"] = list(core_seconds(address, path, charges, asked.seconds))
         # MLServer's queues drain between turns: each contender is measured alone, twice.
         counts = {name: [throughput(*target, asked.seconds) for _ in range(2)] for name, target in one.items()}
     ours = np.mean(counts["isocharge"])
