@@ -95,7 +95,7 @@ def _server(folder: Path) -> Iterator[tuple["HttpLoad | None", str | None]]:
     if find_spec("uvicorn") is None:
         yield None, "HTTP was left out: pip install 'isocharge[http]'"
         return
-    words = [sys.executable, "-m", "isocharge.cli", "serve", "http", "--port", "0", "--models", folder.parents[1]]
+    words = [sys.executable, "-m", "isocharge.cli", "serve", "http", "--port", "0", "--models", str(folder.parents[1])]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None

@@ -138,10 +138,11 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator["Traffic"]:
         yield Traffic()
         return
     with LineQueue(say) as lines:
-        traffic = Traffic(RequestLog(lines.put, secret=token or ""))
-        traffic.lost_lines = lambda: lines.lost
-        logging.basicConfig(level=logging.WARNING, handlers=[traffic.log], force=True)
+        lines_of_json = RequestLog(lines.put, secret=token or "")
+        logging.basicConfig(level=logging.WARNING, handlers=[lines_of_json], force=True)
         logging.captureWarnings(True)
+        traffic = Traffic(lines_of_json)
+        traffic.lost_lines = lambda: lines.lost
         yield traffic
 
 

@@ -52,8 +52,8 @@ class HttpLoad:
             connections: Their number.
             seconds: For so long, s; a tenth of it before that warms up.
         """
-        request, durations = self._request(charge_pC), []
-        began = time.perf_counter_ns()
+        request, began = self._request(charge_pC), time.perf_counter_ns()
+        durations: list[int] = []
         start, end = began + round(1e8 * seconds), began + round(1.1e9 * seconds)
         with selectors.DefaultSelector() as waiting:
             opened = [self._connect() for _ in range(connections)]
