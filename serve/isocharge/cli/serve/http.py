@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from isocharge.cli.serve.options import LogFormat
-from isocharge.cli.shared.standard_streams import announce
+from isocharge.cli.shared.standard_streams import announce, write_stderr
 from isocharge.cli.shared.terminal import say
 from isocharge.errors import InputError
 from isocharge.extras import require
@@ -137,7 +137,7 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator["Traffic"]:
     if log is LogFormat.text:
         yield Traffic()
         return
-    with LineQueue(say) as lines:
+    with LineQueue(write_stderr) as lines:
         lines_of_json = RequestLog(lines.put, secret=token or "")
         logging.basicConfig(level=logging.WARNING, handlers=[lines_of_json], force=True)
         logging.captureWarnings(True)

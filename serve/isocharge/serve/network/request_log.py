@@ -9,7 +9,8 @@ import logging
 import traceback
 from collections.abc import Callable
 from datetime import UTC, datetime
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import orjson
 
@@ -60,24 +61,26 @@ class RequestLog(logging.Handler):
         """
         super().__init__()
         self._write, self._secret = write, secret
-        self._now = now or (lambda: datetime.now(UTC))
+        self._now = now or partial(datetime.now, UTC)
 
     def exchange(self, exchange: Exchange) -> None:
         """Write the line of a request."""
-        client = exchange.client
-        self._line(
-            "error" if exchange.status in (500, "INTERNAL") else "info",
-            event="request",
-            transport=exchange.transport,
-            route=exchange.route,
-            status=exchange.status,
-            model=exchange.model,
-            error=exchange.error,
-            duration_us=exchange.ns / 1000,
-            bytes_in=exchange.bytes_in,
-            bytes_out=exchange.bytes_out,
-            client=client if client is None or isinstance(client, str) else f"{client[0]}:{client[1]}",
-        )
+        transport, route, status, model, error, ns, bytes_in, bytes_out, client = exchange
+        line = {
+            "time": self._now(),
+            "level": "error" if status in (500, "INTERNAL") else "info",
+            "event": "request",
+            "transport": transport,
+            "route": route,
+            "status": status,
+            "model": model,
+            "error": error,
+            "duration_us": ns / 1000,
+            "bytes_in": bytes_in,
+            "bytes_out": bytes_out,
+            "client": "%s:%d" % client if isinstance(client, tuple) else client,  # noqa: UP031 - half the time
+        }
+        self._write(orjson.dumps(line).decode())
 
     def message(self, level: str, event: str, message: str) -> None:
         """Write a line about the server itself."""
@@ -90,9 +93,8 @@ class RequestLog(logging.Handler):
             fields["traceback"] = self._cut("".join(traceback.format_exception(*record.exc_info)))
         self._line(record.levelname.lower(), **fields)
 
-    def _line(self, level: str, **fields: Any) -> None:
-        time = self._now().isoformat(timespec="microseconds")
-        self._write(orjson.dumps({"time": time, "level": level} | fields, default=str).decode())
+    def _line(self, level: str, **fields: str) -> None:
+        self._write(orjson.dumps({"time": self._now(), "level": level} | fields).decode())
 
     def _cut(self, text: str) -> str:
         text = text.encode("utf-8", "replace").decode()
