@@ -7,6 +7,7 @@
 The packages follow the way of a frame; `serve/README.md` shows them.
 """
 
+from isocharge.serve.examination.port_check import Examination, examine
 from isocharge.serve.frames.autodetect import AutoParser
 from isocharge.serve.frames.binary import BinaryParser, encode_frame
 from isocharge.serve.frames.frame import Frame, FrameCounts, Parser
@@ -18,7 +19,6 @@ from isocharge.serve.frames.text_encoder import encode_text
 from isocharge.serve.live.device import Device
 from isocharge.serve.live.device_file import device_from_table, load_device
 from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
-from isocharge.serve.live.port_check import Examination, examine
 from isocharge.serve.live.reading_stream import ReadingStream
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress, SteadyRule
 from isocharge.serve.live.stream import Policy, TouchStream, stream

@@ -117,8 +117,10 @@ def test_built_in_sensor(layout, kind, d31, d32):
 def test_names_of_the_built_in_sensors():
     assert built_in_sensors() == (
         "four-25um-biaxial",
+        "four-25um-biaxial-15mm",
         "four-25um-uniaxial",
         "three-25um-biaxial",
+        "three-25um-biaxial-12mm",
         "three-25um-uniaxial",
     )
 

@@ -24,6 +24,7 @@ with require("train"):
     from isocharge.train.films.release import train_films
     from isocharge.train.release.evaluate import measure_errors
     from isocharge.train.release.release import Release, train_model
+    from isocharge.train.release.student import TaughtScene, distil_model, student_config
     from isocharge.train.rig.train_rig import Rig, train_rig
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
     from isocharge.train.training.fit import Fit, fit_network
@@ -44,10 +45,12 @@ __all__ = [
     "Rig",
     "Scene",
     "SensorFilms",
+    "TaughtScene",
     "TrainingConfig",
     "bayes_estimate",
     "bayes_limit",
     "calibrate",
+    "distil_model",
     "films_for",
     "fit_network",
     "load_config",
@@ -55,6 +58,7 @@ __all__ = [
     "next_presses",
     "read_earlier",
     "read_films",
+    "student_config",
     "train_films",
     "train_model",
     "train_rig",

@@ -1,7 +1,6 @@
 """`isocharge serve stream`: prediction records from a port as they come."""
 
 import signal
-import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -17,6 +16,8 @@ from isocharge.cli.serve.options import (
     OutputOption,
     PolicyName,
     UdpOption,
+    WaitOption,
+    awaited,
 )
 from isocharge.cli.serve.record_output import LATENCIES, record_writer, summary, write_records
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
@@ -36,7 +37,7 @@ def stream_command(
         typer.Option(
             "--port",
             metavar="URL",
-            help="Port of the sensor: device path or pyserial URL; or a file of bytes; - reads stdin.",
+            help="Port of the sensor: device path, tcp:// or udp://HOST:PORT; or a file of bytes; - reads stdin.",
         ),
     ],
     models: ModelsOption = None,
@@ -67,9 +68,7 @@ def stream_command(
     count: Annotated[
         int | None, typer.Option("--count", min=1, help="Number of records after which to stop. (default: at Ctrl-C)")
     ] = None,
-    wait: Annotated[
-        float, typer.Option("--wait", min=0.0, max=3600.0, help="Time to wait until the port exists, s.")
-    ] = 0.0,
+    wait: WaitOption = 0.0,
     baud: Annotated[
         int, typer.Option("--baud", min=1, help="Speed of the port, bits per second; USB ports ignore it.")
     ] = 115200,
@@ -102,7 +101,8 @@ def stream_command(
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         stack.enter_context(log_to_stderr())
-        source = stack.enter_context(open_source(_awaited(port, wait), baud=baud, reconnect=reconnect))
+        request = board.frames.request
+        source = stack.enter_context(open_source(awaited(port, wait), baud=baud, reconnect=reconnect, request=request))
         stack.enter_context(_tare_on_signal(live))
         stack.enter_context(_alarm(seconds))
         lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
@@ -126,14 +126,6 @@ def _board(device: Path | None, offset_limit_pC: float | None) -> "Device":
 
     board = board_of(device)
     return board if offset_limit_pC is None else with_offset_limit(board, offset_limit_pC)
-
-
-def _awaited(port: str, wait: float) -> str:
-    """The port, as soon as there is something under its path, or when the time is over."""
-    end = time.monotonic() + wait
-    while "://" not in port and port != "-" and not Path(port).exists() and time.monotonic() < end:
-        time.sleep(0.05)
-    return port
 
 
 @contextmanager
