@@ -1,17 +1,17 @@
-"""HTTP: ours against a bare route, an idiomatic FastAPI service and MLServer, tuned; all serve the same model file.
+"""HTTP: ours against a bare route, an idiomatic FastAPI service, Triton and MLServer; all serve the same model file.
 
     python tests/benchmarks/bench_http.py [--environments DIR] [--rounds 12] [--requests 400] [--seconds 4] [--json]
 
-FastAPI and MLServer get environments of their own in `--environments`, made once; one that cannot be installed or does
-not start is left out, and stderr says why. Client and servers share the cores; the client is a plain socket, the same
-for all. Latency: one request at a time over one open connection, contenders take
-turns within each round. Throughput: 32 connections, each with one request under way. Ratios come from the same rounds.
-A batch of 1024 is measured twice: bytes on a socket, and arrays in and out of Triton's stock client.
+FastAPI, Triton and MLServer get environments of their own in `--environments`, made once; one that cannot be installed
+or does not start is left out, and stderr says why. Client and servers share the cores; the client is a plain socket,
+the same for all. Latency: one request at a time over one open connection, contenders take turns within each round.
+Throughput: 32 connections, each with one request under way. Ratios come from the same rounds. A batch of 1024 is
+measured twice: bytes on a socket, and arrays in and out of Triton's stock client. Triton runs the model in Python, as
+its wheel has no backend for ONNX.
 """
 
 import argparse
 import json
-import os
 import select
 import signal
 import socket
@@ -33,7 +33,12 @@ from isocharge.serve import find_model, load_model
 from isocharge.serve.model.session import OUTPUTS
 
 HERE = Path(__file__).parent
-PACKAGES = {"fastapi": ["fastapi", "uvicorn[standard]", "onnxruntime"], "mlserver": ["mlserver", "onnxruntime"]}
+DEPLOY = HERE.parents[1] / "serve" / "deploy"
+PACKAGES = {
+    "fastapi": ["fastapi", "uvicorn[standard]", "onnxruntime"],
+    "triton": ["nvidia-pytriton", "onnxruntime"],
+    "mlserver": ["mlserver", "onnxruntime"],
+}
 CONNECTIONS = 32
 
 Address = tuple[str, int] | str
@@ -132,29 +137,6 @@ def python_of(name: str, environments: Path) -> Path:
     return folder / "bin/python"
 
 
-def mlserver_folder(folder: Path, port: int, model: Path) -> Path:
-    """Settings of MLServer, tuned: no worker processes, no metrics, no access log, no other protocols."""
-    settings = {
-        "host": "127.0.0.1",
-        "http_port": port,
-        "grpc_port": free_port(),
-        "metrics_endpoint": None,
-        "parallel_workers": 0,
-        "debug": False,
-        "use_structured_logging": False,
-        "logging_settings": None,
-    }
-    runtime = {
-        "name": "model",
-        "implementation": "mlserver_runtime.Runtime",
-        "parameters": {"uri": str(model), "version": "1"},
-    }
-    (folder / "settings.json").write_text(json.dumps(settings))
-    (folder / "model-settings.json").write_text(json.dumps(runtime))
-    (folder / "mlserver_runtime.py").write_text((HERE / "rivals/mlserver_runtime.py").read_text())
-    return folder
-
-
 @contextmanager
 def running(command: list[str | Path], address: Address, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """A server process, from its first accepted connection to the end of the block.
@@ -202,8 +184,8 @@ def start(stack: ExitStack, model: str, environments: Path | None) -> Contenders
     stack.enter_context(running([*ours, "--uds", uds], uds))
     bare = _start_script(stack, Path(sys.executable), "bare_app.py", folder / "model.onnx")
     contenders = {"isocharge": (tcp, path), "isocharge, Unix socket": (uds, path), "bare route": (bare, path)}
-    rivals = {"FastAPI": _start_fastapi, "MLServer tuned": _start_mlserver} if environments else {}
-    for name, start_rival in rivals.items():
+    rivals = {"FastAPI": _start_fastapi, "Triton": _start_triton, "MLServer tuned": _start_mlserver}
+    for name, start_rival in rivals.items() if environments else ():
         try:
             contenders[name] = start_rival(stack, environments, folder / "model.onnx", path)
         except NotStarted as error:
@@ -230,13 +212,20 @@ def _start_fastapi(stack: ExitStack, environments: Path, model: Path, path: str)
     return _start_script(stack, python_of("fastapi", environments), "fastapi_app.py", model), path
 
 
-def _start_mlserver(stack: ExitStack, environments: Path, model: Path, _path: str) -> tuple[Address, str]:
-    """MLServer, which runs in the folder of its settings."""
+def _start_triton(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
+    return _start_host(stack, python_of("triton", environments), "triton", model), path
+
+
+def _start_mlserver(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
+    return _start_host(stack, python_of("mlserver", environments), "mlserver", model), path
+
+
+def _start_host(stack: ExitStack, python: Path, host: str, model: Path) -> Address:
+    """Start a server of the folder `serve/deploy` on the models as they stand."""
     address = _local_address()
-    settings = mlserver_folder(_temporary_folder(stack), address[1], model)
-    command = [python_of("mlserver", environments).with_name("mlserver"), "start", settings]
-    stack.enter_context(running(command, address, cwd=settings, env=os.environ | {"PYTHONPATH": str(settings)}))
-    return address, "/v2/models/model/infer"
+    command = [python, DEPLOY / host / "start.py", model.parents[2], "--port", str(address[1])]
+    stack.enter_context(running(command, address))
+    return address
 
 
 def latencies(address: Address, request: bytes, count: int) -> np.ndarray:
@@ -279,6 +268,36 @@ def throughput(address: Address, request: bytes, seconds: float) -> float:
     return answers / (now - begin)
 
 
+def core_seconds(address: Address, path: str, charges: np.ndarray, seconds: float) -> Iterator[dict[str, Any]]:
+    """What one core of our server answers: requests over the processor time that they took, of `/metrics`."""
+    before = _metrics(address)
+    for of in (charges[:1], charges):
+        throughput(address, json_request(path, of), seconds)
+        after = _metrics(address)
+        spent = after["process_cpu_seconds_total"] - before["process_cpu_seconds_total"]
+        model = f'{{model="{path.split("/")[3]}",version="1"}}'
+        answered, presses = (
+            after[f"isocharge_{name}{model}"] - before[f"isocharge_{name}{model}"]
+            for name in ("inference_seconds_count", "presses_total")
+        )
+        yield {
+            "presses": len(of),
+            "cpu_us_per_answer": round(1e6 * spent / answered, 1),
+            "answers_per_core_s": round(answered / spent),
+            "presses_per_core_s": round(presses / spent),
+        }
+        before = after
+
+
+def _metrics(address: Address) -> dict[str, float]:
+    """Samples of `/metrics` by name and labels."""
+    connection = Connection(address)
+    connection.send(b"GET /metrics HTTP/1.1\r\n\r\n")
+    lines = connection.receive().decode().splitlines()
+    connection.close()
+    return {name: float(value) for name, _, value in (of.rpartition(" ") for of in lines if not of.startswith("#"))}
+
+
 def _answer_size(address: Address, request: bytes) -> int:
     """Bytes of a good answer, its headers included."""
     connection = Connection(address)
@@ -315,6 +334,26 @@ def rows(durations: dict[str, np.ndarray], against: str) -> Iterator[dict[str, A
         }
 
 
+def counting_cost(address: Address, request: bytes, rounds: int, number: int) -> dict[str, np.ndarray]:
+    """Durations with the counters of `/metrics` and without, shape (rounds, number), us: one process, one connection.
+
+    The two take turns ten requests at a time; the first round only warms up.
+    """
+    connection, clock = Connection(address), time.perf_counter_ns
+    durations = {"off": np.empty((rounds + 1, number)), "on": np.empty((rounds + 1, number))}
+    for i in range((rounds + 1) * number // 10):
+        for switch in ("off", "on") if i % 2 else ("on", "off"):
+            connection.send(http_request(f"/counting/{switch}", b""))
+            connection.receive()
+            for j in range(10 * i, 10 * i + 10):
+                begin = clock()
+                connection.send(request)
+                connection.receive()
+                durations[switch].flat[j] = clock() - begin
+    connection.close()
+    return {f"counters {switch}": of[1:] / 1e3 for switch, of in durations.items()}
+
+
 def stock_client(address: tuple[str, int], name: str, charges: np.ndarray, count: int) -> dict[str, np.ndarray]:
     """Arrays in, arrays out through Triton's HTTP client, shape (1, count), us: its own coding included."""
     client = tritonclient.http.InferenceServerClient(f"{address[0]}:{address[1]}")
@@ -348,6 +387,10 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
                 rows(stock_client(address, path.split("/")[3], charges, asked.requests // 4), "JSON")
             ),
         }
+        switched = _start_script(stack, Path(sys.executable), "counted_app.py", find_model(asked.model) / "model.onnx")
+        cost = counting_cost(switched, one["isocharge"][1], 2 * asked.rounds, 10 * (asked.requests // 10))
+        tables["one press, what the counters of /metrics cost"] = list(rows(cost, "counters off"))
+        tables["one core of the server"] = list(core_seconds(address, path, charges, asked.seconds))
         # MLServer's queues drain between turns: each contender is measured alone, twice.
         counts = {name: [throughput(*target, asked.seconds) for _ in range(2)] for name, target in one.items()}
     ours = np.mean(counts["isocharge"])

@@ -7,35 +7,15 @@ The bare session has the same options as ours (one thread, no spinning) and gets
 
 import argparse
 import json
-import os
-import platform
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 
 from isocharge.serve import Predictor, find_model
+from isocharge.serve.benchmark import machine
 from isocharge.serve.model.session import open_session
-
-
-def machine() -> dict[str, str]:
-    """Where a figure was measured."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    cpu = next(
-        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor()
-    )
-    return {
-        "cpu": cpu,
-        "cores": str(os.cpu_count()),
-        "system": platform.platform(),
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "onnxruntime": ort.__version__,
-    }
 
 
 def microseconds(call: Callable[[], object], calls: int) -> np.ndarray:

@@ -76,7 +76,7 @@ def test_an_example_does_what_it_says(page_example, desks, installed, start_http
 
 def check_commands(example, folder, printed):
     """What the commands of some examples must have printed."""
-    if "curl" in example:
+    if "/infer" in example:
         outputs = json.loads(printed[printed.index("{") :])["outputs"]
         assert outputs[0]["data"] == pytest.approx([3.0, -2.0, 1.0], abs=0.02)
     if "serve check" in example:

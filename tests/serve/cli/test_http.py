@@ -142,3 +142,50 @@ def test_the_token_may_come_from_the_environment(start, monkeypatch):
     monkeypatch.setitem(os.environ, "ISOCHARGE_TOKEN", "open sesame")
     process = start("--port", 0)
     assert ask(process.stdout.readline().strip())[0] == 401
+
+
+def test_the_log_in_json_is_json_line_by_line(film, start, tmp_path, monkeypatch):
+    """From the first line to the last, with a refused model, a stream of requests, and a token that it never says."""
+    monkeypatch.setitem(os.environ, "ISOCHARGE_TOKEN", "open sesame")
+    film.write(tmp_path)
+    film.write(tmp_path, version=2)
+    (tmp_path / "linear/2/golden.json").unlink()
+    process = start("--port", 0, "--grpc-port", 0, "--log", "json", folder=tmp_path)
+    url, grpc_url = process.stdout.readline().strip(), process.stdout.readline()
+    for path in ("/v2/models/linear/infer", "/open%20sesame", "/v2/health/ready?token=open%20sesame"):
+        ask(url, "GET" if "health" in path else "POST", path)
+    process.terminate()
+    err = process.communicate(timeout=20)[1]
+    assert grpc_url.startswith("grpc://")
+    lines = [json.loads(line) for line in err.splitlines()]
+    assert [line["event"] for line in lines] == ["refused", "serving", "request", "request", "request"]
+    assert [line.get("status") for line in lines[2:]] == [401, 401, 200]
+    assert "golden.json: missing" in lines[0]["message"]
+    assert lines[1]["message"] == "linear/1"
+    assert "sesame" not in err
+
+
+def test_a_log_that_nobody_reads_holds_up_no_request(start):
+    """The pipe of stderr takes some 64 KiB; then lines wait, and are not waited for."""
+    process = start("--port", 0, "--log", "json")
+    address = process.stdout.readline().strip().removeprefix("http://")
+    client = http.client.HTTPConnection(address, timeout=20)
+    for _ in range(1500):
+        client.request("POST", "/v2/models/linear/infer", BODY)
+        answer = client.getresponse()
+        assert answer.status == 200
+        answer.read()
+    client.request("GET", "/metrics")
+    assert b"isocharge_log_lines_lost_total 0.0" in client.getresponse().read()  # 10,000 may wait
+    client.close()
+    process.terminate()
+    assert process.wait(timeout=20) == 0
+
+
+def test_a_log_whose_reader_went_away_ends_no_server(start):
+    process = start("--port", 0, "--log", "json")
+    url = process.stdout.readline().strip()
+    process.stderr.close()
+    assert [ask(url)[0] for _ in range(5)] == [200] * 5
+    process.terminate()
+    assert process.wait(timeout=20) == 0

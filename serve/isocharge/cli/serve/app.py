@@ -2,6 +2,7 @@
 
 import typer
 
+from isocharge.cli.serve.bench import bench_command
 from isocharge.cli.serve.check import check_command
 from isocharge.cli.serve.doctor import doctor_command
 from isocharge.cli.serve.http import http_command
@@ -25,3 +26,4 @@ serve_app.command("plot")(plot_command)
 serve_app.command("doctor")(doctor_command)
 serve_app.command("virtual")(virtual_command)
 serve_app.command("http")(http_command)
+serve_app.command("bench")(bench_command)

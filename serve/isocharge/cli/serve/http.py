@@ -1,13 +1,16 @@
 """`isocharge serve http`: the models over HTTP, and over gRPC too if a port is given."""
 
+import logging
 import os
-from contextlib import AbstractContextManager, closing, nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.cli.shared.standard_streams import announce
+from isocharge.cli.serve.options import LogFormat
+from isocharge.cli.shared.standard_streams import announce, write_stderr
 from isocharge.cli.shared.terminal import say
 from isocharge.errors import InputError
 from isocharge.extras import require
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
     from isocharge.serve.network.protocol import Handler
     from isocharge.serve.network.tls import Tls
     from isocharge.serve.network.token import Token
+    from isocharge.serve.network.traffic import Traffic
 
 
 def http_command(
@@ -74,11 +78,15 @@ def http_command(
     header_s: Annotated[
         float, typer.Option("--header-s", min=0.1, help="Longest time for the headers of a request, s.")
     ] = HEADER_SECONDS,
+    log: Annotated[
+        LogFormat,
+        typer.Option("--log", help="On stderr: sentences for people, or a line of JSON for each request and message."),
+    ] = LogFormat.text,
 ) -> None:
     """Serve models over HTTP, and over gRPC if asked, with the Open Inference Protocol v2 of Triton and KServe.
 
     Charges are in pC, positions in mm, forces in N. Prints the address once the server answers; `/` there is a page for
-    people, `/openapi.json` for programs. Ctrl-C stops it after the requests that have begun.
+    people, `/openapi.json` for programs, `/metrics` for Prometheus. Ctrl-C stops it after the requests that have begun.
 
     Example: isocharge serve http --port 8000
     """
@@ -106,16 +114,44 @@ def http_command(
     )
     secret = None if token is None else Token(token)
     tls = None if tls_cert is None else Tls(tls_cert, tls_key)
-    store = open_model_store(models)
-    for reason in store.refusals():
-        say(f"refused: {reason}")
-    handler = Handler(store, limits)
-    server = HttpServer(App(handler, secret), address, limits=limits, tls=tls)
-    with suppress(KeyboardInterrupt), closing(server), _grpc(handler, host, grpc_port, secret, tls) as grpc_url:
-        say("serving " + ", ".join(served.metadata.label for served in store.all()) + "; Ctrl-C stops")
-        for url in filter(None, (server.url, grpc_url)):
-            announce(url)
-        server.run()
+    with suppress(KeyboardInterrupt), _traffic(log, token) as traffic:
+        store = open_model_store(models)
+        for reason in store.refusals():
+            _tell(traffic, "warning", "refused", reason)
+        handler = Handler(store, limits, traffic)
+        server = HttpServer(App(handler, secret), address, limits=limits, tls=tls)
+        with closing(server), _grpc(handler, host, grpc_port, secret, tls) as grpc_url:
+            _tell(traffic, "info", "serving", ", ".join(served.metadata.label for served in store.all()))
+            for url in filter(None, (server.url, grpc_url)):
+                announce(url)
+            server.run()
+
+
+@contextmanager
+def _traffic(log: LogFormat, token: str | None) -> Iterator["Traffic"]:
+    """The counters of the servers, and their log on stderr; no request waits for whoever reads it."""
+    from isocharge.serve.live.line_queue import LineQueue
+    from isocharge.serve.network.request_log import RequestLog
+    from isocharge.serve.network.traffic import Traffic
+
+    if log is LogFormat.text:
+        yield Traffic()
+        return
+    with LineQueue(write_stderr) as lines:
+        lines_of_json = RequestLog(lines.put, secret=token or "")
+        logging.basicConfig(level=logging.WARNING, handlers=[lines_of_json], force=True)
+        logging.captureWarnings(True)
+        traffic = Traffic(lines_of_json)
+        traffic.lost_lines = lambda: lines.lost
+        yield traffic
+
+
+def _tell(traffic: "Traffic", level: str, event: str, message: str) -> None:
+    """Say something about the server: a line of the log, or a sentence for people."""
+    if traffic.log is None:
+        say({"refused": f"refused: {message}", "serving": f"serving {message}; Ctrl-C stops"}[event])
+    else:
+        traffic.log.message(level, event, message)
 
 
 def _grpc(

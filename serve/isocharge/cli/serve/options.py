@@ -36,6 +36,13 @@ class PolicyName(StrEnum):
     latest = "latest"
 
 
+class LogFormat(StrEnum):
+    """What a server writes on stderr."""
+
+    text = "text"
+    json = "json"
+
+
 OutputOption = Annotated[
     Output, typer.Option("--output", help="Records on stdout: a line of JSON each, CSV with a header, or none.")
 ]

@@ -65,6 +65,14 @@ def stdout_writer() -> Callable[[str], None]:
     return lambda text: _write_all(descriptor, text.encode())
 
 
+def write_stderr(line: str) -> None:
+    """Write a line to stderr at once; if that is full or gone, the command goes on without."""
+    try:
+        _write_all(2, f"{line}\n".encode())
+    except OSError:
+        forget(2)
+
+
 def stdout_is_ready() -> bool:
     """Whether stdout would take a line without waiting, after a tenth of a second at most.
 

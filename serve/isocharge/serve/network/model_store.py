@@ -10,6 +10,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 
@@ -19,6 +20,7 @@ from isocharge.serve.model.model_folder import Model, check_golden, load_model
 from isocharge.serve.model.repository import model_names, repositories, version_folders
 from isocharge.serve.network.statistics import Statistics
 from isocharge.serve.prediction.bound_press import BoundPress
+from isocharge.serve.prediction.validity import Domain
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +37,11 @@ class LoadedVersion:
     version: str
     statistics: Statistics = field(default_factory=Statistics)
     _of_thread: threading.local = field(default_factory=threading.local, repr=False)
+
+    @cached_property
+    def misfit_limit(self) -> float:
+        """Misfit above which a press has the flag `misfit`, in standard deviations."""
+        return Domain.of(self.metadata).misfit_limit
 
     def press(self) -> BoundPress:
         """Bound memory for one press; each thread has its own."""
@@ -56,6 +63,9 @@ class ModelVersions:
     def latest(self) -> LoadedVersion | None:
         """The highest version that serves."""
         return self.versions[max(self.versions)] if self.versions else None
+
+
+NO_VERSIONS = ModelVersions({}, {})
 
 
 @dataclass(frozen=True)
@@ -82,10 +92,11 @@ class ModelStore:
         """
         self._folders = folders
         self._turn = threading.Lock()
+        self._statistics: dict[tuple[str, int], Statistics] = {}
         self._entries: dict[str, ModelVersions] = {}
         self._answering: dict[tuple[str, str], LoadedVersion] = {}
         for name, folder in folders().items():
-            self._put(name, _load_versions(name, folder, {}))
+            self._put(name, self._load_versions(name, folder, {}))
         if not self._answering:
             raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'no model was found'}")
 
@@ -97,10 +108,21 @@ class ModelStore:
         """
         loaded = self._answering.get((name, version))
         if loaded is None:
-            label = f"{name}/{version}" if version else name
-            serving = ", ".join(sorted(s.metadata.label for s in self.all())) or "no model"
-            raise ModelNotFound(f"model {label!r:.200} is not found; serving: {serving}")
+            raise ModelNotFound(self._why_not(name, version))
         return loaded
+
+    def label(self, name: str, version: str = "") -> str | None:
+        """`name/version` of the model that would answer, None if none does."""
+        loaded = self._answering.get((name, version))
+        return None if loaded is None else loaded.metadata.label
+
+    def _why_not(self, name: str, version: str) -> str:
+        """Why a model does not serve, and what does."""
+        entry = self._entries.get(name, NO_VERSIONS)
+        reasons = dict.fromkeys(reason for v, reason in sorted(entry.refused.items()) if version in ("", str(v)))
+        label = f"{name}/{version}" if version else name
+        serving = ", ".join(sorted(loaded.metadata.label for loaded in self.all())) or "no model"
+        return "; ".join([f"model {label!r:.200} is not found", f"serving: {serving}", *reasons])
 
     def all(self) -> list[LoadedVersion]:
         """Every version that serves, by name and version."""
@@ -123,11 +145,33 @@ class ModelStore:
         """Why files were refused, a sentence for each version."""
         return [reason for _, entry in sorted(self._entries.items()) for _, reason in sorted(entry.refused.items())]
 
+    def unready(self, *, full: bool) -> str:
+        """Why the server is not ready, in a sentence; empty if it is.
+
+        Args:
+            full: With the reason for each version, which names files; without, only how many there are.
+        """
+        if self.all():
+            return ""
+        rows = self.known()
+        if full:
+            return "no model is loaded" + "".join(f"; {row.name}/{row.version}: {row.reason}" for row in rows)
+        refused = sum(row.reason != UNLOADED for row in rows)
+        return f"no model is loaded (versions refused: {refused}, unloaded: {len(rows) - refused})"
+
+    def known(self) -> list[IndexRow]:
+        """Every version that serves or was refused."""
+        return [row for name, entry in sorted(self._entries.items()) for row in _rows(name, entry)]
+
     def index(self) -> list[IndexRow]:
         """Every version that serves or was refused, and models that nobody has loaded."""
-        entries = dict(self._entries)
-        rows = [row for name, entry in sorted(entries.items()) for row in _rows(name, entry)]
-        return rows + [IndexRow(name, "", "UNAVAILABLE", "") for name in self._folders() if name not in entries]
+        entries = self._entries
+        return self.known() + [IndexRow(n, "", "UNAVAILABLE", "") for n in self._folders() if n not in entries]
+
+    def counters(self) -> dict[tuple[str, str], Statistics]:
+        """Counters of every version that has ever served, by name and version, as they are now."""
+        counters = sorted(dict(self._statistics).items())
+        return {(name, str(version)): statistics.snapshot() for (name, version), statistics in counters}
 
     def load(self, name: str) -> None:
         """Read a model's files again and put all its versions in place of the old ones.
@@ -141,7 +185,7 @@ class ModelStore:
             if folder is None:
                 raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
             known = self._entries.get(name)
-            entry = _load_versions(name, folder, known.versions if known else {})
+            entry = self._load_versions(name, folder, known.versions if known else {})
             self._put(name, entry)
         if entry.refused:
             raise ModelError("; ".join(reason for _, reason in sorted(entry.refused.items())))
@@ -156,6 +200,22 @@ class ModelStore:
             self.get(name)
             versions = self._entries[name].versions
             self._put(name, ModelVersions({}, dict.fromkeys(versions, UNLOADED)))
+
+    def _load_versions(self, name: str, folder: Path, old: Mapping[int, LoadedVersion]) -> ModelVersions:
+        """Load every version; in place of a refused one, the old one stays."""
+        versions, refused = {}, {}
+        for version, path in version_folders(folder).items():
+            try:
+                versions[version] = _load_version(name, version, path, self._statistics_of(name, version))
+            except Exception as error:  # a folder may be broken in any way, and must take no other model with it
+                refused[version] = _reason(path, error)
+                if version in old:
+                    versions[version] = old[version]
+        return ModelVersions(versions, refused)
+
+    def _statistics_of(self, name: str, version: int) -> Statistics:
+        """The counters of a version; they go on when its files are loaded again, as a counter never falls."""
+        return self._statistics.setdefault((name, version), Statistics())
 
     def _put(self, name: str, entry: ModelVersions) -> None:
         """Change what serves in two assignments, so that a reader sees each change whole."""
@@ -180,19 +240,6 @@ def open_model_store(models: Path | None = None) -> ModelStore:
     return ModelStore(lambda: MappingProxyType({n: root / n for root in reversed(roots) for n in model_names(root)}))
 
 
-def _load_versions(name: str, folder: Path, old: Mapping[int, LoadedVersion]) -> ModelVersions:
-    """Load every version; in place of a refused one, the old one stays."""
-    versions, refused = {}, {}
-    for version, path in version_folders(folder).items():
-        try:
-            versions[version] = _load_version(name, version, path)
-        except Exception as error:  # a folder may be broken in any way, and must take no other model with it
-            refused[version] = _reason(path, error)
-            if version in old:
-                versions[version] = old[version]
-    return ModelVersions(versions, refused)
-
-
 def _reason(folder: Path, error: Exception) -> str:
     """Why a version is refused; an error that isocharge did not raise on purpose goes into the log, too."""
     if isinstance(error, ModelError):
@@ -201,7 +248,7 @@ def _reason(folder: Path, error: Exception) -> str:
     return f"{folder}: cannot be checked ({type(error).__name__}); copy or export the model again"
 
 
-def _load_version(name: str, version: int, folder: Path) -> LoadedVersion:
+def _load_version(name: str, version: int, folder: Path, statistics: Statistics) -> LoadedVersion:
     model = load_model(folder)
     if (model.metadata.name, model.metadata.version) != (name, version):
         raise ModelError(
@@ -209,7 +256,7 @@ def _load_version(name: str, version: int, folder: Path) -> LoadedVersion:
             "move it into folders of that name and version"
         )
     check_golden(model)
-    return LoadedVersion(model, model.metadata, str(version))
+    return LoadedVersion(model, model.metadata, str(version), statistics)
 
 
 def _rows(name: str, entry: ModelVersions) -> list[IndexRow]:

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import secrets
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -12,6 +13,7 @@ from isocharge.serve.network.http.answerer import Message, Receive, Send
 from isocharge.serve.network.protocol import Response
 from isocharge.serve.network.protocol.handler import Headers
 from isocharge.serve.network.protocol.response import error_response, json_response
+from isocharge.serve.network.request_log import Client
 from isocharge.serve.viewer.access import PROTOCOL, Access
 from isocharge.serve.viewer.hub import Hub, Viewer
 from isocharge.serve.viewer.messages import confirmed_number, parse_request
@@ -44,7 +46,13 @@ class PageApp:
         """Whether a path is that of the samples."""
         return path == LIVE
 
-    def answer(self, method: str, path: str, headers: Headers, _body: bytes) -> Response:
+    def watch_connections(self, _count: Callable[[], int]) -> None:
+        """Nobody counts them: the page has no metrics."""
+
+    def refused(self, _response: Response, _client: Client = None) -> None:
+        """Nobody takes note: the page has no log of requests."""
+
+    def answer(self, method: str, path: str, headers: Headers, _body: bytes, _client: Client = None) -> Response:
         """A file of the page, which everybody may have, or the description of the films."""
         try:
             if path != SESSION and path not in self._files:

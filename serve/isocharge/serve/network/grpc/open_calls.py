@@ -19,6 +19,10 @@ class OpenCalls:
         self._most, self._open = most, 0
         self._waiting: dict[asyncio.Timeout, None] = {}  # in the order in which they began to wait
 
+    def __len__(self) -> int:
+        """The number of open calls."""
+        return self._open
+
     @contextmanager
     def one_more(self) -> Iterator[None]:
         """A place for a call.

@@ -5,6 +5,7 @@ from typing import Any, Protocol
 
 from isocharge.serve.network.protocol import Response
 from isocharge.serve.network.protocol.handler import Headers
+from isocharge.serve.network.request_log import Client
 
 Message = MutableMapping[str, Any]
 
@@ -23,8 +24,14 @@ class Answerer(Protocol):
     def has_websocket(self, path: str) -> bool:
         """Whether there is a WebSocket under a path."""
 
-    def answer(self, method: str, path: str, headers: Headers, body: bytes) -> Response:
+    def watch_connections(self, count: Callable[[], int]) -> None:
+        """Take what tells the number of open connections."""
+
+    def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
         """Answer one request."""
+
+    def refused(self, response: Response, client: Client = None) -> None:
+        """Take note of a refusal of the server's own: the request could not be read to its end."""
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         """As ASGI."""

@@ -1,12 +1,15 @@
 """The protocol's handler as an ASGI application: reads a bounded body, checks the token, sends one answer."""
 
 import asyncio
+import time
+from collections.abc import Callable
 
 from isocharge.errors import TokenError, TooLarge
 from isocharge.serve.network.http.answerer import Message, Receive, Send
 from isocharge.serve.network.protocol import Handler, Response
 from isocharge.serve.network.protocol.handler import Headers
 from isocharge.serve.network.protocol.response import error_response
+from isocharge.serve.network.request_log import Client, Exchange
 from isocharge.serve.network.token import Token
 
 OPEN = ("/v2/health/live", "/v2/health/ready")
@@ -18,25 +21,63 @@ class App:
 
     def __init__(self, handler: Handler, token: Token | None = None) -> None:
         """Without a token, everybody is answered."""
-        self._handler, self._token = handler, token
+        self.handler, self._token = handler, token
         self.blocks = handler.blocks
 
     def has_websocket(self, _path: str) -> bool:
         """There is none."""
         return False
 
-    def answer(self, method: str, path: str, headers: Headers, body: bytes) -> Response:
-        """Answer one request, as `Handler.answer` does, if it carries the token."""
-        if self._token is not None and path not in OPEN:
-            try:
-                self._token.check(dict(headers).get(b"authorization", b""))
-            except TokenError as error:
-                return error_response(error)
-        return self._handler.answer(method, path, headers, body)
+    def watch_connections(self, count: Callable[[], int]) -> None:
+        """Read the number of open connections for the metrics."""
+        self.handler.traffic.open["http"] = count
+
+    def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
+        """Answer one request, as `Handler.answer` does, if it carries the token; log it."""
+        if self.handler.traffic.log is not None:
+            return self._answer_logged(method, path, headers, body, client)
+        if self._token is not None:
+            return self._answer_to_token(self._token, method, path, headers, body)
+        return self.handler.answer(method, path, headers, body)
+
+    def refused(self, response: Response, client: Client = None) -> None:
+        """Count and log a refusal that did not come from here, as the request could not be read to its end."""
+        self.handler.traffic.count("http", "none", response.status)
+        self._log(None, response, 0, 0, client)
+
+    def _answer_to_token(self, token: Token, method: str, path: str, headers: Headers, body: bytes) -> Response:
+        try:
+            token.check(dict(headers).get(b"authorization", b""))
+        except TokenError as error:
+            if path in OPEN:
+                return self.handler.answer(method, path, headers, body, trusted=False)
+            response = error_response(error)
+            self.handler.traffic.count("http", self.handler.label(path), response.status)
+            return response
+        return self.handler.answer(method, path, headers, body)
+
+    def _answer_logged(self, method: str, path: str, headers: Headers, body: bytes, client: Client) -> Response:
+        began = time.perf_counter_ns()
+        if self._token is None:
+            response = self.handler.answer(method, path, headers, body)
+        else:
+            response = self._answer_to_token(self._token, method, path, headers, body)
+        self._log(path, response, time.perf_counter_ns() - began, len(body), client)
+        return response
+
+    def _log(self, path: str | None, response: Response, ns: int, bytes_in: int, client: Client) -> None:
+        """Write a request into the log, if there is one; without a path it could not be read."""
+        log, sizes = self.handler.traffic.log, (bytes_in, len(response.body))
+        if log is None:
+            return
+        route, model = ("none", None) if path is None else (self.handler.label(path), self.handler.model_label(path))
+        error: str | None = getattr(response, "error", None)
+        log.exchange(Exchange("http", route, response.status, model, error, ns, *sizes, client))
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         """Answer one request, in another thread if that may take long."""
         message = await receive()
+        client = scope.get("client")
         try:
             body = await self._whole_body(message, receive) if message.get("more_body") else message.get("body", b"")
         except ConnectionResetError:
@@ -44,8 +85,9 @@ class App:
         except TooLarge as error:  # the rest of the body is still on its way: no further request can follow it
             response = error_response(error)
             response.headers.append((b"connection", b"close"))
+            self.refused(response, client)
         else:
-            request = scope["method"], scope["path"], scope["headers"], body
+            request = scope["method"], scope["path"], scope["headers"], body, client
             slow = self.blocks(scope["path"])
             response = await asyncio.to_thread(self.answer, *request) if slow else self.answer(*request)
         await send({"type": "http.response.start", "status": response.status, "headers": response.headers})
@@ -55,7 +97,7 @@ class App:
         """A body that comes in pieces, bounded as it grows."""
         body = bytearray(message["body"])
         while message.get("more_body"):
-            self._handler.limits.check_body(len(body))
+            self.handler.limits.check_body(len(body))
             message = await receive()
             if message["type"] == "http.disconnect":
                 raise ConnectionResetError

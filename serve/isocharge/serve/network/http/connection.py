@@ -231,7 +231,8 @@ class BoundedProtocol(HttpToolsProtocol):
             self._answer_as_asgi()
         else:
             method = self.parser.get_method().decode("latin-1")
-            self._write(self.direct.answer(method, path, self.headers, bytes(self._body)), with_body=method != "HEAD")
+            response = self.direct.answer(method, path, self.headers, bytes(self._body), self.client)
+            self._write(response, with_body=method != "HEAD")
             self._wait_for_request()
 
     def on_response_complete(self) -> None:
@@ -325,6 +326,7 @@ class BoundedProtocol(HttpToolsProtocol):
             return
         self._is_refused = True
         self._unparsed.clear()
+        self.direct.refused(response, self.client)
         self.transport.write(_text_of(response, is_last=True))
         if self.transport.can_write_eof():
             self.transport.write_eof()

@@ -87,6 +87,7 @@ class HttpServer:
             timeout_graceful_shutdown=GRACE_SECONDS,
         )
         self._server, self._address = _Uvicorn(config, limits, context), address
+        app.watch_connections(lambda: len(self._server.server_state.connections))
         self._socket = address.listen(BACKLOG)
         self._file = address.file()
         self.url = address.url(self._socket, secure=tls is not None)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from isocharge.errors import ModelError, RequestError, UnknownPath, WrongMethod
 from isocharge.serve.network.limits import ServerLimits
+from isocharge.serve.network.metrics import CONTENT_TYPE, Metrics
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol import describe
 from isocharge.serve.network.protocol.answer import write_answer
@@ -19,6 +20,7 @@ from isocharge.serve.network.protocol.openapi import openapi
 from isocharge.serve.network.protocol.page import PAGE_HEADERS, page
 from isocharge.serve.network.protocol.request import read_infer, read_object
 from isocharge.serve.network.protocol.response import Response, error_response, json_response, response_of
+from isocharge.serve.network.traffic import Traffic
 
 Headers = Iterable[tuple[bytes, bytes]]
 """Names in lower case, values as they came."""
@@ -30,12 +32,13 @@ MODELS, REPOSITORY = "/v2/models/", "/v2/repository/models/"
 
 
 class Request(NamedTuple):
-    """A request with its body unpacked, and the model that its path names."""
+    """A request with its body unpacked, the model that its path names, and whether all may be said to the client."""
 
     headers: Mapping[bytes, bytes]
     body: bytes
     name: str = ""
     version: str = ""
+    trusted: bool = True
 
 
 Route = tuple[str, Callable[[Request], Response]]
@@ -43,14 +46,17 @@ Route = tuple[str, Callable[[Request], Response]]
 
 
 class Handler:
-    """Answers requests from the models of a store."""
+    """Answers requests from the models of a store, and counts them."""
 
-    def __init__(self, store: ModelStore, limits: ServerLimits | None = None) -> None:
-        """`limits` bound body and batch; the others are for transports."""
+    def __init__(self, store: ModelStore, limits: ServerLimits | None = None, traffic: Traffic | None = None) -> None:
+        """`limits` bound body and batch, the others are for transports; they count in `traffic`, too."""
         self.store = store
         self.limits = limits or ServerLimits()
+        self.traffic = traffic or Traffic()
+        metrics = Metrics(store, self.traffic, describe.server_metadata()["version"])
         self._fixed: dict[str, Route] = {
             "/": ("GET", self._page),
+            "/metrics": ("GET", lambda _: response_of(200, CONTENT_TYPE, metrics.text())),
             "/openapi.json": ("GET", lambda _: json_response(openapi(store, self.limits))),
             "/v2": ("GET", lambda _: json_response(describe.server_metadata())),
             "/v2/health/live": ("GET", lambda _: json_response({"live": True})),
@@ -65,14 +71,16 @@ class Handler:
             "stats": ("GET", self._stats),
             "infer": ("POST", self._infer),
         }
+        self._inference = self._of_model["infer"]
         self._route = lru_cache(KNOWN_PATHS)(self._route_of)
+        self.label = lru_cache(KNOWN_PATHS)(self._label_of)
         self._of_repository: dict[str, Route] = {"load": ("POST", self._load), "unload": ("POST", self._unload)}
 
     def blocks(self, path: str) -> bool:
         """Whether answering this path may take longer than others should wait."""
         return path.startswith(REPOSITORY)
 
-    def answer(self, method: str, path: str, headers: Headers, body: bytes) -> Response:
+    def answer(self, method: str, path: str, headers: Headers, body: bytes, *, trusted: bool = True) -> Response:
         """Answer one request.
 
         Args:
@@ -80,6 +88,7 @@ class Handler:
             path: Without query, percent signs undone.
             headers: Headers of the request.
             body: Body of the request, perhaps compressed.
+            trusted: Whether the client may know everything; one without the token may not know names of files.
 
         Returns:
             The answer; an error is one, with the body {"error": "..."}. Nothing is raised.
@@ -92,9 +101,13 @@ class Handler:
             self.limits.check_body(len(body))
             if b"content-encoding" in fields:
                 body = decompress(body, fields[b"content-encoding"].lower(), self.limits.body_bytes)
-            return route[1](Request(fields, body, name, version))
+            response = route[1](Request(fields, body, name, version, trusted))
+            if route is self._inference:  # its model has counted it: a second counter would cost too much
+                return response
         except Exception as error:  # the one place where an error becomes an answer
-            return error_response(error)
+            response = error_response(error)
+        self.traffic.count("http", self.label(path), response.status)
+        return response
 
     def _route_of(self, path: str) -> tuple[Route, str, str]:
         """The route of a path, with the name and version of the model in it."""
@@ -112,6 +125,26 @@ class Handler:
             pass
         raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
 
+    def model_label(self, path: str) -> str | None:
+        """`name/version` of the model that serves under a path, None if there is none."""
+        try:
+            _, name, version = self._route(path)
+        except UnknownPath:
+            return None
+        return self.store.label(name, version)
+
+    def _label_of(self, path: str) -> str:
+        """The route of a path with `{model}` for the model's name, "unknown" for a path that is none."""
+        try:
+            route, _, _ = self._route(path)
+        except UnknownPath:
+            return "unknown"
+        for base, routes in ((f"{MODELS}{{model}}/", self._of_model), (f"{REPOSITORY}{{model}}/", self._of_repository)):
+            for tail, of_tail in routes.items():
+                if route is of_tail:
+                    return (base + tail).rstrip("/")
+        return path
+
     def _loaded(self, request: Request) -> LoadedVersion:
         return self.store.get(request.name, request.version)
 
@@ -125,9 +158,9 @@ class Handler:
         body, json_length = answer_inference(loaded, read, write_answer)
         return _infer_response(body, json_length, headers.get(b"accept-encoding", b""))
 
-    def _ready(self, _: Request) -> Response:
-        if not self.store.all():
-            raise ModelError("not ready: no model is loaded")
+    def _ready(self, request: Request) -> Response:
+        if why := self.store.unready(full=request.trusted):
+            raise ModelError(f"not ready: {why}")
         return json_response({"ready": True})
 
     def _index(self, request: Request) -> Response:

@@ -22,6 +22,9 @@ WIDTH = _ENDS[-1]
 COLUMNS = {name: slice(end - OUTPUTS[name], end) for name, end in zip(OUTPUTS, _ENDS, strict=True)}
 """Where each output lies in the row of numbers that is bound for one press."""
 
+MISFIT = COLUMNS["misfit"].start
+"""Where the misfit lies in it."""
+
 
 class InferRequest(NamedTuple):
     """Charges for a model, and which of its outputs to answer with.
@@ -46,6 +49,8 @@ class InferAnswer(NamedTuple):
         name, version: The model that answered.
         id, binary: As in the request.
         outputs: By name, shape (n, width).
+        unchecked: Presses whose misfit was not computed, as nobody asked for it.
+        alarms: Presses whose misfit is above the limit of the model.
     """
 
     name: str
@@ -53,6 +58,8 @@ class InferAnswer(NamedTuple):
     id: str
     outputs: dict[str, Singles]
     binary: frozenset[str]
+    unchecked: int
+    alarms: int
 
 
 def infer(loaded: LoadedVersion, request: InferRequest) -> InferAnswer:
@@ -61,27 +68,39 @@ def infer(loaded: LoadedVersion, request: InferRequest) -> InferAnswer:
     Raises:
         ModelError: If its graph fails.
     """
-    charges, names = request.charge_pC, request.outputs
+    charges, names, metadata = request.charge_pC, request.outputs, loaded.metadata
     if len(charges) == 1:
-        outputs = _one_press(loaded.press(), charges[0], names)
+        row = _one_press(loaded.press(), charges[0])
+        outputs, unchecked = {name: row[:, COLUMNS[name]] for name in names}, 0
+        alarms = 0 if row.item(MISFIT) <= loaded.misfit_limit else 1  # one for NaN, too
     else:
         outputs = run(loaded.model.session, charges, names)
-        check_rows(outputs, len(charges), loaded.metadata.label)
-    return InferAnswer(loaded.metadata.name, loaded.version, request.id, outputs, request.binary)
+        check_rows(outputs, len(charges), metadata.label)
+        unchecked, alarms = _misfit_alarms(outputs.get("misfit"), len(charges), loaded.misfit_limit)
+    return InferAnswer(metadata.name, loaded.version, request.id, outputs, request.binary, unchecked, alarms)
 
 
-def _one_press(press: BoundPress, charge_pC: Singles, names: tuple[str, ...]) -> dict[str, Singles]:
-    """Outputs of shape (1, width) from bound memory, which is faster than a plain run."""
+def _one_press(press: BoundPress, charge_pC: Singles) -> Singles:
+    """All outputs, shape (1, WIDTH), from bound memory, which is faster than a plain run."""
     row = np.empty((1, WIDTH), np.float32)
     try:
         press.run_into(charge_pC, row[0])
     except Exception as error:  # onnxruntime's exceptions have no common base of their own
         raise run_error(error) from error
-    return {name: row[:, COLUMNS[name]] for name in names}
+    return row
+
+
+def _misfit_alarms(misfit: Singles | None, presses: int, limit: float) -> tuple[int, int]:
+    """How many presses were not checked, and how many are above the limit; NaN counts as above."""
+    return (presses, 0) if misfit is None else (0, presses - int(np.count_nonzero(misfit <= limit)))
 
 
 def answer_inference(
-    loaded: LoadedVersion, read: Callable[[], InferRequest], write: Callable[[InferAnswer], Written]
+    loaded: LoadedVersion,
+    read: Callable[[], InferRequest],
+    write: Callable[[InferAnswer], Written],
+    *,
+    over_grpc: bool = False,
 ) -> Written:
     """Read a request, run the model, write the answer, and count it.
 
@@ -89,6 +108,7 @@ def answer_inference(
         loaded: The model.
         read: Returns the request, or raises what is wrong with it.
         write: Turns the answer into what the transport sends.
+        over_grpc: Whether that is gRPC.
 
     Raises:
         Whatever `read` raises.
@@ -104,5 +124,6 @@ def answer_inference(
     except Exception:
         loaded.statistics.failed(clock() - began)
         raise
-    loaded.statistics.succeeded(len(request.charge_pC), (was_read - began, ran - was_read, clock() - ran))
+    stages_ns = was_read - began, ran - was_read, clock() - ran
+    loaded.statistics.succeeded(len(request.charge_pC), stages_ns, answer.unchecked, answer.alarms, over_grpc=over_grpc)
     return written

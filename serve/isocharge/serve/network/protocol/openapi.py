@@ -44,6 +44,7 @@ def _paths() -> Json:
     paths: Json = {
         "/v2/health/live": _get("Whether the server runs", "any"),
         "/v2/health/ready": _get("Whether a model is loaded", "any"),
+        "/metrics": _get("Counters of all models and requests, in the text format of Prometheus", "text", "text/plain"),
         "/v2": _get("Name, version and extensions of the server", "server"),
         "/v2/models/stats": _get("Counters of all models", "stats"),
         "/v2/repository/index": _post("Every version in the repository", "index", _INDEX_BODY),
@@ -64,8 +65,8 @@ def _with_parameters(path: str, item: Json) -> Json:
     return item | ({"parameters": [_ref(f"parameters/{name}") for name in named]} if named else {})
 
 
-def _get(summary: str, answer: str) -> Json:
-    return {"get": _operation(summary, answer)}
+def _get(summary: str, answer: str, kind: str = "application/json") -> Json:
+    return {"get": _operation(summary, answer, kind)}
 
 
 def _post(summary: str, answer: str, body: Json) -> Json:
@@ -73,8 +74,8 @@ def _post(summary: str, answer: str, body: Json) -> Json:
     return {"post": {**_operation(summary, answer), "requestBody": request}}
 
 
-def _operation(summary: str, answer: str) -> Json:
-    good = {"description": summary, "content": _content(_ref(f"schemas/{answer}"))}
+def _operation(summary: str, answer: str, kind: str = "application/json") -> Json:
+    good = {"description": summary, "content": _content(_ref(f"schemas/{answer}"), kind)}
     return {"summary": summary, "responses": {"200": good, "4XX": _ref("responses/error")}}
 
 
@@ -82,8 +83,8 @@ def _ref(name: str) -> Json:
     return {"$ref": f"#/components/{name}"}
 
 
-def _content(schema: Json) -> Json:
-    return {"application/json": {"schema": schema}}
+def _content(schema: Json, kind: str = "application/json") -> Json:
+    return {kind: {"schema": schema}}
 
 
 def _object(properties: Json, required: list[str] | None = None, **more: Any) -> Json:
@@ -146,6 +147,7 @@ _OUTPUT = _object(
 
 _ANSWERS: Json = {
     "any": {"type": "object"},
+    "text": _TEXT,
     "server": _object({"name": _TEXT, "version": _TEXT, "extensions": _list_of(_TEXT)}),
     "model": _object(
         {

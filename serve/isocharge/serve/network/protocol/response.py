@@ -16,6 +16,12 @@ class Response(NamedTuple):
     body: bytes
 
 
+class ErrorResponse(Response):
+    """The answer to a request that raised an error, and the kind of it."""
+
+    error: str
+
+
 def response_of(status: int, content_type: bytes, body: bytes) -> Response:
     """A response with the headers that each one has."""
     return Response(status, [(b"content-type", content_type), (b"content-length", b"%d" % len(body))], body)
@@ -33,7 +39,8 @@ def refusal(status: int, message: str) -> Response:
 
 def error_response(error: Exception) -> Response:
     """The response to a request that raised an error."""
-    response = refusal(http_status(error), client_message(error))
+    response = ErrorResponse(*refusal(http_status(error), client_message(error)))
+    response.error = type(error).__name__
     if isinstance(error, WrongMethod):
         response.headers.append((b"allow", error.allowed.encode()))
     if response.status == 401:

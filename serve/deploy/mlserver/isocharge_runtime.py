@@ -1,4 +1,4 @@
-"""MLServer's way: a custom runtime around the same session; `bench_http.py` writes its settings and starts it."""
+"""MLServer's way to run a `model.onnx`: a custom runtime around an ONNX session."""
 
 import numpy as np
 import onnxruntime as ort
@@ -7,8 +7,11 @@ from mlserver.codecs import NumpyCodec
 from mlserver.types import InferenceRequest, InferenceResponse
 
 
-class Runtime(MLModel):
+class OnnxRuntime(MLModel):
+    """One version of one model; `parameters.uri` is its file."""
+
     async def load(self) -> bool:
+        """Open the session: one thread, as a press takes microseconds."""
         options = ort.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         path = self.settings.parameters.uri
@@ -17,7 +20,8 @@ class Runtime(MLModel):
         return True
 
     async def predict(self, payload: InferenceRequest) -> InferenceResponse:
+        """All outputs of the model."""
         charges = NumpyCodec.decode_input(payload.inputs[0]).astype(np.float32, copy=False)
-        rows = self.session.run(None, {"charge_pC": charges})
+        rows = self.session.run(None, {payload.inputs[0].name: charges})
         outputs = [NumpyCodec.encode_output(name, row) for name, row in zip(self.names, rows, strict=True)]
-        return InferenceResponse(model_name=self.name, model_version="1", outputs=outputs)
+        return InferenceResponse(model_name=self.name, model_version=self.version, outputs=outputs)

@@ -1,0 +1,273 @@
+"""`/metrics`: read by the stock parser, exact under load, behind the token; what clients invent makes no series."""
+
+import json
+import math
+import time
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+
+import grpc
+import numpy as np
+import pytest
+import tritonclient.grpc
+import tritonclient.http
+from prometheus_client.parser import text_string_to_metric_families
+
+from isocharge.serve import Predictor, find_model
+from isocharge.serve.flags import MISFIT
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.network.grpc import grpc_server
+from isocharge.serve.network.http import App
+from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.statistics import LATENCY_NS, Statistics
+from isocharge.serve.network.token import Token
+from isocharge.serve.prediction.validity import Domain
+
+INFER = "/v2/models/linear/infer"
+MODEL = "three-25um-biaxial"
+
+
+def body(charges, **more):
+    charges = np.atleast_2d(charges)
+    tensor = {"name": "charge_pC", "datatype": "FP32", "shape": list(charges.shape), "data": charges.ravel().tolist()}
+    return json.dumps({"inputs": [tensor]} | more).encode()
+
+
+def families(text):
+    return {family.name: family for family in text_string_to_metric_families(text.decode())}
+
+
+def scrape(handler):
+    """All samples: name and sorted labels to value."""
+    status, headers, text = handler.answer("GET", "/metrics", [], b"")
+    assert status == 200
+    assert dict(headers)[b"content-type"].startswith(b"text/plain; version=0.0.4")
+    samples = [sample for family in families(text).values() for sample in family.samples]
+    values = {(sample.name, *sorted(sample.labels.items())): sample.value for sample in samples}
+    assert len(values) == len(samples)
+    return values
+
+
+def value(samples, name, **labels):
+    return samples[(f"isocharge_{name}", *sorted(labels.items()))]
+
+
+def test_the_stock_parser_reads_types_and_help(handler):
+    read = families(handler.answer("GET", "/metrics", [], b"").body)
+    assert {
+        name: family.type for name, family in read.items() if "inference_seconds" in name or "requests" in name
+    } == {
+        "isocharge_requests": "counter",
+        "isocharge_inference_seconds": "histogram",
+    }
+    assert all(family.documentation for family in read.values())
+    assert "process_resident_memory_bytes" in read
+
+
+def test_requests_are_counted_by_route_and_status(handler):
+    app = App(handler)
+    for path, content in ((INFER, body([1, 2, 3])), (INFER, body([1, 2])), (INFER, b"{"), ("/v2", b""), ("/nope", b"")):
+        app.answer("GET" if path == "/v2" else "POST", path, [], content)
+    samples = scrape(handler)
+    infer = {"transport": "http", "route": "/v2/models/{model}/infer"}
+    assert value(samples, "requests_total", **infer, status="200") == 1
+    assert value(samples, "requests_total", **infer, status="400") == 2
+    assert value(samples, "requests_total", transport="http", route="/v2", status="200") == 1
+    assert value(samples, "requests_total", transport="http", route="unknown", status="404") == 1
+    assert value(samples, "inferences_refused_total", model="linear", version="2") == 2
+
+
+def test_clients_cannot_invent_series(handler):
+    """Any number of paths, models, versions and methods."""
+    app, rng = App(handler), np.random.default_rng(0)
+    before = len(scrape(handler))
+    for number in range(500):
+        name = rng.bytes(8).decode("latin-1")
+        for path in (f"/{name}", f"/v2/models/{name}/infer", f"/v2/models/linear/versions/{number}/infer"):
+            app.answer(f"M{number}", path, [(b"authorization", name.encode())], name.encode())
+    after = scrape(handler)
+    assert len(after) - before <= 6
+    requests = {key: count for key, count in after.items() if key[0] == "isocharge_requests_total"}
+    assert sum(count for key, count in requests.items() if ("route", "/metrics") not in key) == 1500
+
+
+def test_the_histogram_is_that_of_the_durations():
+    """Against numpy's counting of the same durations."""
+    rng, counters = np.random.default_rng(1), Statistics()
+    stages = np.round(np.exp(rng.uniform(np.log(1e3), np.log(2e7), (2000, 3)))).astype(int)
+    stages[:3] = [[10_000, 0, 0], [9_999, 1, 1], [20_000_000, 0, 1]]  # on a bound, and just beyond
+    for row in stages.tolist():
+        counters.succeeded(1, tuple(row))
+    total = stages.sum(axis=1)
+    expected = [np.count_nonzero(total <= bound) for bound in (*LATENCY_NS, math.inf)]
+    assert np.cumsum(counters.latency).tolist() == expected
+
+
+def test_buckets_and_sum_of_a_scrape(handler):
+    for _ in range(7):
+        handler.answer("POST", INFER, [], body([1, 2, 3]))
+    samples, of = scrape(handler), {"model": "linear", "version": "2"}
+    buckets = [v for key, v in samples.items() if key[0].endswith("_seconds_bucket") and ("version", "2") in key]
+    assert buckets == sorted(buckets)
+    assert buckets[-1] == value(samples, "inference_seconds_count", **of) == 7
+    stages = ("compute_input", "compute_infer", "compute_output")
+    by_stage = [value(samples, "inference_stage_seconds_total", **of, stage=stage) for stage in stages]
+    assert value(samples, "inference_seconds_sum", **of) == pytest.approx(sum(by_stage))
+    assert value(samples, "inference_seconds_count", model="linear", version="1") == 0
+
+
+def test_misfit_alarms_are_the_flags_of_records():
+    """Of single presses, of batches, and of requests that do not ask for the misfit."""
+    handler, folder = Handler(open_model_store(find_model(MODEL).parents[1])), find_model(MODEL)
+    charges = np.random.default_rng(2).uniform(300.0, 1500.0, (300, 3)).astype(np.float32)
+    predictor = Predictor(folder)
+    flags = Domain.of(predictor.metadata).batch_flags(predictor.predict_batch(charges))
+    alarms = [MISFIT in of for of in flags]
+    assert 20 < sum(alarms) < 280
+    path, contact_only = f"/v2/models/{MODEL}/infer", {"outputs": [{"name": "contact"}]}
+    handler.answer("POST", path, [], body(charges))  # 300 checked
+    for row in charges[:50]:
+        handler.answer("POST", path, [], body(row))  # 50 checked
+        handler.answer("POST", path, [], body(row, **contact_only))  # 50 checked: a press is always computed whole
+    handler.answer("POST", path, [], body(charges, **contact_only))  # of a batch, only what is asked for
+    samples, of = scrape(handler), {"model": MODEL, "version": "1"}
+    assert value(samples, "presses_total", **of) == 700
+    assert value(samples, "misfit_checked_total", **of) == 400
+    assert value(samples, "misfit_alarms_total", **of) == sum(alarms) + 2 * sum(alarms[:50])
+
+
+def test_counts_are_exact_with_many_clients(handler, start_http):
+    """Eight clients over HTTP and four over gRPC at once, good requests and bad."""
+    url = start_http(handler).url.removeprefix("http://")
+
+    def over_http(number):
+        with tritonclient.http.InferenceServerClient(url) as client:
+            return [infer(client, tritonclient.http, number + i) for i in range(60)]
+
+    def over_grpc(number):
+        with tritonclient.grpc.InferenceServerClient(grpc_url.removeprefix("grpc://")) as client:
+            return [infer(client, tritonclient.grpc, number + i) for i in range(30)]
+
+    def infer(client, module, number):
+        charges = np.ones((1 + number % 3, 3 if number % 5 else 2), np.float32)
+        tensor = module.InferInput("charge_pC", list(charges.shape), "FP32")
+        tensor.set_data_from_numpy(charges)
+        try:
+            client.infer("linear", [tensor])
+        except tritonclient.http.InferenceServerException:
+            return 0
+        return len(charges)
+
+    with grpc_server(handler, "127.0.0.1", 0) as grpc_url, ThreadPoolExecutor(12) as pool:
+        jobs = [pool.submit(over_http, n) for n in range(8)] + [pool.submit(over_grpc, n) for n in range(4)]
+        presses = [n for job in jobs for n in job.result()]
+    samples, of = scrape(handler), {"model": "linear", "version": "2"}
+    good, bad = sum(n > 0 for n in presses), presses.count(0)
+    assert (good, bad) == (480, 120)
+    assert value(samples, "presses_total", **of) == sum(presses)
+    assert value(samples, "inference_seconds_count", **of) == good
+    assert value(samples, "inferences_refused_total", **of) == bad
+    http = {"transport": "http", "route": "/v2/models/{model}/infer"}
+    assert [value(samples, "requests_total", **http, status=s) for s in ("200", "400")] == [384, 96]
+    over = {"transport": "grpc", "route": "ModelInfer"}
+    assert [value(samples, "requests_total", **over, status=s) for s in ("OK", "INVALID_ARGUMENT")] == [96, 24]
+    assert value(samples, "open", transport="grpc") == 0
+
+
+def test_messages_of_a_grpc_stream_are_counted(handler):
+    answers = []
+    with grpc_server(handler, "127.0.0.1", 0) as url:
+        client = tritonclient.grpc.InferenceServerClient(url.removeprefix("grpc://"))
+        client.start_stream(lambda result, error: answers.append((result, error)))
+        for width in (3, 3, 2, 3):
+            tensor = tritonclient.grpc.InferInput("charge_pC", [1, width], "FP32")
+            tensor.set_data_from_numpy(np.ones((1, width), np.float32))
+            client.async_stream_infer("linear", [tensor])
+        client.stop_stream()
+        client.close()
+    assert [error is None for _, error in answers] == [True, True, False, True]
+    samples, of = scrape(handler), {"transport": "grpc", "route": "ModelStreamInfer message"}
+    assert value(samples, "requests_total", **of, status="OK") == 3
+    assert value(samples, "requests_total", **of, status="INVALID_ARGUMENT") == 1
+    assert value(samples, "requests_total", transport="grpc", route="ModelStreamInfer", status="OK") == 1
+
+
+def test_a_call_that_its_client_cancels_is_counted(handler):
+    gone = Event()
+
+    def one_message():
+        yield b""
+        gone.wait(20)
+
+    with grpc_server(handler, "127.0.0.1", 0) as url, grpc.insecure_channel(url.removeprefix("grpc://")) as channel:
+        call = channel.stream_stream("/inference.GRPCInferenceService/ModelStreamInfer")(one_message())
+        next(call)
+        call.cancel()
+        gone.set()
+        deadline = time.monotonic() + 20.0
+        while not (ends := ended(handler)) and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert ends == ended(handler)
+    assert list(ends.values()) == [1]
+    assert set(ends) <= {"CANCELLED", "OK"}  # grpcio may tell us of the end of the stream before it tells us why
+
+
+def ended(handler):
+    """How calls of streams ended: status to number."""
+    counts = handler.traffic.requests()
+    return {kind.status: count for kind, count in counts.items() if kind.route == "ModelStreamInfer"}
+
+
+def test_counters_do_not_fall_when_a_model_is_loaded_again(handler):
+    for action in ("load", "unload", "load"):
+        handler.answer("POST", INFER, [], body([1, 2, 3]))
+        assert handler.answer("POST", f"/v2/repository/models/linear/{action}", [], b"").status == 200
+    samples = scrape(handler)
+    assert value(samples, "presses_total", model="linear", version="2") == 2  # the third met no model
+    assert value(samples, "model_ready", model="linear", version="2") == 1
+
+
+def test_versions_that_serve_and_that_were_refused(film, tmp_path):
+    film.write(tmp_path)
+    sensor = {"name": 'a "quoted"\nname\\', "film": {"radius_mm": 45.0}}
+    film.write(tmp_path, version=2, sensor=sensor)
+    (film.write(tmp_path, version=3) / "golden.json").unlink()
+    store = open_model_store(tmp_path)
+    samples = scrape(Handler(store))
+    ready = [value(samples, "model_ready", model="linear", version=v) for v in ("1", "2", "3")]
+    assert ready == [1, 1, 0]
+    metadata: ModelMetadata = store.get("linear", "2").metadata
+    facts = {"sensor": metadata.frame_id, "sha256": store.get("linear", "2").model.golden.sha256}
+    assert value(samples, "model_info", model="linear", version="2", **facts) == 1
+
+
+@pytest.mark.parametrize(("header", "status"), [([], 401), ([b"Bearer no"], 401), ([b"Bearer yes"], 200)])
+def test_metrics_are_behind_the_token(handler, header, status):
+    app = App(handler, Token("yes"))
+    answer = app.answer("GET", "/metrics", [(b"authorization", of) for of in header], b"")
+    assert answer.status == status
+    assert (b"isocharge_requests" in answer.body) == (status == 200)
+    refused = {"transport": "http", "route": "/metrics", "status": "401"}
+    assert (("isocharge_requests_total", *sorted(refused.items())) in scrape(handler)) == (status == 401)
+
+
+def test_health_says_why_not(film, tmp_path):
+    """In full to those who may know, in numbers to others; the body is the protocol's."""
+    folders = [film.write(tmp_path), film.write(tmp_path, version=2)]
+    app = App(Handler(open_model_store(tmp_path)), Token("yes"))
+    bearer = [(b"authorization", b"Bearer yes")]
+    assert app.answer("GET", "/v2/health/ready", [], b"")[::2] == (200, b'{"ready":true}')
+    app.answer("POST", "/v2/repository/models/linear/unload", bearer, b"")
+    status, _, said = app.answer("GET", "/v2/health/ready", bearer, b"")
+    expected = "not ready: no model is loaded; linear/1: unloaded; linear/2: unloaded"
+    assert (status, json.loads(said)) == (400, {"error": expected})
+    for folder in folders:
+        (folder / "golden.json").unlink()
+    app.answer("POST", "/v2/repository/models/linear/load", bearer, b"")
+    said = json.loads(app.answer("GET", "/v2/health/ready", bearer, b"").body)["error"]
+    assert all(f"{folder}/golden.json: missing" in said for folder in folders)
+    for headers in ([], [(b"authorization", b"Bearer no")]):
+        status, _, said = app.answer("GET", "/v2/health/ready", headers, b"")
+        expected = "not ready: no model is loaded (versions refused: 2, unloaded: 0)"
+        assert (status, json.loads(said)) == (400, {"error": expected})
