@@ -139,6 +139,16 @@ def test_a_weak_spot_between_the_rings_ends_the_area():
     assert not len(working.folds)
 
 
+def test_no_ring_within_the_area_errs_more_than_is_allowed(film):
+    """Beside an electrode within the area the error rises between one ring and the next."""
+    charges = ChargeSpline.of(squares(film, *INNER))
+    for error in (0.3e-3, 1e-3):
+        working = working_area(charges, REFERENCE, twins=False, error=error)
+        worst = limits_at(charges, Rings.spread(working.radius).contacts(0.05), REFERENCE).position.max()
+        assert worst <= error
+        assert working.radius == pytest.approx(working.error_radius, abs=1.01e-4)
+
+
 def test_four_charges_lose_rank_at_a_point():
     """The cross-cap (u^2, u v, v) loses rank at u = v = 0 and nowhere else (Whitney 1944)."""
     model = linear_charges(lambda x, _: (x - 1) ** 2, lambda x, y: (x - 1) * (y + 2), lambda _, y: y)

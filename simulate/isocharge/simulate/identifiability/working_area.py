@@ -22,6 +22,10 @@ ERROR = 1e-3
 GRID = 1e-4
 """Step to which radii of working areas are rounded down, m."""
 
+CONFIRMATIONS = 4
+"""Rings within the area are tried at most so often, each time within a smaller one: beside electrodes the error rises
+between one ring and the next."""
+
 Why = Literal["fold", "twins", "error", "searched"]
 
 
@@ -112,6 +116,7 @@ def working_area(
         min(_within(model, rings, force, noise, error), _nearest_over(model, search.weakest, force, noise, error))
         for force, search in zip(forces, searches, strict=True)
     )
+    error_radius = _confirmed(model, error_radius, forces, noise, error)
     pairs = find_ambiguous_pairs(model, noise, low) if twins else AmbiguousPairs.none()
     twin_radius = float(pairs.reach[0]) if len(pairs) else np.inf
     ends: dict[Why, float] = {
@@ -136,12 +141,24 @@ def working_area(
     )
 
 
+def _confirmed(model: ChargeModel, radius: float, forces: list[float], noise: NoiseModel, error: float) -> float:
+    """The radius within which the error is allowed, m, or a smaller one where rings within it say so."""
+    for _ in range(CONFIRMATIONS if radius < model.radius else 0):
+        if (rounded := _round_down(radius)) <= 0.0:
+            break
+        within = min(_within(model, Rings.spread(rounded), force, noise, error) for force in forces)
+        if within >= rounded * (1.0 - 1e-9):
+            break
+        radius = within
+    return radius
+
+
 def _within(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel, error: float) -> float:
     """Distance at which the position error first exceeds the allowed one, m; between rings ln(error) is linear."""
     worst = rings.per_ring(limits_at(model, rings.contacts(force), noise).position).max(axis=1)
     over = np.flatnonzero(~(worst <= error))
     if not over.size:
-        return model.radius
+        return float(rings.distance[-1])
     first = int(over[0])
     if first == 0:
         return 0.0
