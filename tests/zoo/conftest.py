@@ -41,6 +41,7 @@ class Board:
     noise_pC: float = 0.3
     url: str = ""
     pressed_from: float = float("inf")
+    pressed_from_frame: float = float("inf")
     frames: int = 0
     stop: threading.Event = field(default_factory=threading.Event)
 
@@ -49,13 +50,17 @@ class Board:
         self.rest_pC = self.rng.uniform(-8.0, 8.0, len(self.press_pC))
 
     def press_in(self, seconds):
-        """Press in a while, and hold."""
-        self.pressed_from = time.monotonic() + seconds
+        """Press in a while, and hold; a board that is asked counts its answers, because nobody asks it meanwhile."""
+        if self.line == "asked":
+            self.pressed_from_frame = self.frames + 250
+        else:
+            self.pressed_from = time.monotonic() + seconds
 
     def next_frame(self):
         """The bytes of the next frame."""
         charge_pC = self.rest_pC + self.rng.normal(0.0, self.noise_pC, len(self.press_pC))
-        charge_pC += self.press_pC * (time.monotonic() >= self.pressed_from)
+        is_pressed = time.monotonic() >= self.pressed_from or self.frames >= self.pressed_from_frame
+        charge_pC += self.press_pC * is_pressed
         self.frames += 1
         return self.encode(self.frames - 1, charge_pC)
 

@@ -185,8 +185,8 @@ def diagnosed(command, tmp_path, plug_in, board):
 
 def touch(command, plugged, path, model):
     """The mean of position (mm) and force (N) over the end of a press, and all records."""
-    plugged.press_in(0.8)
-    code, out, err = command("serve", "stream", model, "--port", plugged.url, "--device", path, "--count", "500")
+    plugged.press_in(1.2)
+    code, out, err = command("serve", "stream", model, "--port", plugged.url, "--device", path, "--count", "650")
     assert code == 0, err
     records = [json.loads(line) for line in out.splitlines()]
     pressed = [record for record in records if record["contact"]][20:]

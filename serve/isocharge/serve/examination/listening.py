@@ -126,7 +126,9 @@ def _listen(heard: Heard, seconds: float, is_clear: Callable[[Heard], bool] | No
             if answer is not None and answer.done() and not answer.result():
                 return heard, False
         heard.seconds = time.monotonic() - began
-    return heard, answer is None or answer.result()
+    if is_clear is None:
+        return heard, True
+    return heard, answer.result() if answer else is_clear(heard)
 
 
 def _with_echo(heard: Heard) -> Request:

@@ -35,7 +35,7 @@ CONSTANT_SHARE = 0.98
 LONGEST_SYNC = 6
 """Longest sync, bytes: what follows may be constant for a while only."""
 
-MOST_CHANNELS = 64
+MOST_CHANNELS = 32
 """Largest number of channels side by side."""
 
 PRICE_OF_FIELD, PRICE_OF_CHANNEL = 1.5, 0.15
