@@ -33,7 +33,7 @@ MODEL = "three-25um-biaxial"
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = [
     *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"),
-    *("--disable-component-update", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--disable-component-update", "--disable-gpu", "--enable-unsafe-swiftshader"),
 ]
 
 
@@ -127,6 +127,7 @@ def one_round(port, viewers, seconds, folder, number, live, in_browser):
         watching[-1].start()
         results.append(ours)
     browsed = browse(url, seconds) if in_browser else None
+    assert process.poll() is None, process.communicate()[1]
     if browsed is None:
         time.sleep(seconds)
     memory.append(memory_kB(process.pid))

@@ -75,14 +75,14 @@ export class FilmView {
     if (heavy.traces && this.isNew) this.traces.draw();
     if (this.isNew) { this.showValues(sample, kind); this.noteAge(sample, nowMs); }
     this.isNew = heavy.traces ? false : this.isNew;
-    if (kind !== this.drawnKind && nowMs - this.spokenMs > SPOKEN_MS) this.showSlow(nowMs);
+    if (kind !== this.spokenKind && nowMs - this.spokenMs > SPOKEN_MS) this.showSlow(nowMs);
     this.drawnKind = kind;
   }
 
   /** Twice a second: words and counters. */
   showSlow(nowMs) {
     const kind = this.kind(nowMs);
-    this.spokenMs = nowMs;
+    [this.spokenMs, this.spokenKind] = [nowMs, kind];
     const verdict = this.find(".verdict"), words = {
       contact: "touch", none: this.history.latest ? "no touch" : "waiting for the first frame", tare: "taring: leave the film alone",
       outside: "outside the area or the forces that the model knows: place and force are guesses",
