@@ -1,16 +1,18 @@
 """What tests of several stages share."""
 
-import io
 import os
 import re
 import subprocess
 import sys
-from contextlib import redirect_stdout
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 from isocharge.cli import main
+from isocharge.extras import PACKAGES
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture
@@ -54,39 +56,134 @@ def shell():
 
     def run(script, cwd=None, timeout=280):
         environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-        words = ["bash", "-ec", script]
-        done = subprocess.run(
-            words, cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout, check=False
-        )
+        done = _run(["bash", "-ec", script], cwd, environment, timeout)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     return run
 
 
+ABSENT = """
+import os, sys
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in os.environ["ABSENT_PACKAGES"].split():
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Absent())
+"""
+"""Runs when Python starts: packages that an install does not have are not there."""
+
+
+@pytest.fixture(scope="session")
+def installed(tmp_path_factory):
+    """The environment variables of programs that find only some extras of pyproject.toml, as `pip install '.[x]'`."""
+    folder = tmp_path_factory.mktemp("absent")
+    (folder / "sitecustomize.py").write_text(ABSENT)
+
+    def environment(*extras):
+        needs = {"train": ["simulate"], "grpc": ["http"], "cluster": ["simulate"], "all": [*PACKAGES]}
+        chosen = {*extras, *(other for extra in extras for other in needs.get(extra, ()))}
+        present = {package for extra in chosen & {*PACKAGES} for package in PACKAGES[extra]}
+        absent = {package for packages in PACKAGES.values() for package in packages} - present
+        absent -= {"google"}  # protobuf comes with onnxruntime
+        path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"  # this environment's `isocharge` first
+        return os.environ | {"PATH": path, "PYTHONPATH": str(folder), "ABSENT_PACKAGES": " ".join(sorted(absent))}
+
+    return environment
+
+
 @pytest.fixture
 def run_example():
     """Run a Python example of a page: each print prints what the comment on its line says, to the letter."""
 
-    def run(example, page):
-        with redirect_stdout(io.StringIO()) as printed:
-            exec(compile(example, page, "exec"), {"__name__": "example"})
+    def run(example, folder, environment):
+        done = _run([sys.executable, "-c", example], folder, environment, timeout=3600)
         prints = [line for line in example.splitlines() if line.lstrip().startswith("print(")]
         expected = [line.rpartition(")  # ")[2] for line in prints]
         assert expected
-        assert printed.getvalue().splitlines() == expected
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.splitlines() == expected
+        assert "np.float" not in done.stdout
 
     return run
 
 
 @pytest.fixture
-def run_commands(shell):
+def run_commands():
     """Run a shell example of a page in a folder; what it starts in the background ends with it, outputs are there."""
 
-    def run(example, folder, timeout=280):
-        printed = shell(f"trap 'kill $(jobs -p) || true; wait' EXIT\n{example}", cwd=folder, timeout=timeout)
+    def run(example, folder, environment, timeout=280):
+        script = f"trap 'kill $(jobs -p) || true; wait' EXIT\n{example}"
+        done = _run(["bash", "-ec", script], folder, environment, timeout)
+        assert done.returncode == 0, done.stderr
         for output in re.findall(r" (?:-o|--record|>) ([\w./-]+)", example):
             assert (folder / output).exists(), output
-        return printed
+        return done.stdout
 
     return run
+
+
+def _run(words, folder, environment, timeout):
+    return subprocess.run(
+        words, cwd=folder, env=environment, capture_output=True, text=True, timeout=timeout, check=False
+    )
+
+
+class PageExample(NamedTuple):
+    """A python or sh block of a page; blocks of a page run in their order, in one folder.
+
+    Attributes:
+        page: Its path in the project.
+        language: python or sh.
+        text: The block.
+        extras: What is installed, as the page says: `pip install '.[extra]'` in the lines before the block, or else in
+            the first lines of the page, or else in those of the README beside it; ("base",) without extras.
+    """
+
+    page: str
+    language: str
+    text: str
+    extras: tuple[str, ...]
+
+
+def pytest_generate_tests(metafunc):
+    """Give `page_example` every block of the pages in a module's EXAMPLE_PAGES; `is_slow` of the module marks some."""
+    if "page_example" in metafunc.fixturenames:
+        module, parameters = metafunc.module, []
+        for page in module.EXAMPLE_PAGES:
+            for number, example in enumerate(examples_of(ROOT / page)):
+                slow = [pytest.mark.slow, pytest.mark.timeout(3600)] if module.is_slow(example) else []
+                parameters.append(pytest.param(example, id=f"{page}-{number}-{example.language}", marks=slow))
+        metafunc.parametrize("page_example", parameters)
+
+
+def examples_of(page):
+    """The examples of a page, in their order."""
+    text = page.read_text("utf-8")
+    readme = page.parent / "README.md" if page.parent.name != "docs" else page.parents[1] / "README.md"
+    general = _extras(_opening(text)) or _extras(_opening(readme.read_text("utf-8"))) or ("base",)
+    blocks = list(re.finditer(r"^```(\w+)\n(.*?)^```", text, re.DOTALL | re.MULTILINE))
+    ends = [0, *(block.end() for block in blocks)]
+    return [
+        PageExample(
+            page.relative_to(ROOT).as_posix(),
+            block[1],
+            block[2],
+            _extras(text[end : block.start()].rpartition("\n#")[2]) or general,
+        )
+        for end, block in zip(ends, blocks, strict=False)
+        if block[1] in ("python", "sh")
+    ]
+
+
+def _opening(text):
+    """What stands above the first example and the first section."""
+    return re.split(r"^(?:```|## )", text, maxsplit=1, flags=re.MULTILINE)[0]
+
+
+def _extras(text):
+    """The extras of the first install command in a text: ("base",) for none of them; empty without a command."""
+    command = re.search(r"pip install (?:'\.\[([\w,]+)\]'|\.(?=[`\s]))", text)
+    return () if command is None else tuple((command[1] or "base").split(","))

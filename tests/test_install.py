@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+import sys
 import venv
 from pathlib import Path
 
@@ -77,3 +78,23 @@ def test_a_missing_extra_says_how_to_get_it(fresh, tmp_path):
     assert done.returncode == 1
     assert "pip install 'isocharge[simulate]'" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("extras", "present", "absent"),
+    [
+        (("base",), ("onnxruntime", "serial", "typer"), ("scipy", "matplotlib", "torch", "uvicorn", "grpc", "dask")),
+        (("simulate",), ("scipy", "matplotlib"), ("torch", "sklearn", "onnx", "uvicorn", "dask")),
+        (("train",), ("scipy", "torch", "onnx"), ("uvicorn", "grpc", "dask")),
+        (("http",), ("uvicorn",), ("scipy", "grpc")),
+        (("grpc",), ("uvicorn", "grpc"), ("scipy", "torch")),
+        (("all",), ("scipy", "torch", "grpc", "dask"), ()),
+    ],
+)
+def test_the_examples_of_a_page_find_the_packages_of_its_install_only(installed, extras, present, absent):
+    code = "import sys; from importlib import import_module as load\nfor name in sys.argv[1:]:\n    load(name)"
+    python, environment = [sys.executable, "-c", code], installed(*extras)
+    assert subprocess.run([*python, *present], env=environment, check=False).returncode == 0
+    for name in absent:
+        done = subprocess.run([*python, name], env=environment, capture_output=True, text=True, check=False)
+        assert f"ModuleNotFoundError: No module named '{name}'" in done.stderr

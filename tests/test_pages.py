@@ -1,10 +1,13 @@
 """What README.md and the pages show is true: every example runs and prints what it says, links lead somewhere."""
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+import typer
 
+from isocharge.cli import app
 from isocharge.simulate import Circle, Sweep, load_sensor, run_sweep
 
 ROOT = Path(__file__).parents[1]
@@ -24,13 +27,12 @@ SMALLER = {"--samples 100000": "--samples 500"}
 """Figures of an example that would take a test too long."""
 
 
-def examples(language):
-    """Examples of the pages outside serve, whose tests use ports, with the page as id; the slow ones marked."""
-    for page, text in PAGES.items():
-        for number, block in enumerate(re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)):
-            if not page.startswith("serve/") and page != "CONTRIBUTING.md":  # tests/serve, tests/test_contributing.py
-                slow = [pytest.mark.slow, pytest.mark.timeout(3600)] if any(key in block for key in SLOW) else []
-                yield pytest.param(page, block, id=f"{page}-{number}", marks=slow)
+EXAMPLE_PAGES = [page for page in PAGES if not page.startswith(("serve/", "CONTRIBUTING", "CHANGELOG"))]
+"""Those of serve use ports (tests/serve), and CONTRIBUTING.md has recipes (tests/test_contributing.py)."""
+
+
+def is_slow(example):
+    return any(key in example.text for key in SLOW)
 
 
 @pytest.fixture(scope="module")
@@ -40,36 +42,56 @@ def presses(tmp_path_factory):
     return run_sweep(folder, load_sensor("three-25um-biaxial"), (Circle(1e-3),), Sweep(samples=2000))
 
 
+@pytest.fixture(scope="module")
+def desks(tmp_path_factory):
+    """A folder for each page, with what its reader has already: `train/` of a checkout, and a small configuration."""
+    folders = {page: tmp_path_factory.mktemp("desk") for page in EXAMPLE_PAGES}
+    for folder in folders.values():
+        (folder / "train").symlink_to(ROOT / "train")
+        (folder / "quick.toml").write_text("[training]\nsteps = 50\nmisfit_steps = 20\nmisfit_charges = 2000\n")
+    return folders
+
+
 @pytest.fixture
-def desk(tmp_path, presses, monkeypatch):
-    """An empty folder with the files that examples read: `train/configs`, and `presses` unless they are made there."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("ISOCHARGE_CACHE", str(tmp_path / "cache"))
-    (tmp_path / "train").symlink_to(ROOT / "train")
-    (tmp_path / "quick.toml").write_text("[training]\nsteps = 50\nmisfit_steps = 20\nmisfit_charges = 2000\n")
-
-    def lay_out(example):
-        if not re.search(r'-o presses\b|Path\("presses"\), load_sensor', example):
-            (tmp_path / "presses").symlink_to(presses)
-        return tmp_path
-
-    return lay_out
+def desk(page_example, desks, presses):
+    """The folder of a page; a dataset `presses` is in it where the page reads one that it has not made."""
+    folder = desks[page_example.page]
+    reads = re.search(r'(?:fit|report) presses\b|read_dataset\(Path\("presses"\)\)', page_example.text)
+    makes = re.search(r'-o presses\b|Path\("presses"\), load_sensor', page_example.text)
+    if reads and not makes and not (folder / "presses").exists():
+        (folder / "presses").symlink_to(presses)
+    return folder
 
 
-@pytest.mark.parametrize(("page", "example"), [*examples("python")])
-def test_python_example_prints_what_it_says(page, example, desk, run_example):
-    desk(example)
-    run_example(example, page)
-
-
-@pytest.mark.parametrize(("page", "example"), [*examples("sh")])
-def test_commands_run_line_by_line(page, example, desk, run_commands):
+def test_an_example_does_what_it_says(page_example, desk, installed, run_example, run_commands):
+    """In the order of the page, in the install that it names; Python prints what the comments say."""
+    text, environment = page_example.text, installed(*page_example.extras) | {"ISOCHARGE_CACHE": str(desk / "cache")}
     for shown, smaller in SMALLER.items():
-        example = example.replace(shown, smaller)
-    printed = run_commands(example, desk(example), timeout=3600)
-    if page == "README.md" and "simulate point" in example:
+        text = text.replace(shown, smaller)
+    if page_example.language == "python":
+        run_example(text, desk, environment)
+        return
+    printed = run_commands(text, desk, environment, timeout=3600)
+    if page_example.page == "README.md" and "simulate point" in text:
         assert '"charge_pC"' in printed
         assert printed.count('"frame_id": "three-25um-biaxial"') > 800  # 5 s at 200 Hz
+
+
+def shown_commands():
+    """Commands in blocks that are no examples, because they take too long or need what a test has not."""
+    for page, text in PAGES.items():
+        for block in re.findall(r"^```text\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+            for line in re.findall(r"^(?:\$ )?isocharge (.+)$", block, re.MULTILINE):
+                yield pytest.param(line, id=f"{page}: {line[:60]}")
+
+
+@pytest.mark.parametrize("line", [*shown_commands()])
+def test_a_command_that_is_only_shown_is_one(line):
+    """Its options are those of the command; a comment may follow."""
+    words, group = shlex.split(line, comments=True), typer.main.get_command(app)
+    while hasattr(group, "commands"):
+        group, words = group.commands[words[0]], words[1:]
+    group.make_context(group.name, words)
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -121,7 +143,7 @@ def test_figures_of_the_released_models_are_their_cards():
     rows = re.findall(
         r"^\| `(\S+)` \| within (\S+) mm \| (\S+), (\S+) mm \| (\S+) % \|", PAGES["models/README.md"], re.M
     )
-    assert len(rows) == 3
+    assert len(rows) == 7
     for name, radius, median, rms, force in rows:
         card = (ROOT / "models" / name / "1" / "card.md").read_text("utf-8")
         assert f"within {radius} mm" in card

@@ -13,6 +13,7 @@ PACKAGES = {
     "http": HTTP,
     "grpc": HTTP | {"grpc", "google"},
     "cluster": frozenset({"dask", "distributed"}),
+    "design": SIMULATE | {"ezdxf"},
     "record": frozenset({"mcap", "lz4", "zstandard"}),
 }
 """Import names that come with an extra of pyproject.toml."""

@@ -20,6 +20,10 @@ LONGEST_LINE = 1 << 20
 """Longest line of a text that is read line by line, characters."""
 
 
+READ_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
+"""To open a file without waiting for a pipe's writer, and without changing line ends; each system has its part."""
+
+
 def sha256_of(data: bytes) -> str:
     """Hexadecimal SHA-256."""
     return hashlib.sha256(data).hexdigest()
@@ -35,7 +39,7 @@ def read_whole(path: Path, most: int = MOST_BYTES) -> bytes:
     Raises:
         OSError: If it cannot be read, is no regular file, or is larger; `strerror` says which.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    descriptor = os.open(path, READ_FLAGS)
     state = os.fstat(descriptor)
     if not stat.S_ISREG(state.st_mode):
         os.close(descriptor)
@@ -155,7 +159,12 @@ def _remove_empty(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make sure that renames in a folder, or the content of a file, survive a power cut."""
+    """Make sure that renames in a folder, or the content of a file, survive a power cut.
+
+    Windows opens no folders, and is left to itself.
+    """
+    if not hasattr(os, "O_DIRECTORY"):
+        return
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

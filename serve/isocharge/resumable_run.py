@@ -9,14 +9,14 @@
 A part counts only if its checksum exists and matches; all other parts are computed again.
 """
 
-import fcntl
+import importlib
 import json
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 from isocharge.errors import InputError, OutputError, OutputExists, SolveError, TrainingError
 from isocharge.files import new_folder, read_whole, refuse_existing, sha256_of, sync_folder, write_whole
@@ -205,12 +205,23 @@ def _lock(folder: Path) -> Iterator[None]:
     """Keep other processes out; the system lets go if this one is killed."""
     with (folder / "lock").open("w") as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+            _lock_file(file)
+        except (BlockingIOError, PermissionError) as error:  # the latter on Windows
             raise OutputExists(
                 f"another process is at work in {folder}; wait for it, or choose another output"
             ) from error
         yield
+
+
+def _lock_file(file: IO[str]) -> None:
+    """Lock an open file until it is closed, by what the system has for it."""
+    try:
+        posix: Any = importlib.import_module("fcntl")
+    except ImportError:
+        windows: Any = importlib.import_module("msvcrt")
+        windows.locking(file.fileno(), windows.LK_NBLCK, 1)
+        return
+    posix.flock(file, posix.LOCK_EX | posix.LOCK_NB)
 
 
 def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:

@@ -18,7 +18,9 @@ from isocharge.serve import (
     encode_frame,
     encode_text,
 )
-from isocharge.serve.frames.layout_parser import DescribedParser
+from isocharge.serve.frames.cobs import cobs_encode
+from isocharge.serve.frames.layout_parser import DescribedParser, described_parser
+from isocharge.serve.recognition.recognise import recognise
 
 FRAMES = [Frame(seq, 5000 * seq, (800.0 + seq, 700.0 - seq, 900.5), 0, ("A", "B", "C")) for seq in range(6)]
 
@@ -46,12 +48,32 @@ def described_layout():
     return device_from_table({"frames": DESCRIBED}, "attack").layout
 
 
+def stuffed(framing):
+    """Frames of 24 bits with a constant byte, stuffed as the framing wants it."""
+    fields = [{"name": "seq", "type": "u8"}, {"type": "pad", "value": "0C"}]
+    fields += [{"name": name, "type": "i24"} for name in "ABC"]
+    table = {"format": "described", "framing": framing, "length": 12, "checksum": "crc-8", "fields": fields}
+    layout = device_from_table({"frames": table}, "attack").layout
+    escapes = {
+        "cobs": lambda data: cobs_encode(data) + b"\0",
+        "slip": lambda data: data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0",
+        "hdlc": lambda data: data.replace(b"}", b"}]").replace(b"~", b"}^") + b"~",
+        "datagram": lambda data: data,
+    }
+    return lambda: described_parser(layout), b"".join(escapes[framing](layout.encode(frame)) for frame in FRAMES)
+
+
 def formats():
     layout = described_layout()
     yield "binary", BinaryParser, b"".join(map(encode_frame, FRAMES))
     yield "described", lambda: DescribedParser(layout), b"".join(map(layout.encode, FRAMES))
+    for framing in ("cobs", "slip", "hdlc", "datagram"):
+        yield f"described {framing}", *stuffed(framing)
     for notation in ("csv", "pairs", "teleplot", "json"):
         yield notation, TextParser, text(notation)
+    yield "sentences", TextParser, b"".join(b"$PZT,%d,1.5,2.5*%02X\r\n" % (k, 0x4F ^ k) for k in range(6))
+    clocks = b"".join(b"n:%d,ms:%d,A:1.5\n" % (k % 3, 65534 + k & 0xFFFF) for k in range(9))
+    yield "other names", lambda: TextParser(meanings={"n": "seq", "ms": "t_ms"}), clocks
     nested = b"".join(
         json.dumps({"seq": k, "charge": {"A": 1.5, "B": [2, 3], "": {"": 4}}}).encode() + b"\n" for k in range(6)
     )
@@ -83,6 +105,25 @@ def test_frames_with_faults(name, attack, faults):
         return data[:cut], data[cut:]
 
     attack(f"frames {name}", read, pieces, 90_000)
+
+
+def test_recognition_of_frames_with_faults(attack, faults):
+    """Whatever a board sends, what is recognised of it is a device file, or nothing."""
+    mutated, _ = faults
+    goods = [data for _, data in FORMATS.values()]
+
+    def read(chunks):
+        table = recognise(chunks, 1.0, are_datagrams=len(chunks) > 1)
+        if table is not None:
+            parser = device_from_table({"frames": table}, "attack").parser()
+            for chunk in chunks:
+                parser.feed(chunk)
+
+    def chunks(rng):
+        data = mutated(rng, rng.choice(goods) * rng.choice((1, 3, 10)))
+        return [data] if rng.random() < 0.7 else [data[at : at + 40] for at in range(0, len(data), 40)]
+
+    attack("recognition", read, chunks, 4_000)
 
 
 def test_bombs(attack):

@@ -32,14 +32,14 @@ def main() -> None:
     all_axes = figure.subplots(2, 2)
     print("| sensor | working area | first fold | position, 0.05 N, 1 N | force, 0.05 N, 1 N |\n|---|---|---|---|---|")
     for name, axes in zip(SENSORS, all_axes.ravel(), strict=True):
-        found = identify(replace(film, sensor=load_sensor(name)), noise_model("reference"))
-        weak, one, _ = (made.summary(found.area.radius) for made in found.maps)
+        identified = identify(replace(film, sensor=load_sensor(name)), noise_model("reference"))
+        weak, one, _ = (limits.summary() for limits in identified.inside)
         print(
-            f"| {name} | {1e3 * found.area.radius:.1f} mm | {1e3 * found.area.fold_radius:.1f} mm | "
+            f"| {name} | {1e3 * identified.area.radius:.1f} mm | {1e3 * identified.area.fold_radius:.1f} mm | "
             f"{weak['position_median_mm']:.3f}, {one['position_median_mm']:.3f} mm | "
             f"{weak['force_median_percent']:.2f}, {one['force_median_percent']:.2f} % |"
         )
-        shades = draw_limit_map(axes, found, found.maps[1])
+        shades = draw_limit_map(axes, identified, identified.maps[1])
         axes.set_title(f"{name}: {axes.get_title()}", fontsize=10)
     if output:
         figure.colorbar(

@@ -18,7 +18,7 @@ from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.train.bayes.limit import BayesLimit, Scene, bayes_estimate
 from isocharge.train.data.alarms import alarm_threshold
-from isocharge.train.report.build import inner_radius
+from isocharge.train.data.domain import inner_radius
 from isocharge.train.report.measures import coverage
 
 RELEASED = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial")

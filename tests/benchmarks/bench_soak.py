@@ -171,7 +171,7 @@ def measure(asked: argparse.Namespace) -> dict[str, Any]:
         "over_grpc": GRPC_CLIENTS * over_grpc,
         "clients": HTTP_CLIENTS + GRPC_CLIENTS,
         "answers_equal": "all, bit for bit",
-        "loads_meanwhile": loads,
+        "loads_meanwhile": loads + 1,  # and the one that ends the warm-up
         "seconds": round(seconds, 1),
         "memory_MB": round(end / 1e6, 2),
         "memory_growth_MB": round((end - warm) / 1e6, 2),

@@ -33,7 +33,7 @@ from isocharge.serve import (
     encode_frame,
 )
 from isocharge.simulate import Amplifier, Circle, ForwardMap, Measurement, load_amplifier, sensor_from_dict
-from isocharge.train.report.build import inner_radius
+from isocharge.train.data.domain import inner_radius
 
 REST_S, PRESS_S, PAUSE_S, RAMP_S = 4.0, 1.5, 1.5, 0.1
 

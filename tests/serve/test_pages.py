@@ -7,15 +7,29 @@ import socket
 import subprocess
 import sys
 from contextlib import ExitStack
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from isocharge.serve import Frame, TextParser, encode_frame, flags, load_device
+from isocharge.errors import DeviceError
+from isocharge.serve import (
+    Frame,
+    HumRule,
+    LeakRule,
+    TareRule,
+    TextParser,
+    TouchRule,
+    device_from_table,
+    encode_frame,
+    flags,
+    load_device,
+)
 from isocharge.serve.frames.cobs import cobs_decode
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
+from isocharge.serve.signal_chain.thermal import ThermalRule
 
 SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
@@ -24,12 +38,11 @@ SLOW = {"mcap.md", "recordings.md", "virtual_sensor.md"}
 """Pages whose commands simulate a film each time; those of the README, which do the same, run always."""
 
 
-def examples(language):
-    """Every example of a language, with its page as id."""
-    for page, text in PAGES.items():
-        for number, block in enumerate(re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)):
-            slow = [pytest.mark.slow] if page in SLOW and language == "sh" else []
-            yield pytest.param(block, id=f"{page}-{number}", marks=slow)
+EXAMPLE_PAGES = ["serve/README.md", *(f"serve/docs/{name}" for name in PAGES if name != "README.md")]
+
+
+def is_slow(example):
+    return Path(example.page).name in SLOW and example.language == "sh"
 
 
 def test_frame_example():
@@ -40,20 +53,29 @@ def test_frame_example():
     assert cobs_decode(after[:-1]) == before
 
 
-@pytest.mark.parametrize("example", [*examples("python")])
-def test_python_example_prints_what_it_says(example, start_http, run_example, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    if "127.0.0.1:8000" in example:
-        example = example.replace("127.0.0.1:8000", start_http(Handler(open_model_store())).url.removeprefix("http://"))
-    run_example(example, "serve")
+@pytest.fixture(scope="module")
+def desks(tmp_path_factory):
+    """A folder for each page, with the presses that its reader has already."""
+    folders = {page: tmp_path_factory.mktemp("desk") for page in EXAMPLE_PAGES}
+    (folders["serve/README.md"] / "presses.csv").write_text("A,B,C\n850,840,846\n")
+    return folders
 
 
-@pytest.mark.parametrize("example", [*examples("sh")])
-def test_commands_run_line_by_line(example, tmp_path, run_commands):
-    if "curl" in example and shutil.which("curl") is None:
+def test_an_example_does_what_it_says(page_example, desks, installed, start_http, run_example, run_commands):
+    """In the order of the page, in the install that it names; Python prints what the comments say."""
+    text, folder, environment = page_example.text, desks[page_example.page], installed(*page_example.extras)
+    if page_example.language == "python":
+        if "127.0.0.1:8000" in text:
+            text = text.replace("127.0.0.1:8000", start_http(Handler(open_model_store())).url.removeprefix("http://"))
+        run_example(text, folder, environment)
+        return
+    if "curl" in text and shutil.which("curl") is None:
         pytest.skip("the example uses curl")
-    (tmp_path / "presses.csv").write_text("A,B,C\n850,840,846\n")
-    printed = run_commands(on_free_ports(example), tmp_path, timeout=60)
+    check_commands(text, folder, run_commands(on_free_ports(text), folder, environment, timeout=120))
+
+
+def check_commands(example, folder, printed):
+    """What the commands of some examples must have printed."""
     if "curl" in example:
         outputs = json.loads(printed[printed.index("{") :])["outputs"]
         assert outputs[0]["data"] == pytest.approx([3.0, -2.0, 1.0], abs=0.02)
@@ -61,8 +83,8 @@ def test_commands_run_line_by_line(example, tmp_path, run_commands):
         assert f"```text\n{printed}```" in PAGES["measured_presses.md"]
     if "doctor" in example:
         assert "binary frames of isocharge" in printed
-        assert (tmp_path / "again.jsonl").read_text() == (tmp_path / "touch.jsonl").read_text()
-        assert len((tmp_path / "touch.jsonl").read_text().splitlines()) > 300
+        assert (folder / "again.jsonl").read_text() == (folder / "touch.jsonl").read_text()
+        assert len((folder / "touch.jsonl").read_text().splitlines()) > 300
 
 
 def on_free_ports(example):
@@ -102,6 +124,63 @@ def test_the_device_file_is_one(tmp_path):
     assert board.parser().layout.length == 18
     stages = (chain.gain_pC, chain.limit_pC, chain.hum, chain.tare, chain.leak, chain.touch)
     assert not any(stage is None for stage in stages)
+
+
+REQUIRED = {
+    "saturation": {"limit_pC": 1500.0},
+    "leak": {"tau_s": 10.0},
+    "frames": {"format": "described", "sync": "55", "length": 2, "fields": [{"name": "A", "type": "u8"}]},
+}
+CRC = {"width": 8, "polynomial": "07"}
+
+
+def known_keys(table):
+    """The keys that the reader of a device file knows beside an unknown one, in its own words."""
+    with pytest.raises(DeviceError, match="unknown key") as refused:
+        device_from_table(table, "device.toml")
+    return set(str(refused.value).partition("known are ")[2].split(", "))
+
+
+def documented(begin, end):
+    """The keys in the first cells of the tables between two texts of the page."""
+    section = PAGES["device_file.md"].partition("## Every key")[2].partition(begin)[2].partition(end)[0]
+    cells = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
+    return {key for cell in cells for key in re.findall(r"`([\w.]+)`", cell)}
+
+
+def test_every_key_of_the_device_file_is_explained_and_exists():
+    """Both ways, by what the reader itself says that it knows."""
+    described = REQUIRED["frames"]
+    common = {"format", "request", "request_Hz", "echo"}
+    assert documented("`[frames]`", "More keys of text") == common
+    assert documented("More keys of text", "More keys of described") == known_keys({"frames": {"zz": 1}}) - common
+    assert documented("More keys of described", "The keys of a field") == known_keys({"frames": described | {"zz": 1}})
+    field = described["fields"][0] | {"zz": 1}
+    assert documented("The keys of a field", "key of a checksum") == known_keys(
+        {"frames": described | {"fields": [field]}}
+    )
+    assert documented("key of a checksum", "`[channels]`") == known_keys(
+        {"frames": described | {"length": 3, "checksum": CRC | {"zz": 1}}}
+    )
+    assert documented("`[gain]`", "The stages") == known_keys({"gain": {"zz": 1}})
+    stages = known_keys({"zz": {}}) - {"name", "frames", "channels", "gain"}
+    keys = {f"{stage}.{key}" for stage in stages for key in known_keys({stage: {"zz": 1}}) - {"on"}}
+    assert documented("The stages", "`name` stands") == keys
+
+
+def test_every_default_of_a_stage_is_the_rule_s():
+    """Numbers in the tables are those of the code."""
+    rules = {"hum": HumRule, "tare": TareRule, "leak": LeakRule, "touch": TouchRule, "common_mode": ThermalRule}
+    section = PAGES["device_file.md"].partition("The stages; what")[2].partition("`name` stands")[0]
+    for line in section.splitlines():
+        if not line.startswith("| `"):
+            continue
+        keys, values = re.findall(r"`([\w.]+)`", line.split("|")[1]), line.split("|")[2].replace("`", "").split(",")
+        for key, value in zip(keys, values, strict=True):
+            stage, name = key.split(".")
+            if value.strip() != "required":
+                default = {item.name: item.default for item in fields(rules[stage])}[name]
+                assert value.strip() == (str(default).lower() if default is True else f"{default:g}"), key
 
 
 @pytest.mark.parametrize("row", re.findall(r"^\| .*? \| `(.*)` \|$", PAGES["frames.md"], re.MULTILINE))

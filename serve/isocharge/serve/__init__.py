@@ -7,6 +7,9 @@
 The packages follow the way of a frame; `serve/README.md` shows them.
 """
 
+from typing import TYPE_CHECKING
+
+from isocharge.serve.examination.port_check import Examination, examine
 from isocharge.serve.frames.autodetect import AutoParser
 from isocharge.serve.frames.binary import BinaryParser, encode_frame
 from isocharge.serve.frames.frame import Frame, FrameCounts, Parser
@@ -18,7 +21,6 @@ from isocharge.serve.frames.text_encoder import encode_text
 from isocharge.serve.live.device import Device
 from isocharge.serve.live.device_file import device_from_table, load_device
 from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
-from isocharge.serve.live.port_check import Examination, examine
 from isocharge.serve.live.reading_stream import ReadingStream
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress, SteadyRule
 from isocharge.serve.live.stream import Policy, TouchStream, stream
@@ -30,8 +32,9 @@ from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
 from isocharge.serve.port.serial_port import Chunk, Port
 from isocharge.serve.port.source import open_source
 from isocharge.serve.prediction.check import Check, check_presses
+from isocharge.serve.prediction.contact import Contact, Contacts
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, read_presses, write_presses
-from isocharge.serve.prediction.predictor import Contact, Contacts, Predictor
+from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
 from isocharge.serve.prediction.validity import Domain
@@ -43,6 +46,7 @@ from isocharge.serve.signal_chain.tare import Tare, TareRule
 from isocharge.serve.virtual_sensor.faults import Faults
 from isocharge.serve.virtual_sensor.script import Script, read_script, wander
 from isocharge.serve.virtual_sensor.sensor import Truth, VirtualSensor
+from isocharge.versions import version_attribute
 
 __all__ = [
     "AutoParser",
@@ -111,3 +115,7 @@ __all__ = [
     "write_model",
     "write_presses",
 ]
+
+__version__: str
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for a text
+    __getattr__ = version_attribute(__name__)

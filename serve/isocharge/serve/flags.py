@@ -4,6 +4,7 @@
 |---|---|
 | `tare` | no tare yet, so no contact either |
 | `outside` | the position is outside the working area, or the force outside the range, that the model was trained for |
+| `beyond` | more than three times as far or as hard as the model knows: the numbers are no measurement |
 | `misfit` | the charges fit no single contact: misfit above 5, and above what one good press in a thousand has |
 | `gap` | frames are missing before this one |
 | `repeat` | this frame has the number of the one before |
@@ -18,6 +19,7 @@
 
 TARE = "tare"
 OUTSIDE = "outside"
+BEYOND = "beyond"
 MISFIT = "misfit"
 GAP = "gap"
 REPEAT = "repeat"

@@ -9,9 +9,13 @@ Five lines give the charges of one press.
     charge = touch_charge(sensor, equilibrium)  # C, in the order of sensor.electrode_names
 """
 
+from typing import TYPE_CHECKING
+
 from isocharge.extras import require
+from isocharge.versions import version_attribute
 
 with require("simulate"):
+    from isocharge.simulate.artwork.leads import Leads, route
     from isocharge.simulate.contours.charge_curves import Curves, Mapping
     from isocharge.simulate.contours.field_contours import Contour, ContourField
     from isocharge.simulate.contours.fix import Fix, Meeting
@@ -27,7 +31,11 @@ with require("simulate"):
     from isocharge.simulate.forward.forward_map import ForwardMap
     from isocharge.simulate.forward.readout import contact_charge, pretension_charge, thermal_charge, touch_charge
     from isocharge.simulate.identifiability.cramer_rao import CramerRao, limits_at
+    from isocharge.simulate.identifiability.layout_assessment import LayoutAssessment, assess_layout
     from isocharge.simulate.identifiability.working_area import WorkingArea, working_area
+    from isocharge.simulate.layout.design import Design, design, run_design
+    from isocharge.simulate.layout.scene import Nuisances
+    from isocharge.simulate.layout.task import DesignTask
     from isocharge.simulate.measuring_chain.amplifier import Amplifier, Measurement
     from isocharge.simulate.measuring_chain.noise import NoiseModel
     from isocharge.simulate.measuring_chain.noise_file import load_amplifier, noise_model
@@ -61,6 +69,8 @@ __all__ = [
     "CramerRao",
     "Curves",
     "Dataset",
+    "Design",
+    "DesignTask",
     "DrawnContour",
     "DrawnTriangulation",
     "Electrode",
@@ -71,10 +81,13 @@ __all__ = [
     "FilmSpread",
     "Fix",
     "ForwardMap",
+    "LayoutAssessment",
+    "Leads",
     "Mapping",
     "Measurement",
     "Meeting",
     "NoiseModel",
+    "Nuisances",
     "Piezo",
     "Polygon",
     "Probe",
@@ -87,8 +100,10 @@ __all__ = [
     "Theory",
     "Triangulation",
     "WorkingArea",
+    "assess_layout",
     "built_in_sensors",
     "contact_charge",
+    "design",
     "draw_contour",
     "limits_at",
     "load_amplifier",
@@ -98,6 +113,8 @@ __all__ = [
     "press",
     "pretension_charge",
     "read_dataset",
+    "route",
+    "run_design",
     "run_sweep",
     "sensor_from_dict",
     "sensor_to_dict",
@@ -112,3 +129,7 @@ __all__ = [
     "write_sensor",
     "write_sweep",
 ]
+
+__version__: str
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for a text
+    __getattr__ = version_attribute(__name__)

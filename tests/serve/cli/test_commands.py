@@ -5,6 +5,7 @@ import json
 import re
 import signal
 import socket
+import threading
 import time
 from functools import partial
 
@@ -56,9 +57,16 @@ def test_help_has_an_example(command):
 def test_predict_to_csv(presses, models):
     result = run("predict", "linear", presses, "--models", models)
     lines = result.stdout.splitlines()
-    assert lines[0] == "x_mm,y_mm,force_N,x_std_mm,y_std_mm,force_std_N,misfit"
-    np.testing.assert_allclose(np.loadtxt(lines[1:], delimiter=",")[:, :3], [[1, 0.5, 1], [-2, 3, 0.25]], atol=5e-6)
+    assert lines[0] == "x_mm,y_mm,force_N,x_std_mm,y_std_mm,force_std_N,misfit,flags"
+    contacts = np.loadtxt(lines[1:], delimiter=",", usecols=(0, 1, 2))
+    np.testing.assert_allclose(contacts, [[1, 0.5, 1], [-2, 3, 0.25]], atol=5e-6)
     assert (result.exit_code, result.stderr) == (0, "")
+
+
+def test_predict_to_csv_tells_what_not_to_trust(models):
+    text = "A,B,C\n800,800,800\n9e9,9e9,9e9\n2000,2000,2000\n2700,-9,2700\n"
+    rows = list(csv.DictReader(run("predict", "linear", "-", "--models", models, stdin=text).stdout.splitlines()))
+    assert [row["flags"] for row in rows] == ["", "outside beyond", "outside", "outside misfit"]
 
 
 def test_predict_to_records(presses, models):
@@ -355,6 +363,56 @@ def test_doctor_as_json(film):
         found = json.loads(run("doctor", "--port", sensor.url, "--seconds", 1.0, "--json").stdout)
     assert found["rate_Hz"] == pytest.approx(200.0, rel=0.02)
     assert [round(channel["offset_pC"], 3) for channel in found["channels"]] == [5.0, -6.0, 7.0]
+
+
+def test_doctor_fails_where_nothing_is_recognised(command):
+    silent = PseudoPort()
+    code, out, _ = command("serve", "doctor", "--port", silent.url, "--seconds", 0.5)
+    silent.close()
+    assert (code, "not one byte came" in out) == (1, True)
+
+
+def test_doctor_writes_a_file_that_works(film, models, command, tmp_path):
+    path = tmp_path / "board.toml"
+    encode = lambda frame: b"%d;" % frame.seq + b";".join(b"%.3f" % q for q in frame.values) + b"\n"  # noqa: E731
+    noise = lambda q, rng: q + rng.normal(0.0, 0.3, q.shape)  # noqa: E731
+    with VirtualSensor(film.charge_pC, rest(60.0), noise=noise, encode=encode) as sensor:
+        words = ["--port", sensor.url, "--seconds", 1, "--model", "linear", "--models", models]
+        code, _, err = command("serve", "doctor", *words, "--write", path)
+        assert (code, f"{path} written" in err) == (0, True)
+        again, _, err = command("serve", "doctor", *words, "--write", path)
+        assert (again, "not overwritten" in err) == (1, True)
+        streamed = run("stream", "linear", "--port", sensor.url, "--device", path, "--count", 150, "--models", models)
+    assert 'columns = ["seq", "ch1", "ch2", "ch3"]' in path.read_text()
+    records = [json.loads(line) for line in streamed.stdout.splitlines()]
+    assert records[-1]["tare_pC"] is not None
+    assert records[-1]["seq"] - records[0]["seq"] == 149
+
+
+def test_doctor_waits_for_its_port(film, command, tmp_path):
+    link = tmp_path / "film"
+    with VirtualSensor(film.charge_pC, rest(60.0)) as sensor:
+        plugging = threading.Timer(0.3, link.symlink_to, (sensor.url,))
+        plugging.start()
+        code, out, _ = command("serve", "doctor", "--port", link, "--wait", 10, "--seconds", 0.5)
+        plugging.join()
+    assert (code, "binary frames of isocharge" in out) == (0, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--pC-per-unit", "much"], "--pC-per-unit: expected a number like 0.0457, or A=0.0457,B=-0.0457, got 'much'"),
+        (["--pC-per-unit", "A=1,B"], "--pC-per-unit: expected a number"),
+        (["--request", ""], "--request: expected at least one byte"),
+        (["--request", r"\x1"], "--request: expected a text like"),
+        (["--write", "/proc/none/board.toml"], "--write /proc/none/board.toml: cannot be written"),
+    ],
+)
+def test_doctor_refuses_with_the_reason(film, command, words, said):
+    with VirtualSensor(film.charge_pC, rest(60.0)) as sensor:
+        code, _, err = command("serve", "doctor", "--port", sensor.url, "--seconds", 0.5, *words)
+    assert (code, said in err) == (2, True), err
 
 
 def test_scripted_presses_as_text_are_felt(start, tmp_path):

@@ -40,13 +40,13 @@ WRONG = [
     (
         'checksum = "crc-16/modbus"',
         'cheksum = "crc-16/modbus"',
-        r"cheksum'; known are sync, length",
+        r"cheksum'; known are framing, sync, length",
     ),
-    ('type = "i16"', 'type = "i24"', r"fields\[1\]\.type: expected one of pad, u8.*, got 'i24'"),
+    ('type = "i16"', 'type = "i48"', r"fields\[1\]\.type: expected one of pad, u8.*, got 'i48'"),
     (
         'type = "i16"',
         'type = "i16", count = 2',
-        r"fields\[1\]\.count: expected 1, because only .* pad .*, got 2",
+        r"fields\[1\]\.count: expected none, because only .* pad .*, got 2",
     ),
     (
         'type = "i16"',

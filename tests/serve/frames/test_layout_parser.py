@@ -10,10 +10,14 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from cobs import cobs
+from crcmod.predefined import mkPredefinedCrcFun
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from isocharge.errors import DeviceError
 from isocharge.serve import DescribedParser, Frame, frame_layout
+from isocharge.serve.frames.layout_parser import described_parser
 
 FOLDER = Path(__file__).parents[2] / "data" / "frames"
 LAYOUTS = {path.stem: frame_layout(tomllib.loads(path.read_text("utf-8")), path.name) for path in FOLDER.glob("*.toml")}
@@ -94,3 +98,106 @@ def test_a_number_or_clock_that_is_no_number_costs_its_frame_only(name, value):
     parser = DescribedParser(layout)
     assert [frame.values for frame in parser.feed(good + bad + good)] == [(1.0,), (1.0,)]
     assert (parser.counts.frames, parser.counts.malformed, parser.counts.bytes_dropped) == (2, 1, 10)
+
+
+TRIPLES = """
+sync = "A5 5A"
+length = 13
+byte_order = "{order}"
+checksum = "crc-16/xmodem"
+checksum_from = 2
+checksum_order = "little"
+fields = [{{name = "A", type = "i24"}}, {{name = "B", type = "u24", scale = 0.5}}, {{name = "C", type = "i24"}}]
+"""
+
+
+@settings(derandomize=True)
+@given(
+    st.integers(-(1 << 23), (1 << 23) - 1),
+    st.integers(0, (1 << 24) - 1),
+    st.integers(-(1 << 23), (1 << 23) - 1),
+    st.sampled_from(["little", "big"]),
+)
+def test_three_bytes(a, b, c, order):
+    """Packed by int.to_bytes and crcmod; the checksum skips the sync and has a byte order of its own."""
+    layout = frame_layout(tomllib.loads(TRIPLES.format(order=order)), "test")
+    body = a.to_bytes(3, order, signed=True) + b.to_bytes(3, order) + c.to_bytes(3, order, signed=True)
+    data = b"\xa5\x5a" + body + struct.pack("<H", mkPredefinedCrcFun("xmodem")(body))
+    (frame,) = DescribedParser(layout).feed(data)
+    assert frame.values == (a, b / 2, c)
+    assert layout.encode(frame) == data
+
+
+def stuffed(framing, **others):
+    fields = [{"name": "seq", "type": "u8"}, {"name": "A", "type": "f32"}]
+    return frame_layout({"framing": framing, "length": 9, "checksum": "crc-32", "fields": fields} | others, "test")
+
+
+@pytest.mark.parametrize(
+    ("framing", "stuff"),
+    [
+        ("cobs", lambda data: cobs.encode(data) + b"\0"),
+        ("slip", lambda data: data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"),
+        ("hdlc", lambda data: b"~" + data.replace(b"}", b"}]").replace(b"~", b"}^") + b"~"),
+    ],
+)
+def test_stuffed_frames(framing, stuff):
+    """A damaged one costs itself; a piece of another length is no frame; chunks do not matter."""
+    datas = [struct.pack("<Bf", k, 0.1 * k) for k in range(256)]
+    sent = [stuff(data + struct.pack("<I", binascii.crc32(data))) for data in datas]
+    bad = stuff(datas[0] + struct.pack("<I", binascii.crc32(datas[1])))
+    stream = b"".join(sent[:9]) + bad + stuff(b"123") + b"".join(sent[9:])
+    parser = described_parser(stuffed(framing))
+    frames = [frame for at in range(0, len(stream), 7) for frame in parser.feed(stream[at : at + 7])]
+    assert [frame.seq for frame in frames] == list(range(256))
+    assert frames[3].values == struct.unpack("<f", struct.pack("<f", 0.1 * 3))
+    assert (parser.counts.crc_errors, parser.counts.malformed) == (1, 1)
+
+
+def test_datagrams_hold_whole_frames():
+    parser = described_parser(stuffed("datagram", length=5, checksum="none"))
+    one, two = (struct.pack("<Bf", k, k / 2) for k in (1, 2))
+    assert [frame.values for frame in parser.feed(one + two)] == [(0.5,), (1.0,)]
+    assert parser.feed(one[:3]) == []
+    assert [frame.values for frame in parser.feed(two)] == [(1.0,)]
+    assert (parser.counts.malformed, parser.counts.bytes_dropped) == (1, 3)
+
+
+def test_constant_bytes_are_checked():
+    """A length behind the number: frames of another kind begin alike, and are none of these."""
+    text = """
+sync = "7E"
+length = 5
+fields = [{name = "seq", type = "u8"}, {type = "pad", value = "02"}, {name = "A", type = "i16"}]
+"""
+    layout = frame_layout(tomllib.loads(text), "test")
+    parser = DescribedParser(layout)
+    frames = parser.feed(bytes.fromhex("7E 01 02 10 00  7E 02 09 11 22  7E 03 02 20 00"))
+    assert [(frame.seq, frame.values) for frame in frames] == [(1, (16.0,)), (3, (32.0,))]
+    assert layout.encode(Frame(1, 0, (16.0,))) == bytes.fromhex("7E 01 02 10 00")
+
+
+def test_check_of_given_parameters():
+    """CRC-16/GENIBUS by its parameters, against crcmod."""
+    check = {"width": 16, "polynomial": "1021", "start": "FFFF", "final": "FFFF"}
+    fields = [{"name": "A", "type": "u8"}]
+    layout = frame_layout({"sync": "55", "length": 4, "byte_order": "big", "checksum": check, "fields": fields}, "test")
+    data = b"\x55\x07"
+    assert layout.checked(data) == mkPredefinedCrcFun("crc-16-genibus")(data).to_bytes(2, "big")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"width": 12}, "width: expected 8, 16, 24 or 32"),
+        ({"polynomial": "11021"}, "polynomial: expected a number of 16 bits in hexadecimal"),
+        ({"polynomial": "x"}, "polynomial: expected a number of 16 bits"),
+        ({"poly": "1021"}, "unknown key 'frames.checksum.poly'"),
+        ({"reflected": 1}, "reflected: expected true or false"),
+    ],
+)
+def test_wrong_parameters_of_a_check(change, said):
+    check = {"width": 16, "polynomial": "1021"} | change
+    fields = [{"name": "A", "type": "u8"}]
+    with pytest.raises(DeviceError, match=said):
+        frame_layout({"sync": "55", "length": 4, "checksum": check, "fields": fields}, "device.toml")

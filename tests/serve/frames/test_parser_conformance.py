@@ -31,6 +31,7 @@ from isocharge.serve import (
     encode_text,
     frame_layout,
 )
+from isocharge.serve.frames.layout_parser import described_parser
 from isocharge.serve.frames.text_encoder import TEXT_FORMATS
 from isocharge.serve.virtual_sensor.faults import corrupt
 
@@ -39,6 +40,28 @@ CHECKSUMMED = frame_layout(
         "sync": "AA 55",
         "length": 22,
         "checksum": "crc-16/x-25",
+        "fields": [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
+        + [{"name": name, "type": "f32"} for name in "ABC"],
+    },
+    "test",
+)
+TRIPLES = frame_layout(
+    {
+        "sync": "A5 5A",
+        "length": 16,
+        "byte_order": "big",
+        "checksum": "crc-16/ccitt-false",
+        "checksum_from": 2,
+        "fields": [{"name": "seq", "type": "u16"}, {"type": "pad", "value": "0C"}]
+        + [{"name": name, "type": "i24"} for name in "ABC"],
+    },
+    "test",
+)
+STUFFED = frame_layout(
+    {
+        "framing": "slip",
+        "length": 20,
+        "checksum": "crc-16/modbus",
         "fields": [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
         + [{"name": name, "type": "f32"} for name in "ABC"],
     },
@@ -161,10 +184,21 @@ def described(layout: FrameLayout):
     )
 
 
+def slip(frame):
+    """As RFC 1055 stuffs it."""
+    return STUFFED.encode(frame).replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
+
+
+SLIP = partial(described_parser, STUFFED)
+SLIP_JUNK = st.binary(min_size=1, max_size=12).map(lambda data: data.replace(b"\xc0", b"\x01") + b"\xc0")
 FAULTY_AUTO = partial(SkipsAFrame, AutoParser)
 FORMATS = {
     "binary": binary(),
     "described": described(CHECKSUMMED),
+    "described with 24 bits": described(TRIPLES),
+    "slip": Format(
+        SLIP, slip, st.builds(Frame, seq=SEQ, t_us=T_US, values=THREE), SLIP_JUNK, faulty=partial(SkipsAFrame, SLIP)
+    ),
     **{path.stem: described(frame_layout(tomllib.loads(path.read_text("utf-8")), path.name)) for path in SOLD},
     **{name: text(name) for name in TEXT_FORMATS},
     "auto binary": binary(AutoParser, encode_frame(Frame(0, 0, (1.0, 2.0, 3.0))), FAULTY_AUTO),

@@ -2,11 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve import Frame, TextParser, encode_text
+from isocharge.serve import DeviceClock, Frame, SequenceGaps, TextParser, encode_text
 from isocharge.serve.frames.text import LONGEST_LINE
 from isocharge.serve.frames.text_encoder import TEXT_FORMATS
 from isocharge.serve.frames.text_lines import Notation, parse_line
@@ -158,3 +159,73 @@ def test_number_cut_by_joining_late_is_not_taken():
     parser.feed(b"801.2,799,8")
     parser.forget()
     assert parser.feed(b"3,9,8\n801.2,799,803\n")[0].values[0] == 801.2
+
+
+def sentence(content):
+    """As NMEA 0183 writes it: the xor of what stands between $ and *."""
+    check = 0
+    for byte in content.encode():
+        check ^= byte
+    return f"${content}*{check:02X}"
+
+
+def test_sentences_with_their_checksum():
+    parser = TextParser()
+    frames = feed(
+        *(sentence(f"PZT,{k},801.2,-799.5") for k in range(4)), sentence("PZT,9,1,2")[:-1] + "g", parser=parser
+    )
+    assert [frame.values for frame in frames] == [(k, 801.2, -799.5) for k in range(4)]
+    assert feed(sentence("PZT,9,1,2").replace("9", "8"), "$PZT,9,1,2", parser=parser)[0].values == (9, 1, 2)
+    assert parser.counts.malformed == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "modulus"),
+    [
+        ("t_ms", 1, 1 << 16),
+        ("t_ms", 1, 1 << 32),
+        ("t_us", 1000, 1 << 16),
+        ("t_us", 1000, 1 << 32),
+        ("t_s", 0.001, 4294.967296),
+        ("t_ms", 1, 4294967.296),
+    ],
+)
+def test_clock_in_text_that_wraps(name, unit, modulus):
+    """Without a word on its width, as `millis()` in 16 bits: the time goes on."""
+    start = modulus - 300 * unit
+    parser, clock, times = TextParser(), DeviceClock(), []
+    for k in range(200):
+        frames = feed(f"{name}:{(start + 5 * k * unit) % modulus:.6f},A:1", parser=parser)
+        times += [clock.read(frame.t_us, parser.t_us_modulus, 0.0).device_us for frame in frames]
+    assert clock.restarts == 0
+    np.testing.assert_allclose(np.diff(times), 5000.0 if name != "t_us" else 5 * unit, atol=1.1)
+
+
+def test_clock_in_text_that_begins_anew_has_not_wrapped():
+    parser, clock = TextParser(), DeviceClock()
+    for k in [*range(1000, 1200), *range(20)]:
+        for frame in feed(f"t_ms:{5 * k},A:1", parser=parser):
+            clock.read(frame.t_us, parser.t_us_modulus, 0.0)
+    assert clock.restarts == 1
+
+
+@pytest.mark.parametrize("modulus", [100, 256, 1000, 65536])
+def test_number_in_text_that_wraps(modulus):
+    parser, gaps = TextParser(), SequenceGaps()
+    for k in range(modulus - 20, modulus + 20):
+        for frame in feed(f"seq:{k % modulus},A:1", parser=parser):
+            gaps.update(frame.seq, parser.seq_modulus)
+    assert (gaps.lost, gaps.repeated, gaps.restarts) == (0, 0, 0)
+
+
+def test_other_names_of_number_and_clock():
+    meanings = {"n": "seq", "millis": "t_ms"}
+    for lines in (['{"n": 7, "millis": 12.5, "A": 1}'] * 3, ["n,millis,A", *["7,12.5,1"] * 3]):
+        assert feed(*lines, parser=TextParser(meanings=meanings))[-1] == Frame(7, 12500, (1.0,), names=("A",))
+
+
+def test_echo_between_lines_hinders_nothing():
+    parser = TextParser()
+    frames = feed(*["?", "1,2,3"] * 4, parser=parser)
+    assert [frame.values for frame in frames] == [(1.0, 2.0, 3.0)] * 4
+    assert parser.counts.malformed == 4

@@ -3,8 +3,19 @@
 import numpy as np
 import pytest
 
-from isocharge.errors import ChargeError, DeviceError
-from isocharge.serve import AutoParser, BinaryParser, DescribedParser, Frame, TextParser, device_from_table, load_device
+from isocharge.errors import ChargeError, DeviceError, TareError
+from isocharge.serve import (
+    AutoParser,
+    BinaryParser,
+    Chunk,
+    DescribedParser,
+    Frame,
+    ReadingStream,
+    TextParser,
+    device_from_table,
+    encode_frame,
+    load_device,
+)
 from isocharge.serve.live.channels import ChannelPicker
 from isocharge.serve.live.device import ANY_BOARD
 from isocharge.serve.live.device_file import with_offset_limit
@@ -87,7 +98,41 @@ def test_format_decides_the_parser(device):
     assert isinstance(device(described).parser(), DescribedParser)
 
 
+def test_offset_is_subtracted_before_the_gain(device):
+    """Offset binary: half scale is no charge; one number, or one for each electrode."""
+    for offset, zero in (("8388608", [8388608] * 3), ("{A = 1, B = 2, C = 3}", [1, 2, 3])):
+        chain = device(f"[gain]\noffset = {offset}\npC_per_unit = {{A = 0.5, B = -0.5, C = 1}}\n").chain(ELECTRODES)
+        np.testing.assert_array_equal(chain.raw(np.array(zero) + 10.0), [5.0, -5.0, 10.0])
+
+
+def test_volts_on_a_feedback_capacitance(device):
+    """1 V on 1 nF is 1 nC."""
+    text = "[gain]\nV_per_unit = -0.001\noffset = 1650\nfeedback_pF = {A = 1000, B = 1000, C = 500}\n"
+    np.testing.assert_allclose(device(text).chain(ELECTRODES).raw(np.full(3, 1651.0)), [-1.0, -1.0, -0.5])
+
+
+def test_other_names_of_number_and_clock(device):
+    parser = device('[frames]\nformat = "text"\nseq = "n"\nt_ms = "up"\n').parser()
+    frames = parser.feed(b'\n{"n": 3, "up": 12, "A": 1}\n' * 3)
+    assert frames[-1] == Frame(3, 12000, (1.0,), names=("A",))
+
+
+def test_request_of_a_board(device):
+    assert device("[frames]\n").frames.request is None
+    asked = device('[frames]\nrequest = "3F 0A"\nrequest_Hz = 50\necho = true\n').frames.request
+    assert (asked.data, asked.rate_Hz, asked.echo) == (b"?\n", 50.0, True)
+    described = 'sync = "55"\nlength = 5\nfields = [{name = "A", type = "f32"}]'
+    assert device(f'[frames]\nformat = "described"\nrequest = "01"\n{described}').frames.request.data == b"\x01"
+
+
 WRONG = [
+    ('[frames]\nrequest = "hello"\n', r"frames\.request: expected bytes in hexadecimal, as in '3F 0A', got 'hello'"),
+    ('[frames]\nrequest = "3F"\nrequest_Hz = 0\n', r"frames\.request_Hz: expected a number above 0"),
+    ("[gain]\noffset = 1\n", "key 'gain.pC_per_unit' is missing"),
+    ("[gain]\nV_per_unit = 1.0\n", "key 'gain.feedback_pF' is missing"),
+    ("[gain]\nV_per_unit = 1.0\nfeedback_pF = 0\n", r"gain\.feedback_pF: expected a positive number, got 0"),
+    ("[gain]\nV_per_unit = 1.0\npC_per_unit = 1.0\n", r"gain\.V_per_unit: expected either pC_per_unit, or"),
+    ("[gain]\nfeedback_pF = 1.0\npC_per_unit = 1.0\n", r"gain\.feedback_pF: expected no capacitance beside"),
     ("[gane]\n", "unknown key 'gane'; known are name, frames, channels, gain"),
     ("[tare]\nframe = 50\n", "unknown key 'tare.frame'; known are on, frames, noise_limit_pC"),
     ("[tare]\nframes = 50.5\n", r"tare\.frames: expected a whole number from 0 to 1000000000, got 50\.5"),
@@ -168,6 +213,9 @@ def test_setting_for_other_electrodes_is_refused(device):
         (("charge.C", "charge.A", "charge.B"), {}, [2, 3, 1]),
         (("x", "y", "z"), {}, [1, 2, 3]),
         (("x", "y", "z"), {"A": "z", "B": "y", "C": "x"}, [3, 2, 1]),
+        (("x", "y", "z"), {"A": "3", "B": "ch2", "C": "x"}, [3, 2, 1]),
+        ((), {"A": "3", "B": "ch2", "C": "ch1"}, [3, 2, 1]),
+        (("ch3", "2", "z"), {"A": "2", "B": "ch3", "C": "3"}, [2, 1, 3]),
     ],
 )
 def test_channel_of_each_electrode(names, channels, picked):
@@ -180,6 +228,25 @@ def test_channel_that_is_missing(names, channels):
     picker = ChannelPicker(ELECTRODES, channels, "linear/1")
     with pytest.raises(ChargeError, match=r"\[channels\] A = "):
         picker.pick(Frame(0, 0, tuple(range(len(names))), names=names))
+
+
+def test_the_channel_that_is_missing_is_named():
+    picker = ChannelPicker(ELECTRODES, {"A": "zz", "B": "y", "C": "x"}, "linear/1", "board.toml")
+    with pytest.raises(ChargeError, match=r'^board\.toml: \[channels\] A = "zz": no channel .* have x, y, z, or 1 to'):
+        picker.pick(Frame(0, 0, (1.0, 2.0, 3.0), names=("x", "y", "z")))
+
+
+@pytest.mark.parametrize("name", ["0", "4", "ch0", "ch4", "ch", "", "-1", "1.0", "99999", "²"])
+def test_numbers_of_channels_that_are_none(name):
+    with pytest.raises(ChargeError, match="no channel is called that"):
+        ChannelPicker(("A",), {"A": name}, "linear/1").pick(Frame(0, 0, (1.0, 2.0, 3.0)))
+
+
+def test_a_board_that_rests_elsewhere_is_told_its_offset():
+    stream = ReadingStream(ELECTRODES, device_from_table({"tare": {"frames": 5, "patience": 10}}, "board.toml"))
+    data = b"".join(encode_frame(Frame(k, 5000 * k, (2048.0, 2050.5, 2047.0))) for k in range(20))
+    with pytest.raises(TareError, match=r"\[gain\] offset = \{A = 2048, B = 2050.5, C = 2047\}"):
+        list(stream.feed(Chunk(data, 1e9, 0)))
 
 
 def test_saturation_is_flagged_until_the_press_is_over(device):

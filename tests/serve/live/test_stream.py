@@ -6,12 +6,13 @@ import time
 import numpy as np
 import pytest
 
-from isocharge.errors import ChargeError, PortError, TareError
+from isocharge.errors import ChargeError, ModelError, PortError, TareError
 from isocharge.serve import (
     BinaryParser,
     Chain,
     Chunk,
     Frame,
+    Policy,
     Predictor,
     SequenceGaps,
     TareRule,
@@ -59,6 +60,34 @@ def test_record_of_a_press(film, play):
     assert (record.model, record.frame_id) == ("linear/1", "linear-film")
     assert abs(record.timestamp - time.time()) < 5.0
     assert 0.0 < record.latency_us < 5e6
+
+
+def test_latest_alone_tells_what_happened_before_it(predictor):
+    """Frames without a record pass on what they say of the stream; what they say of themselves goes with them."""
+    touch = TouchStream(predictor, chain=CHAIN, policy=Policy.latest)
+    list(touch.feed(chunk(*frames(np.tile(OFFSET, (10, 1))))))
+    at = lambda seq, *values: Frame(seq, 5000 * seq, values or tuple(OFFSET.tolist()))  # noqa: E731
+    (record,) = touch.feed(chunk(at(20), at(20), at(3), at(4, math.nan, 0.0, 0.0), at(5)))
+    assert record.flags == ("gap", "repeat", "restart")
+    (record,) = touch.feed(chunk(at(6), at(7)))
+    assert record.flags == ()
+    back = chunk(at(8), at(9), at(11))._replace(outage_s=2.0)
+    (record,) = touch.feed(back)
+    assert record.flags == ("reconnected", "gap", "tare")
+    assert touch.counts.skipped == 9 + 4 + 1 + 2
+
+
+def test_another_model_of_the_same_electrodes(film, make_film, predictor, tmp_path):
+    touch = TouchStream(predictor, chain=CHAIN, frame_id="left")
+    rest = list(touch.feed(chunk(*frames(np.tile(OFFSET, (10, 1))))))
+    touch.use(Predictor(film.write(tmp_path, version=2)))
+    raw = tuple((pressed(film) + OFFSET).tolist())
+    (record,) = touch.feed(chunk(Frame(10, 50_000, raw)))
+    assert (rest[-1].model, record.model, record.flags, record.frame_id) == ("linear/1", "linear/2", (), "left")
+    assert record.force_N == pytest.approx(0.5, rel=1e-5)
+    with pytest.raises(ModelError, match=r"linear/1: expected the electrodes \('A', 'B', 'C'\) of linear/2"):
+        touch.use(Predictor(make_film(4).write(tmp_path / "four")))
+    assert touch.predictor.metadata.label == "linear/2"
 
 
 def test_record_out_of_contact(play):

@@ -1,7 +1,10 @@
 """The predictor answers what the session answers, quickly, and refuses what are no charges."""
 
 import math
+import pickle
+import re
 import tracemalloc
+import xml.etree.ElementTree
 from concurrent.futures import ThreadPoolExecutor
 from decimal import Decimal
 
@@ -12,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.errors import ChargeError, ModelError
-from isocharge.serve import Predictor
+from isocharge.serve import Contact, Contacts, Predictor
 from isocharge.serve.prediction.bound_press import BoundPress
 
 PRESSES = st.lists(st.floats(0.0, 5000.0, width=32), min_size=3, max_size=3).filter(lambda q: sum(q) > 1.0)
@@ -188,6 +191,69 @@ def test_bound_memory_that_is_not_shared_is_noticed(models, monkeypatch):
 
 def _unshared(press, session, electrodes):  # noqa: ARG001
     press.write, press.run, press.read = lambda *_: None, lambda: None, lambda: (0.0,) * 7
+
+
+def test_a_predictor_tells_whether_to_trust_a_contact(film, predictor):
+    inside, outside = film.charge_pC([1.0, 9.0], [0.5, 0.0], [1.0, 0.5])
+    assert predictor.flags(predictor.predict(inside)) == ()
+    assert predictor.flags(predictor.predict(outside)) == ("outside",)
+
+
+def test_what_is_no_measurement_is_said_once(models, film, caplog):
+    predictor = Predictor("linear", models=models)
+    predictor.predict(film.charge_pC([0.0], [0.0], [5.9])[0])
+    assert caplog.messages == []
+    contact = predictor.predict([9e9, 9e9, 9e9])
+    assert predictor.flags(contact) == ("outside", "beyond")
+    predictor.predict([9e9, 9e9, 9e9])
+    (message,) = caplog.messages
+    assert re.match(r"linear/1: \[9000000000.0, .* pC are far from any press .* mm, 1.125e\+07 N is no", message)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "shown"),
+    [
+        (
+            (2.9941, -1.9932, 1.00043, 0.0349, 0.034, 0.0028, 0.0812),
+            "Contact(x_mm=2.994 +- 0.035, y_mm=-1.993 +- 0.034, force_N=1.0004 +- 0.0028, misfit=0.081)",
+        ),
+        (
+            (1.0, 2.0, 55_088.4, 25.1, 151.0, 135_900.5, 826.0),
+            "Contact(x_mm=1 +- 25, y_mm=2 +- 151, force_N=55088 +- 135900, misfit=8.3e+02)",
+        ),
+        (
+            (0.0, math.nan, 1.0, 0.0, math.nan, math.inf, math.nan),
+            "Contact(x_mm=0.000000 +- 0.000000, y_mm=nan +- nan, force_N=1.000000 +- inf, misfit=nan)",
+        ),
+    ],
+)
+def test_a_contact_is_shown_as_precisely_as_it_is_known(numbers, shown):
+    contact = Contact(*numbers)
+    assert repr(contact) == shown
+    page = contact._repr_html_().replace("&plusmn;", "+-")
+    assert xml.etree.ElementTree.fromstring(page).tag == "table"
+    assert f"<td>{shown.partition('=')[2].partition(',')[0]}</td>" in page
+
+
+def test_a_contact_stays_seven_numbers_in_their_order():
+    """Other programs, exported C code among them, take them by their place."""
+    names = ("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit")
+    assert Contact._fields == Contacts._fields == names
+    contact = Contact(*map(float, range(7)))
+    assert tuple(contact) == tuple(map(float, range(7)))
+    assert pickle.loads(pickle.dumps(contact)) == contact
+
+
+def test_a_predictor_is_shown_with_its_domain(predictor):
+    assert repr(predictor) == (
+        "Predictor(linear/1: sensor linear-film, charges A B C (pC), positions up to 8 mm, forces 0.05 to 2 N)"
+    )
+
+
+def test_a_predictor_in_a_notebook_is_a_table_whatever_names_it_has(film, tmp_path):
+    page = Predictor(film.write(tmp_path, electrodes=("<b>", "B&C", "C")))._repr_html_()
+    assert "<td>&lt;b&gt; B&amp;C C (pC)</td>" in page
+    assert xml.etree.ElementTree.fromstring(page).tag == "table"
 
 
 def test_missing_model(models):

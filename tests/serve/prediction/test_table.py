@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from isocharge.errors import ChargeError
-from isocharge.serve import read_charges, table_records, write_contacts
+from isocharge.serve import Contacts, read_charges, table_records, write_contacts
 
 NAMES = ("A", "B", "C")
 
@@ -99,6 +99,16 @@ def test_contacts_as_csv(film, predictor):
     lines = out.getvalue().splitlines()
     assert lines[0] == "x_mm,y_mm,force_N,x_std_mm,y_std_mm,force_std_N,misfit"
     np.testing.assert_allclose(np.loadtxt(lines[1:], delimiter=",")[:, :3], [[1, 0.5, 1], [-2, 3, 0.25]], atol=2e-6)
+
+
+def test_contacts_as_csv_with_flags(film, predictor):
+    out = io.StringIO()
+    contacts = predictor.predict_batch(film.charge_pC([1.0, 9.0, 9.0], [0.5, 0.0, 0.0], [1.0, 0.25, 99.0]))
+    write_contacts(contacts, out, predictor.domain)
+    header, *rows = (line.split(",") for line in out.getvalue().splitlines())
+    assert header == [*Contacts._fields, "flags"]
+    assert [row[-1] for row in rows] == ["", "outside", "outside beyond"]
+    assert [row[:-1] for row in rows] == [[f"{value:.6f}" for value in row] for row in np.column_stack(contacts)]
 
 
 def test_contacts_as_records(film, predictor):

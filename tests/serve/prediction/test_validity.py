@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.serve import Contact, Contacts, Domain
+from isocharge.serve import Contact, Contacts, Domain, Predictor
 from isocharge.serve.prediction.validity import MISFIT_LIMIT, inside_polygon
 
 GOOD = Contact(1.0, -2.0, 0.5, 0.1, 0.1, 0.01, 0.3)
@@ -34,6 +34,12 @@ def test_inside_polygon_of_a_notched_square(closed):
         ({"force_N": 2.1}, ("outside",)),
         ({"misfit": MISFIT_LIMIT * 1.01}, ("misfit",)),
         ({"misfit": 99.0, "y_mm": -9.0}, ("outside", "misfit")),
+        ({"force_N": 5.9}, ("outside",)),
+        ({"force_N": 6.1}, ("outside", "beyond")),
+        ({"x_mm": 14.0, "y_mm": -19.0}, ("outside",)),
+        ({"x_mm": 15.0, "y_mm": -20.0}, ("outside", "beyond")),
+        ({"x_mm": 3e38, "force_N": 0.0}, ("outside", "beyond")),
+        ({"force_N": 55_088.0, "misfit": 826.0}, ("outside", "beyond", "misfit")),
     ],
 )
 def test_flags_of_a_contact(film, changes, flags):
@@ -45,6 +51,19 @@ def test_batch_flags_equal_one_by_one(film):
     columns = rng.uniform(-3, 10, (7, 50)).astype(np.float32)
     one_by_one = [domain.flags(Contact(*row)) for row in columns.T.tolist()]
     assert domain.batch_flags(Contacts(*columns)) == one_by_one
+
+
+@pytest.mark.parametrize("name", ["three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial"])
+def test_no_absurd_charge_goes_without_a_flag(name):
+    """Charges of any size and sign: none that no press can give passes as one."""
+    predictor, rng = Predictor(name), np.random.default_rng(0)
+    size = (20_000, len(predictor.metadata.electrodes))
+    charge_pC = 10 ** rng.uniform(-1, 10, size) * rng.choice([1, 1, -1], size)
+    charge_pC[:100] = 10 ** rng.uniform(5, 10, (100, 1))  # the same on all electrodes
+    flags = predictor.domain.batch_flags(predictor.predict_batch(charge_pC))
+    impossible = (charge_pC < 1.0).any(axis=1) | (charge_pC > 1e4).any(axis=1)  # 3,900 pC: 1 N on an electrode
+    assert all(words for words, wrong in zip(flags, impossible, strict=True) if wrong)
+    assert all("beyond" in words for words in flags[:100])
 
 
 def test_flags_of_one_contact_equal_those_in_a_batch():

@@ -133,6 +133,14 @@ def test_impossible_size_in_the_notation(text):
 
 
 @pytest.mark.parametrize(
+    ("text", "said"), [("circle:-1", "radius"), ("rectangle:4x-1", "height"), ("rectangle:-1x4", "width")]
+)
+def test_a_size_is_shown_as_it_was_written(text, said):
+    with pytest.raises(SceneError, match=f"^probe {said}: expected a positive number, got -1 mm in '{text}'$"):
+        parse_probe(text)
+
+
+@pytest.mark.parametrize(
     ("corners", "message"),
     [
         (HOUSE[::-1], r"convex polygon with its corners anticlockwise, got \[\["),

@@ -1,6 +1,8 @@
 """The sensor file: built-in sensors as designed, round trips, and one clear error for every way to be wrong."""
 
 import copy
+import json
+import re
 import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -117,8 +119,10 @@ def test_built_in_sensor(layout, kind, d31, d32):
 def test_names_of_the_built_in_sensors():
     assert built_in_sensors() == (
         "four-25um-biaxial",
+        "four-25um-biaxial-15mm",
         "four-25um-uniaxial",
         "three-25um-biaxial",
+        "three-25um-biaxial-12mm",
         "three-25um-uniaxial",
     )
 
@@ -398,8 +402,13 @@ def test_wrong_type_is_named(path, value):
     ("path", "value", "message"),
     [
         (("film", "poisson"), 0.5, "film poisson: expected 0 <= poisson < 0.5, got 0.5"),
-        (("film", "thickness_um"), 0.0, "film thickness: expected a positive number, got 0 m"),
-        (("film", "thickness_um"), -25.0, "film thickness: expected a positive number, got -2.5e-05 m"),
+        (("film", "thickness_um"), 0.0, r"film\.thickness_um: expected a positive number, got 0\.0"),
+        (("film", "thickness_um"), -25.0, r"film\.thickness_um: expected a positive number, got -25\.0"),
+        (("film", "radius_mm"), -45, r"film\.radius_mm: expected a number above 0 and at most 1e\+06, got -45"),
+        (("film", "radius_mm"), 1e300, r"film\.radius_mm: expected a number above 0 and at most 1e\+06, got 1e\+300"),
+        (("film", "young_GPa"), -3, r"film\.young_GPa: expected a positive number, got -3"),
+        (("film", "pretension_MPa"), -1, r"film\.pretension_MPa: expected a number from 0, got -1"),
+        (("film", "thickness_um"), 3000.3, r"film thickness: .* radius \(30\.0 mm\), got 3000\.3 um"),
         (("electrodes", "side_mm"), 0.0, "electrodes.side_mm: expected a positive number, got 0.0"),
         (("electrodes", "A"), [8.0, 5.0], "electrodes 'A' and 'B' overlap"),
         (("calibration", "gain"), {"A": 0.0}, "calibration.gain.A: expected a positive number, got 0.0"),
@@ -417,6 +426,46 @@ def test_impossible_values(path, value, message):
     at(table, path[:-1])[path[-1]] = value
     with pytest.raises(SensorError, match=rf"^mine\.toml: {message}"):
         sensor_from_dict(table, "mine.toml")
+
+
+def file_with(tmp_path, changes):
+    """A sensor file with other lines."""
+    text = WHOLE
+    for line, other in changes.items():
+        assert line in text
+        text = text.replace(line, other)
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"d31 = 20.0": "d31 = 1e-12"}, r"piezo\.d31 is 1e-12 pC/N, beside 2 pC/N: expected 1 to 30 pC/N"),
+        ({"d32 = 2.0": "d32 = -2e-12"}, r"piezo\.d32 is -2e-12 pC/N, beside 20 pC/N"),
+        ({"d31 = 20.0": "d31 = 20e-12", "d32 = 2.0": "d32 = 0.0"}, r"piezo\.d31 is 2e-11 pC/N, beside 0 pC/N"),
+        ({"B = [8.660254, 5.0]\n": ""}, r"one electrode \('A'\): .* three electrodes or more do"),
+    ],
+)
+def test_what_can_hardly_be_meant_gets_a_warning(tmp_path, changes, said, command, caplog):
+    path = file_with(tmp_path, changes)
+    load_sensor(path)
+    (message,) = caplog.messages
+    assert re.match(f"{path}: {said}", message)
+    code, out, err = command("simulate", "point", path, "--at", "1,2", "--json")
+    assert code == 0
+    assert json.loads(out)["status"] == "converged"
+    (caution,) = (line for line in err.splitlines() if str(path) in line)
+    assert re.match(rf"caution: {path}: {said}", caution)
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"d31 = 20.0": "d31 = 0.0"}, {"d32 = 2.0": "d32 = 0"}, {"d32 = 2.0": "d32 = -0.03"}]
+)
+def test_what_is_unusual_gets_no_warning(tmp_path, changes, caplog):
+    load_sensor(file_with(tmp_path, changes))
+    assert caplog.messages == []
 
 
 def test_electrode_off_the_film_in_a_file(tmp_path):

@@ -23,7 +23,11 @@ QUICK = FitConfig(
 )
 MODELS = Path(__file__).parents[3] / "models"
 LOW, HIGH, RADIUS = 0.05, 2.0, 8.0
-LARGEST = {"three-25um-biaxial-films": (0.4, 0.36, 1.0)}  # three charges tell less of a film of 1.5 MPa
+LARGEST = {
+    "three-25um-biaxial-films": (0.10, 0.4, 0.36, 1.0),  # three charges tell less of a film of 1.5 MPa
+    "three-25um-biaxial-12mm": (0.14, 0.25, 0.18, 0.8),  # and less of a wide area
+}
+"""By model: median and rms of the position, 95 % of clean ones, mm, and rms of the force, %."""
 
 
 @pytest.fixture(scope="module")
@@ -127,8 +131,8 @@ def known_presses(known, count, seed):
 
 def test_the_released_models_reach_what_they_should(known, touch):
     errors = measure_errors(predict(touch), presses(*known_presses(known, 6000, 77)), noise_model("reference"), seed=5)
-    assert errors["position_median_mm"] <= 0.10
-    largest_rms, largest_clean, percent = LARGEST.get(touch.metadata.name, (0.20, 0.18, 0.8))
+    largest_median, largest_rms, largest_clean, percent = LARGEST.get(touch.metadata.name, (0.10, 0.20, 0.18, 0.8))
+    assert errors["position_median_mm"] <= largest_median
     assert errors["position_rms_mm"] <= largest_rms
     assert errors["clean_position_p95_mm"] <= largest_clean
     assert errors["force_rms_percent"] <= percent
@@ -146,9 +150,10 @@ def test_the_deviations_are_honest(known, touch):
     assert np.all(np.abs(np.mean(deviation < 1.0, axis=0) - 0.68) < 0.025)
     assert np.all(np.abs(np.mean(deviation < 1.96, axis=0) - 0.95) < 0.012)
     radius, force = np.hypot(*truth.contact[:, :2].T), truth.contact[:, 2]
+    within = 0.06 if touch.metadata.name.endswith("-student") else 0.04  # 34 units are too few for every third
     for key in (radius, force):
         for rows in np.array_split(np.argsort(key), 3):
-            assert np.all(np.abs(np.mean(deviation[rows] < 1.0, axis=0) - 0.68) < 0.04)
+            assert np.all(np.abs(np.mean(deviation[rows] < 1.0, axis=0) - 0.68) < within)
             assert np.all(np.abs(np.mean(deviation[rows] < 1.96, axis=0) - 0.95) < 0.03)
 
 
@@ -194,9 +199,9 @@ def test_four_electrodes_have_one_check_to_spare(known, touch):
     truth = presses(*known_presses(known, 6000, 4))
     truth = truth[np.hypot(*truth.contact[:, :2].T) < 0.9 * known[1]]
     charge = 1e12 * noise_model("reference").add(1e-12 * truth.charge_pC, np.random.default_rng(3))
-    good = touch.predict_batch(charge).misfit
+    good, off = touch.predict_batch(charge).misfit, 0.4 if touch.metadata.name.endswith("-student") else 0.15
     for share in (0.5, 0.9, 0.95, 0.99):
-        assert np.quantile(good, share) == pytest.approx(halfnorm.ppf(share), rel=0.15)
+        assert np.quantile(good, share) == pytest.approx(halfnorm.ppf(share), rel=off)
 
 
 def test_a_model_of_measured_presses_is_judged_by_them_and_says_so(dataset, tmp_path):

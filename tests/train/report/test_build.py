@@ -11,11 +11,12 @@ import pytest
 from isocharge.cli import main
 from isocharge.errors import DatasetError, ModelError, OutputExists
 from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, run_sweep, write_dataset
+from isocharge.train.data.domain import inner_radius
 from isocharge.train.report import QUICK, write_report
-from isocharge.train.report.build import inner_radius
 
 ROOT = Path(__file__).parents[3]
 MODEL = ROOT / "models" / "three-25um-biaxial" / "1"
+STUDENT = ROOT / "models" / "three-25um-biaxial-student" / "1"
 PICTURES = {"latency", "throughput", "memory", "maps", "force", "calibration", "noise", "effects"}
 
 
@@ -29,7 +30,18 @@ def presses(tmp_path_factory):
 def report(presses, tmp_path_factory):
     """(folder, record printed by --json, words on stderr)."""
     base = tmp_path_factory.mktemp("report")
-    words = ["isocharge", "train", "report", str(presses), "-o", str(base / "out"), "--model", str(MODEL)]
+    words = [
+        "isocharge",
+        "train",
+        "report",
+        str(presses),
+        "-o",
+        str(base / "out"),
+        "--model",
+        str(MODEL),
+        "--student",
+        str(STUDENT),
+    ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ISOCHARGE_CACHE", str(base / "cache"))
         patch.setattr(sys, "argv", [*words, "--quick", "--json"])
@@ -75,6 +87,9 @@ def test_every_method_is_in_the_table(report):
     assert {"linear band", "lookup table, nearest entry", "lookup table, interpolated", "Gauss-Newton"} <= names
     assert {"k-nearest neighbours", "polynomial ridge", "gradient boosting", "Gaussian process"} <= names
     assert records[0]["form"] == "Predictor"
+    (student,) = (entry for entry in records if entry["name"] == "three-25um-biaxial-student")
+    assert student["memory_bytes"] < 0.2 * records[0]["memory_bytes"]
+    assert student["errors"]["position_rms_mm"] < 1.1 * records[0]["errors"]["position_rms_mm"]
     for entry in records:
         assert f"| {entry['name']}" in page.replace("**", "")
         assert entry["p50_us"] > 0

@@ -50,6 +50,7 @@ def test_keys_left_out_keep_their_defaults(tmp_path):
         ("[network]\nhidden = []\n", "network.hidden: expected widths"),
         ("[network]\nhidden = [64]\n", "as many layers as network.hidden"),
         ("[network]\nelectrodes = 2\n", "network.electrodes: expected 0 (as the dataset) or 3 to 64, got 2"),
+        ("[network]\nweights = 'int4'\n", "network.weights: expected one of float32, int8, got 'int4'"),
         ("[training]\nfinish_steps = 5\n", "training.finish_steps: expected 0 with the noise 'reference'"),
         ("[training]\npatience = 0\n", "training.patience: expected a whole number from 1"),
         ("network = 3\n", "network: expected a table, got 3"),

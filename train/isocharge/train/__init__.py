@@ -9,7 +9,10 @@ A few lines make a model from a dataset.
     print(release.metadata.errors)
 """
 
+from typing import TYPE_CHECKING
+
 from isocharge.extras import require
+from isocharge.versions import version_attribute
 
 with require("train"):
     from isocharge.train.bayes.limit import BayesLimit, Scene, bayes_estimate, bayes_limit
@@ -24,6 +27,7 @@ with require("train"):
     from isocharge.train.films.release import train_films
     from isocharge.train.release.evaluate import measure_errors
     from isocharge.train.release.release import Release, train_model
+    from isocharge.train.release.student import TaughtScene, distil_model, student_config
     from isocharge.train.rig.train_rig import Rig, train_rig
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
     from isocharge.train.training.fit import Fit, fit_network
@@ -44,10 +48,12 @@ __all__ = [
     "Rig",
     "Scene",
     "SensorFilms",
+    "TaughtScene",
     "TrainingConfig",
     "bayes_estimate",
     "bayes_limit",
     "calibrate",
+    "distil_model",
     "films_for",
     "fit_network",
     "load_config",
@@ -55,9 +61,14 @@ __all__ = [
     "next_presses",
     "read_earlier",
     "read_films",
+    "student_config",
     "train_films",
     "train_model",
     "train_rig",
     "write_calibration",
     "write_film_model",
 ]
+
+__version__: str
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for a text
+    __getattr__ = version_attribute(__name__)

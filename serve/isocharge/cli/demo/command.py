@@ -12,7 +12,7 @@ import typer
 
 from isocharge.cli.shared.options import ConfigOption
 from isocharge.cli.shared.terminal import progress, say, this_command
-from isocharge.cli.shared.virtual_sensor import virtual_sensor
+from isocharge.cli.shared.virtual_sensor import check_pseudo_terminals, virtual_sensor
 
 if TYPE_CHECKING:
     import numpy as np
@@ -68,6 +68,7 @@ def demo_command(
 
     Example: isocharge demo -o first-light
     """
+    check_pseudo_terminals()
     from isocharge.files import new_folder
     from isocharge.serve import Predictor
     from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, solve_maps, write_sweep

@@ -1,21 +1,34 @@
-"""`isocharge serve doctor`: what is on a port, as text or as JSON."""
+"""`isocharge serve doctor`: what is on a port, as text or as JSON, and the device file that fits it."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from isocharge.cli.serve.options import ModelsOption
+from isocharge.cli.serve.options import ModelsOption, WaitOption, awaited
 from isocharge.cli.shared.options import DeviceOption, JsonOption, board_of
+from isocharge.cli.shared.terminal import say
+from isocharge.errors import InputError, IsochargeError
+from isocharge.number_text import number_of
 
 if TYPE_CHECKING:
     from isocharge.serve import Examination
+    from isocharge.serve.port.request import Request
+
+GAIN_METAVAR = "NUMBER|A=..,B=.."
 
 
 def doctor_command(
     port: Annotated[
-        str, typer.Option("--port", metavar="URL", help="Port of the sensor: device path or pyserial URL.")
+        str,
+        typer.Option(
+            "--port",
+            metavar="URL",
+            help="Port of the sensor: device path, tcp://HOST:PORT, udp://HOST:PORT, pyserial URL.",
+        ),
     ],
     device: DeviceOption = None,
     model: Annotated[
@@ -28,27 +41,131 @@ def doctor_command(
     ] = None,
     models: ModelsOption = None,
     seconds: Annotated[float, typer.Option("--seconds", min=0.5, max=3600.0, help="Time to listen, s.")] = 5.0,
+    wait: WaitOption = 0.0,
     baud: Annotated[
         int | None,
         typer.Option("--baud", min=1, help="Speed of the port, bits per second. (default: the usual ones in turn)"),
     ] = None,
+    write: Annotated[
+        Path | None,
+        typer.Option("--write", metavar="FILE", help="Write a device file for this board, TOML. (default: no)"),
+    ] = None,
+    pC_per_unit: Annotated[
+        str | None,
+        typer.Option(
+            "--pC-per-unit",
+            metavar=GAIN_METAVAR,
+            help="Charge of one unit that the board sends, pC; for the device file. (default: asked for)",
+        ),
+    ] = None,
+    V_per_unit: Annotated[
+        str | None,
+        typer.Option(
+            "--V-per-unit", metavar=GAIN_METAVAR, help="Voltage of one unit, V; with --feedback-pF. (default: none)"
+        ),
+    ] = None,
+    feedback_pF: Annotated[
+        str | None,
+        typer.Option(
+            "--feedback-pF", metavar=GAIN_METAVAR, help="Feedback capacitance of the amplifiers, pF. (default: none)"
+        ),
+    ] = None,
+    request: Annotated[
+        str | None,
+        typer.Option(
+            "--request",
+            metavar="TEXT",
+            help=r"What the board has to be asked, as in '?\n' or '\x01\x04'. (default: nothing)",
+        ),
+    ] = None,
+    request_Hz: Annotated[
+        float, typer.Option("--request-Hz", min=0.1, max=1e5, help="Rate of the requests, at most, Hz.")
+    ] = 100.0,
     json: JsonOption = False,
 ) -> None:
-    """Listen on a port, and report which frames arrive, how good the charges are, and what is missing for a touch.
+    """Listen on a port: what frames arrive, how good the charges are, what is missing for a touch, a device file.
 
-    Leave the film alone meanwhile: offset, noise and drift are those of a film at rest.
+    Leave the film alone meanwhile: offset, noise and drift are those of a film at rest. Exit code 1 if no frames are
+    recognised.
 
-    Example: isocharge serve doctor --port /dev/ttyACM0
+    Example: isocharge serve doctor --port /dev/ttyACM0 --write board.toml
     """
     from json import dumps
 
+    from isocharge.files import refuse_existing
     from isocharge.serve import Predictor, examine
-    from isocharge.serve.live.port_check import BAUDS
+    from isocharge.serve.examination.listening import BAUDS
 
+    if write is not None:
+        refuse_existing(write)
     electrodes = Predictor(model, models=models).metadata.electrodes if model else ()
-    bauds, board = (baud,) if baud else BAUDS, board_of(device)
-    examination = examine(port, bauds=bauds, seconds=seconds, device=board, electrodes=electrodes)
+    settings = {"pC_per_unit": pC_per_unit, "V_per_unit": V_per_unit, "feedback_pF": feedback_pF}
+    examination = examine(
+        awaited(port, wait),
+        bauds=(baud,) if baud else BAUDS,
+        seconds=seconds,
+        device=board_of(device),
+        electrodes=electrodes,
+        gain={key: _setting(key, text) for key, text in settings.items() if text is not None},
+        request=_request(request, request_Hz),
+    )
     print(dumps(asdict(examination)) if json else "\n".join(report_lines(examination)))
+    alive = len(examination.channels)
+    if examination.good and len(electrodes) > alive:
+        say(f"models of {alive} electrodes: {', '.join(_models_of(alive, models)) or 'none'}; choose one with --model")
+    if examination.good and write is not None:
+        _write(write, examination)
+    if not examination.good:
+        raise typer.Exit(1)
+
+
+def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
+    """Names of the models with as many electrodes; those that cannot be read are left out."""
+    from isocharge.serve import Predictor
+    from isocharge.serve.model.repository import model_names, repositories
+
+    names = dict.fromkeys(name for root in repositories(models) for name in model_names(root))
+    for name in names:
+        with suppress(IsochargeError):
+            if len(Predictor(name, models=models).metadata.electrodes) == electrodes:
+                yield name
+
+
+def _setting(key: str, text: str) -> Any:
+    """A number for all electrodes, or one for each: `A=0.1,B=-0.1`."""
+    try:
+        if "=" not in text:
+            return number_of(text)
+        pairs = (part.partition("=") for part in text.split(","))
+        return {name.strip(): number_of(number.strip()) for name, _, number in pairs}
+    except ValueError as error:
+        option = f"--{key.replace('_', '-')}"
+        raise InputError(f"{option}: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}") from error
+
+
+def _request(text: str | None, rate_Hz: float) -> "Request | None":
+    from isocharge.serve.port.request import Request
+
+    if text is None:
+        return None
+    try:
+        data = text.encode("latin-1", "backslashreplace").decode("unicode_escape").encode("latin-1")
+    except (UnicodeDecodeError, UnicodeEncodeError) as error:
+        raise InputError(rf"--request: expected a text like '?\n' or '\x01\x04', got {text!r}") from error
+    if not data:
+        raise InputError("--request: expected at least one byte, got an empty text")
+    return Request(data, rate_Hz)
+
+
+def _write(path: Path, examination: "Examination") -> None:
+    from isocharge.files import write_whole
+    from isocharge.serve.examination.device_text import device_text
+
+    try:
+        write_whole(path, device_text(examination).encode())
+    except OSError as error:
+        raise InputError(f"--write {path}: cannot be written ({error.strerror}); choose another path") from error
+    say(f"{path} written; use it with: isocharge serve stream MODEL --port {examination.url} --device {path}")
 
 
 def report_lines(examination: "Examination") -> Iterator[str]:
@@ -62,14 +179,22 @@ def report_lines(examination: "Examination") -> Iterator[str]:
         else f"{examination.lost} lost, {examination.repeated} repeated"
     )
     yield f"{numbers}; {'a' if examination.device_clock else 'no'} device clock"
+    if examination.unused:
+        yield f"channels that no electrode uses: {', '.join(examination.unused)}"
+    if examination.unit != "pC":
+        yield f"the channels are {'volts, it seems' if examination.unit == 'V' else examination.unit}, not pC"
     if examination.channels:
-        yield "channel    offset pC   noise pC  drift pC/s  50 Hz pC  60 Hz pC"
+        yield _HEAD.replace("pC", {"counts": "ct", "V": " V"}.get(examination.unit, "pC"))
     for channel in examination.channels:
         figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
-        columns = zip(figures, (12, 11, 12, 10, 10), (2, 3, 2, 2, 2), strict=True)
+        digits = (5, 6, 5, 5, 5) if examination.unit == "V" else (2, 3, 2, 2, 2)
+        columns = zip(figures, (12, 11, 12, 10, 10), digits, strict=True)
         yield f"{channel.name:8.8s}" + "".join(_column(*column) for column in columns)
     yield "missing to get a touch: nothing" if not examination.missing else "missing to get a touch:"
     yield from (f"- {sentence}" for sentence in examination.missing)
+
+
+_HEAD = "channel    offset pC   noise pC  drift pC/s  50 Hz pC  60 Hz pC"
 
 
 def _column(figure: float | None, width: int, digits: int) -> str:

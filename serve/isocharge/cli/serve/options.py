@@ -1,5 +1,6 @@
 """Options of several serving commands."""
 
+import time
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +14,10 @@ ModelsOption = Annotated[
         metavar="DIR",
         help="Folder in which a model's name is looked up before the usual places. (default: none)",
     ),
+]
+
+WaitOption = Annotated[
+    float, typer.Option("--wait", min=0.0, max=3600.0, help="Time to wait until the port exists, s.")
 ]
 
 
@@ -69,3 +74,11 @@ McapRecordsOption = Annotated[
         "same text in ROS 2 messages, for `ros2 bag` and rosbags, which refuse a file with anything else.",
     ),
 ]
+
+
+def awaited(port: str, wait: float) -> str:
+    """The port, as soon as there is something under its path, or when the time, s, is over."""
+    end = time.monotonic() + wait
+    while "://" not in port and port != "-" and not Path(port).exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    return port

@@ -34,6 +34,8 @@ def predict_command(
 ) -> None:
     """Turn charges of presses (pC) into positions (mm) and forces (N) with their standard deviations.
 
+    The column `flags` says why not to trust a row: outside the working area or forces, misfit, far beyond both.
+
     Example: isocharge serve predict three-25um-biaxial presses.csv > contacts.csv
     """
     from isocharge.serve import Predictor, read_charges, table_records, write_contacts
@@ -45,7 +47,7 @@ def predict_command(
         if json:
             _print_lines(record.to_json() for record in table_records(charge_pC, predictor))
         else:
-            write_contacts(predictor.predict_batch(charge_pC), sys.stdout)
+            write_contacts(predictor.predict_batch(charge_pC), sys.stdout, predictor.domain)
             sys.stdout.flush()
 
 

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -49,13 +50,14 @@ def replay_command(
     recording, clock = Recording(file), RecordedClock()
     predictor = Predictor(model or recording.model, models=models)
     board = device_from_table(recording.device, str(file))
-    path = TouchStream(predictor, board, policy=Policy(recording.policy), now_ns=clock)
+    path = TouchStream(predictor, board, policy=Policy(recording.policy), now_ns=clock, frame_id=recording.name or None)
+    load = None if model else partial(Predictor, models=models)
     latencies: deque[float] = deque(maxlen=LATENCIES)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         write = record_writer(stack, output, udp, predictor.metadata.electrodes, stdout_writer())
         write = with_lines(write, _new_mcap(stack, mcap, mcap_records, predictor.metadata.electrodes))
-        write_records(replay(recording, path, clock, real_time=real_time), write, latencies)
+        write_records(replay(recording, path, clock, real_time=real_time, load=load), write, latencies)
     say(summary(path, latencies))
     if mcap is not None and not mcap.exists():
         say(f"{mcap} was not written, because the replay was stopped before its end")

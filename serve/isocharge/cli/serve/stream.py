@@ -1,10 +1,8 @@
 """`isocharge serve stream`: prediction records from a port as they come."""
 
-import signal
-import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,6 +18,8 @@ from isocharge.cli.serve.options import (
     OutputOption,
     PolicyName,
     UdpOption,
+    WaitOption,
+    awaited,
 )
 from isocharge.cli.serve.record_output import (
     LATENCIES,
@@ -31,12 +31,15 @@ from isocharge.cli.serve.record_output import (
 )
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
 from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
-from isocharge.cli.shared.stopping import until_stopped
+from isocharge.cli.shared.stopping import on_signal, stop_after, unless_hung_up, until_stopped
 from isocharge.cli.shared.terminal import log_to_stderr, say
+from isocharge.errors import InputError
 
 if TYPE_CHECKING:
-    from isocharge.serve import Device
-    from isocharge.serve.live.recorded_stream import RecordedStream
+    from isocharge.serve import Device, Predictor
+
+LONGEST_NAME = 100
+"""Characters of a film's name."""
 
 
 def stream_command(
@@ -46,7 +49,7 @@ def stream_command(
         typer.Option(
             "--port",
             metavar="URL",
-            help="Port of the sensor: device path or pyserial URL; or a file of bytes; - reads stdin.",
+            help="Port of the sensor: device path, tcp:// or udp://HOST:PORT; or a file of bytes; - reads stdin.",
         ),
     ],
     models: ModelsOption = None,
@@ -59,6 +62,15 @@ def stream_command(
             "--record",
             metavar="FILE",
             help="Also write raw bytes and records for `isocharge serve replay`. (default: no)",
+        ),
+    ] = None,
+    name: Annotated[
+        str | None,
+        typer.Option(
+            "--name",
+            metavar="TEXT",
+            help="Name of this film, the `frame_id` of its records: tells two films on one computer apart. "
+            "(default: name of the model's sensor)",
         ),
     ] = None,
     mcap: McapOption = None,
@@ -79,9 +91,7 @@ def stream_command(
     count: Annotated[
         int | None, typer.Option("--count", min=1, help="Number of records after which to stop. (default: at Ctrl-C)")
     ] = None,
-    wait: Annotated[
-        float, typer.Option("--wait", min=0.0, max=3600.0, help="Time to wait until the port exists, s.")
-    ] = 0.0,
+    wait: WaitOption = 0.0,
     baud: Annotated[
         int, typer.Option("--baud", min=1, help="Speed of the port, bits per second; USB ports ignore it.")
     ] = 115200,
@@ -97,8 +107,9 @@ def stream_command(
     """Follow a sensor live: read its port, and print position (mm) and force (N) for every frame of charges.
 
     The first 100 frames (0.5 s at 200 Hz) are the tare, the charges at rest: leave the film alone meanwhile. The signal
-    SIGUSR1 starts a new tare. Ctrl-C stops. If the reader of stdout is too slow for a sensor, the oldest lines are
-    dropped and counted in the summary; --record gets everything.
+    SIGUSR1 starts a new tare; SIGHUP takes the latest version of MODEL, without losing a frame. Ctrl-C stops. If the
+    reader of stdout is too slow for a sensor, the oldest lines are dropped and counted in the summary; --record gets
+    everything.
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
@@ -107,16 +118,19 @@ def stream_command(
     from isocharge.serve.live.recorded_stream import RecordedStream
 
     predictor, board = Predictor(model, models=models), _board(device, offset_limit_pC)
-    path = TouchStream(predictor, board, policy=Policy(policy.value))
+    path = TouchStream(predictor, board, policy=Policy(policy.value), frame_id=_checked_name(name))
     latencies: deque[float] = deque(maxlen=LATENCIES)
-    recorder = Recorder(record, predictor.metadata.label, policy.value, board.table) if record else None
+    recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name or "") if record else None
     live = RecordedStream(path, recorder)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         stack.enter_context(log_to_stderr())
-        source = stack.enter_context(open_source(_awaited(port, wait), baud=baud, reconnect=reconnect))
-        stack.enter_context(_tare_on_signal(live))
-        stack.enter_context(_alarm(seconds))
+        request = board.frames.request
+        source = stack.enter_context(open_source(awaited(port, wait), baud=baud, reconnect=reconnect, request=request))
+        stack.enter_context(on_signal("SIGUSR1", live.request_tare))
+        renew = partial(live.request_model, partial(_load, model, models))
+        stack.enter_context(on_signal("SIGHUP", unless_hung_up(renew)))
+        stack.enter_context(stop_after(seconds))
         lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
         put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
         write = record_writer(stack, output, udp, predictor.metadata.electrodes, put)
@@ -145,34 +159,16 @@ def _board(device: Path | None, offset_limit_pC: float | None) -> "Device":
     return board if offset_limit_pC is None else with_offset_limit(board, offset_limit_pC)
 
 
-def _awaited(port: str, wait: float) -> str:
-    """The port, as soon as there is something under its path, or when the time is over."""
-    end = time.monotonic() + wait
-    while "://" not in port and port != "-" and not Path(port).exists() and time.monotonic() < end:
-        time.sleep(0.05)
-    return port
+def _load(model: str, models: Path | None) -> "Predictor":
+    """The latest version of a model; it must answer on this machine as where it was trained."""
+    from isocharge.serve import Predictor, check_golden, find_model, load_model
+
+    folder = find_model(model, models)
+    check_golden(load_model(folder))
+    return Predictor(folder)
 
 
-@contextmanager
-def _alarm(seconds: float | None) -> Iterator[None]:
-    """As if Ctrl-C were pressed after some time, also where nothing comes from the port."""
-    if seconds is None:
-        yield
-        return
-    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-
-
-@contextmanager
-def _tare_on_signal(live: "RecordedStream") -> Iterator[None]:
-    """SIGUSR1 asks for a new tare."""
-    before = signal.signal(signal.SIGUSR1, lambda *_: live.request_tare())
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGUSR1, before)
+def _checked_name(name: str | None) -> str | None:
+    if name is not None and not (0 < len(name) <= LONGEST_NAME and name.isprintable()):
+        raise InputError(f"--name: expected 1 to {LONGEST_NAME} printable characters, got {name[:LONGEST_NAME]!r}")
+    return name

@@ -14,7 +14,7 @@ import typer
 from isocharge.cli.shared.options import ProbeOption, SensorArgument
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import progress, say
-from isocharge.cli.shared.virtual_sensor import virtual_sensor
+from isocharge.cli.shared.virtual_sensor import check_pseudo_terminals, virtual_sensor
 from isocharge.default_scene import DEFAULT_FORCE_RANGE
 from isocharge.errors import InputError, OutputExists
 from isocharge.files import bounded_lines
@@ -119,6 +119,7 @@ def virtual_command(
 
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
+    check_pseudo_terminals()
     from isocharge.serve import Faults
     from isocharge.simulate import ForwardMap, load_amplifier
 

@@ -1,7 +1,10 @@
-"""How a command that runs until it is stopped ends well."""
+"""How a command that runs until it is stopped ends well, and what else signals ask of it."""
 
+import _thread
+import os
 import signal
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from isocharge.cli.shared.standard_streams import forget
@@ -19,3 +22,61 @@ def until_stopped() -> Iterator[None]:
         forget(1)
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def stop_after(seconds: float | None) -> Iterator[None]:
+    """As if Ctrl-C were pressed after some time, also where the command waits for a port; None for never."""
+    if seconds is None:
+        yield
+        return
+    with _alarm(max(seconds, 1e-3)) if hasattr(signal, "SIGALRM") else _timer(seconds):
+        yield
+
+
+@contextmanager
+def _alarm(seconds: float) -> Iterator[None]:
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@contextmanager
+def _timer(seconds: float) -> Iterator[None]:
+    """Windows has no alarm; there, a read that is under way ends first."""
+    timer = threading.Timer(seconds, _thread.interrupt_main)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def on_signal(name: str, act: Callable[[], object]) -> Iterator[None]:
+    """Act when a signal comes; a system that does not have it, as Windows, sends none."""
+    number = getattr(signal, name, None)
+    if number is None:
+        yield
+        return
+    before = signal.signal(number, lambda *_: act())
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
+def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
+    """Act at SIGHUP, but stop as at Ctrl-C where it says that the terminal of this command was closed."""
+    terminals = [number for number in (0, 1, 2) if os.isatty(number)]
+
+    def act_or_stop() -> None:
+        if not all(map(os.isatty, terminals)):
+            raise KeyboardInterrupt
+        act()
+
+    return act_or_stop

@@ -4,7 +4,7 @@ import logging
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 import typer
 
@@ -27,11 +27,21 @@ def this_command() -> str:
     return shlex.join(["isocharge", *sys.argv[1:]])
 
 
-@contextmanager
-def log_to_stderr() -> Iterator[None]:
+def log_to_stderr() -> AbstractContextManager[None]:
     """Print warnings of the live path for people."""
-    handler = logging.StreamHandler()
-    logger = logging.getLogger("isocharge.serve")
+    return _printed("isocharge.serve", "%(message)s")
+
+
+def cautions_to_stderr() -> AbstractContextManager[None]:
+    """Print warnings of the simulator for people."""
+    return _printed("isocharge.simulate", "caution: %(message)s")
+
+
+@contextmanager
+def _printed(name: str, style: str) -> Iterator[None]:
+    """Print what a logger warns of."""
+    handler, logger = logging.StreamHandler(), logging.getLogger(name)
+    handler.setFormatter(logging.Formatter(style))
     logger.addHandler(handler)
     try:
         yield

@@ -12,6 +12,13 @@ SCRIPT_S = 60.0
 """Length of the random script that a virtual sensor repeats, s."""
 
 
+def check_pseudo_terminals() -> None:
+    """Raise PortError on a system without pseudo-terminals, before a command computes for what it cannot play."""
+    from isocharge.serve.virtual_sensor.pseudo_port import posix_modules
+
+    posix_modules()
+
+
 def virtual_sensor(
     forward_map: "ForwardMap",
     noise: "str | Amplifier",

@@ -4,6 +4,7 @@ import typer
 
 from isocharge.cli.simulate.contours import contours_command
 from isocharge.cli.simulate.curves import curves_command
+from isocharge.cli.simulate.design import design_command
 from isocharge.cli.simulate.identify import identify_command
 from isocharge.cli.simulate.paper import paper_command
 from isocharge.cli.simulate.point import point_command
@@ -17,4 +18,5 @@ simulate_app.command("sweep")(sweep_command)
 simulate_app.command("curves")(curves_command)
 simulate_app.command("contours")(contours_command)
 simulate_app.command("identify")(identify_command)
+simulate_app.command("design")(design_command)
 simulate_app.command("paper")(paper_command)

@@ -1,6 +1,5 @@
 """`isocharge train fit`: a dataset, or a sensor, to a model."""
 
-import json as json_module
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,8 @@ from isocharge.cli.shared.measured_presses import (
     read_presses_of,
 )
 from isocharge.cli.shared.options import PROBE_HELP, ConfigOption, FreshOption, RadiusOption, radius_mm_of
-from isocharge.cli.shared.terminal import progress, say, this_command
+from isocharge.cli.shared.simulated_presses import simulated_presses
+from isocharge.cli.shared.training_run import train_and_say
 from isocharge.default_scene import DEFAULT_RADIUS
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing
@@ -25,9 +25,6 @@ from isocharge.files import refuse_existing
 if TYPE_CHECKING:
     from isocharge.simulate import Dataset
     from isocharge.train import Release
-
-SAMPLES = 24_000
-"""Number of presses that are simulated if no dataset is given."""
 
 
 def fit_command(
@@ -107,23 +104,7 @@ def fit_command(
         train = _train_on_measured(dataset, str(sensor), probe or ["circle:1.0"], radius, stds, models, config)
     else:
         train = _train_on_presses(dataset, sensor, probe or ["circle:1.0"], radius, config)
-    try:
-        with progress("training") as advance:
-            release = train(
-                output,
-                command=this_command(),
-                version=version,
-                fresh=fresh,
-                progress=advance,
-                warn=lambda message: say(f"caution: {message}"),
-            )
-    except KeyboardInterrupt:
-        if (part := output / f"{version}.part").exists():
-            say(f"stopped; what is done is kept in {part}, and the same command goes on from there")
-        raise
-    if json:
-        typer.echo(json_module.dumps({"folder": str(release.folder), "errors": dict(release.metadata.errors)}))
-    say(_summary(release))
+    train_and_say(train, output, version, fresh=fresh, json=json)
 
 
 def _check_source(dataset: Path | None, sensor: str | None, measured: bool) -> None:
@@ -206,26 +187,7 @@ def _read(folder: Path) -> "Dataset":
 
 
 def _simulate(sensor: str, probes: list[str], radius: str) -> "Dataset":
-    """A sweep with its defaults, deleted once it is read; it takes a few seconds, so one process is enough."""
-    from tempfile import TemporaryDirectory
-
-    from isocharge.simulate import Sweep, SweepCallbacks, load_sensor, parse_probe, read_dataset, run_sweep
+    from isocharge.simulate import Sweep, load_sensor, parse_probe
 
     film_sensor, pressing, forces = load_sensor(sensor), [parse_probe(text) for text in probes], Sweep().force_range
-    reach = sweep_radius(radius, film_sensor, pressing, forces)
-    with TemporaryDirectory() as folder, progress("solving the film") as advance:
-        sweep = Sweep(reach, samples=SAMPLES)
-        return read_dataset(
-            run_sweep(Path(folder) / "presses", film_sensor, pressing, sweep, callbacks=SweepCallbacks(advance))
-        )
-
-
-def _summary(release: "Release") -> str:
-    errors = release.metadata.errors
-    measured = errors.get("measured_presses")
-    presses = f"on {measured:.0f} measured presses that training never saw, " if measured else ""
-    return (
-        f"{release.folder}: {presses}position error {errors['position_median_mm']:g} mm median, "
-        f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "
-        f"force {errors['force_rms_percent']:g} % rms"
-    )
+    return simulated_presses(film_sensor, pressing, sweep_radius(radius, film_sensor, pressing, forces), forces)

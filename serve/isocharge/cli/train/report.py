@@ -1,6 +1,7 @@
 """`isocharge train report`: speed against error, all methods, with the limits."""
 
 import json as json_module
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +10,7 @@ import typer
 from isocharge.cli.shared.measured_presses import read_presses_of
 from isocharge.cli.shared.options import NewFolderOption, ProbeOption
 from isocharge.cli.shared.terminal import progress, say, this_command
-from isocharge.errors import InputError
+from isocharge.errors import InputError, ModelError
 from isocharge.files import refuse_existing
 
 if TYPE_CHECKING:
@@ -32,6 +33,14 @@ def report_command(
             "--model",
             metavar="MODEL",
             help="Model to compare, name or path; once for each DATASET. (default: the one named as the sensor)",
+        ),
+    ] = None,
+    student: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--student",
+            metavar="MODEL",
+            help="Small model to compare too; may be repeated. (default: the released one named MODEL-student)",
         ),
     ] = None,
     sensor: Annotated[
@@ -65,9 +74,15 @@ def report_command(
     loaded = [_read(path, sensor, probe) for path in datasets]
     names = model or [dataset.sensor.name for dataset in loaded]
     subjects = [(dataset, find_model(name)) for dataset, name in zip(loaded, names, strict=True)]
+    students = [find_model(name) for name in student] if student else _students_of(names)
     with progress("report") as advance:
         record = write_report(
-            output, subjects, QUICK if quick else Settings(), command=this_command(), progress=advance
+            output,
+            subjects,
+            QUICK if quick else Settings(),
+            students=students,
+            command=this_command(),
+            progress=advance,
         )
     for section in record["datasets"]:
         for sentence in section["verdict"]["sentences"]:
@@ -75,6 +90,17 @@ def report_command(
     say(str(output / "report.md"))
     if json:
         typer.echo(json_module.dumps(record))
+
+
+def _students_of(models: list[str]) -> list[Path]:
+    """The students that are there, by name."""
+    from isocharge.serve import find_model
+
+    students = []
+    for model in models:
+        with suppress(ModelError):
+            students.append(find_model(f"{model}-student"))
+    return students
 
 
 def _read(path: Path, sensor: str | None, probe: str) -> "Dataset":

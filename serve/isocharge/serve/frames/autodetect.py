@@ -5,6 +5,7 @@ came three times in a row. The bytes are cut where either of them could end a fr
 """
 
 import re
+from collections.abc import Mapping
 
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import Frame, FrameCounts, Parser
@@ -16,13 +17,13 @@ _STEP = re.compile(rb"[^\0\n]*[\0\n]|[^\0\n]+")
 class AutoParser:
     """Bytes in, frames out, from the frames on by which the format was recognised."""
 
-    def __init__(self, columns: tuple[str, ...] = ()) -> None:
+    def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
         """Set up both parsers.
 
         Args:
-            columns: Names for the columns of a CSV without header.
+            columns, meanings: As `TextParser` takes them.
         """
-        self._candidates: tuple[Parser, ...] = (BinaryParser(), TextParser(columns))
+        self._candidates: tuple[Parser, ...] = (BinaryParser(), TextParser(columns, meanings))
         self._chosen: Parser | None = None
         self._seen = 0
 

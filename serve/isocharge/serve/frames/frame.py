@@ -4,6 +4,7 @@ Parsers know no port: bytes in, frames and counters out. However the bytes are c
 are the same, and memory is bounded whatever comes.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -105,15 +106,16 @@ class Splitter:
         self._tail = b""
         self._overlong = False
 
-    def feed(self, data: bytes) -> list[bytes]:
-        """The pieces that end within `data`, without delimiter."""
+    def feed(self, data: bytes) -> Iterator[bytes]:
+        """The pieces that end within `data`, without delimiter; a dropped one is counted when its turn comes."""
         *pieces, self._tail = (self._tail + data).split(self._delimiter)
-        whole = [piece for piece in pieces if self._fits(piece)]
+        for piece in pieces:
+            if self._fits(piece):
+                yield piece
         if self._overlong or len(self._tail) > self._longest:
             self._overlong = True
             self._counts.drop(len(self._tail))
             self._tail = b""
-        return whole
 
     def forget(self) -> None:
         """Drop what is unfinished."""

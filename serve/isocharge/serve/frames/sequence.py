@@ -1,4 +1,6 @@
-"""Gaps, repeats and restarts in the numbers of frames."""
+"""Gaps, repeats and restarts in the numbers of frames, and where a counter in text wraps."""
+
+from collections.abc import Iterable
 
 from isocharge.serve.flags import GAP, REPEAT, RESTART
 
@@ -46,3 +48,47 @@ class SequenceGaps:
             return (RESTART,)
         self.lost += step - 1
         return (GAP,)
+
+
+class CounterWrap:
+    """The number at which a counter in text wraps to 0: text does not say how wide a counter is.
+
+    A counter that falls has wrapped if all it ever showed is below a usual modulus, and the step modulo that is no
+    larger than its steps before. Otherwise it has begun anew.
+
+    Attributes:
+        modulus: Where it wraps, or may wrap if it has not yet.
+    """
+
+    def __init__(self, usual: Iterable[int], modulus: int, most_steps: int) -> None:
+        """Set up the watch.
+
+        Args:
+            usual: Moduli that boards use, smallest first.
+            modulus: That of a counter which has not wrapped yet.
+            most_steps: Largest step over a wrap, in steps before.
+        """
+        self.modulus = modulus
+        self._usual, self._most_steps = tuple(usual), most_steps
+        self._last: int | None = None
+        self._step, self._largest = 1, 0
+
+    def forget(self) -> None:
+        """The next value is the first one of a new connection."""
+        self._last = None
+
+    def update(self, value: int) -> None:
+        """Take the next value."""
+        last, self._last = self._last, value
+        if last is not None and value < last:
+            self._fell(value - last)
+        elif last is not None and value > last:
+            self._step = value - last
+        if value > self._largest:
+            self._largest = value
+
+    def _fell(self, step: int) -> None:
+        for modulus in self._usual:
+            if self._largest < modulus and step % modulus <= min(self._most_steps * self._step, modulus // 2):
+                self.modulus = modulus
+                return

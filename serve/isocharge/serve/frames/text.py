@@ -3,18 +3,20 @@
 A layout is recognised when it has come three times in a row: three rows of the same width or names, or three times the
 same cycle of lines with one name each. A reader may start in the middle of a cycle, so a cycle begins with the name
 that sorts first, number and clock before channels; for the same reason a first line of bare numbers is dropped. After
-recognition a line of another layout is dropped and counted. Text has no checksum: a damaged digit in an otherwise whole
-line cannot be noticed.
+recognition a line of another layout is dropped and counted. Text has no checksum, but for sentences in the manner of
+NMEA: a damaged digit in an otherwise whole line cannot be noticed. A line that is no reading and comes again and again,
+such as the echo of a request, is dropped and hinders no recognition.
 
 Some names mean something: `seq` counts frames; `t_us`, `t_ms` or `t_s` is the device's clock. All others are channels.
+Where number or clock wrap is learned when they do.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from isocharge.serve.frames.frame import T_US_MODULUS, Frame, FrameCounts, Splitter
-from isocharge.serve.frames.sequence import SEQ_MODULUS
+from isocharge.serve.frames.sequence import SEQ_MODULUS, CounterWrap
 from isocharge.serve.frames.text_lines import SEQ, TIMES_US, Line, Notation, parse_line
 
 LONGEST_LINE = 4096
@@ -28,6 +30,12 @@ TIMES_TO_RECOGNISE = 3
 
 MOST_VALUES = 256
 """Largest number of values in a line."""
+
+SEQ_MODULI = (100, 256, 1000, 10_000, SEQ_MODULUS, 1 << 32)
+"""Numbers at which counters of frames wrap."""
+
+MOST_SEQ_STEPS, MOST_TIME_STEPS = 2, 16
+"""Largest step of number and clock over a wrap, in steps before it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,14 +92,21 @@ def _whole(value: float) -> int:
 
 
 class TextParser:
-    """Bytes in, frames out; the layout is recognised, and `columns` are the names of a CSV without header."""
+    """Bytes in, frames out; the layout is recognised."""
 
-    seq_modulus = SEQ_MODULUS
+    def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
+        """Set up the parser.
 
-    def __init__(self, columns: tuple[str, ...] = ()) -> None:
+        Args:
+            columns: Names for the columns of a CSV.
+            meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the device has for it.
+        """
         self.counts = FrameCounts()
         self.layout: Layout | None = None
-        self._columns = columns
+        self._columns, self._meanings = columns, dict(meanings or {})
+        self._seq_wrap = CounterWrap(SEQ_MODULI, SEQ_MODULUS, MOST_SEQ_STEPS)
+        self._clock_wrap: CounterWrap | None = None
+        self._noise = b""
         self._lines = Splitter(b"\n", LONGEST_LINE, self.counts)
         self._history: list[tuple[Line, int]] = []
         self._cycle: dict[str, float] = {}
@@ -99,9 +114,14 @@ class TextParser:
         self._first = True
 
     @property
+    def seq_modulus(self) -> int:
+        """The number at which a frame's `seq` wraps to 0; 16 bits until it has wrapped."""
+        return self._seq_wrap.modulus
+
+    @property
     def t_us_modulus(self) -> int:
-        """The time at which a clock of 32 bits in this unit wraps to 0, us."""
-        return T_US_MODULUS * round(self.layout.us) if self.layout else T_US_MODULUS
+        """The time at which the clock wraps to 0, us; that of 32 bits in its unit until it has wrapped."""
+        return self._clock_wrap.modulus if self._clock_wrap else T_US_MODULUS
 
     @property
     def format(self) -> str:
@@ -120,6 +140,9 @@ class TextParser:
         self._lines.forget()
         self._drop_cycle()
         self._first = True
+        self._seq_wrap.forget()
+        if self._clock_wrap:
+            self._clock_wrap.forget()
 
     def _take(self, data: bytes) -> list[Frame]:
         """The frames that this line completes, usually one."""
@@ -127,8 +150,10 @@ class TextParser:
         try:
             line = parse_line(data)
         except ValueError:
-            self._refuse(size)
+            self._refuse_noise(data, size)
             return []
+        if self._meanings and line.names:
+            line = line._replace(names=tuple(self._meanings.get(name, name) for name in line.names))
         if first and line.notation is Notation.csv:  # "801.2" may have been cut to "1.2": nothing would show it
             self._refuse(size)
             return []
@@ -137,6 +162,14 @@ class TextParser:
         if line.notation is Notation.header:
             return self._name_columns(line, size)
         return self._recognise(line, size) if self.layout is None else self._read(line, size)
+
+    def _refuse_noise(self, data: bytes, size: int) -> None:
+        """Count a line that is no reading; one that comes again is an echo, and the lines round it stay gathered."""
+        if data == self._noise:
+            self.counts.refuse(size)
+            return
+        self._noise = data
+        self._refuse(size)
 
     def _refuse(self, size: int) -> None:
         """Count a bad line, and drop the lines that were gathered to recognise a layout."""
@@ -220,7 +253,20 @@ class TextParser:
             self.counts.refuse(size)
             return []
         self.counts.accept()
+        if frame.seq is not None:
+            self._seq_wrap.update(frame.seq)
+        if frame.t_us is not None:
+            if self._clock_wrap is None:
+                self._clock_wrap = clock_wrap(layout.us)
+            self._clock_wrap.update(frame.t_us)
         return [frame]
+
+
+def clock_wrap(us: float) -> CounterWrap:
+    """The watch over a clock in a unit, us: of 16, 24 or 32 bits, or computed from one of 32 bits in us or ms."""
+    moduli = {1 << bits for bits in (16, 24, 32)}
+    usual = {modulus * round(us) for modulus in moduli} | {T_US_MODULUS, 1000 * T_US_MODULUS}
+    return CounterWrap(sorted(usual), T_US_MODULUS * round(us), MOST_TIME_STEPS)
 
 
 def _before(name: str) -> tuple[bool, str]:

@@ -6,6 +6,7 @@
 | name:value, several in a line or one | `A:801.2,B:799.5,C:803.3` |
 | Teleplot (github.com/nesnes/teleplot) | `>A:1627551892437:801.2§pC` (time in ms and unit are optional) |
 | JSON object or list | `{"seq": 12, "A": 801.2}` |
+| sentence in the manner of NMEA 0183, checksum or not | `$PZT,801.2,799.5,803.3*5D` |
 
 Blank lines and lines that begin with # hold no values. A number is what `isocharge.number_text` reads.
 """
@@ -13,6 +14,8 @@ Blank lines and lines that begin with # hold no values. A number is what `isocha
 import json
 import re
 from enum import StrEnum
+from functools import reduce
+from operator import xor
 from typing import Any, NamedTuple
 
 from isocharge.number_text import number_of
@@ -44,6 +47,7 @@ class Notation(StrEnum):
     pairs = "name:value"
     teleplot = "Teleplot"
     json = "JSON"
+    sentence = "sentences"
     nothing = "nothing"
 
 
@@ -82,6 +86,8 @@ def parse_line(data: bytes) -> Line:
         return _json(text)
     if text[0] == ">":
         return _teleplot(text)
+    if text[0] == "$":
+        return _sentence(text)
     return _pairs(text) if ":" in text or "=" in text else _csv(text)
 
 
@@ -93,6 +99,17 @@ def _csv(text: str) -> Line:
         if all(map(_NAME.fullmatch, cells)) and len(set(cells)) == len(cells):
             return Line(Notation.header, tuple(cells))
         raise
+
+
+def _sentence(text: str) -> Line:
+    """The numbers after the first word, which says what they are; `*` and the xor of all bytes may end a sentence."""
+    content, star, check = text[1:].partition("*")
+    if star and (len(check) != 2 or int(check, 16) != reduce(xor, content.encode(), 0)):
+        raise ValueError(f"expected the checksum of the sentence, got {text[-100:]!r}")
+    _, *cells = _CELL.split(content.rstrip(",; \t"))
+    if not cells:
+        raise ValueError(f"expected numbers after the first word, got {text[:100]!r}")
+    return Line(Notation.sentence, (), tuple(map(number_of, cells)))
 
 
 def _pairs(text: str) -> Line:

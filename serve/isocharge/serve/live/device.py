@@ -12,8 +12,9 @@ from isocharge.serve.frames.autodetect import AutoParser
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import Parser
 from isocharge.serve.frames.frame_layout import FrameLayout
-from isocharge.serve.frames.layout_parser import DescribedParser
+from isocharge.serve.frames.layout_parser import described_parser
 from isocharge.serve.frames.text import TextParser
+from isocharge.serve.port.request import Request
 from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.signal_chain.contact import TouchRule
 from isocharge.serve.signal_chain.hum import HumRule
@@ -61,24 +62,67 @@ class FrameSettings:
 
     Attributes:
         format: "auto", "binary", "text" or "described".
-        columns: Names for the columns of a CSV without header.
+        columns: Names for the columns of a CSV.
+        meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the board has for it; of text.
         layout: Of described frames.
+        request: What the board has to be asked; None if it sends unasked.
     """
 
     format: str = "auto"
     columns: tuple[str, ...] = ()
+    meanings: Mapping[str, str] = field(default_factory=dict)
     layout: FrameLayout | None = None
+    request: Request | None = None
 
     def parser(self) -> Parser:
         """A new parser."""
         if self.layout is not None:
-            return DescribedParser(self.layout)
+            return described_parser(self.layout)
         parsers: dict[str, Callable[[], Parser]] = {
-            "auto": lambda: AutoParser(self.columns),
+            "auto": lambda: AutoParser(self.columns, self.meanings),
             "binary": BinaryParser,
-            "text": lambda: TextParser(self.columns),
+            "text": lambda: TextParser(self.columns, self.meanings),
         }
         return parsers[self.format]()
+
+
+@dataclass(frozen=True)
+class GainSettings:
+    """From the unit of a board to charge.
+
+    Attributes:
+        per_unit: Charge of one unit, pC; or voltage, V, where there is a feedback capacitance.
+        feedback_pF: Feedback capacitance of the amplifiers, pF, so that 1 V is that number of pC.
+        offset: What a board shows without charge, in its unit; None for 0.
+    """
+
+    per_unit: ByElectrode
+    feedback_pF: ByElectrode | None = None
+    offset: ByElectrode | None = None
+
+    def pC_per_unit(self, electrodes: tuple[str, ...]) -> Array:
+        """Charge of one unit with its sign, shape (electrodes,), pC.
+
+        Raises:
+            DeviceError: If the numbers are those of other electrodes.
+        """
+        per_unit = self.per_unit.array(electrodes)
+        return per_unit if self.feedback_pF is None else per_unit * self.feedback_pF.array(electrodes)
+
+    def charge_pC(self, electrode: str, values: Array) -> Array:
+        """Values of one electrode, of any shape, as charges, pC; as they are where there is no setting for it."""
+        factor = self.per_unit.of(electrode, 1.0)
+        if self.feedback_pF is not None:
+            factor *= self.feedback_pF.of(electrode, 1.0)
+        return (values - (self.offset.of(electrode, 0.0) if self.offset else 0.0)) * factor
+
+    def zero(self, electrodes: tuple[str, ...]) -> Array | None:
+        """What is subtracted before the gain, shape (electrodes,), in the board's unit; None for nothing.
+
+        Raises:
+            DeviceError: If the numbers are those of other electrodes.
+        """
+        return None if self.offset is None else self.offset.array(electrodes)
 
 
 @dataclass(frozen=True)
@@ -110,7 +154,7 @@ class Device:
         name: For people.
         frames: What it sends.
         channels: Electrode to the channel's name in the frame; empty where nothing is known.
-        gain_pC: Charge per unit of each channel, pC.
+        gain: From the board's unit to charge; None if it sends pC.
         limit_pC: Largest charge that the converter can show, pC.
         hum, tare, leak, touch: Rules of the stages.
         common_mode: How warming of the film is followed.
@@ -121,7 +165,7 @@ class Device:
     name: str = "any board"
     frames: FrameSettings = field(default_factory=FrameSettings)
     channels: Mapping[str, str] = field(default_factory=dict)
-    gain_pC: ByElectrode | None = None
+    gain: GainSettings | None = None
     limit_pC: float | None = None
     hum: HumRule | None = None
     tare: TareRule | None = field(default_factory=TareRule)
@@ -152,7 +196,8 @@ class Device:
                 "every set of charges fits some contact, and warming cannot be separated from force: remove the section"
             )
         return Chain(
-            gain_pC=None if self.gain_pC is None else self.gain_pC.array(electrodes),
+            gain_pC=None if self.gain is None else self.gain.pC_per_unit(electrodes),
+            zero=None if self.gain is None else self.gain.zero(electrodes),
             limit_pC=self.limit_pC,
             hum=self.hum,
             tare=self.tare,

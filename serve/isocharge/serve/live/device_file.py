@@ -5,13 +5,21 @@
     [frames]                       # optional; without it the format is recognised
     format = "described"           # or "auto", "binary", "text"; the keys of "described" are those of
                                    # isocharge.serve.frames.frame_layout
-    columns = ["seq", "A", "B"]    # "auto" and "text": names of a CSV without header; optional
+    columns = ["seq", "A", "B"]    # "auto" and "text": names of the columns of a CSV; optional
+    seq = "n"                      # and the names that the board has for its number and clock; optional
+    t_ms = "millis"                # or t_us, t_s
+    request = "3F 0A"              # what the board has to be asked, hexadecimal; optional
+    request_Hz = 100.0             # at most that often
+    echo = true                    # if the line brings the request back
 
-    [channels]                     # electrode -> name in the frame; without it the same names, or the same order
-    A = "adc0"
+    [channels]                     # electrode -> name or number in the frame; without it the same names, or the same
+    A = "adc0"                     # order
 
     [gain]                         # optional; a number for all channels, or one for each electrode
-    pC_per_unit = {A = 0.0457, B = -0.0459, C = 0.0457}     # negative where the amplifier inverts
+    offset = 8388608               # what the board shows without charge, in its unit; optional
+    pC_per_unit = {A = 0.0457, B = -0.0459, C = 0.0457}     # negative where the amplifier inverts; or
+    # V_per_unit = 0.000045        # with the amplifier's feedback capacitance:
+    # feedback_pF = 1000.0
 
     [saturation]
     limit_pC = 1500.0
@@ -41,7 +49,9 @@ from typing import Any, TypeVar
 
 from isocharge.errors import DeviceError
 from isocharge.serve.frames.frame_layout import frame_layout
-from isocharge.serve.live.device import ByElectrode, Device, FrameSettings, LeakSettings
+from isocharge.serve.frames.text_lines import SEQ, TIMES_US
+from isocharge.serve.live.device import ByElectrode, Device, FrameSettings, GainSettings, LeakSettings
+from isocharge.serve.port.request import Request
 from isocharge.serve.signal_chain.contact import TouchRule
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
@@ -52,6 +62,17 @@ from isocharge.tables import Table, read_toml
 SECTIONS = ("frames", "channels", "gain", "saturation", "hum", "tare", "leak", "touch", "common_mode")
 
 FORMATS = ("auto", "binary", "text", "described")
+
+REQUEST_KEYS = ("request", "request_Hz", "echo")
+"""Keys of every format: what a board has to be asked."""
+
+TEXT_KEYS = ("columns", SEQ, *TIMES_US)
+"""Keys of the formats that may be text."""
+
+GAIN_KEYS = ("pC_per_unit", "V_per_unit", "feedback_pF", "offset")
+
+FASTEST_HZ = 100_000.0
+"""Highest rate of requests, Hz."""
 
 LARGEST = 1_000_000_000
 """Largest setting of a rule, in the setting's unit."""
@@ -86,7 +107,7 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
         name=str(file.get("name", "unnamed board")),
         frames=_frames(file.table("frames", {})),
         channels=_channels(file.table("channels", {})),
-        gain_pC=_gain(file),
+        gain=_gain(file),
         limit_pC=_limit(file),
         hum=_rule(file, "hum", HumRule, None),
         tare=_rule(file, "tare", TareRule, TareRule()),
@@ -109,24 +130,46 @@ def with_offset_limit(device: Device, offset_limit_pC: float) -> Device:
 
 
 def _frames(table: Table) -> FrameSettings:
-    kind = table.choice("format", FORMATS, "auto")
+    kind, request = table.choice("format", FORMATS, "auto"), _request(table)
     if kind == "described":
-        layout = frame_layout({key: table.get(key) for key in table if key != "format"}, table.where)
-        return FrameSettings(kind, layout=layout)
-    table.only("format", *(() if kind == "binary" else ("columns",)))
-    return FrameSettings(kind, table.texts("columns", (), of="names", or_empty=True))
+        others = {key: table.get(key) for key in table if key not in ("format", *REQUEST_KEYS)}
+        return FrameSettings(kind, layout=frame_layout(others, table.where), request=request)
+    table.only("format", *REQUEST_KEYS, *(() if kind == "binary" else TEXT_KEYS))
+    meanings = {table.text(key): key for key in (SEQ, *TIMES_US) if key in table}
+    return FrameSettings(kind, table.texts("columns", (), of="names", or_empty=True), meanings, request=request)
+
+
+def _request(table: Table) -> Request | None:
+    if "request" not in table:
+        return None
+    try:
+        data = bytes.fromhex(table.text("request"))
+    except ValueError:
+        data = b""
+    if not data:
+        table.refuse("request", "bytes in hexadecimal, as in '3F 0A'")
+    return Request(data, table.number("request_Hz", 100.0, above=0.0, most=FASTEST_HZ), table.flag("echo", False))
 
 
 def _channels(table: Table) -> dict[str, str]:
     return {electrode: table.text(electrode, or_empty=True) for electrode in table}
 
 
-def _gain(file: Table) -> ByElectrode | None:
+def _gain(file: Table) -> GainSettings | None:
     if "gain" not in file:
         return None
-    table = file.table("gain").only("on", "pC_per_unit")
-    gain_pC = _by_electrode(table, "pC_per_unit", not_zero=True)
-    return gain_pC if table.flag("on", True) else None
+    table = file.table("gain").only("on", *GAIN_KEYS)
+    offset = _by_electrode(table, "offset") if "offset" in table else None
+    if "V_per_unit" not in table:
+        if "feedback_pF" in table:
+            table.refuse("feedback_pF", "no capacitance beside pC_per_unit: it belongs to V_per_unit")
+        gain = GainSettings(_by_electrode(table, "pC_per_unit", not_zero=True), None, offset)
+    elif "pC_per_unit" in table:
+        table.refuse("V_per_unit", "either pC_per_unit, or V_per_unit and feedback_pF")
+    else:
+        volts = _by_electrode(table, "V_per_unit", not_zero=True)
+        gain = GainSettings(volts, _by_electrode(table, "feedback_pF", above=0.0), offset)
+    return gain if table.flag("on", True) else None
 
 
 def _limit(file: Table) -> float | None:

@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from isocharge.errors import PortError
+from isocharge.arrays import Array
+from isocharge.errors import PortError, TareError
 from isocharge.serve.flags import RECONNECTED
 from isocharge.serve.frames.frame import SATURATED_BIT, Frame, Parser
 from isocharge.serve.frames.sequence import SequenceGaps
@@ -61,7 +62,8 @@ class ReadingStream:
         self.gaps = gaps or SequenceGaps()
         self.clock = DeviceClock()
         self._chain = chain or device.chain(electrodes)
-        self._picker = ChannelPicker(electrodes, device.channels, reader)
+        self._picker = ChannelPicker(electrodes, device.channels, reader, device.where)
+        self._electrodes = electrodes
         self._state = ChainState.start(len(electrodes))
         self._misfit = misfit
         self._pending_flags: tuple[str, ...] = ()
@@ -94,17 +96,28 @@ class ReadingStream:
         time_of_reading = self.clock.read(frame.t_us, self.parser.t_us_modulus, chunk.timestamp)
         flags = self._pending_flags + self.gaps.update(frame.seq, self.parser.seq_modulus)
         self._pending_flags = ()
-        self._state, reading = advance(
-            self._chain,
-            self._state,
-            self._picker.pick(frame),
-            time_of_reading.clock_s,
-            time_of_reading.step_s,
-            limited=bool(frame.flags & SATURATED_BIT),
-            misfit=self._misfit,
-            flags=flags,
-        )
+        values = self._picker.pick(frame)
+        try:
+            self._state, reading = advance(
+                self._chain,
+                self._state,
+                values,
+                time_of_reading.clock_s,
+                time_of_reading.step_s,
+                limited=bool(frame.flags & SATURATED_BIT),
+                misfit=self._misfit,
+                flags=flags,
+            )
+        except TareError as error:
+            raise TareError(f"{error}; {self._rest_words(values)}") from error
         return TimedReading(reading, time_of_reading)
+
+    def _rest_words(self, values: Array) -> str:
+        """What the channels show while the film is tared, as the device file would say it."""
+        offsets = ", ".join(
+            f"{name} = {value:.10g}" for name, value in zip(self._electrodes, values.tolist(), strict=True)
+        )
+        return f"if the board rests there without a touch, say so in a device file: [gain] offset = {{{offsets}}}"
 
     def arrived(self, frames: list[Frame], chunk: Chunk) -> None:
         """A chunk is over: its arrival sets the clock; bytes that are no frames are refused.

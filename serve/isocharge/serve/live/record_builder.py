@@ -27,10 +27,10 @@ class RecordBuilder:
     frame_id: str
 
     @classmethod
-    def of(cls, predictor: Predictor) -> "RecordBuilder":
-        """The builder for a model."""
+    def of(cls, predictor: Predictor, frame_id: str | None = None) -> "RecordBuilder":
+        """The builder for a model; `frame_id` names the film, by default as the model's sensor."""
         metadata = predictor.metadata
-        return cls(predictor, Domain.of(metadata), metadata.electrodes, metadata.label, metadata.frame_id)
+        return cls(predictor, predictor.domain, metadata.electrodes, metadata.label, frame_id or metadata.frame_id)
 
     def record(
         self, chunk: Chunk, frame: Frame, reading: Reading, when: ReadingTime, now_ns: Callable[[], int]

@@ -1,16 +1,23 @@
 """A touch stream with its recording: chunks and records are written as they come, and played again.
 
-A recording holds what `RecordedStream` passed on; `replay` takes it through the same stream. The same model gives the
+A recording holds what `RecordedStream` passed on; `replay` takes it through the same stream. The same models give the
 same records, bit for bit.
 """
 
+import logging
 import time
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 
 from isocharge.serve.live.stream import TouchStream
-from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
+from isocharge.serve.port.recording import NewModel, RecordedClock, Recorder, Recording
 from isocharge.serve.port.serial_port import Chunk
+from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
+
+Load = Callable[[], Predictor]
+
+log = logging.getLogger(__name__)
 
 
 class RecordedStream:
@@ -25,10 +32,19 @@ class RecordedStream:
         """
         self._stream, self._recorder = stream, recorder
         self._tare_requested = False
+        self._load_requested: Load | None = None
+        self._loading: Future[Predictor] | None = None
 
     def request_tare(self) -> None:
         """Tare again before the next chunk; may be called from a signal handler."""
         self._tare_requested = True
+
+    def request_model(self, load: Load) -> None:
+        """Load a model meanwhile, and go on with it from the first chunk after that; may be called as `request_tare`.
+
+        A model that cannot be loaded, or has other electrodes, is refused with a word, and the one before serves on.
+        """
+        self._load_requested = load
 
     def follow(self, chunks: Iterable[Chunk]) -> Generator[tuple[PredictionRecord, str]]:
         """Records, each with its line of JSON, until the chunks end.
@@ -40,6 +56,8 @@ class RecordedStream:
             As `isocharge.serve.live.stream.stream`.
         """
         for chunk in chunks:
+            if self._load_requested or self._loading:
+                self._take_model()
             if self._tare_requested:
                 self._tare()
             lines: list[str] = []
@@ -52,6 +70,29 @@ class RecordedStream:
                     self._recorder.chunk(chunk, lines)
         self._stream.finish()
 
+    def _take_model(self) -> None:
+        """Use the model whose loading is done; begin to load the next one."""
+        if self._loading is not None and self._loading.done():
+            self._use(self._loading)
+            self._loading = None
+        if self._load_requested and self._loading is None:
+            load, self._load_requested = self._load_requested, None
+            loader = ThreadPoolExecutor(1, "model")
+            self._loading = loader.submit(load)
+            loader.shutdown(wait=False)
+
+    def _use(self, loaded: "Future[Predictor]") -> None:
+        before = self._stream.predictor.metadata.label
+        try:
+            predictor = loaded.result()
+            self._stream.use(predictor)
+        except Exception as error:  # whatever is wrong with a new model, the old one serves
+            log.error("%s serves on, because the new model is refused: %s: %s", before, type(error).__name__, error)
+            return
+        if self._recorder is not None:
+            self._recorder.model(predictor.metadata.label)
+        log.warning("%s serves from now on, after %s", predictor.metadata.label, before)
+
     def _tare(self) -> None:
         self._tare_requested = False
         self._stream.tare()
@@ -60,7 +101,12 @@ class RecordedStream:
 
 
 def replay(
-    recording: Recording, stream: TouchStream, clock: RecordedClock, *, real_time: bool = False
+    recording: Recording,
+    stream: TouchStream,
+    clock: RecordedClock,
+    *,
+    real_time: bool = False,
+    load: Callable[[str], Predictor] | None = None,
 ) -> Iterator[tuple[PredictionRecord, str]]:
     """The records of a recording, each with its line of JSON; as many for each chunk as were taken then.
 
@@ -69,12 +115,18 @@ def replay(
         stream: A new stream of the same model, device and policy, whose `now_ns` is the clock.
         clock: The clock of the replay.
         real_time: Whether to wait as long between two chunks as it took then.
+        load: Gives the model of a label, where the recording went on with another one; None stays with the first.
 
     Raises:
         RecordingError: If a line other than the last one is damaged.
+        ModelError: If a model of the recording cannot be loaded.
     """
     delay_s: float | None = None
     for event in recording.events():
+        if isinstance(event, NewModel):
+            if load is not None:
+                stream.use(load(event.label))
+            continue
         clock.set(event)
         if event.chunk is None:
             stream.tare()

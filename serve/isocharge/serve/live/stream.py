@@ -2,10 +2,12 @@
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from isocharge.arrays import Array, Reals
+from isocharge.errors import ModelError
+from isocharge.serve.flags import GAP, RECONNECTED, REPEAT, RESTART
 from isocharge.serve.frames.frame import Parser
 from isocharge.serve.frames.sequence import SequenceGaps
 from isocharge.serve.live.device import ANY_BOARD, Device
@@ -14,7 +16,10 @@ from isocharge.serve.live.record_builder import RecordBuilder
 from isocharge.serve.port.serial_port import Chunk
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
-from isocharge.serve.signal_chain.chain import Chain
+from isocharge.serve.signal_chain.chain import Chain, Reading
+
+LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
+"""Flags of a frame without a record that pass to the next record: they say what happened before it."""
 
 
 class Policy(StrEnum):
@@ -86,6 +91,7 @@ class TouchStream:
         gaps: SequenceGaps | None = None,
         policy: Policy = Policy.every,
         now_ns: Callable[[], int] = time.perf_counter_ns,
+        frame_id: str | None = None,
     ) -> None:
         """Put the path together.
 
@@ -97,6 +103,7 @@ class TouchStream:
             gaps: Follows the frame numbers.
             policy: Which frames get a record.
             now_ns: The clock of `Chunk.clock_ns`, for latencies.
+            frame_id: Name of this film in its records; by default that of the model's sensor.
 
         Raises:
             DeviceError: If the device file has other electrodes than the model.
@@ -112,10 +119,27 @@ class TouchStream:
         )
         self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
         self.counts = StreamCounts()
-        self._records = RecordBuilder.of(predictor)
-        self._policy = policy
-        self._now_ns = now_ns
-        self._predictor = predictor
+        self._policy, self._now_ns, self._frame_id = policy, now_ns, frame_id
+        self._predictor, self._records = predictor, RecordBuilder.of(predictor, frame_id)
+
+    @property
+    def predictor(self) -> Predictor:
+        """The model of the next record."""
+        return self._predictor
+
+    def use(self, predictor: Predictor) -> None:
+        """Go on with another model of the same electrodes; tare and chain stay as they are.
+
+        Raises:
+            ModelError: If its electrodes are others, or in another order; nothing changes then.
+        """
+        before, after = self._predictor.metadata, predictor.metadata
+        if after.electrodes != before.electrodes:
+            raise ModelError(
+                f"model {after.label}: expected the electrodes {before.electrodes} of {before.label}, got "
+                f"{after.electrodes}; start another stream for it"
+            )
+        self._predictor, self._records = predictor, RecordBuilder.of(predictor, self._frame_id)
 
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
@@ -129,12 +153,15 @@ class TouchStream:
         """
         self.counts.outages += chunk.outage_s > 0.0
         frames = self._readings.frames(chunk)
-        last = len(frames) - 1
+        last, skipped = len(frames) - 1, set[str]()
         for number, frame in enumerate(frames):
             reading, time_of_reading = self._readings.advance(frame, chunk)
             if self._policy is Policy.latest and number < last:
                 self.counts.skipped += 1
+                skipped.update(reading.flags)
                 continue
+            if skipped:
+                reading = _after(skipped, reading)
             self.counts.records += 1
             yield self._records.record(chunk, frame, reading, time_of_reading, self._now_ns)
         self._readings.arrived(frames, chunk)
@@ -150,3 +177,9 @@ class TouchStream:
     def _misfit(self, charge_pC: Array) -> Reals:
         """The model's misfit, shape (n,), for charges of shape (n, electrodes), pC."""
         return self._predictor.predict_batch(charge_pC).misfit
+
+
+def _after(skipped: set[str], reading: Reading) -> Reading:
+    """A reading with the flags of the skipped frames before it that say what happened meanwhile."""
+    earlier = tuple(flag for flag in LASTING_FLAGS if flag in skipped and flag not in reading.flags)
+    return replace(reading, flags=earlier + reading.flags)

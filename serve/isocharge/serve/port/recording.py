@@ -1,9 +1,10 @@
 """Recordings: the chunks of a port and the records that came of them, a line of JSON each, written as they come.
 
-    {"isocharge_recording": 1, "model": "three/1", "policy": "every", "device": {...}}
+    {"isocharge_recording": 1, "model": "three/1", "policy": "every", "device": {...}, "name": "left"}
     {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
     {"timestamp": ..., ...}                       the records of that chunk, as they went out
     {"tare": true}                                a request for a new tare
+    {"use": "three/2"}                            the model of all that follows
 
 Everything in a replay is recomputed except `latency_us`, which is copied from the recording because it belongs to the
 original run. So the same model gives the same records, bit for bit. Whole lines are written at once; a line that a full
@@ -41,6 +42,9 @@ LONGEST_ENTRY = 1 << 20
 LONGEST_US, LATEST_S = 1e12, 1e11
 """Largest latency that counts as one, us: eleven days; and latest time, unix seconds: the year 5138."""
 
+WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+"""To open a new file, without changing line ends on Windows."""
+
 log = logging.getLogger(__name__)
 
 Entry = TypeVar("Entry")
@@ -55,7 +59,7 @@ class Recorder:
         failed: Whether writing has stopped because the disk is full. What was written before is whole.
     """
 
-    def __init__(self, path: Path, model: str, policy: str, device: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, model: str, policy: str, device: Mapping[str, Any], name: str = "") -> None:
         """Describe a recording; the file is created on entering the context.
 
         Args:
@@ -63,10 +67,13 @@ class Recorder:
             model: The model's label, `name/version`.
             policy: Which frames get a record.
             device: Content of the device file.
+            name: The film's own name in the records; empty for that of the model's sensor.
         """
         self.path = path
         self.failed = False
         self._header = {KIND: VERSION, "model": model, "policy": policy, "device": dict(device)}
+        if name:
+            self._header["name"] = name
         self._descriptor = -1
         self._good = 0
 
@@ -79,7 +86,7 @@ class Recorder:
         """
         refuse_existing(self.path)
         try:
-            self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+            self._descriptor = os.open(self.path, WRITE_FLAGS, 0o666)
         except OSError as error:
             raise OutputError(f"{self.path} cannot be written: {error.strerror}; choose another file") from error
         self._write(json.dumps(self._header))
@@ -100,6 +107,10 @@ class Recorder:
     def tare(self) -> None:
         """Write a request for a new tare."""
         self._write('{"tare": true}')
+
+    def model(self, label: str) -> None:
+        """Write the label, `name/version`, of the model of all that follows."""
+        self._write(json.dumps({"use": label}))
 
     def _write(self, lines: str) -> None:
         """Write whole lines or none."""
@@ -125,6 +136,12 @@ class Event(NamedTuple):
     latencies_us: tuple[float, ...] = ()
 
 
+class NewModel(NamedTuple):
+    """The label, `name/version`, of the model that computed all that follows."""
+
+    label: str
+
+
 class Recording:
     """A recording to read.
 
@@ -132,6 +149,7 @@ class Recording:
         model: The model's label, `name/version`.
         policy: Which frames got a record.
         device: Content of the device file.
+        name: The film's own name in the records; empty for that of the model's sensor.
     """
 
     def __init__(self, path: Path) -> None:
@@ -146,6 +164,7 @@ class Recording:
             version = header.whole(KIND)
             self.model, self.policy = header.text("model"), header.choice("policy", POLICIES)
             self.device = dict(header.table("device").values)
+            self.name = header.text("name", "", or_empty=True)
         except (OSError, ValueError) as error:
             raise RecordingError(
                 f"{path}: expected a recording of `serve stream --record` ({cut(str(error))})"
@@ -153,8 +172,8 @@ class Recording:
         if version != VERSION:
             raise RecordingError(f"{path}: recording version {version} is not supported (this version reads {VERSION})")
 
-    def events(self) -> Iterator[Event]:
-        """Chunks and requests for a new tare, in their order.
+    def events(self) -> Iterator[Event | NewModel]:
+        """Chunks, requests for a new tare and changes of the model, in their order.
 
         Raises:
             RecordingError: If a line other than the last one is damaged.
@@ -166,9 +185,9 @@ class Recording:
                 continue
             if chunk is not None:
                 yield Event(chunk, tuple(latencies_us))
-            chunk, latencies_us = entry, []
+            chunk, latencies_us = entry if isinstance(entry, Chunk) else None, []
             if chunk is None:
-                yield Event(None)
+                yield entry if isinstance(entry, NewModel) else Event(None)
         if chunk is not None:
             yield Event(chunk, tuple(latencies_us))
 
@@ -185,7 +204,7 @@ class Recording:
         for _ in self._parsed(lambda entry: take(entry) if "timestamp" in entry else None, progress):
             pass
 
-    def _entries(self) -> Iterator[Chunk | float | None]:
+    def _entries(self) -> Iterator[Chunk | float | NewModel | None]:
         """The content of each line, as `_entry` gives it."""
         return self._parsed(_entry)
 
@@ -215,8 +234,8 @@ def _header(path: Path) -> Table:
     return Table(parse_json(line, "first line", RecordingError), "first line", RecordingError)
 
 
-def _entry(content: Table) -> Chunk | float | None:
-    """A chunk, the latency of a record (us), or None for a request for a new tare.
+def _entry(content: Table) -> Chunk | float | NewModel | None:
+    """A chunk, the latency of a record (us), a new model, or None for a request for a new tare.
 
     Raises:
         RecordingError, ValueError: If it is none of these.
@@ -225,6 +244,8 @@ def _entry(content: Table) -> Chunk | float | None:
         return content.number("latency_us", least=-LONGEST_US, most=LONGEST_US)
     if "tare" in content:
         return None
+    if "use" in content:
+        return NewModel(content.text("use"))
     *times, data = content.sequence("chunk", of="timestamp, clock, outage and bytes")
     timestamp, _, outage_s = content.as_numbers("chunk", times, count=3, of="three numbers and bytes")
     if not isinstance(data, str):

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from isocharge.errors import InputError
+from isocharge.serve.port.request import Request
 from isocharge.serve.port.serial_port import Chunk, Port
 
 STDIN = "-"
@@ -35,12 +36,19 @@ class FileSource:
             yield Chunk(data, time.time(), time.perf_counter_ns())
 
 
-def open_source(url: str, *, baud: int = 115200, silence_s: float = 5.0, reconnect: bool = False) -> Chunks:
+def open_source(
+    url: str,
+    *,
+    baud: int = 115200,
+    silence_s: float = 5.0,
+    reconnect: bool = False,
+    request: Request | None = None,
+) -> Chunks:
     """The source of chunks behind a name, as a context manager.
 
     Args:
-        url: A device path or pyserial URL, the path of a file or named pipe, or - for stdin.
-        baud, silence_s, reconnect: As `Port` takes them; ignored for files.
+        url: A device path or URL, the path of a file or named pipe, or - for stdin.
+        baud, silence_s, reconnect, request: As `Port` takes them; ignored for files.
 
     Raises:
         InputError: If the file cannot be read.
@@ -49,7 +57,7 @@ def open_source(url: str, *, baud: int = 115200, silence_s: float = 5.0, reconne
         return contextlib.nullcontext(FileSource(sys.stdin.fileno()))
     if "://" not in url and _is_file(Path(url)):
         return _file(Path(url))
-    return Port(url, baud=baud, silence_s=silence_s, reconnect=reconnect)
+    return Port(url, baud=baud, silence_s=silence_s, reconnect=reconnect, request=request)
 
 
 def _is_file(path: Path) -> bool:

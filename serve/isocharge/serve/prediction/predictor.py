@@ -6,9 +6,9 @@ allocates no array and is faster than a plain `session.run`. Batches go through 
 The loop of a host program uses `predict_into` with its two arrays; people use `predict`, which checks and explains.
 """
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import onnxruntime as ort
@@ -22,37 +22,11 @@ from isocharge.serve.model.model_folder import Model, load_model
 from isocharge.serve.model.repository import find_model
 from isocharge.serve.model.session import OUTPUTS, run
 from isocharge.serve.prediction.bound_press import BoundPress
+from isocharge.serve.prediction.contact import Contact, Contacts
+from isocharge.serve.prediction.validity import Domain
+from isocharge.tables import shown
 
-
-class Contact(NamedTuple):
-    """Where and how hard one press is, and how sure that is.
-
-    Attributes:
-        x_mm, y_mm: Position in the sensor's frame, mm.
-        force_N: Force, N, positive when pushing.
-        x_std_mm, y_std_mm, force_std_N: Standard deviations.
-        misfit: Distance of the charges from the nearest single contact the model knows, in standard deviations.
-    """
-
-    x_mm: float
-    y_mm: float
-    force_N: float
-    x_std_mm: float
-    y_std_mm: float
-    force_std_N: float
-    misfit: float
-
-
-class Contacts(NamedTuple):
-    """Contacts of n presses: the fields of `Contact`, each an array of shape (n,), float32."""
-
-    x_mm: Singles
-    y_mm: Singles
-    force_N: Singles
-    x_std_mm: Singles
-    y_std_mm: Singles
-    force_std_N: Singles
-    misfit: Singles
+log = logging.getLogger(__name__)
 
 
 class Predictor:
@@ -63,8 +37,11 @@ class Predictor:
     Example:
         >>> from isocharge.serve import Predictor
         >>> touch = Predictor("three-25um-biaxial")
-        >>> touch.predict([812.0, 790.0, 801.0])  # doctest: +SKIP
-        Contact(x_mm=0.1, ...)
+        >>> contact = touch.predict([942.9, 910.4, 690.8])
+        >>> contact
+        Contact(x_mm=2.990 +- 0.045, y_mm=-1.994 +- 0.031, force_N=1.0027 +- 0.0021, misfit=0.025)
+        >>> touch.flags(contact)  # a reason for each doubt
+        ()
     """
 
     def __init__(self, model: str | Path, *, models: Path | None = None) -> None:
@@ -80,7 +57,10 @@ class Predictor:
         loaded = load_model(find_model(model, models))
         self._metadata = loaded.metadata
         self._session = loaded.session
+        self._domain = Domain.of(loaded.metadata)
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
+        self._far_mm2, self._far_N = self._domain.far
+        self._warned = False
         _check_shared(self._press, loaded)
 
     @property
@@ -88,8 +68,15 @@ class Predictor:
         """What the model says about itself: sensor, electrodes, working area, measured errors."""
         return self._metadata
 
+    @property
+    def domain(self) -> Domain:
+        """Where the model may be trusted; its `batch_flags` are those of `predict_batch`."""
+        return self._domain
+
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
-        """The contact of one press.
+        """The contact of one press; `flags` says whether to trust it.
+
+        The first answer that is no measurement at all is logged as a warning.
 
         Args:
             charge_pC: Touch charges, shape (electrodes,), pC, in the order of `metadata.electrodes`.
@@ -101,7 +88,19 @@ class Predictor:
         if not write_finite(self._press.write, values):  # raises what is wrong, or converts
             self._press.write(*as_press(charge_pC, self._metadata.electrodes))
         self._press.run()
-        return Contact(*self._press.read())
+        contact = Contact(*self._press.read())
+        x_mm, y_mm, force_N, _, _, _, _ = contact
+        if force_N > self._far_N or x_mm * x_mm + y_mm * y_mm > self._far_mm2:
+            self._warn(charge_pC, contact)
+        return contact
+
+    def flags(self, contact: Contact) -> tuple[str, ...]:
+        """The reasons not to trust a contact of this model: `outside`, `beyond`, `misfit`; none if empty.
+
+        Three charges and three unknowns: with three electrodes, a wrong charge mostly looks like another press, and
+        only one that leads out of the working area or the forces is seen.
+        """
+        return self._domain.flags(contact)
 
     def predict_into(self, charge_pC: Singles, out: Singles) -> None:
         """The contact of one press, for the hot loop: from an array into an array, and nothing else.
@@ -137,6 +136,37 @@ class Predictor:
         """
         outputs = run(self._session, as_batch(charge_pC, self._metadata.electrodes))
         return Contacts(*np.concatenate([outputs[name] for name in OUTPUTS], axis=1).T)
+
+    def __repr__(self) -> str:
+        """Model, electrodes and domain."""
+        return f"Predictor({self._metadata.label}: {', '.join(f'{name} {text}' for name, text in self._summary())})"
+
+    def _repr_html_(self) -> str:
+        """A table, for notebooks."""
+        from html import escape  # late: its list of entities would take longer to import than serial ports
+
+        rows = [f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self._summary()]
+        return f"<table><caption>Predictor {self._metadata.label}</caption>{''.join(rows)}</table>"
+
+    def _summary(self) -> Iterator[tuple[str, str]]:
+        """What the model takes and where it may be trusted."""
+        low, high = self._domain.force_range_N
+        yield "sensor", self._metadata.frame_id
+        yield "charges", f"{' '.join(self._metadata.electrodes)} (pC)"
+        yield "positions", f"up to {self._domain.reach_mm:.3g} mm"
+        yield "forces", f"{low:.3g} to {high:.3g} N"
+
+    def _warn(self, charge_pC: object, contact: Contact) -> None:
+        """Log, once, that an answer is no measurement."""
+        if not self._warned:
+            self._warned = True
+            log.warning(
+                "%s: %s pC are far from any press that the model knows, and (%.2f, %.2f) mm, %.6g N is no measurement; "
+                "check unit, gain and tare. Predictor.flags says so of each contact, this line only once",
+                self._metadata.label,
+                shown(charge_pC),
+                *contact[:3],
+            )
 
 
 def _kind(value: object) -> str:

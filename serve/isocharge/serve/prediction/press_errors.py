@@ -9,8 +9,9 @@ from isocharge.arrays import Array, Booleans
 from isocharge.errors import PressError
 from isocharge.serve.flags import MISFIT, OUTSIDE
 from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.prediction.contact import Contacts
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
-from isocharge.serve.prediction.predictor import Contacts, Predictor
+from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.validity import MISFIT_LIMIT, Domain, inside_polygon
 
 NO_CHARGE, NOTHING_KNOWN, NOT_TRAINED = "a charge is unknown", "neither place nor force is known", "not trained for"

@@ -8,7 +8,7 @@ import json
 from dataclasses import dataclass, fields
 from typing import Any
 
-from isocharge.serve.prediction.predictor import Contact
+from isocharge.serve.prediction.contact import Contact
 
 DECIMALS = 6
 """Decimals of numbers in JSON: 1 nm, 1 uN, 1 aC, 1 us, all far below what a sensor resolves."""

@@ -14,12 +14,13 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.errors import ChargeError
+from isocharge.serve.prediction.contact import Contacts
 from isocharge.serve.prediction.csv_numbers import CsvNumbers, ignored_words
-from isocharge.serve.prediction.predictor import Contacts, Predictor
+from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.prediction.validity import Domain
 
-BLOCK = 16384
+BLOCK = 4096
 """Rows that are worked on at a time."""
 
 CHARGE = "a charge in pC"
@@ -60,12 +61,21 @@ def read_charges(
     return np.frombuffer(charges, dtype=np.float64).reshape(-1, len(electrodes))
 
 
-def write_contacts(contacts: Contacts, out: TextIO) -> None:
-    """Write contacts as CSV, a row for each press, columns as in `Contact`, numbers to six decimals."""
+def write_contacts(contacts: Contacts, out: TextIO, domain: Domain | None = None) -> None:
+    """Write contacts as CSV, a row for each press, columns as in `Contact`, numbers to six decimals.
+
+    Args:
+        contacts: The contacts.
+        out: Receives the text.
+        domain: Where their model may be trusted: adds a column `flags`, words with blanks between.
+    """
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(Contacts._fields)
+    writer.writerow(Contacts._fields + ("flags",) * (domain is not None))
     for block in blocks(np.column_stack(contacts)):
-        writer.writerows([f"{value:.6f}" for value in row] for row in block.tolist())
+        words = (
+            [()] * len(block) if domain is None else [(" ".join(f),) for f in domain.batch_flags(Contacts(*block.T))]
+        )
+        writer.writerows((*map("{:.6f}".format, row), *flags) for row, flags in zip(block.tolist(), words, strict=True))
 
 
 def blocks(rows: Array) -> Iterator[Array]:
@@ -86,7 +96,7 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
 
 def _block_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
     metadata, contacts = predictor.metadata, predictor.predict_batch(charge_pC)
-    flags = Domain.of(metadata).batch_flags(contacts)
+    flags = predictor.domain.batch_flags(contacts)
     for charges, contact, its_flags in zip(charge_pC.tolist(), np.column_stack(contacts).tolist(), flags, strict=True):
         yield PredictionRecord(
             timestamp=None,

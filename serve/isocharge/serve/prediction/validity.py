@@ -1,4 +1,4 @@
-"""The flags `outside` and `misfit`: the check of contacts against the domain that a model was trained for."""
+"""The flags `outside`, `misfit` and `beyond`: the check of contacts against the domain that a model was trained for."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,12 +6,15 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.arrays import Array, Booleans, Reals
-from isocharge.serve.flags import MISFIT, OUTSIDE
+from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.prediction.predictor import Contact, Contacts
+from isocharge.serve.prediction.contact import Contact, Contacts
 
 MISFIT_LIMIT = 5.0
 """Smallest limit of the misfit, in standard deviations; a model may state a larger one, that of 0.1 % of presses."""
+
+FAR = 3.0
+"""Multiple of the largest force, and of the working area's reach, beyond which an answer is no measurement."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,16 @@ class Domain:
         return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit)
 
     @cached_property
+    def reach_mm(self) -> float:
+        """Distance of the working area's farthest corner from the origin, mm."""
+        return float(np.linalg.norm(self.corners_mm, axis=1).max())
+
+    @cached_property
+    def far(self) -> tuple[float, float]:
+        """Squared distance from the origin, mm^2, and force, N, beyond which an answer is no measurement."""
+        return (FAR * self.reach_mm) ** 2, FAR * self.force_range_N[1]
+
+    @cached_property
     def safe_mm2(self) -> float:
         """Squared radius of the largest disk about the origin inside the area, mm^2; 0 if the origin is outside."""
         zero = np.zeros(1)
@@ -45,7 +58,7 @@ class Domain:
         return float(nearest) if inside_polygon(zero, zero, self.corners_mm)[0] else 0.0
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
-        """The flags of one contact."""
+        """The flags of one contact, a quarter of a microsecond where there are none."""
         low, high = self.force_range_N
         inside = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm < self.safe_mm2
         if inside and low <= contact.force_N <= high and contact.misfit <= self.misfit_limit:
@@ -58,9 +71,14 @@ class Domain:
         outside = ~inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm)
         outside |= (contacts.force_N < low) | (contacts.force_N > high)
         misfit = contacts.misfit > self.misfit_limit
+        far_mm2, far_N = self.far
+        with np.errstate(over="ignore"):  # infinity is far, too
+            beyond = (contacts.x_mm**2 + contacts.y_mm**2 > far_mm2) | (contacts.force_N > far_N)
+        if not (outside | misfit).any():
+            return [()] * len(outside)
         return [
-            (OUTSIDE,) * is_outside + (MISFIT,) * is_misfit
-            for is_outside, is_misfit in zip(outside.tolist(), misfit.tolist(), strict=True)
+            (OUTSIDE,) * is_outside + (BEYOND,) * is_beyond + (MISFIT,) * is_misfit
+            for is_outside, is_beyond, is_misfit in zip(outside.tolist(), beyond.tolist(), misfit.tolist(), strict=True)
         ]
 
 

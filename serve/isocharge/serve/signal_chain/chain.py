@@ -3,7 +3,7 @@
 Each stage is a rule (frozen settings) and a pure function; `advance` puts them in order and carries their state. A
 stage whose rule is None is switched off.
 
-1. gain: the device's unit to pC, sign and gain of each channel;
+1. gain: the device's unit to pC, offset, sign and gain of each channel;
 2. saturation: a charge at the converter's limit, flagged until the press is over;
 3. hum: mains hum, followed and subtracted (`isocharge.serve.signal_chain.hum`);
 4. tare: mean and noise of quiet frames, subtracted from everything after (`isocharge.serve.signal_chain.tare`);
@@ -38,6 +38,7 @@ class Chain:
 
     Attributes:
         gain_pC: Charge per unit of the device, with sign, shape (electrodes,), pC.
+        zero: What the device shows without charge, shape (electrodes,), in its unit.
         limit_pC: Largest charge that the converter can show, pC.
         hum: How mains hum is followed.
         tare: Which frames are quiet enough for a tare.
@@ -48,6 +49,7 @@ class Chain:
     """
 
     gain_pC: Array | None = None
+    zero: Array | None = None
     limit_pC: float | None = None
     hum: HumRule | None = None
     tare: TareRule | None = field(default_factory=TareRule)
@@ -62,7 +64,8 @@ class Chain:
 
     def raw(self, values: Array) -> Array:
         """The first stage: what the device sent, shape (electrodes,), as charges, pC."""
-        return values if self.gain_pC is None else values * self.gain_pC
+        charges = values if self.zero is None else values - self.zero
+        return charges if self.gain_pC is None else charges * self.gain_pC
 
 
 @dataclass(frozen=True, slots=True)

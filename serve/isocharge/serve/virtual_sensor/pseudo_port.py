@@ -2,10 +2,11 @@
 
 import array
 import contextlib
-import fcntl
+import importlib
 import os
-import termios
-import tty
+from typing import Any
+
+from isocharge.errors import PortError
 
 PORT_BUFFER = 3840
 """Largest number of bytes that wait for the reader. Linux holds 4095: beyond, a write could be cut within a frame."""
@@ -15,6 +16,12 @@ class PseudoPort:
     """An open pseudo-terminal in raw mode; `url` is the device path. Close it to make the port vanish."""
 
     def __init__(self) -> None:
+        """Open one.
+
+        Raises:
+            PortError: If the system has none: Windows.
+        """
+        tty, self._fcntl, self._termios = posix_modules()
         # The reader's end stays open here, so the port does not hang up when a reader closes it.
         self._writer, self._reader = os.openpty()
         tty.setraw(self._reader)
@@ -32,10 +39,26 @@ class PseudoPort:
     def _waiting(self) -> int:
         """Number of bytes that the reader has not read yet."""
         count = array.array("i", [0])
-        fcntl.ioctl(self._reader, termios.FIONREAD, count)
+        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, count)
         return count[0]
 
     def close(self) -> None:
         """Make the port vanish, as when a cable is pulled."""
         os.close(self._writer)
         os.close(self._reader)
+
+
+def posix_modules() -> tuple[Any, Any, Any]:
+    """The modules `tty`, `fcntl` and `termios`, which handle pseudo-terminals.
+
+    Raises:
+        PortError: If this system has no pseudo-terminals.
+    """
+    try:
+        tty, fcntl, termios = map(importlib.import_module, ("tty", "fcntl", "termios"))
+    except ImportError as error:
+        raise PortError(
+            f"a virtual sensor needs a pseudo-terminal, and this system has none ({error}); run it on Linux or macOS, "
+            "or on Windows in WSL"
+        ) from error
+    return tty, fcntl, termios

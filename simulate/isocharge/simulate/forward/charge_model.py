@@ -65,3 +65,31 @@ class ChargeFunction:
                 ahead[:, axis], behind[:, axis] = contact[:, axis] + step, contact[:, axis] - step
             columns.append((self.charge(ahead) - self.charge(behind)) / (2.0 * step))
         return np.stack(columns, axis=2)
+
+
+@dataclass(frozen=True)
+class _WithinRadius:
+    """A charge model over a smaller disk; see `ChargeModel`."""
+
+    model: ChargeModel
+    radius: float
+
+    @property
+    def force_range(self) -> tuple[float, float]:
+        return self.model.force_range
+
+    def charge(self, contact: Array) -> Array:
+        return self.model.charge(contact)
+
+    def jacobian(self, contact: Array) -> Array:
+        return self.model.jacobian(contact)
+
+
+def within_radius(model: ChargeModel, radius: float) -> ChargeModel:
+    """The same charges over a smaller disk, radius in m."""
+    return _WithinRadius(model, radius)
+
+
+def electrode_count(model: ChargeModel) -> int:
+    """Number of charges."""
+    return int(model.charge(np.array([[0.0, 0.0, model.force_range[0]]])).shape[1])

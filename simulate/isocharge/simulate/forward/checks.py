@@ -62,6 +62,19 @@ def check_radius(radius: float, largest: float, source: str) -> None:
         raise SceneError(f"radius: expected up to the {source}'s {largest * 1e3:g} mm, got {radius * 1e3:g} mm")
 
 
+def check_determined(electrodes: int) -> None:
+    """Refuse sensors whose charges cannot determine a contact anywhere.
+
+    Raises:
+        SceneError: If there are fewer than three electrodes.
+    """
+    if electrodes < 3:
+        raise SceneError(
+            f"expected at least three electrodes, got {electrodes}: x, y and the force are three unknowns, so with "
+            "fewer charges a whole line of contacts has the same ones; add an electrode"
+        )
+
+
 def as_charges(charge: Array, electrode_names: tuple[str, ...]) -> Array:
     """Charges of presses as float64, one for each electrode.
 

@@ -20,7 +20,7 @@ from isocharge.simulate.numerics.polygon import area_in_disk, shared_area
 from isocharge.simulate.numerics.quadrature import gauss_line, gauss_polygon, gauss_square
 from isocharge.simulate.sensor.electrode import Electrode
 from isocharge.simulate.sensor.probe import Circle, Probe
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor import Readout, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium
 
 DIRECT, FINE, COARSE = 20, 12, 4
@@ -48,8 +48,7 @@ class ReadoutPoints:
     @classmethod
     def of(cls, sensor: Sensor, per_side: int) -> "ReadoutPoints":
         """Integration points for a sensor's electrodes and readout."""
-        rule = _edge_rule if sensor.readout == "edge" else _area_rule
-        parts = [rule(electrode, per_side) for electrode in sensor.electrodes]
+        parts = [electrode_rule(electrode, sensor.readout, per_side) for electrode in sensor.electrodes]
         most = max(share.shape[0] for _, share in parts)
         points = np.stack([np.pad(at, ((0, most - len(at)), (0, 0)), mode="edge") for at, _ in parts])
         shares = np.stack([np.pad(share, ((0, most - len(share)), (0, 0))) for _, share in parts])
@@ -127,6 +126,11 @@ def _per_area(sensor: Sensor, density: float) -> Array:
     """Reading of a uniform charge density (C/m^2), shape (n_electrode,), C."""
     reading: Array = sensor.gains * np.array([electrode.area for electrode in sensor.electrodes]) * density
     return reading
+
+
+def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tuple[Array, Array]:
+    """Integration points, shape (n, 2), m, and the share of each in the mean of (s11, s22, s12), shape (n, 3)."""
+    return _edge_rule(electrode, per_side) if readout == "edge" else _area_rule(electrode, per_side)
 
 
 def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:

@@ -4,6 +4,7 @@ A map without folds may still give two distant contacts the same charges, as a s
 The search for such pairs covers the whole film at once.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,18 @@ class AmbiguousPairs:
         """No pair."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
+    @classmethod
+    def joined(cls, pairs: Sequence["AmbiguousPairs"]) -> "AmbiguousPairs":
+        """All pairs of several searches."""
+        every = [cls.none(), *pairs]
+        joined = cls(
+            np.concatenate([each.first for each in every]),
+            np.concatenate([each.second for each in every]),
+            np.concatenate([each.distance for each in every]),
+        )
+        order = np.argsort(joined.reach, kind="stable")
+        return cls(joined.first[order], joined.second[order], joined.distance[order])
+
     def __len__(self) -> int:
         return len(self.first)
 
@@ -60,6 +73,18 @@ class AmbiguousPairs:
         """Distance of the outer contact of each pair from the centre, shape (n,), m."""
         reach: Array = np.maximum(np.hypot(*self.first[:, :2].T), np.hypot(*self.second[:, :2].T))
         return reach
+
+    @property
+    def words(self) -> str:
+        """The pair nearest to the centre, in a sentence; nothing without pairs."""
+        if not len(self):
+            return ""
+        (x, y, force), (other_x, other_y, other_force) = self.first[0], self.second[0]
+        return (
+            f"Contacts far apart can have the same charges: {force:.3g} N at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm and "
+            f"{other_force:.3g} N at ({1e3 * other_x:.1f}, {1e3 * other_y:.1f}) mm are alike within "
+            f"{self.distance[0]:.1f} standard deviations."
+        )
 
 
 def find_ambiguous_pairs(model: ChargeModel, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
@@ -80,12 +105,12 @@ def find_ambiguous_pairs(model: ChargeModel, noise: NoiseModel, force: float, pl
     charge = model.charge(first)
     apart = np.maximum(APART, WIDTHS * limits_at(model, first, noise).position)
     pairs, start = _candidates(model, noise, position, charge, apart)
+    if not pairs.size:
+        return AmbiguousPairs.none()
     second, distance = nearest_contact(model, noise, charge[pairs], start)
     far = np.hypot(*(second - first[pairs])[:, :2].T) > apart[pairs]
     ambiguous = np.flatnonzero(far & (distance < INDISTINGUISHABLE_SIGMAS))
-    unordered = AmbiguousPairs(first[pairs[ambiguous]], second[ambiguous], distance[ambiguous])
-    order = np.argsort(unordered.reach, kind="stable")
-    return AmbiguousPairs(unordered.first[order], unordered.second[order], unordered.distance[order])
+    return AmbiguousPairs.joined([AmbiguousPairs(first[pairs[ambiguous]], second[ambiguous], distance[ambiguous])])
 
 
 def _candidates(

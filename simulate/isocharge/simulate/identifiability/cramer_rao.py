@@ -5,6 +5,7 @@ With J = d(Q)/d(x, y, ln F, ...) the Fisher information is J' diag(i) J, i what 
 An estimator that knows the prior may do better where the charges say little: that is the Bayes limit, in train.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,10 @@ Limits become some 1e7 times larger than the others instead of infinite."""
 NOTHING = 1e-60
 """Fisher information below which a parameter counts as unobservable: 1/m^2 for x and y, dimensionless for ln F."""
 
+Nuisance = Callable[[Array], Array]
+"""From contacts (x, y, F), shape (n, 3), to how the charges change with what nobody knows: d(Q)/d(parameter) times the
+parameter's standard deviation, shape (n, n_electrode, n_parameter), C. Parameters: the probe's radius, pretension."""
+
 
 @dataclass(frozen=True)
 class CramerRao:
@@ -27,6 +32,7 @@ class CramerRao:
 
     Attributes:
         covariance: Smallest covariance of (x, y, ln F, ...), shape (n, p, p); x and y in m, ln F dimensionless.
+            Nuisances come last, in units of their prior standard deviation.
     """
 
     covariance: Array
@@ -48,20 +54,29 @@ class CramerRao:
         return deviation
 
 
-def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel) -> CramerRao:
+def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Array | None = None) -> CramerRao:
     """Limits from charges and their derivatives.
 
     Args:
         charge: Charges, shape (n, n_electrode), C.
         jacobian: d(Q)/d(parameters), shape (n, n_electrode, p); the first three parameters are x, y, ln F.
         noise: Noise of the readings, with white noise above zero.
+        nuisance: Change of the charges by one prior standard deviation of each further unknown, shape
+            (n, n_electrode, n_parameter), C. They are unknown too, but known to that standard deviation: their prior
+            adds to the information (Van Trees 1968, sec. 2.4.3).
     """
-    return CramerRao(_invert(np.einsum("nei,ne,nej->nij", jacobian, noise.information(charge), jacobian)))
+    prior = np.zeros(jacobian.shape[2])
+    if nuisance is not None:
+        prior = np.concatenate([prior, np.ones(nuisance.shape[2])])
+        jacobian = np.concatenate([jacobian, nuisance], axis=2)
+    information = np.einsum("nei,ne,nej->nij", jacobian, noise.information(charge), jacobian, optimize=True)
+    return CramerRao(_invert(information + np.diag(prior)))
 
 
-def limits_at(model: ChargeModel, contact: Array, noise: NoiseModel) -> CramerRao:
-    """Limits at contacts (x, y, F), shape (n, 3), m and N."""
-    return cramer_rao(model.charge(contact), model.jacobian(contact), noise)
+def limits_at(model: ChargeModel, contact: Array, noise: NoiseModel, nuisance: Nuisance | None = None) -> CramerRao:
+    """Limits at contacts (x, y, F), shape (n, 3), m and N; `nuisance` says what else nobody knows."""
+    unknown = None if nuisance is None else nuisance(contact)
+    return cramer_rao(model.charge(contact), model.jacobian(contact), noise, unknown)
 
 
 def _invert(information: Array) -> Array:

@@ -10,6 +10,7 @@ from isocharge.errors import SolveError
 from isocharge.json_values import finite_or_none
 from isocharge.progress import Progress
 from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.checks import check_determined
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import scaled_jacobian, singular_values
@@ -53,11 +54,10 @@ class LimitMap:
         values = (limits.position, limits.force, largest / np.maximum(smallest, 1e-12 * largest))
         return cls(force, rings, *(rings.per_ring(value) for value in values))
 
-    def summary(self, radius: float) -> dict[str, float]:
-        """Errors within a radius (m), each position weighted with its area."""
-        inside = self.rings.distance <= radius * (1.0 + 1e-9)
-        area = np.repeat(self.rings.distance[inside], self.position.shape[1])
-        position, force = 1e3 * self.position[inside].ravel(), 1e2 * self.relative_force[inside].ravel()
+    def summary(self) -> dict[str, float]:
+        """Errors, each position weighted with its area."""
+        area = np.repeat(self.rings.distance, self.position.shape[1])
+        position, force = 1e3 * self.position.ravel(), 1e2 * self.relative_force.ravel()
         return {
             "force_N": self.force,
             "position_median_mm": _quantile(position, area, 0.5),
@@ -66,7 +66,7 @@ class LimitMap:
             "force_median_percent": _quantile(force, area, 0.5),
             "force_rms_percent": float(np.sqrt(np.average(force**2, weights=area))),
             "force_worst_percent": float(force.max()),
-            "condition_worst": float(self.condition[inside].max()),
+            "condition_worst": float(self.condition.max()),
         }
 
 
@@ -81,6 +81,7 @@ class Identification:
         charges: Charges of the sensor as splines.
         area: The working area, with folds and ambiguous pairs.
         maps: Limits under the smallest force, 1 N if that is in the range, and the largest.
+        inside: The same within the working area; none where that is a point.
     """
 
     sensor: Sensor
@@ -89,6 +90,7 @@ class Identification:
     charges: ChargeSpline = field(repr=False)
     area: WorkingArea
     maps: tuple[LimitMap, ...] = field(repr=False)
+    inside: tuple[LimitMap, ...] = field(repr=False)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON; infinite radii are None."""
@@ -109,7 +111,7 @@ class Identification:
                 "searched_mm": 1e3 * area.searched,
                 "words": area.words,
             },
-            "limits_in_working_area": [limits.summary(area.radius) for limits in self.maps] if area.radius else [],
+            "limits_in_working_area": [limits.summary() for limits in self.inside],
             "by_distance": {
                 "distance_mm": (1e3 * rings.distance).tolist(),
                 **{
@@ -133,14 +135,20 @@ def identify(
         noise: Noise of the readings, with white noise above zero.
         error: Largest Cramer-Rao position error allowed in the working area, m.
         charges: The forward map as splines; tabulated if absent.
+
+    Raises:
+        SceneError: If there are fewer than three electrodes.
     """
+    check_determined(len(forward_map.electrode_names))
     charges = charges or ChargeSpline.of(forward_map)
     low, high = forward_map.force_range
     forces = sorted({low, min(max(low, 1.0), high), high})
-    rings = Rings.spread(forward_map.radius)
-    maps = tuple(LimitMap.of(charges, noise, force, rings) for force in forces)
     area = working_area(charges, noise, error=error)
-    return Identification(forward_map.sensor, forward_map.probe, noise, charges, area, maps)
+    maps, inside = (
+        tuple(LimitMap.of(charges, noise, force, Rings.spread(radius)) for force in forces if radius > 0.0)
+        for radius in (charges.radius, area.radius)
+    )
+    return Identification(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inside)
 
 
 def search_radius(sensor: Sensor, probe: Probe) -> float:

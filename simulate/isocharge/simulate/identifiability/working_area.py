@@ -6,12 +6,13 @@ from typing import Literal
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.simulate.forward.charge_model import ChargeModel
+from isocharge.simulate.forward.charge_model import ChargeModel, electrode_count
 from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.checks import check_determined
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.ambiguities import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
-from isocharge.simulate.identifiability.folds import fold_points
+from isocharge.simulate.identifiability.folds import find_folds
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings
 
@@ -32,14 +33,16 @@ class WorkingArea:
         radius: Radius of the disk, m, rounded down to 0.1 mm; 0 if there is none.
         why: What bounds it: "fold", "twins" (an ambiguous pair), "error", or "searched" if none of these lies within
             the search radius. Near a fold the error grows without bounds, so "error" comes before "fold".
-        fold_radius: Distance from the centre of the nearest fold, m; infinite if there is none.
+        fold_radius: Distance from the centre of the nearest fold, m; infinite if there is none. With more than three
+            electrodes a fold is a point where the map loses rank.
         twin_radius: Radius of the smallest disk that holds two contacts with the same charges, m; infinite if none.
         error_radius: Radius within which the position error is at most `error` at every force, m.
         error: Allowed Cramer-Rao position error (root mean square), m.
         searched: Radius of the search, m.
         force_range: Smallest and largest force, N.
-        folds: Positions on fold lines, shape (n, 2), m.
+        folds: Positions on fold lines, or where rank is lost, shape (n, 2), m.
         twins: Pairs of contacts with the same charges.
+        electrodes: Number of electrodes.
     """
 
     radius: float
@@ -52,6 +55,7 @@ class WorkingArea:
     force_range: tuple[float, float]
     folds: Array
     twins: AmbiguousPairs
+    electrodes: int
 
     @property
     def unfolded(self) -> float:
@@ -66,12 +70,9 @@ class WorkingArea:
         if self.error_radius < min(self.searched, self.fold_radius, self.twin_radius):
             parts.append(f"Farther out the position error exceeds {_in_millimetres(self.error)} at {low:g} N.")
         if np.isfinite(self.fold_radius):
-            parts.append(
-                f"The map folds {1e3 * self.fold_radius:.1f} mm from the centre: contacts on both sides of the fold "
-                "give the same charges, and no method can tell them apart."
-            )
+            parts.append(_fold_sentence(self.fold_radius, self.electrodes))
         if len(self.twins):
-            parts.append(_pair_sentence(self.twins))
+            parts.append(self.twins.words)
         if self.why == "searched":
             parts.append(f"The search ended at {_in_millimetres(self.searched)}.")
         return " ".join(parts)
@@ -94,14 +95,23 @@ def working_area(
         noise: Noise of the readings, with white noise above zero.
         error: Allowed Cramer-Rao position error, m, at every force.
         twins: Whether to search for contacts far apart with the same charges, too.
+
+    Raises:
+        SceneError: If there are fewer than three charges.
     """
     model = ChargeSpline.of(charges) if isinstance(charges, ForwardMap) else charges
+    electrodes = electrode_count(model)
+    check_determined(electrodes)
     rings = Rings.spread(model.radius)
     low, high = model.force_range
     forces = sorted({low, float(np.sqrt(low * high)), high})
-    folds = np.concatenate([fold_points(model, rings, force, noise) for force in forces])
+    searches = [find_folds(model, rings, force, noise) for force in forces]
+    folds = np.concatenate([search.points for search in searches])
     fold_radius = float(np.hypot(*folds.T).min()) if len(folds) else np.inf
-    error_radius = min(_within(model, rings, force, noise, error) for force in forces)
+    error_radius = min(
+        min(_within(model, rings, force, noise, error), _nearest_over(model, search.weakest, force, noise, error))
+        for force, search in zip(forces, searches, strict=True)
+    )
     pairs = find_ambiguous_pairs(model, noise, low) if twins else AmbiguousPairs.none()
     twin_radius = float(pairs.reach[0]) if len(pairs) else np.inf
     ends: dict[Why, float] = {
@@ -122,6 +132,7 @@ def working_area(
         model.force_range,
         folds,
         pairs,
+        electrodes,
     )
 
 
@@ -138,12 +149,17 @@ def _within(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel, e
     return float(np.interp(np.log(error), logs, rings.distance[first - 1 : first + 1]))
 
 
-def _pair_sentence(twins: AmbiguousPairs) -> str:
-    (x, y, force), (other_x, other_y, other_force) = twins.first[0], twins.second[0]
+def _nearest_over(model: ChargeModel, position: Array, force: float, noise: NoiseModel, error: float) -> float:
+    """Distance of the nearest position, shape (n, 2), at which the position error exceeds the allowed one, m."""
+    limit = limits_at(model, np.column_stack([position, np.full(len(position), force)]), noise).position
+    return float(np.hypot(*position.T).min(initial=np.inf, where=~(limit <= error)))
+
+
+def _fold_sentence(radius: float, electrodes: int) -> str:
+    sides = "the fold" if electrodes == 3 else "the points where it loses rank"
     return (
-        f"Contacts far apart can have the same charges: {force:.3g} N at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm and "
-        f"{other_force:.3g} N at ({1e3 * other_x:.1f}, {1e3 * other_y:.1f}) mm are alike within "
-        f"{twins.distance[0]:.1f} standard deviations."
+        f"The map folds {1e3 * radius:.1f} mm from the centre: contacts on both sides of {sides} give the same "
+        "charges, and no method can tell them apart."
     )
 
 

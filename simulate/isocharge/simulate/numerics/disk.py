@@ -1,4 +1,4 @@
-"""Points on a disk: lattice, sunflower, rings, and the projection back onto it."""
+"""Points on a disk: lattice, square grid, sunflower, rings, and the projection back onto it."""
 
 from dataclasses import dataclass
 
@@ -56,6 +56,14 @@ def lattice(most: int) -> np.ndarray:
     inside = inside[np.lexsort((j[inside], i[inside], squared[inside]))]
     points: np.ndarray = (i[inside] + 1j * j[inside]) / max(np.sqrt(ring), 1.0) * (1.0 - 1e-15)
     return points
+
+
+def square_grid(radius: float, spacing: float) -> Array:
+    """Places of a square grid through the centre of a disk, shape (n, 2), in the unit of the radius."""
+    count = int(radius / spacing * (1.0 + 1e-9))
+    x, y = (axis.ravel() for axis in np.meshgrid(*[spacing * np.arange(-count, count + 1)] * 2))
+    places: Array = np.stack([x, y], axis=1)[np.hypot(x, y) <= radius * (1.0 + 1e-9)]
+    return places
 
 
 def sunflower(count: int) -> Complexes:

@@ -1,4 +1,4 @@
 """Pictures of a film, to scale, in mm and pC. The only package, besides paper, that imports matplotlib.
 
-May import: contours, identifiability, forward, solver, sensor.
+May import: layout, contours, identifiability, forward, solver, sensor.
 """

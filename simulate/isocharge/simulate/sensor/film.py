@@ -40,7 +40,7 @@ class Film:
         if self.thickness > 0.1 * self.radius:
             raise SensorError(
                 f"film thickness: expected at most a tenth of the radius ({self.radius * 1e3} mm), "
-                f"got {self.thickness * 1e6} um; this is a solid, not a film"
+                f"got {float(f'{self.thickness * 1e6:.6g}')} um; this is a solid, not a film"
             )
 
 

@@ -178,6 +178,9 @@ def parse_probe(text: str) -> Probe:
             f"probe {cut(text)!r}: expected 'circle:R', 'rectangle:WxH', 'triangle:S' or 'polygon:X,Y;X,Y;X,Y' in mm, "
             "each optionally turned as in 'triangle:4.0@30' (degrees)"
         )
+    for size in ("radius", "width", "height", "side"):
+        if match[size] is not None and not 0.0 < float(match[size]) < np.inf:
+            raise SceneError(f"probe {size}: expected a positive number, got {match[size]} mm in {cut(text)!r}")
     angle = float(np.deg2rad(float(match["angle"] or 0.0)))
     if match["circle"]:
         return Circle(float(match["radius"]) * 1e-3)

@@ -1,6 +1,7 @@
 """The sensor file: TOML with units in its keys, to and from `Sensor`. Unknown keys are errors, and missing ones too."""
 
-from collections.abc import Iterable, Mapping
+import logging
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -18,6 +19,11 @@ from isocharge.toml_text import to_toml
 FARTHEST_MM = 1e6
 """Largest coordinate of a point, mm."""
 
+TINY = 1e-3
+"""A coefficient below this, in pC/N or as a share of the other one, is one in another unit: PVDF has 1 to 30 pC/N."""
+
+log = logging.getLogger(__name__)
+
 SECTIONS = ("name", "readout", "surface", "film", "piezo", "electrodes", "calibration")
 
 
@@ -28,7 +34,7 @@ def built_in_sensors() -> tuple[str, ...]:
 
 
 def load_sensor(sensor: str | Path) -> Sensor:
-    """Read a sensor.
+    """Read a sensor; what can exist, but hardly be meant, is logged as a warning.
 
     Args:
         sensor: A built-in name such as "three-25um-biaxial", or the path of a TOML file.
@@ -43,7 +49,10 @@ def load_sensor(sensor: str | Path) -> Sensor:
     if not path.is_file():
         names = ", ".join(built_in_sensors())
         raise SensorError(f"no sensor {str(sensor)!r}: it is neither a built-in name ({names}) nor a file")
-    return sensor_from_dict(read_toml(path, "a sensor file", SensorError), str(path))
+    described = sensor_from_dict(read_toml(path, "a sensor file", SensorError), str(path))
+    for caution in _cautions(described):
+        log.warning("%s: %s", path, caution)
+    return described
 
 
 def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
@@ -52,6 +61,22 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
         return _build(Table(table, "", SensorError).only(*SECTIONS))
     except SensorError as error:
         raise SensorError(f"{where}: {error}") from error
+
+
+def _cautions(sensor: Sensor) -> Iterator[str]:
+    """Sentences on what can exist, but hardly be meant."""
+    d31, d32 = 1e12 * sensor.piezo.d31, 1e12 * sensor.piezo.d32
+    for name, value, other in (("d31", d31, d32), ("d32", d32, d31)):
+        if 0.0 < abs(value) < TINY * max(1.0, abs(other)):
+            yield (
+                f"piezo.{name} is {value:.3g} pC/N, beside {other:.3g} pC/N: expected 1 to 30 pC/N, as PVDF has, or "
+                "exactly 0; look at its unit"
+            )
+    if len(sensor.electrodes) == 1:
+        yield (
+            f"one electrode ({sensor.electrode_names[0]!r}): its charge can be computed, but one charge does not "
+            "determine x, y and force; three electrodes or more do"
+        )
 
 
 def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
@@ -142,11 +167,11 @@ def _build(file: Table) -> Sensor:
     return Sensor(
         name=file.text("name"),
         film=Film(
-            radius=film.number("radius_mm") * 1e-3,
-            thickness=film.number("thickness_um") * 1e-6,
-            young=film.number("young_GPa") * 1e9,
+            radius=film.number("radius_mm", above=0.0, most=FARTHEST_MM) * 1e-3,
+            thickness=film.number("thickness_um", above=0.0) * 1e-6,
+            young=film.number("young_GPa", above=0.0) * 1e9,
             poisson=film.number("poisson"),
-            pretension=film.number("pretension_MPa", 0.0) * 1e6,
+            pretension=film.number("pretension_MPa", 0.0, least=0.0) * 1e6,
         ),
         piezo=Piezo(
             d31=piezo.number("d31") * 1e-12,

@@ -1,5 +1,6 @@
 """The contacts a model knows, and the range of charges it takes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,3 +47,11 @@ class ContactDomain:
 
 LOWEST_PC, HIGHEST_PC = 1.0, 1e6
 """Charges are brought between these before the logarithm: what is negative or absurd still gives a finite answer."""
+
+
+def inner_radius(polygon_mm: Sequence[tuple[float, float]]) -> float:
+    """Radius of the largest disk about the origin in a convex polygon, mm, to 0.001 mm."""
+    corners = np.array(polygon_mm)
+    along = np.roll(corners, -1, axis=0) - corners
+    distances = np.abs(along[:, 0] * corners[:, 1] - along[:, 1] * corners[:, 0]) / np.hypot(*along.T)
+    return round(float(distances.min()), 3)

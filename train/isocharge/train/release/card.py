@@ -25,7 +25,7 @@ def _interface(metadata: ModelMetadata, fit: Fit) -> str:
     electrodes = ", ".join(metadata.electrodes)
     return f"""# {metadata.name}, version {metadata.version}
 
-Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of one press out.
+Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of one press out.{_taught(metadata)}
 
 | | |
 |---|---|
@@ -111,6 +111,11 @@ def _command(metadata: ModelMetadata) -> str:
 {metadata.made_with["command"] or "(made by a program, see metadata)"}
 ```
 """
+
+
+def _taught(metadata: ModelMetadata) -> str:
+    teacher = metadata.made_with.get("teacher")
+    return f"\nA small network that learned the answers of `{teacher}`." if teacher else ""
 
 
 def _folded(fit: Fit) -> str:

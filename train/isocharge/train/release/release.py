@@ -8,7 +8,7 @@ import copy
 import platform
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ from isocharge.train.release.measured import MeasuredTest, measured_alarm, measu
 from isocharge.train.training.checkpoint import Checkpoint
 from isocharge.train.training.config import FitConfig
 from isocharge.train.training.fit import Fit, fit_network
+from isocharge.train.training.teacher import Teacher
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,7 @@ def train_model(
     version: int = 1,
     fresh: bool = False,
     test: MeasuredTest | None = None,
+    teacher: Teacher | None = None,
     progress: StageProgress | None = None,
     warn: Warn = warnings.warn,
 ) -> Release:
@@ -75,6 +77,7 @@ def train_model(
         fresh: Throw away what an earlier run left.
         test: Measured presses to measure the errors on; those held out of a measured dataset if absent, and for a
             simulated one its held-out presses with noise.
+        teacher: A model whose answers are learned; the presses' contacts if absent.
         progress: Called with steps done, all steps, and a text with the loss and errors.
         warn: Called where the map folds, and about damaged parts of an earlier run.
 
@@ -88,10 +91,12 @@ def train_model(
     """
     check_target(folder, version, dataset.sensor.electrode_names)
     config = config or FitConfig()
-    with resume_parts(folder / str(version), _identity(dataset, config), fresh=fresh, warn=warn) as draft:
-        fit = fit_network(dataset, config, progress, checkpoint=Checkpoint(draft), warn=warn)
+    with resume_parts(folder / str(version), _identity(dataset, config, teacher), fresh=fresh, warn=warn) as draft:
+        fit = fit_network(dataset, config, progress, checkpoint=Checkpoint(draft), teacher=teacher, warn=warn)
         test = test or (MeasuredTest(fit.held) if fit.measured else None)
         about = _metadata(fit, dataset, folder.resolve().name, version, command, test)
+        if teacher:
+            about = replace(about, made_with={**about.made_with, "teacher": teacher.label})
         graph = export_onnx(fold_network(fit.network), about.to_props())
         golden = check_graph(graph, _in_double(fit), fit.held, misfit_noise(noise_model(fit.config.training.noise)))
         further = test.further if test else {}
@@ -99,7 +104,7 @@ def train_model(
     return Release(written, about)
 
 
-def _identity(dataset: Dataset, config: FitConfig) -> dict[str, Any]:
+def _identity(dataset: Dataset, config: FitConfig, teacher: Teacher | None) -> dict[str, Any]:
     """All that decides about the weights."""
     return {
         "dataset_sha256": dataset.sha256,
@@ -107,6 +112,7 @@ def _identity(dataset: Dataset, config: FitConfig) -> dict[str, Any]:
         "config": config.to_dict(),
         "isocharge": metadata.version("isocharge"),
         "torch": torch.__version__,
+        **({"teacher_sha256": teacher.sha256} if teacher else {}),
     }
 
 

@@ -12,7 +12,7 @@ from isocharge.arrays import Array
 from isocharge.errors import ModelError
 from isocharge.files import new_folder, write_whole
 from isocharge.progress import StageProgress
-from isocharge.serve import ModelMetadata
+from isocharge.serve import ModelMetadata, Predictor
 from isocharge.simulate import Dataset, Samples, SolveSettings, sensor_to_dict
 from isocharge.train.baselines import (
     Fitted,
@@ -24,6 +24,7 @@ from isocharge.train.baselines import (
     polynomial,
     table,
 )
+from isocharge.train.data.domain import inner_radius
 from isocharge.train.data.measured import check_enough, held_out, is_measured
 from isocharge.train.data.presses import LabelledPresses, domain_of
 from isocharge.train.report import effects, maps, pictures
@@ -83,6 +84,7 @@ def write_report(
     subjects: Sequence[tuple[Dataset, Path]],
     settings: Settings | None = None,
     *,
+    students: Sequence[Path] = (),
     command: str = "",
     progress: StageProgress | None = None,
 ) -> dict[str, Any]:
@@ -92,6 +94,7 @@ def write_report(
         folder: Where; must not exist yet.
         subjects: Datasets, each with the version folder of the released model for it.
         settings: How much work; the full report if absent.
+        students: Version folders of small models, each compared on the datasets of its sensor.
         command: How to make this report again, for the page.
         progress: Called with steps done, all steps, and the step that begins.
 
@@ -107,7 +110,8 @@ def write_report(
     A measured dataset (`is_measured`) is judged by its own presses: a fifth is held out and scored as measured.
     """
     settings = settings or Settings()
-    prepared = [_Subject.of(dataset, model, settings) for dataset, model in subjects]
+    small = [ReleasedModel(student, Predictor(student).metadata.name) for student in dict.fromkeys(students)]
+    prepared = [_Subject.of(dataset, model, settings, small) for dataset, model in subjects]
     steps = Steps(sum(subject.steps for subject in prepared), progress)
     with new_folder(folder) as draft, one_thread():
         sections = [subject.measure(draft, stem, steps) for stem, subject in _stems(prepared)]
@@ -139,41 +143,53 @@ def _stems(subjects: "list[_Subject]") -> "list[tuple[str, _Subject]]":
 
 @dataclass(frozen=True)
 class _Subject:
-    """One dataset and its model; of measured presses, `held` are the test presses, and `dataset` the others."""
+    """One dataset, its model and that model's students.
+
+    Of measured presses, `held` are the test presses, and `dataset` the others.
+    """
 
     dataset: Dataset
     released: ReleasedModel
+    students: tuple[ReleasedModel, ...]
     task: FittingTask
     bench: EvaluationScene
     settings: Settings
     held: LabelledPresses | None = None
 
     @classmethod
-    def of(cls, dataset: Dataset, model: Path, settings: Settings) -> "_Subject":
+    def of(cls, dataset: Dataset, model: Path, settings: Settings, small: Sequence[ReleasedModel]) -> "_Subject":
         released = ReleasedModel(model)
+        students = tuple(each for each in small if each.predictor.metadata.sensor == released.predictor.metadata.sensor)
         if is_measured(dataset):
-            return cls._of_measured(dataset, released, settings)
+            return cls._of_measured(dataset, released, students, settings)
         dataset = _known_to(released.predictor.metadata, dataset)
         if len(dataset.samples) > settings.learn_from:
             dataset = replace(dataset, samples=_rows(dataset.samples, np.arange(settings.learn_from)))
         bench = EvaluationScene.of(dataset, settings.presses, settings.seed)
         task = task_of(dataset, bench, settings)
-        return cls(dataset, released, task, bench, settings)
+        return cls(dataset, released, students, task, bench, settings)
 
     @classmethod
-    def _of_measured(cls, dataset: Dataset, released: ReleasedModel, settings: Settings) -> "_Subject":
+    def _of_measured(
+        cls, dataset: Dataset, released: ReleasedModel, students: tuple[ReleasedModel, ...], settings: Settings
+    ) -> "_Subject":
         dataset = _measured_known_to(released.predictor.metadata, dataset)
         presses = LabelledPresses.of(dataset.samples)
         held = held_out(presses.contact)
         bench = EvaluationScene.of(dataset, settings.presses, settings.seed)
         others = replace(dataset, samples=_rows(dataset.samples, np.flatnonzero(~held)[: settings.learn_from]))
-        return cls(others, released, task_of(others, bench, settings), bench, settings, presses[held])
+        return cls(others, released, students, task_of(others, bench, settings), bench, settings, presses[held])
 
     @property
     def steps(self) -> int:
         """Number of steps that progress is called with, roughly."""
         remaining = 0 if len(self.bench.sensor.electrodes) < 4 else len(self.bench.sensor.electrodes)
         return 22 + len(self.settings.sizes) + 2 * self.settings.rounds + len(self.settings.shapes) + remaining
+
+    @property
+    def _given(self) -> tuple[ReleasedModel, ...]:
+        """The models that are compared as they are, the released one first."""
+        return self.released, *self.students
 
     def measure(self, folder: Path, stem: str, steps: Steps) -> dict[str, Any]:
         """Everything about this dataset: its section of the record, its pictures written."""
@@ -187,7 +203,7 @@ class _Subject:
         test = EvaluationPresses.of(bench, press_on(test_maps, bench.sweep()))
         steps("integrating the Bayes limit")
         limits = error_bounds(bench, forward_maps, test.presses, test.charge_pC, settings.limited, steps.say)
-        methods = fit_all(all_methods(self.dataset, forward_maps[0], settings), self.released, self.task, test, steps)
+        methods = fit_all(all_methods(self.dataset, forward_maps[0], settings), self._given, self.task, test, steps)
         methods = timed(methods, test, settings, steps)
         section = self._section(test, limits, methods, steps)
         section["pictures"] = _draw(folder, stem, section, self._draws(test), bench, settings, steps)
@@ -196,7 +212,7 @@ class _Subject:
     def _measured(self, folder: Path, stem: str, test: EvaluationPresses, steps: Steps) -> dict[str, Any]:
         """The same of measured presses, as they are: what needs a simulator is left out."""
         estimators = all_methods(self.dataset, None, self.settings)
-        methods, refused = fit_those_that_can(estimators, self.released, self.task, test, steps)
+        methods, refused = fit_those_that_can(estimators, self._given, self.task, test, steps)
         records = records_of(timed(methods, test, self.settings, steps), test, None)
         section = {
             **self._about(test),
@@ -288,14 +304,6 @@ def _known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
 
 SLACK = 1.0 + 1e-6
 """By how much a range may be passed: rounding."""
-
-
-def inner_radius(polygon_mm: Sequence[tuple[float, float]]) -> float:
-    """Radius of the largest disk about the origin in a convex polygon, mm, to 0.001 mm."""
-    corners = np.array(polygon_mm)
-    along = np.roll(corners, -1, axis=0) - corners
-    distances = np.abs(along[:, 0] * corners[:, 1] - along[:, 1] * corners[:, 0]) / np.hypot(*along.T)
-    return round(float(distances.min()), 3)
 
 
 def _model_record(released: ReleasedModel) -> dict[str, Any]:

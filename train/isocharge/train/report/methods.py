@@ -1,7 +1,7 @@
 """Every method, fitted and measured on the same presses."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,14 +131,14 @@ def all_methods(dataset: Dataset, forward_map: ForwardMap | None, settings: Sett
 
 def fit_all(
     estimators: list[tuple[str, Estimator]],
-    released: ReleasedModel,
+    given: Sequence[ReleasedModel],
     task: FittingTask,
     test: EvaluationPresses,
     progress: Announce,
 ) -> list[Method]:
-    """Fit every method and let all of its forms answer the test presses; the released model comes first."""
-    given: list[Fitted] = [released, released.contact_only()]
-    methods = [Method(form, "network", form.predict(test.charge_pC), 0.0) for form in given]
+    """Fit every method and let all of its forms answer the test presses; models that are given come first."""
+    forms_given: list[Fitted] = [form for model in given for form in (model, model.contact_only())]
+    methods = [Method(form, "network", form.predict(test.charge_pC), 0.0) for form in forms_given]
     for kind, estimator in estimators:
         progress(f"fitting: {estimator.name}")
         begin = time.perf_counter()
@@ -150,16 +150,16 @@ def fit_all(
 
 def fit_those_that_can(
     estimators: list[tuple[str, Estimator]],
-    released: ReleasedModel,
+    given: Sequence[ReleasedModel],
     task: FittingTask,
     test: EvaluationPresses,
     progress: Announce,
 ) -> tuple[list[Method], dict[str, str]]:
     """As `fit_all`, of few measured presses: methods that they cannot teach are left out, by name with the reason."""
-    methods, refused = fit_all([], released, task, test, progress), {}
+    methods, refused = fit_all([], given, task, test, progress), {}
     for kind, estimator in estimators:
         try:
-            methods += fit_all([(kind, estimator)], released, task, test, progress)[2:]
+            methods += fit_all([(kind, estimator)], (), task, test, progress)
         except (DatasetError, TrainingError) as error:
             refused[estimator.name] = str(error)
     return methods, refused

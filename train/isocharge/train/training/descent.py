@@ -134,8 +134,8 @@ def _rate_share(done: float) -> float:
 
 
 def _optimisers(part: Trainable, rate: float) -> list[torch.optim.Optimizer]:
-    matrices = part.hidden_matrices()
-    hidden = {id(matrix) for matrix in matrices}
+    matrices = [matrix for matrix in part.hidden_matrices() if matrix.requires_grad]
+    hidden = {id(matrix) for matrix in part.hidden_matrices()}
     others = [parameter for parameter in part.parameters() if id(parameter) not in hidden]
     adam = torch.optim.Adam(others, lr=rate, betas=(0.9, 0.98))
     muon = [torch.optim.Muon(matrices, lr=MUON_RATE * rate, weight_decay=0.0)] if matrices else []

@@ -4,12 +4,14 @@ The contact network learns mean and standard deviation by maximum likelihood on 
 the first steps learn the mean by least squares, because a likelihood with free deviations is slow to find it. Without
 noise Levenberg-Marquardt finishes the mean. The misfit network learns from charges of all kinds, whose distance from
 the nearest known contact is searched for beforehand.
+
+With a teacher the contact network learns the teacher's answers to those charges instead of the presses.
 """
 
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -25,7 +27,7 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.fold_free import SMALLEST_SHARE, fold_free_domain, probable_fold_mm
+from isocharge.train.data.fold_free import SMALLEST_SHARE, fold_free_domain, probable_fold_mm, twins_within
 from isocharge.train.data.measured import held_out, is_measured
 from isocharge.train.data.misfit_charges import MisfitExamples, draw_misfit_examples
 from isocharge.train.data.noise import misfit_noise, noisy_charges
@@ -35,10 +37,14 @@ from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.levenberg_marquardt import FIRST, levenberg_marquardt
 from isocharge.train.training.misfit_data import WATCHED, MisfitData
-from isocharge.train.training.network import Features, InverseNetwork
+from isocharge.train.training.network import Features, InverseNetwork, Perceptron
+from isocharge.train.training.teacher import Teacher, teaching_loss
 
 WARM_UP = 0.15
 """Length of the first stage, which learns the mean by least squares, over all steps, dimensionless."""
+
+SETTLING = 0.25
+"""Steps that the other weights are trained on for, once the hidden ones are rounded, over those before."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,7 @@ def fit_network(
     progress: StageProgress | None = None,
     *,
     checkpoint: Checkpoint | None = None,
+    teacher: Teacher | None = None,
     warn: Warn = warnings.warn,
 ) -> Fit:
     """Train on a dataset.
@@ -80,7 +87,8 @@ def fit_network(
         config: Sizes, steps, seed.
         progress: Called with steps done, all steps, and a text with the loss and errors on watched presses.
         checkpoint: Keeps the state, so that a stopped run goes on.
-        warn: Called where the map folds.
+        teacher: A model whose answers are learned; the presses' contacts if absent.
+        warn: Called where the map folds, and where contacts far apart have the same charges.
 
     Raises:
         ConfigError: If the noise level is unknown.
@@ -101,7 +109,7 @@ def fit_network(
         network = InverseNetwork(
             domain, Features.fit(train.charge_pC), config.network.hidden, config.network.misfit_hidden
         )
-        _Training(network, field, train, watched, training, checkpoint or Checkpoint(), progress).run()
+        _Training(network, field, train, watched, config, checkpoint or Checkpoint(), teacher, progress).run()
     network.eval()
     return Fit(network, field, held, config, asked, is_measured(dataset), tuple(cautions))
 
@@ -144,6 +152,8 @@ def _without_folds(
                 f"across it, up to {asked.radius_mm:g} mm; see 'isocharge simulate identify', then ask for a smaller "
                 "radius or add an electrode"
             )
+        else:
+            _warn_of_twins(field, noise, asked, warn)
         return asked, presses
     if domain.radius_mm < SMALLEST_SHARE * asked.radius_mm:
         raise DatasetError(
@@ -156,7 +166,13 @@ def _without_folds(
         f"there; the model is trained for {domain.radius_mm:g} mm, not {asked.radius_mm:g} mm, on {len(inside)} of "
         f"{len(presses)} presses"
     )
+    _warn_of_twins(field, noise, domain, warn)
     return domain, inside
+
+
+def _warn_of_twins(field: ChargeField, noise: NoiseModel, domain: ContactDomain, warn: Warn) -> None:
+    if twins := twins_within(field, noise, domain.radius_mm).words:
+        warn(f"{twins[0].lower()}{twins[1:-1]}; no model tells which of them it is; see 'isocharge simulate identify'")
 
 
 @contextmanager
@@ -184,18 +200,25 @@ class _Training:
         field: ChargeField,
         train: LabelledPresses,
         watched: LabelledPresses,
-        config: TrainingConfig,
+        settings: FitConfig,
         checkpoint: Checkpoint,
+        teacher: Teacher | None,
         progress: StageProgress | None,
     ) -> None:
         self.network, self.field, self.train, self.watched = network, field, train, watched
-        self.config, self.checkpoint, self.progress = config, checkpoint, progress
+        self.config, self.rounded = settings.training, settings.network.weights == "int8"
+        self.checkpoint, self.teacher, self.progress = checkpoint, teacher, progress
+        config = self.config
         self.noise = noise_model(config.noise)
         self.charge = torch.tensor(train.charge_pC).float()
         self.unit = torch.tensor(field.domain.to_unit(train.contact)).float()
         self.watched_charge = torch.tensor(noisy_charges(watched, self.noise, config.seed)).float()
         self.watched_unit = torch.tensor(field.domain.to_unit(watched.contact)).float()
-        self.total = config.steps + config.finish_steps + config.misfit_steps
+        self.total = sum(map(self._steps, (config.steps, config.misfit_steps))) + config.finish_steps
+
+    def _steps(self, steps: int) -> int:
+        """All steps of a stage, those after rounding included."""
+        return steps + round(SETTLING * steps) * self.rounded
 
     def run(self) -> None:
         config = self.config
@@ -207,12 +230,26 @@ class _Training:
             config.steps,
             round(WARM_UP * config.steps),
         )
-        self._descend(contact, 0)
+        self._train_part(contact, self.network.contact, 0)
         if config.finish_steps:
             self._finish()
         data = MisfitData.of(self.network, self._misfit_examples(), config)
         misfit = TrainingStage("misfit", self.network.misfit_vector, data.loss, data.score, config.misfit_steps)
-        self._descend(misfit, config.steps + config.finish_steps)
+        self._train_part(misfit, self.network.misfit_vector, self._steps(config.steps) + config.finish_steps)
+
+    def _train_part(self, task: TrainingStage, part: Perceptron, before: int) -> None:
+        """Train a perceptron; where weights are rounded, round its hidden ones and train the others on."""
+        self._descend(task, before)
+        if self.rounded:
+            part.round_hidden()
+            settling = replace(
+                task,
+                name=f"{task.name}-rounded",
+                loss=lambda step, random: task.loss(task.steps + step, random),
+                steps=round(SETTLING * task.steps),
+                warm_up_steps=0,
+            )
+            self._descend(settling, before + task.steps)
 
     def _descend(self, task: TrainingStage, before: int) -> None:
         descent = Descent(task, self.config.learning_rate, self.config.patience, self.config.seed)
@@ -224,9 +261,13 @@ class _Training:
 
     def _contact_loss(self, step: int, random: torch.Generator) -> Tensor:
         rows = torch.randint(len(self.charge), (min(self.config.batch, len(self.charge)),), generator=random)
-        mean, log_std = self.network.posterior(with_fresh_noise(self.charge[rows], self.noise, random))
+        charge_pC = with_fresh_noise(self.charge[rows], self.noise, random)
+        mean, log_std = self.network.posterior(charge_pC)
         warm_up = step < round(WARM_UP * self.config.steps)
-        return (start_loss if warm_up else likelihood_loss)(mean, log_std, self.unit[rows])
+        if self.teacher is None:
+            return (start_loss if warm_up else likelihood_loss)(mean, log_std, self.unit[rows])
+        taught = self.teacher.posterior(charge_pC, self.network.domain)
+        return start_loss(mean, log_std, taught[0]) if warm_up else teaching_loss(mean, log_std, *taught)
 
     def _contact_score(self) -> tuple[float, str]:
         with torch.no_grad():

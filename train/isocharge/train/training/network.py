@@ -24,6 +24,9 @@ from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain
 MISFIT_UNIT = 5.0
 """Standard deviations up to which the misfit is learned about linearly; beyond, its logarithm is."""
 
+LARGEST_INT8 = 127
+"""A rounded weight is a whole number from minus this to this, times the scale of its output."""
+
 
 @dataclass(frozen=True)
 class Features:
@@ -88,6 +91,13 @@ class Perceptron(Trainable):
     def hidden_matrices(self) -> list[Tensor]:
         """Weights from one hidden layer to the next."""
         return [layer.weight for layer in self.layers()[1:-1]]
+
+    def round_hidden(self) -> None:
+        """Round the hidden matrices to 8 bits, a scale for each output, and train them no further."""
+        for matrix in self.hidden_matrices():
+            scale = matrix.detach().abs().amax(dim=1, keepdim=True) / LARGEST_INT8
+            matrix.detach().copy_(torch.round(matrix.detach() / scale.clamp(min=1e-30)) * scale)
+            matrix.requires_grad_(False)
 
 
 class InverseNetwork(nn.Module):

@@ -120,7 +120,7 @@ class BenchEvents:
         assert self._keyboard is not None
         rest = b""
         while not self._stop.is_set():
-            if not select.select([self._keyboard], [], [], POLL_S)[0]:
+            if os.name != "nt" and not select.select([self._keyboard], [], [], POLL_S)[0]:  # Windows: sockets only
                 continue
             data = os.read(self._keyboard, LONGEST_LINE)
             *lines, rest = (rest + data).split(b"\n")

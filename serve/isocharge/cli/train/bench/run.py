@@ -142,11 +142,13 @@ def _events(bench: BenchPort, chosen: "SensorFilms") -> "Iterator[BenchEvents]":
     from isocharge.serve import PressWatch, ReadingStream, open_source
 
     sensor, machine = chosen.films.prior.sensor, bench.press_list is not None
-    stream = ReadingStream(sensor.electrode_names, _board(bench.device), reader=f"sensor {sensor.name}")
+    board = _board(bench.device)
+    stream = ReadingStream(sensor.electrode_names, board, reader=f"sensor {sensor.name}")
     keyboard = None if machine or bench.yes else _keyboard()
     with ExitStack() as stack:
         stack.enter_context(log_to_stderr())
-        source = stack.enter_context(open_source(bench.url, baud=bench.baud, reconnect=not machine))
+        request = board.frames.request
+        source = stack.enter_context(open_source(bench.url, baud=bench.baud, reconnect=not machine, request=request))
         yield stack.enter_context(BenchEvents(source, stream, PressWatch(sensor.electrode_names), keyboard))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 from dataclasses import asdict
 from functools import partial
 
@@ -111,6 +112,89 @@ def test_check_at_another_baud_rate():
     port.close()
     assert report.bytes_seen > 100
     assert "bytes come, but no frames: another baud rate" in missing(report)
+
+
+@pytest.fixture
+def talk():
+    """Let a port say the same again and again."""
+    talking = []
+
+    def start(data, pause_s=0.005):
+        port, stop = PseudoPort(), threading.Event()
+
+        def send():
+            number = 0
+            while not stop.wait(pause_s):
+                port.write_whole(data(number) if callable(data) else data)
+                number += 1
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        talking.append((port, stop, thread))
+        return port.url
+
+    yield start
+    for port, stop, thread in talking:
+        stop.set()
+        thread.join()
+        port.close()
+
+
+def row(number):
+    """Counts: four inputs that live about 300, two that do not."""
+    q = [300 + (7 * number * (k + 3)) % 11 for k in range(4)]
+    return f"{q[0]},0,{q[1]},{q[2]},4095,{q[3]}\n".encode()
+
+
+def test_two_seconds_take_two_seconds(talk):
+    """Also where the speed is looked for: what is heard then counts."""
+    url = talk(row)
+    began = time.monotonic()
+    report = examine(url, seconds=2.0)
+    assert 1.9 < report.seconds < 2.2
+    assert time.monotonic() - began < 4.0  # what was heard is examined after it
+
+
+def test_inputs_that_do_not_live_are_ignored(talk):
+    report = examine(talk(row), seconds=0.6, electrodes=("A", "B", "C", "D"))
+    assert report.device["channels"] == {"A": "1", "B": "3", "C": "4", "D": "6"}
+    assert report.unused == ("2", "5")
+    assert "life" not in missing(report)
+    assert report.unit == "counts"
+    assert "--pC-per-unit" in missing(report)
+    text = "\n".join(report_lines(report))
+    assert "the channels are counts, not pC" in text
+    assert "pC" not in text.partition("channel ")[2].splitlines()[0]
+
+
+def test_channels_that_a_file_leaves_out_are_ignored(talk):
+    board = {"channels": {"A": "ch1", "B": "3", "C": "4"}, "gain": {"pC_per_unit": 0.5, "offset": 300}}
+    report = examine(talk(row), seconds=0.6, device=device_from_table(board, "test"))
+    assert [channel.name for channel in report.channels] == ["1", "3", "4"]
+    assert report.unused == ("2", "5", "6")
+    assert all(abs(channel.offset_pC) < 10 for channel in report.channels)
+    assert "life" not in missing(report)
+
+
+def test_the_proposal_is_a_device_that_reads_the_same(talk):
+    """What doctor says of the board, its file says again."""
+    gain = {"pC_per_unit": {"A": 0.5, "B": -0.5, "C": 0.5, "D": 0.5}}
+    url = talk(row)
+    first = examine(url, seconds=0.6, electrodes=("A", "B", "C", "D"), gain=gain)
+    assert first.device["gain"]["offset"] == pytest.approx(305, abs=10)
+    again = examine(url, seconds=0.6, device=device_from_table(first.device, "test"))
+    assert [channel.name for channel in again.channels] == [channel.name for channel in first.channels]
+    assert all(abs(channel.offset_pC) < 5 for channel in again.channels)
+    assert (again.unit, again.unused) == ("pC", ("2", "5"))
+    json.dumps(asdict(first), allow_nan=False)
+
+
+def test_a_file_that_does_not_fit_is_no_reason_to_be_silent(talk):
+    fields = [{"name": "A", "type": "f32"}]
+    table = {"frames": {"format": "described", "sync": "AA", "length": 5, "fields": fields}}
+    report = examine(talk(row), bauds=BAUD, seconds=0.5, device=device_from_table(table, "test"))
+    assert report.good == 0
+    assert "bytes come, but no frames" in missing(report)
 
 
 def test_check_without_a_port():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.serve.live.channel_health import channel_health
+from isocharge.serve.examination.channel_health import channel_health
 
 
 def test_offset_drift_hum_and_noise_of_a_channel():

@@ -1,0 +1,42 @@
+"""`train distil`: a released model to a student that serves, and what it refuses."""
+
+import json
+
+QUICK = """
+[network]
+hidden = [16, 16]
+misfit_hidden = [8, 8]
+weights = "int8"
+
+[training]
+steps = 600
+misfit_steps = 50
+misfit_charges = 1000
+batch = 256
+"""
+
+
+def test_a_student_serves(command, tmp_path):
+    (tmp_path / "quick.toml").write_text(QUICK)
+    folder, settings = tmp_path / "small", str(tmp_path / "quick.toml")
+    code, out, err = command("train", "distil", "four-25um-biaxial", "-o", str(folder), "--config", settings, "--json")
+    assert code == 0, err
+    assert json.loads(out)["errors"]["position_median_mm"] < 1.0
+    (tmp_path / "charges.csv").write_text("A,B,C,D\n800,810,790,805\n")
+    code, out, _ = command("serve", "predict", str(folder), str(tmp_path / "charges.csv"), "--json")
+    assert code == 0
+    assert json.loads(out)["model"] == "small/1"
+
+
+def test_a_form_stands_in_one_place(command, tmp_path):
+    words = ["four-25um-biaxial", "-o", str(tmp_path / "small"), "--int8", "--config", "quick.toml"]
+    code, _, err = command("train", "distil", *words)
+    assert code == 2
+    assert "--int8: expected no --config beside it" in err
+
+
+def test_a_model_that_is_not_there_is_said(command, tmp_path):
+    code, _, err = command("train", "distil", "nothing", "-o", str(tmp_path / "small"))
+    assert code == 2
+    assert "nothing" in err
+    assert not (tmp_path / "small").exists()

@@ -1,0 +1,69 @@
+"""UDP sockets as ports: datagrams are chunks, and lines without an end get one."""
+
+import socket
+
+import pytest
+
+from isocharge.errors import PortError
+from isocharge.serve import Port
+from isocharge.serve.port.udp import is_text
+
+
+@pytest.fixture
+def address():
+    """An address that nobody uses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()
+
+
+def received(address, *datagrams):
+    """What a port reads of datagrams that a board sends."""
+    with (
+        Port(f"udp://127.0.0.1:{address[1]}", silence_s=2.0) as port,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board,
+    ):
+        for datagram in datagrams:
+            board.sendto(datagram, address)
+        chunks = iter(port)
+        return [next(chunks).data for datagram in datagrams if datagram]
+
+
+def test_each_datagram_is_a_chunk(address):
+    sent = [b"\x00\xff" * 20, b"\x01", b"\x02\n" * 700]
+    assert received(address, *sent) == sent
+
+
+def test_lines_without_an_end_get_one(address):
+    assert received(address, b'{"A": 1}', b"A:1\nB:2", b"\xaa\x00") == [b'{"A": 1}\n', b"A:1\nB:2\n", b"\xaa\x00"]
+
+
+def test_a_board_that_ends_its_lines_gets_no_more_ends(address):
+    assert received(address, b"1,2\n", b"3,", b"4\n") == [b"1,2\n", b"3,", b"4\n"]
+
+
+def test_silence(address):
+    with Port(f"udp://127.0.0.1:{address[1]}", silence_s=0.05) as port:
+        assert port.read(0.01) is None
+        with pytest.raises(PortError, match=r"no data for 0\.05 s"):
+            next(iter(port))
+
+
+@pytest.mark.parametrize(
+    "url", ["udp://127.0.0.1", "udp://127.0.0.1:99999", "udp://127.0.0.1:9/x", "udp://300.0.0.1:9"]
+)
+def test_addresses_that_are_none(url):
+    with pytest.raises(PortError, match=f"{url}: cannot be opened"), Port(url):
+        pass
+
+
+def test_an_address_that_is_taken(address):
+    with Port(f"udp://127.0.0.1:{address[1]}"), pytest.raises(PortError, match="in use"):
+        Port(f"udp://127.0.0.1:{address[1]}").__enter__()
+
+
+@pytest.mark.parametrize(
+    ("data", "said"), [(b"A:1\t2\r\n", True), ("1 µC".encode(), True), (b"\xaa\x55", False), (b"1\x002", False)]
+)
+def test_what_is_text(data, said):
+    assert is_text(data) == said

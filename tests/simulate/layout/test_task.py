@@ -1,0 +1,92 @@
+"""What is refused before the search begins, and maps of what matters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.errors import InputError, IsochargeError, SensorError
+from isocharge.simulate import Calibration, DesignTask, Polygon
+from isocharge.simulate.layout.goal import Goal
+from isocharge.simulate.layout.placing import Zone
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"electrodes": 1}, "expected 3 to 8, got 1; one electrode gives one number"),
+        ({"electrodes": 2}, "expected 3 to 8, got 2; two electrodes give two numbers"),
+        ({"electrodes": 0}, "expected 3 to 8, got 0"),
+        ({"electrodes": 9}, "expected 3 to 8, got 9"),
+        ({"side": (40e-3, 40e-3)}, "4 new squares of 40 mm do not fit"),
+        ({"zones": (Zone((0.0, 0.0), 44.5e-3),)}, "do not fit .* 1 keep-out zones"),
+        ({"radius": 44.5e-3}, "leave the film of radius 45 mm"),
+        ({"radius": -1e-3}, "radius: expected a positive number"),
+        ({"forces": (1e4,)}, "beyond small strains"),
+        ({"probes": (Polygon.rectangle(4e-3, 2e-3),)}, "round probes"),
+        ({"keep": ("A", "A")}, "expected different names"),
+        ({"keep": ("A", "B", "C", "D")}, "nothing to place"),
+        ({"keep": ("A",), "zones": (Zone((10e-3, 0.0), 2e-3),)}, "electrode 'A' lies in a keep-out zone"),
+        ({"gap": -1e-3}, "gap: expected a length from 0 mm"),
+        ({"side": (3e-3, 2e-3)}, "side: expected 0 < MIN <= MAX"),
+        ({"pretensions": (-1.0,)}, "pretension: expected a number from 0 MPa"),
+        ({"symmetry": "3-fold", "electrodes": 5}, "expected a multiple of 3"),
+        ({"forces": ()}, "at least one probe and one force"),
+    ],
+)
+def test_impossible_tasks(sensor, changes, message):
+    task = replace(DesignTask(sensor, 4, 8e-3), **changes)
+    with pytest.raises(IsochargeError, match=message) as error:
+        task.check()
+    assert isinstance(error.value, InputError)
+
+
+def test_electrodes_that_do_not_exist_or_are_calibrated(sensor):
+    with pytest.raises(SensorError, match="no electrode 'Q'"):
+        DesignTask(sensor, 4, 8e-3, keep=("Q",)).check()
+    calibrated = replace(sensor, calibration=Calibration(rotation=0.1))
+    with pytest.raises(InputError, match="is calibrated"):
+        DesignTask(calibrated, 4, 8e-3, keep=("A",)).check()
+
+
+def test_new_electrodes_have_free_names(sensor):
+    task = DesignTask(sensor, 4, 8e-3, keep=("B", "D"))
+    task.check()
+    assert task.names == ("A", "C")
+    made = task.layout(np.array([[20e-3, 0.0], [-20e-3, 0.0]]), np.array([3e-3, 3e-3]), "mine")
+    assert made.electrode_names == ("A", "B", "C", "D")
+    assert made.electrodes[1] == sensor.electrodes[1]
+
+
+def test_a_map_of_what_matters(tmp_path):
+    path = tmp_path / "map.csv"
+    path.write_text("x_mm,y_mm,weight\n0,0,1\n10,0,0\n0,10,0\n")
+    goal = Goal.of(str(path))
+    assert goal.kind == "rms"
+    assert goal.weigh(np.array([[0.0, 0.0], [5e-3, 0.0], [20e-3, 0.0]])) == pytest.approx([1.0, 0.5, 0.0])
+    assert Goal.of("worst").weigh(np.zeros((2, 2))) == pytest.approx([1.0, 1.0])
+    with pytest.raises(InputError, match="no place within the radius"):
+        goal.weigh(np.array([[20e-3, 0.0]]))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x,y,w\n1,2,3\n", "expected the columns x_mm, y_mm, weight"),
+        ("x_mm,y_mm,weight\n1,2\n", "row 2: expected three numbers"),
+        ("x_mm,y_mm,weight\n1,2,-1\n", "row 2: expected finite numbers and a weight from 0"),
+        ("x_mm,y_mm,weight\n1,2,nan\n", "row 2: expected finite"),
+        ("x_mm,y_mm,weight\n", "at least one place"),
+        ("", "got nothing"),
+    ],
+)
+def test_maps_that_cannot_be_read(tmp_path, text, message):
+    path = tmp_path / "map.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        Goal.of(str(path))
+
+
+def test_a_goal_that_is_none():
+    with pytest.raises(InputError, match="expected 'worst', 'rms' or a CSV file"):
+        Goal.of("best")

@@ -1,0 +1,61 @@
+"""What flags can see, and what they cannot: the figures of the pages, on fresh presses of every released sensor."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from isocharge.serve import Predictor
+from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text("utf-8")
+PAGE = (ROOT / "serve" / "docs" / "predictions.md").read_text("utf-8")
+PRESSES = 1500
+TOLERANCE = 3.0
+"""Percentage points: three standard deviations of a share of so many presses, and rounding."""
+
+
+def column(sensor):
+    """The page's shares for a sensor, in %, by fault."""
+    lines = re.search(r"^\| fault \|.*?\n\n", PAGE, re.DOTALL | re.MULTILINE)[0].splitlines()
+    header, _, *rows = [[cell.strip(" `") for cell in line.split("|")] for line in lines if line]
+    return {row[1]: float(row[header.index(sensor)].removesuffix(" %")) for row in rows}
+
+
+def shares(name):
+    """Shares of presses with a flag, in %, by fault."""
+    predictor, rng = Predictor(name), np.random.default_rng(7)
+    reach, names = 0.999 * predictor.domain.reach_mm, predictor.metadata.electrodes
+    forward_map = ForwardMap.build(load_sensor(name), Circle(1e-3), radius=1e-3 * reach, force_range=(0.4, 2.0))
+    radius, angle = 1e-3 * reach * np.sqrt(rng.random(PRESSES)), 2.0 * np.pi * rng.random(PRESSES)
+    force = np.exp(rng.uniform(np.log(0.5), np.log(2.0), PRESSES))
+    clean = forward_map.forward(radius * np.cos(angle), radius * np.sin(angle), force)
+    charge_pC = 1e12 * noise_model("reference").add(clean, rng)
+
+    def share(*gains):
+        flags = []
+        for gain in gains:
+            for electrode in range(len(names)):
+                faulty = charge_pC * np.where(np.arange(len(names)) == electrode, gain, 1.0)
+                flags += predictor.domain.batch_flags(predictor.predict_batch(faulty))
+        return 100.0 * sum(map(bool, flags)) / len(flags)
+
+    swapped = predictor.domain.batch_flags(predictor.predict_batch(charge_pC[:, [1, 0, *range(2, len(names))]]))
+    return {
+        "none": share(1.0),
+        "one gain 5 % off": share(0.95, 1.05),
+        "one gain 20 % off": share(0.8, 1.2),
+        "one electrode dead": share(0.0),
+        "A and B swapped": 100.0 * sum(map(bool, swapped)) / PRESSES,
+    }
+
+
+@pytest.mark.parametrize("sensor", ["three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial"])
+def test_figures_of_what_is_flagged(sensor):
+    measured = shares(sensor)
+    assert column(sensor) == pytest.approx(measured, abs=TOLERANCE)
+    in_readme = [float(share) for share in re.findall(r"(\d+) %(?: of presses| with four)", README)]
+    assert in_readme[sensor.startswith("four")] == pytest.approx(measured["one gain 20 % off"], abs=TOLERANCE)
+    assert measured["one electrode dead"] > 99.9  # "always"
