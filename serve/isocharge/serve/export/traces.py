@@ -159,7 +159,8 @@ class TraceCollector:
         self._press += touches and not self._touches
         self._touches = touches
         if touches:
-            point = Point(time, *contact, *std[:2], self._press)
+            (x, y, force), (x_std, y_std, _) = contact, std
+            point = Point(time, x, y, force, x_std, y_std, self._press)
             self._path.add(point)
             if doubtful:
                 self._doubts.add(point)

@@ -15,7 +15,6 @@ import numpy as np
 
 from isocharge.arrays import Array
 from isocharge.simulate.identifiability.identification import Identification, LimitMap
-from isocharge.simulate.numerics.disk import Rings
 
 RINGS, ANGLES, FORCES = 100, 90, 13
 """Distances from the centre, angles and forces at which limits are tabulated."""
@@ -32,7 +31,7 @@ NEAT = (1.0, 2.0, 5.0, 10.0)
 
 def resolution_page(identification: Identification) -> str:
     """The page, as HTML with everything in it."""
-    rings = Rings.spread(identification.area.searched, RINGS, ANGLES)
+    rings = identification.maps[0].rings.spread(identification.area.searched, RINGS, ANGLES)
     low, high = identification.area.force_range
     forces = np.geomspace(low, high, FORCES if high > low else 1)
     maps = [LimitMap.of(identification.charges, identification.noise, float(force), rings) for force in forces]
