@@ -21,7 +21,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Find where a piezoelectric tactile film is touched, and how hard, from the charges of three or four "
+    help="Find where a piezoelectric tactile film is touched, and how hard, from the charges of three to eight "
     "electrodes.",
 )
 app.command("demo")(demo_command)

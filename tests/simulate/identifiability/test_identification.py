@@ -11,6 +11,7 @@ from isocharge.simulate import (
     ChargeFunction,
     ChargeSpline,
     Circle,
+    Electrode,
     ForwardMap,
     Resolution,
     SolveSettings,
@@ -73,6 +74,28 @@ def test_summaries_are_ordered_and_fall_with_the_force(identification):
         assert 0.0 < row["position_median_mm"] <= row["position_rms_mm"] <= row["position_worst_mm"] < 1.0
         assert row["condition_worst"] >= 1.0
     assert rows[0]["position_rms_mm"] > 2.0 * rows[1]["position_rms_mm"] > rows[2]["position_rms_mm"]
+
+
+def test_an_electrode_at_the_centre_leaves_a_small_area(film):
+    """The area is smaller than the distance of the rings of the whole film."""
+    places = ((0.0, 0.0), (8.66e-3, 5e-3), (-8.66e-3, 5e-3))
+    electrodes = tuple(Electrode.of_square(name, at, 3e-3) for name, at in zip("ABC", places, strict=True))
+    sensor = replace(load_sensor("three-25um-biaxial"), electrodes=electrodes)
+    numbers = identify(replace(film, sensor=sensor), REFERENCE).to_dict()
+    assert 0.0 < numbers["working_area"]["radius_mm"] < 0.5
+    assert [row["force_N"] for row in numbers["limits_in_working_area"]] == [0.05, 1.0, 2.0]
+    assert all(0.0 < row["position_median_mm"] <= 1.0 for row in numbers["limits_in_working_area"])
+
+
+def test_where_nothing_is_determined_there_are_no_limits(film):
+    assert identify(film, REFERENCE, error=1e-6).to_dict()["limits_in_working_area"] == []
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_fewer_than_three_electrodes_are_refused(film, count):
+    sensor = replace(film.sensor, electrodes=film.sensor.electrodes[:count])
+    with pytest.raises(SceneError, match=f"at least three electrodes, got {count}"):
+        identify(replace(film, sensor=sensor), REFERENCE)
 
 
 def test_the_search_goes_over_the_electrodes_but_not_to_the_rim():

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import DatasetError
+from isocharge.errors import ChargeError, DatasetError
+from isocharge.serve import Predictor
 from isocharge.simulate import (
     ChargeFunction,
     Circle,
@@ -17,10 +18,11 @@ from isocharge.simulate import (
     sensor_from_dict,
     sensor_to_dict,
 )
+from isocharge.simulate.identifiability.ambiguities import AmbiguousPairs
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network, train_model
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.fold_free import FieldModel, fold_free_domain, probable_fold_mm
+from isocharge.train.data.fold_free import FieldModel, fold_free_domain, probable_fold_mm, twins_within
 
 TINY = FitConfig(NetworkConfig((8, 8), (8, 8)), TrainingConfig(steps=5, misfit_steps=5, misfit_charges=1_000))
 
@@ -78,6 +80,64 @@ def test_training_across_a_fold_is_in_card_and_metadata(tmp_path, noisy):
     release = train_model(dataset, tmp_path / "models" / "centre", TINY, warn=said.append)
     (caution,) = said
     assert "seems to fold about 0." in caution or "seems to fold about 1." in caution
+    assert release.metadata.made_with["cautions"] == [caution]
+    assert f"- {caution}." in (release.folder / "card.md").read_text("utf-8")
+
+
+def crossing(x, y, force):
+    """ln Q along a nodal cubic (u^2, u^3 - a^2 u): x = 3 mm and x = -3 mm have the same charges, and nothing folds."""
+    u, v = 0.1 * x, 0.1 * y
+    shapes = np.stack([0 * u, u**2, u * (u**2 - 0.09), v], axis=1)
+    return 1e4 * force[:, None] ** 0.7 * np.exp(shapes)
+
+
+def test_contacts_far_apart_with_the_same_charges_are_seen():
+    field, reference = field_of(crossing), noise_model("reference")
+    assert fold_free_domain(field, reference).radius_mm == 8.0
+    twins = twins_within(field, reference, 8.0)
+    assert len(twins)
+    assert not len(twins_within(field, reference, 2.0))
+    assert not len(twins_within(replace(field, error=1e-2), reference, 8.0))
+    nearest = 1e3 * np.stack([twins.first[0, :2], twins.second[0, :2]])
+    assert np.sort(nearest[:, 0]) == pytest.approx([-3.0, 3.0], abs=0.5)
+    assert nearest[0, 1] == pytest.approx(nearest[1, 1], abs=0.5)
+
+
+def inner_electrodes(count, radius, samples, folder):
+    """Presses on a film with an electrode at the centre and the others on a circle of 12 mm: no folds."""
+    angles = 2.0 * np.pi * np.arange(count - 1) / (count - 1)
+    places = [[0.0, 0.0], *([12.0 * np.cos(a), 12.0 * np.sin(a)] for a in angles)]
+    table = sensor_to_dict(load_sensor("three-25um-biaxial"))
+    table["electrodes"] = {"side_mm": 3.0, **dict(zip("ABCDEFGH", places, strict=False))}
+    sweep = Sweep(samples=samples, radius=radius)
+    return read_dataset(run_sweep(folder, sensor_from_dict(table), (Circle(1e-3),), sweep))
+
+
+@pytest.mark.parametrize("count", [5, 8])
+def test_five_and_eight_electrodes_with_one_in_the_middle(tmp_path, count):
+    """From presses to the served model, without a word of folds: an electrode within the area is none."""
+    said = []
+    dataset = inner_electrodes(count, 5e-3, 3_000, tmp_path / "presses")
+    release = train_model(dataset, tmp_path / "models" / "inner", TINY, warn=said.append)
+    assert not said
+    names = tuple("ABCDEFGH"[:count])
+    assert release.metadata.electrodes == names
+    predictor = Predictor(release.folder)
+    assert predictor.metadata.electrodes == names
+    contacts = predictor.predict_batch(dataset.samples.charge_pC[:50])
+    assert np.isfinite(contacts.x_mm).all()
+    assert np.isfinite(contacts.force_N).all()
+    with pytest.raises(ChargeError, match=f"expected .*{count}"):
+        predictor.predict(dataset.samples.charge_pC[0][:-1])
+
+
+def test_twins_are_in_card_and_metadata(tmp_path, dataset, monkeypatch):
+    pair = AmbiguousPairs(np.array([[3e-3, 0.0, 0.05]]), np.array([[-3e-3, 0.0, 0.06]]), np.array([1.2]))
+    monkeypatch.setattr("isocharge.train.training.fit.twins_within", lambda *_: pair)
+    said = []
+    release = train_model(dataset, tmp_path / "models" / "twins", TINY, warn=said.append)
+    (caution,) = said
+    assert caution.startswith("contacts far apart can have the same charges: 0.05 N at (3.0, 0.0) mm and 0.06 N at")
     assert release.metadata.made_with["cautions"] == [caution]
     assert f"- {caution}." in (release.folder / "card.md").read_text("utf-8")
 

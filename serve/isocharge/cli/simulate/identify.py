@@ -70,6 +70,7 @@ def identify_command(
     Example: isocharge simulate identify three-25um-biaxial --probe circle:1.0 --error 0.5 -o limits
     """
     from isocharge.simulate import load_sensor, noise_model, parse_probe
+    from isocharge.simulate.forward.checks import check_determined
     from isocharge.simulate.identifiability.identification import identify
 
     if output is not None:
@@ -79,6 +80,7 @@ def identify_command(
     if not (isfinite(error) and error > 0.0):
         raise InputError(f"--error: expected a positive number of mm, got {error}")
     film_sensor, noise_level = load_sensor(sensor), noise_model(noise)
+    check_determined(len(film_sensor.electrodes))
     if noise_level.white <= 0.0:
         raise InputError(
             f"--noise: expected white noise above 0 pC, got {noise!r}: without noise the errors have no lower limit"

@@ -92,4 +92,4 @@ def within_radius(model: ChargeModel, radius: float) -> ChargeModel:
 
 def electrode_count(model: ChargeModel) -> int:
     """Number of charges."""
-    return model.charge(np.array([[0.0, 0.0, model.force_range[0]]])).shape[1]
+    return int(model.charge(np.array([[0.0, 0.0, model.force_range[0]]])).shape[1])

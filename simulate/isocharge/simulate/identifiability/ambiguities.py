@@ -74,6 +74,18 @@ class AmbiguousPairs:
         reach: Array = np.maximum(np.hypot(*self.first[:, :2].T), np.hypot(*self.second[:, :2].T))
         return reach
 
+    @property
+    def words(self) -> str:
+        """The pair nearest to the centre, in a sentence; nothing without pairs."""
+        if not len(self):
+            return ""
+        (x, y, force), (other_x, other_y, other_force) = self.first[0], self.second[0]
+        return (
+            f"Contacts far apart can have the same charges: {force:.3g} N at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm and "
+            f"{other_force:.3g} N at ({1e3 * other_x:.1f}, {1e3 * other_y:.1f}) mm are alike within "
+            f"{self.distance[0]:.1f} standard deviations."
+        )
+
 
 def find_ambiguous_pairs(model: ChargeModel, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
     """Pairs of contacts far apart whose charges differ by less than the noise.
@@ -93,6 +105,8 @@ def find_ambiguous_pairs(model: ChargeModel, noise: NoiseModel, force: float, pl
     charge = model.charge(first)
     apart = np.maximum(APART, WIDTHS * limits_at(model, first, noise).position)
     pairs, start = _candidates(model, noise, position, charge, apart)
+    if not pairs.size:
+        return AmbiguousPairs.none()
     second, distance = nearest_contact(model, noise, charge[pairs], start)
     far = np.hypot(*(second - first[pairs])[:, :2].T) > apart[pairs]
     ambiguous = np.flatnonzero(far & (distance < INDISTINGUISHABLE_SIGMAS))

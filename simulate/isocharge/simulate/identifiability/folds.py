@@ -17,19 +17,19 @@ press moves to its mirror image in the circle.
 Even without folds two contacts may have the same charges, see `ambiguities`.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from isocharge.arrays import Array, Booleans
 from isocharge.simulate.forward.charge_model import ChargeModel
+from isocharge.simulate.identifiability.nearest_contact import INSIDE
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings, onto_disk
 
 FINEST = 2e-5
 """Distance within which a map turns over at a fold, m. Beside an electrode it may turn over within 0.1 mm and yet lose
 nothing: at 1 N the charges still tell the sides apart. On a circle of four electrodes it takes some 0.01 mm."""
-
-INSIDE = 1.0 - 1e-9
-"""Radius that is searched, relative to the model's: rounding must not leave its disk."""
 
 MOST_STEPS = 40
 """Steps downhill to a minimum at most: it takes 8 to 20, more where it creeps along a valley."""
@@ -69,22 +69,40 @@ def singular_values(scaled: Array) -> Array:
     return np.asarray(np.linalg.svd(across, compute_uv=False))
 
 
-def fold_points(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel) -> Array:
-    """Positions at which the map folds, the nearest to the centre first.
+@dataclass(frozen=True)
+class Folds:
+    """Where a map folds under one force, and where it is nearest to folding.
+
+    Attributes:
+        points: Shape (n, 2), m, the nearest to the centre first: on fold lines, with three electrodes; where rank is
+            lost, with more.
+        weakest: Local minima of the smallest singular value of J, shape (k, 2), m: the position errors between the
+            places of a grid are largest there.
+    """
+
+    points: Array
+    weakest: Array
+
+
+def find_folds(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel) -> Folds:
+    """Folds and weakest places.
 
     Args:
         model: The charges.
         rings: Positions between which folds are looked for; they need not be as fine as the folds.
         force: Force of the contacts, N.
         noise: Noise of the readings.
-
-    Returns:
-        Shape (n, 2), m: points on fold lines, with three electrodes; points where rank is lost, with more.
     """
     search = _FoldSearch(model, noise, force)
     scaled = rings.per_ring(search.scaled(rings.position.reshape(-1, 2)))
-    points = np.concatenate([search.crossings(rings, scaled), search.smallest_folds(rings, scaled)])
-    return points[np.argsort(np.hypot(*points.T), kind="stable")]
+    weakest = search.weakest_places(rings, scaled)
+    points = np.concatenate([search.crossings(rings, scaled), search.folded(weakest)])
+    return Folds(points[np.argsort(np.hypot(*points.T), kind="stable")], weakest)
+
+
+def fold_points(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel) -> Array:
+    """Positions at which the map folds, shape (n, 2), m, the nearest to the centre first; see `find_folds`."""
+    return find_folds(model, rings, force, noise).points
 
 
 class _FoldSearch:
@@ -114,7 +132,8 @@ class _FoldSearch:
     def _bisected(self, first: Array, second: Array) -> Array:
         """Middles of those segments, between whose ends the map turns over, that still do at a length of FINEST."""
         points = [np.empty((0, 2))]
-        start, end = self.scaled(first), self.scaled(second)
+        if len(first):
+            start, end = self.scaled(first), self.scaled(second)
         while len(first):
             middle = 0.5 * (first + second)
             short = np.hypot(*(second - first).T) <= FINEST
@@ -128,16 +147,20 @@ class _FoldSearch:
             end = np.where(ahead[..., None], end[rest], between[rest])
         return np.concatenate(points)
 
-    def smallest_folds(self, rings: Rings, scaled: Array) -> Array:
-        """Folds that no two neighbouring positions enclose: about the minima of the smallest singular value."""
+    def weakest_places(self, rings: Rings, scaled: Array) -> Array:
+        """Minima of the smallest singular value, followed downhill from those among the positions of the rings."""
         weakest = singular_values(scaled.reshape(-1, *scaled.shape[2:]))[:, -1].reshape(scaled.shape[:2])
         lowest = _local_minima(weakest)
         step = np.maximum(rings.distance[0], rings.distance * 2.0 * np.pi / scaled.shape[1])
-        ring, _ = np.nonzero(lowest)
-        points = self._downhill(rings.position[lowest], weakest[lowest], step[ring])
-        around = self.scaled((points[:, None] + 0.5 * FINEST * COMPASS).reshape(-1, 2))
-        around = around.reshape(len(points), 8, *around.shape[1:])
-        return points[turned_over(around[:, :4], around[:, 4:]).any(axis=1)]
+        ring, _ = np.nonzero(lowest)  # not empty: the lowest value of all is one
+        return self._downhill(rings.position[lowest], weakest[lowest], step[ring])
+
+    def folded(self, position: Array) -> Array:
+        """Those positions about which the map turns over: folds that no two neighbours on the rings enclose."""
+        around = self.scaled((position[:, None] + 0.5 * FINEST * COMPASS).reshape(-1, 2))
+        around = around.reshape(len(position), 8, *around.shape[1:])
+        folded: Array = position[turned_over(around[:, :4], around[:, 4:]).any(axis=1)]
+        return folded
 
     def _downhill(self, position: Array, value: Array, step: Array) -> Array:
         """Minima of the smallest singular value near positions, by a compass search (Kolda, Lewis, Torczon 2003)."""

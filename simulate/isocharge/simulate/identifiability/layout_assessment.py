@@ -112,10 +112,10 @@ def assess_layout(
         SceneError: If the charges do not reach so far or hold at these forces, or there are fewer than three.
     """
     reach = charges.radius if radius is None else radius
-    check_radius(reach, charges.radius, "charges")
+    check_radius(reach, charges.radius, "charge model")
     if not forces:
         raise SceneError("forces: expected at least one force, got none")
-    check_forces(np.array(forces), charges.force_range, "charges")
+    check_forces(np.array(forces), charges.force_range, "charge model")
     model = ChargeSpline.of(charges) if isinstance(charges, ForwardMap) else charges
     check_determined(electrode_count(model))
     disk, rings, at = within_radius(model, reach), Rings.spread(reach), square_grid(reach, spacing)

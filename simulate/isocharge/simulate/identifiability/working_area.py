@@ -12,7 +12,7 @@ from isocharge.simulate.forward.checks import check_determined
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.ambiguities import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
-from isocharge.simulate.identifiability.folds import fold_points
+from isocharge.simulate.identifiability.folds import find_folds
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings
 
@@ -72,7 +72,7 @@ class WorkingArea:
         if np.isfinite(self.fold_radius):
             parts.append(_fold_sentence(self.fold_radius, self.electrodes))
         if len(self.twins):
-            parts.append(_pair_sentence(self.twins))
+            parts.append(self.twins.words)
         if self.why == "searched":
             parts.append(f"The search ended at {_in_millimetres(self.searched)}.")
         return " ".join(parts)
@@ -105,9 +105,13 @@ def working_area(
     rings = Rings.spread(model.radius)
     low, high = model.force_range
     forces = sorted({low, float(np.sqrt(low * high)), high})
-    folds = np.concatenate([fold_points(model, rings, force, noise) for force in forces])
+    searches = [find_folds(model, rings, force, noise) for force in forces]
+    folds = np.concatenate([search.points for search in searches])
     fold_radius = float(np.hypot(*folds.T).min()) if len(folds) else np.inf
-    error_radius = min(_within(model, rings, force, noise, error) for force in forces)
+    error_radius = min(
+        min(_within(model, rings, force, noise, error), _nearest_over(model, search.weakest, force, noise, error))
+        for force, search in zip(forces, searches, strict=True)
+    )
     pairs = find_ambiguous_pairs(model, noise, low) if twins else AmbiguousPairs.none()
     twin_radius = float(pairs.reach[0]) if len(pairs) else np.inf
     ends: dict[Why, float] = {
@@ -145,20 +149,17 @@ def _within(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel, e
     return float(np.interp(np.log(error), logs, rings.distance[first - 1 : first + 1]))
 
 
+def _nearest_over(model: ChargeModel, position: Array, force: float, noise: NoiseModel, error: float) -> float:
+    """Distance of the nearest position, shape (n, 2), at which the position error exceeds the allowed one, m."""
+    limit = limits_at(model, np.column_stack([position, np.full(len(position), force)]), noise).position
+    return float(np.hypot(*position.T).min(initial=np.inf, where=~(limit <= error)))
+
+
 def _fold_sentence(radius: float, electrodes: int) -> str:
     sides = "the fold" if electrodes == 3 else "the points where it loses rank"
     return (
         f"The map folds {1e3 * radius:.1f} mm from the centre: contacts on both sides of {sides} give the same "
         "charges, and no method can tell them apart."
-    )
-
-
-def _pair_sentence(twins: AmbiguousPairs) -> str:
-    (x, y, force), (other_x, other_y, other_force) = twins.first[0], twins.second[0]
-    return (
-        f"Contacts far apart can have the same charges: {force:.3g} N at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm and "
-        f"{other_force:.3g} N at ({1e3 * other_x:.1f}, {1e3 * other_y:.1f}) mm are alike within "
-        f"{twins.distance[0]:.1f} standard deviations."
     )
 
 

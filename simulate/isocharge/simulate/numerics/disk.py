@@ -62,8 +62,8 @@ def square_grid(radius: float, spacing: float) -> Array:
     """Places of a square grid through the centre of a disk, shape (n, 2), in the unit of the radius."""
     count = int(radius / spacing * (1.0 + 1e-9))
     x, y = (axis.ravel() for axis in np.meshgrid(*[spacing * np.arange(-count, count + 1)] * 2))
-    inside = np.hypot(x, y) <= radius * (1.0 + 1e-9)
-    return np.stack([x, y], axis=1)[inside]
+    places: Array = np.stack([x, y], axis=1)[np.hypot(x, y) <= radius * (1.0 + 1e-9)]
+    return places
 
 
 def sunflower(count: int) -> Complexes:

@@ -49,8 +49,7 @@ class PolynomialRidge:
         noisy = task.noisy_train(1 if task.quick else task.copies)
         features, unit = LogFeatures.into_box(noisy.charge_pC), task.domain.to_unit(noisy.contact)
         boxed, n_electrode = box(features, noisy.charge_pC), noisy.charge_pC.shape[1]
-        degrees = [degree for degree in self.degrees if comb(n_electrode + degree, degree) <= MOST_TERMS]
-        candidates = [(degree, alpha) for degree in degrees[-2:] for alpha in self.alphas]
+        candidates = [(degree, alpha) for degree in self._degrees(n_electrode) for alpha in self.alphas]
 
         def fitted(candidate: tuple[int, float]) -> SklearnPolynomial:
             degree, alpha = candidate
@@ -66,6 +65,12 @@ class PolynomialRidge:
         )
         library = replace(models[best], choice=choice)
         return library, NumpyPolynomial.of(library)
+
+    def _degrees(self, n_electrode: int) -> list[int]:
+        """The two highest candidates whose monomials are not too many; where all have too many, the highest below."""
+        degrees = range(1, max(self.degrees) + 1)
+        small = [degree for degree in degrees if comb(n_electrode + degree, degree) <= MOST_TERMS]
+        return [degree for degree in self.degrees if degree in small][-2:] or small[-1:]
 
 
 def box(features: LogFeatures, charge_pC: Array) -> Array:

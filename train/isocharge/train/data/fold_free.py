@@ -1,6 +1,7 @@
 """How far from the centre a dataset's map from contacts to charges can be turned back.
 
-The simulator's search for folds, on the series fitted to the dataset, be that simulated or measured.
+The simulator's search for folds and for contacts far apart with the same charges, on the series fitted to the dataset,
+be that simulated or measured.
 """
 
 from dataclasses import dataclass
@@ -8,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.arrays import Array
+from isocharge.simulate.forward.charge_model import within_radius
+from isocharge.simulate.identifiability.ambiguities import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.charge_field import ChargeField
@@ -25,6 +28,9 @@ it from one side only, and noise moves them inwards."""
 
 RIM = 0.98
 """Searched radius over the domain's, dimensionless: at the very rim no press holds the slopes from outside."""
+
+TWIN_PLACES = 400
+"""Places from which contacts with the same charges are looked for; 400 take half a second."""
 
 SMALLEST_SHARE = 0.2
 """Smallest fold-free radius over the dataset's, dimensionless, for which a training makes sense."""
@@ -79,6 +85,16 @@ def probable_fold_mm(field: ChargeField, noise: NoiseModel) -> float:
     credible = CREDIBLE_SMOOTH if field.error < SMOOTH else CREDIBLE_NOISY
     fold_mm = _fold_mm(field, noise)
     return fold_mm if fold_mm < credible * field.domain.radius_mm else np.inf
+
+
+def twins_within(field: ChargeField, noise: NoiseModel, radius_mm: float) -> AmbiguousPairs:
+    """Contacts far apart, within a radius (mm), whose charges differ by less than the noise; none where the fit is too
+    poor to tell."""
+    if field.error >= SMOOTH:
+        return AmbiguousPairs.none()
+    model = FieldModel(field)
+    inside = within_radius(model, min(1e-3 * RIM * radius_mm, model.radius))
+    return find_ambiguous_pairs(inside, noise, inside.force_range[0], TWIN_PLACES)
 
 
 def _fold_mm(field: ChargeField, noise: NoiseModel) -> float:

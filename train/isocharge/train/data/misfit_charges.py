@@ -3,7 +3,7 @@
 The misfit network answers whatever charges come in, so it has to have seen all kinds: presses with their noise, charges
 off the image of the forward map by any distance, wrong gains, dying electrodes, forces far outside, two presses at once
 (their charges added: the film is not linear, so this is only like two presses), and charges drawn from a box that holds
-everything. Three or four electrodes make a space small enough to be covered.
+everything. Few electrodes make a space small enough to be covered.
 """
 
 from dataclasses import dataclass

@@ -25,7 +25,7 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.fold_free import SMALLEST_SHARE, fold_free_domain, probable_fold_mm
+from isocharge.train.data.fold_free import SMALLEST_SHARE, fold_free_domain, probable_fold_mm, twins_within
 from isocharge.train.data.measured import held_out, is_measured
 from isocharge.train.data.misfit_charges import MisfitExamples, draw_misfit_examples
 from isocharge.train.data.noise import misfit_noise, noisy_charges
@@ -80,7 +80,7 @@ def fit_network(
         config: Sizes, steps, seed.
         progress: Called with steps done, all steps, and a text with the loss and errors on watched presses.
         checkpoint: Keeps the state, so that a stopped run goes on.
-        warn: Called where the map folds.
+        warn: Called where the map folds, and where contacts far apart have the same charges.
 
     Raises:
         ConfigError: If the noise level is unknown.
@@ -144,6 +144,8 @@ def _without_folds(
                 f"across it, up to {asked.radius_mm:g} mm; see 'isocharge simulate identify', then ask for a smaller "
                 "radius or add an electrode"
             )
+        else:
+            _warn_of_twins(field, noise, asked, warn)
         return asked, presses
     if domain.radius_mm < SMALLEST_SHARE * asked.radius_mm:
         raise DatasetError(
@@ -156,7 +158,13 @@ def _without_folds(
         f"there; the model is trained for {domain.radius_mm:g} mm, not {asked.radius_mm:g} mm, on {len(inside)} of "
         f"{len(presses)} presses"
     )
+    _warn_of_twins(field, noise, domain, warn)
     return domain, inside
+
+
+def _warn_of_twins(field: ChargeField, noise: NoiseModel, domain: ContactDomain, warn: Warn) -> None:
+    if twins := twins_within(field, noise, domain.radius_mm).words:
+        warn(f"{twins[0].lower()}{twins[1:-1]}; no model tells which of them it is; see 'isocharge simulate identify'")
 
 
 @contextmanager
