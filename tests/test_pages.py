@@ -20,7 +20,15 @@ PAGES = {
 LONGEST_README, LONGEST_PAGE = 120, 200
 """Lines."""
 
-SLOW = {"simulate paper", "simulate identify", "simulate curves", "--orientation random", "train report", "bayes_limit"}
+SLOW = {
+    "simulate design",
+    "simulate paper",
+    "simulate identify",
+    "simulate curves",
+    "--orientation random",
+    "train report",
+    "bayes_limit",
+}
 """What takes an example more than a few seconds."""
 
 SMALLER = {"--samples 100000": "--samples 500"}

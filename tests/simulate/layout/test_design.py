@@ -5,9 +5,11 @@ import pytest
 
 from isocharge.simulate import ChargeSpline, DesignTask, ForwardMap, Nuisances, run_design
 from isocharge.simulate.identifiability.layout_assessment import assess_layout
-from isocharge.simulate.layout.costs import ErrorMap, rows_of, tolerance_costs
+from isocharge.simulate.layout.costs import ErrorMap, rows_of, tolerance_costs, trade_off
 from isocharge.simulate.layout.position_error import ErrorModel
 from isocharge.simulate.numerics.disk import square_grid
+from isocharge.simulate.plots.figure import picture_bytes
+from isocharge.simulate.plots.layout_maps import trade_off_picture
 
 KNOWN = Nuisances.none()
 SMALL = {"starts": 3, "presses": 50}
@@ -75,3 +77,13 @@ def test_tolerances_cost_more_the_wider_they_are(found):
     assert added == pytest.approx([added[0] * i for i in range(1, 6)])
     assert 0.0 < added[0] < 0.1e-3
     assert costs[0].measured >= 0.98 * found.chosen.value
+
+
+def test_a_trade_off_is_a_table_and_a_picture(sensor, monkeypatch):
+    """One radius, one size, the roughest search: the two points are the same task, so the same error."""
+    for name, value in {"TRADE_STARTS": 1, "TRADE_PRESSES": 20, "RADII": (1.0,), "SIZES": (1.0,)}.items():
+        monkeypatch.setattr(f"isocharge.simulate.layout.costs.{name}", value)
+    trade = trade_off(DesignTask(sensor, 3, 4e-3, nuisances=KNOWN), numbers=(3,))
+    assert trade.by_number[3] == pytest.approx(trade.by_side)
+    assert 0.01 < trade.to_dict()["error_mm_by_electrodes"]["3"][0] < 0.5
+    assert picture_bytes(trade_off_picture(trade, "worst", 3e-3)).startswith(b"\x89PNG")

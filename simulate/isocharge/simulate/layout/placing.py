@@ -164,7 +164,7 @@ class Parameters:
     @property
     def free(self) -> int:
         """Number of free numbers."""
-        return self.places.shape[1] + (self.count if self.sized else 0)
+        return int(self.places.shape[1]) + (self.count if self.sized else 0)
 
     def layout(self, free: Array) -> tuple[Array, Array]:
         """Centres, shape (n, 2), and sides, shape (n,), m, of free numbers of shape (n_free,)."""
