@@ -4,7 +4,7 @@ import asyncio
 import json
 import struct
 import urllib.request
-from threading import Thread
+from threading import Event, Thread
 
 import pytest
 from websockets.asyncio.client import connect
@@ -33,14 +33,14 @@ class Page:
         ends = [make_link() for _ in range(films)]
         self.readers = [reader for reader, _ in ends]
         links = [FilmLink(page, describe_film(f"film {k}", metadata, None)) for k, (_, page) in enumerate(ends)]
-        self.url = ""
+        self.url, self._listens = "", Event()
         self._thread = Thread(target=run_page, args=(links, PageSettings(Address(), **settings), self._announce))
         self._thread.start()
-        while not self.url and self._thread.is_alive():
-            pass
+        assert self._listens.wait(20)
 
     def _announce(self, url):
         self.url = url
+        self._listens.set()
 
     @property
     def live(self):
