@@ -147,6 +147,7 @@ def design_command(
     """
     from isocharge.resumable_run import refuse_finished
     from isocharge.simulate import load_sensor, noise_model, parse_probe
+    from isocharge.simulate.artwork import dxf  # noqa: F401  (a missing extra is said before the search)
     from isocharge.simulate.layout.goal import Goal
     from isocharge.simulate.layout.task import DesignTask
 
