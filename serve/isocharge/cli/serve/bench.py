@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
@@ -16,6 +15,7 @@ import typer
 from isocharge.cli.serve.options import ModelsOption
 from isocharge.cli.shared.options import JsonOption
 from isocharge.cli.shared.terminal import progress, say
+from isocharge.errors import MissingExtra
 
 if TYPE_CHECKING:
     from isocharge.serve import Model
@@ -92,8 +92,10 @@ def _server(folder: Path) -> Iterator[tuple["HttpLoad | None", str | None]]:
     """A client of a server of this model in a process of its own, or None and why there is none."""
     from isocharge.serve.benchmark import HttpLoad
 
-    if find_spec("uvicorn") is None:
-        yield None, "HTTP was left out: pip install 'isocharge[http]'"
+    try:
+        import isocharge.serve.network.http  # noqa: F401 (whether it can be imported)
+    except MissingExtra as error:
+        yield None, f"HTTP was left out: {error}"
         return
     words = [sys.executable, "-m", "isocharge.cli", "serve", "http", "--port", "0", "--models", str(folder.parents[1])]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
