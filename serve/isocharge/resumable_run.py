@@ -177,13 +177,19 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
     if fresh and (folder / "run.json").is_file():
         with _lock(folder):
             draft.remove()
-    if not folder.exists():
-        with output_errors(draft.target), new_folder(folder) as new:
-            (new / "lock").touch()
-            write_whole(new / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
-    with _lock(folder):
-        _check_same_run(folder, identity)
-        yield
+    begins = not folder.exists()
+    try:
+        if begins:
+            with output_errors(draft.target), new_folder(folder) as new:
+                (new / "lock").touch()
+                write_whole(new / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
+        with _lock(folder):
+            _check_same_run(folder, identity)
+            yield
+    except KeyboardInterrupt:
+        if begins and draft.is_empty():  # stopped before the run had its draft in hand
+            draft.remove()
+        raise
 
 
 @contextmanager
