@@ -169,3 +169,25 @@ def test_a_model_that_is_not_there(command):
     code, out, err = command("serve", "bench", "nowhere", "--seconds", "0.1")
     assert (code, out) == (2, "")
     assert err.startswith("ModelError: ")
+
+
+def test_a_secret_of_the_environment_is_not_for_its_server(command, monkeypatch):
+    monkeypatch.setenv("ISOCHARGE_TOKEN", "0123456789abcdef0123456789abcdef")
+    code, out, err = command("serve", "bench", "--seconds", "0.1")
+    assert code == 0, err
+    assert "HTTP, JSON, 16 connections" in out
+
+
+def test_the_server_is_asked_for_the_version_that_is_measured(command, film, make_film, tmp_path):
+    version = film.write(tmp_path)
+    (version.parent / "config.pbtxt").unlink()
+    make_film(4).write(tmp_path, version=2)  # would refuse three charges
+    code, out, err = command("serve", "bench", version, "--seconds", "0.1")
+    assert (code, err) == (0, "")
+    assert "linear/1" in out
+
+
+def test_a_time_without_end_is_refused(command):
+    code, out, err = command("serve", "bench", "--seconds", "inf")
+    assert (code, out) == (2, "")
+    assert "--seconds" in err

@@ -49,6 +49,13 @@ def test_silence(address):
             next(iter(port))
 
 
+def test_an_empty_datagram_is_no_silence(address):
+    assert received(address, b"\x01", b"", b"\x02") == [b"\x01", b"\x02"]
+    with Port(f"udp://127.0.0.1:{address[1]}", silence_s=0.05) as port, socket.socket(type=socket.SOCK_DGRAM) as board:
+        board.sendto(b"", address)
+        assert port.read(0.01) is None
+
+
 @pytest.mark.parametrize(
     "url", ["udp://127.0.0.1", "udp://127.0.0.1:99999", "udp://127.0.0.1:9/x", "udp://300.0.0.1:9"]
 )

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from websockets.asyncio.client import connect
 
 from isocharge.serve import Recording, Script, VirtualSensor
@@ -212,3 +213,38 @@ def test_the_stream_goes_on_without_its_page(sensor, models, start_command):
     assert process.returncode == 0, err
     assert len(out.splitlines()) == 1000
     assert "goes on without it" in err
+
+
+def test_a_replay_on_the_page_leaves_its_mcap_file(sensor, models, start_command, tmp_path):
+    """Ctrl-C is the only end of such a replay: the file is whole before."""
+    path, mcap = tmp_path / "touch.rec", tmp_path / "touch.mcap"
+    made = start_command(
+        *("serve", "stream", "linear", "--models", models, "--port", sensor.url, "--record", path, "--count", 200)
+    )
+    made.communicate(timeout=30)
+    process = start_command(
+        *("serve", "replay", path, "--models", models, "--live", "--live-port", 0, "--output", "none"),
+        *("--mcap", mcap),
+    )
+    asyncio.run(follow(url_in(process), lambda _, state: state.get("is_complete")))
+    assert mcap.exists()
+    stop(process)
+    with mcap.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert 200 in summary.statistics.channel_message_counts.values()
+
+
+def test_readers_end_when_their_page_is_killed(sensor, models, start_command, tmp_path):
+    """Else they would hold their ports for ever."""
+    streams = tmp_path / "one.toml"
+    streams.write_text(f'[[stream]]\nmodel = "linear"\nport = "{sensor.url}"\n')
+    process = start_command("serve", "live", streams, "--models", models, "--live-port", 0)
+    asyncio.run(follow(url_in(process), lambda rows, _: len(rows) > 0))
+    process.kill()
+    _, err = process.communicate(timeout=20)  # returns once the reader, too, has closed stderr
+    assert "this stream ends with it" in err
+
+
+def test_the_help_names_the_table_of_a_stream(command):
+    _, out, _ = command("serve", "live", "--help")
+    assert "[[stream]]" in out

@@ -39,6 +39,8 @@ def test_absolute_ports_stay(tmp_path):
         (ONE + ONE, "name: expected another one"),
         (ONE + ONE.replace("linear", "other"), "port: expected another one"),
         (ONE + "baud = 0", "baud"),
+        (ONE + 'name = "a\\nb"', "name: expected 1 to 100 printable characters"),
+        (ONE + f'name = "{"x" * 101}"', "name: expected 1 to 100 printable characters"),
         ("".join(ONE.replace("linear", f"m{k}").replace("board", f"p{k}") for k in range(9)), "1 to 8"),
     ],
 )

@@ -1,6 +1,7 @@
 """`isocharge serve bench`: how fast a model is on this machine, and how accurate."""
 
 import json as json_module
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -38,7 +39,9 @@ def bench_command(
     model: Annotated[
         str, typer.Argument(metavar="[MODEL]", help="Model: a name in `models/`, or a path.")
     ] = "three-25um-biaxial",
-    seconds: Annotated[float, typer.Option("--seconds", min=0.1, help="Time for all measurements, s.")] = 40.0,
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=0.1, max=86400.0, help="Time for all measurements, s.")
+    ] = 40.0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the order of presses.")] = 0,
     json: JsonOption = False,
     models: ModelsOption = None,
@@ -98,7 +101,9 @@ def _server(folder: Path) -> Iterator[tuple["HttpLoad | None", str | None]]:
         yield None, f"HTTP was left out: {error}"
         return
     words = [sys.executable, "-m", "isocharge.cli", "serve", "http", "--port", "0", "--models", str(folder.parents[1])]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+    environment = {name: value for name, value in os.environ.items() if name != "ISOCHARGE_TOKEN"}
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, env=environment) as server:
         try:
             assert server.stdout is not None
             url = urlsplit(server.stdout.readline().strip())
@@ -106,7 +111,7 @@ def _server(folder: Path) -> Iterator[tuple["HttpLoad | None", str | None]]:
                 reason = server.communicate()[1].strip().splitlines()
                 yield None, f"HTTP was left out: the server did not start: {reason[-1] if reason else 'no reason'}"
                 return
-            with HttpLoad(url.hostname, url.port, folder.parent.name) as load:
+            with HttpLoad(url.hostname, url.port, f"{folder.parent.name}/versions/{folder.name}") as load:
                 yield load, None
         finally:
             with suppress(OSError):

@@ -41,7 +41,7 @@ STOP_S = 5.0
 
 def live_command(
     streams: Annotated[
-        Path, typer.Argument(metavar="STREAMS", help="TOML file with a table [[stream]] for each: model, port, ...")
+        Path, typer.Argument(metavar="STREAMS", help="TOML file with a table [\\[stream]] for each: model, port, ...")
     ],
     models: ModelsOption = None,
     live_port: LivePortOption = PORT,
@@ -119,6 +119,7 @@ def _follow(stream: "StreamSettings", models: Path | None, link: "ReaderEnd") ->
     recorder = Recorder(stream.record, predictor.metadata.label, *header) if stream.record else None
     live = RecordedStream(touch, recorder)
     feed = page_feed(link, touch, live, predictor.metadata.electrodes)
+    feed.ended = f"{stream.name}: the process of the live page has ended, and this stream ends with it"
     with ExitStack() as stack:
         stack.enter_context(answering(PageRequests(link, live, header, recorder is not None)))
         request = board.frames.request
@@ -127,3 +128,5 @@ def _follow(stream: "StreamSettings", models: Path | None, link: "ReaderEnd") ->
             stack.enter_context(recorder)
         for record, _ in stack.enter_context(closing(live.follow(source))):
             feed.put(record)
+            if not link.is_open:  # the page's process was killed: nobody else would ever end this one
+                return

@@ -92,8 +92,9 @@ def replay_command(
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         write = record_writer(stack, output, udp, predictor.metadata.electrodes, stdout_writer())
+        file_output = stack.enter_context(ExitStack())
         if mcap is not None:
-            write = in_turn(_mcap_writer(stack, mcap, mcap_records, predictor.metadata.electrodes), write)
+            write = in_turn(_mcap_writer(file_output, mcap, mcap_records, predictor.metadata.electrodes), write)
         if settings is None:
             write_records(replay(recording, path, clock, real_time=real_time, load=load), write, latencies)
         else:
@@ -106,6 +107,7 @@ def replay_command(
 
             marked = replay(recording, path, clock, real_time=real_time, load=load, on_marker=mark)
             write_records(marked, in_turn(write, lambda record, _: feed.put(record)), latencies)
+            file_output.close()  # now, as Ctrl-C, the only end of the page, would throw the file away
             link.tell(is_complete=True)
             while link.request() is not None:  # until the page's process ends, or Ctrl-C
                 pass

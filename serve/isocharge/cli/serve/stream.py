@@ -55,9 +55,6 @@ if TYPE_CHECKING:
     from isocharge.serve.viewer.link import ReaderEnd
     from isocharge.serve.viewer.server import PageSettings
 
-LONGEST_NAME = 100
-"""Characters of a film's name."""
-
 
 def stream_command(
     model: ModelArgument,
@@ -214,6 +211,8 @@ def _load(model: str, models: Path | None) -> "Predictor":
 
 
 def _checked_name(name: str | None) -> str | None:
-    if name is not None and not (0 < len(name) <= LONGEST_NAME and name.isprintable()):
-        raise InputError(f"--name: expected 1 to {LONGEST_NAME} printable characters, got {name[:LONGEST_NAME]!r}")
+    from isocharge.serve.prediction.record import LONGEST_NAME, NAME, is_name
+
+    if name is not None and not is_name(name):
+        raise InputError(f"--name: expected {NAME}, got {name[:LONGEST_NAME]!r}")
     return name

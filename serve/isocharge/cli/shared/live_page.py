@@ -136,6 +136,7 @@ class PageFeed:
     pack: "Callable[[PredictionRecord], bytes]"
     touch: "TouchStream"
     live: "RecordedStream | None" = None
+    ended: str = "the process of the live page has ended; the stream goes on without it"
     _told_s: float = 0.0
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=RATE_RECORDS))
 
@@ -145,7 +146,7 @@ class PageFeed:
         self.link.put(self.pack(record))
         self._times.append(now_s)
         if was_open and not self.link.is_open:
-            say("the process of the live page has ended; the stream goes on without it")
+            say(self.ended)
         if now_s - self._told_s > STATE_S:
             self._told_s = now_s
             self._tell_state(record, now_s - self._times[0])

@@ -23,6 +23,10 @@ class HttpLoad:
     def __init__(self, host: str, port: int, model: str) -> None:
         """Connect.
 
+        Args:
+            host, port: Of the server.
+            model: Name of the model, or NAME/versions/NUMBER; the latest version without a number.
+
         Raises:
             OSError: If nothing listens there.
         """

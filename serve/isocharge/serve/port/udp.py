@@ -7,6 +7,7 @@ it; from the first datagram on that ends with a line end, the board ends its lin
 import re
 import select
 import socket
+import time
 from urllib.parse import urlsplit
 
 SCHEME = "udp://"
@@ -54,10 +55,12 @@ class UdpSocket:
 
     def receive(self, timeout_s: float | None = None) -> bytes:
         """The next datagram that is not empty; nothing if none comes in time."""
-        if not self._is_ready(self._timeout_s if timeout_s is None else timeout_s):
-            return b""
-        data, self._peer = self._socket.recvfrom(MOST_BYTES)
-        return self._with_line_end(data)
+        end_s = time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s)
+        while self._is_ready(max(0.0, end_s - time.monotonic())):
+            data, self._peer = self._socket.recvfrom(MOST_BYTES)
+            if data:
+                return self._with_line_end(data)
+        return b""
 
     def write(self, data: bytes) -> None:
         """Send to the board whose datagram came last; nowhere if none has come."""
@@ -73,7 +76,7 @@ class UdpSocket:
 
     def _with_line_end(self, data: bytes) -> bytes:
         self._ends_lines |= data.endswith(b"\n")
-        return data if self._ends_lines or not data or not is_text(data) else data + b"\n"
+        return data if self._ends_lines or not is_text(data) else data + b"\n"
 
 
 def is_text(data: bytes) -> bool:

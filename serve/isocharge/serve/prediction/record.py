@@ -16,6 +16,17 @@ DECIMALS = 6
 Charges = dict[str, float | None]
 """Electrode name to charge, pC; None where the device sent no number."""
 
+LONGEST_NAME = 100
+"""Characters of a film's name."""
+
+NAME = f"1 to {LONGEST_NAME} printable characters"
+"""What a film's name is, for messages."""
+
+
+def is_name(text: str) -> bool:
+    """Whether a text can be a film's name, the `frame_id` of its records."""
+    return 0 < len(text) <= LONGEST_NAME and text.isprintable()
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictionRecord:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from isocharge.errors import ConfigError
+from isocharge.serve.prediction.record import NAME, is_name
 from isocharge.tables import Table, read_toml
 
 MOST_STREAMS = 8
@@ -63,9 +64,12 @@ def read_streams(path: Path) -> tuple[StreamSettings, ...]:
 
 def _stream(table: Table, folder: Path) -> StreamSettings:
     model = table.text("model")
+    name = table.text("name", default=Path(model).name)
+    if not is_name(name):
+        table.refuse("name", NAME)
     device, record = table.text("device", default="", or_empty=True), table.text("record", default="", or_empty=True)
     return StreamSettings(
-        table.text("name", default=Path(model).name),
+        name,
         str(folder / model) if "/" in model else model,
         _port(table.text("port"), folder),
         folder / device if device else None,
