@@ -209,9 +209,9 @@ class DesignTask:
 
     def _check_sides(self) -> None:
         """With the edge readout a sensor file has one side for all squares."""
-        kept = [electrode.corners[1][0] - electrode.corners[0][0] for electrode in self.stay]
-        if self.sensor.readout == "edge" and np.ptp([*self.sides, *kept]) > TOUCHING:
-            words = ", ".join(f"{1e3 * side:g}" for side in sorted({*self.sides, *kept}))
+        stay = [electrode.corners[1][0] - electrode.corners[0][0] for electrode in self.stay]
+        if self.sensor.readout == "edge" and np.ptp([*self.sides, *stay]) > TOUCHING:
+            words = ", ".join(f"{1e3 * side:g}" for side in sorted({*self.sides, *stay}))
             raise InputError(
                 f"side: with the readout 'edge' all squares have one side, those that stay too; got {words} mm; give "
                 "one side"
