@@ -427,6 +427,31 @@ def test_scripted_presses_as_text_are_felt(start, tmp_path):
     assert (last["x_mm"], last["y_mm"], last["force_N"]) == pytest.approx((1.0, 2.0, 0.5), abs=0.05)
 
 
+def test_presses_beyond_the_usual_radius(start, tmp_path):
+    """A script may go as far as it says."""
+    link, script = tmp_path / "film", tmp_path / "presses.csv"
+    script.write_text("seconds,x_mm,y_mm,force_N\n0,14,0,0\n1.2,14,0,0\n1.3,14,0,0.5\n9,14,0,0.5\n")
+    model, words = "four-25um-biaxial-15mm", ["--link", link, "--force-max", "0.5", "--noise", "clean"]
+    process = start("virtual", model, "--script", script, *words)
+    process.stdout.readline()
+    last = json.loads(run("stream", model, "--port", link, "--count", 300).stdout.splitlines()[-1])
+    assert (last["x_mm"], last["y_mm"], last["force_N"]) == pytest.approx((14.0, 0.0, 0.5), abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("words", "radius_mm"), [((), 8.0), (("--radius", 15), 15.0), (("--script", "far.csv"), 13.0), (("--film", 1), 8.0)]
+)
+def test_a_virtual_film_is_solved_as_far_as_it_is_pressed(tmp_path, monkeypatch, words, radius_mm):
+    def build(*_, radius, **__):
+        raise InputError(f"asked for {radius:.6f} m")
+
+    (tmp_path / "far.csv").write_text("seconds,x_mm,y_mm,force_N\n0,5,12,0\n1,5,12,0\n2,5,12,1\n3,5,12,1\n4,5,12,0\n")
+    monkeypatch.setattr(ForwardMap, "build", build)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=f"asked for {1e-3 * radius_mm:.6f} m"):
+        run("virtual", "four-25um-biaxial-15mm", *words)
+
+
 HELD = "seconds,x_mm,y_mm,force_N\n0,0,0,0\n0.5,0,0,0\n0.501,1,2,0.5\n60,1,2,0.5\n"
 """A script: half a second without touch, then one press that is held."""
 

@@ -1,7 +1,9 @@
 """Drawings read back by other programs: svgelements and ezdxf."""
 
 import re
+from dataclasses import replace
 from itertools import combinations, pairwise
+from xml.etree import ElementTree
 
 import ezdxf
 import numpy as np
@@ -54,6 +56,15 @@ def test_svg_has_the_places_and_sizes_of_the_sensor(sensor, tmp_path):
     lines = list(drawing.elements(lambda element: isinstance(element, SimpleLine)))
     lengths = [abs(line.implicit_x2 - line.implicit_x1) for line in lines]
     assert max(lengths) == pytest.approx(RULER_MM, abs=MICROMETRE)
+
+
+def test_svg_is_xml_whatever_the_names_hold():
+    sensor = load_sensor("three-25um-biaxial")
+    first = replace(sensor.electrodes[0], name="a\x01\n]]>")
+    sensor = replace(sensor, name="</title><script>\x02\uffff", electrodes=(first, *sensor.electrodes[1:]))
+    root = ElementTree.fromstring(layout_svg(sensor, route(sensor)))
+    title = root.find("{http://www.w3.org/2000/svg}title")
+    assert title.text.startswith("</title><script>\ufffd\ufffd, electrodes")
 
 
 def test_dxf_has_the_places_and_sizes_of_the_sensor(sensor, tmp_path):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from isocharge.errors import InputError, IsochargeError, SensorError
-from isocharge.simulate import Calibration, DesignTask, Polygon
+from isocharge.simulate import Calibration, DesignTask, Electrode, Polygon
+from isocharge.simulate.layout.design import design
 from isocharge.simulate.layout.goal import Goal
 from isocharge.simulate.layout.placing import Zone
 
@@ -39,6 +40,41 @@ def test_impossible_tasks(sensor, changes, message):
     with pytest.raises(IsochargeError, match=message) as error:
         task.check()
     assert isinstance(error.value, InputError)
+
+
+def test_an_electrode_near_the_rim_stays_whatever_zones_there_are(sensor):
+    outer = replace(sensor, electrodes=(Electrode.of_square("A", (42e-3, 0.0), 3e-3), *sensor.electrodes[1:]))
+    for zones in ((), (Zone((-20e-3, 0.0), 2e-3),)):
+        DesignTask(outer, 4, 8e-3, keep=("A",), rim=3e-3, zones=zones).check()
+
+
+def test_a_long_electrode_beside_a_zone_stays(sensor):
+    strip = Electrode("A", ((9e-3, -1e-3), (21e-3, -1e-3), (21e-3, 1e-3), (9e-3, 1e-3)))
+    beside = replace(sensor, electrodes=(strip, *sensor.electrodes[1:]))
+    DesignTask(beside, 4, 8e-3, keep=("A",), zones=(Zone((15e-3, 5e-3), 3.5e-3),)).check()
+    with pytest.raises(InputError, match="electrode 'A' lies in a keep-out zone"):
+        DesignTask(beside, 4, 8e-3, keep=("A",), zones=(Zone((15e-3, 4e-3), 3.5e-3),)).check()
+
+
+@pytest.mark.parametrize("changes", [{"keep": ("A",), "side": (2e-3, 2e-3)}, {"side": (2e-3, 4e-3)}])
+def test_several_sides_with_the_edge_readout_are_refused_before_the_search(sensor, changes):
+    task = DesignTask(replace(sensor, readout="edge"), 4, 8e-3, **changes)
+    with pytest.raises(InputError, match=r"side: with the readout 'edge' all squares have one side.*got 2, (3|4) mm"):
+        task.check()
+
+
+def test_numbers_of_a_task_are_without_round_off(sensor):
+    numbers = DesignTask(sensor, 4, 1e-3 * 8.2, side=(1e-3 * 2.3, 1e-3 * 4.1), zones=(Zone((0.0, 1.1e-3), 3e-3),))
+    written = numbers.to_dict()
+    assert written["radius_mm"] == 8.2
+    assert written["side_mm"] == [2.3, 4.1]
+    assert written["keep_out_mm"] == [[0.0, 1.1, 3.0]]
+    assert DesignTask(sensor, 4, 8e-3).to_dict()["side_mm"] == [3.0, 3.0]
+
+
+def test_a_zone_is_refused_in_millimetres():
+    with pytest.raises(InputError, match=r"radius above 0 in mm, got \(0, 1.5\) and -3 mm"):
+        Zone((0.0, 1.5e-3), -3e-3)
 
 
 def test_electrodes_that_do_not_exist_or_are_calibrated(sensor):
@@ -76,6 +112,7 @@ def test_a_map_of_what_matters(tmp_path):
         ("x_mm,y_mm,weight\n1,2\n", "row 2: expected three numbers"),
         ("x_mm,y_mm,weight\n1,2,-1\n", "row 2: expected finite numbers and a weight from 0"),
         ("x_mm,y_mm,weight\n1,2,nan\n", "row 2: expected finite"),
+        ("x_mm,y_mm,weight\n\n1,2,3\n\n1,2,-1\n", "row 5: expected finite"),
         ("x_mm,y_mm,weight\n", "at least one place"),
         ("", "got nothing"),
     ],
@@ -85,6 +122,23 @@ def test_maps_that_cannot_be_read(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(InputError, match=message):
         Goal.of(str(path))
+
+
+def test_a_map_whose_file_is_called_worst_is_a_map(tmp_path):
+    path = tmp_path / "worst"
+    path.write_text("x_mm,y_mm,weight\n0,0,1\n")
+    assert Goal.of(str(path)).kind == "rms"
+
+
+def test_a_map_without_weight_within_the_radius_is_refused_before_anything_is_solved(sensor, tmp_path):
+    path = tmp_path / "map.csv"
+    path.write_text("x_mm,y_mm,weight\n0,0,0\n")
+
+    def solve(*_):
+        pytest.fail("solved before the map was looked at")
+
+    with pytest.raises(InputError, match="no place within the radius has a weight"):
+        design(sensor, 3, 4e-3, goal=str(path), map_jobs=solve)
 
 
 def test_a_goal_that_is_none():

@@ -20,6 +20,10 @@ BOARDS = {
     "any board": {},
     "leak": {"leak": {"tau_s": {"A": 10.0, "B": 7.5, "C": 9.9, "D": 2.0}}},
     "leak, not learned": {"leak": {"tau_s": 3.0, "learn": False}},
+    "offset, gain and limit": {
+        "gain": {"pC_per_unit": GAIN, "offset": {"A": 8388608.0, "B": -3.5, "C": 0.0, "D": 2048.0}},
+        "saturation": {"limit_pC": 900.0},
+    },
     "gain and limit": {"gain": {"pC_per_unit": GAIN}, "saturation": {"limit_pC": 900.0}},
     "hum": {"hum": {"frequency_Hz": 60.0, "settle_s": 0.3}, "leak": {"tau_s": 10.0}},
     "no tare": {"tare": {"on": False}},
@@ -55,8 +59,9 @@ def recording(board, seed, electrodes=4, seconds=20.0):
     charge += rng.uniform(0.0, 1.0) * np.sin(2 * np.pi * 60.0 * t_s)[:, None] + rng.uniform(-0.1, 0.1) * t_s[:, None]
     charge += np.where(press > 0, 30.0, 0.0)[:, None] * rng.random()
     charge[rng.choice(np.flatnonzero(press > 0), 3)] *= 40.0  # spikes are no peaks
-    gain = device(board).chain(("A", "B", "C", "D")[:electrodes]).gain_pC
-    values = charge if gain is None else charge / gain
+    chain = device(board).chain(("A", "B", "C", "D")[:electrodes])
+    values = charge if chain.gain_pC is None else charge / chain.gain_pC
+    values += 0.0 if chain.zero is None else chain.zero
     for bad in (np.nan, np.inf, -np.inf, 3e9, 1e300):
         values[rng.integers(0, n, 2), rng.integers(0, electrodes, 2)] = bad
     return values, t_s, dt_s, rng.random(n) < 0.003, np.isin(np.arange(n), rng.integers(n // 2, n, 1))

@@ -1,5 +1,7 @@
 """A student: small, near its teacher, and refused where it would be no student of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import onnx
 import pytest
@@ -79,3 +81,11 @@ def test_a_version_that_exists_stays(teacher, student, dataset):
     with pytest.raises(OutputExists):
         distil_model(teacher.folder, dataset, student.folder.parent, STUDENT)
     assert (student.folder / "model.onnx").read_bytes() == before
+
+
+def test_presses_of_a_model_of_measured_presses_are_not_simulated(teacher):
+    about = load_model(teacher.folder).metadata
+    assert TaughtScene.of(about).sensor.name == about.frame_id
+    measured = replace(about, errors={**about.errors, "measured_presses": 40.0})
+    with pytest.raises(ModelError, match="teacher/1 was trained on measured presses"):
+        TaughtScene.of(measured)

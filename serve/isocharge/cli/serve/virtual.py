@@ -6,16 +6,18 @@ from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
+from math import hypot, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from isocharge.cli.shared.forward_maps import SLACK
 from isocharge.cli.shared.options import ProbeOption, SensorArgument
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import progress, say
 from isocharge.cli.shared.virtual_sensor import check_pseudo_terminals, virtual_sensor
-from isocharge.default_scene import DEFAULT_FORCE_RANGE
+from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import InputError, OutputExists
 from isocharge.files import bounded_lines
 
@@ -46,6 +48,10 @@ def virtual_command(
     force_max: Annotated[
         float, typer.Option("--force-max", min=0.05, help="Largest force, N; the smallest is 0.05 N.")
     ] = DEFAULT_FORCE_RANGE[1],
+    radius: Annotated[
+        float,
+        typer.Option("--radius", metavar="MM", help="Largest distance of a random press from the centre, mm."),
+    ] = 1e3 * DEFAULT_RADIUS,
     noise: Annotated[
         str, typer.Option("--noise", help="Amplifier: clean, reference, bench, surgery, or a TOML file.")
     ] = "reference",
@@ -134,8 +140,9 @@ def virtual_command(
         clock_ppm=clock_ppm,
     )
     encode, presses = _encoder(frames, device), _presses(script, rate_Hz)
+    farthest, force_range = 1e-3 * _farthest_mm(radius, presses), (DEFAULT_FORCE_RANGE[0], force_max)
     with progress("solving the film") as advance:
-        forward_map = ForwardMap.build(*scene, force_range=(DEFAULT_FORCE_RANGE[0], force_max), progress=advance)
+        forward_map = ForwardMap.build(*scene, radius=farthest, force_range=force_range, progress=advance)
     _refuse_taken(link)
     player = virtual_sensor(
         forward_map, amplifier, seed, rate_Hz, script=presses, encode=encode, faults=faults, link=link
@@ -189,6 +196,14 @@ def _presses(script: Path | None, rate_Hz: float) -> "Script | None":
             return read_script(bounded_lines(lines), rate_Hz, str(script))
     except OSError as error:
         raise InputError(f"--script {script}: cannot be read ({error.strerror})") from error
+
+
+def _farthest_mm(radius: float, presses: "Script | None") -> float:
+    """Distance from the centre up to which charges are needed, mm."""
+    if presses is None or not presses.touching.any():
+        return radius
+    distances = [hypot(x, y) for x, y in zip(presses.x_mm, presses.y_mm, strict=True) if isfinite(x)]
+    return max(1e3 * DEFAULT_RADIUS, SLACK * max(distances))
 
 
 def _refuse_taken(link: Path | None) -> None:

@@ -47,6 +47,22 @@ WorkersOption = Annotated[
     ),
 ]
 
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster", metavar="ADDRESS", help="Dask scheduler to use instead, like tcp://10.0.0.1:8786. (default: no)"
+    ),
+]
+
+NoiseOption = Annotated[
+    str,
+    typer.Option(
+        "--noise",
+        metavar="LEVEL|FILE.toml",
+        help="Noise of the readings: reference, bench, surgery, or a TOML file with white_pC and proportional.",
+    ),
+]
+
 FreshOption = Annotated[
     bool, typer.Option("--fresh", help="Delete what a stopped run left, and begin again. (default: go on from there)")
 ]

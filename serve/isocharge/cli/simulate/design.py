@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from isocharge.cli.shared.options import (
+    ClusterOption,
     FreshOption,
     JsonOption,
     NewFolderOption,
+    NoiseOption,
     SensorArgument,
     WorkersOption,
     most_workers,
@@ -31,8 +33,6 @@ if TYPE_CHECKING:
 
 SENSOR, SVG, DXF, NUMBERS, PAGE = "sensor.toml", "layout.svg", "layout.dxf", "design.json", "design.html"
 """Files in the output folder."""
-
-NOISE_HELP = "Noise of the readings: reference, bench, surgery, or a TOML file with white_pC and proportional."
 
 
 def design_command(
@@ -74,7 +74,7 @@ def design_command(
             "SENSOR's)",
         ),
     ] = None,
-    noise: Annotated[str, typer.Option("--noise", metavar="LEVEL|FILE.toml", help=NOISE_HELP)] = "reference",
+    noise: NoiseOption = "reference",
     known: Annotated[
         bool,
         typer.Option(
@@ -127,14 +127,7 @@ def design_command(
         ),
     ] = 24,
     workers: WorkersOption = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            "--cluster",
-            metavar="ADDRESS",
-            help="Dask scheduler to use instead, like tcp://10.0.0.1:8786. (default: no)",
-        ),
-    ] = None,
+    cluster: ClusterOption = None,
     fresh: FreshOption = False,
     json: JsonOption = False,
 ) -> None:

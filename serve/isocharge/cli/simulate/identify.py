@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from isocharge.cli.shared.forward_maps import solve_forward_map, solve_map_to_search
-from isocharge.cli.shared.options import PROBE_HELP, ForceRangeOption, JsonOption, SensorArgument
+from isocharge.cli.shared.options import PROBE_HELP, ForceRangeOption, JsonOption, NoiseOption, SensorArgument
 from isocharge.cli.shared.terminal import progress, say
 from isocharge.default_scene import DEFAULT_FORCE_RANGE
 from isocharge.errors import InputError
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 PICTURE, NUMBERS = "identify.png", "identify.json"
 """Files in an output folder."""
-
-NOISE_HELP = "Noise of the readings: reference, bench, surgery, or a TOML file with white_pC and proportional."
 
 
 def identify_command(
@@ -35,7 +33,7 @@ def identify_command(
         ),
     ] = None,
     force: ForceRangeOption = DEFAULT_FORCE_RANGE,
-    noise: Annotated[str, typer.Option("--noise", metavar="LEVEL|FILE.toml", help=NOISE_HELP)] = "reference",
+    noise: NoiseOption = "reference",
     error: Annotated[
         float, typer.Option("--error", metavar="MM", help="Largest position error in the working area, mm, rms.")
     ] = 1.0,

@@ -10,6 +10,7 @@ import typer
 from isocharge.cli.shared.forward_maps import sweep_radius
 from isocharge.cli.shared.options import (
     PROBE_HELP,
+    ClusterOption,
     ForceRangeOption,
     FreshOption,
     NewFolderOption,
@@ -65,14 +66,7 @@ def sweep_command(
     ] = Sampling.sobol,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the presses; the same seed, the same data.")] = 0,
     workers: WorkersOption = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            "--cluster",
-            metavar="ADDRESS",
-            help="Dask scheduler to use instead, like tcp://10.0.0.1:8786. (default: no)",
-        ),
-    ] = None,
+    cluster: ClusterOption = None,
     fresh: FreshOption = False,
 ) -> None:
     """Simulate many presses, spread over positions and forces, and write their charges as a dataset for training.

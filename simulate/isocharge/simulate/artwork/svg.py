@@ -1,5 +1,6 @@
 """A layout as SVG in millimetres: one user unit is one millimetre, y up as in the sensor's frame."""
 
+import re
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -14,6 +15,10 @@ MARGIN_MM = 5.0
 
 DIGITS = 6
 """Decimals of a millimetre in the file: a nanometre."""
+
+
+NO_XML = re.compile("[^\\t\\n\\r\\x20-\\ud7ff\\ue000-\\ufffd\\U00010000-\\U0010ffff]")
+"""Characters that XML cannot hold, not even escaped; a sensor's file can have them in a name."""
 
 
 def layout_svg(sensor: Sensor, leads: Leads) -> str:
@@ -43,7 +48,7 @@ def layout_svg(sensor: Sensor, leads: Leads) -> str:
     ]
     names = [_text(electrode.name, 1e3 * np.array(electrode.centre), 2.0) for electrode in sensor.electrodes]
     names.append(_text(f"{RULER_MM:g} mm", np.array([0.0, -radius - drawing_height_mm()]), 2.5))
-    return "\n".join(
+    lines = "\n".join(
         [
             '<?xml version="1.0" encoding="UTF-8"?>',
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{_number(width)}mm" height="{_number(height)}mm" '
@@ -59,6 +64,7 @@ def layout_svg(sensor: Sensor, leads: Leads) -> str:
             "",
         ]
     )
+    return NO_XML.sub("\N{REPLACEMENT CHARACTER}", lines)
 
 
 def _text(text: str, at_mm: Array, size_mm: float) -> str:

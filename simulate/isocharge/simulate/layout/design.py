@@ -190,7 +190,7 @@ class Search:
         """Solve and tabulate all scenes; where there are several, find the best layout for each alone."""
         unit = lattice(presses)
         at = task.radius * np.stack([unit.real, unit.imag], axis=1)
-        charges, conditions = [], []
+        weights, charges, conditions = task.goal.weigh(at), [], []
         for scene in task.scenes:
             sensor = replace(task.sensor, film=scene.film)
             solved = solve_square_charges(
@@ -200,7 +200,7 @@ class Search:
                 solved, at, task.sides, map_jobs=map_jobs, progress=_stage(progress, "tabulating charges")
             )
             charges.append(solved)
-            conditions.append(Condition(table, _rows_that_stay(task, solved, at), task.goal.weigh(at), 1.0))
+            conditions.append(Condition(table, _rows_that_stay(task, solved, at), weights, 1.0))
         errors = ErrorModel.of(task.noise, task.nuisances)
         search = cls(task, errors, tuple(charges), tuple(conditions))
         if len(conditions) == 1:

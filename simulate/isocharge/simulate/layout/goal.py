@@ -50,7 +50,7 @@ class Goal:
     @property
     def kind(self) -> str:
         """ "worst", or "rms" of errors that may be weighted."""
-        return "worst" if self.name == "worst" else "rms"
+        return "worst" if self.name == "worst" and not len(self.places) else "rms"
 
     def weigh(self, presses: Array) -> Array:
         """Weights of presses, shape (n, 2), m: linear between the places of a map, beyond them those of the nearest.
@@ -77,7 +77,9 @@ def _read_map(path: Path) -> Array:
     if not rows or [cell.strip() for cell in rows[0]] != HEADER:
         raise InputError(f"goal {path}: expected the columns {', '.join(HEADER)}, got {rows[0] if rows else 'nothing'}")
     values = []
-    for number, row in enumerate((row for row in rows[1:] if row), start=2):
+    for number, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
         try:
             x, y, weight = (number_of(cell.strip()) for cell in row)
         except ValueError as error:

@@ -16,6 +16,9 @@ from isocharge.simulate.sensor.electrode import Electrode
 MILLIMETRE = 1e-3
 """Unit of violations in the penalty, m."""
 
+TOUCHING = 1e-9
+"""Overlap up to which a given electrode beside a zone counts as outside, m."""
+
 
 @dataclass(frozen=True)
 class Zone:
@@ -31,7 +34,10 @@ class Zone:
 
     def __post_init__(self) -> None:
         if not (np.isfinite([*self.centre, self.radius]).all() and self.radius > 0.0):
-            raise InputError(f"keep-out zone: expected finite x, y and a radius above 0, got {self} m")
+            x, y, radius = (f"{1e3 * value:g}" for value in (*self.centre, self.radius))
+            raise InputError(
+                f"keep-out zone: expected finite x, y and a radius above 0 in mm, got ({x}, {y}) and {radius} mm"
+            )
 
 
 @dataclass(frozen=True)
@@ -66,6 +72,13 @@ class Rules:
         parts = [*self._rim(centres, sides), *self._zones(centres, sides), *self._gaps(centres, sides)]
         values = np.array([value for value, _ in parts])
         return values, np.stack([slope for _, slope in parts])
+
+    def in_zone(self, electrode: Electrode) -> bool:
+        """Whether the box round an electrode reaches into a zone."""
+        corners = np.array(electrode.corners)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        return any(_apart(0, 1, middle - zone.centre, half, zone.radius, 0.5)[0] > TOUCHING for zone in self.zones)
 
     def _rim(self, centres: Array, sides: Array) -> list[tuple[float, Array]]:
         parts = []

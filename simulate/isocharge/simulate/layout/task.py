@@ -12,7 +12,7 @@ from isocharge.arrays import Array
 from isocharge.errors import InputError, SceneError
 from isocharge.simulate.forward.checks import check_determined
 from isocharge.simulate.layout.goal import Goal
-from isocharge.simulate.layout.placing import MILLIMETRE, Parameters, Rules, Zone, axial_choices
+from isocharge.simulate.layout.placing import MILLIMETRE, TOUCHING, Parameters, Rules, Zone, axial_choices
 from isocharge.simulate.layout.scene import DesignScene, Nuisances
 from isocharge.simulate.measuring_chain.levels import NOISE_LEVELS
 from isocharge.simulate.measuring_chain.noise import NoiseModel
@@ -149,7 +149,7 @@ class DesignTask:
         """For JSON: everything that the design depends on, beside the sensor."""
         return {
             "electrodes": self.electrodes,
-            "radius_mm": 1e3 * self.radius,
+            "radius_mm": _mm(self.radius),
             "goal": self.goal.name,
             "keep": list(self.keep),
             "probes": [probe.notation for probe in self.probes],
@@ -162,10 +162,10 @@ class DesignTask:
                 "pretension_MPa": 1e-6 * self.nuisances.pretension,
                 "gain": self.nuisances.gain,
             },
-            "side_mm": [1e3 * side for side in self.sides],
-            "gap_mm": 1e3 * self.gap,
-            "rim_mm": 1e3 * self.rim,
-            "keep_out_mm": [[*(1e3 * value for value in zone.centre), 1e3 * zone.radius] for zone in self.zones],
+            "side_mm": [_mm(side) for side in self.sides],
+            "gap_mm": _mm(self.gap),
+            "rim_mm": _mm(self.rim),
+            "keep_out_mm": [[_mm(value) for value in (*zone.centre, zone.radius)] for zone in self.zones],
             "symmetry": self.symmetry,
             "seed": self.seed,
         }
@@ -202,16 +202,20 @@ class DesignTask:
                 f"keep: {len(self.keep)} of {self.electrodes} electrodes stay, so there is nothing to place; ask for "
                 "more electrodes or keep fewer"
             )
-        rules = Rules(self.sensor.film.radius, self.gap, self.rim, self.zones)
         for electrode in self.stay:
-            corners = np.array(electrode.corners)
-            middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-            side = float(np.ptp(corners, axis=0).max())
-            if rules.zones and rules.violations(middle[None], np.array([side]))[0].max() > 1e-9:
-                raise InputError(
-                    f"keep: electrode {electrode.name!r} lies in a keep-out zone or nearer than {self.rim * 1e3:g} mm "
-                    "to the rim"
-                )
+            if self.rules.in_zone(electrode):
+                raise InputError(f"keep: electrode {electrode.name!r} lies in a keep-out zone")
+        self._check_sides()
+
+    def _check_sides(self) -> None:
+        """With the edge readout a sensor file has one side for all squares."""
+        stay = [electrode.corners[1][0] - electrode.corners[0][0] for electrode in self.stay]
+        if self.sensor.readout == "edge" and np.ptp([*self.sides, *stay]) > TOUCHING:
+            words = ", ".join(f"{1e3 * side:g}" for side in sorted({*self.sides, *stay}))
+            raise InputError(
+                f"side: with the readout 'edge' all squares have one side, those that stay too; got {words} mm; give "
+                "one side"
+            )
 
     def _crowded(self) -> str:
         count, side = self.electrodes - len(self.keep), self.sides[0]
@@ -238,6 +242,11 @@ def check_determined_with_words(electrodes: int) -> None:
     except SceneError as error:
         raise InputError(f"electrodes: expected 3 to {MOST_ELECTRODES}, got {electrodes}; "
                          f"{tells.get(electrodes, str(error))}") from error  # fmt: skip
+
+
+def _mm(length: float) -> float:
+    """A length in mm without the round-off of its unit."""
+    return round(1e3 * length, 9)
 
 
 def _fit(parameters: Parameters, rules: Rules, seed: int) -> bool:

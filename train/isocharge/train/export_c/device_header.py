@@ -33,7 +33,9 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     chain = device.chain(electrodes)
     _check_tare(device, chain)
     gain_pC = np.ones(len(electrodes)) if chain.gain_pC is None else chain.gain_pC
+    zero = np.zeros(len(electrodes)) if chain.zero is None else chain.zero
     numbers = {
+        "ZERO": c_doubles(zero.tolist()),
         "GAIN_PC": c_doubles(gain_pC.tolist()),
         "LARGEST": c_double(chain.largest),
         "SATURATION": str(int(chain.limit_pC is not None)),

@@ -20,6 +20,7 @@ from isocharge.simulate import Probe, Sensor, parse_probe
 from isocharge.simulate.dataset.shards import Dataset
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train.data.domain import ContactDomain, inner_radius
+from isocharge.train.release.measured import HELD_PRESSES
 from isocharge.train.release.release import Release, train_model
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.training.teacher import Teacher
@@ -51,7 +52,16 @@ class TaughtScene:
 
     @classmethod
     def of(cls, about: ModelMetadata) -> "TaughtScene":
-        """From the model's metadata."""
+        """From the model's metadata.
+
+        Raises:
+            ModelError: If it was trained on measured presses, which no simulation repeats.
+        """
+        if HELD_PRESSES in about.errors:
+            raise ModelError(
+                f"{about.label} was trained on measured presses, and simulated presses of its sensor are not like "
+                "those; distil a model of simulated presses, such as one of 'isocharge train calibrate'"
+            )
         probes = tuple(parse_probe(notation) for notation in about.probes)
         domain = ContactDomain(inner_radius(about.working_area_mm), about.force_range_N)
         return cls(sensor_from_dict(dict(about.sensor)), probes, domain)

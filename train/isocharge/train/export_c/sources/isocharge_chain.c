@@ -353,13 +353,13 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
 void isocharge_chain_advance(isocharge_chain *chain, const isocharge_real value[ISOCHARGE_ELECTRODES], double t_s,
                              isocharge_real dt_s, int limited, isocharge_reading *reading)
 {
-    static const real gain_pC[N] = ISOCHARGE_GAIN_PC;
+    static const real zero[N] = ISOCHARGE_ZERO, gain_pC[N] = ISOCHARGE_GAIN_PC;
     real *raw_pC = reading->raw_pC, quiet_pC[N], squares = 0;
 
     EACH(k)
     {
         squares += value[k] / LARGEST * (value[k] / LARGEST);
-        raw_pC[k] = value[k] * gain_pC[k];
+        raw_pC[k] = (value[k] - zero[k]) * gain_pC[k];
         reading->charge_pC[k] = reading->tare_pC[k] = 0;
     }
     reading->contact = 0;

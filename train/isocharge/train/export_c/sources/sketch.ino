@@ -1,7 +1,7 @@
 // Where a film is touched and how hard, on a board with a floating-point unit (Cortex-M4F or M7, ESP32, RP2350).
 //
 // Analog inputs are read at a steady rate, in the order of the electrodes. What they count is turned into pC by the
-// gain in isocharge_device.h: export with --device, or the chain takes counts for pC. Lines go out as
+// offset and gain in isocharge_device.h: export with --device, or the chain takes counts for pC. Lines go out as
 // `>name:value`, which serial plotters draw. With SEND_FRAMES set to 1 the charges go out as binary frames instead,
 // for `isocharge serve stream` on a host.
 #include "isocharge_chain.h"
