@@ -86,6 +86,11 @@ def of_another_sensor(make_film, repository):
     shutil.copytree(other, repository / "linear" / "2")
 
 
+def of_another_version(film, repository):
+    film.write(repository, version=2)
+    (repository / "linear" / "2").rename(repository / "linear" / "9")
+
+
 def not_there(film, repository):  # noqa: ARG001
     shutil.rmtree(repository / "linear")
 
@@ -96,6 +101,7 @@ def not_there(film, repository):  # noqa: ARG001
         (not_there, "ModelError: no model 'linear'"),
         (damaged, "model.onnx: expected sha256"),
         (answering_otherwise, "golden"),
+        (of_another_version, "expected version 9, got linear/2"),
         (
             of_another_sensor,
             "model linear/2: expected the electrodes ('A', 'B', 'C') of linear/1, got ('A', 'B', 'C', ",
@@ -114,6 +120,7 @@ def test_a_bad_version_is_refused_and_the_old_one_serves_on(film, make_film, rep
         assert lines[-1], lines
     assert "linear/1 serves on, because the new model is refused" in lines[-1]
     assert said in lines[-1]
+    shutil.rmtree(repository / "linear" / "9", ignore_errors=True)
     film.write(repository, version=3)
     process.send_signal(signal.SIGHUP)
     assert next(record for record in records if record["model"] != "linear/1")["model"] == "linear/3"

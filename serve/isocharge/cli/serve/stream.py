@@ -48,7 +48,7 @@ from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
 from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
 from isocharge.cli.shared.stopping import on_signal, stop_after, unless_hung_up, until_stopped
 from isocharge.cli.shared.terminal import log_to_stderr, say
-from isocharge.errors import InputError
+from isocharge.errors import InputError, ModelError
 
 if TYPE_CHECKING:
     from isocharge.serve import Device, Predictor, TouchStream
@@ -206,7 +206,10 @@ def _load(model: str, models: Path | None) -> "Predictor":
     from isocharge.serve import Predictor, check_golden, find_model, load_model
 
     folder = find_model(model, models)
-    check_golden(load_model(folder))
+    loaded = load_model(folder)
+    check_golden(loaded)
+    if folder.name.isdecimal() and folder.name != str(loaded.metadata.version):
+        raise ModelError(f"{folder}: expected version {folder.name}, got {loaded.metadata.label}; export it again")
     return Predictor(folder)
 
 

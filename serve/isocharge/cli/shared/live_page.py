@@ -158,6 +158,7 @@ class PageFeed:
             counters=self.touch.totals()._asdict()
             | {"reconnects": self.touch.counts.outages, "not_shown": self.link.dropped},
             rate_Hz=rate_Hz,
+            model=record.model,
             tare_pC=record.tare_pC,
             recording=None if recorder is None else str(recorder.path.name),
             recording_failed=recorder is not None and recorder.failed,

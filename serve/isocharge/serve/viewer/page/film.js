@@ -17,12 +17,16 @@ export class FilmView {
     this.history = new History(description.electrodes.length, this.isReplay);
     this.find = (selector) => this.root.querySelector(selector);
     this.find(".name").textContent = description.name;
-    const version = description.model.startsWith(`${description.name}/`);
-    this.find(".model").textContent = version ? `version ${description.model.slice(description.name.length + 1)}` : description.model;
+    this.showModel(description.model);
     this.root.addEventListener("click", (event) => { const button = event.target.closest("[data-do]"); if (button) { act(button.dataset.do, this); if (event.detail) button.blur(); } });
     if (this.isReplay) for (const button of this.root.querySelectorAll("[data-do]")) button.hidden = button.dataset.do !== "pause";
     this.latencies = [];
     this.ages = [];
+  }
+
+  showModel(label) {
+    const isOfThisName = label.startsWith(`${this.description.name}/`);
+    this.find(".model").textContent = isOfThisName ? `version ${label.slice(this.description.name.length + 1)}` : label;
   }
 
   /** Once the card is in the page and has a size. */
@@ -49,6 +53,7 @@ export class FilmView {
 
   update(state) {
     this.state = state;
+    if (state.model) this.showModel(state.model);
     this.history.markers = state.markers ?? [];
     const record = this.find("[data-do=record]");
     record.setAttribute("aria-pressed", String(Boolean(state.recording)));
