@@ -28,6 +28,8 @@ SLOW = {
     "--orientation random",
     "train report",
     "bayes_limit",
+    "run_design",
+    "train_rig",
 }
 """What takes an example more than a few seconds."""
 

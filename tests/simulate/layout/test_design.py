@@ -58,6 +58,7 @@ def test_the_same_seed_gives_the_same_design(sensor, found):
     assert again.chosen.centres.tolist() == found.chosen.centres.tolist()
 
 
+@pytest.mark.slow
 def test_electrodes_stay_and_rules_are_kept(sensor):
     """Two electrodes stay; the third one keeps its distance although it may choose its size."""
     task = DesignTask(sensor, 3, 4e-3, keep=("A", "B"), nuisances=KNOWN, side=(2e-3, 3e-3))
@@ -79,6 +80,7 @@ def test_tolerances_cost_more_the_wider_they_are(found):
     assert costs[0].measured >= 0.98 * found.chosen.value
 
 
+@pytest.mark.slow
 def test_a_trade_off_is_a_table_and_a_picture(sensor, monkeypatch):
     """One radius, one size, the roughest search: the two points are the same task, so the same error."""
     for name, value in {"TRADE_STARTS": 1, "TRADE_PRESSES": 20, "RADII": (1.0,), "SIZES": (1.0,)}.items():

@@ -35,7 +35,16 @@ def release(dataset, tmp_path_factory):
     return train_model(dataset, tmp_path_factory.mktemp("models") / "mine", QUICK, command="make it")
 
 
-@pytest.fixture(scope="module", params=model_names(MODELS))
+QUICK_FILMS = "four-25um-biaxial-films"
+"""Of the models whose film is not that of the other tests, the one that is measured in every run."""
+
+
+def _measured_here(name):
+    is_slow = name.endswith("-films") and name != QUICK_FILMS
+    return pytest.param(name, marks=pytest.mark.slow) if is_slow else name
+
+
+@pytest.fixture(scope="module", params=map(_measured_here, model_names(MODELS)))
 def touch(request):
     """Every released model."""
     return Predictor(find_model(MODELS / request.param))
