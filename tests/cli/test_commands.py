@@ -258,6 +258,7 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
     assert warm["charge_pC"]["B"] - json.loads(out)["charge_pC"]["B"] == pytest.approx(27.0)
 
 
+@pytest.mark.slow
 def test_sweep_fit_predict_one_by_one(command, tmp_path):
     presses, model, table = tmp_path / "presses", tmp_path / "models" / "mine", tmp_path / "charges.csv"
     assert command("simulate", "sweep", SENSOR, "--samples", 2000, "--radius", 5, "--workers", 2, "-o", presses)[0] == 0

@@ -105,6 +105,7 @@ def test_press_on_two_meshes_starts_its_neighbour():
     assert worst_error(FILM, warm, cold) < 1e-5
 
 
+@pytest.mark.slow
 def test_wrinkling_on_a_finer_mesh_is_an_error():
     """A film of 7 um under 9 N beside the rim wrinkles."""
     with pytest.raises(SolveError, match="wrinkles"):

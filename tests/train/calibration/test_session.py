@@ -143,6 +143,7 @@ def test_a_press_at_another_place_than_said_is_named(four, plan):
     assert len(bench.session.words) == 1
 
 
+@pytest.mark.slow
 def test_presses_that_no_film_explains_end_no_session(four, plan, bench):
     """Columns swapped: said, the presses stay, others are proposed, and undo helps."""
     contact = np.array([press.contact for press in plan[:7]])

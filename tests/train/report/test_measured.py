@@ -17,6 +17,8 @@ from isocharge.train.report import QUICK, write_report
 
 NAME, PROBE = "three-25um-biaxial", Circle(1e-3)
 
+pytestmark = pytest.mark.slow  # it measures every method; `serve check` on measured presses is tested in every run
+
 
 @pytest.fixture(scope="module")
 def presses():
