@@ -82,7 +82,8 @@ def memory_kB(pid):
     total = 0
     for each in [str(pid), *children]:
         text = Path(f"/proc/{each}/status").read_text()
-        total += int(re.search(r"VmRSS:\s+(\d+)", text)[1])
+        resident = re.search(r"VmRSS:\s+(\d+)", text)  # a process that has just ended has none
+        total += int(resident[1]) if resident else 0
     return total
 
 
