@@ -19,8 +19,7 @@ from isocharge.serve.network.statistics import Statistics
 
 
 def answer_uncounted(self, method, path, headers, body, _client=None):
-    if self._token is not None and path not in OPEN:
-        raise NotImplementedError
+    assert self._token is None or path in OPEN  # this server has no token; the look costs what it costs ours
     return self.handler.answer(method, path, headers, body)
 
 

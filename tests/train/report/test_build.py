@@ -68,7 +68,8 @@ def test_the_files_are_there(report):
 def test_the_record_has_every_part(report):
     _, record, _ = report
     assert record["format_version"] == 1
-    assert record["machine"]["cpu"]
+    assert all(record["machine"].values())
+    assert {"cpu", "cores", "python", "numpy", "scikit-learn", "torch"} <= record["machine"].keys()
     (section,) = record["datasets"]
     assert set(section["pictures"]) == PICTURES
     assert section["limits"]["bayes"]["position_rms_mm"] > 0.05

@@ -17,7 +17,7 @@ from isocharge.cli.shared.options import ProbeOption, SensorArgument
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import progress, say
 from isocharge.cli.shared.virtual_sensor import check_pseudo_terminals, virtual_sensor
-from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import InputError, OutputExists
 from isocharge.files import bounded_lines
 

@@ -10,7 +10,7 @@ import typer
 from isocharge.cli.shared.forward_maps import solve_forward_map, solve_map_to_search
 from isocharge.cli.shared.options import PROBE_HELP, ForceRangeOption, JsonOption, NoiseOption, SensorArgument
 from isocharge.cli.shared.terminal import progress, say
-from isocharge.default_scene import DEFAULT_FORCE_RANGE
+from isocharge.defaults import DEFAULT_FORCE_RANGE
 from isocharge.errors import InputError
 from isocharge.files import new_folder, refuse_existing, write_whole
 

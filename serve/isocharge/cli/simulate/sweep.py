@@ -20,7 +20,7 @@ from isocharge.cli.shared.options import (
     most_workers,
 )
 from isocharge.cli.shared.terminal import progress_rows, say
-from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import InputError
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from isocharge.cli.shared.measured_presses import (
 from isocharge.cli.shared.options import PROBE_HELP, ConfigOption, FreshOption, RadiusOption, radius_mm_of
 from isocharge.cli.shared.simulated_presses import simulated_presses
 from isocharge.cli.shared.training_run import train_and_say
-from isocharge.default_scene import DEFAULT_RADIUS
+from isocharge.defaults import DEFAULT_RADIUS
 from isocharge.errors import InputError
 from isocharge.files import refuse_existing
 

@@ -1,7 +1,7 @@
 """`config.pbtxt`: with it Triton serves a model folder without changes."""
 
+from isocharge.defaults import MAX_BATCH
 from isocharge.serve.model.session import INPUT, OUTPUTS
-from isocharge.server_defaults import MAX_BATCH
 
 
 def triton_config(name: str, electrodes: int) -> str:

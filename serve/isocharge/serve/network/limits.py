@@ -1,9 +1,9 @@
-"""The bounds of a server on requests, connections and time; default numbers are in `isocharge.server_defaults`."""
+"""The bounds of a server on requests, connections and time; default numbers are in `isocharge.defaults`."""
 
 from dataclasses import dataclass
 
+from isocharge.defaults import BODY_BYTES, CONNECTIONS, HEADER_SECONDS, IDLE_SECONDS, MAX_BATCH
 from isocharge.errors import TooLarge
-from isocharge.server_defaults import BODY_BYTES, CONNECTIONS, HEADER_SECONDS, IDLE_SECONDS, MAX_BATCH
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isocharge.arrays import Array, Booleans
-from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import SceneError
 from isocharge.number_text import number_of
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from isocharge.arrays import Array, Integers
-from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import SceneError
 from isocharge.simulate.numerics.disk import lattice
 from isocharge.simulate.sensor.probe import Probe

@@ -21,7 +21,7 @@ from typing import Any, cast, get_args
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import InputError, SceneError, SolveError
 from isocharge.progress import Progress
 from isocharge.simulate.execution.checkpointed_map import JobMap

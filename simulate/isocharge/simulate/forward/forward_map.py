@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.arrays import Array, Complexes, Integers
-from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import SceneError, SolveError
 from isocharge.progress import Progress
 from isocharge.simulate.execution.blas import single_threaded_blas

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.default_scene import DEFAULT_FORCE_RANGE
+from isocharge.defaults import DEFAULT_FORCE_RANGE
 from isocharge.errors import SolveError
 from isocharge.progress import StageProgress
 from isocharge.simulate.execution.checkpointed_map import JobMap

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.arrays import Array
-from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.errors import ChargeError, InputError
 from isocharge.files import sha256_of
 from isocharge.progress import Progress

@@ -13,6 +13,7 @@ from isocharge.errors import ModelError
 from isocharge.files import new_folder, write_whole
 from isocharge.progress import StageProgress
 from isocharge.serve import ModelMetadata, Predictor
+from isocharge.serve.benchmark import machine
 from isocharge.simulate import Dataset, Samples, SolveSettings, sensor_to_dict
 from isocharge.train.baselines import (
     Fitted,
@@ -44,10 +45,13 @@ from isocharge.train.report.methods import (
 from isocharge.train.report.page import page
 from isocharge.train.report.settings import Settings
 from isocharge.train.report.speed import AXES, speed_plot
-from isocharge.train.report.timing import machine, one_thread
+from isocharge.train.report.timing import one_thread
 from isocharge.train.report.verdict import verdict
 
 FORMAT_VERSION = 1
+
+MEASURED_WITH = ("isocharge", "numpy", "scipy", "scikit-learn", "torch", "onnxruntime")
+"""Packages whose versions belong to the figures."""
 
 COMPARED = (gauss_newton.NAME, polynomial.NAME, table.INTERPOLATED, boosting.NAME, linear_band.NAME)
 """Methods in the pictures of effects next to the released model; of their forms the last, the plain one."""
@@ -118,7 +122,7 @@ def write_report(
         record = {
             "format_version": FORMAT_VERSION,
             "command": command,
-            "machine": machine(),
+            "machine": machine(MEASURED_WITH),
             "settings": settings.to_dict(),
             "datasets": sections,
         }

@@ -4,13 +4,9 @@ Machines are noisy, so the contenders take turns: rounds of a few milliseconds e
 contender begins with calls that only warm up, because another one has just used the cache.
 """
 
-import os
-import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib import metadata
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -38,21 +34,6 @@ def one_thread() -> Iterator[None]:
             yield
     finally:
         torch.set_num_threads(threads)
-
-
-def machine() -> dict[str, str]:
-    """Where figures were measured."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text("utf-8").splitlines() if info.exists() else []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    packages = ("isocharge", "numpy", "scipy", "scikit-learn", "torch", "onnxruntime")
-    return {
-        "cpu": next(names, platform.processor()),
-        "cores": str(os.cpu_count()),
-        "system": platform.platform(),
-        "python": platform.python_version(),
-        **{name: metadata.version(name) for name in packages},
-    }
 
 
 def latencies(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.arrays import Array, Booleans
-from isocharge.default_scene import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.files import sha256_of
 from isocharge.progress import StageProgress, Warn
 from isocharge.serve.model.model_folder import check_target

@@ -1,7 +1,14 @@
-"""The default numbers of a server's bounds: sizes, connections, seconds.
+"""Defaults that several portions share: the scene that is pressed, and the bounds of a server.
 
-These numbers have no imports, so that `isocharge serve http --help` can show them at once.
+These numbers have no imports, so that `--help` can show them at once.
 """
+
+DEFAULT_RADIUS = 8e-3
+"""Largest distance of a press from the film's centre, m: the electrodes of the built-in sensors, 10 mm from the centre,
+begin about there."""
+
+DEFAULT_FORCE_RANGE = (0.05, 2.0)
+"""Smallest and largest force, N. The released models cover it."""
 
 MAX_BATCH = 4096
 """Presses in one request, and the largest batch that Triton may form; the model's graph itself takes any."""
