@@ -67,6 +67,8 @@ class BoundedProtocol(HttpToolsProtocol):
         self._body, self._unparsed = bytearray(), bytearray()
         self._turn: asyncio.Handle | None = None
         self._starts_in_chunk = True  # whether this piece begins with a request
+        self._has_answered = False  # whether a request of this piece was answered
+        self._head, self._repeat_bytes = b"", 0  # head and size of a request that came in one piece, to know it again
         self._is_last = self._is_refused = self._is_half_closed = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -94,7 +96,13 @@ class BoundedProtocol(HttpToolsProtocol):
         cycle = self.cycle  # the tests of `_may_answer` stand here: a call takes longer than they do
         may_answer = (cycle is None or cycle.response_complete) and not self.flow.write_paused
         if may_answer and not self._unparsed and len(data) <= SLICE_BYTES:
+            if len(data) == self._repeat_bytes and data.startswith(self._head):
+                self._answer(data[len(self._head) :])
+                return
+            is_new = self._phase is Phase.IDLE
             self._parse(data)
+            if is_new and self._has_answered:
+                self._remember(data)
             return
         self._unparsed += data
         if self._turn is None:
@@ -102,7 +110,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def eof_received(self) -> bool:  # type: ignore[override]
         """The client sends no more; what it has asked for is still answered, where the transport can do that."""
-        self._is_half_closed = bool(self._unparsed) or not self._has_answered()
+        self._is_half_closed = bool(self._unparsed) or not self._is_answered()
         return self._is_half_closed and self.transport.can_write_eof()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -112,9 +120,9 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def _may_answer(self) -> bool:
         """Whether an answer could go out now: the one before is complete, and the client reads."""
-        return self._has_answered() and not self.flow.write_paused
+        return self._is_answered() and not self.flow.write_paused
 
-    def _has_answered(self) -> bool:
+    def _is_answered(self) -> bool:
         return self.cycle is None or bool(self.cycle.response_complete)
 
     def _take_turn(self) -> None:
@@ -137,7 +145,7 @@ class BoundedProtocol(HttpToolsProtocol):
             self.flow.pause_reading()
         elif not self.flow.write_paused:
             self.flow.resume_reading()
-            if self._is_half_closed and self._has_answered():
+            if self._is_half_closed and self._is_answered():
                 self.transport.close()
 
     def _parse(self, data: bytes) -> None:
@@ -145,6 +153,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._chunk = len(data)
         self._fed += self._chunk
         self._starts_in_chunk = self._phase is Phase.IDLE or self._phase is Phase.ANSWER
+        self._has_answered, self._repeat_bytes = False, 0
         try:
             self.parser.feed_data(data)
         except httptools.HttpParserUpgrade as upgrade:
@@ -230,10 +239,25 @@ class BoundedProtocol(HttpToolsProtocol):
             self._allow(math.inf)
             self._answer_as_asgi()
         else:
-            method = self.parser.get_method().decode("latin-1")
-            response = self.direct.answer(method, path, self.headers, bytes(self._body), self.client)
-            self._write(response, with_body=method != "HEAD")
-            self._wait_for_request()
+            self._has_answered = True
+            self._answer(bytes(self._body))
+
+    def _answer(self, body: bytes) -> None:
+        """Answer the request whose head was parsed last."""
+        method = self.parser.get_method().decode("latin-1")
+        response = self.direct.answer(method, _path(self.url), self.headers, body, self.client)
+        self._write(response, with_body=method != "HEAD")
+        self._wait_for_request()
+
+    def _remember(self, data: bytes) -> None:
+        """Remember the head of a request if it came alone and in one piece.
+
+        Clients send the same head again and again. Where its bytes are the same, and as many bytes follow it, the
+        parser would say the same of it again.
+        """
+        head, end, body = data.partition(b"\r\n\r\n")
+        if body == self._body and self._phase is Phase.IDLE:
+            self._head, self._repeat_bytes = head + end, len(data)
 
     def on_response_complete(self) -> None:
         """uvicorn has sent an answer: do what its own method does, but start no timer."""

@@ -1,0 +1,171 @@
+"""One connection, without a network: the answers do not depend on how the requests are cut into pieces."""
+
+import asyncio
+
+import pytest
+import uvicorn
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from isocharge.serve.network.http.connection import bounded
+from isocharge.serve.network.limits import ServerLimits
+from isocharge.serve.network.protocol.response import response_of
+
+INNER = b"POST /one HTTP/1.1\r\nHost: x\r\nContent-Length: 3\r\n\r\nabc"
+
+
+class Echo:
+    """Answers with what it was asked."""
+
+    def blocks(self, _path):
+        return False
+
+    def has_websocket(self, _path):
+        return False
+
+    def answer(self, method, path, headers, body, _client=None):
+        return response_of(200, b"text/plain", repr((method, path, sorted(headers), body)).encode())
+
+    def refused(self, _response, _client=None):
+        pass
+
+
+class Wire(asyncio.Transport):
+    """Keeps what is sent."""
+
+    def __init__(self):
+        super().__init__()
+        self.sent, self.closed = bytearray(), False
+
+    def write(self, data):
+        self.sent += data
+
+    def write_eof(self):
+        self.closed = True
+
+    close = abort = write_eof
+
+    def can_write_eof(self):
+        return True
+
+    def is_closing(self):
+        return self.closed
+
+    def pause_reading(self):
+        pass
+
+    resume_reading = pause_reading
+
+
+def request(method, path, header, body, *, chunked):
+    if chunked:
+        framing = b"Transfer-Encoding: chunked\r\n"
+        body = (b"%x\r\n%s\r\n" % (len(body), body) if body else b"") + b"0\r\n\r\n"
+    else:
+        framing = b"Content-Length: %d\r\n" % len(body)
+    return b"%s %s HTTP/1.1\r\nHost: x\r\n%s%s\r\n%s" % (method, path, header, framing, body)
+
+
+REQUESTS = st.builds(
+    request,
+    st.sampled_from([b"POST", b"HEAD"]),
+    st.sampled_from([b"/one", b"/two", b"/%6fne"]),
+    st.sampled_from([b"", b"Connection: close\r\n", b"Expect: 100-continue\r\n"]),
+    st.sampled_from([b"", b"abc", b"xyz", b"\r\n\r\n", INNER, b"\r\n\r\n" + INNER]),
+    chunked=st.booleans(),
+)
+"""Few, so that they repeat; some bodies hold a request themselves."""
+
+
+@pytest.fixture(scope="module")
+def connect():
+    """A function that gives a fresh connection and its wire."""
+    with asyncio.Runner() as runner:
+        loop = runner.get_loop()
+        config = uvicorn.Config(Echo(), ws="none", lifespan="off", log_config=None)
+        config.load()
+        state = uvicorn.server.ServerState()
+
+        def make():
+            protocol = bounded(Echo(), ServerLimits())(config, state, {}, loop)
+            wire = Wire()
+            protocol.connection_made(wire)
+            return protocol, wire
+
+        yield make
+
+
+def answers(connect, pieces):
+    protocol, wire = connect()
+    for piece in pieces:
+        protocol.data_received(piece)
+    return bytes(wire.sent).replace(b"HTTP/1.1 100 Continue\r\n\r\n", b""), wire.closed
+
+
+def byte_by_byte(data):
+    return [data[at : at + 1] for at in range(len(data))]
+
+
+@given(requests=st.lists(REQUESTS, min_size=1, max_size=6), prefix=st.sampled_from([b"", b"\r\n"]))
+@settings(max_examples=150, deadline=None)
+def test_a_request_in_one_piece_is_answered_as_byte_by_byte(connect, requests, prefix):
+    """A known head is not parsed again, a byte is no head: both give the same answers."""
+    requests = [prefix + each for each in requests for _ in range(2)]
+    assert answers(connect, requests) == answers(connect, byte_by_byte(b"".join(requests)))
+
+
+@given(requests=st.lists(REQUESTS, min_size=1, max_size=6), cuts=st.lists(st.integers(1, 120), max_size=30))
+@settings(max_examples=150, deadline=None)
+def test_pieces_that_begin_and_end_anywhere(connect, requests, cuts):
+    data = b"".join(each for each in requests for _ in range(2))
+    pieces, rest = [], data
+    for size in cuts:
+        pieces.append(rest[:size])
+        rest = rest[size:]
+    assert answers(connect, [*filter(None, [*pieces, rest])]) == answers(connect, byte_by_byte(data))
+
+
+def test_a_body_is_no_request(connect):
+    """The second half of a request looks like a request that was answered before."""
+    outer = request(b"POST", b"/two", b"", b"first\r\n\r\n" + INNER, chunked=False)
+    at = outer.index(INNER)
+    sent, _ = answers(connect, [INNER, outer[:at], outer[at:], INNER])
+    assert sent.count(b"HTTP/1.1 200 OK") == 3
+    assert sent.count(b"'/two'") == 1
+
+
+def test_the_end_of_a_head_is_no_head(connect):
+    """What completed a request once is no request when it comes alone."""
+    sent, closed = answers(connect, [INNER[:1], INNER[1:], INNER[1:]])
+    assert (sent.count(b"HTTP/1.1 200"), sent.count(b"HTTP/1.1 400"), closed) == (1, 1, True)
+
+
+@pytest.mark.parametrize("blank", [b"\r\n\r\n", b"\n\r\n\r\n"])
+def test_blank_lines_are_no_requests(connect, blank):
+    sent, _ = answers(connect, [blank, blank, INNER, blank, blank])
+    assert sent.count(b"HTTP/1.1 200") == 1
+
+
+def test_a_head_is_parsed_once(connect, monkeypatch):
+    protocol, wire = connect()
+    protocol.data_received(INNER)
+    monkeypatch.setattr(protocol, "parser", ParsedAlready(protocol.parser))
+    protocol.data_received(INNER.replace(b"abc", b"xyz"))
+    assert b"b'abc'" in wire.sent
+    assert b"b'xyz'" in wire.sent
+
+
+@pytest.mark.parametrize("other", [INNER.replace(b"/one", b"/two"), INNER.replace(b"POST", b"HEAD"), INNER + b" "])
+def test_another_head_is_parsed(connect, monkeypatch, other):
+    protocol, _ = connect()
+    protocol.data_received(INNER)
+    monkeypatch.setattr(protocol, "parser", ParsedAlready(protocol.parser))
+    with pytest.raises(AttributeError):
+        protocol.data_received(other)
+
+
+class ParsedAlready:
+    """A parser that cannot parse."""
+
+    def __init__(self, parser):
+        self.get_method, self.should_keep_alive = parser.get_method, parser.should_keep_alive
