@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from websockets.asyncio.client import connect
 
-from isocharge.serve import Predictor, Recording, VirtualSensor, wander
+from isocharge.serve import Predictor, Recording, Script, VirtualSensor, wander
 from isocharge.serve.viewer.messages import HEADER
 from isocharge.serve.viewer.sample import SampleFormat
 
@@ -44,9 +44,16 @@ def charge_pC(x_mm, y_mm, force_N):
     return 850.0 * force_N[:, None] ** (2 / 3) * 10.0 / (2.0 + 0.8 * distance)
 
 
+def presses(rate_Hz):
+    """A second of rest before every press, so that a stream that begins at any time finds its tare."""
+    scripts = [wander(seed=seed, seconds=2.5, rate_Hz=rate_Hz) for seed in range(12)]
+    columns = [np.concatenate([getattr(script, name) for script in scripts]) for name in ("x_mm", "y_mm", "force_N")]
+    return Script(*columns, rate_Hz)
+
+
 def play(rate_Hz, url, stop, counts):
     """The board, in a process of its own."""
-    with VirtualSensor(charge_pC, wander(seed=1, seconds=30.0, rate_Hz=rate_Hz)) as sensor:
+    with VirtualSensor(charge_pC, presses(rate_Hz)) as sensor:
         url.send(sensor.url)
         stop.wait()
         counts.send((sensor.sent, sensor.withheld))
@@ -63,6 +70,7 @@ async def _watch(url, form, stalls, seconds):
         if stalls:
             client.transport.pause_reading()
             await asyncio.sleep(seconds)
+            client.transport.abort()  # a stalled client would not take part in closing, either
             return ages
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -114,11 +122,24 @@ def one_round(port, viewers, seconds, folder, number, live, in_browser):
     path = folder / f"{number}.rec"
     words = [sys.executable, "-m", "isocharge.cli", "serve", "stream", MODEL, "--port", port, "--output", "none"]
     words += ["--record", str(path)] + (["--live", "--live-port", "0"] if live else [])
-    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
-    url = ""
-    while "taring" not in (line := process.stderr.readline()):
-        url = match[1] if (match := re.search(r"page: (\S+)", line)) else url
-        assert line
+    said = folder / f"{number}.txt"
+    with said.open("w") as output:
+        process = subprocess.Popen(words, stderr=output)
+    try:
+        return _follow(process, path, said, viewers, seconds, in_browser)
+    except Exception as error:
+        raise RuntimeError(f"round {number}: the stream said {said.read_text()!r}") from error
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+def _follow(process, path, said, viewers, seconds, in_browser):
+    while "taring" not in said.read_text():
+        assert process.poll() is None
+        time.sleep(0.05)
+    match = re.search(r"page: (\S+)", said.read_text())
+    url = match[1] if match else ""
     time.sleep(2.0)
     memory, results, watching = [memory_kB(process.pid)], [], []
     for k in range(viewers):
@@ -128,15 +149,15 @@ def one_round(port, viewers, seconds, folder, number, live, in_browser):
         watching[-1].start()
         results.append(ours)
     browsed = browse(url, seconds) if in_browser else None
-    assert process.poll() is None, process.communicate()[1]
     if browsed is None:
         time.sleep(seconds)
     memory.append(memory_kB(process.pid))
     ages = [age for result in results for age in (result.recv() if result.poll(20) else [])]
     for each in watching:
         each.join()
+    assert process.poll() is None
     process.terminate()
-    process.communicate(timeout=30)
+    process.wait(30)
     latencies = np.array([us for event in Recording(path).events() for us in event.latencies_us])
     lines = (json.loads(line) for line in path.open() if line.startswith('{"timestamp"'))
     seq = np.array([line["seq"] for line in lines])
@@ -161,7 +182,7 @@ def main():
     context = multiprocessing.get_context("spawn")
     (url, their_url), (counts, their_counts) = context.Pipe(duplex=False), context.Pipe(duplex=False)
     stop = context.Event()
-    board = context.Process(target=play, args=(options.rate_Hz, their_url, stop, their_counts))
+    board = context.Process(target=play, args=(options.rate_Hz, their_url, stop, their_counts), daemon=True)
     board.start()
     port, p99 = url.recv(), {0: [], 3: []}
     print(
