@@ -7,6 +7,11 @@ the newest sample when a viewer has it, and the memory of the processes. With --
 viewers and says how old its pictures are and how many a second it draws.
 
     python tests/benchmarks/bench_live.py --rounds 4 --seconds 10 [--browser] [--rate-Hz 1000]
+
+With --soak there is one long round with viewers and no recording, and the memory of each process over it. As many
+samples as a board of 200 Hz sends in four hours, in ten minutes:
+
+    python tests/benchmarks/bench_live.py --soak --browser --rate-Hz 4800 --seconds 600
 """
 
 import argparse
@@ -19,7 +24,9 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -84,19 +91,24 @@ async def _watch(url, form, stalls, seconds):
     return ages
 
 
-def memory_kB(pid):
-    """Resident memory of a process and its children, kB."""
-    children = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True, check=False).stdout.split()
-    total = 0
-    for each in [str(pid), *children]:
-        text = Path(f"/proc/{each}/status").read_text()
+def children(pid):
+    """Numbers of the processes that a process has started."""
+    found = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True, check=False)
+    return [int(word) for word in found.stdout.split()]
+
+
+def memory_MB(*pids):
+    """Resident memory of processes together, MB."""
+    total = 0.0
+    for pid in pids:
+        text = Path(f"/proc/{pid}/status").read_text()
         resident = re.search(r"VmRSS:\s+(\d+)", text)  # a process that has just ended has none
-        total += int(resident[1]) if resident else 0
+        total += int(resident[1]) / 1e3 if resident else 0.0
     return total
 
 
 def browse(url, seconds):
-    """Chromium's view: ages of its pictures (ms), pictures a second, and memory of the page at start and end (MB)."""
+    """Chromium's view: ages of its pictures (ms), pictures a second, and memory of the page every two seconds (MB)."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as started:
@@ -117,51 +129,86 @@ def browse(url, seconds):
     return ages, rates, [size / 1e6 for size in memory]
 
 
-def one_round(port, viewers, seconds, folder, number, live, in_browser):
-    """Follow the port for a while: latencies (us), lost frames, ages (s), memory (kB, start and end), browser."""
-    path = folder / f"{number}.rec"
-    words = [sys.executable, "-m", "isocharge.cli", "serve", "stream", MODEL, "--port", port, "--output", "none"]
-    words += ["--record", str(path)] + (["--live", "--live-port", "0"] if live else [])
-    said = folder / f"{number}.txt"
+@contextmanager
+def following(port, folder, name, *words):
+    """A stream that follows the port and has its tare, with the URL of its page; it says why if it ends."""
+    said = folder / f"{name}.txt"
+    command = [sys.executable, "-m", "isocharge.cli", "serve", "stream", MODEL, "--port", port, "--output", "none"]
     with said.open("w") as output:
-        process = subprocess.Popen(words, stderr=output)
+        process = subprocess.Popen([*command, *words], stderr=output)
     try:
-        return _follow(process, path, said, viewers, seconds, in_browser)
+        while "tared" not in said.read_text():
+            assert process.poll() is None
+            time.sleep(0.05)
+        match = re.search(r"page: (\S+)", said.read_text())
+        yield process, match[1] if match else ""
+        assert process.poll() is None
     except Exception as error:
-        raise RuntimeError(f"round {number}: the stream said {said.read_text()!r}") from error
+        raise RuntimeError(f"{name}: the stream said {said.read_text()!r}") from error
     finally:
         process.terminate()
         process.wait(30)
 
 
-def _follow(process, path, said, viewers, seconds, in_browser):
-    while "taring" not in said.read_text():
-        assert process.poll() is None
-        time.sleep(0.05)
-    match = re.search(r"page: (\S+)", said.read_text())
-    url = match[1] if match else ""
-    time.sleep(2.0)
-    memory, results, watching = [memory_kB(process.pid)], [], []
+@contextmanager
+def watched(url, viewers, seconds):
+    """Viewers for a while, the first of which stalls; the list has the ages of what the others saw after the block."""
+    ages, electrodes, watching = [], Predictor(MODEL).metadata.electrodes, []
     for k in range(viewers):
         ours, theirs = multiprocessing.Pipe(duplex=False)
-        electrodes = Predictor(MODEL).metadata.electrodes
-        watching.append(multiprocessing.Process(target=watch, args=(url, electrodes, k == 0, seconds, theirs)))
-        watching[-1].start()
-        results.append(ours)
-    browsed = browse(url, seconds) if in_browser else None
-    if browsed is None:
-        time.sleep(seconds)
-    memory.append(memory_kB(process.pid))
-    ages = [age for result in results for age in (result.recv() if result.poll(20) else [])]
-    for each in watching:
-        each.join()
-    assert process.poll() is None
-    process.terminate()
-    process.wait(30)
+        process = multiprocessing.Process(target=watch, args=(url, electrodes, k == 0, seconds, theirs))
+        process.start()
+        watching.append((process, ours))
+    yield ages
+    for process, result in watching:
+        ages += result.recv() if result.poll(20) else []
+        process.join()
+
+
+def one_round(port, viewers, seconds, folder, name, in_browser):
+    """Follow the port for a while: latencies (us), lost frames, ages (s), memory (MB, start and end), browser."""
+    path = folder / f"{name}.rec"
+    words = ["--live", "--live-port", "0"] if viewers else []
+    with following(port, folder, name, "--record", path, *words) as (process, url):
+        pids = [process.pid, *children(process.pid)]
+        memory = [memory_MB(*pids)]
+        with watched(url, viewers - in_browser, seconds) as ages:
+            browsed = browse(url, seconds) if in_browser else time.sleep(seconds)
+            memory.append(memory_MB(*pids))
     latencies = np.array([us for event in Recording(path).events() for us in event.latencies_us])
     lines = (json.loads(line) for line in path.open() if line.startswith('{"timestamp"'))
     seq = np.array([line["seq"] for line in lines])
     return latencies, int(((np.diff(seq) - 1) % 65536).sum()), ages, memory, browsed
+
+
+def soak(port, seconds, folder, in_browser):
+    """Memory of reader, page process and browser's page over one long round, MB: rows by name."""
+    with following(port, folder, "soak", "--live", "--live-port", "0") as (process, url):
+        (page,) = (pid for pid in children(process.pid) if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text())
+        memory, over = {"reader": [], "page process": []}, threading.Event()
+
+        def sample():
+            while not over.wait(2.0):
+                for name, pid in zip(memory, (process.pid, page), strict=True):
+                    memory[name].append(memory_MB(pid))
+
+        sampling = threading.Thread(target=sample)
+        with watched(url, 3 - in_browser, seconds) as ages:
+            sampling.start()
+            browsed = browse(url, seconds) if in_browser else time.sleep(seconds)
+            over.set()
+            sampling.join()
+    if browsed is not None:
+        memory["page in the browser"] = browsed[2]
+    return memory, ages
+
+
+def report_soak(memory, ages):
+    """Print medians of the tenths of the round: what grows, grows from one to the next."""
+    for name, sizes in memory.items():
+        tenths = [f"{np.median(part):.1f}" for part in np.array_split(sizes, 10)]
+        print(f"{name}, MB, median of each tenth: {' '.join(tenths)}")
+    print(f"age ms {percentiles(ages, 1e3)}")
 
 
 def percentiles(values, scale=1.0):
@@ -178,6 +225,7 @@ def main():
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rate-Hz", type=float, default=1000.0)
     parser.add_argument("--browser", action="store_true")
+    parser.add_argument("--soak", action="store_true")
     options = parser.parse_args()
     context = multiprocessing.get_context("spawn")
     (url, their_url), (counts, their_counts) = context.Pipe(duplex=False), context.Pipe(duplex=False)
@@ -189,7 +237,9 @@ def main():
         f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {options.rate_Hz:g} Hz, {options.seconds:g} s a round"
     )
     with tempfile.TemporaryDirectory() as name:
-        for number in range(options.rounds):
+        if options.soak:
+            report_soak(*soak(port, options.seconds, Path(name), options.browser))
+        for number in range(0 if options.soak else options.rounds):
             for viewers in (0, 3) if number % 2 == 0 else (3, 0):
                 in_browser = options.browser and viewers > 0
                 latencies, lost, ages, memory, browsed = one_round(
@@ -198,14 +248,13 @@ def main():
                     options.seconds,
                     Path(name),
                     f"{number}-{viewers}",
-                    viewers > 0,
                     in_browser,
                 )
                 p99[viewers].append(float(np.percentile(latencies, 99)))
                 print(
                     f"round {number}, {viewers} viewers: latency us {percentiles(latencies)}; "
                     f"{len(latencies)} records, {lost} lost; age ms {percentiles(ages, 1e3)}; memory MB "
-                    f"{' -> '.join(f'{size / 1e3:.1f}' for size in memory)}"
+                    f"{' -> '.join(f'{size:.1f}' for size in memory)}"
                 )
                 if browsed is not None:
                     pictures, rates, heap = browsed
@@ -213,10 +262,10 @@ def main():
                         f"  Chromium: age of a picture ms {percentiles(pictures)}; pictures/s "
                         f"{np.median(rates):.1f}; heap MB {heap[0]:.1f} -> {heap[-1]:.1f}, most {max(heap):.1f}"
                     )
-    ratios = np.array(p99[3]) / np.array(p99[0])
-    print(
-        f"p99 with three viewers over without: median {np.median(ratios):.2f}, {ratios.min():.2f} to {ratios.max():.2f}"
-    )
+    if not options.soak:
+        ratios = np.array(p99[3]) / np.array(p99[0])
+        spread = f"median {np.median(ratios):.2f}, {ratios.min():.2f} to {ratios.max():.2f}"
+        print(f"p99 with three viewers over without: {spread}")
     stop.set()
     sent, withheld = counts.recv()
     print(f"board: {sent} frames sent, {withheld} withheld while nobody followed")
