@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 
 .PHONY: demo test test-all attack docs bench soak release report proto clean
 
-# Tests that measure time, or wait for a port to come back: one at a time. All others share the cores, a file a worker.
+# Tests that measure time, or wait for a port to come back: one at a time. All others share the cores, a file a worker;
+# some wait for processes that they started, so there is a worker more than the two cores that we count on.
 ALONE := tests/serve/live tests/serve/port tests/serve/virtual_sensor tests/serve/test_end_to_end.py tests/test_live.py tests/test_bench.py
 # The file whose tests take longest goes first, so that no core waits for it at the end.
 FIRST := tests/test_pages.py
@@ -19,7 +20,7 @@ test: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(ONE_THREAD) $(BIN)/python -m pytest $(FIRST) tests $(addprefix --ignore=,$(ALONE)) -n 2 --dist loadfile --no-loadscope-reorder
+	$(ONE_THREAD) $(BIN)/python -m pytest $(FIRST) tests $(addprefix --ignore=,$(ALONE)) -n 3 --dist loadfile --no-loadscope-reorder
 	$(BIN)/python -m pytest $(ALONE)
 
 test-all: docs

@@ -33,6 +33,9 @@ SLOW = {
 }
 """What takes an example more than a few seconds."""
 
+SLOW_PAGES = ("simulate/docs/contours.md", "simulate/docs/identifiability.md", "train/docs/calibration.md")
+"""Pages whose examples take a minute together."""
+
 SMALLER = {"--samples 100000": "--samples 500"}
 """Figures of an example that would take a test too long."""
 
@@ -42,7 +45,7 @@ EXAMPLE_PAGES = [page for page in PAGES if not page.startswith(("serve/", "CONTR
 
 
 def is_slow(example):
-    return any(key in example.text for key in SLOW)
+    return example.page in SLOW_PAGES or any(key in example.text for key in SLOW)
 
 
 @pytest.fixture(scope="module")

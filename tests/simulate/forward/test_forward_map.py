@@ -306,6 +306,7 @@ def test_the_issues_ranges(probe):
     assert error.max() < 5e-3
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("probe", [Circle(1e-3), Polygon.triangle(4e-3)], ids=["circle", "triangle"])
 def test_result_does_not_depend_on_the_executor(two_processes, probe: Probe):
     sensor, family = load_sensor("three-25um-biaxial"), {**QUICK, "force_range": (0.9, 1.0), "radius": 1e-3}

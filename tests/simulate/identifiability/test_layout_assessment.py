@@ -105,6 +105,7 @@ def test_fewer_than_three_charges_are_refused():
         assess_layout(two, REFERENCE)
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(
     ("places_mm", "worst", "rms"),
     [

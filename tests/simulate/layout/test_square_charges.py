@@ -30,6 +30,7 @@ def pressed_one_by_one(name, readout, at, force=1.0, radius=1e-3, pretension=0.0
 FULL = press(load_sensor("four-25um-biaxial").film, Circle(1e-3), (0.0, 0.0), 1.0).theory
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(
     ("fixture", "name", "readout"),
     [

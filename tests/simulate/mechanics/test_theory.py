@@ -207,6 +207,7 @@ def scenes(seed: int, count: int, accuracy: float) -> list[tuple]:
     return found
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("accuracy", [1e-3, 1e-2])
 def test_modelling_error_bounds_the_real_difference(accuracy):
     """A hundredth of the accuracy is for the digits of Newton's method, where next to nothing is left out."""

@@ -41,13 +41,8 @@ def worst_error(film: Film, rough, fine) -> float:
     return float(max(errors))
 
 
-@pytest.mark.parametrize(
-    "scene",
-    [
-        pytest.param(scene, id=name, marks=[pytest.mark.slow] if i > 3 else [])
-        for i, (name, scene) in enumerate((INSIDE | BESIDE_THE_RIM).items())
-    ],
-)
+@pytest.mark.first_cases(3)
+@pytest.mark.parametrize("scene", [pytest.param(scene, id=name) for name, scene in (INSIDE | BESIDE_THE_RIM).items()])
 def test_mesh_error_bounds_the_difference_from_a_finer_mesh(scene):
     """Against a mesh two orders higher with more rings, evenly and at the rim."""
     thickness, pretension, poisson, probe, distance, force = scene

@@ -63,6 +63,7 @@ def test_it_is_the_minimum_of_the_joint_problem(scene):
     np.testing.assert_allclose(std, np.sqrt(np.diag(joint_covariance)), rtol=0.05)
 
 
+@pytest.mark.first_cases(1)
 def test_errors_are_as_large_as_they_say(layout):
     """Over films, the misses of the parameters in their own covariance add up to a chi-squared."""
     charges, scene = layout.scene.charges, layout.scene
@@ -77,6 +78,7 @@ def test_errors_are_as_large_as_they_say(layout):
     assert chi2.ppf(0.001, count) < total < chi2.ppf(0.999, count)
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("row", [0, 4])
 def test_a_bad_press_is_left_out_and_moves_nothing(scene, row):
     _, presses = rig(scene.charges, 10, seed=21)

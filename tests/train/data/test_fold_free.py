@@ -113,6 +113,7 @@ def inner_electrodes(count, radius, samples, folder):
     return read_dataset(run_sweep(folder, sensor_from_dict(table), (Circle(1e-3),), sweep))
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("count", [5, 8])
 def test_five_and_eight_electrodes_with_one_in_the_middle(tmp_path, count):
     """From presses to the served model, without a word of folds: an electrode within the area is none."""

@@ -60,6 +60,7 @@ def presses(model, count, seed):
     return noisy_charges(LabelledPresses(contact, charge_pC), noise_model("reference"), seed).astype(np.float32)
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("model", ["three-25um-biaxial", "four-25um-biaxial"])
 def test_ten_thousand_presses_agree_with_onnxruntime(model, compiled):
     charge_pC = presses(model, 10_000, seed=0)

@@ -61,6 +61,7 @@ def weights(fit):
     return torch.cat([parameter.flatten() for parameter in fit.network.parameters()])
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(("config", "calls"), [(NOISY, (1, 3)), (CLEAN, (1, 4, 7))], ids=["noisy", "clean"])
 def test_a_stopped_run_ends_with_the_same_weights(dataset, tmp_path, config, calls):
     whole = weights(fit_network(dataset, config))
