@@ -77,6 +77,7 @@ def test_there_are_recipes():
     assert len(RECIPES) == 4
 
 
+@pytest.mark.first_cases(2)
 @pytest.mark.parametrize("name", RECIPES)
 def test_a_recipe_works(name, project):
     follow(RECIPES[name], project)

@@ -3,9 +3,12 @@
 import importlib.util
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.slow
 def test_the_pipeline_runs_from_sweep_to_contact(tmp_path, capsys):
     spec = importlib.util.spec_from_file_location("pipeline", ROOT / "train" / "examples" / "pipeline.py")
     pipeline = importlib.util.module_from_spec(spec)

@@ -157,7 +157,7 @@ def test_taut_membrane_under_a_centred_disk(share):
 POLYGONS = [Polygon.rectangle(4e-3, 2e-3, 0.5), Polygon.triangle(6e-3, 1.0)]
 
 
-@pytest.mark.first_cases(3)
+@pytest.mark.first_cases(2)
 @pytest.mark.parametrize("at", PLACES[1:])
 @pytest.mark.parametrize("probe", POLYGONS, ids=lambda probe: probe.name)
 def test_taut_membrane_under_a_polygon(at, probe):
@@ -198,7 +198,7 @@ def test_plate_under_a_centred_disk(share):
     assert solved.deflection(np.zeros((1, 2)))[0] == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.first_cases(3)
+@pytest.mark.first_cases(2)
 @pytest.mark.parametrize("at", PLACES[1:])
 @pytest.mark.parametrize("probe", POLYGONS, ids=lambda probe: probe.name)
 def test_plate_under_a_polygon(at, probe):

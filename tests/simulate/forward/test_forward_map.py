@@ -98,6 +98,7 @@ def test_four_electrodes_with_the_probe_on_them_too(four_map):
     assert error.max() < 5e-3
 
 
+@pytest.mark.first_cases(1)
 def test_random_orientations(turned_map):
     """Over electrodes and beside them."""
     error = errors(turned_map, *draw(turned_map, 10, seed=10))

@@ -196,7 +196,7 @@ def test_result_says_what_was_solved(film):
     assert 0.0 < solved.mesh_error <= solved.estimated_error < 1e-3
 
 
-@pytest.mark.first_cases(3)
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("seed", range(6))
 def test_mesh_error_is_a_bound(film, seed):
     """Against a refined solve, for the worst charge over the press's largest, probes on electrodes and far out too."""

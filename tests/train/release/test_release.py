@@ -35,13 +35,9 @@ def release(dataset, tmp_path_factory):
     return train_model(dataset, tmp_path_factory.mktemp("models") / "mine", QUICK, command="make it")
 
 
-QUICK_FILMS = "four-25um-biaxial-films"
-"""Of the models whose film is not that of the other tests, the one that is measured in every run."""
-
-
 def _measured_here(name):
-    is_slow = name.endswith("-films") and name != QUICK_FILMS
-    return pytest.param(name, marks=pytest.mark.slow) if is_slow else name
+    """The films of these models are others than that of all tests: they would have to be solved."""
+    return pytest.param(name, marks=pytest.mark.slow) if name.endswith("-films") else name
 
 
 @pytest.fixture(scope="module", params=map(_measured_here, model_names(MODELS)))

@@ -6,6 +6,7 @@ import hashlib
 import tracemalloc
 import zlib
 
+import jsonschema_rs
 import numpy as np
 import onnxruntime
 import orjson
@@ -305,6 +306,15 @@ def test_binary_data_that_do_not_fit(ask, changes, cut, said):
     status, error = refusal(ask("POST", INFER, body[:cut], inference_header_content_length=str(length)))
     assert status == 400
     assert said in error
+
+
+def test_what_is_not_finite_is_null(ask, bare):
+    """The toy film divides by the sum of the charges. JSON has no NaN, and the document says so."""
+    status, _, body = ask("POST", INFER, orjson.dumps(request([[0.0, 0.0, 0.0]])))
+    np.testing.assert_array_equal(bare([[0.0, 0.0, 0.0]])["contact"].ravel(), [np.nan, np.nan, 0.0])
+    assert (status, orjson.loads(body)["outputs"][0]["data"]) == (200, [None, None, 0.0])
+    schema = orjson.loads(ask("GET", "/openapi.json")[2])["components"]["schemas"]["answer"]
+    jsonschema_rs.Draft202012Validator(schema).validate(orjson.loads(body))
 
 
 def test_binary_nan_is_refused_by_name(ask):

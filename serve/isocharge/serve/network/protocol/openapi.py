@@ -140,7 +140,7 @@ _OUTPUT = _object(
         "name": {"enum": list(OUTPUTS)},
         "datatype": {"const": "FP32"},
         "shape": _list_of(_WHOLE),
-        "data": _list_of({"type": "number"}),
+        "data": _list_of({"type": ["number", "null"], "description": "null: not finite, which JSON has no number for"}),
     },
     ["name", "datatype", "shape"],
 )
