@@ -112,6 +112,7 @@ def read_port(stream: "StreamSettings", models: Path | None, link: "ReaderEnd") 
 def _follow(stream: "StreamSettings", models: Path | None, link: "ReaderEnd") -> None:
     from isocharge.serve import Policy, Predictor, Recorder, TouchStream, open_source
     from isocharge.serve.live.recorded_stream import RecordedStream
+    from isocharge.serve.live.time_slice import ask_for_short_slices
 
     predictor, board = Predictor(stream.model, models=models), board_of(stream.device)
     touch = TouchStream(predictor, board, frame_id=stream.name)
@@ -126,6 +127,7 @@ def _follow(stream: "StreamSettings", models: Path | None, link: "ReaderEnd") ->
         source = stack.enter_context(open_source(stream.port, baud=stream.baud, reconnect=True, request=request))
         if recorder:
             stack.enter_context(recorder)
+        ask_for_short_slices()
         for record, _ in stack.enter_context(closing(live.follow(source))):
             feed.put(record)
             if not link.is_open:  # the page's process was killed: nobody else would ever end this one

@@ -142,6 +142,7 @@ def stream_command(
     from isocharge.serve import Policy, Predictor, Recorder, TouchStream, find_model, open_source
     from isocharge.serve.live.line_queue import LineQueue
     from isocharge.serve.live.recorded_stream import RecordedStream
+    from isocharge.serve.live.time_slice import ask_for_short_slices
 
     settings = page_settings(live_host, live_port, live_token, insecure, tls_cert, tls_key) if live_page else None
     predictor, board = Predictor(model, models=models), _board(device, offset_limit_pC)
@@ -176,6 +177,7 @@ def stream_command(
         if recorder:
             stack.enter_context(recorder)
         records = stack.enter_context(closing(live.follow(source)))  # closed before the recorder
+        ask_for_short_slices()  # after the page's process was started, which should not have them
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
             write_records(islice(records, count), write, latencies)
