@@ -52,8 +52,8 @@ def charge_pC(x_mm, y_mm, force_N):
 
 
 def presses(rate_Hz):
-    """A second of rest before every press, so that a stream that begins at any time finds its tare."""
-    scripts = [wander(seed=seed, seconds=2.5, rate_Hz=rate_Hz) for seed in range(12)]
+    """A second of rest before every short press: a stream that begins at any time finds its tare in 2,000 frames."""
+    scripts = [wander(seed=seed, seconds=1.0 + min(1.5, 1500 / rate_Hz), rate_Hz=rate_Hz) for seed in range(12)]
     columns = [np.concatenate([getattr(script, name) for script in scripts]) for name in ("x_mm", "y_mm", "force_N")]
     return Script(*columns, rate_Hz)
 
