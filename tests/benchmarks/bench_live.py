@@ -244,7 +244,7 @@ def main():
                 in_browser = options.browser and viewers > 0
                 latencies, lost, ages, memory, browsed = one_round(
                     port,
-                    viewers - in_browser,
+                    viewers,
                     options.seconds,
                     Path(name),
                     f"{number}-{viewers}",

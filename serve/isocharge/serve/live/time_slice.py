@@ -1,8 +1,8 @@
 """Asks the scheduler of Linux for short time slices: who wants little at a time gets it sooner.
 
-A reader works for a tenth of a millisecond whenever a frame comes. With the usual slices of some milliseconds, another
-process may finish its own first, or interrupt the reader in the middle of a frame. Since Linux 6.12 every process may
-choose its own; elsewhere nothing changes.
+A reader works for some tenths of a millisecond whenever a frame comes. With the usual slices of some milliseconds,
+another process may finish its own first, or interrupt the reader in the middle of a frame. Since Linux 6.12 every
+process may choose its own; elsewhere nothing changes.
 """
 
 import ctypes
@@ -11,8 +11,8 @@ import platform
 import struct
 import sys
 
-SLICE_NS = 100_000
-"""The shortest slice that Linux grants, and about the time that a frame takes, ns."""
+SLICE_NS = 500_000
+"""Longer than a frame takes, ns: a shorter slice ends in the middle of one, with a longer one others come first."""
 
 CALLS = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
 """Numbers of the system call sched_setattr by machine: the C library of Debian 12 has no function for it."""
