@@ -44,6 +44,17 @@ def test_linux_grants_the_slice_and_keeps_the_rest():
 
 
 @needs_linux
+def test_a_policy_that_somebody_chose_stays():
+    """Who runs a stream with `chrt` wants that."""
+
+    def work():
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        return time_slice.ask_for_short_slices(), attributes()[0]
+
+    assert in_a_thread(work) == (False, os.SCHED_BATCH)
+
+
+@needs_linux
 def test_a_stream_has_short_slices(film, models, start_command):
     with VirtualSensor(film.charge_pC, wander(seed=2)) as sensor:
         process = start_command("serve", "stream", "linear", "--models", models, "--port", sensor.url)

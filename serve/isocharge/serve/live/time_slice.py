@@ -22,9 +22,13 @@ ATTRIBUTES = struct.Struct("=IIQiIQQQ")
 
 
 def ask_for_short_slices() -> bool:
-    """Ask for slices of SLICE_NS for the calling thread and what it starts later; False where Linux cannot be asked."""
+    """Ask for slices of SLICE_NS for the calling thread and what it starts later.
+
+    Returns:
+        Whether they were granted. Nobody asks on another system, or where somebody chose another scheduling policy.
+    """
     number = CALLS.get(platform.machine())
-    if sys.platform != "linux" or number is None:
+    if sys.platform != "linux" or number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
         return False
     nice = os.getpriority(os.PRIO_PROCESS, 0)
     attributes = ATTRIBUTES.pack(ATTRIBUTES.size, os.SCHED_OTHER, 0, nice, 0, SLICE_NS, 0, 0)
