@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import pytest
 
-from isocharge.cli import main
-from isocharge.extras import PACKAGES
+from isocharge.cli.main import main
+from isocharge.common.extras import PACKAGES
 
 ROOT = Path(__file__).parents[1]
 

@@ -9,12 +9,20 @@ import time
 import numpy as np
 import pytest
 
-from isocharge.errors import InputError, OutputError, OutputExists
-from isocharge.files import bounded_lines, new_file, read_whole, sha256_of
-from isocharge.number_text import number_of
-from isocharge.resumable_run import resume_folder
+from isocharge.common.errors import InputError, OutputError, OutputExists
+from isocharge.common.files import bounded_lines, new_file, read_whole, sha256_of
+from isocharge.common.number_text import number_of
+from isocharge.common.resumable_run import resume_folder
+from isocharge.common.tables import (
+    DEEPEST,
+    MOST_JSON_BYTES,
+    MOST_TOML_BYTES,
+    parse_json,
+    parse_toml,
+    read_json,
+    read_toml,
+)
 from isocharge.simulate.execution.checkpointed_map import CheckpointedMap
-from isocharge.tables import DEEPEST, MOST_JSON_BYTES, MOST_TOML_BYTES, parse_json, parse_toml, read_json, read_toml
 from isocharge.train.training.checkpoint import Checkpoint
 
 

@@ -62,7 +62,7 @@ def test_licence_and_readme_came_along(fresh, tmp_path):
 @pytest.mark.parametrize("stage", ["simulate", "train"])
 def test_a_missing_extra_says_so_in_python_too(fresh, tmp_path, stage):
     done = run(fresh, "python", "-c", f"import isocharge.{stage}", cwd=tmp_path)
-    assert "isocharge.errors.MissingExtra" in done.stderr
+    assert "isocharge.common.errors.MissingExtra" in done.stderr
     assert f"pip install 'isocharge[{stage}]'" in done.stderr
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from isocharge.json_values import finite_or_none, plain_values
+from isocharge.common.json_values import finite_or_none, plain_values
 
 
 @pytest.mark.parametrize(

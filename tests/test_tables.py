@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from isocharge.errors import DeviceError, SensorError
-from isocharge.tables import LONGEST_VALUE, Table, is_number, is_whole, parse_toml, read_toml, shown
+from isocharge.common.errors import DeviceError, SensorError
+from isocharge.common.tables import LONGEST_VALUE, Table, is_number, is_whole, parse_toml, read_toml, shown
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),

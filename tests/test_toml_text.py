@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.toml_text import to_toml
+from isocharge.common.toml_text import to_toml
 
 TEXT = st.text(st.characters(codec="utf-8"), max_size=8)
 SCALARS = TEXT | st.booleans() | st.integers(-(2**62), 2**62) | st.floats(allow_nan=False)

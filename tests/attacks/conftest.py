@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from isocharge.errors import IsochargeError
+from isocharge.common.errors import IsochargeError
 
 FAST_SHARE = 0.01
 """Share of the inputs in `make test`."""

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from isocharge.files import sha256_of
-from isocharge.resumable_run import resume_folder
+from isocharge.common.files import sha256_of
+from isocharge.common.resumable_run import resume_folder
 from isocharge.serve import (
     Chunk,
     Recorder,

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.errors import SceneError, SolveError
+from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
     Circle,
     Equilibrium,

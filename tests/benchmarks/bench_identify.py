@@ -12,7 +12,7 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from isocharge.files import write_whole
+from isocharge.common.files import write_whole
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 from isocharge.simulate.identifiability.identification import identify, search_radius
 from isocharge.simulate.plots.limit_map import TICKS, draw_limit_map

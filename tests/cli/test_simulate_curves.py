@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from isocharge.cli import main
+from isocharge.cli.main import main
 
 SENSOR = "three-25um-biaxial"
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from isocharge.cli.simulate.design import _sides, _zone
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 from isocharge.simulate import load_sensor
 from isocharge.simulate.layout import design as design_module
 

@@ -9,7 +9,7 @@ import pytest
 from isocharge.cli.train.bench.dialogue import Dialogue
 from isocharge.cli.train.bench.events import Ended, Typed
 from isocharge.cli.train.bench.screen import Screen
-from isocharge.errors import PortLost
+from isocharge.common.errors import PortLost
 from isocharge.serve import Frame, SteadyPress, encode_frame, read_presses
 from isocharge.serve.live.steady_press import AWAY, Phase, Watched
 from isocharge.simulate import Circle, load_amplifier, load_sensor

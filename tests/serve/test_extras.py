@@ -2,8 +2,8 @@
 
 import pytest
 
-from isocharge.errors import MissingExtra
-from isocharge.extras import require
+from isocharge.common.errors import MissingExtra
+from isocharge.common.extras import require
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from isocharge.errors import DeviceError
+from isocharge.common.errors import DeviceError
 from isocharge.serve import (
     Frame,
     HumRule,

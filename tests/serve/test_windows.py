@@ -53,7 +53,7 @@ def run(code, *arguments, stdin=None, cwd=None):
     return done.returncode, done.stdout, done.stderr
 
 
-COMMAND = "from isocharge.cli import main; main()"
+COMMAND = "from isocharge.cli.main import main; main()"
 
 
 def test_posix_is_hidden():
@@ -150,7 +150,7 @@ def test_a_stream_is_recorded_and_ends_by_itself(tmp_path):
 def test_a_pseudo_terminal_says_what_it_needs(tmp_path):
     code = """
 from isocharge.serve import VirtualSensor, wander
-from isocharge.errors import PortError
+from isocharge.common.errors import PortError
 try:
     with VirtualSensor(lambda x, y, force: force[:, None] * [[1.0, 1.0, 1.0]], wander(seed=1)):
         pass
@@ -184,8 +184,8 @@ def locking(descriptor, mode, size):
     held.add(os.fstat(descriptor).st_ino)
 
 sys.modules["msvcrt"] = types.SimpleNamespace(locking=locking, LK_NBLCK=2)
-from isocharge.errors import OutputExists
-from isocharge.resumable_run import resume_folder
+from isocharge.common.errors import OutputExists
+from isocharge.common.resumable_run import resume_folder
 with resume_folder(Path("run"), {"seed": 1}) as work:
     work.save("part", b"data", final=True)
     try:

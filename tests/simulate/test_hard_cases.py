@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import SceneError, SolveError
+from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import Circle, Film, Polygon, Probe, SolveSettings, load_sensor, press, touch_charge
 
 REASONS = (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from isocharge.errors import OutputExists
+from isocharge.common.errors import OutputExists
 from isocharge.simulate import Circle, Fix, ForwardMap, Meeting, Resolution, Theory, load_sensor
 from isocharge.simulate.execution.workers import Workers
 from isocharge.simulate.forward import forward_map

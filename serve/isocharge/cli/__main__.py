@@ -1,6 +1,6 @@
 """`python -m isocharge.cli`."""
 
-from isocharge.cli import main
+from isocharge.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -9,6 +9,7 @@ The packages follow the way of a frame; `serve/README.md` shows them.
 
 from typing import TYPE_CHECKING
 
+from isocharge.common.versions import version_attribute
 from isocharge.serve.examination.port_check import Examination, examine
 from isocharge.serve.frames.autodetect import AutoParser
 from isocharge.serve.frames.binary import BinaryParser, encode_frame
@@ -46,7 +47,6 @@ from isocharge.serve.signal_chain.tare import Tare, TareRule
 from isocharge.serve.virtual_sensor.faults import Faults
 from isocharge.serve.virtual_sensor.script import Script, read_script, wander
 from isocharge.serve.virtual_sensor.sensor import Truth, VirtualSensor
-from isocharge.versions import version_attribute
 
 __all__ = [
     "AutoParser",

@@ -11,8 +11,8 @@ Five lines give the charges of one press.
 
 from typing import TYPE_CHECKING
 
-from isocharge.extras import require
-from isocharge.versions import version_attribute
+from isocharge.common.extras import require
+from isocharge.common.versions import version_attribute
 
 with require("simulate"):
     from isocharge.simulate.artwork.leads import Leads, route

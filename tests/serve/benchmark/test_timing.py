@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from isocharge.errors import IsochargeError
+from isocharge.common.errors import IsochargeError
 from isocharge.serve import Predictor, find_model, load_model
 from isocharge.serve.benchmark import (
     Contender,

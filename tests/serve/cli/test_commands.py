@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pytest
 
-from isocharge.errors import ChargeError, InputError, ModelError, PortError, PortLost
+from isocharge.common.errors import ChargeError, InputError, ModelError, PortError, PortLost
 from isocharge.serve import Script, VirtualSensor, wander
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 

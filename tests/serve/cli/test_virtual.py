@@ -7,7 +7,7 @@ import signal
 import numpy as np
 import pytest
 
-from isocharge.errors import InputError, OutputExists, SensorError
+from isocharge.common.errors import InputError, OutputExists, SensorError
 from isocharge.serve import BinaryParser, Port
 from isocharge.simulate import Circle, ForwardMap, load_sensor, virtual_film
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from isocharge.cli.serve.doctor import report_lines
-from isocharge.errors import PortError
+from isocharge.common.errors import PortError
 from isocharge.serve import Script, VirtualSensor, device_from_table, encode_text, examine
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 

@@ -26,7 +26,7 @@ from rosbags.rosbag2 import Reader, storage_mcap
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import get_types_from_msg
 
-from isocharge.errors import InputError, OutputError, OutputExists
+from isocharge.common.errors import InputError, OutputError, OutputExists
 from isocharge.serve import PredictionRecord
 from isocharge.serve.export.mcap_file import McapFile, RecordEncoding
 from isocharge.serve.export.record_schema import record_schema

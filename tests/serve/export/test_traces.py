@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.errors import RecordingError
+from isocharge.common.errors import RecordingError
+from isocharge.common.tables import Table
 from isocharge.serve.export import traces as module
 from isocharge.serve.export.traces import TraceCollector
-from isocharge.tables import Table
 
 FIELDS = ("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit")
 numbers = st.floats(-100.0, 100.0, width=32)

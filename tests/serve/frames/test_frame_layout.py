@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from isocharge.errors import DeviceError
+from isocharge.common.errors import DeviceError
 from isocharge.serve import DescribedParser, Frame, frame_layout
 
 ROBOTIQ = (Path(__file__).parents[2] / "data" / "frames" / "robotiq_ft300.toml").read_text("utf-8")

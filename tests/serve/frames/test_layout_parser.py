@@ -15,7 +15,7 @@ from crcmod.predefined import mkPredefinedCrcFun
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.errors import DeviceError
+from isocharge.common.errors import DeviceError
 from isocharge.serve import DescribedParser, Frame, frame_layout
 from isocharge.serve.frames.layout_parser import described_parser
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.errors import ChargeError, DeviceError, TareError
+from isocharge.common.errors import ChargeError, DeviceError, TareError
 from isocharge.serve import (
     AutoParser,
     BinaryParser,

@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 from isocharge.serve import UdpSink, csv_header, csv_line
 
 ELECTRODES = ("A", "B")

@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from isocharge.errors import RecordingError
+from isocharge.common.errors import RecordingError
 from isocharge.serve import (
     Chunk,
     Frame,

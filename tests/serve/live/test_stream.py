@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from isocharge.errors import ChargeError, ModelError, PortError, TareError
+from isocharge.common.errors import ChargeError, ModelError, PortError, TareError
 from isocharge.serve import (
     BinaryParser,
     Chain,

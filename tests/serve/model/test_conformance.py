@@ -8,7 +8,7 @@ import pytest
 from google.protobuf import text_format
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
-from isocharge.errors import ChargeError
+from isocharge.common.errors import ChargeError
 from isocharge.serve import Predictor, check_golden, find_model, load_model
 from isocharge.serve.model.repository import model_names
 from isocharge.serve.model.session import OUTPUTS

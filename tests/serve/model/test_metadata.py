@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from isocharge.errors import ModelError
+from isocharge.common.errors import ModelError
 from isocharge.serve import ModelMetadata
 
 WHERE = "models/linear/1/model.onnx"

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
 
-from isocharge.errors import ChargeError, ModelError, OutputExists
-from isocharge.files import sha256_of
+from isocharge.common.errors import ChargeError, ModelError, OutputExists
+from isocharge.common.files import sha256_of
 from isocharge.serve import check_golden, load_model, write_model
 from isocharge.serve.model.golden import make_golden
 
@@ -150,7 +150,7 @@ def test_interrupted_writing_leaves_nothing_behind(film, tmp_path, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("isocharge.files._rename", interrupt)
+    monkeypatch.setattr("isocharge.common.files._rename", interrupt)
     with pytest.raises(KeyboardInterrupt):
         write(film, tmp_path / "linear")
     assert list(tmp_path.iterdir()) == []

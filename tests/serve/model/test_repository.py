@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from isocharge.errors import ModelError
+from isocharge.common.errors import ModelError
 from isocharge.serve import find_model
 from isocharge.serve.model.repository import model_names
 

@@ -8,7 +8,7 @@ import stat
 import pytest
 import trustme
 
-from isocharge.errors import InputError, ListenError, TokenError
+from isocharge.common.errors import InputError, ListenError, TokenError
 from isocharge.serve.network.address import Address, check_exposure
 from isocharge.serve.network.http import App, HttpServer
 from isocharge.serve.network.tls import Tls

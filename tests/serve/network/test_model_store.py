@@ -14,8 +14,8 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from isocharge.errors import ModelError, ModelNotFound
-from isocharge.files import sha256_of
+from isocharge.common.errors import ModelError, ModelNotFound
+from isocharge.common.files import sha256_of
 from isocharge.serve.network import model_store
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler

@@ -2,7 +2,7 @@
 
 import pytest
 
-from isocharge.errors import OutputError, OutputExists, RecordingError
+from isocharge.common.errors import OutputError, OutputExists, RecordingError
 from isocharge.serve import Chunk, RecordedClock, Recorder, Recording
 
 CHUNKS = [Chunk(bytes([k, 255 - k]), 1e9 + 0.1 * k, 1000 * k, 1.5 if k == 3 else 0.0) for k in range(5)]

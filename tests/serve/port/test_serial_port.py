@@ -9,7 +9,7 @@ from unittest import mock
 import pytest
 import serial
 
-from isocharge.errors import PortError, PortLost
+from isocharge.common.errors import PortError, PortLost
 from isocharge.serve import Port
 from isocharge.serve.virtual_sensor.pseudo_port import PORT_BUFFER, PseudoPort
 

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 from isocharge.serve import Port, open_source
 
 

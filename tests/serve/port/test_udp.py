@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-from isocharge.errors import PortError
+from isocharge.common.errors import PortError
 from isocharge.serve import Port
 from isocharge.serve.port.udp import is_text
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from isocharge.errors import PressError
+from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, Predictor, check_presses
 from isocharge.serve.prediction.agreement import Common, ErrorSummary
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from isocharge.errors import PressError
+from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.prediction import csv_numbers, measured_presses
 from isocharge.serve.prediction.measured_presses import KINDS, parse_presses

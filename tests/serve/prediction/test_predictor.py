@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.errors import ChargeError, ModelError
+from isocharge.common.errors import ChargeError, ModelError
 from isocharge.serve import Contact, Contacts, Predictor
 from isocharge.serve.prediction.bound_press import BoundPress
 

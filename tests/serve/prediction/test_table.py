@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from isocharge.errors import ChargeError
+from isocharge.common.errors import ChargeError
 from isocharge.serve import Contacts, read_charges, table_records, write_contacts
 
 NAMES = ("A", "B", "C")

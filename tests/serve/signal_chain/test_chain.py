@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import TareError
+from isocharge.common.errors import TareError
 from isocharge.serve import Chain, LeakRule, TareRule, TouchRule
 from isocharge.serve.signal_chain.chain import ChainState, advance
 from isocharge.serve.signal_chain.contact import Touch, update_contact

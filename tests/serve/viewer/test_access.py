@@ -4,7 +4,7 @@ import base64
 
 import pytest
 
-from isocharge.errors import OriginError, TokenError
+from isocharge.common.errors import OriginError, TokenError
 from isocharge.serve.network.token import Token
 from isocharge.serve.viewer.access import Access
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from isocharge.errors import RequestError
+from isocharge.common.errors import RequestError
 from isocharge.serve.viewer.messages import LIVE_ACTIONS, REPLAY_ACTIONS, PageRequest, confirmed_number, parse_request
 
 ACTIONS = LIVE_ACTIONS + REPLAY_ACTIONS

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.deflection_field import points_mm, read_deflection_field
+from isocharge.common.deflection_field import points_mm, read_deflection_field
 from isocharge.serve.viewer.messages import samples_message
 from isocharge.serve.viewer.sample import SampleFormat
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from isocharge.errors import ConfigError
+from isocharge.common.errors import ConfigError
 from isocharge.serve.viewer.streams_file import StreamSettings, read_streams
 
 ONE = '[[stream]]\nmodel = "linear"\nport = "board"\n'

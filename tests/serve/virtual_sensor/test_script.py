@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.errors import SceneError
+from isocharge.common.errors import SceneError
 from isocharge.serve import Script, read_script, wander
 
 

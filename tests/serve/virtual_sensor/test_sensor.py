@@ -7,7 +7,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from isocharge.errors import PortError, SceneError
+from isocharge.common.errors import PortError, SceneError
 from isocharge.serve import (
     AutoParser,
     BinaryParser,

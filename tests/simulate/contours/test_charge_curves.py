@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from isocharge.errors import SceneError, SensorError
+from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate import (
     Circle,
     Curves,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from isocharge.errors import SceneError, SensorError
+from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate import (
     Circle,
     ContourField,

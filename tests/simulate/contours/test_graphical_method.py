@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from isocharge.errors import ChargeError, SensorError
+from isocharge.common.errors import ChargeError, SensorError
 from isocharge.simulate import (
     Circle,
     Curves,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from isocharge.errors import ChargeError, SceneError, SensorError
+from isocharge.common.errors import ChargeError, SceneError, SensorError
 from isocharge.simulate import (
     Circle,
     Film,

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from isocharge.errors import OutputExists, SceneError, SolveError
-from isocharge.resumable_run import draft_of, resume_folder
+from isocharge.common.errors import OutputExists, SceneError, SolveError
+from isocharge.common.resumable_run import draft_of, resume_folder
 from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, SweepCallbacks, Theory, load_sensor, run_sweep
 from isocharge.simulate.execution.workers import Workers
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from isocharge.errors import SceneError
+from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Polygon, Sweep
 from isocharge.simulate.numerics.disk import lattice
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.errors import DatasetError, OutputError, OutputExists
+from isocharge.common.errors import DatasetError, OutputError, OutputExists
 from isocharge.simulate import Samples, load_sensor, read_dataset, write_dataset
 from isocharge.simulate.dataset.card import COLUMNS
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.errors import OutputError, OutputExists, SceneError
+from isocharge.common.errors import OutputError, OutputExists, SceneError
 from isocharge.simulate import (
     Circle,
     ForwardMap,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.resumable_run import resume_parts
+from isocharge.common.resumable_run import resume_parts
 from isocharge.simulate.execution.checkpointed_map import CheckpointedMap
 
 

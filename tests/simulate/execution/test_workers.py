@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from isocharge.errors import InputError, MissingExtra, WorkersLost
+from isocharge.common.errors import InputError, MissingExtra, WorkersLost
 from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, SweepCallbacks, Theory, load_sensor, run_sweep
 from isocharge.simulate.execution import workers as module
 from isocharge.simulate.execution.workers import Workers, dask_workers, local_workers

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import SceneError
+from isocharge.common.errors import SceneError
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Resolution, SolveSettings, Theory, load_sensor
 from isocharge.simulate.numerics.disk import sunflower
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.errors import ChargeError, SceneError
+from isocharge.common.errors import ChargeError, SceneError
 from isocharge.simulate.forward.checks import as_charges, check_forces, check_presses, check_radius
 
 FORCES = (0.1, 2.0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
-from isocharge.deflection_field import read_deflection_field
-from isocharge.errors import InputError
+from isocharge.common.deflection_field import read_deflection_field
+from isocharge.common.errors import InputError
 from isocharge.simulate import Circle, load_sensor, press
 from isocharge.simulate.forward.deflection import deflection_field
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import InputError, SceneError
+from isocharge.common.errors import InputError, SceneError
 from isocharge.simulate import Circle, FilmFamily, FilmPrior, FilmSpread, load_sensor, press, touch_charge
 
 SPREAD = FilmSpread(pretension=0.2e6, young=0.02, thickness=0.02, probe_radius=0.03e-3)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import SceneError, SolveError
+from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
     Circle,
     ForwardMap,

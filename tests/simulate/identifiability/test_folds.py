@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from isocharge.errors import SceneError
+from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     ChargeFunction,
     ChargeSpline,

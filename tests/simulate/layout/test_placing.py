@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 from isocharge.simulate import Electrode
 from isocharge.simulate.layout.placing import Parameters, Rules, Zone, axial_choices
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import InputError, SceneError
+from isocharge.common.errors import InputError, SceneError
 from isocharge.simulate import Circle, Electrode, Polygon, SolveSettings, load_sensor, press, touch_charge
 from isocharge.simulate.layout.scene import DesignScene, Nuisances
 from isocharge.simulate.layout.stress_table import settings_for

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import InputError, IsochargeError, SensorError
+from isocharge.common.errors import InputError, IsochargeError, SensorError
 from isocharge.simulate import Calibration, DesignTask, Electrode, Polygon
 from isocharge.simulate.layout.design import design
 from isocharge.simulate.layout.goal import Goal

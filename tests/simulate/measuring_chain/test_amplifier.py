@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 from isocharge.simulate import Amplifier, load_amplifier, noise_model
 
 CLEAN, RATE = noise_model("clean"), 200.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 from isocharge.simulate import NoiseModel, load_amplifier, noise_model
 from isocharge.simulate.measuring_chain.levels import AMPLIFIER_LEVELS
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from isocharge.errors import SceneError
+from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Film, Polygon, Probe, Resolution, Theory
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import truncnorm
 
-from isocharge.errors import SceneError, SensorError
+from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate import Circle, FilmPrior, FilmSpread, load_sensor, virtual_film
 
 PRIOR = FilmPrior(load_sensor("four-25um-uniaxial"), Circle(1e-3))

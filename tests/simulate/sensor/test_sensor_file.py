@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.errors import SensorError
+from isocharge.common.errors import SensorError
 from isocharge.simulate import (
     Calibration,
     built_in_sensors,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.errors import OutputExists, SensorError
+from isocharge.common.errors import OutputExists, SensorError
 from isocharge.simulate import (
     Calibration,
     Electrode,

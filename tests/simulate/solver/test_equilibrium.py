@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import SceneError
+from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     Circle,
     Film,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.errors import SceneError
+from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Film, Polygon, Resolution, SolveSettings, press
 from isocharge.simulate.mesh.elements import Geometry
 from isocharge.simulate.solver.press import needed_resolution

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import SolveError
+from isocharge.common.errors import SolveError
 from isocharge.simulate import Circle, Film, Polygon, Probe, SolveSettings, Theory, load_sensor, press, touch_charge
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.template import template_for

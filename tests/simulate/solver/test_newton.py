@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import SceneError, SolveError
+from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import Circle, Polygon, Resolution, SolveSettings, Theory, load_sensor, press, touch_charge
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.solver import newton

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import SensorError
+from isocharge.common.errors import SensorError
 from isocharge.simulate import (
     Circle,
     Electrode,

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from isocharge.errors import ChargeError, InputError
+from isocharge.common.errors import ChargeError, InputError
 from isocharge.simulate import ChargeSpline, Circle, noise_model
 from isocharge.train import BayesLimit, Scene, bayes_estimate, bayes_limit
 from isocharge.train.bayes import cache as cache_module

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from isocharge.errors import ChargeError, InputError
+from isocharge.common.errors import ChargeError, InputError
 from isocharge.simulate import ChargeSpline, NoiseModel, noise_model
 from isocharge.train.bayes.posterior import Posterior
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.train.calibration.conftest import contacts, presses_of, rig
 
-from isocharge.errors import ModelError, PressError, SceneError
+from isocharge.common.errors import ModelError, PressError, SceneError
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle, Polygon, load_sensor, sensor_from_dict, sensor_to_dict
 from isocharge.train import calibrate, films_for, next_presses

@@ -10,7 +10,7 @@ from tests.train.calibration.conftest import contacts, rig
 from typer.testing import CliRunner
 
 from isocharge.cli import app
-from isocharge.errors import InputError, ModelError, PressError
+from isocharge.common.errors import InputError, ModelError, PressError
 from isocharge.serve import Predictor, load_model, read_presses, write_presses
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from isocharge.train import calibrate, films_for, read_earlier, write_calibration

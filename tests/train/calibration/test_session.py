@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.errors import PressError
+from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses
 from isocharge.train import BenchSession, calibrate, next_presses
 from isocharge.train.calibration.session import Answer, Reply, read_answer

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.errors import TrainingError
+from isocharge.common.errors import TrainingError
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.domain import ContactDomain
 

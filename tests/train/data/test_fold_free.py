@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import ChargeError, DatasetError
+from isocharge.common.errors import ChargeError, DatasetError
 from isocharge.serve import Predictor
 from isocharge.simulate import (
     ChargeFunction,

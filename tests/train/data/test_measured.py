@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.errors import PressError
+from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle
 from isocharge.train.data.measured import dataset_of, held_out, is_measured

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import DatasetError
+from isocharge.common.errors import DatasetError
 from isocharge.simulate import Samples
 from isocharge.train.data.presses import domain_of, presses_of, split_by_position
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.errors import DeviceError, TareError
+from isocharge.common.errors import DeviceError, TareError
 from isocharge.serve import Predictor
 from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
 from isocharge.serve.live.device_file import device_from_table

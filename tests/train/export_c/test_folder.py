@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.errors import ModelError, OutputExists
+from isocharge.common.errors import ModelError, OutputExists
 from isocharge.serve import (
     BinaryParser,
     Chunk,

@@ -8,7 +8,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from isocharge.errors import ModelError
+from isocharge.common.errors import ModelError
 from isocharge.serve import find_model, write_model
 from isocharge.serve.model.model_folder import load_model
 from isocharge.train.export_c.blocks import Block, diagonal_blocks

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import DatasetError
+from isocharge.common.errors import DatasetError
 from isocharge.simulate import FilmPrior, Piezo, load_sensor
 from isocharge.train.films import film_presses
 from isocharge.train.films.film_presses import draw_film_presses, film_charge, total_charge

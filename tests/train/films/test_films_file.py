@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from isocharge.errors import ModelError
+from isocharge.common.errors import ModelError
 from isocharge.simulate import load_sensor
 from isocharge.train import read_films
 from isocharge.train.data.presses import position_error

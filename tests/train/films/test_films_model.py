@@ -9,7 +9,7 @@ import onnx
 import pytest
 import torch
 
-from isocharge.errors import InputError, ModelError, OutputExists, SceneError
+from isocharge.common.errors import InputError, ModelError, OutputExists, SceneError
 from isocharge.serve import Predictor, check_golden, load_model
 from isocharge.simulate import Calibration, load_sensor
 from isocharge.train import write_film_model

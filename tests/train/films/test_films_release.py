@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.errors import OutputExists
+from isocharge.common.errors import OutputExists
 from isocharge.serve import Predictor, check_golden, load_model
 from isocharge.train import read_films, train_films
 from isocharge.train.films import fit as films_fit

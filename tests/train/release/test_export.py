@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.errors import TrainingError
+from isocharge.common.errors import TrainingError
 from isocharge.simulate import noise_model
 from isocharge.train.data.noise import noisy_charges
 from isocharge.train.release.export import export_onnx

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import halfnorm
 
-from isocharge.errors import OutputExists
+from isocharge.common.errors import OutputExists
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.model.repository import model_names
 from isocharge.simulate import Circle, Sweep, noise_model, sensor_from_dict, solve_maps

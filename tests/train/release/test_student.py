@@ -7,7 +7,7 @@ import onnx
 import pytest
 from onnx import numpy_helper
 
-from isocharge.errors import DatasetError, ModelError, OutputExists
+from isocharge.common.errors import DatasetError, ModelError, OutputExists
 from isocharge.serve import Predictor, load_model
 from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, run_sweep
 from isocharge.train import FitConfig, NetworkConfig, TaughtScene, TrainingConfig, distil_model, train_model

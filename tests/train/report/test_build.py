@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.cli import main
-from isocharge.errors import DatasetError, ModelError, OutputExists
+from isocharge.cli.main import main
+from isocharge.common.errors import DatasetError, ModelError, OutputExists
 from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, run_sweep, write_dataset
 from isocharge.train.data.domain import inner_radius
 from isocharge.train.report import QUICK, write_report

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from isocharge.cli import main
-from isocharge.errors import ModelError, PressError
+from isocharge.cli.main import main
+from isocharge.common.errors import ModelError, PressError
 from isocharge.serve import MeasuredPresses, Predictor, check_presses, find_model, write_presses
 from isocharge.simulate import Circle, ForwardMap, load_sensor, read_dataset, virtual_film, write_dataset
 from isocharge.train.data.domain import ContactDomain

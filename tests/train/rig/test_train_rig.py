@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.errors import PressError
+from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, Predictor, check_presses, read_presses
 from isocharge.simulate import Circle, ForwardMap, load_sensor, virtual_film
 from isocharge.train import FitConfig, NetworkConfig, Rig, TrainingConfig, train_rig

@@ -10,8 +10,8 @@ import onnx
 import pytest
 import torch
 
-from isocharge.errors import OutputExists
-from isocharge.resumable_run import resume_parts
+from isocharge.common.errors import OutputExists
+from isocharge.common.resumable_run import resume_parts
 from isocharge.simulate import Circle, Sweep, read_dataset, run_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network, train_model
 from isocharge.train.training import checkpoint

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.errors import ConfigError
+from isocharge.common.errors import ConfigError
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, load_config
 
 CONFIGS = Path(__file__).parents[3] / "train" / "configs"

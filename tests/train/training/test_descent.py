@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from isocharge.errors import TrainingError
+from isocharge.common.errors import TrainingError
 from isocharge.train.training.checkpoint import Checkpoint
 from isocharge.train.training.descent import REPORT_EVERY, Descent, TrainingStage
 from isocharge.train.training.network import Perceptron

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from isocharge.errors import ConfigError, InputError, TrainingError
+from isocharge.common.errors import ConfigError, InputError, TrainingError
 from isocharge.simulate import Dataset, Samples, noise_model
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit_network
 from isocharge.train.data.noise import noisy_charges

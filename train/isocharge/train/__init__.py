@@ -11,8 +11,8 @@ A few lines make a model from a dataset.
 
 from typing import TYPE_CHECKING
 
-from isocharge.extras import require
-from isocharge.versions import version_attribute
+from isocharge.common.extras import require
+from isocharge.common.versions import version_attribute
 
 with require("train"):
     from isocharge.train.bayes.limit import BayesLimit, Scene, bayes_estimate, bayes_limit

@@ -96,7 +96,7 @@ def demo_command(
     if live_page:
         show_live_film(SENSOR, RATE_HZ, seed, live_port, seconds, browser)
         return
-    from isocharge.files import new_folder
+    from isocharge.common.files import new_folder
     from isocharge.serve import Predictor
     from isocharge.simulate import Circle, Sweep, load_sensor, read_dataset, solve_maps, write_sweep
     from isocharge.train import load_config, train_model

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.plots.figure import FELT, PRESSED, new_figure, save_picture
 from isocharge.simulate.plots.film import (
     draw_charge_map,

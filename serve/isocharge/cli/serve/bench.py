@@ -16,7 +16,7 @@ import typer
 from isocharge.cli.serve.options import ModelsOption
 from isocharge.cli.shared.options import JsonOption
 from isocharge.cli.shared.terminal import progress, say
-from isocharge.errors import MissingExtra
+from isocharge.common.errors import MissingExtra
 
 if TYPE_CHECKING:
     from isocharge.serve import Model

@@ -11,8 +11,8 @@ import typer
 from isocharge.cli.serve.options import ModelsOption, WaitOption, awaited
 from isocharge.cli.shared.options import DeviceOption, JsonOption, board_of
 from isocharge.cli.shared.terminal import say
-from isocharge.errors import InputError, IsochargeError
-from isocharge.number_text import number_of
+from isocharge.common.errors import InputError, IsochargeError
+from isocharge.common.number_text import number_of
 
 if TYPE_CHECKING:
     from isocharge.serve import Examination
@@ -92,7 +92,7 @@ def doctor_command(
     """
     from json import dumps
 
-    from isocharge.files import refuse_existing
+    from isocharge.common.files import refuse_existing
     from isocharge.serve import Predictor, examine
     from isocharge.serve.examination.listening import BAUDS
 
@@ -158,7 +158,7 @@ def _request(text: str | None, rate_Hz: float) -> "Request | None":
 
 
 def _write(path: Path, examination: "Examination") -> None:
-    from isocharge.files import write_whole
+    from isocharge.common.files import write_whole
     from isocharge.serve.examination.device_text import device_text
 
     try:

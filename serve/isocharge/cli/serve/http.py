@@ -12,9 +12,9 @@ import typer
 from isocharge.cli.serve.options import LogFormat
 from isocharge.cli.shared.standard_streams import announce, write_stderr
 from isocharge.cli.shared.terminal import say
-from isocharge.defaults import BODY_BYTES, CONNECTIONS, HEADER_SECONDS, IDLE_SECONDS, MAX_BATCH
-from isocharge.errors import InputError
-from isocharge.extras import require
+from isocharge.common.defaults import BODY_BYTES, CONNECTIONS, HEADER_SECONDS, IDLE_SECONDS, MAX_BATCH
+from isocharge.common.errors import InputError
+from isocharge.common.extras import require
 
 if TYPE_CHECKING:
     from isocharge.serve.network.protocol import Handler

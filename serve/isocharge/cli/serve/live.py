@@ -29,7 +29,7 @@ from isocharge.cli.shared.live_page import (
 from isocharge.cli.shared.options import board_of
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import log_to_stderr, say
-from isocharge.errors import IsochargeError
+from isocharge.common.errors import IsochargeError
 
 if TYPE_CHECKING:
     from isocharge.serve.viewer.link import ReaderEnd

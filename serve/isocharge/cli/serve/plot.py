@@ -7,14 +7,14 @@ import typer
 
 from isocharge.cli.serve.options import ModelsOption
 from isocharge.cli.shared.terminal import progress, say
-from isocharge.errors import InputError, RecordingError
+from isocharge.common.errors import InputError, RecordingError
 
 if TYPE_CHECKING:
     from isocharge.cli.serve.pictures.recording import Scene
-    from isocharge.progress import Progress
+    from isocharge.common.progress import Progress
+    from isocharge.common.tables import Table
     from isocharge.serve import Recording
     from isocharge.serve.export.traces import Traces
-    from isocharge.tables import Table
 
 
 def plot_command(
@@ -39,7 +39,7 @@ def plot_command(
 
     Example: isocharge serve plot touch.rec -o touch.png
     """
-    from isocharge.extras import require
+    from isocharge.common.extras import require
 
     with require("simulate"):
         from isocharge.cli.serve.pictures.recording import recording_picture

@@ -13,8 +13,8 @@ from isocharge.cli.serve.options import ModelsOption
 from isocharge.cli.shared.options import ModelArgument
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import say
-from isocharge.errors import InputError
-from isocharge.files import bounded_lines
+from isocharge.common.errors import InputError
+from isocharge.common.files import bounded_lines
 
 
 def predict_command(

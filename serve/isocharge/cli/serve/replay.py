@@ -34,7 +34,7 @@ from isocharge.cli.shared.live_page import (
 from isocharge.cli.shared.standard_streams import stdout_writer
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import say
-from isocharge.files import new_file
+from isocharge.common.files import new_file
 
 if TYPE_CHECKING:
     from isocharge.serve import Predictor

@@ -48,7 +48,7 @@ from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
 from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
 from isocharge.cli.shared.stopping import on_signal, stop_after, unless_hung_up, until_stopped
 from isocharge.cli.shared.terminal import log_to_stderr, say
-from isocharge.errors import InputError, ModelError
+from isocharge.common.errors import InputError, ModelError
 
 if TYPE_CHECKING:
     from isocharge.serve import Device, Predictor, TouchStream

@@ -17,9 +17,9 @@ from isocharge.cli.shared.options import ProbeOption, SensorArgument
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import progress, say
 from isocharge.cli.shared.virtual_sensor import check_pseudo_terminals, virtual_sensor
-from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.errors import InputError, OutputExists
-from isocharge.files import bounded_lines
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.errors import InputError, OutputExists
+from isocharge.common.files import bounded_lines
 
 if TYPE_CHECKING:
     from isocharge.serve import Script

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from isocharge.cli.shared.options import radius_mm_of
 from isocharge.cli.shared.terminal import progress, progress_rows, say
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 
 if TYPE_CHECKING:
     from isocharge.simulate import ForwardMap, Probe, Sensor

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from isocharge.cli.shared.terminal import say
-from isocharge.errors import InputError, IsochargeError
-from isocharge.extras import require
+from isocharge.common.errors import InputError, IsochargeError
+from isocharge.common.extras import require
 
 if TYPE_CHECKING:
     from isocharge.serve import PredictionRecord, TouchStream

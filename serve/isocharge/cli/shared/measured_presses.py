@@ -48,7 +48,7 @@ def read_presses_of(
 
 def films_or_none(sensor: str, probe: str, models: Path | None) -> "SensorFilms | None":
     """The network for all films of a sensor; None, and said, if there is none."""
-    from isocharge.errors import ModelError, SceneError
+    from isocharge.common.errors import ModelError, SceneError
     from isocharge.simulate import load_sensor, parse_probe
     from isocharge.train import films_for
 

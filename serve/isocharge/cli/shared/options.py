@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from isocharge.errors import InputError
-from isocharge.number_text import number_of
+from isocharge.common.errors import InputError
+from isocharge.common.number_text import number_of
 
 if TYPE_CHECKING:
     from isocharge.serve import Device

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 
-from isocharge.errors import OutputError
+from isocharge.common.errors import OutputError
 
 
 class ClosedOutput(io.TextIOBase):

@@ -5,7 +5,7 @@ from itertools import cycle
 
 import numpy as np
 
-from isocharge.arrays import Singles
+from isocharge.common.arrays import Singles
 from isocharge.serve.benchmark.timing import Contender
 from isocharge.serve.prediction.predictor import Predictor
 

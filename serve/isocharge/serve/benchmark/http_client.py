@@ -9,8 +9,8 @@ from typing import Self
 
 import numpy as np
 
-from isocharge.arrays import Singles
-from isocharge.errors import IsochargeError
+from isocharge.common.arrays import Singles
+from isocharge.common.errors import IsochargeError
 from isocharge.serve.benchmark.timing import Contender, Timing
 
 TIMEOUT_S = 20.0

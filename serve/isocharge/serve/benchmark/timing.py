@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 
 Clock = Callable[[], int]
 """Time in ns."""

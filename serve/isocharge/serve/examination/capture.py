@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.serve.examination.listening import Heard
 from isocharge.serve.frames.frame import Frame, Parser
 from isocharge.serve.frames.sequence import SequenceGaps

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.serve.signal_chain.chain import LARGEST_PC
 
 MAINS_HZ = (50.0, 60.0)

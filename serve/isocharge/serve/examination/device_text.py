@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator
 
+from isocharge.common.toml_text import to_toml
 from isocharge.serve.examination.port_check import Examination
-from isocharge.toml_text import to_toml
 
 HEAD = (
     "Written by `isocharge serve doctor` from what came through a port; the keys are in serve/docs/device_file.md.",

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
-from isocharge.errors import PortLost
+from isocharge.common.errors import PortLost
 from isocharge.serve.port.request import Request
 from isocharge.serve.port.serial_port import Chunk, Port
 from isocharge.serve.port.udp import SCHEME

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.serve.examination.capture import Capture, read_frames
 from isocharge.serve.examination.listening import Heard
 from isocharge.serve.frames.binary import BinaryParser

@@ -22,9 +22,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from isocharge.errors import InputError, OutputError
-from isocharge.extras import require
-from isocharge.files import refuse_existing
+from isocharge.common.errors import InputError, OutputError
+from isocharge.common.extras import require
+from isocharge.common.files import refuse_existing
 from isocharge.serve.export.record_schema import NAME, record_schema
 from isocharge.serve.export.ros_messages import (
     POSE,

@@ -14,7 +14,7 @@ import struct
 from collections.abc import Mapping
 from typing import Any
 
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 
 DEFLECTION_STD = 5e-3
 """Standard deviation of z, m: the model does not say how far the film gives way, a few mm under some newtons."""

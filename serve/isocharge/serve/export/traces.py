@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import RecordingError
-from isocharge.tables import Table
+from isocharge.common.arrays import Array
+from isocharge.common.errors import RecordingError
+from isocharge.common.tables import Table
 
 MOST_GROUPS = 4096
 """Groups of an envelope: two for each pixel of a wide picture. There are half as many or more."""

@@ -26,12 +26,12 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
 
-from isocharge.errors import DeviceError
+from isocharge.common.errors import DeviceError
+from isocharge.common.tables import Table
 from isocharge.serve.frames.checksums import CHECKSUMS, Checksum, Crc
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.frames.stuffing import STUFFINGS
 from isocharge.serve.frames.text_lines import SEQ, TIMES_US
-from isocharge.tables import Table
 
 FLAGS = "flags"
 """Name of the field that holds a frame's flags."""

@@ -8,7 +8,7 @@
 | JSON object or list | `{"seq": 12, "A": 801.2}` |
 | sentence in the manner of NMEA 0183, checksum or not | `$PZT,801.2,799.5,803.3*5D` |
 
-Blank lines and lines that begin with # hold no values. A number is what `isocharge.number_text` reads.
+Blank lines and lines that begin with # hold no values. A number is what `isocharge.common.number_text` reads.
 """
 
 import json
@@ -18,7 +18,7 @@ from functools import reduce
 from operator import xor
 from typing import Any, NamedTuple
 
-from isocharge.number_text import number_of
+from isocharge.common.number_text import number_of
 
 SEQ = "seq"
 """Name under which a device sends the number of a frame."""

@@ -6,10 +6,10 @@ from operator import itemgetter
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import ChargeError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import ChargeError
+from isocharge.common.tables import cut
 from isocharge.serve.frames.frame import Frame
-from isocharge.tables import cut
 
 
 class ChannelPicker:

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import DeviceError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import DeviceError
 from isocharge.serve.frames.autodetect import AutoParser
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import Parser

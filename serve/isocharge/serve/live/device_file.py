@@ -47,7 +47,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from isocharge.errors import DeviceError
+from isocharge.common.errors import DeviceError
+from isocharge.common.tables import Table, read_toml
 from isocharge.serve.frames.frame_layout import frame_layout
 from isocharge.serve.frames.text_lines import SEQ, TIMES_US
 from isocharge.serve.live.device import ByElectrode, Device, FrameSettings, GainSettings, LeakSettings
@@ -57,7 +58,6 @@ from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
-from isocharge.tables import Table, read_toml
 
 SECTIONS = ("frames", "channels", "gain", "saturation", "hum", "tare", "leak", "touch", "common_mode")
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from types import TracebackType
 from typing import Any, Self
 
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 from isocharge.serve.prediction.record import FIELDS, PredictionRecord
 
 BY_ELECTRODE = ("charge_pC", "charge_raw_pC", "tare_pC")

@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from isocharge.arrays import Array
-from isocharge.errors import PortError, TareError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import PortError, TareError
 from isocharge.serve.flags import RECONNECTED
 from isocharge.serve.frames.frame import SATURATED_BIT, Frame, Parser
 from isocharge.serve.frames.sequence import SequenceGaps

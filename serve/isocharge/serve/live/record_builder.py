@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.serve.flags import INVALID
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.port.device_clock import ReadingTime

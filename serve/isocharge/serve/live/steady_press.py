@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE
 from isocharge.serve.live.reading_stream import TimedReading
 from isocharge.serve.signal_chain.chain import Reading

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
-from isocharge.arrays import Array, Reals
-from isocharge.errors import ModelError
+from isocharge.common.arrays import Array, Reals
+from isocharge.common.errors import ModelError
 from isocharge.serve.flags import GAP, RECONNECTED, REPEAT, RESTART
 from isocharge.serve.frames.frame import Parser
 from isocharge.serve.frames.sequence import SequenceGaps

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isocharge.arrays import Singles
-from isocharge.errors import ChargeError
+from isocharge.common.arrays import Singles
+from isocharge.common.errors import ChargeError
 
 LARGEST_SQUARE_SUM = 1e38
 """Sum of squared charges, pC^2, up to which each charge is certainly finite and fits into float32."""

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import onnxruntime as ort
 
-from isocharge.arrays import Singles
-from isocharge.errors import ModelError
-from isocharge.files import sha256_of
+from isocharge.common.arrays import Singles
+from isocharge.common.errors import ModelError
+from isocharge.common.files import sha256_of
+from isocharge.common.tables import Table, read_json
 from isocharge.serve.model.session import INPUT, OUTPUTS, run
-from isocharge.tables import Table, read_json
 
 RELATIVE = 1e-5
 """Largest difference of two answers, relative to max(|answer|, floor), dimensionless."""

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from isocharge.errors import ModelError
-from isocharge.tables import Table, parse_json, shown
+from isocharge.common.errors import ModelError
+from isocharge.common.tables import Table, parse_json, shown
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 """Pattern of model names: safe in paths, URLs, pages and config.pbtxt."""

@@ -17,8 +17,8 @@ from types import MappingProxyType
 import onnxruntime as ort
 from numpy.typing import ArrayLike
 
-from isocharge.errors import ModelError, OutputExists
-from isocharge.files import new_folder, read_whole, refuse_existing, sha256_of, write_whole
+from isocharge.common.errors import ModelError, OutputExists
+from isocharge.common.files import new_folder, read_whole, refuse_existing, sha256_of, write_whole
 from isocharge.serve.model.charges import as_batch
 from isocharge.serve.model.golden import Golden, check_answers, make_golden, read_golden
 from isocharge.serve.model.metadata import NAME, ModelMetadata

@@ -9,7 +9,7 @@ import os
 import re
 from pathlib import Path
 
-from isocharge.errors import ModelError
+from isocharge.common.errors import ModelError
 
 VERSION = re.compile("[1-9][0-9]{0,17}")
 """Pattern of version folders: whole numbers of 63 bits."""

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 
 import onnxruntime as ort
 
-from isocharge.arrays import Singles
-from isocharge.errors import ModelError
-from isocharge.tables import cut
+from isocharge.common.arrays import Singles
+from isocharge.common.errors import ModelError
+from isocharge.common.tables import cut
 
 INPUT = "charge_pC"
 """Name of the input."""

@@ -1,6 +1,6 @@
 """`config.pbtxt`: with it Triton serves a model folder without changes."""
 
-from isocharge.defaults import MAX_BATCH
+from isocharge.common.defaults import MAX_BATCH
 from isocharge.serve.model.session import INPUT, OUTPUTS
 
 

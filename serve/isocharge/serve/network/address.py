@@ -9,7 +9,7 @@ import stat
 from dataclasses import dataclass
 from pathlib import Path
 
-from isocharge.errors import InputError, ListenError
+from isocharge.common.errors import InputError, ListenError
 
 ADVICE = {
     errno.EADDRINUSE: "another program listens there; stop it or choose another port",

@@ -1,9 +1,9 @@
-"""The bounds of a server on requests, connections and time; default numbers are in `isocharge.defaults`."""
+"""The bounds of a server on requests, connections and time; default numbers are in `isocharge.common.defaults`."""
 
 from dataclasses import dataclass
 
-from isocharge.defaults import BODY_BYTES, CONNECTIONS, HEADER_SECONDS, IDLE_SECONDS, MAX_BATCH
-from isocharge.errors import TooLarge
+from isocharge.common.defaults import BODY_BYTES, CONNECTIONS, HEADER_SECONDS, IDLE_SECONDS, MAX_BATCH
+from isocharge.common.errors import TooLarge
 
 
 @dataclass(frozen=True, kw_only=True)

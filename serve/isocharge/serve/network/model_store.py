@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 
-from isocharge.errors import ModelError, ModelNotFound
+from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import Model, check_golden, load_model
 from isocharge.serve.model.repository import model_names, repositories, version_folders

@@ -4,8 +4,8 @@ import ssl
 from dataclasses import dataclass
 from pathlib import Path
 
-from isocharge.errors import InputError
-from isocharge.files import read_whole
+from isocharge.common.errors import InputError
+from isocharge.common.files import read_whole
 
 WRONG_DATES = (9, 10)
 """OpenSSL's numbers for certificates that are not valid yet, and no more."""

@@ -2,7 +2,7 @@
 
 import hmac
 
-from isocharge.errors import InputError, TokenError
+from isocharge.common.errors import InputError, TokenError
 
 
 class Token:

@@ -22,11 +22,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self, TypeVar
 
-from isocharge.errors import OutputError, RecordingError
-from isocharge.files import bounded_lines, refuse_existing
-from isocharge.progress import Progress
+from isocharge.common.errors import OutputError, RecordingError
+from isocharge.common.files import bounded_lines, refuse_existing
+from isocharge.common.progress import Progress
+from isocharge.common.tables import Table, cut, is_whole, parse_json
 from isocharge.serve.port.serial_port import Chunk
-from isocharge.tables import Table, cut, is_whole, parse_json
 
 VERSION = 1
 """Version of the file's format."""

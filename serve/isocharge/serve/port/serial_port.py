@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
-from isocharge.errors import PortError, PortLost
+from isocharge.common.errors import PortError, PortLost
 from isocharge.serve.port.request import Asker, Request
 from isocharge.serve.port.udp import SCHEME, UdpSocket
 

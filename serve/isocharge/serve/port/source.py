@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 from isocharge.serve.port.request import Request
 from isocharge.serve.port.serial_port import Chunk, Port
 

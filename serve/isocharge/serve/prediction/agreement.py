@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.prediction.chi_squared import chi_squared_survival
 from isocharge.serve.prediction.press_errors import PressErrors
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
-from isocharge.arrays import Singles
+from isocharge.common.arrays import Singles
 from isocharge.serve.model.session import INPUT, OUTPUTS
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Booleans
-from isocharge.json_values import plain_values
+from isocharge.common.arrays import Booleans
+from isocharge.common.json_values import plain_values
 from isocharge.serve.flags import MISFIT
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.agreement import Agreement, ErrorSummary

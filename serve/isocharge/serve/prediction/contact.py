@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from isocharge.arrays import Singles
+from isocharge.common.arrays import Singles
 
 MOST_DECIMALS = 6
 """Decimals that are shown at most: 1 nm and 1 uN."""

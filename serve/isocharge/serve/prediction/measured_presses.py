@@ -15,12 +15,12 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans, Integers
-from isocharge.errors import PressError
-from isocharge.files import bounded_lines, write_whole
+from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.errors import PressError
+from isocharge.common.files import bounded_lines, write_whole
+from isocharge.common.tables import is_number, shown
 from isocharge.serve.prediction.csv_numbers import CsvNumbers
 from isocharge.serve.prediction.table import CHARGE
-from isocharge.tables import is_number, shown
 
 POSITION_STD_MM = 0.1
 """Uncertainty of a position where nothing else is said, mm: that of a hand-set stage."""

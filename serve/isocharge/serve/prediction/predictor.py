@@ -14,8 +14,9 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import ArrayLike
 
-from isocharge.arrays import Array, Singles
-from isocharge.errors import ChargeError, ModelError
+from isocharge.common.arrays import Array, Singles
+from isocharge.common.errors import ChargeError, ModelError
+from isocharge.common.tables import shown
 from isocharge.serve.model.charges import as_batch, as_press, write_finite
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import Model, load_model
@@ -24,7 +25,6 @@ from isocharge.serve.model.session import OUTPUTS, run
 from isocharge.serve.prediction.bound_press import BoundPress
 from isocharge.serve.prediction.contact import Contact, Contacts
 from isocharge.serve.prediction.validity import Domain
-from isocharge.tables import shown
 
 log = logging.getLogger(__name__)
 

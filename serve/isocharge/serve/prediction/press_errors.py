@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans
-from isocharge.errors import PressError
+from isocharge.common.arrays import Array, Booleans
+from isocharge.common.errors import PressError
 from isocharge.serve.flags import MISFIT, OUTSIDE
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.contact import Contacts

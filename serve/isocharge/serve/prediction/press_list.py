@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import PressError
-from isocharge.files import bounded_lines
+from isocharge.common.arrays import Array
+from isocharge.common.errors import PressError
+from isocharge.common.files import bounded_lines
 from isocharge.serve.prediction.csv_numbers import CsvNumbers
 from isocharge.serve.prediction.measured_presses import CONTACT, KINDS
 

@@ -12,8 +12,8 @@ from typing import TextIO
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import ChargeError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import ChargeError
 from isocharge.serve.prediction.contact import Contacts
 from isocharge.serve.prediction.csv_numbers import CsvNumbers, ignored_words
 from isocharge.serve.prediction.predictor import Predictor

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans, Reals
+from isocharge.common.arrays import Array, Booleans, Reals
 from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.contact import Contact, Contacts

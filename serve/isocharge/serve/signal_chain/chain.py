@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
 from isocharge.serve.signal_chain.contact import Touch, TouchRule, update_contact
 from isocharge.serve.signal_chain.hum import Hum, HumRule, remove_hum

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 
 LEAST_TURN = 0.02
 """Smallest squared step of the unit phasor between two frames, dimensionless, from which hum can be learned."""

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import TareError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import TareError
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array, Reals
+from isocharge.common.arrays import Array, Reals
 
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
 """Changes of the common charge at which the misfit is evaluated, pC."""

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
-from isocharge.errors import OriginError
+from isocharge.common.errors import OriginError
 from isocharge.serve.network.address import is_address
 from isocharge.serve.network.token import Token
 

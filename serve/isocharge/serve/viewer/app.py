@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from isocharge.errors import IsochargeError, RequestError, TooMany, UnknownPath, WrongMethod
+from isocharge.common.errors import IsochargeError, RequestError, TooMany, UnknownPath, WrongMethod
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.network.http.answerer import Message, Receive, Send
 from isocharge.serve.network.protocol import Response

@@ -10,10 +10,10 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
-from isocharge.deflection_field import DeflectionField, read_deflection_field
-from isocharge.errors import InputError
+from isocharge.common.deflection_field import DeflectionField, read_deflection_field
+from isocharge.common.errors import InputError
+from isocharge.common.tables import Table
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.tables import Table
 
 FILE = "deflection.json"
 """Name of the field in a model's version folder; `isocharge simulate deflection` writes one."""

@@ -10,9 +10,9 @@ import struct
 from dataclasses import dataclass
 from typing import Any
 
-from isocharge.errors import RequestError
+from isocharge.common.errors import RequestError
+from isocharge.common.tables import Table, parse_json
 from isocharge.serve.viewer.coalesce import Samples
-from isocharge.tables import Table, parse_json
 
 HEADER = struct.Struct("<BBHIdII")
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import uvloop
 
-from isocharge.errors import IsochargeError, ListenError
+from isocharge.common.errors import IsochargeError, ListenError
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import HttpServer
 from isocharge.serve.network.http.websocket import bounded_websocket

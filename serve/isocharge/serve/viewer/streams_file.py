@@ -14,9 +14,9 @@ Paths are relative to the folder of the file.
 from dataclasses import dataclass
 from pathlib import Path
 
-from isocharge.errors import ConfigError
+from isocharge.common.errors import ConfigError
+from isocharge.common.tables import Table, read_toml
 from isocharge.serve.prediction.record import NAME, is_name
-from isocharge.tables import Table, read_toml
 
 MOST_STREAMS = 8
 """Streams on one page: each has a process of its own."""

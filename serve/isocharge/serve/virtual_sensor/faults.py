@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.errors import SceneError
+from isocharge.common.errors import SceneError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ import importlib
 import os
 from typing import Any
 
-from isocharge.errors import PortError
+from isocharge.common.errors import PortError
 
 PORT_BUFFER = 3840
 """Largest number of bytes that wait for the reader. Linux holds 4095: beyond, a write could be cut within a frame."""

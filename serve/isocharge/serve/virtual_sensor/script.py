@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from isocharge.arrays import Array, Booleans
-from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.errors import SceneError
-from isocharge.number_text import number_of
+from isocharge.common.arrays import Array, Booleans
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.errors import SceneError
+from isocharge.common.number_text import number_of
 
 REST_S = 1.0
 """Rest at the start of a script, s: time for a tare."""

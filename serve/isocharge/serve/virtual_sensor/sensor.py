@@ -17,8 +17,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import PortError, SceneError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import PortError, SceneError
 from isocharge.serve.frames.binary import encode_frame
 from isocharge.serve.frames.frame import T_US_MODULUS, Frame
 from isocharge.serve.frames.sequence import SEQ_MODULUS

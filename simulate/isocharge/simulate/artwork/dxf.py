@@ -2,8 +2,8 @@
 
 import io
 
-from isocharge.arrays import Array
-from isocharge.extras import require
+from isocharge.common.arrays import Array
+from isocharge.common.extras import require
 from isocharge.simulate.artwork.leads import Leads
 from isocharge.simulate.artwork.ruler import RULER_MM, drawing_height_mm, ruler_lines_mm
 from isocharge.simulate.sensor.sensor import Sensor

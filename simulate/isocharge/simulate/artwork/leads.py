@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from isocharge.arrays import Array, Booleans, Integers
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.simulate.sensor.electrode import Electrode
 from isocharge.simulate.sensor.sensor import Sensor
 

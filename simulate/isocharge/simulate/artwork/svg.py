@@ -5,7 +5,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.artwork.leads import Leads
 from isocharge.simulate.artwork.ruler import RULER_MM, drawing_height_mm, ruler_lines_mm
 from isocharge.simulate.sensor.sensor import Sensor

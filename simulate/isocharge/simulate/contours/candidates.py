@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.ndimage import minimum_filter
 
-from isocharge.arrays import Array, Integers
+from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.numerics.disk import onto_disk
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from isocharge.arrays import Array
-from isocharge.errors import SceneError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor, electrode_index

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from contourpy import LineType, contour_generator
 
-from isocharge.arrays import Array
-from isocharge.errors import SceneError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.checks import check_forces
 from isocharge.simulate.forward.forward_map import ForwardMap

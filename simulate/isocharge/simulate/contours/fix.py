@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array, Integers
-from isocharge.errors import SensorError
+from isocharge.common.arrays import Array, Integers
+from isocharge.common.errors import SensorError
 
 TOLERANCE = 1e-3
 """Largest distance of three crossings from their mean at which the contours count as meeting there, m."""

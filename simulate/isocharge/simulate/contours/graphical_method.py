@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.contours.charge_curves import Curves
 from isocharge.simulate.contours.fix import AMBIGUOUS, APART, TOLERANCE, Fix, Meeting, check_electrodes
 from isocharge.simulate.forward.checks import as_charges

@@ -15,8 +15,8 @@ from itertools import combinations
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import SceneError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
 from isocharge.simulate.contours.candidates import FLAT, Candidates, SeedGrid, gauss_newton_step
 from isocharge.simulate.contours.fix import AMBIGUOUS, APART, RESOLVED, TOLERANCE, Fix, Meeting, check_electrodes
 from isocharge.simulate.forward.charge_spline import ChargeSpline

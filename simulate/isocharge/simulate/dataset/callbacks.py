@@ -3,7 +3,7 @@
 import warnings
 from dataclasses import dataclass
 
-from isocharge.progress import Progress, Warn
+from isocharge.common.progress import Progress, Warn
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.stats import qmc
 
-from isocharge.arrays import Array, Integers
-from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.errors import SceneError
+from isocharge.common.arrays import Array, Integers
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.errors import SceneError
 from isocharge.simulate.numerics.disk import lattice
 from isocharge.simulate.sensor.probe import Probe
 

@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import DatasetError, SensorError
-from isocharge.files import new_folder, read_whole, sha256_of, write_whole
+from isocharge.common.arrays import Array
+from isocharge.common.errors import DatasetError, SensorError
+from isocharge.common.files import new_folder, read_whole, sha256_of, write_whole
+from isocharge.common.tables import MOST_JSON_BYTES, Table, cut, parse_json, shown
 from isocharge.simulate.dataset.card import COLUMNS, data_card
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
-from isocharge.tables import MOST_JSON_BYTES, Table, cut, parse_json, shown
 
 FORMAT_VERSION = 1
 

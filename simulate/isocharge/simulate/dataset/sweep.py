@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array, Integers
-from isocharge.errors import SceneError
-from isocharge.progress import Progress
-from isocharge.resumable_run import ResumableRun, output_errors, refuse_finished, resume_folder
+from isocharge.common.arrays import Array, Integers
+from isocharge.common.errors import SceneError
+from isocharge.common.progress import Progress
+from isocharge.common.resumable_run import ResumableRun, output_errors, refuse_finished, resume_folder
 from isocharge.simulate.dataset.callbacks import SweepCallbacks
 from isocharge.simulate.dataset.sampling import Sweep as Sweep
 from isocharge.simulate.dataset.sampling import SweepPresses

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.resumable_run import ResumableRun
+from isocharge.common.arrays import Array
+from isocharge.common.resumable_run import ResumableRun
 
 JobMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Applies a function to jobs and gives the results in their order: `map`, an executor's `map`, `Workers.in_order`."""

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Generic, TypeVar
 
-from isocharge.errors import InputError, WorkersLost
-from isocharge.extras import require
+from isocharge.common.errors import InputError, WorkersLost
+from isocharge.common.extras import require
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.execution.code_version import code_fingerprint
 

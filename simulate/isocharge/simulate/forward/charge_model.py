@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 
 STEPS = (5e-5, 5e-5, 1e-3)
 """Steps of the central differences in x and y (m) and in ln F (dimensionless)."""

@@ -15,7 +15,7 @@ from scipy.interpolate import NdBSpline
 from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.forward.checks import check_presses, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared

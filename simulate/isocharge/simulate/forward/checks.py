@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import ChargeError, SceneError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import ChargeError, SceneError
 
 SLACK = 1.0 + 1e-9
 """Factor by which a radius or force may lie outside a limit, dimensionless: a limit that was converted from mm and back

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.deflection_field import DeflectionField, points_mm
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.deflection_field import DeflectionField, points_mm
+from isocharge.common.progress import Progress
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.solver.equilibrium import Equilibrium

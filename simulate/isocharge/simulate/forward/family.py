@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.stress import turn_stress
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values

@@ -20,10 +20,10 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.errors import InputError, SceneError, SolveError
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.errors import InputError, SceneError, SolveError
+from isocharge.common.progress import Progress
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.family import Family
 from isocharge.simulate.forward.film_grid import AXES, COUNTS, FilmGrid, FilmLimits, limits_of

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film_prior import FilmPrior
 

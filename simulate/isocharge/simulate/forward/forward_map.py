@@ -12,10 +12,10 @@ from functools import cached_property
 
 import numpy as np
 
-from isocharge.arrays import Array, Complexes, Integers
-from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.errors import SceneError, SolveError
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array, Complexes, Integers
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.errors import SceneError, SolveError
+from isocharge.common.progress import Progress
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.family import TURNS, Family

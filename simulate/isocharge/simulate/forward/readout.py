@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import SensorError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SensorError
 from isocharge.simulate.numerics.polygon import area_in_disk, shared_area
 from isocharge.simulate.numerics.quadrature import gauss_line, gauss_polygon, gauss_square
 from isocharge.simulate.sensor.electrode import Electrode

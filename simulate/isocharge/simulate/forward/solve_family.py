@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import SceneError
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
+from isocharge.common.progress import Progress
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.family import Family
 from isocharge.simulate.mechanics.stress import turn_stress

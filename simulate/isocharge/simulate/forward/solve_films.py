@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.progress import Progress
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.film_grid import FilmGrid
 from isocharge.simulate.forward.solve_family import report_each

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from isocharge.arrays import Array, Integers
+from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.forward.charge_model import ChargeModel
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.force_profile import ForceProfile

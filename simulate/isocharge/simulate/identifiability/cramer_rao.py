@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_model import ChargeModel
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 

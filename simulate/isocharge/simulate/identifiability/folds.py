@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.forward.charge_model import ChargeModel
 from isocharge.simulate.identifiability.nearest_contact import INSIDE
 from isocharge.simulate.measuring_chain.noise import NoiseModel

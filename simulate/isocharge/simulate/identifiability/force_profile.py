@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 STEPS = 4

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import SolveError
-from isocharge.json_values import finite_or_none
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SolveError
+from isocharge.common.json_values import finite_or_none
+from isocharge.common.progress import Progress
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.checks import check_determined
 from isocharge.simulate.forward.forward_map import ForwardMap

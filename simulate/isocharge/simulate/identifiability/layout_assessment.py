@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import SceneError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.charge_model import ChargeModel, electrode_count, within_radius
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.checks import check_determined, check_forces, check_radius

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array, Integers
+from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.forward.charge_model import ChargeModel
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk_least_squares import minimise

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import SceneError
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
+from isocharge.common.progress import Progress
 from isocharge.simulate.forward.charge_model import ChargeModel
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_model import ChargeModel, electrode_count
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.checks import check_determined

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.json_values import finite_or_none
-from isocharge.progress import StageProgress
+from isocharge.common.arrays import Array
+from isocharge.common.json_values import finite_or_none
+from isocharge.common.progress import StageProgress
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.layout.design import SPACING, Design, Search
 from isocharge.simulate.layout.position_error import ErrorModel

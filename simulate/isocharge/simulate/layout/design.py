@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.defaults import DEFAULT_FORCE_RANGE
-from isocharge.errors import SolveError
-from isocharge.progress import StageProgress
+from isocharge.common.arrays import Array
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE
+from isocharge.common.errors import SolveError
+from isocharge.common.progress import StageProgress
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from isocharge.arrays import Array
-from isocharge.errors import InputError
-from isocharge.files import read_whole
-from isocharge.number_text import number_of
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError
+from isocharge.common.files import read_whole
+from isocharge.common.number_text import number_of
 
 HEADER = ["x_mm", "y_mm", "weight"]
 """Columns of a map of what matters."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.layout.objective import Objective
 from isocharge.simulate.layout.placing import MILLIMETRE
 

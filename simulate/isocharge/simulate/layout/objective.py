@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.layout.place_table import PlaceTable
 from isocharge.simulate.layout.placing import MILLIMETRE, Parameters, Rules
 from isocharge.simulate.layout.position_error import ErrorModel

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans, Integers
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.progress import Progress
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.solve_family import report_each
 from isocharge.simulate.layout.square_charges import COLUMNS, SquareCharges

@@ -9,8 +9,8 @@ from itertools import combinations
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import InputError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError
 from isocharge.simulate.sensor.electrode import Electrode
 
 MILLIMETRE = 1e-3

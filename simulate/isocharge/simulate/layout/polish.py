@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.layout.placing import MILLIMETRE, Parameters, Rules
 from isocharge.simulate.layout.position_error import ErrorModel
 from isocharge.simulate.layout.square_charges import PressedSquares, SquareCharges

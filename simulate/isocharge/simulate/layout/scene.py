@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.errors import InputError, SceneError
+from isocharge.common.errors import InputError, SceneError
 from isocharge.simulate.forward.solve_family import check_family
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Circle, Probe

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array, Complexes, Integers
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array, Complexes, Integers
+from isocharge.common.progress import Progress
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.readout import electrode_rule
 from isocharge.simulate.forward.solve_family import report_each

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.arrays import Array, Complexes, Integers
+from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.simulate.layout.scene import DesignScene
 from isocharge.simulate.mesh.conformal_map import automorphism_onto
 from isocharge.simulate.numerics.cubic import cubic_weights

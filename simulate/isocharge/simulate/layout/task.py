@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from isocharge.arrays import Array
-from isocharge.errors import InputError, SceneError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError, SceneError
 from isocharge.simulate.forward.checks import check_determined
 from isocharge.simulate.layout.goal import Goal
 from isocharge.simulate.layout.placing import MILLIMETRE, TOUCHING, Parameters, Rules, Zone, axial_choices

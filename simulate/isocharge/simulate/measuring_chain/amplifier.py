@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.signal import lfilter
 
-from isocharge.arrays import Array
-from isocharge.errors import InputError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 PVDF_PYRO = 30e-6 * 9e-6

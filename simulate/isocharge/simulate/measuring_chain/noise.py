@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import InputError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
+from isocharge.common.tables import Table, read_toml
 from isocharge.simulate.measuring_chain.amplifier import Amplifier
 from isocharge.simulate.measuring_chain.levels import AMPLIFIER_LEVELS, NOISE_LEVELS
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.tables import Table, read_toml
 
 PICO, UNIT = 1e-12, 1.0
 

@@ -25,7 +25,7 @@ tension), so the matrix is quasi-definite and needs no pivoting (Vanderbei 1995)
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.mesh.elements import Geometry
 
 SHIFT = 5.0

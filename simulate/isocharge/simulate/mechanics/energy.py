@@ -7,7 +7,7 @@ in the units of `mechanics.membrane`, as a function of the nodal field (U1, U2, 
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.bending import Bending
 from isocharge.simulate.mechanics.membrane import Membrane
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups

@@ -19,7 +19,7 @@ that the variation of E' is sym(F_ia v_i,b) for all three components alike.
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mechanics.stress import strain, stress
 from isocharge.simulate.mesh.elements import Geometry

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.sensor.film import Film
 
 MEMBRANE_STIFFNESS = 1.6

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 
 
 def principal_stresses(total: Array) -> tuple[float, float]:

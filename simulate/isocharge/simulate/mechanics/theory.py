@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.errors import SceneError
+from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups, slenderness
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe

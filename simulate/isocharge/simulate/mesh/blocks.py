@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans, Complexes, Integers
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.numerics.interpolation import lobatto_nodes
 

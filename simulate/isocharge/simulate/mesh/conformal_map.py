@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from isocharge.arrays import Array, Complexes
+from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.mesh.blocks import Blocks
 from isocharge.simulate.mesh.resolution import Resolution
 

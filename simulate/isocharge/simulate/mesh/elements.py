@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from isocharge.arrays import Array, Complexes, Integers
+from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import lobatto_nodes, lobatto_quadrature, tensor_basis
 from isocharge.simulate.numerics.quadrature import gauss_reference_square

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from isocharge.arrays import Complexes
+from isocharge.common.arrays import Complexes
 from isocharge.simulate.mesh.elements import Geometry
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.resolution import Resolution

@@ -20,7 +20,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from isocharge.arrays import Array, Complexes, Integers
+from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks
 from isocharge.simulate.mesh.conformal_map import (
     automorphism_onto,

@@ -4,7 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from isocharge.arrays import Complexes, Integers
+from isocharge.common.arrays import Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.resolution import Resolution

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from isocharge.arrays import Array, Integers
+from isocharge.common.arrays import Array, Integers
 
 TAPS = np.arange(4)
 """Neighbours along one axis."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array, Complexes
+from isocharge.common.arrays import Array, Complexes
 
 
 def onto_disk(position: Array, radius: float) -> Array:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from isocharge.arrays import Array, Integers
+from isocharge.common.arrays import Array, Integers
 
 Residuals = Callable[[Integers, Array], tuple[Array, Array]]
 """From numbers of problems (m,) and their points u (m, 3) to r, shape (m, k), and dr/du, shape (m, 3, k)."""

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import eval_legendre, roots_jacobi
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 
 
 @lru_cache(maxsize=32)

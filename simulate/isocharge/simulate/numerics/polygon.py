@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from isocharge.arrays import Array, Complexes
+from isocharge.common.arrays import Array, Complexes
 
 
 def area_of(corners: Array) -> float:

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 
 
 def gauss_line(count: int) -> tuple[Array, Array]:

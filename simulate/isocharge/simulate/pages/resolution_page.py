@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.identifiability.identification import Identification, LimitMap
 
 RINGS, ANGLES, FORCES = 100, 90, 13

@@ -4,8 +4,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from isocharge.files import new_folder
-from isocharge.progress import Progress
+from isocharge.common.files import new_folder
+from isocharge.common.progress import Progress
 from isocharge.simulate.execution.workers import Workers
 from isocharge.simulate.paper.choices import Choices
 from isocharge.simulate.paper.claims import claims, what_choices_change

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.contours.charge_curves import Mapping
 from isocharge.simulate.forward.readout import contact_charge, thermal_charge
 from isocharge.simulate.paper.choices import PAPER

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.paper.choices import PAPER, normalised_cubic
 from isocharge.simulate.paper.entry import Entry, Row
 from isocharge.simulate.paper.solves import Solves

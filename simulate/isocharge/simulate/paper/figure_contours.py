@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.contours.field_contours import ContourField
 from isocharge.simulate.contours.fix import Fix, Meeting
 from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTriangulation

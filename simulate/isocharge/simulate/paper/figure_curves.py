@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from isocharge.simulate.contours.graphical_method import draw_contour
 from isocharge.simulate.paper.choices import PAPER

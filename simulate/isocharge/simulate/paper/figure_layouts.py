@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.collections import LineCollection
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.contours.charge_curves import Mapping
 from isocharge.simulate.forward.readout import contact_charge
 from isocharge.simulate.numerics.interpolation import tensor_values

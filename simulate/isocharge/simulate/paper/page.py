@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 
-from isocharge.json_values import plain_values
+from isocharge.common.json_values import plain_values
 from isocharge.simulate.paper.choices import Choices
 from isocharge.simulate.paper.entry import Entry
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from isocharge.arrays import Array
-from isocharge.errors import SolveError
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SolveError
+from isocharge.common.progress import Progress
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from isocharge.simulate.execution.workers import Workers
 from isocharge.simulate.forward.charge_spline import ChargeSpline

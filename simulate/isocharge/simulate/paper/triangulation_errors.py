@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.progress import Progress
 from isocharge.simulate.contours.fix import Fix, Meeting
 from isocharge.simulate.contours.graphical_method import DrawnTriangulation
 from isocharge.simulate.contours.triangulation import Triangulation

@@ -11,9 +11,9 @@ from matplotlib import colormaps, rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from isocharge.arrays import Array
-from isocharge.errors import InputError
-from isocharge.files import refuse_existing, write_whole
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError
+from isocharge.common.files import refuse_existing, write_whole
 
 INK, PRESSED, FELT = "#1b2a41", "#9aa5b1", "#d1495b"
 """Colours of outlines, of true presses and of estimated ones."""

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.patches import Circle as Disk
 from matplotlib.patches import Polygon as Patch
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.plots.figure import FELT, INK
 from isocharge.simulate.sensor.probe import Circle, Probe

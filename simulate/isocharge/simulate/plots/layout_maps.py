@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disk
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.layout.costs import ErrorMap, ToleranceCost, TradeOff
 from isocharge.simulate.plots.figure import FELT, INK, new_figure, shades
 from isocharge.simulate.plots.film import draw_electrodes

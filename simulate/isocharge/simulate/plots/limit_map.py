@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disk
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import SensorError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SensorError
 from isocharge.simulate.numerics.polygon import area_of, is_convex
 from isocharge.simulate.sensor.film import Film
 

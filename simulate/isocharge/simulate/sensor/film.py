@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from isocharge.errors import SensorError
+from isocharge.common.errors import SensorError
 
 Surface = Literal["middle", "top", "bottom"]
 

@@ -19,8 +19,8 @@ from functools import cached_property
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import SceneError, SensorError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate.sensor.electrode import Calibration
 from isocharge.simulate.sensor.film import Film, Piezo
 from isocharge.simulate.sensor.probe import Circle

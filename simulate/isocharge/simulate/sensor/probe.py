@@ -12,10 +12,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from isocharge.arrays import Array, Complexes
-from isocharge.errors import SceneError
+from isocharge.common.arrays import Array, Complexes
+from isocharge.common.errors import SceneError
+from isocharge.common.tables import cut
 from isocharge.simulate.numerics.polygon import area_of, centroid_of, is_convex
-from isocharge.tables import cut
 
 NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 

@@ -8,12 +8,12 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import SensorError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SensorError
+from isocharge.common.tables import cut, shown
 from isocharge.simulate.numerics.polygon import overlap
 from isocharge.simulate.sensor.electrode import Calibration, Electrode, _check_electrode
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
-from isocharge.tables import cut, shown
 
 Readout = Literal["area", "edge"]
 

@@ -8,13 +8,13 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
-from isocharge.errors import SensorError
-from isocharge.files import refuse_existing, write_whole
+from isocharge.common.errors import SensorError
+from isocharge.common.files import refuse_existing, write_whole
+from isocharge.common.tables import Table, parse_toml, read_toml
+from isocharge.common.toml_text import to_toml
 from isocharge.simulate.sensor.electrode import Calibration, Electrode
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.sensor import Readout, Sensor
-from isocharge.tables import Table, parse_toml, read_toml
-from isocharge.toml_text import to_toml
 
 FARTHEST_MM = 1e6
 """Largest coordinate of a point, mm."""

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
-from isocharge.arrays import Array, Integers
+from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.mesh.template import Template, template
 

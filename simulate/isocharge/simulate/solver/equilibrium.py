@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from isocharge.arrays import Array, Complexes, Integers
-from isocharge.errors import SceneError
-from isocharge.json_values import finite_or_none
+from isocharge.common.arrays import Array, Complexes, Integers
+from isocharge.common.errors import SceneError
+from isocharge.common.json_values import finite_or_none
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mechanics.stress import principal_stresses, strain, stress, turn_stress
 from isocharge.simulate.mechanics.theory import Theory, bending_length, modelling_error

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import modal_matrix
 

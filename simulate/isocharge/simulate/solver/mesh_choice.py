@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from isocharge.errors import SceneError
+from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.theory import ACCURACY, Theory, bending_length
 from isocharge.simulate.mesh.conformal_map import CLEARANCE
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, place

@@ -9,7 +9,7 @@ bounds the error of the finer one.
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.theory import ACCURACY
 from isocharge.simulate.numerics.quadrature import gauss_reference_square
 from isocharge.simulate.sensor.film import Film

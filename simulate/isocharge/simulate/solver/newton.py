@@ -12,7 +12,7 @@ from typing import Self
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.solver.assembly import Assembly, Factor

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from isocharge.errors import SolveError
+from isocharge.common.errors import SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.sensor.film import Film

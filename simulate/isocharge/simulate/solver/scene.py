@@ -6,8 +6,8 @@ from typing import Self
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import SceneError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared
 from isocharge.simulate.mechanics.theory import Theory, choose_theory

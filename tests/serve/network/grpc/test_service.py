@@ -13,7 +13,7 @@ import trustme
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from tritonclient.grpc import service_pb2
 
-from isocharge.errors import InputError, ListenError
+from isocharge.common.errors import InputError, ListenError
 from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE
 from isocharge.serve.network.limits import ServerLimits

@@ -12,7 +12,7 @@ import onnxruntime
 import orjson
 import pytest
 
-from isocharge.errors import InputError, ModelNotFound, TokenError
+from isocharge.common.errors import InputError, ModelNotFound, TokenError
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.encoding import compress, decompress

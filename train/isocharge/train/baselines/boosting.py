@@ -15,7 +15,7 @@ from onnx import TensorProto, helper, numpy_helper
 from sklearn.ensemble import HistGradientBoostingRegressor
 from sklearn.multioutput import MultiOutputRegressor
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.serve.model.session import open_session
 from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
 from isocharge.train.baselines.features import LogFeatures, affine_fit, with_one

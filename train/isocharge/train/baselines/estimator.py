@@ -13,7 +13,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.domain import ContactDomain

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.numerics.disk_least_squares import minimise, minimise_one
 from isocharge.train.baselines.estimator import Fitted, FittingTask
 from isocharge.train.baselines.features import LogFeatures

@@ -14,7 +14,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Kernel, WhiteKernel
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.train.baselines.estimator import Fitted, FittingTask
 from isocharge.train.baselines.features import LogFeatures
 from isocharge.train.data.domain import ContactDomain

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.spatial import cKDTree
 
-from isocharge.arrays import Array
-from isocharge.errors import DatasetError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import DatasetError
 from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
 from isocharge.train.data.presses import LabelledPresses
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from sklearn.linear_model import LinearRegression
 from sklearn.neighbors import KNeighborsRegressor
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
 from isocharge.train.baselines.features import RULERS, LogFeatures, affine_fit, with_one
 from isocharge.train.data.domain import ContactDomain

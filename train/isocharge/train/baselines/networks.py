@@ -16,7 +16,7 @@ import onnx.utils
 import onnxruntime as ort
 import torch
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.serve import Predictor
 from isocharge.serve.model.session import open_session
 from isocharge.simulate.dataset.shards import Dataset

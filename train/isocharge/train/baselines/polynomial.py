@@ -17,7 +17,7 @@ from sklearn.linear_model import Ridge
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import PolynomialFeatures
 
-from isocharge.arrays import Array, Integers
+from isocharge.common.arrays import Array, Integers
 from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
 from isocharge.train.baselines.features import LogFeatures
 from isocharge.train.data.domain import ContactDomain

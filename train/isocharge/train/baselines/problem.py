@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.charge_field import ChargeField
 

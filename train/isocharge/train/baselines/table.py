@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.train.baselines.estimator import Fitted, FittingTask, best_of
 from isocharge.train.baselines.features import RULERS, LogFeatures
 from isocharge.train.data.domain import ContactDomain

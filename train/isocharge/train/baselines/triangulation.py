@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.contours.triangulation import Triangulation
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.train.baselines.estimator import Fitted, FittingTask

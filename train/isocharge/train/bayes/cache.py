@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from isocharge.files import sha256_of, write_whole
+from isocharge.common.files import sha256_of, write_whole
 
 
 def cache_folder() -> Path:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans, Integers
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.simulate.numerics.disk import onto_disk
 
 EDGE = 8

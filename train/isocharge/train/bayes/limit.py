@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.errors import ChargeError, InputError
-from isocharge.files import sha256_of
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.errors import ChargeError, InputError
+from isocharge.common.files import sha256_of
+from isocharge.common.progress import Progress
 from isocharge.simulate.dataset.sampling import Sweep
 from isocharge.simulate.execution.code_version import code_fingerprint
 from isocharge.simulate.forward.charge_spline import ChargeSpline

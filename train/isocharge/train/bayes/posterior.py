@@ -18,8 +18,8 @@ from functools import cached_property
 
 import numpy as np
 
-from isocharge.arrays import Array, Integers
-from isocharge.errors import ChargeError, InputError
+from isocharge.common.arrays import Array, Integers
+from isocharge.common.errors import ChargeError, InputError
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.identifiability.folds import singular_values
 from isocharge.simulate.identifiability.force_profile import ForceProfile

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
-from isocharge.arrays import Array
-from isocharge.errors import PressError
-from isocharge.progress import Warn
+from isocharge.common.arrays import Array
+from isocharge.common.errors import PressError
+from isocharge.common.progress import Warn
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.sensor.probe import Circle

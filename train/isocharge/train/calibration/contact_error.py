@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.train.calibration.film_charges import FilmCharges

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower

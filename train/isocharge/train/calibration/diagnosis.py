@@ -10,8 +10,8 @@ from itertools import permutations
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import PressError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import PressError
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.train.calibration.film_charges import FilmCharges
 

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.sensor.film import Film

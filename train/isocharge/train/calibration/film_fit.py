@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_distribution
 
-from isocharge.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans
 from isocharge.train.calibration.contacts import AdjustedContacts, RigData, adjust_contacts, search_places, with_slopes
 from isocharge.train.calibration.film_charges import FilmCharges
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import ModelError, SceneError, SensorError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import ModelError, SceneError, SensorError
 from isocharge.serve.model.repository import find_model, model_names, repositories
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor

@@ -20,15 +20,15 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import ModelError, PressError
-from isocharge.files import read_whole, write_whole
-from isocharge.json_values import plain_values
+from isocharge.common.arrays import Array
+from isocharge.common.errors import ModelError, PressError
+from isocharge.common.files import read_whole, write_whole
+from isocharge.common.json_values import plain_values
+from isocharge.common.tables import parse_json
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.repository import version_folders
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, write_presses
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
-from isocharge.tables import parse_json
 from isocharge.train.calibration.calibrate import Calibration, CalibrationScene, EarlierFilm, loosened
 from isocharge.train.calibration.card import calibration_card
 from isocharge.train.calibration.picture import calibration_picture

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import PressError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import PressError
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.train.calibration.contact_error import ContactSensitivity

@@ -7,7 +7,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
 from isocharge.train.calibration.calibrate import Calibration

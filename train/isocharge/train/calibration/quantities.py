@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.sensor.film_prior import FilmPrior
 
 IDENTIFIED = 0.5

@@ -12,9 +12,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import PressError
-from isocharge.number_text import number_of
+from isocharge.common.arrays import Array
+from isocharge.common.errors import PressError
+from isocharge.common.number_text import number_of
 from isocharge.serve.prediction.measured_presses import FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.train.calibration.calibrate import (
     FEW,

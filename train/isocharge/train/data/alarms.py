@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans
 
 FALSE_ALARMS = 0.01
 """Share of good presses whose misfit is above the alarm's threshold, dimensionless."""

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.linalg import cho_factor, cho_solve
 
-from isocharge.arrays import Array, Integers
-from isocharge.errors import TrainingError
+from isocharge.common.arrays import Array, Integers
+from isocharge.common.errors import TrainingError
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.domain import ContactDomain
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 
 
 @dataclass(frozen=True)

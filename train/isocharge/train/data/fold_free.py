@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_model import within_radius
 from isocharge.simulate.identifiability.ambiguities import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.working_area import working_area

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans
-from isocharge.errors import PressError
-from isocharge.files import sha256_of
+from isocharge.common.arrays import Array, Booleans
+from isocharge.common.errors import PressError
+from isocharge.common.files import sha256_of
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.simulate.dataset.shards import Dataset, Samples
 from isocharge.simulate.sensor.probe import Probe

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
 from isocharge.train.data.nearest_contact import CANDIDATES, NearestField, nearest_in_field, search_field

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from scipy.stats import qmc
 
-from isocharge.arrays import Array, Integers
+from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk_least_squares import minimise
 from isocharge.train.data.domain import ContactDomain

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.data.presses import LabelledPresses

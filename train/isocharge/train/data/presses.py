@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import DatasetError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import DatasetError
 from isocharge.simulate.dataset.shards import Dataset, Samples
 from isocharge.train.data.domain import ContactDomain
 

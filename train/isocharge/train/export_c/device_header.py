@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.errors import DeviceError
+from isocharge.common.errors import DeviceError
 from isocharge.serve.live.device import Device
 from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.signal_chain.hum import LEAST_TURN

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from isocharge.files import new_folder, refuse_existing, write_whole
+from isocharge.common.files import new_folder, refuse_existing, write_whole
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.model.model_folder import load_model
 from isocharge.train.export_c.device_header import device_header

@@ -13,9 +13,9 @@ import onnx
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 
-from isocharge.errors import ModelError
+from isocharge.common.errors import ModelError
+from isocharge.common.tables import cut
 from isocharge.serve.model.session import INPUT, OUTPUTS
-from isocharge.tables import cut
 
 UNARY = ("Log", "Exp", "Tanh", "Sinh")
 """Operators that turn each number of a row into another."""

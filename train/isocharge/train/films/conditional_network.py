@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.train.release.folding import PlainPerceptron
 from isocharge.train.training.network import Trainable
 

@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 
 
 @dataclass(frozen=True)

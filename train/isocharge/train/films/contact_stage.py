@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.sensor.film_prior import REACH, SHARED
 from isocharge.train.films.film_presses import D31, D32, FilmPresses, gains_of, part_factors

@@ -10,9 +10,9 @@ from functools import partial
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import DatasetError
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.errors import DatasetError
+from isocharge.common.progress import Progress
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.forward.solve_family import report_each

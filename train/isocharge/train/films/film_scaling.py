@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.forward.film_grid import SOFTENING
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 from isocharge.train.data.domain import ContactDomain

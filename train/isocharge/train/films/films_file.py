@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import InputError, ModelError
-from isocharge.files import read_whole
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError, ModelError
+from isocharge.common.files import read_whole
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import InputError
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, write_model
 from isocharge.simulate.forward.film_family import FilmFamily

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from isocharge.arrays import Array
-from isocharge.progress import Progress, StageProgress
+from isocharge.common.arrays import Array
+from isocharge.common.progress import Progress, StageProgress
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.measuring_chain.noise_file import noise_model

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
 from isocharge.train.films.film_presses import FilmPresses
 from isocharge.train.films.film_scaling import FilmScaling

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.noise import with_noise
 from isocharge.train.data.presses import LabelledPresses, position_error

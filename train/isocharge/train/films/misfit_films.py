@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from isocharge.arrays import Array
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.progress import Progress
 from isocharge.simulate.execution.checkpointed_map import JobMap
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.forward.forward_map import ForwardMap

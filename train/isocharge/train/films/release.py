@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from isocharge.arrays import Array
-from isocharge.progress import StageProgress, Warn
-from isocharge.resumable_run import resume_parts
+from isocharge.common.arrays import Array
+from isocharge.common.progress import StageProgress, Warn
+from isocharge.common.resumable_run import resume_parts
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate.execution.checkpointed_map import JobMap

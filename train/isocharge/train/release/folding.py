@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from torch import nn
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain
 from isocharge.train.training.network import MISFIT_UNIT, InverseNetwork, Perceptron
 

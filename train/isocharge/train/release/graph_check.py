@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from isocharge.arrays import Singles
-from isocharge.errors import TrainingError
+from isocharge.common.arrays import Singles
+from isocharge.common.errors import TrainingError
 from isocharge.serve.model.session import open_session, run
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain

@@ -18,9 +18,9 @@ import onnx
 import onnxruntime
 import torch
 
-from isocharge.arrays import Array
-from isocharge.progress import StageProgress, Warn
-from isocharge.resumable_run import resume_parts
+from isocharge.common.arrays import Array
+from isocharge.common.progress import StageProgress, Warn
+from isocharge.common.resumable_run import resume_parts
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, write_model
 from isocharge.simulate.dataset.shards import Dataset

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import DatasetError, ModelError
-from isocharge.progress import StageProgress, Warn
+from isocharge.common.arrays import Array
+from isocharge.common.errors import DatasetError, ModelError
+from isocharge.common.progress import StageProgress, Warn
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.simulate import Probe, Sensor, parse_probe

@@ -7,7 +7,7 @@ from isocharge.train.report import write_report
 write_report(Path("report"), [(read_dataset(Path("presses")), find_model("three-25um-biaxial"))])
 """
 
-from isocharge.extras import require
+from isocharge.common.extras import require
 
 with require("train"):
     from isocharge.train.report.build import write_report

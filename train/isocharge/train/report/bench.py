@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.errors import DatasetError
+from isocharge.common.errors import DatasetError
 from isocharge.simulate import (
     Dataset,
     ForwardMap,

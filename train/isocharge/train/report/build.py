@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import ModelError
-from isocharge.files import new_folder, write_whole
-from isocharge.progress import StageProgress
+from isocharge.common.arrays import Array
+from isocharge.common.errors import ModelError
+from isocharge.common.files import new_folder, write_whole
+from isocharge.common.progress import StageProgress
 from isocharge.serve import ModelMetadata, Predictor
 from isocharge.serve.benchmark import machine
 from isocharge.simulate import Dataset, Samples, SolveSettings, sensor_to_dict

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import IsochargeError
-from isocharge.progress import Announce
+from isocharge.common.arrays import Array
+from isocharge.common.errors import IsochargeError
+from isocharge.common.progress import Announce
 from isocharge.simulate import Sensor, SolveSettings, parse_probe
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.baselines import Fitted, FittingTask, GaussNewton, PolynomialRidge, ReleasedModel

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate import ChargeSpline, ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import CramerRao, limits_at
 from isocharge.simulate.numerics.statistics import rms

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array, Integers
+from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines import ReleasedModel
 from isocharge.train.data.domain import ContactDomain

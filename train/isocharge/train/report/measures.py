@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.stats import norm
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.presses import position_error
 

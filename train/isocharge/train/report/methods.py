@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.arrays import Array
-from isocharge.errors import DatasetError, TrainingError
-from isocharge.progress import Announce
+from isocharge.common.arrays import Array
+from isocharge.common.errors import DatasetError, TrainingError
+from isocharge.common.progress import Announce
 from isocharge.simulate import Dataset, ForwardMap
 from isocharge.train.baselines import (
     Estimator,

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
-from isocharge.arrays import Integers
+from isocharge.common.arrays import Integers
 from isocharge.simulate import Sensor
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.plots.figure import FELT, INK, new_figure, save_picture

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.simulate.plots.figure import INK, new_figure
 from isocharge.train.baselines import networks
 from isocharge.train.report.measures import MethodRecord, Plot

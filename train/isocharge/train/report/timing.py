@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from isocharge.arrays import Array
-from isocharge.progress import Progress
+from isocharge.common.arrays import Array
+from isocharge.common.progress import Progress
 
 WARM_UP = 0.2
 """Share of a round's calls that only warm up."""

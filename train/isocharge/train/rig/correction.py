@@ -17,7 +17,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.linalg import cho_factor, cho_solve
 
-from isocharge.arrays import Array, Integers
+from isocharge.common.arrays import Array, Integers
 
 DEGREES = (1, 2, 3, 4, 6)
 """Degrees that are tried."""

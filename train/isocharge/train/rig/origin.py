@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from isocharge.arrays import Booleans
+from isocharge.common.arrays import Booleans
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.train.rig.rig_film import RigFilm
 

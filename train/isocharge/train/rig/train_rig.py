@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from isocharge.arrays import Array, Booleans
-from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.files import sha256_of
-from isocharge.progress import StageProgress, Warn
+from isocharge.common.arrays import Array, Booleans
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.files import sha256_of
+from isocharge.common.progress import StageProgress, Warn
 from isocharge.serve.model.model_folder import check_target
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, write_presses
 from isocharge.simulate.dataset.shards import Dataset, Samples

@@ -1,6 +1,6 @@
 """The state of a training run, saved every few seconds, so that a killed run goes on and ends with the same weights.
 
-Each stage has a part in the run's draft (`isocharge.resumable_run`): written whole, with a checksum.
+Each stage has a part in the run's draft (`isocharge.common.resumable_run`): written whole, with a checksum.
 """
 
 import io
@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from isocharge.resumable_run import ResumableRun
+from isocharge.common.resumable_run import ResumableRun
 
 EVERY_S = 3.0
 """Seconds between two writes of a running stage."""

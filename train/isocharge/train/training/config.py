@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from isocharge.errors import ConfigError
-from isocharge.tables import Table, is_whole, read_toml
+from isocharge.common.errors import ConfigError
+from isocharge.common.tables import Table, is_whole, read_toml
 
 T = TypeVar("T", "NetworkConfig", "TrainingConfig")
 

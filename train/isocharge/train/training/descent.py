@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from isocharge.errors import TrainingError
+from isocharge.common.errors import TrainingError
 from isocharge.train.training.checkpoint import Checkpoint
 from isocharge.train.training.network import Trainable
 

@@ -20,8 +20,8 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from isocharge.errors import ConfigError, DatasetError
-from isocharge.progress import StageProgress, Warn
+from isocharge.common.errors import ConfigError, DatasetError
+from isocharge.common.progress import StageProgress, Warn
 from isocharge.simulate.dataset.shards import Dataset
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model

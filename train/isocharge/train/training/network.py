@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain
 
 MISFIT_UNIT = 5.0

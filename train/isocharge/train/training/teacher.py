@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.train.data.domain import ContactDomain
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.patches import Polygon as Patch
 
-from isocharge.arrays import Array
+from isocharge.common.arrays import Array
 from isocharge.serve.export.traces import Envelope, Point, Traces
 from isocharge.simulate import Sensor
 from isocharge.simulate.plots.figure import FELT, INK, new_figure, shades

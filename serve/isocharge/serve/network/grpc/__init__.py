@@ -3,7 +3,7 @@
 May import: network.protocol, network.
 """
 
-from isocharge.extras import require
+from isocharge.common.extras import require
 
 with require("grpc"):
     from isocharge.serve.network.grpc.server import grpc_server

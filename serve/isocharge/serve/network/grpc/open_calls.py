@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 
-from isocharge.errors import TooMany
+from isocharge.common.errors import TooMany
 
 
 class OpenCalls:

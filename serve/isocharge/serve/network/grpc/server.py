@@ -13,7 +13,7 @@ import grpc
 import grpc.aio
 import uvloop
 
-from isocharge.errors import ListenError
+from isocharge.common.errors import ListenError
 from isocharge.serve.network.grpc.service import Service, handlers
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler

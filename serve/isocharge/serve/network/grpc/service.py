@@ -12,7 +12,7 @@ import grpc.aio
 from google.protobuf.json_format import ParseDict
 from google.protobuf.message import DecodeError
 
-from isocharge.errors import ModelNotFound, RequestError
+from isocharge.common.errors import ModelNotFound, RequestError
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE
 from isocharge.serve.network.grpc.open_calls import OpenCalls
 from isocharge.serve.network.grpc.tensors import read_infer, write_answer

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Singles
-from isocharge.errors import RequestError
+from isocharge.common.arrays import Singles
+from isocharge.common.errors import RequestError
 from isocharge.serve.network.protocol.infer import InferAnswer, InferRequest
 from isocharge.serve.network.protocol.parameters import UNSUPPORTED
 from isocharge.serve.network.protocol.tensors import charges_from_bytes, charges_from_values, check_head, check_outputs

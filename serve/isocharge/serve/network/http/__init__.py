@@ -3,7 +3,7 @@
 May import: network.protocol, network.
 """
 
-from isocharge.extras import require
+from isocharge.common.extras import require
 
 with require("http"):
     from isocharge.serve.network.http.app import App

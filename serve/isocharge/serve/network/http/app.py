@@ -4,7 +4,7 @@ import asyncio
 import time
 from collections.abc import Callable
 
-from isocharge.errors import TokenError, TooLarge
+from isocharge.common.errors import TokenError, TooLarge
 from isocharge.serve.network.http.answerer import Message, Receive, Send
 from isocharge.serve.network.protocol import Handler, Response
 from isocharge.serve.network.protocol.handler import Headers

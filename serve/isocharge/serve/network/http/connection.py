@@ -24,7 +24,7 @@ from typing import Any
 import httptools
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
-from isocharge.errors import TooLarge
+from isocharge.common.errors import TooLarge
 from isocharge.serve.network.http.answerer import Answerer
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Response

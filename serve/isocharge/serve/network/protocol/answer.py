@@ -4,7 +4,7 @@ from typing import Any
 
 import orjson
 
-from isocharge.arrays import Singles
+from isocharge.common.arrays import Singles
 from isocharge.serve.network.protocol.infer import InferAnswer
 
 

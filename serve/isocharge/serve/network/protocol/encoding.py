@@ -3,7 +3,7 @@
 import gzip
 import zlib
 
-from isocharge.errors import RequestError, TooLarge, UnknownEncoding
+from isocharge.common.errors import RequestError, TooLarge, UnknownEncoding
 
 WORTH_BYTES = 1024
 """Size from which an answer is compressed, bytes: to send a shorter one is faster than to set up a compressor."""

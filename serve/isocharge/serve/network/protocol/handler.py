@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
 from typing import NamedTuple
 
-from isocharge.errors import ModelError, RequestError, UnknownPath, WrongMethod
+from isocharge.common.errors import ModelError, RequestError, UnknownPath, WrongMethod
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.metrics import CONTENT_TYPE, Metrics
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore

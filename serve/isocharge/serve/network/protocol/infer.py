@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from isocharge.arrays import Singles
+from isocharge.common.arrays import Singles
 from isocharge.serve.model.session import OUTPUTS, check_rows, run, run_error
 from isocharge.serve.network.model_store import LoadedVersion
 from isocharge.serve.prediction.bound_press import BoundPress

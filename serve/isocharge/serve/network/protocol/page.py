@@ -10,7 +10,7 @@ from functools import lru_cache
 from html import escape
 from urllib.parse import quote
 
-from isocharge.files import read_whole
+from isocharge.common.files import read_whole
 from isocharge.serve.model.model_folder import Model
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol.describe import server_metadata

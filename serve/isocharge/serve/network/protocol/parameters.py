@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from isocharge.errors import RequestError
+from isocharge.common.errors import RequestError
 
 UNSUPPORTED = ("shared_memory_region", "classification")
 """Parameters of Triton that change what a request means and that this server does not know."""

@@ -4,7 +4,7 @@ from typing import Any
 
 import orjson
 
-from isocharge.errors import RequestError
+from isocharge.common.errors import RequestError
 from isocharge.serve.network.protocol.infer import InferRequest
 from isocharge.serve.network.protocol.parameters import flag
 from isocharge.serve.network.protocol.tensors import charges_of, outputs_of

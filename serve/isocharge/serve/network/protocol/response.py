@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import orjson
 
-from isocharge.errors import WrongMethod
+from isocharge.common.errors import WrongMethod
 from isocharge.serve.network.protocol.status import client_message, http_status
 
 

@@ -2,7 +2,7 @@
 
 import logging
 
-from isocharge.errors import (
+from isocharge.common.errors import (
     InputError,
     IsochargeError,
     ModelNotFound,

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from isocharge.arrays import Singles
-from isocharge.errors import RequestError, TooLarge
+from isocharge.common.arrays import Singles
+from isocharge.common.errors import RequestError, TooLarge
 from isocharge.serve.model.charges import as_singles, write_finite
 from isocharge.serve.model.session import INPUT, OUTPUTS
 from isocharge.serve.network.protocol.parameters import flag, parameters_of

@@ -20,8 +20,8 @@ from isocharge.cli.shared.options import (
     most_workers,
 )
 from isocharge.cli.shared.terminal import progress_rows, say
-from isocharge.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.errors import InputError
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.errors import InputError
 
 if TYPE_CHECKING:
     from isocharge.simulate.execution.workers import Workers
@@ -75,7 +75,7 @@ def sweep_command(
 
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
-    from isocharge.resumable_run import refuse_finished
+    from isocharge.common.resumable_run import refuse_finished
     from isocharge.simulate import Sweep, SweepCallbacks, load_sensor, parse_probe, run_sweep
 
     if workers and cluster:

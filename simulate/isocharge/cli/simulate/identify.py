@@ -10,9 +10,9 @@ import typer
 from isocharge.cli.shared.forward_maps import solve_forward_map, solve_map_to_search
 from isocharge.cli.shared.options import PROBE_HELP, ForceRangeOption, JsonOption, NoiseOption, SensorArgument
 from isocharge.cli.shared.terminal import progress, say
-from isocharge.defaults import DEFAULT_FORCE_RANGE
-from isocharge.errors import InputError
-from isocharge.files import new_folder, refuse_existing, write_whole
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE
+from isocharge.common.errors import InputError
+from isocharge.common.files import new_folder, refuse_existing, write_whole
 
 if TYPE_CHECKING:
     from isocharge.simulate import ForwardMap, Probe

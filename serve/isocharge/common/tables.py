@@ -19,8 +19,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NoReturn, TypeGuard
 
-from isocharge.errors import InputError
-from isocharge.files import read_whole
+from isocharge.common.errors import InputError
+from isocharge.common.files import read_whole
 
 REQUIRED: Final = object()
 """The default of a key that must be there."""

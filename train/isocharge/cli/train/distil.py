@@ -10,8 +10,8 @@ from isocharge.cli.shared.measured_presses import ModelsOption
 from isocharge.cli.shared.options import ConfigOption, FreshOption, ModelArgument
 from isocharge.cli.shared.simulated_presses import simulated_presses
 from isocharge.cli.shared.training_run import train_and_say
-from isocharge.errors import InputError
-from isocharge.files import refuse_existing
+from isocharge.common.errors import InputError
+from isocharge.common.files import refuse_existing
 
 
 def distil_command(

@@ -16,10 +16,10 @@ from isocharge.cli.shared.terminal import log_to_stderr, say
 from isocharge.cli.train.bench.dialogue import Dialogue
 from isocharge.cli.train.bench.events import BenchEvents
 from isocharge.cli.train.bench.screen import Screen
-from isocharge.errors import InputError, PressError
+from isocharge.common.errors import InputError, PressError
 
 if TYPE_CHECKING:
-    from isocharge.arrays import Array
+    from isocharge.common.arrays import Array
     from isocharge.serve import Device, MeasuredPresses, SteadyPress
     from isocharge.train import BenchSession, Calibration, EarlierFilm, SensorFilms
 
@@ -199,7 +199,7 @@ def _result(session: "BenchSession") -> "Calibration":
 
 def _print_press(session: "BenchSession", press: "SteadyPress", *, machine: bool) -> None:
     """The last press, and what is known since, as a line of JSON."""
-    from isocharge.json_values import plain_values
+    from isocharge.common.json_values import plain_values
 
     presses, calibration = session.presses, session.calibration
     values = {

@@ -18,8 +18,8 @@ from isocharge.cli.shared.options import (
     position_of,
 )
 from isocharge.cli.shared.terminal import say
-from isocharge.errors import InputError
-from isocharge.number_text import number_of
+from isocharge.common.errors import InputError
+from isocharge.common.number_text import number_of
 
 if TYPE_CHECKING:
     from isocharge.simulate import ContourField, DrawnContour, ForwardMap, Mapping, Sensor

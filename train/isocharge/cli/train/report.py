@@ -10,8 +10,8 @@ import typer
 from isocharge.cli.shared.measured_presses import read_presses_of
 from isocharge.cli.shared.options import NewFolderOption, ProbeOption
 from isocharge.cli.shared.terminal import progress, say, this_command
-from isocharge.errors import InputError, ModelError
-from isocharge.files import refuse_existing
+from isocharge.common.errors import InputError, ModelError
+from isocharge.common.files import refuse_existing
 
 if TYPE_CHECKING:
     from isocharge.simulate import Dataset

@@ -20,8 +20,8 @@ from isocharge.cli.shared.options import (
     most_workers,
 )
 from isocharge.cli.shared.terminal import progress, say
-from isocharge.errors import InputError
-from isocharge.number_text import number_of
+from isocharge.common.errors import InputError
+from isocharge.common.number_text import number_of
 
 if TYPE_CHECKING:
     from isocharge.simulate import Nuisances
@@ -138,7 +138,7 @@ def design_command(
 
     Example: isocharge simulate design four-25um-biaxial --electrodes 4 --radius 15 -o over-15mm
     """
-    from isocharge.resumable_run import refuse_finished
+    from isocharge.common.resumable_run import refuse_finished
     from isocharge.simulate import load_sensor, noise_model, parse_probe
     from isocharge.simulate.artwork import dxf  # noqa: F401  (a missing extra is said before the search)
     from isocharge.simulate.layout.goal import Goal
@@ -190,7 +190,7 @@ class _Request:
 
 def _run(request: _Request, pool: "Workers", advance: Callable[..., None]) -> dict[str, Any]:
     """Design, or go on with a stopped one, and write the folder; gives the numbers."""
-    from isocharge.resumable_run import resume_folder
+    from isocharge.common.resumable_run import resume_folder
     from isocharge.simulate import sensor_to_dict
     from isocharge.simulate.execution.checkpointed_map import CheckpointedMap
     from isocharge.simulate.execution.code_version import code_fingerprint
@@ -222,7 +222,7 @@ def _run(request: _Request, pool: "Workers", advance: Callable[..., None]) -> di
 
 def _files(design: "Design", trade: Any) -> tuple[dict[str, bytes], dict[str, Any]]:
     """Contents of all files by name, and the numbers."""
-    from isocharge.json_values import plain_values
+    from isocharge.common.json_values import plain_values
     from isocharge.simulate import sensor_to_toml
     from isocharge.simulate.artwork.dxf import layout_dxf
     from isocharge.simulate.artwork.leads import route

@@ -8,7 +8,7 @@ import typer
 
 from isocharge.cli.shared.options import ForceOption, JsonOption, ProbeOption, SensorArgument, position_of
 from isocharge.cli.shared.terminal import say
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 
 if TYPE_CHECKING:
     from isocharge.simulate import Equilibrium

@@ -8,7 +8,7 @@ import typer
 
 from isocharge.cli.shared.options import ProbeOption, SensorArgument
 from isocharge.cli.shared.terminal import progress, say
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 
 
 def deflection_command(
@@ -25,7 +25,7 @@ def deflection_command(
 
     Example: isocharge simulate deflection my-sensor.toml -o models/my-sensor/1/deflection.json
     """
-    from isocharge.files import refuse_existing, write_whole
+    from isocharge.common.files import refuse_existing, write_whole
     from isocharge.simulate import Circle, load_sensor, parse_probe
     from isocharge.simulate.forward.deflection import deflection_field
 

@@ -18,10 +18,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-from isocharge.errors import InputError, OutputError, OutputExists, SolveError, TrainingError
-from isocharge.files import new_folder, read_whole, refuse_existing, sha256_of, sync_folder, write_whole
-from isocharge.progress import Warn
-from isocharge.tables import cut, read_json
+from isocharge.common.errors import InputError, OutputError, OutputExists, SolveError, TrainingError
+from isocharge.common.files import new_folder, read_whole, refuse_existing, sha256_of, sync_folder, write_whole
+from isocharge.common.progress import Warn
+from isocharge.common.tables import cut, read_json
 
 Content = TypeVar("Content")
 

@@ -17,8 +17,8 @@ from isocharge.cli.shared.standard_streams import open_closed_streams
 from isocharge.cli.shared.terminal import cautions_to_stderr, say
 from isocharge.cli.simulate.app import simulate_app
 from isocharge.cli.train.app import train_app
-from isocharge.errors import InputError, IsochargeError
-from isocharge.versions import package_version
+from isocharge.common.errors import InputError, IsochargeError
+from isocharge.common.versions import package_version
 
 app = typer.Typer(
     no_args_is_help=True,

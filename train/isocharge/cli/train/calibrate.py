@@ -10,7 +10,7 @@ from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, 
 from isocharge.cli.shared.options import DeviceOption, FreshOption, JsonOption, ProbeOption
 from isocharge.cli.shared.terminal import say, this_command
 from isocharge.cli.train.bench.run import BenchPort, calibrate_at_port
-from isocharge.errors import InputError
+from isocharge.common.errors import InputError
 
 if TYPE_CHECKING:
     from isocharge.serve import MeasuredPresses
@@ -203,7 +203,7 @@ def _proposed(
 
 
 def _table(calibration: "Calibration | None", proposed: "list[ProposedPress]") -> dict[str, object]:
-    from isocharge.json_values import plain_values
+    from isocharge.common.json_values import plain_values
 
     table: dict[str, object] = dict(calibration.to_dict()) if calibration else {}
     values = plain_values(table | {"next": [vars(press) for press in proposed]})

@@ -18,9 +18,9 @@ from isocharge.cli.shared.measured_presses import (
 from isocharge.cli.shared.options import PROBE_HELP, ConfigOption, FreshOption, RadiusOption, radius_mm_of
 from isocharge.cli.shared.simulated_presses import simulated_presses
 from isocharge.cli.shared.training_run import train_and_say
-from isocharge.defaults import DEFAULT_RADIUS
-from isocharge.errors import InputError
-from isocharge.files import refuse_existing
+from isocharge.common.defaults import DEFAULT_RADIUS
+from isocharge.common.errors import InputError
+from isocharge.common.files import refuse_existing
 
 if TYPE_CHECKING:
     from isocharge.simulate import Dataset

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from isocharge.errors import IsochargeError, OutputError, OutputExists
+from isocharge.common.errors import IsochargeError, OutputError, OutputExists
 
 MOST_BYTES = 64 << 20
 """Largest file that is read whole, bytes: far more than any file of ours has."""

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
 from isocharge.cli.train.bench.events import Ended, Typed
-from isocharge.errors import InputError, PortLost, PressError
+from isocharge.common.errors import InputError, PortLost, PressError
 
 if TYPE_CHECKING:
-    from isocharge.arrays import Array
     from isocharge.cli.train.bench.screen import Screen
+    from isocharge.common.arrays import Array
     from isocharge.serve import SteadyPress
     from isocharge.serve.live.steady_press import Watched
     from isocharge.train import BenchSession

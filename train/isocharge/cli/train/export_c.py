@@ -2,7 +2,7 @@
 
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, NewFolderOption, board_of
 from isocharge.cli.shared.terminal import say, this_command
-from isocharge.files import refuse_existing
+from isocharge.common.files import refuse_existing
 
 
 def export_c_command(model: ModelArgument, output: NewFolderOption, device: DeviceOption = None) -> None:

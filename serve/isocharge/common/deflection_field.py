@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.arrays import Array, Complexes
-from isocharge.errors import InputError
-from isocharge.tables import Table, read_json
+from isocharge.common.arrays import Array, Complexes
+from isocharge.common.errors import InputError
+from isocharge.common.tables import Table, read_json
 
 VERSION = 1
 """Version of the file's format."""

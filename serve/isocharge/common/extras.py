@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from isocharge.errors import MissingExtra
+from isocharge.common.errors import MissingExtra
 
 SIMULATE = frozenset({"scipy", "threadpoolctl", "matplotlib", "contourpy"})
 HTTP = frozenset({"uvicorn", "uvloop", "httptools", "orjson", "markdown_it", "prometheus_client", "websockets"})

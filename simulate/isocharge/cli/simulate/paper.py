@@ -26,7 +26,7 @@ def paper_command(
 
     Example: isocharge simulate paper -o paper
     """
-    from isocharge.files import refuse_existing
+    from isocharge.common.files import refuse_existing
     from isocharge.simulate.execution.workers import local_workers
     from isocharge.simulate.paper import Choices, write_paper
 
