@@ -1,0 +1,165 @@
+"""The map from contacts to charges: one protocol that everything speaks that gives or needs charges."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
+
+STEPS = (0.05, 0.05, 1e-3)
+"""Steps of the central differences in x and y (mm) and in ln F (dimensionless)."""
+
+SLACK = 1.0 + 1e-9
+"""Factor by which rounding may carry a contact out of a domain."""
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Contacts for which a map holds: a disk about the film's centre, and a range of forces.
+
+    Attributes:
+        radius: Largest distance from the centre, mm.
+        force_range: Smallest and largest force, N.
+    """
+
+    radius: float
+    force_range: tuple[float, float]
+
+    @property
+    def centre(self) -> Array:
+        """Middle of (x, y, ln F), shape (3,), mm and logarithm of N."""
+        low, high = np.log(self.force_range)
+        return np.array([0.0, 0.0, 0.5 * (low + high)])
+
+    @property
+    def scale(self) -> Array:
+        """Half width of (x, y, ln F), shape (3,), mm and logarithm of N."""
+        low, high = np.log(self.force_range)
+        return np.array([self.radius, self.radius, max(0.5 * (high - low), 0.05)])
+
+    def to_unit(self, contact: Array) -> Array:
+        """Contacts (x, y, F), shape (n, 3), to [-1, 1]^3: (x, y, ln F), centred and scaled."""
+        logs = np.stack([contact[:, 0], contact[:, 1], np.log(contact[:, 2])], axis=1)
+        unit: Array = (logs - self.centre) / self.scale
+        return unit
+
+    def to_contact(self, unit: Array) -> Array:
+        """The inverse of `to_unit`: shape (..., 3) to (x, y, F), shape (..., 3)."""
+        contact: Array = unit * self.scale + self.centre
+        contact[..., 2] = np.exp(contact[..., 2])
+        return contact
+
+    def within(self, radius: float) -> "Domain":
+        """The same forces on a smaller disk."""
+        return replace(self, radius=radius)
+
+    def check(self, contact: Array, source: str) -> None:
+        """Refuse contacts outside.
+
+        Args:
+            contact: (x, y, F), shape (n, 3), mm and N.
+            source: The map that is asked, for the message: "forward map".
+
+        Raises:
+            SceneError: With the first contact that lies outside.
+        """
+        distance, force = np.hypot(contact[:, 0], contact[:, 1]), contact[:, 2]
+        low, high = self.force_range
+        inside = (distance <= self.radius * SLACK) & (force >= low / SLACK) & (force <= high * SLACK)
+        if not inside.all():
+            i = int(np.argmin(inside))
+            x, y, f = contact[i]
+            raise SceneError(
+                f"press {i} at ({x:.4g}, {y:.4g}) mm with {f:.4g} N is outside the {source}: expected at most "
+                f"{self.radius:g} mm from the centre and {low:g} to {high:g} N"
+            )
+
+
+class ChargeMap(Protocol):
+    """Charges as a function of the contact (x, y, F), mm and N."""
+
+    @property
+    def electrodes(self) -> tuple[str, ...]:
+        """Names of the electrodes, in the order of the charges."""
+
+    @property
+    def domain(self) -> Domain:
+        """The contacts for which it holds."""
+
+    def charges(self, contact: Array) -> Array:
+        """Touch charges, shape (n, n_electrode), pC, of contacts (x, y, F), shape (n, 3), mm and N."""
+
+    def derivatives(self, contact: Array) -> Array:
+        """d(Q)/d(x, y, ln F) at contacts, shape (n, 3): (n, n_electrode, 3), pC/mm, pC/mm and pC."""
+
+
+@dataclass(frozen=True)
+class FunctionMap:
+    """Any function of contacts as a map, with derivatives by central differences.
+
+    Attributes:
+        function: Contacts (x, y, F), shape (n, 3), mm and N, to charges, shape (n, n_electrode), pC.
+        electrodes: Names of the electrodes.
+        domain: Where the function holds. Differences call it up to `STEPS` outside; state a slightly smaller domain if
+            it does not hold there.
+    """
+
+    function: Callable[[Array], Array]
+    electrodes: tuple[str, ...]
+    domain: Domain
+
+    def charges(self, contact: Array) -> Array:
+        """See `ChargeMap`."""
+        return np.asarray(self.function(contact))
+
+    def derivatives(self, contact: Array) -> Array:
+        """See `ChargeMap`."""
+        return differences(self.function, contact)
+
+
+@dataclass(frozen=True)
+class _Within:
+    """A map on a smaller domain; see `ChargeMap`."""
+
+    whole: ChargeMap
+    domain: Domain
+
+    @property
+    def electrodes(self) -> tuple[str, ...]:
+        return self.whole.electrodes
+
+    def charges(self, contact: Array) -> Array:
+        return self.whole.charges(contact)
+
+    def derivatives(self, contact: Array) -> Array:
+        return self.whole.derivatives(contact)
+
+
+def within(charge_map: ChargeMap, radius: float) -> ChargeMap:
+    """The same charges on a smaller disk, radius in mm."""
+    return _Within(charge_map, charge_map.domain.within(radius))
+
+
+def differences(function: Callable[[Array], Array], contact: Array, steps: tuple[float, float, float] = STEPS) -> Array:
+    """Central differences of a function of contacts: the only ones of the project.
+
+    Args:
+        function: Contacts (x, y, F), shape (n, 3), mm and N, to values, shape (n, k). Called once, with all steps.
+        contact: Where to differentiate, shape (n, 3).
+        steps: In x and y, mm, and in ln F.
+
+    Returns:
+        Derivatives by (x, y, ln F), shape (n, k, 3), in the values' unit per mm, per mm, and by ln F.
+    """
+    moved = []
+    for axis, step in enumerate(steps):
+        for sign in (1.0, -1.0):
+            at = contact.copy()
+            at[:, axis] = at[:, 2] * np.exp(sign * step) if axis == 2 else at[:, axis] + sign * step
+            moved.append(at)
+    values = np.asarray(function(np.concatenate(moved))).reshape(3, 2, len(contact), -1)
+    slopes = (values[:, 0] - values[:, 1]) / (2.0 * np.array(steps))[:, None, None]
+    return np.moveaxis(slopes, 0, 2)
