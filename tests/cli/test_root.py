@@ -1,4 +1,4 @@
-"""What every command line has: a version, completion by the shell; and numbers as other programs write them."""
+"""What every command line has: a version, and completion by the shell."""
 
 import os
 import re
@@ -64,27 +64,3 @@ def test_completion_can_be_installed(tmp_path):
     run(ISOCHARGE, "--install-completion", "bash", HOME=str(tmp_path), _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")
     (script,) = re.findall(r"source '?([^'\n]+)", (tmp_path / ".bashrc").read_text())
     assert "_ISOCHARGE_COMPLETE" in Path(script).read_text()
-
-
-@pytest.mark.parametrize(
-    ("words", "option", "text"),
-    [
-        (("serve", "virtual", "three-25um-biaxial", "--rate-Hz", "1_00"), "--rate-Hz", "1_00"),
-        (("serve", "virtual", "three-25um-biaxial", "--rate-Hz=1_00"), "--rate-Hz", "1_00"),
-        (("serve", "stream", "m", "--port", "p", "--count", "1_0"), "--count", "1_0"),
-        (("serve", "check", "m", "f.csv", "--position-std", "0.0_5"), "--position-std", "0.0_5"),
-        (("simulate", "sweep", "s", "--force", "0.05", "1_0", "-o", "x"), "--force", "1_0"),
-        (("simulate", "point", "three-25um-biaxial", "--force", "\u0661"), "--force", "\u0661"),
-    ],
-)
-def test_numbers_that_only_python_reads_are_none(command, words, option, text):
-    code, out, err = command(*words)
-    assert (code, out) == (2, "")
-    assert option in err
-    assert text in err or "valid" in err
-
-
-def test_texts_may_have_underscores(command):
-    code, _, err = command("serve", "stream", "1_0", "--port", "p")
-    assert code == 2
-    assert "ModelError: no model '1_0'" in err

@@ -1,7 +1,7 @@
 """The command `isocharge`: the composition root, the only part that sees all stages.
 
-Each stage has its commands in a package here, one file a command; a command imports its stage when it runs, so that
-help is instant. Data go to stdout, messages for people to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage or input.
+Each stage brings its commands, one module each, as `isocharge.cli.simulate.sweep`. Data go to stdout, messages for
+people to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage or input.
 """
 
 import signal
@@ -10,9 +10,8 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.demo.command import demo_command
 from isocharge.cli.serve.app import serve_app
-from isocharge.cli.shared.plain_numbers import plain_numbers
+from isocharge.cli.shared.lazy import lazy_group
 from isocharge.cli.shared.standard_streams import open_closed_streams
 from isocharge.cli.shared.terminal import cautions_to_stderr, say
 from isocharge.cli.simulate.app import simulate_app
@@ -20,13 +19,10 @@ from isocharge.cli.train.app import train_app
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.versions import package_version
 
-app = typer.Typer(
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    help="Find where a piezoelectric tactile film is touched, and how hard, from the charges of three to eight "
-    "electrodes.",
+app = lazy_group(
+    "Find where a piezoelectric tactile film is touched, and how hard, from the charges of three to eight electrodes.",
+    {"demo": ("isocharge.cli.demo.command:demo_command", "Simulate, train, follow a virtual sensor, draw: all once.")},
 )
-app.command("demo")(demo_command)
 app.add_typer(simulate_app, name="simulate")
 app.add_typer(train_app, name="train")
 app.add_typer(serve_app, name="serve")
@@ -53,7 +49,7 @@ def main() -> None:
     open_closed_streams()
     try:
         with cautions_to_stderr():
-            plain_numbers(typer.main.get_command(app))()
+            app()
     except (IsochargeError, OSError, MemoryError) as error:
         say(f"{type(error).__name__}: {error}")
         sys.exit(2 if isinstance(error, InputError) else 1)

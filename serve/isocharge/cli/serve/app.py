@@ -1,29 +1,27 @@
-"""`isocharge serve ...`: its commands, one file each."""
+"""`isocharge serve ...`: its commands, one module each."""
 
-import typer
+from isocharge.cli.shared.lazy import lazy_group
 
-from isocharge.cli.serve.bench import bench_command
-from isocharge.cli.serve.check import check_command
-from isocharge.cli.serve.doctor import doctor_command
-from isocharge.cli.serve.http import http_command
-from isocharge.cli.serve.live import live_command
-from isocharge.cli.serve.plot import plot_command
-from isocharge.cli.serve.predict import predict_command
-from isocharge.cli.serve.replay import replay_command
-from isocharge.cli.serve.stream import stream_command
-from isocharge.cli.serve.virtual import virtual_command
-
-serve_app = typer.Typer(
-    no_args_is_help=True,
-    help="Estimate contacts from charges: from a file, from a sensor's port, over HTTP. Or play a virtual sensor.",
+serve_app = lazy_group(
+    "Estimate contacts from charges: from a file, from a sensor's port, over HTTP. Or play a virtual sensor.",
+    {
+        "predict": ("isocharge.cli.serve.predict:predict_command", "Estimate the contacts of the charges in a file."),
+        "check": ("isocharge.cli.serve.check:check_command", "Measure the errors of a model on measured presses."),
+        "stream": (
+            "isocharge.cli.serve.stream:stream_command",
+            "Follow a sensor live: a record for every frame of charges.",
+        ),
+        "replay": (
+            "isocharge.cli.serve.replay:replay_command",
+            "Play a recording again, as it was or with other settings.",
+        ),
+        "plot": ("isocharge.cli.serve.plot:plot_command", "Draw a recording."),
+        "doctor": (
+            "isocharge.cli.serve.doctor:doctor_command",
+            "Say what a port sends, and what is wrong with it.",
+        ),
+        "http": ("isocharge.cli.serve.http:http_command", "Serve models over HTTP and gRPC."),
+        "virtual": ("isocharge.cli.serve.virtual:virtual_command", "Play a virtual sensor on a pseudo-terminal."),
+        "bench": ("isocharge.cli.serve.bench:bench_command", "Measure speed against error of a model on this machine."),
+    },
 )
-serve_app.command("predict")(predict_command)
-serve_app.command("check")(check_command)
-serve_app.command("stream")(stream_command)
-serve_app.command("live")(live_command)
-serve_app.command("replay")(replay_command)
-serve_app.command("plot")(plot_command)
-serve_app.command("doctor")(doctor_command)
-serve_app.command("virtual")(virtual_command)
-serve_app.command("http")(http_command)
-serve_app.command("bench")(bench_command)

@@ -3,12 +3,17 @@
 import logging
 import shlex
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 import typer
 
 from isocharge.cli.shared.standard_streams import forget
+from isocharge.common.progress import Listener, listening
+
+LINE_S = 5.0
+"""Time between two lines of progress where there is no terminal, s."""
 
 Advance = Callable[..., None]
 """`advance(done, total)` or `advance(done, total, note)`: moves a progress bar; the note stands behind it."""
@@ -32,9 +37,11 @@ def log_to_stderr() -> AbstractContextManager[None]:
     return _printed("isocharge.serve", "%(message)s")
 
 
-def cautions_to_stderr() -> AbstractContextManager[None]:
-    """Print warnings of the simulator for people."""
-    return _printed("isocharge.simulate", "caution: %(message)s")
+@contextmanager
+def cautions_to_stderr() -> Iterator[None]:
+    """Print warnings of simulation and training for people."""
+    with _printed("isocharge.simulate", "caution: %(message)s"), _printed("isocharge.train", "caution: %(message)s"):
+        yield
 
 
 @contextmanager
@@ -47,6 +54,65 @@ def _printed(name: str, style: str) -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
+
+
+@contextmanager
+def shown_progress() -> Iterator[None]:
+    """Show the progress of all work inside the block: bars on a terminal, else a line every few seconds."""
+    if not sys.stderr.isatty():
+        with listening(_Lines()):
+            yield
+        return
+    with _bars() as bar, listening(bar):
+        yield
+
+
+class _Lines:
+    """Progress as plain lines, at most one every `LINE_S`."""
+
+    def __init__(self) -> None:
+        self._next = time.monotonic() + LINE_S
+
+    def __call__(self, title: str, done: int, total: int, note: str) -> None:
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + LINE_S
+            say(f"{title}: {done} of {total} {note}".rstrip())
+
+
+@contextmanager
+def _bars() -> Iterator[Listener]:
+    """A bar for each title, with the remaining time."""
+    # 40 ms that help and short commands need not wait for
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskID,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        rows: dict[str, TaskID] = {}
+
+        def show(title: str, done: int, total: int, note: str) -> None:
+            if title not in rows:
+                rows[title] = bars.add_task(title, total=total, note=note)
+            elif done < bars.tasks[rows[title]].completed:  # the same work once more: its clock starts again
+                bars.reset(rows[title])
+            bars.update(rows[title], completed=done, total=total, note=note)
+
+        yield show
 
 
 @contextmanager

@@ -1,16 +1,20 @@
-"""`isocharge train ...`: its commands, one file each."""
+"""`isocharge train ...`: its commands, one module each."""
 
-import typer
+from isocharge.cli.shared.lazy import lazy_group
 
-from isocharge.cli.train.calibrate import calibrate_command
-from isocharge.cli.train.distil import distil_command
-from isocharge.cli.train.export_c import export_c_command
-from isocharge.cli.train.fit import fit_command
-from isocharge.cli.train.report import report_command
-
-train_app = typer.Typer(no_args_is_help=True, help="Train models on simulated charges; compare methods.")
-train_app.command("fit")(fit_command)
-train_app.command("report")(report_command)
-train_app.command("distil")(distil_command)
-train_app.command("calibrate")(calibrate_command)
-train_app.command("export-c")(export_c_command)
+train_app = lazy_group(
+    "Train models on simulated or measured charges; calibrate films; compare methods.",
+    {
+        "fit": ("isocharge.cli.train.fit:fit_command", "Train a network and write its model folder."),
+        "calibrate": (
+            "isocharge.cli.train.calibrate:calibrate_command",
+            "Fit a real film to some presses, and write its model folder.",
+        ),
+        "report": ("isocharge.cli.train.report:report_command", "Compare methods: speed against error."),
+        "distil": (
+            "isocharge.cli.train.distil:distil_command",
+            "Train a small network for microcontrollers on a model's answers.",
+        ),
+        "export-c": ("isocharge.cli.train.export_c:export_c_command", "Write a model as C source."),
+    },
+)
