@@ -10,20 +10,26 @@ A part counts only if its checksum exists and matches; all other parts are compu
 """
 
 import importlib
+import io
 import json
+import logging
 import shutil
-import warnings
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
+import numpy as np
+
+from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, OutputError, OutputExists, SolveError, TrainingError
 from isocharge.common.files import new_folder, read_whole, refuse_existing, sha256_of, sync_folder, write_whole
-from isocharge.common.progress import Warn
 from isocharge.common.tables import cut, read_json
 
 Content = TypeVar("Content")
+
+_log = logging.getLogger(__name__)
 
 MOST_PART_BYTES = 1 << 30
 """Largest part of a run, bytes."""
@@ -38,8 +44,8 @@ class ResumableRun:
         data: The folder in the draft that becomes the target.
     """
 
-    def __init__(self, target: Path, warn: Warn = warnings.warn) -> None:
-        self.target, self.folder, self._warn = target, draft_of(target), warn
+    def __init__(self, target: Path) -> None:
+        self.target, self.folder = target, draft_of(target)
         self.data, self._parts = self.folder / "data", self.folder / "parts"
 
     def save(self, name: str, data: bytes, *, final: bool = False) -> None:
@@ -75,8 +81,19 @@ class ResumableRun:
                 raise ValueError(f"expected sha256 {checksum[:12]}..., got {sha256_of(data)[:12]}...")
             return decode(data)
         except Exception as error:  # decoders of other packages raise what they like
-            self._warn(f"{path} is damaged: {cut(str(error) or type(error).__name__)}; computed again")
+            _log.warning("%s is damaged: %s; computed again", path, cut(str(error) or type(error).__name__))
             return None
+
+    def keeping(self, name: str, executor: Executor | None = None) -> Executor:
+        """An executor whose results, arrays of numbers, are parts of the run: those that it has are not computed again.
+
+        Tasks are numbered as they are submitted: a run that goes on must submit the same tasks in the same order.
+
+        Args:
+            name: First part of the file names.
+            executor: Runs the tasks; None runs them in this process.
+        """
+        return _Keeping(self, name, executor or _InThisProcess())
 
     def is_empty(self) -> bool:
         """Whether no part is finished yet."""
@@ -108,6 +125,62 @@ class ResumableRun:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
+class _InThisProcess(Executor):
+    """Runs a task when it is submitted."""
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(function(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class _Keeping(Executor):
+    """See `ResumableRun.keeping`."""
+
+    def __init__(self, run: ResumableRun, name: str, executor: Executor) -> None:
+        self._run, self._name, self._executor, self._submitted = run, name, executor, 0
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        part = f"{self._name}-{self._submitted:04d}.npy"
+        self._submitted += 1
+        kept: Future[Any] = Future()
+        if (saved := self._run.load_as(part, _array)) is not None:
+            kept.set_result(saved)
+            return kept
+        computed = self._executor.submit(function, *args, **kwargs)
+        computed.add_done_callback(lambda _: self._keep(part, computed, kept))
+        kept.add_done_callback(lambda _: computed.cancel())
+        return kept
+
+    def _keep(self, part: str, computed: Future[Any], kept: Future[Any]) -> None:
+        if computed.cancelled():
+            kept.cancel()
+        if not kept.set_running_or_notify_cancel():
+            return
+        try:
+            result = computed.result()
+            self._run.save(part, _npy(result))
+            kept.set_result(result)
+        except BaseException as error:  # as an executor does: it is raised where the result is taken
+            kept.set_exception(error)
+
+
+def _array(data: bytes) -> Array:
+    array = np.load(io.BytesIO(data), allow_pickle=False)
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        raise ValueError(f"expected an array of numbers, got {getattr(array, 'dtype', 'an archive')}")
+    return array
+
+
+def _npy(array: Array) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    return buffer.getvalue()
+
+
 def draft_of(target: Path) -> Path:
     """Folder of a target's draft."""
     return target.with_name(f"{target.name}.part")
@@ -122,16 +195,13 @@ def refuse_finished(target: Path) -> None:
 
 
 @contextmanager
-def resume_folder(
-    target: Path, identity: Mapping[str, Any], *, fresh: bool = False, warn: Warn = warnings.warn
-) -> Iterator[ResumableRun]:
+def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
     """Begin a run, or go on with one that was stopped; the target appears when the block ends well.
 
     Args:
         target: The folder to write.
         identity: Everything that the result depends on, as JSON.
         fresh: Throw an earlier draft away.
-        warn: Called with a sentence for each damaged part.
 
     Yields:
         The draft; fill `data`. If the block fails, the draft stays, unless nothing is finished or the same error would
@@ -141,18 +211,16 @@ def resume_folder(
         OutputExists: If the target is already there, or the draft is another run's or in use.
         OutputError: If the file system refuses.
     """
-    with resume_parts(target, identity, fresh=fresh, warn=warn) as draft:
+    with resume_parts(target, identity, fresh=fresh) as draft:
         yield draft
         draft.publish()
 
 
 @contextmanager
-def resume_parts(
-    target: Path, identity: Mapping[str, Any], *, fresh: bool = False, warn: Warn = warnings.warn
-) -> Iterator[ResumableRun]:
+def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
     """Like `resume_folder`, but the block writes the target itself; the draft is removed when the block ends well."""
     refuse_finished(target)
-    draft = ResumableRun(target, warn)
+    draft = ResumableRun(target)
     parents = [parent for parent in target.parents if not parent.exists()]
     try:
         with _claim(draft, json.loads(json.dumps(identity)), fresh):

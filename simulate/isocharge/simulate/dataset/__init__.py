@@ -1,4 +1,1 @@
-"""Datasets of presses and charges: sampling plans, sweeps, and the file format.
-
-May import: forward, solver, sensor, execution, numerics.
-"""
+"""Datasets of presses and charges: sampling plans, sweeps, and the file format."""

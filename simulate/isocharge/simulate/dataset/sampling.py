@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.stats import qmc
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError
 from isocharge.simulate.numerics.disk import lattice
@@ -24,6 +24,13 @@ MOST_SAMPLES = 10_000_000
 """Largest sweep: about 600 MB on disk."""
 
 FULL_TURN = 2.0 * np.pi
+
+PLANS = {
+    "sobol": "scrambled Sobol, uniform over the disk, log-uniform in force",
+    "random": "independent, uniform over the disk, log-uniform in force",
+    "grid": "grid: square lattice over the disk, forces in equal steps of the logarithm, evenly spread orientations",
+}
+"""What the manifest says of a sampling."""
 
 Sampling = Literal["sobol", "random", "grid"]
 
@@ -36,23 +43,19 @@ class SweepPresses:
 
     Attributes:
         probe: Number of the probe, shape (n,).
-        x: Position along the drawn direction, shape (n,), m.
-        y: Position across it, shape (n,), m.
-        force: Shape (n,), N.
-        turn: How far the probe is turned further, shape (n,), rad.
+        contact: (x, y, F), shape (n, 3), mm and N.
+        rotation: Angle by which the probe is turned against its notation, shape (n,), rad.
     """
 
     probe: Integers
-    x: Array
-    y: Array
-    force: Array
-    turn: Array
+    contact: Array
+    rotation: Array
 
     def __len__(self) -> int:
-        return self.x.size
+        return self.probe.size
 
     def __getitem__(self, part: slice | Integers) -> "SweepPresses":
-        return SweepPresses(self.probe[part], self.x[part], self.y[part], self.force[part], self.turn[part])
+        return SweepPresses(self.probe[part], self.contact[part], self.rotation[part])
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class Sweep:
     """What to sample.
 
     Attributes:
-        radius: Largest distance of a press from the centre, m.
+        radius: Largest distance of a press from the centre, mm.
         force_range: Smallest and largest force, N.
         samples: Number of presses, shared equally among the probes; a grid may have fewer, see `sampling`.
         seed: Seed of the sequence; a grid uses none.
@@ -88,9 +91,9 @@ class Sweep:
         if self.sampling not in get_args(Sampling):
             raise SceneError(f"sampling: expected 'sobol', 'random' or 'grid', got {self.sampling!r}")
 
-    def presses(self) -> tuple[Array, Array, Array, Array]:
-        """x, y (m), force (N) and orientation (rad) of every sample of a sweep with one probe, each of shape (n,)."""
-        return self._of_probe(0, 1, FULL_TURN)
+    def contacts(self) -> Array:
+        """(x, y, F) of every press of a sweep with one probe, shape (n, 3), mm and N."""
+        return self._of_probe(0, 1, FULL_TURN).contact
 
     def over(self, probes: Sequence[Probe]) -> SweepPresses:
         """Every press of a sweep with these probes, which take turns.
@@ -103,21 +106,22 @@ class Sweep:
         if self.sampling == "grid" and self.samples < len(probes):
             raise SceneError(f"samples: expected at least one for each of {len(probes)} probes, got {self.samples}")
         parts = [self._of_probe(number, len(probes), probe.period) for number, probe in enumerate(probes)]
-        counts = [part[0].size for part in parts]
-        order = np.argsort(np.concatenate([np.arange(count) for count in counts]), kind="stable")
-        x, y, force, turn = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-        return SweepPresses(np.repeat(np.arange(len(probes)), counts), x, y, force, turn)[order]
+        order = np.argsort(np.concatenate([np.arange(len(part)) for part in parts]), kind="stable")
+        columns = ([getattr(part, name) for part in parts] for name in ("probe", "contact", "rotation"))
+        return SweepPresses(*(np.concatenate(column) for column in columns))[order]
 
-    def _of_probe(self, number: int, probes: int, period: float) -> tuple[Array, Array, Array, Array]:
+    def _of_probe(self, number: int, probes: int, period: float) -> SweepPresses:
         if self.sampling == "grid":
-            return self._grid(self.samples // probes, period)
-        unit = self._unit(len(range(number, self.samples, probes)), number)
-        distance, angle = self.radius * np.sqrt(unit[:, 0]), FULL_TURN * unit[:, 1]
-        turn = FULL_TURN * unit[:, 3] if self.orientation == "random" else np.zeros(len(unit))
-        return distance * np.cos(angle), distance * np.sin(angle), self._force(unit[:, 2]), turn
+            at, force, rotation = self._grid(self.samples // probes, period)
+        else:
+            unit = self._unit(len(range(number, self.samples, probes)), number)
+            at = self.radius * np.sqrt(unit[:, 0]) * np.exp(1j * FULL_TURN * unit[:, 1])
+            force = self._force(unit[:, 2])
+            rotation = FULL_TURN * unit[:, 3] if self.orientation == "random" else np.zeros(len(unit))
+        return SweepPresses(np.full(at.size, number), np.stack([at.real, at.imag, force], axis=1), rotation)
 
     def _unit(self, count: int, number: int) -> Array:
-        """Points of the unit cube (distance, angle, force, turn), shape (count, 4)."""
+        """Points of the unit cube (distance, angle, force, rotation), shape (count, 4)."""
         rng = np.random.default_rng([self.seed, number])
         if self.sampling == "random":
             return rng.random((count, 4))
@@ -131,14 +135,15 @@ class Sweep:
         force: Array = np.clip(np.exp(low + (high - low) * share), *self.force_range)
         return force
 
-    def _grid(self, most: int, period: float) -> tuple[Array, Array, Array, Array]:
-        """At most `most` presses: equal numbers of steps in each direction, then all forces that still fit."""
-        forces, turns = self.force_range[0] < self.force_range[1], self.orientation == "random" and period > 0.0
-        side = max(1, round(most ** (1.0 / (2 + forces + turns))))
-        n_turn = side if turns else 1
-        place = self.radius * lattice(most // (n_turn * (side if forces else 1)))
-        n_force = most // (place.size * n_turn) if forces else 1
+    def _grid(self, most: int, period: float) -> tuple[Complexes, Array, Array]:
+        """At most `most` positions, forces and rotations: equal numbers of steps in each direction, then all forces
+        that still fit."""
+        forces, rotations = self.force_range[0] < self.force_range[1], self.orientation == "random" and period > 0.0
+        side = max(1, round(most ** (1.0 / (2 + forces + rotations))))
+        n_rotation = side if rotations else 1
+        place = self.radius * lattice(most // (n_rotation * (side if forces else 1)))
+        n_force = most // (place.size * n_rotation) if forces else 1
         force = self._force(np.linspace(0.0, 1.0, n_force) if n_force > 1 else np.array([0.5]))
-        turn = period * np.arange(n_turn) / n_turn
-        at, pushed, turned = (axis.ravel() for axis in np.meshgrid(place, force, turn, indexing="ij"))
-        return at.real, at.imag, pushed, turned
+        rotation = period * np.arange(n_rotation) / n_rotation
+        at, pushed, turned = (axis.ravel() for axis in np.meshgrid(place, force, rotation, indexing="ij"))
+        return at, pushed.real, turned.real

@@ -12,7 +12,7 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -24,11 +24,19 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, SensorError
 from isocharge.common.files import new_folder, read_whole, sha256_of, write_whole
 from isocharge.common.tables import MOST_JSON_BYTES, Table, cut, parse_json, shown
-from isocharge.simulate.dataset.card import COLUMNS, data_card
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
 FORMAT_VERSION = 1
+
+COLUMNS = {
+    "x_mm": "position of the press along the drawn direction, mm",
+    "y_mm": "position of the press across it, mm",
+    "force_N": "force of the press, N, positive pushes",
+    "probe": "the object that presses, notation without the angle",
+    "orientation_deg": "angle by which the probe is turned against its notation, deg, anticlockwise",
+    "charge_pC": "touch charge of each electrode, pC, electrodes in the manifest's order",
+}
 
 MOST_SHARD_BYTES = 1 << 26
 """Largest shard, and largest column in it once unpacked, bytes: a sweep's have a twentieth."""
@@ -150,6 +158,43 @@ def write_manifest(
     }
     write_whole(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
     write_whole(folder / "README.md", data_card(name, manifest).encode())
+
+
+def data_card(name: str, manifest: dict[str, Any]) -> str:
+    """The README.md of a dataset, from its manifest."""
+    ranges, solver = manifest.get("ranges", {}), manifest.get("solver", {})
+    lines = [
+        f"# {name}",
+        "",
+        f"{manifest['samples']} presses on the sensor `{manifest['sensor']['name']}` and the touch charge of each "
+        f"electrode ({', '.join(manifest['electrodes'])}).",
+        "",
+        f"Made by isocharge {manifest['package_version']}. Touch charge is the reading under load minus the reading "
+        "without load.",
+        "",
+        "| column | meaning |",
+        "|---|---|",
+        *(f"| `{column}` | {meaning} |" for column, meaning in COLUMNS.items()),
+        "",
+        "| what | value |",
+        "|---|---|",
+        f"| probes | {', '.join(manifest.get('probes', []))} |",
+        *(f"| {key} | {value} |" for key, value in ranges.items()),
+        *(f"| {key} | {manifest[key]} |" for key in ("sampling", "noise", "seed") if key in manifest),
+        *(f"| solver: {key} | {value} |" for key, value in _flat(solver)),
+        "",
+        "Read it with `isocharge.simulate.read_dataset(folder)`, which checks every shard's checksum.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _flat(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from ((f"{key} {inner}", deep) for inner, deep in _flat(value))
+        else:
+            yield key, value
 
 
 def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:

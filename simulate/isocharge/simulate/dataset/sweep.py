@@ -1,11 +1,12 @@
 """A sweep: many presses spread over the working area and the forces, and their charges.
 
 A forward map is solved for every probe and evaluated for every press. Both are cut into tasks that do not depend on the
-workers, so neither do the bytes. Finished parts are kept in a folder next to the dataset, so
-a run that was killed goes on.
+executor, so neither do the bytes. Finished parts are kept in a folder next to the dataset, so that a run that was
+killed goes on.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict
 from itertools import tee
 from pathlib import Path
@@ -15,11 +16,9 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import SceneError
-from isocharge.common.progress import Progress
+from isocharge.common.progress import report
 from isocharge.common.resumable_run import ResumableRun, output_errors, refuse_finished, resume_folder
-from isocharge.simulate.dataset.callbacks import SweepCallbacks
-from isocharge.simulate.dataset.sampling import Sweep as Sweep
-from isocharge.simulate.dataset.sampling import SweepPresses
+from isocharge.simulate.dataset.sampling import PLANS, Sweep, SweepPresses
 from isocharge.simulate.dataset.shards import (
     Samples,
     pack_shard,
@@ -29,9 +28,8 @@ from isocharge.simulate.dataset.shards import (
     write_manifest,
 )
 from isocharge.simulate.execution.blas import single_threaded_blas
-from isocharge.simulate.execution.checkpointed_map import CheckpointedMap, JobMap
 from isocharge.simulate.execution.code_version import code_fingerprint
-from isocharge.simulate.execution.workers import Workers
+from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
@@ -44,12 +42,6 @@ SHARD = 16384
 TASK = 8192
 """Presses per task: a second of work, long compared with sending the map to the worker (12 MB)."""
 
-SAMPLING = {
-    "sobol": "scrambled Sobol, uniform over the disk, log-uniform in force",
-    "random": "independent, uniform over the disk, log-uniform in force",
-    "grid": "grid: square lattice over the disk, forces in equal steps of the logarithm, evenly spread orientations",
-}
-
 
 def run_sweep(
     folder: Path,
@@ -58,8 +50,7 @@ def run_sweep(
     sweep: Sweep,
     settings: SolveSettings = SolveSettings(),
     *,
-    workers: Workers = Workers(),
-    callbacks: SweepCallbacks = SweepCallbacks(),
+    executor: Executor | None = None,
     shard: int = SHARD,
     fresh: bool = False,
 ) -> Path:
@@ -71,8 +62,8 @@ def run_sweep(
         probes: The objects that press, in turn.
         sweep: Which presses to sample.
         settings: How the film is solved.
-        workers: Who does the work, this process by default. The bytes written do not depend on it.
-        callbacks: What to call with progress and warnings.
+        executor: Does the work: a process pool, the executor of a Dask cluster; this process if absent. The bytes
+            written do not depend on it.
         shard: Samples per shard.
         fresh: Throw away the parts of an earlier run.
 
@@ -84,17 +75,25 @@ def run_sweep(
         OutputExists: If the folder is already there, or an unfinished run of other settings; raised before the work
             begins.
         OutputError: If the file system refuses; the finished work is kept.
+        WorkersLost: If the executor's workers end; the finished work is kept.
     """
     folder, probes = Path(folder), tuple(probes)
     refuse_finished(folder)
     presses = sweep.over(probes)  # before anything is written: scipy's Sobol tables swallow an interrupt
-    identity = _identity(sensor, probes, sweep, settings, shard)
-    with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh, warn=callbacks.warn) as run:
-        maps = tuple(
-            _build(sensor, probe, sweep, settings, map_jobs, callbacks.solved)
-            for probe, map_jobs in _checkpointed_maps(run, probes, workers)
-        )
-        entries = _finish_shards(run, maps, presses, workers, shard, callbacks.sampled)
+    identity = {
+        "made_by": code_fingerprint(),
+        "sensor": sensor_to_dict(sensor),
+        "probes": [f"{probe.notation}@{np.rad2deg(probe.angle):.12g}" for probe in probes],
+        "sweep": asdict(sweep),
+        "solver": asdict(settings),
+        "shard": shard,
+    }
+    with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh) as run:
+        maps = [
+            _solved(sensor, probe, sweep, settings, run.keeping(f"solve-{number:02d}", executor))
+            for number, probe in enumerate(probes)
+        ]
+        entries = _finish_shards(run, maps, presses, executor, shard)
         with output_errors(folder):
             write_manifest(run.data, folder.name, sensor, entries, _about(maps, sweep))
     return folder
@@ -106,54 +105,24 @@ def solve_maps(
     sweep: Sweep,
     settings: SolveSettings = SolveSettings(),
     *,
-    workers: Workers = Workers(),
-    progress: Progress | None = None,
+    executor: Executor | None = None,
 ) -> tuple[ForwardMap, ...]:
     """A forward map for each probe, over the sweep's ranges."""
     if not probes:
         raise SceneError("probes: expected at least one, got none")
-    return tuple(_build(sensor, probe, sweep, settings, workers.in_order, progress) for probe in probes)
+    return tuple(_solved(sensor, probe, sweep, settings, executor) for probe in probes)
 
 
 def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
     """Write a sweep's presses and charges, given the solved maps, in this process; see `run_sweep`."""
     presses = sweep.over([forward_map.probe for forward_map in maps])
-    return write_dataset(folder, maps[0].sensor, _samples(maps, _cut(presses, SHARD), Workers()), _about(maps, sweep))
+    return write_dataset(folder, maps[0].sensor, _samples(maps, _cut(presses, SHARD), None), _about(maps, sweep))
 
 
-def _build(
-    sensor: Sensor,
-    probe: Probe,
-    sweep: Sweep,
-    settings: SolveSettings,
-    map_jobs: JobMap,
-    progress: Progress | None,
+def _solved(
+    sensor: Sensor, probe: Probe, sweep: Sweep, settings: SolveSettings, executor: Executor | None
 ) -> ForwardMap:
-    return ForwardMap.build(
-        sensor, probe, sweep.radius, sweep.force_range, settings, map_jobs=map_jobs, progress=progress
-    )
-
-
-def _checkpointed_maps(
-    run: ResumableRun, probes: Sequence[Probe], workers: Workers
-) -> Iterator[tuple[Probe, CheckpointedMap]]:
-    """Each probe with the map function whose results the run keeps under its number."""
-    for number, probe in enumerate(probes):
-        yield probe, CheckpointedMap(run, f"solve-{number:02d}", workers.in_order)
-
-
-def _identity(
-    sensor: Sensor, probes: Sequence[Probe], sweep: Sweep, settings: SolveSettings, shard: int
-) -> dict[str, Any]:
-    """Everything that the bytes of the dataset depend on."""
-    return {
-        "made_by": code_fingerprint(),
-        "sensor": sensor_to_dict(sensor),
-        "probes": [f"{probe.notation}@{np.rad2deg(probe.angle):.12g}" for probe in probes],
-        "sweep": asdict(sweep),
-        "solver": asdict(settings),
-        "shard": shard,
-    }
+    return ForwardMap.build(sensor, probe, sweep.radius, sweep.force_range, settings, executor=executor)
 
 
 def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
@@ -161,11 +130,11 @@ def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
     return {
         "probes": list(dict.fromkeys(forward_map.probe.notation for forward_map in maps)),
         "ranges": {
-            "radius_mm": float(f"{sweep.radius * 1e3:.12g}"),
+            "radius_mm": float(f"{sweep.radius:.12g}"),
             "force_N": list(sweep.force_range),
             "orientation": sweep.orientation,
         },
-        "sampling": SAMPLING[sweep.sampling],
+        "sampling": PLANS[sweep.sampling],
         "seed": sweep.seed,
         "noise": "clean",
         "solver": {
@@ -178,32 +147,24 @@ def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
 
 
 def _finish_shards(
-    run: ResumableRun,
-    maps: Sequence[ForwardMap],
-    presses: SweepPresses,
-    workers: Workers,
-    shard: int,
-    sampled: Progress | None,
+    run: ResumableRun, maps: Sequence[ForwardMap], presses: SweepPresses, executor: Executor | None, shard: int
 ) -> list[dict[str, Any]]:
     """Write the shards that the run does not have yet; the manifest's entry of each shard, in order."""
-    parts = dict(enumerate(_cut(presses, shard)))
+    parts = list(_cut(presses, shard))
     entries: dict[int, dict[str, Any]] = {}
-    for number, part in parts.items():
+    for number, part in enumerate(parts):
         if (data := run.load(shard_name(number), final=True)) is not None:
             entries[number] = shard_entry(shard_name(number), len(part), data)
     done = sum(entry["samples"] for entry in entries.values())
-    missing = [number for number in parts if number not in entries]
-    if sampled:
-        sampled(done, len(presses))
-    computed = _samples(maps, (parts[number] for number in missing), workers)
-    for number, samples in zip(missing, computed, strict=True):
+    missing = [number for number in range(len(parts)) if number not in entries]
+    report("pressing", done, len(presses))
+    for number, samples in zip(missing, _samples(maps, (parts[each] for each in missing), executor), strict=True):
         name, data = pack_shard(number, samples, maps[0].sensor)
         run.save(name, data, final=True)
         entries[number] = shard_entry(name, len(samples), data)
         done += len(samples)
-        if sampled:
-            sampled(done, len(presses))
-    return [entries[number] for number in parts]
+        report("pressing", done, len(presses))
+    return [entry for _, entry in sorted(entries.items())]
 
 
 def _cut(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
@@ -211,26 +172,26 @@ def _cut(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
         yield presses[start : start + size]
 
 
-def _samples(maps: Sequence[ForwardMap], shards: Iterable[SweepPresses], workers: Workers) -> Iterator[Samples]:
+def _samples(
+    maps: Sequence[ForwardMap], shards: Iterable[SweepPresses], executor: Executor | None
+) -> Iterator[Samples]:
     """Samples of each shard, in order; the workers run ahead of the one that is taken."""
     shards, coming = tee(shards)
-    tasks = ((maps[number], part[rows]) for part in coming for number, rows in _tasks(part, len(maps)))
-    charges = workers.in_order(_charges, tasks)
+    tasks = (
+        (maps[number], part.contact[rows], part.rotation[rows])
+        for part in coming
+        for number, rows in _tasks(part, len(maps))
+    )
+    charges = in_order(executor, _charges, tasks)
     notation = np.array([forward_map.probe.notation for forward_map in maps])
     angle = np.array([forward_map.probe.angle for forward_map in maps])
     for part in shards:
-        charge = np.empty((len(part), len(maps[0].sensor.electrodes)))
+        charge = np.empty((len(part), len(maps[0].electrodes)))
         for _, rows in _tasks(part, len(maps)):
             charge[rows] = next(charges)
-        turned = np.rad2deg(angle[part.probe] + part.turn)
-        yield Samples(
-            x_mm=part.x * 1e3,
-            y_mm=part.y * 1e3,
-            force_N=part.force,
-            probe=notation[part.probe],
-            orientation_deg=np.mod(np.round(turned, 9), 360.0),
-            charge_pC=charge * 1e12,
-        )
+        x, y, force = (np.ascontiguousarray(column) for column in part.contact.T)
+        rotation = np.mod(np.round(np.rad2deg(angle[part.probe] + part.rotation), 9), 360.0)
+        yield Samples(x, y, force, notation[part.probe], rotation, charge)
 
 
 def _tasks(part: SweepPresses, probes: int) -> Iterator[tuple[int, Integers]]:
@@ -241,7 +202,7 @@ def _tasks(part: SweepPresses, probes: int) -> Iterator[tuple[int, Integers]]:
             yield number, rows[start : start + TASK]
 
 
-def _charges(task: tuple[ForwardMap, SweepPresses]) -> Array:
-    """Touch charges of a task's presses, shape (n, n_electrode), C."""
-    forward_map, presses = task
-    return forward_map.forward(presses.x, presses.y, presses.force, presses.turn)
+def _charges(task: tuple[ForwardMap, Array, Array]) -> Array:
+    """Touch charges of a task's presses, shape (n, n_electrode), pC."""
+    forward_map, contact, rotation = task
+    return forward_map.charges(contact, rotation)

@@ -1,4 +1,1 @@
-"""Who computes: threads, worker processes, a Dask cluster; checkpoints, and the fingerprint of the code.
-
-May import: nothing else of isocharge.simulate.
-"""
+"""Where long work is done: this process, worker processes, a Dask cluster; and the fingerprint of the code."""

@@ -1,7 +1,7 @@
-"""Where the work of a sweep is done: in this process, in processes on this machine, or on a Dask cluster.
+"""Where long work is done: any `concurrent.futures.Executor`, such as processes on this machine or a Dask cluster.
 
-All of them are one `concurrent.futures.Executor`. What they compute does not depend on which, on how many, or on who
-is first: tasks are cut beforehand and their results are taken in order.
+The results do not depend on the executor, on the number of workers, or on which of them finishes first: tasks are cut
+beforehand and their results are taken in order.
 """
 
 import multiprocessing
@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Generic, TypeVar
 
@@ -25,41 +24,64 @@ Job = TypeVar("Job")
 
 Result = TypeVar("Result")
 
-AHEAD = 16
-"""Tasks handed out before the first result is back."""
+AHEAD = 64
+"""Most tasks handed out whose results were not taken yet: enough for some thirty workers, few enough for memory."""
 
 CONNECT_S = 10.0
 """Longest wait for a cluster to answer, s."""
 
 
-@dataclass(frozen=True)
-class Workers:
-    """Who does the work.
+def in_order(
+    executor: Executor | None, function: Callable[[Job], Result], jobs: Iterable[Job], *, ahead: int = AHEAD
+) -> Iterator[Result]:
+    """The results of all jobs, in their order; jobs are drawn as they are needed.
 
-    Attributes:
-        executor: Runs the tasks; None runs them in this process.
-        ahead: Tasks to hand out before the first result is back: enough to keep workers busy, few enough for memory.
+    Args:
+        executor: Runs the tasks: a process pool with any start method, `Client.get_executor()` of Dask, threads. None
+            runs them in this process, one when its result is asked for.
+        function: Called with each job; processes must be able to import it.
+        jobs: What it is called with.
+        ahead: Most tasks handed out whose results were not taken yet.
+
+    Raises:
+        WorkersLost: If workers end by themselves, or run another version of isocharge.
     """
+    if executor is None:
+        yield from map(function, jobs)
+        return
+    task = SameCodeOnly(function)
+    pending: deque[Future[Result]] = deque()
+    try:
+        for job in jobs:
+            with _loss_of_workers():
+                pending.append(executor.submit(task, job))
+            while pending and (pending[0].done() or len(pending) >= ahead):
+                yield _result(pending.popleft())
+        while pending:
+            yield _result(pending.popleft())
+    finally:
+        for future in pending:
+            future.cancel()
 
-    executor: Executor | None = None
-    ahead: int = AHEAD
 
-    def in_order(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
-        """The results of all jobs, in their order; jobs are drawn as workers come free."""
-        if self.executor is None:
-            yield from map(function, jobs)
-            return
-        pending: deque[Future[Result]] = deque()
-        try:
-            for job in jobs:
-                pending.append(self.executor.submit(SameCodeOnly(function), job))
-                if len(pending) >= self.ahead:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
-        finally:
-            for future in pending:
-                future.cancel()
+def _result(future: Future[Result]) -> Result:
+    with _loss_of_workers():
+        return future.result()
+
+
+@contextmanager
+def _loss_of_workers() -> Iterator[None]:
+    """Turn what executors raise when their workers are gone into WorkersLost."""
+    try:
+        yield
+    except BrokenExecutor as error:
+        raise WorkersLost("a worker process ended by itself: out of memory, or killed from outside") from error
+    except CancelledError as error:
+        raise WorkersLost("the executor was shut down, or lost its workers, before the work was done") from error
+    except Exception as error:
+        if not type(error).__module__.startswith("distributed."):  # KilledWorker, CommClosedError
+            raise
+        raise WorkersLost(f"the Dask cluster gave up: {error}") from error
 
 
 class SameCodeOnly(Generic[Job, Result]):
@@ -73,7 +95,8 @@ class SameCodeOnly(Generic[Job, Result]):
             raise WorkersLost(
                 f"a worker runs {code_fingerprint()}, expected {self._fingerprint}; install the same on all of them"
             )
-        return self._function(job)
+        with single_threaded_blas():
+            return self._function(job)
 
 
 def cores() -> int:
@@ -82,24 +105,18 @@ def cores() -> int:
 
 
 @contextmanager
-def local_workers(count: int) -> Iterator[Workers]:
-    """Processes on this machine, none for one worker. They end with the block, and if this process is killed.
-
-    Raises:
-        WorkersLost: If one of them ends by itself.
-    """
+def local_workers(count: int) -> Iterator[Executor | None]:
+    """Processes on this machine, None for one worker. They end with the block, and if this process is killed."""
     if count == 1:
-        yield Workers()
+        yield None
         return
     context = multiprocessing.get_context("spawn")  # a fork copies locks that other threads hold
     watched, held = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(watched,))
     try:
-        yield Workers(pool, 2 * count + 2)
-    except BaseException as error:
-        held.close()
-        if isinstance(error, BrokenExecutor):
-            raise WorkersLost("a worker process ended by itself: out of memory, or killed from outside") from error
+        yield pool
+    except BaseException:
+        held.close()  # workers in the middle of a task end, too
         raise
     finally:
         pool.shutdown(cancel_futures=True)
@@ -111,7 +128,6 @@ def _begin(watched: Connection) -> None:
     """Interrupts are the parent's to handle; the worker ends when the parent lets go of its end of the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    single_threaded_blas().__enter__()  # for good
     threading.Thread(target=_end_with_parent, args=(watched,), daemon=True).start()
 
 
@@ -121,21 +137,19 @@ def _end_with_parent(watched: Connection) -> None:
 
 
 @contextmanager
-def dask_workers(address: str) -> Iterator[Workers]:
+def dask_workers(address: str) -> Iterator[Executor]:
     """The workers of a Dask cluster, such as "tcp://10.0.0.1:8786"; they need the same isocharge as this process.
 
-    A worker that is killed is no matter as long as others are left: Dask gives its tasks to them.
+    If a worker is killed, Dask gives its tasks to the others.
 
     Raises:
         InputError: If this is no address.
-        WorkersLost: If the cluster does not answer, or is lost.
+        WorkersLost: If the cluster does not answer.
         MissingExtra: If the extra `cluster` is not installed.
     """
     with require("cluster"):
         import dask
         from distributed import Client
-        from distributed.comm.core import CommClosedError
-        from distributed.scheduler import KilledWorker
 
     with dask.config.set({"distributed.admin.large-graph-warning-threshold": "100MiB"}):  # a task carries its map
         try:
@@ -147,10 +161,8 @@ def dask_workers(address: str) -> Iterator[Workers]:
                 f"no Dask scheduler answers at {address}: {error}; is 'dask scheduler' running?"
             ) from error
         with client:
-            executor = client.get_executor(pure=False)
+            executor: Executor = client.get_executor(pure=False)
             try:
-                yield Workers(executor, 2 * sum(client.ncores().values()) + 2)
-            except (KilledWorker, CancelledError, CommClosedError) as error:
-                raise WorkersLost(f"the Dask cluster at {address} gave up: {error}") from error
+                yield executor
             finally:
                 executor.shutdown(wait=False)
