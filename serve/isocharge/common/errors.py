@@ -5,6 +5,22 @@ A message says what was expected, what was got, where, and what to do. The comma
 `isocharge.serve.network.protocol.status`.
 """
 
+LONGEST_VALUE = 200
+"""Characters of a wrong value, or of a list of keys, that a message shows."""
+
+
+def cut(text: str) -> str:
+    """A text for a message, cut after `LONGEST_VALUE` characters."""
+    return text if len(text) <= LONGEST_VALUE else text[:LONGEST_VALUE] + "..."
+
+
+def shown(value: object) -> str:
+    """A value for a message: its repr, cut after `LONGEST_VALUE` characters."""
+    try:
+        return cut(repr(value))
+    except (RecursionError, ValueError):  # nested too deeply; an int with more digits than Python prints
+        return f"a {type(value).__name__} that is too large to print"
+
 
 class IsochargeError(Exception):
     """Root of all errors that isocharge raises on purpose."""

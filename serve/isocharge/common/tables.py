@@ -19,14 +19,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NoReturn, TypeGuard
 
+from isocharge.common.errors import LONGEST_VALUE as LONGEST_VALUE
 from isocharge.common.errors import InputError
+from isocharge.common.errors import cut as cut
+from isocharge.common.errors import shown as shown
 from isocharge.common.files import read_whole
 
 REQUIRED: Final = object()
 """The default of a key that must be there."""
-
-LONGEST_VALUE = 200
-"""Characters of a wrong value, or of a list of keys, that a message shows."""
 
 LONGEST_TEXT = 1000
 """Characters of a text: names stand in messages, records and pages."""
@@ -57,14 +57,6 @@ def is_number(value: object) -> TypeGuard[int | float]:
 def is_whole(value: object) -> TypeGuard[int]:
     """Whether a value is an int of 64 bits; a bool is not."""
     return isinstance(value, int) and not isinstance(value, bool) and -(1 << 63) <= value < 1 << 63
-
-
-def shown(value: object) -> str:
-    """A value for a message: its repr, cut after `LONGEST_VALUE` characters."""
-    try:
-        return cut(repr(value))
-    except (RecursionError, ValueError):  # nested too deeply; an int with more digits than Python prints
-        return f"a {type(value).__name__} that is too large to print"
 
 
 def read_toml(path: Path, what: str, error: type[InputError]) -> dict[str, Any]:
@@ -289,8 +281,3 @@ def _kind_of_number(noun: str, least: float, most: float, above: float) -> str:
 def _plain(bound: float) -> str:
     """A bound as people write it: whole numbers with all their digits, up to a million."""
     return f"{bound:g}" if isinstance(bound, float) else str(bound)
-
-
-def cut(text: str) -> str:
-    """A text for a message, cut after `LONGEST_VALUE` characters."""
-    return text if len(text) <= LONGEST_VALUE else text[:LONGEST_VALUE] + "..."

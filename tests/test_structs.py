@@ -1,0 +1,141 @@
+"""Typed structs from TOML and JSON: what is wrong is said with its place, what was expected and what was given."""
+
+import math
+import re
+from typing import Annotated, Literal
+
+import msgspec
+import pytest
+from msgspec import Meta
+
+from isocharge.common.errors import LONGEST_VALUE, DeviceError, SensorError
+from isocharge.common.structs import (
+    MOST_TOML_BYTES,
+    Finite,
+    NotNegative,
+    Positive,
+    Settings,
+    Text,
+    WrongKey,
+    convert,
+    parse_json,
+    parse_toml,
+    read_json,
+    read_toml,
+)
+
+
+class Auto(Settings, tag_field="format", tag="auto"):
+    columns: tuple[str, ...] = ()
+
+
+class Binary(Settings, tag_field="format", tag="binary"):
+    length: Annotated[int, Meta(ge=1, le=100)]
+
+
+class Part(Settings):
+    name: Text
+    at: Annotated[tuple[float, float], Meta(description="[x, y] in mm")] = (0.0, 0.0)
+
+
+class Board(Settings):
+    radius: Positive = 1.0
+    share: NotNegative = 0.0
+    offset: Finite = 0.0
+    poisson: Annotated[float, Meta(gt=-1.0, le=0.5)] = 0.3
+    frames: Auto | Binary = Auto()
+    gain: Positive | dict[str, Positive] = 1.0
+    order: Literal["little", "big"] = "little"
+    parts: tuple[Part, ...] = ()
+    on: bool = True
+    low: int = 0
+    high: int = 1
+
+    def __post_init__(self):
+        if self.low > self.high:
+            raise WrongKey("low", f"at most high ({self.high})", self.low)
+
+
+class File(Settings):
+    board: Board
+    names: tuple[str, ...] = ()
+
+
+def test_a_value_that_fits_is_taken():
+    text = 'board = {radius = 2, gain = {A = 1.5, B = 2}, frames = {format = "binary", length = 3}}'
+    board = parse_toml(text, "mine.toml", SensorError, File).board
+    assert (board.radius, board.gain, board.frames) == (2.0, {"A": 1.5, "B": 2.0}, Binary(length=3))
+    assert board.share == 0.0
+    assert parse_json(msgspec.json.encode(File(board=board)), "", SensorError, File).board == board
+
+
+@pytest.mark.parametrize(
+    ("board", "message"),
+    [
+        ({"radius": -45}, "board.radius: expected a positive number, got -45"),
+        ({"radius": math.nan}, "board.radius: expected a positive number, got nan"),
+        ({"radius": True}, "board.radius: expected a positive number, got True"),
+        ({"share": "x"}, "board.share: expected a number from 0, got 'x'"),
+        ({"offset": math.inf}, "board.offset: expected a finite number, got inf"),
+        ({"offset": 10**400}, f"board.offset: expected a finite number, got {'1' + '0' * (LONGEST_VALUE - 1)}..."),
+        ({"poisson": 0.6}, "board.poisson: expected a number above -1 and at most 0.5, got 0.6"),
+        ({"low": 1.5}, "board.low: expected a whole number, got 1.5"),
+        ({"low": 3, "high": 2}, "board.low: expected at most high (2), got 3"),
+        ({"on": 1}, "board.on: expected true or false, got 1"),
+        ({"order": "odd"}, "board.order: expected one of little, big, got 'odd'"),
+        ({"gain": {"A": 1, "B": 0}}, "board.gain.B: expected a positive number, got 0"),
+        ({"gain": []}, "board.gain: expected a positive number or a table, got []"),
+        ({"frames": {"format": "binary", "length": 0}}, "board.frames.length: expected a whole number from 1 to 100"),
+        ({"frames": {"format": "binary"}}, "key 'board.frames.length' is missing"),
+        ({"frames": {"format": "morse"}}, "board.frames.format: expected one of auto, binary, got 'morse'"),
+        ({"parts": [{"name": "a"}, {"name": ""}]}, "board.parts[2].name: expected a text of 1 to 1000 characters"),
+        ({"parts": [{"name": "a", "at": [1]}]}, "board.parts[1].at: expected [x, y] in mm, got [1]"),
+        ({"parts": 3}, "board.parts: expected a list, got 3"),
+        ({"parts": [3]}, "board.parts[1]: expected a table, got 3"),
+        ({"radus": 1}, "unknown key 'board.radus'; did you mean 'radius'? Known are radius, share"),
+        ({"zzz": 1}, "unknown key 'board.zzz'; known are radius"),
+        (3, "board: expected a table, got 3"),
+    ],
+)
+def test_what_does_not_fit_is_named(board, message):
+    with pytest.raises(SensorError, match=rf"^mine\.toml: {re.escape(message)}"):
+        convert({"board": board}, File, "mine.toml", SensorError)
+    if not isinstance(board, dict) or all(value == value and value not in (math.inf,) for value in board.values()):
+        with pytest.raises(SensorError, match=rf"^mine\.json: {re.escape(message)}"):
+            parse_json(msgspec.json.encode({"board": board}), "mine.json", SensorError, File)
+
+
+def test_the_table_itself_is_named_without_a_path():
+    with pytest.raises(SensorError, match=r"^mine\.toml: key 'board' is missing$"):
+        convert({}, File, "mine.toml", SensorError)
+    with pytest.raises(SensorError, match=r"^expected a table, got 3$"):
+        convert(3, File, "", SensorError)
+
+
+def test_messages_stay_short():
+    nested: list = []
+    for _ in range(100_000):
+        nested = [nested]
+    for value in ("x" * 1_000_000, nested, {f"key{i}": i for i in range(10_000)}):
+        with pytest.raises(SensorError) as caught:
+            convert({"board": value}, File, "", SensorError)
+        assert len(str(caught.value)) < 3 * LONGEST_VALUE
+
+
+def test_files_that_are_none(tmp_path):
+    path = tmp_path / "board.toml"
+    for content, message in (
+        (b"a = x", "not a TOML file: .*line 1"),
+        (b"\xff", "not a TOML file: not text in UTF-8"),
+        (b"#" * (MOST_TOML_BYTES + 1), r"cannot be read \(larger than 262144 bytes\); expected a device file in TOML"),
+        (b"a = " + b"[" * 100_000, "not a TOML file"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(DeviceError, match=rf"^{path}: {message}"):
+            read_toml(path, "a device file", DeviceError)
+    with pytest.raises(DeviceError, match=r"cannot be read \(.*\); expected a device file in TOML"):
+        read_toml(tmp_path, "a device file", DeviceError)
+    for content in (b"{", b"[" * 100_000, b"NaN", b"\xef", b"1" * 5000):
+        path.write_bytes(content)
+        with pytest.raises(DeviceError, match=rf"^{path}: (expected JSON, got|not a JSON file)"):
+            read_json(path, "a list", DeviceError)
