@@ -32,10 +32,10 @@ from isocharge.serve.port.device_clock import DeviceClock
 from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
 from isocharge.serve.port.serial_port import Chunk, Port
 from isocharge.serve.port.source import open_source
-from isocharge.serve.prediction.check import Check, check_presses
 from isocharge.serve.prediction.contact import Contact, Contacts
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.prediction.press_check import PressCheck, check_presses
 from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
 from isocharge.serve.prediction.validity import Domain
@@ -52,7 +52,6 @@ __all__ = [
     "AutoParser",
     "BinaryParser",
     "Chain",
-    "Check",
     "Chunk",
     "Contact",
     "Contacts",
@@ -75,6 +74,7 @@ __all__ = [
     "Port",
     "PredictionRecord",
     "Predictor",
+    "PressCheck",
     "PressWatch",
     "ReadingStream",
     "RecordedClock",

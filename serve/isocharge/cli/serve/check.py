@@ -3,17 +3,16 @@
 import json as json_module
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import numpy as np
 import typer
 
-from isocharge.cli.serve.options import ModelsOption
+from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
 from isocharge.cli.shared.options import JsonOption, ModelArgument
-from isocharge.cli.shared.terminal import say
-
-if TYPE_CHECKING:
-    from isocharge.serve import Check
-    from isocharge.serve.prediction.agreement import ErrorSummary
+from isocharge.serve.prediction.agreement import ErrorSummary
+from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.prediction.press_check import PressCheck, check_presses
 
 MOST_ROWS = 40
 """Presses in the table for people; of more, the worst are shown."""
@@ -29,20 +28,8 @@ def check_command(
             "empty cell is unknown. position_std_mm and force_std (share) may be columns, too.",
         ),
     ],
-    position_std_mm: Annotated[
-        float,
-        typer.Option(
-            "--position-std", metavar="MM", help="Standard deviation of known x and y, mm, where the file has none."
-        ),
-    ] = 0.1,
-    force_std: Annotated[
-        float,
-        typer.Option(
-            "--force-std",
-            metavar="SHARE",
-            help="Standard deviation of known forces, a share of the force in N, where the file has none.",
-        ),
-    ] = 0.01,
+    position_std_mm: PositionStdOption = 0.1,
+    force_std: ForceStdOption = 0.01,
     json: JsonOption = False,
     models: ModelsOption = None,
 ) -> None:
@@ -52,19 +39,13 @@ def check_command(
 
     Example: isocharge serve check three-25um-biaxial presses.csv --position-std 0.05
     """
-    from isocharge.serve import Predictor, check_presses, read_presses
-    from isocharge.serve.prediction.csv_numbers import ignored_words
-
     predictor = Predictor(model, models=models)
-    presses = read_presses(file, predictor.metadata.electrodes, position_std_mm=position_std_mm, force_std=force_std)
-    if presses.ignored:
-        say(ignored_words(str(file), presses.ignored))
-    check = check_presses(predictor, presses)
+    check = check_presses(predictor, read_presses_of(file, predictor.metadata.electrodes, position_std_mm, force_std))
     typer.echo(json_module.dumps(check.to_dict(), allow_nan=False) if json else "\n".join(_text(check)))
     raise typer.Exit(0 if check.fits else 1)
 
 
-def _text(check: "Check") -> Iterator[str]:
+def _text(check: PressCheck) -> Iterator[str]:
     """The lines for people: presses, summary, common part, verdict, notes."""
     yield from _press_lines(check)
     yield ""
@@ -90,10 +71,8 @@ def _text(check: "Check") -> Iterator[str]:
     yield from (f"- {note}" for note in check.notes)
 
 
-def _press_lines(check: "Check") -> Iterator[str]:
+def _press_lines(check: PressCheck) -> Iterator[str]:
     """A table of the presses; if they are many, of those with the largest errors."""
-    import numpy as np
-
     squares = np.nansum(check.errors.error**2 / check.errors.variance, axis=1)
     chosen = sorted(np.argsort(-squares, kind="stable")[:MOST_ROWS].tolist())
     if check.presses > MOST_ROWS:
@@ -110,7 +89,7 @@ def _press_lines(check: "Check") -> Iterator[str]:
         yield f"{row['line']:>6}{numbers}  {', '.join(words)}".rstrip()
 
 
-def _summary_line(name: str, errors: "ErrorSummary | None") -> Iterator[str]:
+def _summary_line(name: str, errors: ErrorSummary | None) -> Iterator[str]:
     if errors:
         values = (errors.rms, errors.median, errors.max, errors.noise, errors.rig, errors.beyond)
         yield f"{name:14}" + "".join(f"{value:9.3g}" for value in values)

@@ -1,7 +1,7 @@
 """Numbers from CSV text: the one place that knows header, blank lines, comments and cells of a table of presses.
 
 A line that begins with # is a comment. Blanks round a name or a number do not matter. A number has a decimal point and
-at most an exponent: `1_0`, `nan` and `inf`, which Python reads, are none.
+at most an exponent; `nan` and `inf` are none.
 """
 
 import csv
@@ -16,9 +16,6 @@ from isocharge.common.tables import shown
 
 MOST_COLUMNS = 1_000
 """Columns of a table."""
-
-LONGEST_LINE = 100_000
-"""Characters of a line."""
 
 LARGEST = float(np.finfo(np.float32).max)
 """Largest number of a cell: that of the models' tensors."""
@@ -68,13 +65,12 @@ class CsvNumbers:
         Raises:
             error: If a required column is missing, or one of these is there twice.
         """
-        required = tuple(required)
         present = [*required, *(name for name in optional if name in self.header)]
-        missing = [name for name in required if name not in self.header]
-        twice = [name for name in present if self.header.count(name) > 1]
-        for what, names in (("missing", missing), ("repeated", twice)):
+        for what, wrong in (("missing", lambda count: count == 0), ("repeated", lambda count: count > 1)):
+            names = [shown(name) for name in present if wrong(self.header.count(name))]
             if names:
-                self._refuse_header(f"{what}: {_listed(names)}")
+                more = f" and {len(names) - 10} more" if len(names) > 10 else ""
+                self._refuse_header(f"{what}: {', '.join(names[:10])}{more}")
         return {name: self.header.index(name) for name in present}
 
     def rows(self, columns: Mapping[str, int], kinds: Mapping[str, str]) -> Iterator[tuple[int, list[float]]]:
@@ -114,7 +110,7 @@ class CsvNumbers:
 
     def _numbered_rows(self, lines: Iterable[str], names: frozenset[str]) -> Iterator[tuple[int, list[str]]]:
         """Rows that are neither blank nor comments, with their line numbers from 1."""
-        reader = csv.reader(self._without_comments(lines, names))
+        reader = csv.reader("\n" if _is_comment(line, names) else line for line in lines)
         try:
             for row in reader:
                 if any(cell.strip() for cell in row):
@@ -125,13 +121,9 @@ class CsvNumbers:
             where = f"{self.where}, line {reader.line_num + 1}"
             raise self.error(f"{where}: not CSV text in UTF-8 ({cause})") from cause
 
-    def _without_comments(self, lines: Iterable[str], names: frozenset[str]) -> Iterator[str]:
-        """The lines, a comment as a blank line, so that lines keep their numbers."""
-        for number, line in enumerate(lines, start=1):
-            if len(line) > LONGEST_LINE:
-                raise self.error(f"{self.where}, line {number}: expected at most {LONGEST_LINE:,} characters, got more")
-            comment = line.lstrip().startswith("#") and line.partition(",")[0].strip() not in names
-            yield "\n" if comment else line
+
+def _is_comment(line: str, names: frozenset[str]) -> bool:
+    return line.lstrip().startswith("#") and line.partition(",")[0].strip() not in names
 
 
 def _number_or_nan(text: str) -> float:
@@ -139,9 +131,3 @@ def _number_or_nan(text: str) -> float:
         return number_of(text)
     except ValueError:
         return np.nan
-
-
-def _listed(names: Sequence[str]) -> str:
-    """The names of a message, cut if they are many."""
-    more = len(names) - 10
-    return ", ".join(map(shown, names[:10])) + (f" and {more} more" if more > 0 else "")

@@ -2,23 +2,24 @@
 
 The header has `x_mm, y_mm, force_N` and the electrodes' names (pC), in any order. An empty cell is unknown. Optional
 columns `position_std_mm` and `force_std` (a share: 0.01 is 1 %) say how well the rig knows place and force. Further
-columns are ignored. The file `isocharge serve predict` reads it too.
+columns are ignored where the electrodes are named. The file `isocharge serve predict` reads it too.
 """
 
 import csv
 import io
 from array import array
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError
 from isocharge.common.files import bounded_lines, write_whole
-from isocharge.common.tables import is_number, shown
+from isocharge.common.tables import shown
 from isocharge.serve.prediction.csv_numbers import CsvNumbers
 from isocharge.serve.prediction.table import CHARGE
 
@@ -69,12 +70,12 @@ class MeasuredPresses:
     ignored: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check_electrodes(self.electrodes)
+        _check_electrodes(self.electrodes)
         n = len(self.lines)
-        _check_shape("contact", self.contact, (n, 3))
-        _check_shape("charge_pC", self.charge_pC, (n, len(self.electrodes)))
-        _check_shape("position_std_mm", self.position_std_mm, (n,))
-        _check_shape("force_std", self.force_std, (n,))
+        shapes = {"contact": (n, 3), "charge_pC": (n, len(self.electrodes)), "position_std_mm": (n,), "force_std": (n,)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise PressError(f"{name}: expected an array of shape {shape}, got {getattr(self, name).shape}")
         self._check_values()
 
     def __len__(self) -> int:
@@ -83,21 +84,30 @@ class MeasuredPresses:
     def __getitem__(self, rows: int | slice | Sequence[int] | Integers | Booleans) -> "MeasuredPresses":
         """Some of the presses, by their places or by a mask; one alone for a whole number."""
         chosen = np.atleast_1d(np.arange(len(self))[rows])
-        return MeasuredPresses(
-            self.contact[chosen],
-            self.charge_pC[chosen],
-            self.position_std_mm[chosen],
-            self.force_std[chosen],
-            self.electrodes,
-            tuple(self.lines[row] for row in chosen),
-            self.ignored,
-        )
+        names = ("contact", "charge_pC", "position_std_mm", "force_std")
+        columns = {name: getattr(self, name)[chosen] for name in names}
+        return replace(self, **columns, lines=tuple(self.lines[row] for row in chosen))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, MeasuredPresses):
             return NotImplemented
         numbers, others = self._columns(), other._columns()
         return self.electrodes == other.electrodes and np.array_equal(numbers, others, equal_nan=True)
+
+    def of_electrodes(self, electrodes: Sequence[str], whose: str) -> "MeasuredPresses":
+        """The same presses with the charges of these electrodes, in this order.
+
+        Raises:
+            PressError: If one of them is missing; `whose` says in the message who has these electrodes.
+        """
+        names = tuple(electrodes)
+        if missing := [name for name in names if name not in self.electrodes]:
+            raise PressError(
+                f"expected charges of the electrodes {names} of {whose}, got {self.electrodes}; "
+                f"missing: {', '.join(map(shown, missing))}"
+            )
+        order = [self.electrodes.index(name) for name in names]
+        return replace(self, charge_pC=self.charge_pC[:, order], electrodes=names)
 
     def _columns(self) -> Array:
         """All numbers, in the columns of the file, shape (n, 5 + electrodes)."""
@@ -124,7 +134,7 @@ class MeasuredPresses:
 
 def read_presses(
     path: Path,
-    electrodes: Sequence[str],
+    electrodes: Sequence[str] | None = None,
     *,
     position_std_mm: float = POSITION_STD_MM,
     force_std: float = FORCE_STD,
@@ -133,70 +143,78 @@ def read_presses(
 
     Args:
         path: CSV in UTF-8, with or without byte order mark.
-        electrodes: Names of the electrodes, in the order in which the charges are wanted.
+        electrodes: Names of the electrodes, in the order in which the charges are wanted; all columns without another
+            meaning if absent.
         position_std_mm: Standard deviation of x and of y where the file has none, mm.
         force_std: Standard deviation of a force where the file has none, as a share of it.
 
     Raises:
         PressError: Names file, line and column, what was expected, what was got and what to do.
     """
-    try:
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            return parse_presses(
-                bounded_lines(file), electrodes, str(path), position_std_mm=position_std_mm, force_std=force_std
-            )
-    except OSError as error:
-        raise PressError(f"{path}: cannot be read ({error.strerror}); expected a CSV file of presses") from error
-
-
-def parse_presses(
-    lines: Iterable[str],
-    electrodes: Sequence[str],
-    where: str,
-    *,
-    position_std_mm: float = POSITION_STD_MM,
-    force_std: float = FORCE_STD,
-) -> MeasuredPresses:
-    """As `read_presses`, of lines; `where` names them in messages."""
-    electrodes = tuple(electrodes)
-    check_electrodes(electrodes)
-    _check_default("position_std_mm", position_std_mm)
-    _check_default("force_std", force_std, most=1.0)
-    table = _open_table(lines, electrodes, where)
-    columns = table.columns(electrodes, (*CONTACT, *UNCERTAINTY))
-    if ("x_mm" in columns) != ("y_mm" in columns):
-        missing = "y_mm" if "x_mm" in columns else "x_mm"
-        raise PressError(f"{where}: expected the columns x_mm and y_mm, or neither, got one of them; add {missing!r}")
-    numbered = array("q")
-    values = _values(table, columns, electrodes, numbered)
+    named = f"the electrodes {tuple(electrodes)}" if electrodes is not None else "the electrodes' names"
+    with _open_table(path, (*(electrodes or ()), *KINDS), f"{', '.join(CONTACT)} and {named} (charges in pC)") as table:
+        if electrodes is None:
+            electrodes = [name for name in table.header if name and name not in KINDS]
+        electrodes = tuple(electrodes)
+        _check_electrodes(electrodes)
+        columns = table.columns(electrodes, KINDS)
+        lines, values = _values(table, columns, electrodes)
+    defaults = {"position_std_mm": position_std_mm, "force_std": force_std}
+    column = {name: values[:, number] for number, name in enumerate(columns)}
+    for name in KINDS:
+        given, default = column.get(name, np.full(len(lines), np.nan)), defaults.get(name, np.nan)
+        column[name] = np.where(np.isnan(given), default, given)
     try:
         return MeasuredPresses(
-            np.column_stack([_column(values, columns, name, np.nan) for name in CONTACT]),
-            np.column_stack([_column(values, columns, name, np.nan) for name in electrodes]),
-            _column(values, columns, "position_std_mm", position_std_mm),
-            _column(values, columns, "force_std", force_std),
+            np.column_stack([column[name] for name in CONTACT]),
+            np.column_stack([column[name] for name in electrodes]),
+            column["position_std_mm"],
+            column["force_std"],
             electrodes,
-            tuple(numbered),
+            lines,
             tuple(name for name in table.header if name not in columns),
         )
     except PressError as error:
-        raise PressError(f"{where}, {error}") from error
+        raise PressError(f"{path}, {error}") from error
+
+
+def read_press_list(path: Path) -> Array:
+    """Presses that a machine makes, in their order: (x_mm, y_mm, force_N), NaN where unknown, shape (n, 3).
+
+    Args:
+        path: CSV in UTF-8 with x_mm, y_mm and force_N; further columns are ignored.
+
+    Raises:
+        PressError: If the file cannot be read, or a row is no press; names line and column.
+    """
+    with _open_table(path, CONTACT, ", ".join(CONTACT)) as table:
+        lines, contact = _values(table, table.columns(CONTACT), ())
+    known = np.zeros((len(lines), 1)), np.ones(len(lines)), np.ones(len(lines))
+    try:
+        return MeasuredPresses(contact, *known, ("charge",), lines).contact
+    except PressError as error:
+        raise PressError(f"{path}, {error}") from error
 
 
 def write_presses(out: Path | TextIO, presses: MeasuredPresses) -> None:
     """Write presses as `read_presses` reads them, to the last bit; a file appears whole and replaces an older one."""
     if isinstance(out, Path):
-        text = io.StringIO()
-        write_presses(text, presses)
-        write_whole(out, text.getvalue().encode())
-        return
-    writer = csv.writer(out, lineterminator="\n")
+        write_whole(out, presses_text(presses).encode())
+    else:
+        out.write(presses_text(presses))
+
+
+def presses_text(presses: MeasuredPresses) -> str:
+    """What `write_presses` writes."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
     writer.writerow((*CONTACT, *presses.electrodes, *UNCERTAINTY))
     for row in presses._columns().tolist():
         writer.writerow("" if value != value else repr(value) for value in row)
+    return text.getvalue()
 
 
-def check_electrodes(electrodes: tuple[str, ...]) -> None:
+def _check_electrodes(electrodes: tuple[str, ...]) -> None:
     """Raise PressError if names of electrodes cannot be those of columns."""
     if not electrodes or len(set(electrodes)) < len(electrodes) or not all(electrodes):
         raise PressError(f"electrodes: expected one name or more, all different, none empty, got {shown(electrodes)}")
@@ -208,37 +226,24 @@ def check_electrodes(electrodes: tuple[str, ...]) -> None:
             )
 
 
-def _check_shape(name: str, values: Array, shape: tuple[int, ...]) -> None:
-    if values.shape != shape:
-        raise PressError(f"{name}: expected an array of shape {shape}, got {values.shape}")
+@contextmanager
+def _open_table(path: Path, names: Sequence[str], expected: str) -> Iterator[CsvNumbers]:
+    """The table of an open file; `names` have a meaning, and `expected` are those that the header should have."""
+    try:
+        with Path(path).open(encoding="utf-8-sig", newline="") as file:
+            yield CsvNumbers(bounded_lines(file), names, str(path), PressError, f"a header with {expected}")
+    except OSError as error:
+        raise PressError(f"{path}: cannot be read ({error.strerror}); expected a CSV file of presses") from error
 
 
-def _check_default(name: str, value: float, most: float = np.inf) -> None:
-    if not (is_number(value) and 0.0 < value <= most):
-        raise PressError(f"{name}: expected {KINDS[name]}, got {shown(value)}")
-
-
-def _open_table(lines: Iterable[str], electrodes: tuple[str, ...], where: str) -> CsvNumbers:
-    expected = f"a header with {', '.join(CONTACT)} and the electrodes {electrodes} (charges in pC)"
-    return CsvNumbers(lines, (*electrodes, *KINDS), where, PressError, expected)
-
-
-def _values(table: CsvNumbers, columns: dict[str, int], electrodes: tuple[str, ...], numbered: Any) -> Array:
-    """Numbers of the columns, shape (n, columns); the lines are appended to `numbered`."""
-    values = array("d")
+def _values(table: CsvNumbers, columns: dict[str, int], electrodes: Sequence[str]) -> tuple[tuple[int, ...], Array]:
+    """Lines, and the numbers of the columns, shape (n, columns); NaN for an empty cell."""
+    lines, values = array("q"), array("d")
     for line, row in table.rows(columns, KINDS | dict.fromkeys(electrodes, CHARGE)):
-        numbered.append(line)
+        lines.append(line)
         values.extend(row)
-        if len(numbered) > MOST_ROWS:
+        if len(lines) > MOST_ROWS:
             raise PressError(f"{table.where}: expected at most {MOST_ROWS:,} presses, got more; split the file")
-    if not numbered:
+    if not lines:
         raise PressError(f"{table.where}: expected one press or more below the header, got none")
-    return np.array(values, dtype=np.float64).reshape(-1, len(columns))
-
-
-def _column(values: Array, columns: dict[str, int], name: str, default: float) -> Array:
-    """A column of the table, the default where it is absent or its cell empty, shape (n,)."""
-    if name not in columns:
-        return np.full(len(values), default)
-    column = values[:, list(columns).index(name)]
-    return np.where(np.isnan(column), default, column)
+    return tuple(lines), np.array(values, dtype=np.float64).reshape(len(lines), -1)

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.common.errors import PressError
 from isocharge.serve.flags import MISFIT, OUTSIDE
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.contact import Contacts
@@ -78,13 +77,10 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     """Predict measured presses and compare.
 
     Raises:
-        PressError: If the electrodes are not the model's, in its order.
+        PressError: If a charge of one of the model's electrodes is missing.
     """
     metadata = predictor.metadata
-    if presses.electrodes != metadata.electrodes:
-        raise PressError(
-            f"expected charges of the electrodes {metadata.electrodes} of {metadata.label}, got {presses.electrodes}"
-        )
+    presses = presses.of_electrodes(metadata.electrodes, metadata.label)
     answer = _answers(predictor, presses.charge_pC)
     known = presses.contact
     scale = np.column_stack([np.ones((len(presses), 2)), known[:, 2]])

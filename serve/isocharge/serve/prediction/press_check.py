@@ -32,7 +32,7 @@ BAD_SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class Check:
+class PressCheck:
     """What measured presses say about a model.
 
     Attributes:
@@ -83,21 +83,21 @@ class Check:
         return {name: plain_values(value) for name, value in values.items()}
 
 
-def check_presses(predictor: Predictor, presses: MeasuredPresses) -> Check:
+def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     """Compare a model with measured presses.
 
     A press counts if all its charges are known, its place or its force is known, and what is known lies in the model's
     working area and range of forces. A few bad presses are named and left out if all others agree with the model.
 
     Raises:
-        PressError: If the electrodes are not the model's, in its order.
+        PressError: If a charge of one of the model's electrodes is missing.
     """
     errors = press_errors(predictor, presses)
     rows, bad = _without_bad(errors)
     agreement, count = Agreement.of(errors, rows), int(rows.sum())
     fits = agreement.acceptable if count >= FEWEST else None
-    position, force = _position(errors, rows), _force(errors, rows)
-    return Check(
+    position, force = _summaries(errors, rows)
+    return PressCheck(
         model=predictor.metadata.label,
         presses=len(presses),
         counted=count,
@@ -132,16 +132,15 @@ def _bad(errors: PressErrors, counted: Booleans) -> Booleans:
     return bad
 
 
-def _position(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
-    known = rows & ~np.isnan(errors.error[:, 0])
-    parts = (np.sum(std[known, :2] ** 2, axis=1) for std in (errors.noise_std, errors.rig_std))
-    return ErrorSummary.of(errors.position_error_mm[known], *parts)
-
-
-def _force(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
-    known = rows & ~np.isnan(errors.error[:, 2])
-    parts = ((100.0 * std[known, 2]) ** 2 for std in (errors.noise_std, errors.rig_std))
-    return ErrorSummary.of(100.0 * np.abs(errors.error[known, 2]), *parts)
+def _summaries(errors: PressErrors, rows: Booleans) -> tuple[ErrorSummary | None, ErrorSummary | None]:
+    """Of the positions, mm, and of the forces, %; None where none is known."""
+    kinds = (errors.position_error_mm, slice(0, 2), 1.0), (np.abs(errors.error[:, 2]), slice(2, 3), 100.0)
+    summaries = []
+    for size, columns, unit in kinds:
+        known = rows & ~np.isnan(size)
+        noise, rig = (np.sum((unit * std[known, columns]) ** 2, axis=1) for std in (errors.noise_std, errors.rig_std))
+        summaries.append(ErrorSummary.of(unit * size[known], noise, rig))
+    return summaries[0], summaries[1]
 
 
 def _verdict(fits: bool | None, count: int, position: ErrorSummary | None, force: ErrorSummary | None) -> str:
@@ -160,7 +159,7 @@ def _notes(
     """What else a reader should know."""
     for reason in sorted(set(filter(None, errors.left_out))):
         chosen = [line for line, other in zip(errors.lines, errors.left_out, strict=True) if other == reason]
-        yield f"{len(chosen)} of {len(rows)} presses do not count: {_words(reason, metadata)} ({_lines(chosen)})"
+        yield f"{len(chosen)} of {len(rows)} presses do not count: {_explained(reason, metadata)} ({_lines(chosen)})"
     if bad.any():
         yield f"{_lines(np.array(errors.lines)[bad].tolist())}: nothing like the other presses, left out; look at it"
     misfits = sum(MISFIT in flags for flags in errors.flags)
@@ -172,7 +171,7 @@ def _notes(
     yield from _common_notes(agreement)
 
 
-def _words(reason: str, metadata: ModelMetadata) -> str:
+def _explained(reason: str, metadata: ModelMetadata) -> str:
     if reason != NOT_TRAINED:
         return reason
     low, high = metadata.force_range_N
