@@ -1,10 +1,10 @@
-"""Defaults that several portions share: the scene that is pressed, and the bounds of a server.
+"""Defaults that several packages share: the presses of a sweep, and the bounds of a server.
 
 These numbers have no imports, so that `--help` can show them at once.
 """
 
-DEFAULT_RADIUS = 8e-3
-"""Largest distance of a press from the film's centre, m: the electrodes of the built-in sensors, 10 mm from the centre,
+DEFAULT_RADIUS = 8.0
+"""Largest distance of a press from the film's centre, mm: the electrodes of the built-in sensors, 10 mm from the centre,
 begin about there."""
 
 DEFAULT_FORCE_RANGE = (0.05, 2.0)

@@ -21,7 +21,7 @@ from isocharge.simulate.numerics.cubic import cubic_weights
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.solver.equilibrium import Equilibrium
-from isocharge.simulate.solver.mesh_choice import layer_for
+from isocharge.simulate.solver.load_case import layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
 from isocharge.simulate.solver.settings import SolveSettings
 

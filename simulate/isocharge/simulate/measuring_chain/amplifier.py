@@ -20,28 +20,28 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
-PVDF_PYRO = 30e-6 * 9e-6
-"""Pyroelectric charge per temperature of a PVDF electrode of 9 mm^2, C/K: 30 uC/(m^2 K)."""
+PVDF_PYRO = 30.0 * 9.0
+"""Pyroelectric charge per temperature of a PVDF electrode of 9 mm^2, pC/K: 30 uC/(m^2 K)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Amplifier:
-    """A measuring chain of any number of channels; SI units.
+    """A measuring chain of any number of channels.
 
     Attributes:
         noise: Memoryless noise of each reading.
         tau: Time constant of the leak, s; infinite for none.
         tau_mismatch, gain_mismatch: Standard deviation of a channel's relative error.
-        hum: Amplitude of the mains hum, C; its phase differs between channels.
+        hum: Amplitude of the mains hum, pC; its phase differs between channels.
         hum_frequency: Hz.
-        offset: Standard deviation of a channel's constant output, C.
-        bias: Current that every channel integrates, A; its sign differs.
-        pyro: Charge per temperature, C/K, on every electrode.
+        offset: Standard deviation of a channel's constant output, pC.
+        bias: Current that every channel integrates, pC/s; its sign differs.
+        pyro: Charge per temperature, pC/K, on every electrode.
         temperature_rms: Root mean square of the film's slow temperature drift, K.
         temperature_time: Time constant of that drift, s: two first-order lags in series, as of a film with mass.
         step: Temperature step, K.
         step_at, step_time: Start and duration of the temperature step, s.
-        limit: Largest charge that can be read, C; infinite for any.
+        limit: Largest charge that can be read, pC; infinite for any.
         bits: Resolution of the converter between both limits; 0 for no converter.
     """
 
@@ -66,7 +66,7 @@ class Amplifier:
         if self.bits and not math.isfinite(self.limit):
             raise InputError(
                 f"bits: a converter of {self.bits} bits needs the largest charge that it reads, got a limit of "
-                f"{self.limit} C; give limit_pC with bits, or bits = 0 for no converter"
+                f"{self.limit} pC; give limit_pC with bits, or bits = 0 for no converter"
             )
 
     def start(self, electrodes: int, rate: float, rng: np.random.Generator) -> "Measurement":
@@ -91,7 +91,7 @@ class Measurement:
 
     Attributes:
         amplifier, rate, rng: As given to `Amplifier.start`.
-        tau, gain, bias, offset, phase: Values drawn for each channel, shape (electrodes,), SI units.
+        tau, gain, bias, offset, phase: Values drawn for each channel, shape (electrodes,).
     """
 
     amplifier: Amplifier
@@ -117,7 +117,7 @@ class Measurement:
             self._output = self.bias / (1.0 - np.exp(-1.0 / (self.rate * self.tau))) / self.rate
 
     def __call__(self, charge: Array) -> Array:
-        """Readings of the next touch charges, both of shape (n, electrodes), C."""
+        """Readings of the next touch charges, both of shape (n, electrodes), pC."""
         time = (self._readings + np.arange(len(charge))) / self.rate
         self._readings += len(charge)
         film = charge + (self.amplifier.pyro * self._temperature(time))[:, np.newaxis]
@@ -138,7 +138,7 @@ class Measurement:
         return warm
 
     def _integrate(self, film: Array) -> Array:
-        """The amplifier's output, shape (n, electrodes), C."""
+        """The amplifier's output, shape (n, electrodes), pC."""
         steps = self.gain * np.diff(film, axis=0, prepend=self._charge[np.newaxis]) + self.bias / self.rate
         self._charge = film[-1]
         keep = np.exp(-1.0 / (self.rate * self.tau))

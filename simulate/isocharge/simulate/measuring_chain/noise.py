@@ -8,7 +8,7 @@ What has a memory - leak, hum, drift, temperature, mismatch, clipping - is `meas
 """
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,7 +22,7 @@ class NoiseModel:
 
     Attributes:
         name: Name of the level.
-        white: Standard deviation that every reading has, C.
+        white: Standard deviation that every reading has, pC.
         gain: Standard deviation in proportion to the charge, dimensionless.
     """
 
@@ -37,16 +37,16 @@ class NoiseModel:
                 raise InputError(f"noise {self.name!r}: {name}: expected a finite number from 0, got {value}")
 
     def sigma(self, charge: Array) -> Array:
-        """Standard deviation for charges of any shape, C; the same shape."""
+        """Standard deviation for charges of any shape, pC; the same shape."""
         return np.hypot(self.white, self.gain * np.asarray(charge))
 
     def variance(self, charge: Array) -> Array:
-        """Square of `sigma`, C^2; faster where there are many."""
+        """Square of `sigma`, pC^2; faster where there are many."""
         variance: Array = self.white**2 + (self.gain * np.asarray(charge)) ** 2
         return variance
 
     def information(self, charge: Array) -> Array:
-        """Fisher information of a reading, 1/C^2: one over the variance of the best unbiased estimate of its charge.
+        """Fisher information of a reading, 1/pC^2: one over the variance of the best unbiased estimate of its charge.
 
         Of a Gaussian whose mean and standard deviation both depend on the charge (Kay 1993, eq. 3.31),
         (1 + 2 (d sigma / dQ)^2) / sigma^2.
@@ -56,11 +56,10 @@ class NoiseModel:
         return information
 
     def add(self, charge: Array, rng: np.random.Generator) -> Array:
-        """Noisy readings of charges of any shape, C."""
+        """Noisy readings of charges of any shape, pC."""
         noisy: Array = charge + self.sigma(charge) * rng.standard_normal(np.shape(charge))
         return noisy
 
     def to_dict(self) -> dict[str, float | str]:
-        """For metadata: white in pC."""
-        table = asdict(self)
-        return {"name": table["name"], "white_pC": float(f"{self.white * 1e12:.12g}"), "gain": self.gain}
+        """For metadata."""
+        return {"name": self.name, "white_pC": self.white, "gain": self.gain}

@@ -11,30 +11,28 @@ from isocharge.simulate.measuring_chain.amplifier import Amplifier
 from isocharge.simulate.measuring_chain.levels import AMPLIFIER_LEVELS, NOISE_LEVELS
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
-PICO, UNIT = 1e-12, 1.0
-
 NOT_NEGATIVE: dict[str, Any] = {"least": 0}
 POSITIVE: dict[str, Any] = {"above": 0.0}
 POSITIVE_OR_INFINITE: dict[str, Any] = {"above": 0.0, "or_infinite": True}
 ANY: dict[str, Any] = {}
 
-KEYS: dict[str, tuple[str, float, dict[str, Any]]] = {
-    "tau_s": ("tau", UNIT, POSITIVE_OR_INFINITE),
-    "tau_mismatch": ("tau_mismatch", UNIT, NOT_NEGATIVE),
-    "gain_mismatch": ("gain_mismatch", UNIT, NOT_NEGATIVE),
-    "hum_pC": ("hum", PICO, NOT_NEGATIVE),
-    "hum_Hz": ("hum_frequency", UNIT, POSITIVE),
-    "offset_pC": ("offset", PICO, NOT_NEGATIVE),
-    "bias_pA": ("bias", PICO, NOT_NEGATIVE),
-    "pyro_pC_per_K": ("pyro", PICO, NOT_NEGATIVE),
-    "temperature_rms_K": ("temperature_rms", UNIT, NOT_NEGATIVE),
-    "temperature_time_s": ("temperature_time", UNIT, POSITIVE),
-    "temperature_step_K": ("step", UNIT, ANY),
-    "temperature_step_at_s": ("step_at", UNIT, ANY),
-    "temperature_step_time_s": ("step_time", UNIT, POSITIVE),
-    "limit_pC": ("limit", PICO, POSITIVE_OR_INFINITE),
+KEYS: dict[str, tuple[str, dict[str, Any]]] = {
+    "tau_s": ("tau", POSITIVE_OR_INFINITE),
+    "tau_mismatch": ("tau_mismatch", NOT_NEGATIVE),
+    "gain_mismatch": ("gain_mismatch", NOT_NEGATIVE),
+    "hum_pC": ("hum", NOT_NEGATIVE),
+    "hum_Hz": ("hum_frequency", POSITIVE),
+    "offset_pC": ("offset", NOT_NEGATIVE),
+    "bias_pA": ("bias", NOT_NEGATIVE),
+    "pyro_pC_per_K": ("pyro", NOT_NEGATIVE),
+    "temperature_rms_K": ("temperature_rms", NOT_NEGATIVE),
+    "temperature_time_s": ("temperature_time", POSITIVE),
+    "temperature_step_K": ("step", ANY),
+    "temperature_step_at_s": ("step_at", ANY),
+    "temperature_step_time_s": ("step_time", POSITIVE),
+    "limit_pC": ("limit", POSITIVE_OR_INFINITE),
 }
-"""Numbers of a TOML file: the attribute of `Amplifier`, one unit in SI, and the bounds of the number."""
+"""Numbers of a TOML file: the attribute of `Amplifier` and the bounds of the number."""
 
 OTHER_KEYS = ("like", "white_pC", "proportional", "bits")
 
@@ -62,12 +60,10 @@ def _amplifier(values: Mapping[str, Any], where: str) -> Amplifier:
     like = AMPLIFIER_LEVELS[table.choice("like", tuple(AMPLIFIER_LEVELS), "clean")]
     noise = NoiseModel(
         Path(where).stem,
-        table.number("white_pC", like.noise.white / PICO, least=0) * PICO,
+        table.number("white_pC", like.noise.white, least=0),
         table.number("proportional", like.noise.gain, least=0),
     )
-    changes = {
-        attribute: table.number(key, **bounds) * unit for key, (attribute, unit, bounds) in KEYS.items() if key in table
-    }
+    changes = {attribute: table.number(key, **bounds) for key, (attribute, bounds) in KEYS.items() if key in table}
     try:
         return replace(like, noise=noise, bits=table.whole("bits", like.bits, least=0, most=32), **changes)
     except InputError as error:

@@ -1,4 +1,1 @@
-"""The film's physics, dimensionless: membrane and bending energy, stress, and which theory a scene needs.
-
-May import: mesh, sensor, numerics.
-"""
+"""The film's physics, dimensionless: membrane and bending energy, stress, and which theory a press needs."""

@@ -1,11 +1,11 @@
-"""The dimensionless groups of a scene, and the amplitude that makes its solution a number of order one.
+"""The dimensionless groups of a press, and the amplitude that makes its solution a number of order one.
 
 Under a central force F a slack membrane, a taut one and a plate sink by
 
     w / a = A,   F / (E h a) ~ A^3,   (pretension / E) A,   16 pi b A   with b = (h / a)^2 / (12 (1 - poisson^2))
 
 (Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). Their sum is a cubic for A that holds everywhere
-between. The in-plane displacement goes with A^2. What is left of the scene are ratios.
+between. The in-plane displacement goes with A^2. What is left of the press are ratios.
 """
 
 from dataclasses import dataclass, replace
@@ -65,7 +65,7 @@ class DimensionlessGroups:
         return self.height**3 / self.load
 
     def stiffened(self, tension: float) -> "DimensionlessGroups":
-        """The same scene with more tension."""
+        """The same press with more tension."""
         return replace(self, tension=self.tension + tension)
 
 

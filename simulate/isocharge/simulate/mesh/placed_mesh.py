@@ -5,11 +5,12 @@ from functools import cached_property
 
 import numpy as np
 
-from isocharge.common.arrays import Complexes
-from isocharge.simulate.mesh.elements import Geometry
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
+from isocharge.simulate.mesh.elements import Geometry, film_gradient
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.mesh.template import Template, template_for
+from isocharge.simulate.numerics.interpolation import tensor_basis
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 
@@ -48,6 +49,39 @@ class PlacedMesh:
     def geometry(self) -> Geometry:
         """The elements, ready for integration."""
         return Geometry.build(self.template, self.points)
+
+    def locate(self, points: Complexes) -> tuple[Integers, Array, Array, Booleans]:
+        """Element, xi and eta of film points, shape (n,), in film radii, the press turned onto the x axis.
+
+        And which points were mirrored into the half that is meshed.
+        """
+        position, mirrored = self.template.into_meshed_half(points)
+        element, xi, eta = self.placement.batch().locate(self.template, position[None])
+        return element[0], xi[0], eta[0], mirrored
+
+    def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:
+        """d(basis)/d(X1, X2) at points of elements, shape (n, 2, n_local)."""
+        _, by_local = tensor_basis(self.resolution.order, xi, eta)
+        return film_gradient(by_local[:, :, None, :], self.points[element])[0][:, 0]
+
+    def node_derivatives(self, values: Array) -> Array:
+        """Derivatives by (X1, X2) at the nodes of every element, of values at those nodes.
+
+        Args:
+            values: Shape (n_element, n_local, k).
+
+        Returns:
+            Shape (n_element, n_local, 2, k).
+        """
+        gradient = self._node_gradient
+        flat = gradient.reshape(len(gradient), -1, gradient.shape[-1])
+        return (flat @ values).reshape(*gradient.shape[:3], -1)
+
+    @cached_property
+    def _node_gradient(self) -> Array:
+        """d(basis)/d(X1, X2) at the nodes of every element, shape (n_element, n_local, 2, n_local)."""
+        _, by_local = tensor_basis(self.resolution.order, self.template.xi, self.template.eta)
+        return film_gradient(by_local[:, None], self.points)[0]
 
 
 def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> PlacedMesh:

@@ -74,8 +74,8 @@ class Placement:
         Args:
             blocks: The blocks; their number of corners must be the probe's.
             probe: The footprint, turned as it is when the press lies on the x axis.
-            distance: Distance of the footprint's centroid from the film's centre, m, any shape.
-            film_radius: m.
+            distance: Distance of the footprint's centroid from the film's centre, mm, any shape.
+            film_radius: mm.
             layer: Width of the thin rings at the rim over the film's radius.
             turn: Further turn of the footprint, rad, the shape of `distance` or a number.
         """
@@ -204,10 +204,10 @@ class Placement:
             by_t = (1.0 - v) * (b - a) + v * np.where(arc, turned, d - c)
             inner = a + t * (b - a)
             by_v = outer - inner
-            miss = inner + v * by_v - points
+            residual = inner + v * by_v - points
             determinant = (np.conj(by_v) * by_t).imag
-            v = np.clip(v - (np.conj(miss) * by_t).imag / determinant, -OVERSHOOT, 1.0 + OVERSHOOT)
-            t = np.clip(t - (np.conj(by_v) * miss).imag / determinant, -OVERSHOOT, 1.0 + OVERSHOOT)
+            v = np.clip(v - (np.conj(residual) * by_t).imag / determinant, -OVERSHOOT, 1.0 + OVERSHOOT)
+            t = np.clip(t - (np.conj(by_v) * residual).imag / determinant, -OVERSHOOT, 1.0 + OVERSHOOT)
         return v, t
 
 

@@ -1,4 +1,1 @@
-"""Numerics without physics: interpolation, points of a disk, convex polygons, Gauss rules.
-
-May import: nothing else of isocharge.simulate.
-"""
+"""Numerics without physics: interpolation, points of a disk, convex polygons, Gauss rules."""

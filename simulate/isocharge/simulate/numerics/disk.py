@@ -8,7 +8,7 @@ from isocharge.common.arrays import Array, Complexes
 
 
 def onto_disk(position: Array, radius: float) -> Array:
-    """Positions (x, y), shape (n, 2), those outside the disk moved onto its edge; m."""
+    """Positions (x, y), shape (n, 2), those outside the disk moved onto its edge, in the unit of the radius."""
     onto: Array = position / np.maximum(1.0, np.hypot(*position.T) / radius)[:, None]
     return onto
 
@@ -18,8 +18,8 @@ class Rings:
     """Positions on rings about the centre.
 
     Attributes:
-        distance: From the centre, shape (n_ring,), m.
-        position: x and y, shape (n_ring, n_angle, 2), m.
+        distance: From the centre, shape (n_ring,).
+        position: x and y, shape (n_ring, n_angle, 2), in the same unit.
     """
 
     distance: Array

@@ -1,4 +1,1 @@
-"""What the sensor is and what presses it: film, electrodes, probe, and their TOML file.
-
-May import: numerics.
-"""
+"""What the sensor is and what presses it: film, electrodes, probe, and their TOML file."""

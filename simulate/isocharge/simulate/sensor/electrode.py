@@ -8,9 +8,13 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import SensorError
 from isocharge.simulate.numerics.polygon import area_of, is_convex
 from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.size_check import check_millimetres
 
 MOST_CORNERS = 256
 """Largest number of corners of an electrode."""
+
+LEAST_EXTENT = 0.02
+"""Smallest extent of an electrode along x or y, the larger of both, mm: smaller numbers are in metres."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +23,7 @@ class Electrode:
 
     Attributes:
         name: As in the sensor file.
-        corners: Corners of a convex polygon, anticlockwise, m.
+        corners: Corners of a convex polygon, anticlockwise, mm.
         square: Whether it comes from `of_square`; only squares have the edges that the edge readout averages over.
     """
 
@@ -29,19 +33,19 @@ class Electrode:
 
     @classmethod
     def of_square(cls, name: str, centre: tuple[float, float], side: float) -> "Electrode":
-        """A square along the axes, centre and side in m; the first corner is the lower left one."""
+        """A square along the axes, centre and side in mm; the first corner is the lower left one."""
         (x, y), half = centre, 0.5 * side
         corners = ((x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half))
         return cls(name, corners, square=True)
 
     @property
     def area(self) -> float:
-        """Area, m^2."""
+        """Area, mm^2."""
         return area_of(np.array(self.corners))
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Mean of the corners, m."""
+        """Mean of the corners, mm."""
         x, y = np.mean(self.corners, axis=0)
         return float(x), float(y)
 
@@ -52,7 +56,7 @@ class Calibration:
 
     Attributes:
         gain: Charge read over charge collected, by electrode name; missing names count as 1.
-        shift: Displacement of the electrodes from the layout, m.
+        shift: Displacement of the electrodes from the layout, mm.
         rotation: Angle by which they are turned about the film's centre before the shift, rad, anticlockwise.
     """
 
@@ -67,7 +71,12 @@ class Calibration:
         return placed
 
 
-def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration) -> None:
+def check_electrode(electrode: Electrode, film: Film, calibration: Calibration) -> None:
+    """Refuse an electrode that cannot exist on a film.
+
+    Raises:
+        SensorError: If it is no convex polygon, tiny, a square that is none, or not wholly on the film.
+    """
     if len(electrode.corners) > MOST_CORNERS:
         raise SensorError(
             f"electrode {electrode.name!r}: expected at most {MOST_CORNERS} corners, got {len(electrode.corners)}"
@@ -80,25 +89,24 @@ def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration)
     if not is_convex(corners):
         raise SensorError(
             f"electrode {electrode.name!r}: expected a convex polygon with its corners anticlockwise, "
-            f"got {(corners * 1e3).tolist()} mm"
+            f"got {corners.tolist()} mm"
         )
+    check_millimetres(f"electrode {electrode.name!r}", float(np.ptp(corners, axis=0).max()), LEAST_EXTENT, SensorError)
     side = float(corners[1, 0] - corners[0, 0])
     square = Electrode.of_square(electrode.name, electrode.centre, side).corners
     if electrode.square and not (len(corners) == 4 and np.allclose(corners, square, rtol=0.0, atol=1e-9 * side)):
         raise SensorError(
             f"electrode {electrode.name!r}: expected the corners of a square along the axes, "
-            f"got {(corners * 1e3).tolist()} mm; make squares with Electrode.of_square"
+            f"got {corners.tolist()} mm; make squares with Electrode.of_square"
         )
     placed = calibration.place(corners)
     if not np.linalg.norm(placed, axis=1).max() < film.radius:
-        x, y = 1e3 * placed.mean(axis=0)
-        reach = 1e3 * np.linalg.norm(placed - placed.mean(axis=0), axis=1).max()
-        size = (
-            f"half side {_short(500.0 * side)} mm" if electrode.square else f"corners up to {_short(reach)} mm from it"
-        )
+        x, y = placed.mean(axis=0)
+        reach = np.linalg.norm(placed - placed.mean(axis=0), axis=1).max()
+        size = f"half side {_short(0.5 * side)} mm" if electrode.square else f"corners up to {_short(reach)} mm from it"
         raise SensorError(
             f"electrode {electrode.name!r} lies outside the film: centre ({_short(x)}, {_short(y)}) mm, {size}, "
-            f"film radius {_short(1e3 * film.radius)} mm"
+            f"film radius {_short(film.radius)} mm"
         )
 
 

@@ -7,10 +7,10 @@ draw from it, and a network for all films is trained over it.
 Parameters are deviations from the sensor's file, so that zero is the film as described, but for the pretension, which
 is the pretension itself:
 
-    pretension                     Pa
+    pretension                     MPa
     young, thickness, d31, d32     ln(value / described value), dimensionless
-    shift_x, shift_y, rotation     of the electrodes, added to the described ones, m and rad
-    probe_radius                   added to the described radius, m
+    shift_x, shift_y, rotation     of the electrodes, added to the described ones, mm and rad
+    probe_radius                   added to the described radius, mm
     gain A, gain B, ...            ln(gain / described gain), dimensionless, by electrode
 """
 
@@ -44,25 +44,25 @@ class FilmSpread:
     """How far films spread: the largest pretension, and one standard deviation of everything else.
 
     Attributes:
-        pretension: Largest pretension, Pa; all from none to this are equally likely.
+        pretension: Largest pretension, MPa; all from none to this are equally likely.
         young: Of the logarithm of Young's modulus, dimensionless, as those of thickness, d31, d32 and gain.
         thickness: As above.
         d31: As above.
         d32: As above.
-        shift: Displacement of the electrodes along x and along y, m.
-        rotation: Turn of the electrodes, rad.
-        probe_radius: m.
+        shift: Displacement of the electrodes along x and along y, mm.
+        rotation: Rotation of the electrodes, rad.
+        probe_radius: mm.
         gain: Of every electrode's gain, each by itself.
     """
 
-    pretension: float = 3e6
+    pretension: float = 3.0
     young: float = 0.2
     thickness: float = 0.05
     d31: float = 0.2
     d32: float = 0.2
-    shift: float = 0.3e-3
+    shift: float = 0.3
     rotation: float = float(np.deg2rad(2.0))
-    probe_radius: float = 0.3e-3
+    probe_radius: float = 0.3
     gain: float = 0.05
 
     def __post_init__(self) -> None:
@@ -174,7 +174,7 @@ class FilmPrior:
         for what, value, expected in (
             ("readout", (sensor.readout, sensor.surface), (described.readout, described.surface)),
             ("film radius (mm) and poisson", _round_film(sensor.film), _round_film(described.film)),
-            ("d33 (pC/N)", 1e12 * sensor.piezo.d33, 1e12 * described.piezo.d33),
+            ("d33 (pC/N)", sensor.piezo.d33, described.piezo.d33),
         ):
             if value != expected:
                 raise SensorError(f"{sensor.name}: {what}: expected those of {described.name}, {expected}, got {value}")
@@ -205,16 +205,16 @@ class FilmPrior:
 
 def _shapes(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
     """Corners of the electrodes as described, mm, rounded to a nanometre."""
-    return {e.name: [(round(1e3 * x, 6), round(1e3 * y, 6)) for x, y in e.corners] for e in sensor.electrodes}
+    return {e.name: [(round(x, 6), round(y, 6)) for x, y in e.corners] for e in sensor.electrodes}
 
 
 def _centres(sensor: Sensor) -> str:
-    places = [(e.name, 1e3 * e.centre[0], 1e3 * e.centre[1]) for e in sensor.electrodes]
+    places = [(e.name, *e.centre) for e in sensor.electrodes]
     return ", ".join(f"{name} at ({x:.4g}, {y:.4g})" for name, x, y in places[:8]) + " mm" + ", ..." * (len(places) > 8)
 
 
 def _round_film(film: Film) -> tuple[float, float]:
-    return round(1e3 * film.radius, 6), round(film.poisson, 9)
+    return round(film.radius, 6), round(film.poisson, 9)
 
 
 def _ratio(value: float, described: float) -> float:
@@ -231,6 +231,6 @@ def _film(described: Film, values: dict[str, float]) -> Film:
 
 
 def virtual_film(sensor: Sensor, probe: Circle, seed: int) -> tuple[Sensor, Circle]:
-    """A film drawn from the spread about a sensor and a probe: the bench that nobody has measured yet."""
+    """A film drawn from the spread about a sensor and a probe."""
     prior = FilmPrior(sensor, probe)
     return prior.film(prior.draw(np.random.default_rng(seed), 1)[0])

@@ -16,6 +16,7 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
 from isocharge.common.tables import cut
 from isocharge.simulate.numerics.polygon import area_of, centroid_of, is_convex
+from isocharge.simulate.sensor.size_check import check_millimetres
 
 NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 
@@ -30,30 +31,34 @@ NOTATION = re.compile(
 MOST_CORNERS = 64
 """Largest number of corners of a polygon: beyond it a circle gives the same charges with fewer unknowns."""
 
+LEAST_REACH = 0.02
+"""Smallest distance of a footprint's farthest point from its centroid, mm: smaller numbers are in metres."""
+
 
 @dataclass(frozen=True)
 class Circle:
-    """A circular footprint of `radius` (m) that presses uniformly."""
+    """A circular footprint of `radius` (mm) that presses uniformly."""
 
     radius: float
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.radius) and self.radius > 0.0):
-            raise SceneError(f"probe radius: expected a positive number, got {self.radius} m")
+            raise SceneError(f"probe radius: expected a positive number, got {self.radius} mm")
+        check_millimetres("probe radius", self.radius, LEAST_REACH, SceneError)
 
     @property
     def notation(self) -> str:
         """As on the command line, the radius in mm."""
-        return f"circle:{_in_millimetres(self.radius)}"
+        return f"circle:{_tidy(self.radius)}"
 
     @property
     def area(self) -> float:
-        """Area, m^2."""
+        """Area, mm^2."""
         return float(np.pi * self.radius**2)
 
     @property
     def reach(self) -> float:
-        """Distance of the footprint's farthest point from its centroid, m."""
+        """Distance of the footprint's farthest point from its centroid, mm."""
         return self.radius
 
     @property
@@ -76,7 +81,7 @@ class Polygon:
     """A convex polygonal footprint that presses uniformly.
 
     Attributes:
-        corners: (x, y) relative to the centroid, anticlockwise, m, before turning.
+        corners: (x, y) relative to the centroid, anticlockwise, mm, before turning.
         angle: Turn about the centroid, anticlockwise, rad.
         name: Kind of footprint: "rectangle", "triangle" or "polygon".
     """
@@ -92,17 +97,17 @@ class Polygon:
         if not np.isfinite(self.angle):
             raise SceneError(f"probe angle: expected a finite number, got {self.angle}")
         if not is_convex(at):
-            raise SceneError(
-                f"probe: expected a convex polygon with its corners anticlockwise, got {(1e3 * at).tolist()} mm"
-            )
+            raise SceneError(f"probe: expected a convex polygon with its corners anticlockwise, got {at.tolist()} mm")
         if not np.linalg.norm(centroid_of(at)) <= 1e-9 * np.linalg.norm(at, axis=1).max():
             raise SceneError(
-                f"probe: expected corners relative to their centroid, got {(1e3 * at).tolist()} mm; use Polygon.of"
+                f"probe: expected corners relative to their centroid, got {at.tolist()} mm; use Polygon.of"
             )
+
+        check_millimetres("probe reach", self.reach, LEAST_REACH, SceneError)
 
     @classmethod
     def of(cls, corners: Array, angle: float = 0.0, name: str = "polygon") -> "Polygon":
-        """From corners (x, y) anywhere, anticlockwise, shape (n, 2), m: they are moved onto their centroid."""
+        """From corners (x, y) anywhere, anticlockwise, shape (n, 2), mm: they are moved onto their centroid."""
         at = np.asarray(corners, dtype=float)
         if at.ndim == 2 and at.shape[0] >= 3 and at.shape[1] == 2 and is_convex(at):
             at = at - centroid_of(at)
@@ -110,14 +115,14 @@ class Polygon:
 
     @classmethod
     def rectangle(cls, width: float, height: float, angle: float = 0.0) -> "Polygon":
-        """Sides along x and y, m."""
+        """Sides along x and y, mm."""
         _check_positive(width=width, height=height)
         x, y = 0.5 * width, 0.5 * height
         return cls(((x, y), (-x, y), (-x, -y), (x, -y)), angle, "rectangle")
 
     @classmethod
     def triangle(cls, side: float, angle: float = 0.0) -> "Polygon":
-        """Equilateral, one corner to +y; side in m."""
+        """Equilateral, one corner to +y; side in mm."""
         _check_positive(side=side)
         turn = np.exp(1j * (0.5 * np.pi + 2.0 * np.pi / 3.0 * np.arange(3))) * side / np.sqrt(3.0)
         return cls(tuple((float(z.real), float(z.imag)) for z in turn), angle, "triangle")
@@ -127,24 +132,24 @@ class Polygon:
         """As on the command line, lengths in mm, without the angle."""
         at = np.array(self.corners)
         if self.name == "rectangle":
-            return f"rectangle:{_in_millimetres(2.0 * at[0, 0])}x{_in_millimetres(2.0 * at[0, 1])}"
+            return f"rectangle:{_tidy(2.0 * at[0, 0])}x{_tidy(2.0 * at[0, 1])}"
         if self.name == "triangle":
-            return f"triangle:{_in_millimetres(float(np.linalg.norm(at[1] - at[0])))}"
-        return "polygon:" + ";".join(f"{_in_millimetres(x)},{_in_millimetres(y)}" for x, y in at)
+            return f"triangle:{_tidy(float(np.linalg.norm(at[1] - at[0])))}"
+        return "polygon:" + ";".join(f"{_tidy(x)},{_tidy(y)}" for x, y in at)
 
     @property
     def area(self) -> float:
-        """Area, m^2."""
+        """Area, mm^2."""
         return area_of(np.array(self.corners))
 
     @property
     def reach(self) -> float:
-        """Distance of the footprint's farthest point from its centroid, m."""
+        """Distance of the footprint's farthest point from its centroid, mm."""
         return float(np.linalg.norm(np.array(self.corners), axis=1).max())
 
     @property
     def outline(self) -> Complexes:
-        """Corners as x + iy relative to the centroid, turned, anticlockwise, shape (n,), m."""
+        """Corners as x + iy relative to the centroid, turned, anticlockwise, shape (n,), mm."""
         outline: Complexes = np.array(self.corners) @ np.array([1.0, 1j]) * np.exp(1j * self.angle)
         return outline
 
@@ -183,29 +188,29 @@ def parse_probe(text: str) -> Probe:
             raise SceneError(f"probe {size}: expected a positive number, got {match[size]} mm in {cut(text)!r}")
     angle = float(np.deg2rad(float(match["angle"] or 0.0)))
     if match["circle"]:
-        return Circle(float(match["radius"]) * 1e-3)
+        return Circle(float(match["radius"]))
     if match["rectangle"]:
-        return Polygon.rectangle(float(match["width"]) * 1e-3, float(match["height"]) * 1e-3, angle)
+        return Polygon.rectangle(float(match["width"]), float(match["height"]), angle)
     if match["triangle"]:
-        return Polygon.triangle(float(match["side"]) * 1e-3, angle)
+        return Polygon.triangle(float(match["side"]), angle)
     corners = np.array([[float(value) for value in corner.split(",")] for corner in match["corners"].split(";")])
     if not np.isfinite(corners).all():
         raise SceneError(f"probe {cut(text)!r}: expected finite corners")
-    return Polygon.of(corners * 1e-3, angle)
+    return Polygon.of(corners, angle)
 
 
 def _check_positive(**sizes: float) -> None:
     for name, value in sizes.items():
         if not (np.isfinite(value) and value > 0.0):
-            raise SceneError(f"probe {name}: expected a positive number, got {value} m")
+            raise SceneError(f"probe {name}: expected a positive number, got {value} mm")
 
 
-def _in_millimetres(metres: float) -> float:
-    return float(f"{metres * 1e3:.12g}")
+def _tidy(value: float) -> float:
+    return float(f"{value:.12g}")
 
 
 def farthest(probe: Probe, at: tuple[float, float]) -> float:
-    """Distance of the footprint's farthest point from the film's centre, m."""
+    """Distance of the footprint's farthest point from the film's centre, mm."""
     if isinstance(probe, Polygon):
         return float(np.abs(complex(*at) + probe.outline).max())
     return float(np.hypot(*at)) + probe.radius

@@ -1,4 +1,4 @@
-"""What a sensor is: film, piezoelectric coefficients, electrodes, readout, calibration. SI units throughout.
+"""What a sensor is: film, piezoelectric coefficients, electrodes, readout, calibration. mm, N, MPa and pC throughout.
 
 Frame: origin at the film's centre, x along the drawn direction (1), y transverse (2), z the way the probe pushes.
 """
@@ -12,7 +12,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import SensorError
 from isocharge.common.tables import cut, shown
 from isocharge.simulate.numerics.polygon import overlap
-from isocharge.simulate.sensor.electrode import Calibration, Electrode, _check_electrode
+from isocharge.simulate.sensor.electrode import Calibration, Electrode, check_electrode
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
 
 Readout = Literal["area", "edge"]
@@ -52,7 +52,7 @@ class Sensor:
         if not self.electrodes:
             raise SensorError("electrodes: expected at least one, got none")
         for electrode in self.electrodes:
-            _check_electrode(electrode, self.film, self.calibration)
+            check_electrode(electrode, self.film, self.calibration)
             if self.readout == "edge" and not electrode.square:
                 raise SensorError(f"readout 'edge' needs square electrodes, but {electrode.name!r} is a polygon")
         for i, first in enumerate(self.electrodes):

@@ -65,7 +65,7 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
 
 def _cautions(sensor: Sensor) -> Iterator[str]:
     """Sentences on what can exist, but hardly be meant."""
-    d31, d32 = 1e12 * sensor.piezo.d31, 1e12 * sensor.piezo.d32
+    d31, d32 = sensor.piezo.d31, sensor.piezo.d32
     for name, value, other in (("d31", d31, d32), ("d32", d32, d31)):
         if 0.0 < abs(value) < TINY * max(1.0, abs(other)):
             yield (
@@ -87,22 +87,22 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
         "readout": sensor.readout,
         "surface": sensor.surface,
         "film": {
-            "radius_mm": _tidy(film.radius * 1e3),
-            "thickness_um": _tidy(film.thickness * 1e6),
-            "young_GPa": _tidy(film.young * 1e-9),
+            "radius_mm": _tidy(film.radius),
+            "thickness_um": _tidy(film.thickness * 1e3),
+            "young_GPa": _tidy(film.young * 1e-3),
             "poisson": film.poisson,
-            "pretension_MPa": _tidy(film.pretension * 1e-6),
+            "pretension_MPa": _tidy(film.pretension),
         },
         "piezo": {
-            "d31": _tidy(piezo.d31 * 1e12),
-            "d32": _tidy(piezo.d32 * 1e12),
-            "d33": _tidy(piezo.d33 * 1e12),
-            "pyro_uC_per_m2_K": _tidy(piezo.pyro * 1e6),
+            "d31": _tidy(piezo.d31),
+            "d32": _tidy(piezo.d32),
+            "d33": _tidy(piezo.d33),
+            "pyro_uC_per_m2_K": _tidy(piezo.pyro),
         },
         "electrodes": _electrode_tables(sensor),
         "calibration": {
             "gain": dict(calibration.gain),
-            "shift_mm": [_tidy(1e3 * value) for value in calibration.shift],
+            "shift_mm": [_tidy(value) for value in calibration.shift],
             "rotation_deg": _tidy(float(np.rad2deg(calibration.rotation))),
         },
     }
@@ -140,7 +140,7 @@ def write_sensor(sensor: Sensor, path: Path, comment: Iterable[str] = ()) -> Non
 
 def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
     """Squares share one side in the file; those of another side than the first are written as polygons."""
-    sides = {e.name: _tidy(1e3 * (e.corners[1][0] - e.corners[0][0])) for e in sensor.electrodes if e.square}
+    sides = {e.name: _tidy(e.corners[1][0] - e.corners[0][0]) for e in sensor.electrodes if e.square}
     if sensor.readout == "edge" and len(set(sides.values())) > 1:
         raise SensorError(
             f"readout 'edge' needs squares, and in a sensor file all squares have one side: got {sides} mm"
@@ -149,9 +149,9 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
     tables: dict[str, Any] = {} if shared is None else {"side_mm": shared}
     for electrode in sensor.electrodes:
         if sides.get(electrode.name) == shared is not None:
-            tables[electrode.name] = [_tidy(1e3 * value) for value in electrode.centre]
+            tables[electrode.name] = [_tidy(value) for value in electrode.centre]
         else:
-            corners = [[_tidy(1e3 * value) for value in corner] for corner in electrode.corners]
+            corners = [[_tidy(value) for value in corner] for corner in electrode.corners]
             tables[electrode.name] = {"polygon_mm": corners}
     return tables
 
@@ -167,17 +167,17 @@ def _build(file: Table) -> Sensor:
     return Sensor(
         name=file.text("name"),
         film=Film(
-            radius=film.number("radius_mm", above=0.0, most=FARTHEST_MM) * 1e-3,
-            thickness=film.number("thickness_um", above=0.0) * 1e-6,
-            young=film.number("young_GPa", above=0.0) * 1e9,
+            radius=film.number("radius_mm", above=0.0, most=FARTHEST_MM),
+            thickness=film.number("thickness_um", above=0.0) * 1e-3,
+            young=film.number("young_GPa", above=0.0) * 1e3,
             poisson=film.number("poisson"),
-            pretension=film.number("pretension_MPa", 0.0, least=0.0) * 1e6,
+            pretension=film.number("pretension_MPa", 0.0, least=0.0),
         ),
         piezo=Piezo(
-            d31=piezo.number("d31") * 1e-12,
-            d32=piezo.number("d32") * 1e-12,
-            d33=piezo.number("d33", 0.0) * 1e-12,
-            pyro=piezo.number("pyro_uC_per_m2_K", 0.0) * 1e-6,
+            d31=piezo.number("d31"),
+            d32=piezo.number("d32"),
+            d33=piezo.number("d33", 0.0),
+            pyro=piezo.number("pyro_uC_per_m2_K", 0.0),
         ),
         electrodes=_electrodes(file.table("electrodes")),
         readout=cast(Readout, file.choice("readout", get_args(Readout), "area")),
@@ -194,19 +194,19 @@ def _electrode(table: Table, name: str) -> Electrode:
     if isinstance(table.get(name), Mapping):
         polygon = table.table(name).only("polygon_mm")
         corners = polygon.sequence("polygon_mm", of="[x, y]")
-        return Electrode(name, tuple(_metres(polygon, "polygon_mm", corner) for corner in corners))
+        return Electrode(name, tuple(_point(polygon, "polygon_mm", corner) for corner in corners))
     side = table.number("side_mm", above=0.0)
     if side > FARTHEST_MM:
         table.refuse("side_mm", f"at most {FARTHEST_MM:g}")
-    return Electrode.of_square(name, _metres(table, name, table.get(name)), side * 1e-3)
+    return Electrode.of_square(name, _point(table, name, table.get(name)), side)
 
 
-def _metres(table: Table, key: str, point_mm: object) -> tuple[float, float]:
-    """A point of the plane, m."""
+def _point(table: Table, key: str, point_mm: object) -> tuple[float, float]:
+    """A point of the plane, mm."""
     x_mm, y_mm = table.as_numbers(key, point_mm, count=2, of="[x, y] in mm")
     if max(abs(x_mm), abs(y_mm)) > FARTHEST_MM:
         table.refuse(key, f"[x, y] in mm, each at most {FARTHEST_MM:g}", point_mm)
-    return 1e-3 * x_mm, 1e-3 * y_mm
+    return x_mm, y_mm
 
 
 def _calibration(table: Table) -> Calibration:
@@ -214,6 +214,6 @@ def _calibration(table: Table) -> Calibration:
     gain = table.table("gain", {})
     return Calibration(
         gain={name: gain.number(name, above=0.0) for name in gain},
-        shift=_metres(table, "shift_mm", table.get("shift_mm", [0.0, 0.0])),
+        shift=_point(table, "shift_mm", table.get("shift_mm", [0.0, 0.0])),
         rotation=float(np.deg2rad(table.number("rotation_deg", 0.0))),
     )
