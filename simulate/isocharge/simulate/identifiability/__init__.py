@@ -1,4 +1,1 @@
-"""What charges can tell about a contact: Cramer-Rao limits, folds, ambiguities, working area, probe.
-
-May import: forward, sensor, measuring_chain, numerics.
-"""
+"""What charges determine about a contact: Cramer-Rao limits, folds, ambiguous pairs, working area."""

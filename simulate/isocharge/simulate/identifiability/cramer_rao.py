@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.charge_model import ChargeModel
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 SMALLEST = 1e-14
@@ -19,11 +19,11 @@ SMALLEST = 1e-14
 Limits become some 1e7 times larger than the others instead of infinite."""
 
 NOTHING = 1e-60
-"""Fisher information below which a parameter counts as unobservable: 1/m^2 for x and y, dimensionless for ln F."""
+"""Fisher information below which a parameter counts as unobservable: 1/mm^2 for x and y, dimensionless for ln F."""
 
 Nuisance = Callable[[Array], Array]
 """From contacts (x, y, F), shape (n, 3), to how the charges change with what nobody knows: d(Q)/d(parameter) times the
-parameter's standard deviation, shape (n, n_electrode, n_parameter), C. Parameters: the probe's radius, pretension."""
+parameter's standard deviation, shape (n, n_electrode, n_parameter), pC. Parameters: the probe's radius, pretension."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class CramerRao:
     """Cramer-Rao limits of contacts.
 
     Attributes:
-        covariance: Smallest covariance of (x, y, ln F, ...), shape (n, p, p); x and y in m, ln F dimensionless.
+        covariance: Smallest covariance of (x, y, ln F, ...), shape (n, p, p); x and y in mm, ln F dimensionless.
             Nuisances come last, in units of their prior standard deviation.
     """
 
@@ -39,7 +39,7 @@ class CramerRao:
 
     @property
     def position(self) -> Array:
-        """Root of the mean square distance from the true position, shape (n,), m."""
+        """Root of the mean square distance from the true position, shape (n,), mm."""
         position: Array = np.sqrt(self.covariance[:, 0, 0] + self.covariance[:, 1, 1])
         return position
 
@@ -58,11 +58,11 @@ def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Arra
     """Limits from charges and their derivatives.
 
     Args:
-        charge: Charges, shape (n, n_electrode), C.
+        charge: Charges, shape (n, n_electrode), pC.
         jacobian: d(Q)/d(parameters), shape (n, n_electrode, p); the first three parameters are x, y, ln F.
         noise: Noise of the readings, with white noise above zero.
         nuisance: Change of the charges by one prior standard deviation of each further unknown, shape
-            (n, n_electrode, n_parameter), C. They are unknown too, but known to that standard deviation: their prior
+            (n, n_electrode, n_parameter), pC. They are unknown too, but known to that standard deviation: their prior
             adds to the information (Van Trees 1968, sec. 2.4.3).
     """
     prior = np.zeros(jacobian.shape[2])
@@ -73,10 +73,10 @@ def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Arra
     return CramerRao(_invert(information + np.diag(prior)))
 
 
-def limits_at(model: ChargeModel, contact: Array, noise: NoiseModel, nuisance: Nuisance | None = None) -> CramerRao:
-    """Limits at contacts (x, y, F), shape (n, 3), m and N; `nuisance` says what else nobody knows."""
+def limits_at(charge_map: ChargeMap, contact: Array, noise: NoiseModel, nuisance: Nuisance | None = None) -> CramerRao:
+    """Limits at contacts (x, y, F), shape (n, 3), mm and N; `nuisance` says what else is unknown."""
     unknown = None if nuisance is None else nuisance(contact)
-    return cramer_rao(model.charge(contact), model.jacobian(contact), noise, unknown)
+    return cramer_rao(charge_map.charges(contact), charge_map.derivatives(contact), noise, unknown)
 
 
 def _invert(information: Array) -> Array:

@@ -14,7 +14,7 @@ reached by following the smallest singular value of J downhill.
 Electrodes on one circle fold a biaxial film near this circle, however many they are: their charges hardly change if the
 press moves to its mirror image in the circle.
 
-Even without folds two contacts may have the same charges, see `ambiguities`.
+Even without folds two contacts may have the same charges, see `ambiguous_pairs`.
 """
 
 from dataclasses import dataclass
@@ -22,13 +22,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.simulate.forward.charge_model import ChargeModel
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.identifiability.nearest_contact import INSIDE
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings, onto_disk
 
-FINEST = 2e-5
-"""Distance within which a map turns over at a fold, m. Beside an electrode it may turn over within 0.1 mm and yet lose
+FINEST = 0.02
+"""Distance within which a map turns over at a fold, mm. Beside an electrode it may turn over within 0.1 mm and yet lose
 nothing: at 1 N the charges still tell the sides apart. On a circle of four electrodes it takes some 0.01 mm."""
 
 MOST_STEPS = 40
@@ -51,14 +51,14 @@ def _unit_columns(jacobian: Array) -> Array:
     return unit
 
 
-def scaled_jacobian(model: ChargeModel, contact: Array, noise: NoiseModel) -> Array:
-    """J / sigma of contacts (x, y, F): shape (n, 3) to (n, n_electrode, 3), 1/m, 1/m and without unit."""
-    scaled: Array = model.jacobian(contact) / noise.sigma(model.charge(contact))[..., None]
+def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> Array:
+    """J / sigma of contacts (x, y, F): shape (n, 3) to (n, n_electrode, 3), 1/mm, 1/mm and without unit."""
+    scaled: Array = charge_map.derivatives(contact) / noise.sigma(charge_map.charges(contact))[..., None]
     return scaled
 
 
 def singular_values(scaled: Array) -> Array:
-    """Singular values of J / sigma for the position with unknown force: (n, n_electrode, 3) to (n, 2), 1/m.
+    """Singular values of J / sigma for the position with unknown force: (n, n_electrode, 3) to (n, 2), 1/mm.
 
     One over them are the smallest and the largest standard deviation of the position by direction; at a fold the second
     is zero.
@@ -74,9 +74,9 @@ class Folds:
     """Where a map folds under one force, and where it is nearest to folding.
 
     Attributes:
-        points: Shape (n, 2), m, the nearest to the centre first: on fold lines, with three electrodes; where rank is
+        points: Shape (n, 2), mm, the nearest to the centre first: on fold lines, with three electrodes; where rank is
             lost, with more.
-        weakest: Local minima of the smallest singular value of J, shape (k, 2), m: the position errors between the
+        weakest: Local minima of the smallest singular value of J, shape (k, 2), mm: the position errors between the
             places of a grid are largest there.
     """
 
@@ -84,40 +84,36 @@ class Folds:
     weakest: Array
 
 
-def find_folds(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel) -> Folds:
+def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel) -> Folds:
     """Folds and weakest places.
 
     Args:
-        model: The charges.
+        charge_map: The charges.
         rings: Positions between which folds are looked for; they need not be as fine as the folds.
         force: Force of the contacts, N.
         noise: Noise of the readings.
     """
-    search = _FoldSearch(model, noise, force)
+    search = _FoldSearch(charge_map, noise, force)
     scaled = rings.per_ring(search.scaled(rings.position.reshape(-1, 2)))
     weakest = search.weakest_places(rings, scaled)
     points = np.concatenate([search.crossings(rings, scaled), search.folded(weakest)])
     return Folds(points[np.argsort(np.hypot(*points.T), kind="stable")], weakest)
 
 
-def fold_points(model: ChargeModel, rings: Rings, force: float, noise: NoiseModel) -> Array:
-    """Positions at which the map folds, shape (n, 2), m, the nearest to the centre first; see `find_folds`."""
-    return find_folds(model, rings, force, noise).points
-
-
 class _FoldSearch:
-    """The search under one force; positions have shape (n, 2), m."""
+    """The search under one force; positions have shape (n, 2), mm."""
 
-    def __init__(self, model: ChargeModel, noise: NoiseModel, force: float) -> None:
-        self.model, self.noise, self.force = model, noise, force
+    def __init__(self, charge_map: ChargeMap, noise: NoiseModel, force: float) -> None:
+        self.charge_map, self.noise, self.force = charge_map, noise, force
+        self.radius = INSIDE * charge_map.domain.radius
 
     def scaled(self, position: Array) -> Array:
         """J / sigma, shape (n, n_electrode, 3)."""
-        at = onto_disk(position, INSIDE * self.model.radius)
-        return scaled_jacobian(self.model, np.column_stack([at, np.full(len(at), self.force)]), self.noise)
+        at = onto_disk(position, self.radius)
+        return scaled_derivatives(self.charge_map, np.column_stack([at, np.full(len(at), self.force)]), self.noise)
 
     def weakest(self, position: Array) -> Array:
-        """Smallest singular value of J / sigma for the position, shape (n,), 1/m."""
+        """Smallest singular value of J / sigma for the position, shape (n,), 1/mm."""
         return singular_values(self.scaled(position))[:, -1]
 
     def crossings(self, rings: Rings, scaled: Array) -> Array:
@@ -169,7 +165,7 @@ class _FoldSearch:
             if not active.size:
                 break
             tried = position[active, None] + step[active, None, None] * COMPASS
-            tried = onto_disk(tried.reshape(-1, 2), INSIDE * self.model.radius)
+            tried = onto_disk(tried.reshape(-1, 2), self.radius)
             values = self.weakest(tried).reshape(-1, 8)
             best = values.argmin(axis=1)
             lowest = np.take_along_axis(values, best[:, None], axis=1)[:, 0]

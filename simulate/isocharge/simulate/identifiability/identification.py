@@ -1,23 +1,31 @@
 """How well the charges of a sensor determine a contact: limits over the film, folds and the working area."""
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import SolveError
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE
+from isocharge.common.errors import SceneError, SolveError
 from isocharge.common.json_values import finite_or_none
-from isocharge.common.progress import Progress
-from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.checks import check_determined
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
-from isocharge.simulate.identifiability.folds import scaled_jacobian, singular_values
-from isocharge.simulate.identifiability.working_area import ERROR, WorkingArea, working_area
+from isocharge.simulate.identifiability.folds import scaled_derivatives, singular_values
+from isocharge.simulate.identifiability.working_area import (
+    ERROR,
+    Bound,
+    WorkingArea,
+    with_fast_derivatives,
+    working_area,
+)
 from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.simulate.numerics.disk import Rings
-from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 CLEAR = 0.75
@@ -25,6 +33,12 @@ CLEAR = 0.75
 
 RETREAT, RETREATS = 0.9, 3
 """Factor on the search radius if the charges cannot be interpolated that far, and the largest number of reductions."""
+
+MOST_PAIRS = 20
+"""Most ambiguous pairs that the numbers for JSON list."""
+
+IN_JSON: dict[Bound, str] = {"fold": "fold", "ambiguous pair": "twins", "error": "error", "search": "searched"}
+"""Names of the bounds in files and JSON."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +48,7 @@ class LimitMap:
     Attributes:
         force: Force, N.
         rings: Positions.
-        position: Position error, root mean square, shape (n_ring, n_angle), m.
+        position: Position error, root mean square, shape (n_ring, n_angle), mm.
         relative_force: Error of the force over the force, shape (n_ring, n_angle).
         condition: Largest over smallest standard deviation of the position by direction, shape (n_ring, n_angle).
     """
@@ -46,24 +60,24 @@ class LimitMap:
     condition: Array
 
     @classmethod
-    def of(cls, charges: ChargeSpline, noise: NoiseModel, force: float, rings: Rings) -> "LimitMap":
+    def of(cls, charge_map: ChargeMap, noise: NoiseModel, force: float, rings: Rings) -> "LimitMap":
         """Limits at every position of the rings."""
         contact = rings.contacts(force)
-        limits = limits_at(charges, contact, noise)
-        largest, smallest = singular_values(scaled_jacobian(charges, contact, noise)).T
+        limits = limits_at(charge_map, contact, noise)
+        largest, smallest = singular_values(scaled_derivatives(charge_map, contact, noise)).T
         values = (limits.position, limits.force, largest / np.maximum(smallest, 1e-12 * largest))
         return cls(force, rings, *(rings.per_ring(value) for value in values))
 
-    def summary(self) -> dict[str, float]:
+    def statistics(self) -> dict[str, float]:
         """Errors, each position weighted with its area."""
         area = np.repeat(self.rings.distance, self.position.shape[1])
-        position, force = 1e3 * self.position.ravel(), 1e2 * self.relative_force.ravel()
+        position, force = self.position.ravel(), 100.0 * self.relative_force.ravel()
         return {
             "force_N": self.force,
-            "position_median_mm": _quantile(position, area, 0.5),
+            "position_median_mm": _median(position, area),
             "position_rms_mm": float(np.sqrt(np.average(position**2, weights=area))),
             "position_worst_mm": float(position.max()),
-            "force_median_percent": _quantile(force, area, 0.5),
+            "force_median_percent": _median(force, area),
             "force_rms_percent": float(np.sqrt(np.average(force**2, weights=area))),
             "force_worst_percent": float(force.max()),
             "condition_worst": float(self.condition.max()),
@@ -78,7 +92,7 @@ class Identification:
         sensor: The sensor.
         probe: The footprint.
         noise: Noise of the readings.
-        charges: Charges of the sensor as splines.
+        charges: Charges of the sensor, with fast derivatives.
         area: The working area, with folds and ambiguous pairs.
         maps: Limits under the smallest force, 1 N if that is in the range, and the largest.
         inside: The same within the working area; none where that is a point.
@@ -87,72 +101,110 @@ class Identification:
     sensor: Sensor
     probe: Probe
     noise: NoiseModel
-    charges: ChargeSpline = field(repr=False)
+    charges: ChargeMap = field(repr=False)
     area: WorkingArea
     maps: tuple[LimitMap, ...] = field(repr=False)
     inside: tuple[LimitMap, ...] = field(repr=False)
 
+    @classmethod
+    def of(cls, forward_map: ForwardMap, noise: NoiseModel, *, error: float = ERROR) -> "Identification":
+        """See `identify`; within the radius and the forces of a forward map that is already solved."""
+        check_determined(len(forward_map.electrodes))
+        charges = with_fast_derivatives(forward_map)
+        low, high = charges.domain.force_range
+        forces = sorted({low, min(max(low, 1.0), high), high})
+        area = working_area(charges, noise, error=error)
+        maps, inside = (
+            tuple(LimitMap.of(charges, noise, force, Rings.spread(radius)) for force in forces if radius > 0.0)
+            for radius in (charges.domain.radius, area.radius)
+        )
+        return cls(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inside)
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON; infinite radii are None."""
-        area, rings = self.area, self.maps[0].rings
+        area = self.area
         return {
             "sensor": self.sensor.name,
             "probe": self.probe.notation,
             "noise": self.noise.to_dict(),
             "force_N": list(area.force_range),
             "working_area": {
-                "radius_mm": 1e3 * area.radius,
-                "why": area.why,
-                "fold_radius_mm": finite_or_none(1e3 * area.fold_radius),
-                "twin_radius_mm": finite_or_none(1e3 * area.twin_radius),
-                "error_radius_mm": 1e3 * area.error_radius,
-                "unfolded_radius_mm": 1e3 * area.unfolded,
-                "error_mm": 1e3 * area.error,
-                "searched_mm": 1e3 * area.searched,
-                "words": area.words,
+                "radius_mm": area.radius,
+                "why": IN_JSON[area.bound],
+                "fold_radius_mm": finite_or_none(area.fold_radius),
+                "twin_radius_mm": finite_or_none(area.pairs.radius),
+                "error_radius_mm": area.error_radius,
+                "unfolded_radius_mm": area.unambiguous_radius,
+                "error_mm": area.error,
+                "searched_mm": area.searched,
+                "words": area.summary,
             },
-            "limits_in_working_area": [limits.summary() for limits in self.inside],
+            "limits_in_working_area": [limits.statistics() for limits in self.inside],
             "by_distance": {
-                "distance_mm": (1e3 * rings.distance).tolist(),
+                "distance_mm": self.maps[0].rings.distance.tolist(),
                 **{
-                    f"{name}_position_mm_at_{limits.force:g}_N": (1e3 * statistic(limits.position, axis=1)).tolist()
+                    f"{name}_position_mm_at_{limits.force:g}_N": statistic(limits.position, axis=1).tolist()
                     for limits in self.maps
                     for name, statistic in (("median", np.median), ("worst", np.max))
                 },
             },
-            "folds_mm": (1e3 * area.folds).round(3).tolist(),
-            "twins": _pair_rows(area),
+            "folds_mm": area.folds.round(3).tolist(),
+            "twins": [
+                {"first": _contact_row(first), "second": _contact_row(second), "sigmas_apart": float(distance)}
+                for first, second, distance in list(
+                    zip(area.pairs.first, area.pairs.second, area.pairs.distance, strict=True)
+                )[:MOST_PAIRS]
+            ],
         }
 
 
 def identify(
-    forward_map: ForwardMap, noise: NoiseModel, *, error: float = ERROR, charges: ChargeSpline | None = None
+    sensor: Sensor,
+    probe: Probe = Circle(1.0),
+    noise: NoiseModel | None = None,
+    *,
+    force_range: tuple[float, float] = DEFAULT_FORCE_RANGE,
+    radius: float | None = None,
+    error: float = ERROR,
+    executor: Executor | None = None,
 ) -> Identification:
-    """How well the charges determine contacts within the radius and the forces of a forward map: some 10 s.
+    """How well the charges of a sensor determine contacts: some 20 s.
 
     Args:
-        forward_map: Charges of the sensor under the probe.
-        noise: Noise of the readings, with white noise above zero.
-        error: Largest Cramer-Rao position error allowed in the working area, m.
-        charges: The forward map as splines; tabulated if absent.
+        sensor: The sensor.
+        probe: The object that presses.
+        noise: Noise of the readings, with white noise above zero; `reference` if absent.
+        force_range: Smallest and largest force, N.
+        radius: Distance from the centre up to which contacts are searched, mm; to the electrodes' far corners if
+            absent.
+        error: Largest Cramer-Rao position error allowed in the working area, mm.
+        executor: Runs the solves; this process if absent.
 
     Raises:
-        SceneError: If there are fewer than three electrodes.
+        SceneError: If there are fewer than three electrodes, no noise, or some presses cannot exist.
+        SolveError: If an equilibrium or the target of the interpolation error was not reached.
+
+    Example:
+        >>> area = identify(load_sensor("three-25um-biaxial")).area  # doctest: +SKIP
+        >>> print(area.summary)  # doctest: +SKIP
+        Working area: up to 7.6 mm from the centre, 0.05 to 2 N. ...
     """
-    check_determined(len(forward_map.electrode_names))
-    charges = charges or ChargeSpline.of(forward_map)
-    low, high = forward_map.force_range
-    forces = sorted({low, min(max(low, 1.0), high), high})
-    area = working_area(charges, noise, error=error)
-    maps, inside = (
-        tuple(LimitMap.of(charges, noise, force, Rings.spread(radius)) for force in forces if radius > 0.0)
-        for radius in (charges.radius, area.radius)
-    )
-    return Identification(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inside)
+    check_determined(len(sensor.electrodes))
+    noise = noise or noise_model("reference")
+    if noise.white <= 0.0:
+        raise SceneError(
+            f"noise: expected white noise above 0 pC, got that of {noise.name!r}: without noise the errors have no "
+            "lower limit"
+        )
+    if radius is None:
+        forward_map = map_to_search(sensor, probe, force_range, executor)
+    else:
+        forward_map = ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
+    return Identification.of(forward_map, noise, error=error)
 
 
 def search_radius(sensor: Sensor, probe: Probe) -> float:
-    """Radius of the search for the working area, m: to the outermost corner of an electrode.
+    """Radius of the search for the working area, mm: to the outermost corner of an electrode.
 
     Electrodes that surround the working area bound it, mostly by a fold that runs through them.
     """
@@ -161,7 +213,7 @@ def search_radius(sensor: Sensor, probe: Probe) -> float:
 
 
 def map_to_search(
-    sensor: Sensor, probe: Probe, force_range: tuple[float, float], progress: Progress | None = None
+    sensor: Sensor, probe: Probe, force_range: tuple[float, float], executor: Executor | None = None
 ) -> ForwardMap:
     """A forward map over the search radius, or a smaller one if the charges cannot be interpolated so far out.
 
@@ -172,21 +224,17 @@ def map_to_search(
     radius = search_radius(sensor, probe)
     for _ in range(RETREATS):
         try:
-            return ForwardMap.build(sensor, probe, radius, force_range, progress=progress)
+            return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
         except SolveError:
             radius *= RETREAT
-    return ForwardMap.build(sensor, probe, radius, force_range, progress=progress)
+    return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
 
 
-def _quantile(values: Array, weights: Array, share: float) -> float:
+def _median(values: Array, weights: Array) -> float:
     order = np.argsort(values)
     total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, share * total[-1])])
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
-def _pair_rows(area: WorkingArea, most: int = 20) -> list[dict[str, Any]]:
-    def contact(row: Array) -> dict[str, float]:
-        return {"x_mm": 1e3 * float(row[0]), "y_mm": 1e3 * float(row[1]), "force_N": float(row[2])}
-
-    rows = zip(area.twins.first[:most], area.twins.second[:most], area.twins.distance[:most], strict=True)
-    return [{"first": contact(a), "second": contact(b), "sigmas_apart": float(d)} for a, b, d in rows]
+def _contact_row(contact: Array) -> dict[str, float]:
+    return {"x_mm": float(contact[0]), "y_mm": float(contact[1]), "force_N": float(contact[2])}

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.simulate.forward.charge_model import ChargeModel
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.force_profile import ForceProfile
-from isocharge.simulate.identifiability.nearest_contact import nearest_contact
+from isocharge.simulate.identifiability.nearest_contact import INSIDE, nearest_contact
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import lattice
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
@@ -22,8 +22,8 @@ from isocharge.simulate.numerics.interpolation import barycentric_weights, cheby
 INDISTINGUISHABLE_SIGMAS = 3.0
 """Largest difference of the charges at which two contacts count as the same, standard deviations of the noise."""
 
-APART, WIDTHS = 1e-3, 6.0
-"""Smallest distance of an ambiguous pair: APART, m, and WIDTHS standard deviations of the position. Nearer contacts are
+APART, WIDTHS = 1.0, 6.0
+"""Smallest distance of an ambiguous pair: APART, mm, and WIDTHS standard deviations of the position. Nearer contacts are
 one uncertain contact."""
 
 FORCES = 8
@@ -39,7 +39,7 @@ class AmbiguousPairs:
     """Pairs of contacts with the same charges, the nearest to the centre first.
 
     Attributes:
-        first: (x, y, F), shape (n, 3), m and N.
+        first: (x, y, F), shape (n, 3), mm and N.
         second: The other contact of each pair, likewise.
         distance: Difference of their charges, standard deviations of the noise, shape (n,).
     """
@@ -58,73 +58,76 @@ class AmbiguousPairs:
         """All pairs of several searches."""
         every = [cls.none(), *pairs]
         joined = cls(
-            np.concatenate([each.first for each in every]),
-            np.concatenate([each.second for each in every]),
-            np.concatenate([each.distance for each in every]),
+            *(np.concatenate([getattr(each, name) for each in every]) for name in ("first", "second", "distance"))
         )
-        order = np.argsort(joined.reach, kind="stable")
+        order = np.argsort(joined.outer_radius, kind="stable")
         return cls(joined.first[order], joined.second[order], joined.distance[order])
 
     def __len__(self) -> int:
         return len(self.first)
 
     @property
-    def reach(self) -> Array:
-        """Distance of the outer contact of each pair from the centre, shape (n,), m."""
-        reach: Array = np.maximum(np.hypot(*self.first[:, :2].T), np.hypot(*self.second[:, :2].T))
-        return reach
+    def outer_radius(self) -> Array:
+        """Distance of the outer contact of each pair from the centre, shape (n,), mm."""
+        outer: Array = np.maximum(np.hypot(*self.first[:, :2].T), np.hypot(*self.second[:, :2].T))
+        return outer
 
     @property
-    def words(self) -> str:
+    def radius(self) -> float:
+        """Radius of the smallest disk that holds both contacts of a pair, mm; infinite if there are no pairs."""
+        return float(self.outer_radius.min(initial=np.inf))
+
+    @property
+    def summary(self) -> str:
         """The pair nearest to the centre, in a sentence; nothing without pairs."""
         if not len(self):
             return ""
         (x, y, force), (other_x, other_y, other_force) = self.first[0], self.second[0]
         return (
-            f"Contacts far apart can have the same charges: {force:.3g} N at ({1e3 * x:.1f}, {1e3 * y:.1f}) mm and "
-            f"{other_force:.3g} N at ({1e3 * other_x:.1f}, {1e3 * other_y:.1f}) mm are alike within "
+            f"Contacts far apart can have the same charges: {force:.3g} N at ({x:.1f}, {y:.1f}) mm and "
+            f"{other_force:.3g} N at ({other_x:.1f}, {other_y:.1f}) mm are alike within "
             f"{self.distance[0]:.1f} standard deviations."
         )
 
 
-def find_ambiguous_pairs(model: ChargeModel, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
+def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
     """Pairs of contacts far apart whose charges differ by less than the noise.
 
     For each position of a square lattice, pressed with `force`, every other position is tried with the force that fits
     best; the best two are improved by least squares.
 
     Args:
-        model: The charges.
+        charge_map: The charges.
         noise: Noise of the readings.
         force: Force of the first contact of each pair, N; the second may have any.
         places: Number of positions of the lattice: 1,000 take some 3 s with splines.
     """
     unit = lattice(places)
-    position = model.radius * (1.0 - 1e-9) * np.stack([unit.real, unit.imag], axis=1)
-    first = np.concatenate([position, np.full((len(position), 1), force)], axis=1)
-    charge = model.charge(first)
-    apart = np.maximum(APART, WIDTHS * limits_at(model, first, noise).position)
-    pairs, start = _candidates(model, noise, position, charge, apart)
+    position = INSIDE * charge_map.domain.radius * np.stack([unit.real, unit.imag], axis=1)
+    first = np.column_stack([position, np.full(len(position), force)])
+    charge = charge_map.charges(first)
+    apart = np.maximum(APART, WIDTHS * limits_at(charge_map, first, noise).position)
+    pairs, start = _candidates(charge_map, noise, position, charge, apart)
     if not pairs.size:
         return AmbiguousPairs.none()
-    second, distance = nearest_contact(model, noise, charge[pairs], start)
+    second, distance = nearest_contact(charge_map, noise, charge[pairs], start)
     far = np.hypot(*(second - first[pairs])[:, :2].T) > apart[pairs]
     ambiguous = np.flatnonzero(far & (distance < INDISTINGUISHABLE_SIGMAS))
     return AmbiguousPairs.joined([AmbiguousPairs(first[pairs[ambiguous]], second[ambiguous], distance[ambiguous])])
 
 
 def _candidates(
-    model: ChargeModel, noise: NoiseModel, position: Array, charge: Array, apart: Array
+    charge_map: ChargeMap, noise: NoiseModel, position: Array, charge: Array, apart: Array
 ) -> tuple[Integers, Array]:
     """Numbers of first contacts, and for each a contact (x, y, F) far away that may have the same charges."""
-    curve, terms = _tabulate(model, position)
+    profile, terms = _tabulate(charge_map, position)
     near = cKDTree(position)
     neighbours = near.query(position, min(9, len(position)))[1]
     numbers, contacts = [], []
     for i, row in enumerate(charge):
         observed = np.broadcast_to(row, charge.shape)
-        logs = curve.best(terms, observed, noise)
-        known = curve.charge(logs, terms)
+        logs = profile.best(terms, observed, noise)
+        known = profile.charge(logs, terms)
         chi2 = ((observed - known) ** 2 / noise.variance(known)).sum(axis=1)
         lowest = chi2 <= chi2[neighbours].min(axis=1)
         elsewhere = np.flatnonzero(lowest & (np.hypot(*(position - position[i]).T) > apart[i]))
@@ -134,18 +137,17 @@ def _candidates(
     return np.concatenate(numbers), np.concatenate(contacts)
 
 
-def _tabulate(model: ChargeModel, position: Array) -> tuple[ForceProfile, Array]:
+def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Array]:
     """Charges at every position as a function of the force."""
-    low, high = np.log(model.force_range)
+    low, high = np.log(charge_map.domain.force_range)
     nodes = chebyshev_nodes(FORCES, low, high) if high > low else np.array([low])
-    rows = [
-        model.charge(np.concatenate([position, np.full((len(position), 1), np.exp(node))], axis=1)) for node in nodes
-    ]
-    terms = np.stack([row / np.exp(EXPONENT * node) for row, node in zip(rows, nodes, strict=True)], axis=1)
+    forces = np.clip(np.exp(nodes), *charge_map.domain.force_range)
+    rows = [charge_map.charges(np.column_stack([position, np.full(len(position), force)])) for force in forces]
+    terms = np.stack([row / force**EXPONENT for row, force in zip(rows, forces, strict=True)], axis=1)
     barycentric = barycentric_weights(nodes)
 
     def weights(logs: Array) -> Array:
         by_force: Array = lagrange_values(nodes, barycentric, logs) * np.exp(EXPONENT * logs)[:, None]
         return by_force
 
-    return ForceProfile.of(weights, model.force_range), terms
+    return ForceProfile.of(weights, charge_map.domain.force_range), terms
