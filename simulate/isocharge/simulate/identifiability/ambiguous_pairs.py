@@ -23,8 +23,8 @@ INDISTINGUISHABLE_SIGMAS = 3.0
 """Largest difference of the charges at which two contacts count as the same, standard deviations of the noise."""
 
 APART, WIDTHS = 1.0, 6.0
-"""Smallest distance of an ambiguous pair: APART, mm, and WIDTHS standard deviations of the position. Nearer contacts are
-one uncertain contact."""
+"""Smallest distance of an ambiguous pair: APART, mm, and WIDTHS standard deviations of the position. Nearer contacts
+are one uncertain contact."""
 
 FORCES = 8
 """Number of forces at which the charges of the second contact are tabulated."""

@@ -34,6 +34,9 @@ CLEAR = 0.75
 RETREAT, RETREATS = 0.9, 3
 """Factor on the search radius if the charges cannot be interpolated that far, and the largest number of reductions."""
 
+USUAL_PROBE = Circle(1.0)
+"""Probe of the released models, mm."""
+
 MOST_PAIRS = 20
 """Most ambiguous pairs that the numbers for JSON list."""
 
@@ -160,7 +163,7 @@ class Identification:
 
 def identify(
     sensor: Sensor,
-    probe: Probe = Circle(1.0),
+    probe: Probe = USUAL_PROBE,
     noise: NoiseModel | None = None,
     *,
     force_range: tuple[float, float] = DEFAULT_FORCE_RANGE,
@@ -183,11 +186,6 @@ def identify(
     Raises:
         SceneError: If there are fewer than three electrodes, no noise, or some presses cannot exist.
         SolveError: If an equilibrium or the target of the interpolation error was not reached.
-
-    Example:
-        >>> area = identify(load_sensor("three-25um-biaxial")).area  # doctest: +SKIP
-        >>> print(area.summary)  # doctest: +SKIP
-        Working area: up to 7.6 mm from the centre, 0.05 to 2 N. ...
     """
     check_determined(len(sensor.electrodes))
     noise = noise or noise_model("reference")
