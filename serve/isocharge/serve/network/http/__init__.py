@@ -1,7 +1,4 @@
-"""The Open Inference Protocol over HTTP: an ASGI application, and the server that runs it within bounds.
-
-May import: network.protocol, network.
-"""
+"""The Open Inference Protocol over HTTP, within bounds of size and time."""
 
 from isocharge.common.extras import require
 

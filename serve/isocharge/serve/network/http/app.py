@@ -1,11 +1,9 @@
-"""The protocol's handler as an ASGI application: reads a bounded body, checks the token, sends one answer."""
+"""The protocol's handler behind the token and the log of requests."""
 
-import asyncio
 import time
 from collections.abc import Callable
 
-from isocharge.common.errors import TokenError, TooLarge
-from isocharge.serve.network.http.answerer import Message, Receive, Send
+from isocharge.common.errors import TokenError
 from isocharge.serve.network.protocol import Handler, Response
 from isocharge.serve.network.protocol.handler import Headers
 from isocharge.serve.network.protocol.response import error_response
@@ -17,16 +15,12 @@ OPEN = ("/v2/health/live", "/v2/health/ready")
 
 
 class App:
-    """The handler, behind a token: as a function, and as an ASGI application for any server."""
+    """The handler, behind a token."""
 
     def __init__(self, handler: Handler, token: Token | None = None) -> None:
         """Without a token, everybody is answered."""
         self.handler, self._token = handler, token
         self.blocks = handler.blocks
-
-    def has_websocket(self, _path: str) -> bool:
-        """There is none."""
-        return False
 
     def watch_connections(self, count: Callable[[], int]) -> None:
         """Read the number of open connections for the metrics."""
@@ -73,33 +67,3 @@ class App:
         route, model = ("none", None) if path is None else (self.handler.label(path), self.handler.model_label(path))
         error: str | None = getattr(response, "error", None)
         log.exchange(Exchange("http", route, response.status, model, error, ns, *sizes, client))
-
-    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
-        """Answer one request, in another thread if that may take long."""
-        message = await receive()
-        client = scope.get("client")
-        try:
-            body = await self._whole_body(message, receive) if message.get("more_body") else message.get("body", b"")
-        except ConnectionResetError:
-            return  # the client went away
-        except TooLarge as error:  # the rest of the body is still on its way: no further request can follow it
-            response = error_response(error)
-            response.headers.append((b"connection", b"close"))
-            self.refused(response, client)
-        else:
-            request = scope["method"], scope["path"], scope["headers"], body, client
-            slow = self.blocks(scope["path"])
-            response = await asyncio.to_thread(self.answer, *request) if slow else self.answer(*request)
-        await send({"type": "http.response.start", "status": response.status, "headers": response.headers})
-        await send({"type": "http.response.body", "body": response.body})
-
-    async def _whole_body(self, message: Message, receive: Receive) -> bytes:
-        """A body that comes in pieces, bounded as it grows."""
-        body = bytearray(message["body"])
-        while message.get("more_body"):
-            self.handler.limits.check_body(len(body))
-            message = await receive()
-            if message["type"] == "http.disconnect":
-                raise ConnectionResetError
-            body += message["body"]
-        return bytes(body)

@@ -1,62 +1,35 @@
 """The HTTP server: where it listens, who may talk to it, and how it starts and stops."""
 
 import asyncio
-import logging
+import signal
 import socket
-import ssl
+import threading
 from functools import partial
-from typing import Any
 
-import uvicorn
+import uvloop
 
 from isocharge.serve.network.address import Address
-from isocharge.serve.network.http.answerer import Answerer
-from isocharge.serve.network.http.connection import bounded, close_overdue
-from isocharge.serve.network.http.tls_listener import TlsListener
+from isocharge.serve.network.http.app import App
+from isocharge.serve.network.http.connection import Connection, close_overdue
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.tls import Tls
 
-GRACE_SECONDS = 10
+GRACE_SECONDS = 10.0
 """Time that requests which have begun get when the server stops, s."""
+
+TICK_SECONDS = 0.1
+"""Time between two looks at all deadlines, and between two attempts to accept where no descriptor is left, s."""
 
 BACKLOG = 2048
 """Connections that may wait to be accepted."""
 
-
-class _Uvicorn(uvicorn.Server):
-    """uvicorn, looking after overdue connections while it waits, and with our listener in front of TLS."""
-
-    def __init__(self, config: uvicorn.Config, limits: ServerLimits, context: ssl.SSLContext | None) -> None:
-        super().__init__(config)
-        self._limits, self._context = limits, context
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup([] if self._context else sockets)
-        if self._context is not None:
-            make_protocol: Any = self.config.http_protocol_class
-            protocol = partial(make_protocol, self.config, self.server_state, self.lifespan.state)
-            connections = self.server_state.connections
-            for listening in sockets or ():
-                listener: Any = TlsListener(listening, self._context, self._limits, protocol, connections)
-                self.servers.append(listener)
-
-    async def on_tick(self, counter: int) -> bool:
-        close_overdue(self.server_state.connections, asyncio.get_running_loop().time())
-        return await super().on_tick(counter)
+SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class HttpServer:
     """A server that listens from its construction until `close`, and answers while `run` runs."""
 
-    def __init__(
-        self,
-        app: Answerer,
-        address: Address,
-        *,
-        limits: ServerLimits,
-        tls: Tls | None = None,
-        websocket: type[asyncio.Protocol] | None = None,
-    ) -> None:
+    def __init__(self, app: App, address: Address, *, limits: ServerLimits, tls: Tls | None = None) -> None:
         """Listen.
 
         Args:
@@ -64,53 +37,85 @@ class HttpServer:
             address: Where to listen.
             limits: Bounds of requests and connections.
             tls: Certificate and key; None for no TLS.
-            websocket: The protocol of the WebSockets that the application has, `bounded_websocket(limits)`.
 
         Raises:
             InputError: If a TLS file cannot be used.
             ListenError: If the address is taken or impossible.
         """
-        context = tls.context() if tls else None
-        config = uvicorn.Config(
-            app,
-            loop="uvloop",
-            http=bounded(app, limits),
-            ws=websocket or "none",
-            ws_max_size=limits.message_bytes,
-            ws_per_message_deflate=False,
-            lifespan="off",
-            log_config=None,
-            access_log=False,
-            server_header=False,
-            date_header=False,
-            proxy_headers=False,
-            timeout_graceful_shutdown=GRACE_SECONDS,
-        )
-        self._server, self._address = _Uvicorn(config, limits, context), address
-        app.watch_connections(lambda: len(self._server.server_state.connections))
+        self._app, self._address, self._limits = app, address, limits
+        self._tls = tls.context() if tls else None
+        self._connections: set[Connection] = set()
+        self._handshakes: set[asyncio.Task[None]] = set()
+        self._is_stopped = False
+        app.watch_connections(lambda: len(self._connections))
         self._socket = address.listen(BACKLOG)
         self._file = address.file()
         self.url = address.url(self._socket, secure=tls is not None)
 
     def run(self) -> None:
         """Answer until SIGTERM, SIGINT or `stop`; then finish the requests that have begun."""
-        _log_no_clients()
-        self._server.run([self._socket])
-
-    async def serve(self) -> None:
-        """As `run`, in a loop that does other things, too."""
-        _log_no_clients()
-        await self._server.serve([self._socket])
+        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            runner.run(self._serve())
 
     def stop(self) -> None:
         """Tell `run` to finish; from any thread."""
-        self._server.should_exit = True
+        self._is_stopped = True
 
     def close(self) -> None:
         """Listen no more."""
         self._socket.close()
         self._address.release(self._file)
 
+    async def _serve(self) -> None:
+        loop = asyncio.get_running_loop()
+        signals = SIGNALS if threading.current_thread() is threading.main_thread() else ()
+        for number in signals:
+            loop.add_signal_handler(number, self.stop)
+        accepting = loop.create_task(self._accept(loop))
+        while not self._is_stopped:
+            await asyncio.sleep(TICK_SECONDS)
+            close_overdue(self._connections, loop.time())
+        for number in signals:
+            loop.remove_signal_handler(number)  # a second Ctrl-C does not wait
+        for task in (accepting, *self._handshakes):
+            task.cancel()
+        await asyncio.gather(accepting, *self._handshakes, return_exceptions=True)
+        self._socket.close()
+        await self._finish(loop)
 
-def _log_no_clients() -> None:
-    logging.getLogger("uvicorn").setLevel(logging.CRITICAL)  # mistakes of clients are answered, not logged
+    async def _finish(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Answer what has begun, for as long as the grace lasts."""
+        for connection in list(self._connections):
+            connection.shutdown()
+        end = loop.time() + GRACE_SECONDS
+        while self._connections and loop.time() < end:
+            await asyncio.sleep(0.5 * TICK_SECONDS)
+            close_overdue(self._connections, loop.time())
+        for connection in list(self._connections):
+            connection.abort()
+
+    async def _accept(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Accept connections; those whose TLS handshake is not done count, too."""
+        self._socket.setblocking(False)
+        while True:
+            try:
+                accepted, _ = await loop.sock_accept(self._socket)
+            except OSError:  # the client has gone, or no descriptor is left
+                await asyncio.sleep(TICK_SECONDS)
+                continue
+            is_full = len(self._connections) + len(self._handshakes) >= self._limits.connections
+            if is_full and self._tls is not None:
+                accepted.close()  # a reason could only be sent after a handshake
+                continue
+            handshake = loop.create_task(self._begin(accepted, loop))
+            self._handshakes.add(handshake)
+            handshake.add_done_callback(self._handshakes.discard)
+
+    async def _begin(self, accepted: socket.socket, loop: asyncio.AbstractEventLoop) -> None:
+        """Hand a socket over to its connection, after the TLS handshake if there is one."""
+        make = partial(Connection, self._app, self._limits, self._connections, loop)
+        seconds = self._limits.header_seconds if self._tls else None
+        try:
+            await loop.connect_accepted_socket(make, accepted, ssl=self._tls, ssl_handshake_timeout=seconds)
+        except OSError:  # ssl.SSLError and TimeoutError are, too: the client did not want to
+            accepted.close()
