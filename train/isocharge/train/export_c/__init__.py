@@ -7,7 +7,5 @@
     host_example.c           a serial port in, contacts out
     arduino/                 a sketch with copies of what it needs
 
-What is the same for every model lies in `sources/` as C; what a model or a board decides is generated.
-
-May import: nothing else of isocharge.train.
+`sources/` holds these files with `$names` for what a model or a board decides; layers of the network are generated.
 """

@@ -1,6 +1,8 @@
 """Numbers, arrays and texts as C99."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from importlib import resources
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -10,12 +12,14 @@ LINE = 110
 """Columns of a line of numbers."""
 
 
+def source_text(name: str, **values: object) -> str:
+    """A file of `sources/` with values for its `$names`."""
+    return Template((resources.files(__package__) / "sources" / name).read_text("utf-8")).substitute(values)
+
+
 def c_float(value: float) -> str:
-    """A float32 as the shortest literal that gives it back, bit by bit; it is finite."""
-    single = np.float32(value)
-    if not np.isfinite(single):
-        raise ValueError(f"expected a finite number, got {value}")
-    return _with_point(str(single)) + "f"
+    """A finite float32 as the shortest literal that gives it back, bit by bit."""
+    return _with_point(str(np.float32(value))) + "f"
 
 
 def c_double(value: float) -> str:
@@ -27,6 +31,25 @@ def _with_point(digits: str) -> str:
     return digits if any(mark in digits for mark in ".e") else digits + ".0"
 
 
+def c_doubles(values: Iterable[float]) -> str:
+    """An initialiser of doubles in one line: `{1.0, 2.0}`."""
+    return "{" + ", ".join(map(c_double, values)) + "}"
+
+
+def c_array(name: str, values: NDArray[Any]) -> str:
+    """A constant array of one dimension, of float or signed char, from values of any shape, in the order of rows."""
+    whole = values.dtype == np.int8
+    lines, line = [], ""
+    for value in values.ravel():
+        word = f"{value}, " if whole else f"{c_float(value)}, "
+        if len(line) + len(word) > LINE:
+            lines.append(line.rstrip())
+            line = ""
+        line += word
+    numbers = "\n    ".join([*lines, line.rstrip(", ")])
+    return f"static const {'signed char' if whole else 'float'} {name}[{values.size}] = {{\n    {numbers}\n}};\n"
+
+
 def c_string(text: str) -> str:
     """A text as a C string; all but letters, digits and blanks by their octal codes, so no compiler reads them."""
     plain = (chr(byte) if chr(byte).isalnum() and byte < 128 else f"\\{byte:03o}" for byte in text.encode())
@@ -36,26 +59,3 @@ def c_string(text: str) -> str:
 def c_comment(text: str) -> str:
     """A text that may stand in a comment: what could end it, or begin another, is left out."""
     return "".join(sign if sign.isascii() and (sign.isalnum() or sign in " ._-,:()=/") else "_" for sign in text)
-
-
-def c_array(kind: str, name: str, values: NDArray[Any]) -> str:
-    """A constant array of one dimension from values of any shape, in the order of their rows."""
-    flat = values.ravel()
-    words = [c_float(value) for value in flat] if kind == "float" else [str(int(value)) for value in flat]
-    return f"static const {kind} {name}[{flat.size}] = {{\n{wrapped(words)}\n}};\n"
-
-
-def wrapped(words: Iterable[str]) -> str:
-    """Words with commas between them, in lines of at most `LINE` columns."""
-    lines, line = [], ""
-    for word in words:
-        if len(line) + len(word) + 2 > LINE:
-            lines.append(line.rstrip())
-            line = ""
-        line += f"{word}, "
-    return "\n".join(f"    {text}" for text in [*lines, line.rstrip().rstrip(",")])
-
-
-def c_doubles(values: Sequence[float]) -> str:
-    """An initialiser of doubles in one line: `{1.0, 2.0}`."""
-    return "{" + ", ".join(c_double(value) for value in values) + "}"

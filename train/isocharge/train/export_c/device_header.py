@@ -9,7 +9,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.serve.live.device import Device
 from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.signal_chain.hum import LEAST_TURN
-from isocharge.train.export_c.c_text import c_comment, c_double, c_doubles
+from isocharge.train.export_c.c_text import c_comment, c_double, c_doubles, source_text
 
 MOST_TARE_FRAMES = 10_000
 """Frames of a tare that a state in C may hold: 320 kB with four electrodes."""
@@ -35,8 +35,8 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     gain_pC = np.ones(len(electrodes)) if chain.gain_pC is None else chain.gain_pC
     zero = np.zeros(len(electrodes)) if chain.zero is None else chain.zero
     numbers = {
-        "ZERO": c_doubles(zero.tolist()),
-        "GAIN_PC": c_doubles(gain_pC.tolist()),
+        "ZERO": c_doubles(zero),
+        "GAIN_PC": c_doubles(gain_pC),
         "LARGEST": c_double(chain.largest),
         "SATURATION": str(int(chain.limit_pC is not None)),
         "HUM_LEAST_TURN": c_double(LEAST_TURN),
@@ -47,20 +47,8 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
         rule = getattr(chain, stage)
         numbers[SWITCHES[stage]] = str(int(rule is not None))
         numbers |= {} if rule is None else _numbers(prefix, rule)
-    lines = [f"#define ISOCHARGE_{name} {text}" for name, text in numbers.items()]
-    return "\n".join(
-        [
-            f"/* The board {c_comment(device.name)}: its numbers for the signal chain, from its device file. "
-            "Written by isocharge train export-c. */",
-            "#ifndef ISOCHARGE_DEVICE_H",
-            "#define ISOCHARGE_DEVICE_H",
-            "",
-            *lines,
-            "",
-            "#endif",
-            "",
-        ]
-    )
+    lines = "\n".join(f"#define ISOCHARGE_{name} {text}" for name, text in numbers.items())
+    return source_text("isocharge_device.h", board=c_comment(device.name), lines=lines)
 
 
 def _numbers(prefix: str, rule: Any) -> dict[str, str]:
@@ -73,7 +61,7 @@ def _numbers(prefix: str, rule: Any) -> dict[str, str]:
 
 def _number(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        return c_doubles(value.tolist())
+        return c_doubles(value)
     return str(int(value)) if isinstance(value, int) else c_double(value)
 
 

@@ -5,23 +5,16 @@ from pathlib import Path
 from isocharge.common.files import new_folder, refuse_existing, write_whole
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.model.model_folder import load_model
+from isocharge.train.export_c.c_text import c_comment, source_text
 from isocharge.train.export_c.device_header import device_header
-from isocharge.train.export_c.differences import with_differences
-from isocharge.train.export_c.graph import read_graph
-from isocharge.train.export_c.model_source import model_header, model_source, self_test, source_text
-from isocharge.train.export_c.readme import readme
+from isocharge.train.export_c.model_source import model_header, model_source, self_test
+from isocharge.train.export_c.network import read_network
 
 SKETCH = "isocharge_sketch"
 """Name of the Arduino sketch: of its folder and of the file in it."""
 
-FOR_THE_SKETCH = (
-    "isocharge_model.h",
-    "isocharge_model.c",
-    "isocharge_chain.h",
-    "isocharge_chain.c",
-    "isocharge_frames.h",
-    "isocharge_frames.c",
-)
+FOR_BOARDS = ("isocharge_chain.h", "isocharge_chain.c", "isocharge_frames.h", "isocharge_frames.c")
+"""Copied as they are, to the sketch as well."""
 
 SINGLE = "/* This board computes the chain in single precision. */\n#define ISOCHARGE_CHAIN_FLOAT\n\n"
 
@@ -56,20 +49,25 @@ def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: 
 def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[str, str]:
     """The texts of an export by their paths in its folder; the errors are those of `export_c`."""
     loaded = load_model(model)
-    path = loaded.folder / "model.onnx"
-    graph = with_differences(read_graph(path.read_bytes(), str(path)))
-    metadata = loaded.metadata
-    copied = ("isocharge_chain.h", "isocharge_chain.c", "isocharge_frames.h", "isocharge_frames.c", "host_example.c")
+    path, metadata = loaded.folder / "model.onnx", loaded.metadata
+    network = read_network(path.read_bytes(), str(path))
     files = {
-        "isocharge_model.h": model_header(metadata, graph),
-        "isocharge_model.c": model_source(metadata, graph),
+        "isocharge_model.h": model_header(metadata, network),
+        "isocharge_model.c": model_source(metadata, network),
         "isocharge_device.h": device_header(device, metadata.electrodes),
-        **{name: source_text(name) for name in copied},
+        **{name: source_text(name) for name in (*FOR_BOARDS, "host_example.c")},
         "self_test.c": self_test(loaded.golden),
-        "README.md": readme(metadata, device, command),
+        "README.md": source_text(
+            "README.md",
+            label=metadata.label,
+            command=" ".join(command.replace("`", "'").split()) or "isocharge train export-c",
+            charges=", ".join(["800.0f"] * len(metadata.electrodes)),
+            electrodes=c_comment(", ".join(metadata.electrodes)),
+            board=c_comment(device.name),
+        ),
     }
-    pins = ", ".join(f"A{number}" for number in range(len(metadata.electrodes)))
-    sketch = {name: files[name] for name in FOR_THE_SKETCH}
+    sketch = {name: files[name] for name in ("isocharge_model.h", "isocharge_model.c", *FOR_BOARDS)}
     sketch["isocharge_device.h"] = SINGLE + files["isocharge_device.h"]
-    sketch[f"{SKETCH}.ino"] = source_text("sketch.ino").replace("@PINS@", pins)
+    pins = ", ".join(f"A{number}" for number in range(len(metadata.electrodes)))
+    sketch[f"{SKETCH}.ino"] = source_text("sketch.ino", pins=pins)
     return files | {f"arduino/{SKETCH}/{name}": text for name, text in sketch.items()}

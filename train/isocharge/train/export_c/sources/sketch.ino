@@ -11,7 +11,7 @@
 #define SEND_FRAMES 0
 #endif
 
-static const int PIN[] = {@PINS@};
+static const int PIN[] = {$pins};
 static const unsigned long PERIOD_US = 5000;
 
 static isocharge_chain chain;

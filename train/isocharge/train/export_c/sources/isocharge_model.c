@@ -1,3 +1,8 @@
+/* The network of $label in single precision. Written by isocharge train export-c. */
+#include "isocharge_model.h"
+
+#include <math.h>
+
 /* tanh within 4e-7 for every x, as x P(x^2) / Q(x^2); beyond +-9.02 it is +-1 in single precision. NaN gives NaN.
    Without branches, so that a compiler can work on several numbers at once. All terms have one sign: nothing cancels. */
 static float tanh_of(float x)
@@ -34,4 +39,25 @@ static float log_ratio(float a, float b)
     const float ratio = a / b;
 
     return ratio > 0.5f && ratio < 2.0f ? log1pf((a - b) / b) : logf(ratio);
+}
+
+$factor
+$layers
+void isocharge_predict(const float charge_pC[ISOCHARGE_ELECTRODES], float contact[7])
+{
+    float logs[$electrodes], $rows, skipped[$answers], answers[$answers], length = 0.0f;
+
+    for (int i = 0; i < $electrodes; ++i)
+        logs[i] = clip(charge_pC[i], $low, $high) * FACTOR[i];
+    for (int i = 1; i < $electrodes; ++i)
+        logs[i] = log_ratio(logs[i], logs[0]);
+    logs[0] = logf(logs[0]);
+    $calls
+    for (int i = 0; i < $plane; ++i)
+        contact[i] = answers[i];
+    for (int i = $plane; i < $known; ++i)
+        contact[i] = expf(answers[i]);
+    for (int i = $known; i < $answers; ++i)
+        length += answers[i] * answers[i];
+    contact[$known] = sinhf(sqrtf(length)) * $misfit_unit;
 }

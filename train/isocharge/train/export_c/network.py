@@ -1,0 +1,136 @@
+"""The network of a model file, read along the one graph that `release.export` writes.
+
+A file with another node, wiring or attribute is refused with the name of the node: a foreign graph must not become
+wrong C.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NoReturn
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from isocharge.common.arrays import Singles
+from isocharge.common.errors import ModelError
+from isocharge.common.tables import cut
+from isocharge.serve.model.session import INPUT, OUTPUTS
+
+OPSET = 17
+"""Version of the ONNX operators."""
+
+PLANE, LOGS = 2, 4
+"""Answers of the last layer: x and y; logarithms of force and standard deviations; then comes the misfit vector."""
+
+CONSTANT = ""
+"""Stands for a constant among the inputs of a node."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """What a model computes from the logarithms of its charges, all float32.
+
+    Attributes:
+        low, high: Bounds of the charges, pC.
+        factor: Unit of each charge, shape (electrodes,), 1/pC.
+        hidden: Weights (inputs, outputs) and bias of the layers that tanh follows.
+        last: Weights from the last of them to the answers.
+        skip: Weights and bias from the logarithms to the answers.
+        misfit_unit: Factor on the hyperbolic sine of the misfit vector's length.
+    """
+
+    low: Singles
+    high: Singles
+    factor: Singles
+    hidden: tuple[tuple[Singles, Singles], ...]
+    last: Singles
+    skip: tuple[Singles, Singles]
+    misfit_unit: Singles
+
+
+def read_network(onnx_model: bytes, where: str) -> Network:
+    """The network of a model file.
+
+    Args:
+        onnx_model: The file.
+        where: Its name, for messages.
+
+    Raises:
+        ModelError: If it is not a graph of `release.export`.
+    """
+    try:
+        model = onnx.load_model_from_string(onnx_model)
+        onnx.checker.check_model(model, full_check=True)
+    except Exception as error:  # protobuf's exceptions have no base in onnx
+        raise ModelError(f"{where}: not a valid ONNX file ({cut(str(error))})") from error
+    nodes = _Nodes(model.graph, where)
+    if (versions := {entry.domain: entry.version for entry in model.opset_import}) != {"": OPSET}:
+        nodes.refuse(f"expected ONNX operators of version {OPSET} alone, got {versions}")
+    [clipped], [low, high] = nodes.take("Clip", INPUT, CONSTANT, CONSTANT)
+    [scaled], [factor] = nodes.take("Mul", clipped, CONSTANT)
+    [logs], _ = nodes.take("Log", scaled)
+    value = logs
+    hidden: list[tuple[Singles, Singles]] = []
+    while not hidden or nodes.coming(2) == ["Gemm", "Tanh"]:
+        [row], [weights, bias] = nodes.take("Gemm", value, CONSTANT, CONSTANT)
+        [value], _ = nodes.take("Tanh", row)
+        hidden.append((weights, bias))
+    [skipped], skip = nodes.take("Gemm", logs, CONSTANT, CONSTANT)
+    [answers], [last] = nodes.take("Gemm", value, CONSTANT, skipped)
+    [plane, logarithms, vector], parts = nodes.take("Split", answers, CONSTANT, results=3, axis=1)
+    [exponentials], _ = nodes.take("Exp", logarithms)
+    [force, contact_std], powers = nodes.take("Split", exponentials, CONSTANT, results=2, axis=1)
+    [contact], _ = nodes.take("Concat", plane, force, axis=1)
+    [length], _ = nodes.take("ReduceL2", vector, axes=[1], keepdims=1)
+    [sinh], _ = nodes.take("Sinh", length)
+    [misfit], [unit] = nodes.take("Mul", sinh, CONSTANT)
+    n = factor.size
+    found = [contact, contact_std, misfit, *parts[0].tolist(), *powers[0].tolist(), nodes.coming(1)]
+    if found != [*OUTPUTS, PLANE, LOGS, n, 1, LOGS - 1, []]:
+        nodes.refuse(f"expected the outputs {', '.join(OUTPUTS)} from {PLANE}, {LOGS} and {n} answers, got {found}")
+    network = Network(low, high, factor, tuple(hidden), last, (skip[0], skip[1]), unit)
+    nodes.check_shapes(network)
+    return network
+
+
+class _Nodes:
+    """Takes the nodes of a graph one after the other."""
+
+    def __init__(self, graph: onnx.GraphProto, where: str) -> None:
+        self._left, self._where = list(graph.node), where
+        self._constants = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
+
+    def coming(self, count: int) -> list[str]:
+        """Operators of the next nodes."""
+        return [node.op_type for node in self._left[:count]]
+
+    def take(
+        self, operator: str, *inputs: str, results: int = 1, **attributes: Any
+    ) -> tuple[list[str], list[NDArray[Any]]]:
+        """Names of the results and constants of the next node, which is the one described."""
+        node = self._left.pop(0) if self._left else onnx.NodeProto()
+        names = [CONSTANT if name in self._constants else name for name in node.input]
+        given = {entry.name: onnx.helper.get_attribute_value(entry) for entry in node.attribute}
+        expected = (operator, list(inputs), results, attributes)
+        got = (node.op_type, names, len(node.output), given)
+        if got != expected:
+            self.refuse(f"node {node.op_type} {list(node.output)}: expected {expected}, got {got}")
+        constants = [self._constants[name] for name in node.input if name in self._constants]
+        if not all(np.isfinite(values).all() for values in constants):
+            self.refuse(f"node {operator} {list(node.output)}: expected finite constants")
+        return list(node.output), constants
+
+    def check_shapes(self, network: Network) -> None:
+        """The constants must fit each other."""
+        n = network.factor.size
+        widths = [n, *(bias.size for _, bias in network.hidden), PLANE + LOGS + n]
+        layers = [*network.hidden, (network.last, network.skip[1]), network.skip]
+        expected = [*pairwise(widths), (n, widths[-1])]
+        got = [weights.shape for weights, _ in layers]
+        if got != expected or any(bias.shape != shape[1:] for (_, bias), shape in zip(layers, expected, strict=True)):
+            self.refuse(f"expected weights of the shapes {expected} and a bias for each column, got {got}")
+
+    def refuse(self, what: str) -> NoReturn:
+        """Say what is foreign."""
+        raise ModelError(f"{self._where}: {what}; this is not a graph of isocharge, which alone can be written as C")
