@@ -1,4 +1,1 @@
-"""From presses to charges, fast: the readout, the forward map from few solves, and its spline table.
-
-May import: solver, mechanics, mesh, sensor, execution, numerics.
-"""
+"""From presses to charges, fast: the readout, the forward map from few solves, and its spline table."""

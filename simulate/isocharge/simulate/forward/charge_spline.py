@@ -6,7 +6,6 @@ no place is singular. Between the forces Lagrange polynomials in ln F interpolat
 between forces in the same way, so at its force nodes nothing is lost.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,15 +15,16 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.checks import check_presses, check_radius
+from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.forward.checks import check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.numerics.disk import lattice, onto_disk, sunflower
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film
 
-SPACING, SHARE = 0.3e-3, 1.0 / 6.0
-"""Distance of the knots: at most SPACING, m, and at most SHARE of the probe's reach, on which the charges vary."""
+SPACING, SHARE = 0.3, 1.0 / 6.0
+"""Distance of the knots: at most SPACING, mm, and at most SHARE of the probe's reach, on which the charges vary."""
 
 CELLS = (8, 400)
 """Fewest and most cells of the spline across the disk."""
@@ -46,28 +46,23 @@ CHECKS = 400
 STRIDE = 1e-4
 """Step in ln F of the derivative by ln F, dimensionless."""
 
-Forward = Callable[[Array, Array, Array], Array]
-"""(x, y, force) of shape (n,), SI, to charges of shape (n, n_electrode)."""
-
 
 @dataclass(frozen=True)
 class ChargeSpline:
     """Touch charges as a function of (x, y, F), for one probe in one orientation.
 
     Attributes:
-        electrode_names: In the order of the charges.
+        electrodes: Names in the order of the charges.
         film: For the amplitude that scales the charges.
-        radius: Largest distance from the centre, m.
-        force_range: Smallest and largest force, N.
+        domain: The presses that are tabulated.
         force: Forces of the table, shape (n_term,), N.
         table: Scaled charge over x and y, values of shape (n_term, n_electrode).
         error: Largest error against the tabulated function, relative to a press's largest charge.
     """
 
-    electrode_names: tuple[str, ...]
+    electrodes: tuple[str, ...]
     film: Film
-    radius: float
-    force_range: tuple[float, float]
+    domain: Domain
     force: Array
     table: NdBSpline
     error: float
@@ -78,61 +73,45 @@ class ChargeSpline:
 
         Args:
             forward_map: The charges; the orientation of the probe is the one it was built with.
-            radius: Up to this distance from the centre, m; as far as the map reaches if absent.
-            spacing: Of the knots, m; a sixth of the probe's reach, at most SPACING, if absent.
+            radius: Up to this distance from the centre, mm; as far as the map reaches if absent.
+            spacing: Of the knots, mm; a sixth of the probe's reach, at most SPACING, if absent.
 
         Raises:
             SceneError: If the radius is not positive or reaches beyond the map.
         """
-        radius = forward_map.radius if radius is None else radius
-        check_radius(radius, forward_map.radius, "forward map")
+        whole = forward_map.domain
+        domain = whole if radius is None else whole.within(radius)
+        check_radius(domain.radius, whole.radius, "forward map")
         spacing = spacing or min(SPACING, SHARE * forward_map.probe.reach)
-        sensor, force = forward_map.sensor, _force_nodes(forward_map)
-        return cls.fit(
-            forward_map.forward, sensor.electrode_names, sensor.film, radius, force, forward_map.force_range, spacing
-        )
+        film, force = forward_map.sensor.film, _force_nodes(forward_map)
+        cells = int(np.clip(np.ceil(2.0 * domain.radius / spacing), *CELLS))
+        at = domain.radius * _samples(cells)
+        contact = np.column_stack([at, np.empty(len(at))])
+        columns = []
+        for f in force.tolist():
+            contact[:, 2] = f
+            columns.append(forward_map.charges(contact) / amplitude_squared(film, f))
+        table = _least_squares(at, np.stack(columns, axis=1), domain.radius, cells)
+        spline = cls(forward_map.electrodes, film, domain, force, table, np.nan)
+        return replace(spline, error=_largest_error(spline, forward_map))
 
-    @classmethod
-    def fit(
-        cls,
-        forward: Forward,
-        electrode_names: tuple[str, ...],
-        film: Film,
-        radius: float,
-        force: Array,
-        force_range: tuple[float, float],
-        spacing: float,
-    ) -> "ChargeSpline":
-        """Tabulate any function of (x, y, force): least squares on a lattice and along the disk's edge."""
-        cells = int(np.clip(np.ceil(2.0 * radius / spacing), *CELLS))
-        at = radius * _samples(cells)
-        columns = [forward(at[:, 0], at[:, 1], np.full(len(at), f)) / amplitude_squared(film, float(f)) for f in force]
-        table = _least_squares(at, np.stack(columns, axis=1), radius, cells)
-        spline = cls(electrode_names, film, radius, force_range, force, table, np.nan)
-        return replace(spline, error=_largest_error(spline, forward))
-
-    @property
-    def electrodes(self) -> int:
-        """Number of electrodes."""
-        return len(self.electrode_names)
-
-    def charge(self, contact: Array) -> Array:
-        """Touch charges, shape (n, n_electrode), C, of contacts (x, y, F), shape (n, 3), m and N.
+    def charges(self, contact: Array) -> Array:
+        """Touch charges, shape (n, n_electrode), pC, of contacts (x, y, F), shape (n, 3), mm and N.
 
         Raises:
-            SceneError: If a contact lies outside the radius or the forces.
+            SceneError: If a contact lies outside the domain.
         """
-        self._check_inside(contact)
+        self.domain.check(contact, "table")
         charge: Array = np.einsum("nk,nke->ne", self.by_force(np.log(contact[:, 2])), self.terms(contact[:, :2]))
         return charge
 
-    def jacobian(self, contact: Array) -> Array:
-        """d(Q)/d(x, y, ln F) of contacts (x, y, F): shape (n, 3) to (n, n_electrode, 3), C/m, C/m and C.
+    def derivatives(self, contact: Array) -> Array:
+        """d(Q)/d(x, y, ln F) of contacts (x, y, F): shape (n, 3) to (n, n_electrode, 3), pC/mm, pC/mm and pC.
 
         Raises:
-            SceneError: If a contact lies outside the radius or the forces.
+            SceneError: If a contact lies outside the domain.
         """
-        self._check_inside(contact)
+        self.domain.check(contact, "table")
         _, slope, by_force = self.first_order(contact[:, :2], contact[:, 2])
         return np.concatenate([slope, by_force[..., None]], axis=2)
 
@@ -140,13 +119,13 @@ class ChargeSpline:
         """Charges and their derivatives, wherever Newton's method steps.
 
         Args:
-            position: (x, y), shape (n, 2), m; moved onto the disk's edge where outside.
+            position: (x, y), shape (n, 2), mm; moved onto the disk's edge where outside.
             force: Shape (n,) or a number, N.
 
         Returns:
-            Charges (n, n_electrode), C; d/d(x, y), shape (n, n_electrode, 2), C/m; d/d(ln F), (n, n_electrode), C.
+            Charges (n, n_electrode), pC; d/d(x, y), shape (n, n_electrode, 2), pC/mm; d/d(ln F), (n, n_electrode), pC.
         """
-        position, logs = onto_disk(position, self.radius), np.log(np.broadcast_to(force, len(position)))
+        position, logs = onto_disk(position, self.domain.radius), np.log(np.broadcast_to(force, len(position)))
         weights, terms = self.by_force(logs), self.terms(position)
         change = (self.by_force(logs + STRIDE) - self.by_force(logs - STRIDE)) / (2.0 * STRIDE)
         slope = np.einsum("nk,nkei->nei", weights, self.slopes(position))
@@ -164,21 +143,18 @@ class ChargeSpline:
         return weights.reshape(*logs.shape, nodes.size)
 
     def terms(self, position: Array) -> Array:
-        """Scaled charges at the table's forces: positions (x, y), shape (n, 2), m, to (n, n_term, n_electrode)."""
+        """Scaled charges at the table's forces: positions (x, y), shape (n, 2), mm, to (n, n_term, n_electrode)."""
         terms: Array = self.table(position)
         return terms
 
     def slopes(self, position: Array) -> Array:
-        """Derivatives of `terms` by x and y, shape (n, n_term, n_electrode, 2), 1/m."""
+        """Derivatives of `terms` by x and y, shape (n, n_term, n_electrode, 2), 1/mm."""
         return np.stack([self.table(position, nu=nu) for nu in ((1, 0), (0, 1))], axis=-1)
-
-    def _check_inside(self, contact: Array) -> None:
-        check_presses(*contact.T, radius=self.radius, force_range=self.force_range, source="table")
 
 
 def _force_nodes(forward_map: ForwardMap) -> Array:
     """Force nodes of the forward map, between which it is a polynomial; more of them with d33."""
-    low, high = np.log(forward_map.force_range)
+    low, high = np.log(forward_map.domain.force_range)
     if forward_map.sensor.piezo.d33 == 0.0 or low == high:
         return forward_map.family.force
     nodes: Array = np.exp(chebyshev_nodes(forward_map.family.force.size + MORE_FORCES, low, high))
@@ -208,11 +184,12 @@ def _least_squares(at: Array, values: Array, radius: float, cells: int) -> NdBSp
     return NdBSpline((knots, knots), solved.reshape(count, count, *values.shape[1:]), 3)
 
 
-def _largest_error(spline: ChargeSpline, forward: Forward) -> float:
+def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:
     """Largest error at presses that are spread evenly but off the lattice."""
-    at, number = spline.radius * sunflower(CHECKS), np.arange(CHECKS)
-    low, high = spline.force_range
+    at, number = spline.domain.radius * sunflower(CHECKS), np.arange(CHECKS)
+    low, high = spline.domain.force_range
     force = np.clip(low * (high / low) ** (number * 0.618 % 1.0), low, high)
-    truth = forward(at.real, at.imag, force)
-    error = spline.charge(np.stack([at.real, at.imag, force], axis=1)) - truth
+    contact = np.stack([at.real, at.imag, force], axis=1)
+    truth = forward_map.charges(contact)
+    error = spline.charges(contact) - truth
     return float((np.abs(error).max(axis=1) / np.abs(truth).max(axis=1)).max())

@@ -1,39 +1,10 @@
-"""Checks of what a charge map is asked: presses within its disk and forces, charges of its electrodes."""
+"""Checks of radii, forces and charges that a user gives."""
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError, SceneError
-
-SLACK = 1.0 + 1e-9
-"""Factor by which a radius or force may lie outside a limit, dimensionless: a limit that was converted from mm and back
-still counts as inside."""
-
-
-def check_presses(
-    x: Array, y: Array, force: Array, *, radius: float, force_range: tuple[float, float], source: str
-) -> None:
-    """Refuse presses outside a disk and a range of forces.
-
-    Args:
-        x: Positions, shape (n,), m.
-        y: Positions, shape (n,), m.
-        force: Forces, shape (n,), N.
-        radius: Largest distance from the centre, m.
-        force_range: Smallest and largest force, N.
-        source: What has these limits, for the message: "table".
-
-    Raises:
-        SceneError: If a press lies outside.
-    """
-    low, high = force_range
-    outside = ~((np.hypot(x, y) <= radius * SLACK) & _within(force, force_range))
-    if outside.any():
-        i = int(np.argmax(outside))
-        raise SceneError(
-            f"press {i} at ({x[i] * 1e3:.4g}, {y[i] * 1e3:.4g}) mm with {force[i]:.4g} N is outside the {source}: "
-            f"expected at most {radius * 1e3:g} mm from the centre and {low:g} to {high:g} N"
-        )
+from isocharge.simulate.forward.charge_map import SLACK
 
 
 def check_forces(force: Array | float, force_range: tuple[float, float], source: str) -> None:
@@ -53,13 +24,13 @@ def check_forces(force: Array | float, force_range: tuple[float, float], source:
 
 
 def check_radius(radius: float, largest: float, source: str) -> None:
-    """Refuse a radius (m) that is not positive or larger than `largest` (m); `source` says what has that limit.
+    """Refuse a radius (mm) that is not positive or larger than `largest`; `source` says what has that limit.
 
     Raises:
         SceneError: If the radius lies outside.
     """
     if not 0.0 < radius <= largest * SLACK:
-        raise SceneError(f"radius: expected up to the {source}'s {largest * 1e3:g} mm, got {radius * 1e3:g} mm")
+        raise SceneError(f"radius: expected up to the {source}'s {largest:g} mm, got {radius:g} mm")
 
 
 def check_determined(electrodes: int) -> None:
@@ -79,7 +50,7 @@ def as_charges(charge: Array, electrode_names: tuple[str, ...]) -> Array:
     """Charges of presses as float64, one for each electrode.
 
     Args:
-        charge: Charges, shape (n, n_electrode), C.
+        charge: Charges, shape (n, n_electrode), pC.
         electrode_names: In the order of the charges.
 
     Raises:

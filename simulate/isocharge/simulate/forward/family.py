@@ -1,14 +1,26 @@
 """A family of presses of one probe: where it is solved, and how presses between are interpolated."""
 
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
+from isocharge.common.progress import track
+from isocharge.simulate.execution.workers import in_order
+from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.mechanics.stress import turn_stress
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
+from isocharge.simulate.sensor.film import Film, Surface
+from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
+from isocharge.simulate.solver.load_case import check_press
+from isocharge.simulate.solver.press import press
+from isocharge.simulate.solver.settings import SolveSettings
 
 TURNS = 7
 """Smallest number of orientations: only the first harmonics of the rim, far from the probe, reach the probe."""
@@ -19,45 +31,35 @@ class Family:
     """Nodes at which a family of presses is solved.
 
     Attributes:
-        radius: Largest distance from the centre, m.
-        force_range: Smallest and largest force, N.
-        distance: Distances from the centre, Chebyshev nodes, shape (n_distance,), m.
+        domain: The presses that it covers.
+        distance: Distances from the centre, Chebyshev nodes, shape (n_distance,), mm.
         force: Forces, Chebyshev nodes in the logarithm, shape (n_force,), N.
         turn: Orientations against the direction of the press, evenly spread over a full turn, shape (n_turn,), rad.
         folds: Order of the probe's rotational symmetry: how often it maps onto itself in a full turn.
     """
 
-    radius: float
-    force_range: tuple[float, float]
+    domain: Domain
     distance: Array
     force: Array
     turn: Array
     folds: int
 
     @classmethod
-    def spread(
-        cls,
-        radius: float,
-        force_range: tuple[float, float],
-        count: tuple[int, int],
-        period: float,
-        turns: int = TURNS,
-    ) -> "Family":
+    def spread(cls, domain: Domain, count: tuple[int, int], period: float, turns: int = TURNS) -> "Family":
         """Nodes for a probe.
 
         Args:
-            radius: Largest distance from the centre, m.
-            force_range: Smallest and largest force, N.
+            domain: The presses to cover.
             count: Number of distances and of forces.
             period: Angle after which the probe looks the same, rad; 0 for a round one.
             turns: Smallest number of orientations.
         """
-        low, high = np.log(force_range)
-        force = np.exp(chebyshev_nodes(count[1], low, high)) if high > low else np.array([force_range[0]])
+        low, high = np.log(domain.force_range)
+        force = np.exp(chebyshev_nodes(count[1], low, high)) if high > low else np.array([domain.force_range[0]])
         folds = round(2.0 * np.pi / period) if period > 0.0 else 1
         n_turn = folds * (-(-turns // folds)) if period > 0.0 else 1
         turn = 2.0 * np.pi * np.arange(n_turn) / n_turn
-        return cls(radius, force_range, chebyshev_nodes(count[0], 0.0, radius), force, turn, folds)
+        return cls(domain, chebyshev_nodes(count[0], 0.0, domain.radius), force, turn, folds)
 
     @property
     def solved_turns(self) -> Array:
@@ -83,6 +85,19 @@ class Family:
         by_turn: Array = kernel / self.turn.size
         return by_turn
 
+    def solve(self, sensor: Sensor, probe: Probe, settings: SolveSettings, executor: Executor | None) -> Array:
+        """Scaled stress at the nodes, as `unfold` takes it: (n_distance, n_solved_turn, n_force, ...).
+
+        The settings give theory, mesh and width of the thin rings, the same for all members.
+        """
+        chains = [
+            _Chain(sensor.film, probe.turned(float(turn)), sensor.surface, float(distance), self.force, settings)
+            for distance in self.distance
+            for turn in self.solved_turns
+        ]
+        solved = track(in_order(executor, _solve_chain, chains), "solving the film", len(chains))
+        return np.stack(list(solved)).reshape(self.distance.size, self.solved_turns.size, self.force.size, -1)
+
     def unfold(self, solved: Array, mesh: Template) -> Array:
         """Fields of all orientations from those that were solved, each node in its turned place.
 
@@ -106,10 +121,51 @@ class Family:
         """Presses to check the interpolation with: between the nodes and, last, at the edge of the family.
 
         Yields:
-            Distance (m), angle (rad), force (N) and orientation (rad).
+            Distance (mm), angle (rad), force (N) and orientation (rad).
         """
         shares = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
-        low, high = np.log(self.force_range)
+        low, high = np.log(self.domain.force_range)
         for number, share in enumerate([*shares, 1.0]):
-            force = np.clip(np.exp(low + (high - low) * ((0.5 + 0.618 * number) % 1.0)), *self.force_range)
-            yield float(self.radius * share), 2.4 * number, float(force), 0.7 * number
+            force = np.clip(np.exp(low + (high - low) * ((0.5 + 0.618 * number) % 1.0)), *self.domain.force_range)
+            yield float(self.domain.radius * share), 2.4 * number, float(force), 0.7 * number
+
+
+def check_family(film: Film, probe: Probe, domain: Domain) -> None:
+    """Refuse domains that hold presses which cannot exist.
+
+    Raises:
+        SceneError: If radius or forces are no positive numbers, or the outermost or strongest press cannot exist.
+    """
+    radius, (low, high) = domain.radius, domain.force_range
+    if not (0.0 < low <= high and np.isfinite(high)):
+        raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {low} to {high}")
+    if not (np.isfinite(radius) and radius > 0.0):
+        raise SceneError(f"radius: expected a positive number, got {radius} mm")
+    if radius + probe.reach >= film.radius:
+        raise SceneError(
+            f"radius: presses up to {radius:.4g} mm from the centre with {probe.notation}, which reaches "
+            f"{probe.reach:.4g} mm, leave the film of radius {film.radius:.4g} mm"
+        )
+    check_press(film, probe, (radius, 0.0), high)
+
+
+@dataclass(frozen=True)
+class _Chain:
+    """Presses of one distance (mm) and orientation, in the order of their forces (N), by a probe turned as it is."""
+
+    film: Film
+    probe: Probe
+    surface: Surface
+    distance: float
+    forces: Array
+    settings: SolveSettings
+
+
+def _solve_chain(chain: _Chain) -> Array:
+    """Scaled stress at the nodes for each force, solved from the one before; shape (n_force, ...)."""
+    start: Equilibrium | None = None
+    rows = []
+    for force in chain.forces:
+        start = press(chain.film, chain.probe, (chain.distance, 0.0), float(force), chain.settings, start=start)
+        rows.append(turn_stress(nodal_stress(start, chain.surface), -chain.probe.angle).ravel())
+    return np.stack(rows)

@@ -15,6 +15,7 @@ In a file, coefficients and modes are integers of 16 bits, each mode with its ow
 """
 
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, cast, get_args
 
@@ -23,29 +24,31 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, SceneError, SolveError
-from isocharge.common.progress import Progress
-from isocharge.simulate.execution.checkpointed_map import JobMap
-from isocharge.simulate.forward.family import Family
-from isocharge.simulate.forward.film_grid import AXES, COUNTS, FilmGrid, FilmLimits, limits_of
-from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.forward.readout import touch_charge
-from isocharge.simulate.forward.solve_family import check_family
-from isocharge.simulate.forward.solve_films import THEORY, decompose, solve_films
+from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.forward.family import Family, check_family
+from isocharge.simulate.forward.film_grid import (
+    AXES,
+    COUNTS,
+    THEORY,
+    FilmGrid,
+    FilmLimits,
+    decompose,
+    limits_of,
+    solve_films,
+)
+from isocharge.simulate.forward.forward_map import ForwardMap, relative_error
 from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.solver.mesh_choice import layer_for
-from isocharge.simulate.solver.press import needed_resolution, press
+from isocharge.simulate.solver.load_case import layer_for
+from isocharge.simulate.solver.press import needed_resolution
 from isocharge.simulate.solver.settings import SolveSettings
 
 LARGEST_ERROR = 2e-3
 """Largest relative error of any charge against direct solves that a family may have, dimensionless: the lightest
 presses on the tautest films have it, whose charges are a few pC; a thousandth of 100 pC is 1e-4."""
-
-SMALL = 0.1
-"""Floor for the charge that an error is relative to, as a share of the press's largest charge, dimensionless."""
 
 CHECKS = 24
 """Number of direct solves that a family is compared with."""
@@ -89,38 +92,34 @@ class FilmFamily:
         force_range: tuple[float, float] = DEFAULT_FORCE_RANGE,
         *,
         counts: tuple[int, ...] = COUNTS,
-        map_jobs: JobMap = map,
-        progress: Progress | None = None,
+        executor: Executor | None = None,
     ) -> "FilmFamily":
         """Solve the films that a calibration may find, some five thousand presses, and check the interpolation.
 
         Args:
             prior: The films.
-            radius: Largest distance of a press from the centre, m.
+            radius: Largest distance of a press from the centre, mm.
             force_range: Smallest and largest force, N.
             counts: Nodes along each of `AXES`; a narrow spread needs fewer.
-            map_jobs: Runs the solves, in this process by default.
-            progress: Called with (done, total) groups of solves.
+            executor: Runs the solves; None for this process.
 
         Raises:
             SceneError: If some presses cannot exist.
             SolveError: If an equilibrium or the interpolation error is not reached.
         """
-        film, limits = prior.sensor.film, limits_of(prior, radius, force_range)
+        domain, film, surface = Domain(radius, force_range), prior.sensor.film, prior.sensor.surface
+        limits = limits_of(prior, domain)
         grid, a = FilmGrid.spread(limits, counts), film.radius
-        widest = Circle(limits["reach"][1] * a)
-        check_family(film, widest, radius, force_range)
+        check_family(film, Circle(limits["reach"][1] * a), domain)
         middle = float(np.sqrt(force_range[0] * force_range[1]))
         layer = layer_for(film, middle)
         settings = SolveSettings(theory=THEORY, layer=layer)
         smallest = Circle(limits["reach"][0] * a)
         resolution = needed_resolution(film, smallest, (radius, 0.0), middle, settings)
         settings = replace(settings, resolution=resolution)
-        stress = solve_films(film, prior.sensor.surface, grid, settings, map_jobs, progress)
-        coefficients, modes = decompose(stress)
-        surface = prior.sensor.surface
+        coefficients, modes = decompose(solve_films(film, surface, grid, settings, executor))
         family = cls(film.poisson, surface, limits, grid, resolution, layer, coefficients, modes, np.nan)
-        error = _check_against_solves(family, prior, radius, force_range)
+        error = _check_against_solves(family, prior, domain)
         if error > LARGEST_ERROR:
             raise SolveError(
                 f"the films of {prior.sensor.name} interpolate to {error:.2g} only, expected {LARGEST_ERROR:g}; ask "
@@ -148,8 +147,7 @@ class FilmFamily:
         load = film.young * film.thickness * a
         low, high = self.limits["load"]
         family = Family(
-            radius=self.limits["distance"][1] * a,
-            force_range=(low * load, high * load),
+            domain=Domain(self.limits["distance"][1] * a, (low * load, high * load)),
             distance=self.grid.distance * a,
             force=self.grid.load * load,
             turn=np.zeros(1),
@@ -224,19 +222,12 @@ def _quantised(values: Array, axis: int | tuple[int, ...]) -> tuple[np.ndarray, 
     return np.round(values / scale).astype(np.int16), scale
 
 
-def _check_against_solves(
-    family: FilmFamily, prior: FilmPrior, radius: float, force_range: tuple[float, float], seed: int = 0
-) -> float:
+def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain, seed: int = 0) -> float:
     """Largest relative error of a charge over presses of films drawn at random."""
-    rng, errors = np.random.default_rng(seed), []
+    rng, errors, (low, high) = np.random.default_rng(seed), [], domain.force_range
     for number, parameters in enumerate(prior.draw(rng, CHECKS)):
-        sensor, probe = prior.film(parameters)
-        forward_map = family.forward_map(sensor, probe)
-        angle = 2.4 * number
-        x, y = radius * np.sqrt((number + 1.0) / CHECKS) * np.array([np.cos(angle), np.sin(angle)])
-        force = float(force_range[0] * (force_range[1] / force_range[0]) ** rng.random())
-        direct = touch_charge(sensor, press(sensor.film, probe, (x, y), force, forward_map.settings))
-        mapped = forward_map.forward(np.array([x]), np.array([y]), np.array([force]))[0]
-        scale = np.maximum(np.abs(direct), SMALL * np.abs(direct).max())
-        errors.append((np.abs(mapped - direct) / scale).max())
-    return float(np.max(errors))
+        forward_map = family.forward_map(*prior.film(parameters))
+        distance, angle = domain.radius * np.sqrt((number + 1.0) / CHECKS), 2.4 * number
+        force = float(low * (high / low) ** rng.random())
+        errors.append(relative_error(forward_map, distance, angle, force))
+    return max(errors)

@@ -7,6 +7,7 @@ interpolated as a field, and the charge is integrated from the interpolated fiel
 position of the electrode, also with the probe on it. Building a map compares it with direct solves.
 """
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,13 +15,11 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.common.errors import SceneError, SolveError
-from isocharge.common.progress import Progress
+from isocharge.common.errors import SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
-from isocharge.simulate.execution.checkpointed_map import JobMap
-from isocharge.simulate.forward.family import TURNS, Family
+from isocharge.simulate.forward.charge_map import Domain, differences
+from isocharge.simulate.forward.family import TURNS, Family, check_family
 from isocharge.simulate.forward.readout import COARSE, FINE, NEAR, ReadoutPoints, contact_charge, touch_charge
-from isocharge.simulate.forward.solve_family import check_family, solve_family
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.stress import turn_stress
 from isocharge.simulate.mechanics.theory import Theory, theory_for
@@ -30,7 +29,7 @@ from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.solver.mesh_choice import layer_for
+from isocharge.simulate.solver.load_case import layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
 from isocharge.simulate.solver.settings import SolveSettings
 
@@ -81,57 +80,50 @@ class ForwardMap:
         force_range: tuple[float, float] = DEFAULT_FORCE_RANGE,
         settings: SolveSettings = SolveSettings(),
         *,
-        map_jobs: JobMap = map,
-        progress: Progress | None = None,
+        executor: Executor | None = None,
     ) -> "ForwardMap":
         """Solve a family and check it.
 
         Args:
             sensor: The sensor.
             probe: The footprint.
-            radius: Largest distance of a press from the centre, m.
+            radius: Largest distance of a press from the centre, mm.
             force_range: Smallest and largest force, N.
-            settings: Accuracy, theory and mesh. What is None is chosen for all presses: the fewest terms that the
+            settings: Accuracy, theory and mesh. What is "auto" is chosen for all presses: the fewest terms that the
                 accuracy allows over the forces, the mesh of the outermost press, thin rings for the middle force.
-            map_jobs: Runs the solves, in this process by default; `executor.map` or `Workers.in_order`. The result does
-                not depend on it.
-            progress: Called with (done, total) distances and orientations.
+            executor: Runs the solves; None for this process. The result does not depend on it.
 
         Raises:
             SceneError: If some presses cannot exist.
             SolveError: If an equilibrium or the interpolation error is not reached.
         """
-        film = sensor.film
-        check_family(film, probe, radius, force_range)
-        theory = settings.theory or theory_for(sensor, probe, force_range, settings.accuracy)
+        film, domain = sensor.film, Domain(radius, force_range)
+        check_family(film, probe, domain)
         middle = float(np.sqrt(force_range[0] * force_range[1]))
-        layer = settings.layer or layer_for(film, middle)
+        theory = settings.theory
+        if theory == "auto":
+            theory = theory_for(sensor, probe, force_range, settings.accuracy)
+        layer = layer_for(film, middle) if settings.layer == "auto" else settings.layer
         settings = replace(settings, theory=theory, layer=layer)
-        resolution = settings.resolution or needed_resolution(film, probe, (radius, 0.0), middle, settings)
+        resolution = needed_resolution(film, probe, (radius, 0.0), middle, settings)
         settings = replace(settings, resolution=resolution)
         error = np.inf
         for count, turns in (((5, 3), TURNS), ((8, 5), 2 * TURNS), ((13, 8), 3 * TURNS)):
-            family = Family.spread(radius, force_range, count, probe.period, turns)
-            solved = solve_family(sensor, probe, family, settings, map_jobs, progress)
-            table = family.unfold(solved, template_for(probe, resolution))
+            family = Family.spread(domain, count, probe.period, turns)
+            table = family.unfold(family.solve(sensor, probe, settings, executor), template_for(probe, resolution))
             forward_map = cls(sensor, probe, family, theory, resolution, layer, table, error)
-            error = _check_against_solves(forward_map)
+            error = max(relative_error(forward_map, *press) for press in family.probes_between(CHECKS))
             if error <= INTERPOLATION_ERROR:
                 return replace(forward_map, error=error)
         raise SolveError(
-            f"the forward map of {sensor.name} up to {radius * 1e3:g} mm and {force_range[1]:g} N interpolates to "
+            f"the forward map of {sensor.name} up to {radius:g} mm and {force_range[1]:g} N interpolates to "
             f"{error:.2g} only, expected {INTERPOLATION_ERROR:g}; ask for a smaller radius or range of forces"
         )
 
     @property
-    def radius(self) -> float:
-        """Presses up to this distance from the centre are covered, m."""
-        return self.family.radius
-
-    @property
-    def force_range(self) -> tuple[float, float]:
-        """Smallest and largest force covered, N."""
-        return self.family.force_range
+    def domain(self) -> Domain:
+        """The presses that are covered."""
+        return self.family.domain
 
     @property
     def settings(self) -> SolveSettings:
@@ -139,7 +131,7 @@ class ForwardMap:
         return SolveSettings(theory=self.theory, resolution=self.resolution)
 
     @property
-    def electrode_names(self) -> tuple[str, ...]:
+    def electrodes(self) -> tuple[str, ...]:
         """Names of the sensor's electrodes, in the order of the charges."""
         return self.sensor.electrode_names
 
@@ -148,45 +140,47 @@ class ForwardMap:
         """Number of equilibria that were solved for the map."""
         return self.family.distance.size * self.family.force.size * self.family.solved_turns.size
 
-    def forward(self, x: Array, y: Array, force: Array, orientation: Array | float = 0.0) -> Array:
+    def charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
         """Touch charges.
 
         Args:
-            x: Positions, shape (n,), m.
-            y: Positions, shape (n,), m.
-            force: Forces, shape (n,), N; where zero the film is untouched and the charges are zero.
-            orientation: Further turn of the probe, shape (n,) or a number, rad, anticlockwise.
+            contact: (x, y, F), shape (n, 3), mm and N; where F is zero the film is untouched and the charges are zero.
+            orientation: Further rotation of the probe, shape (n,) or a number, rad, anticlockwise.
 
         Returns:
-            Shape (n, n_electrode), C.
+            Shape (n, n_electrode), pC.
 
         Raises:
-            SceneError: If a press lies outside the covered radius or forces.
+            SceneError: If a press lies outside the domain.
         """
-        x, y, force, orientation = np.broadcast_arrays(
-            *(np.asarray(value, dtype=float) for value in (x, y, force, orientation))
-        )
-        self._check_inside(x, y, force)
-        touched = np.flatnonzero(force != 0.0)
-        charge = np.zeros((x.size, len(self.sensor.electrodes)))
-        with single_threaded_blas():
-            for start in range(0, touched.size, CHUNK):
-                chunk = touched[start : start + CHUNK]
-                charge[chunk] = self._charges(x[chunk] + 1j * y[chunk], force[chunk], orientation[chunk])
+        contact = np.asarray(contact, dtype=float)
+        untouched = contact[:, 2] == 0.0
+        self.domain.check(np.where(untouched[:, None], (0.0, 0.0, self.domain.force_range[0]), contact), "forward map")
+        orientation = np.broadcast_to(orientation, len(contact))
+        charge, touched = np.zeros((len(contact), len(self.electrodes))), np.flatnonzero(~untouched)
+        charge[touched] = self._at(contact[touched], orientation[touched])
         return charge
 
-    def _check_inside(self, x: Array, y: Array, force: Array) -> None:
-        """SceneError if a press is outside the covered radius or forces; without a force there is no press."""
-        distance, slack = np.hypot(x, y), 1.0 + 1e-9
-        low, high = self.force_range
-        inside = (distance <= self.radius * slack) & (force >= low / slack) & (force <= high * slack)
-        outside = ~inside & (force != 0.0)
-        if outside.any():
-            i = int(np.argmax(outside))
-            raise SceneError(
-                f"press {i} at ({x[i] * 1e3:.4g}, {y[i] * 1e3:.4g}) mm with {force[i]:.4g} N is outside the forward "
-                f"map: expected at most {self.radius * 1e3:g} mm from the centre and {low:g} to {high:g} N"
-            )
+    def derivatives(self, contact: Array) -> Array:
+        """d(Q)/d(x, y, ln F), shape (n, n_electrode, 3), pC/mm, pC/mm and pC, of contacts, shape (n, 3), mm and N.
+
+        By central differences, which reach beyond the edge of the domain.
+
+        Raises:
+            SceneError: If a press lies outside the domain.
+        """
+        contact = np.asarray(contact, dtype=float)
+        self.domain.check(contact, "forward map")
+        return differences(lambda moved: self._at(moved, np.zeros(len(moved))), contact)
+
+    def _at(self, contact: Array, orientation: Array) -> Array:
+        """Charges of presses of the domain or a little beyond."""
+        at, charge = contact[:, 0] + 1j * contact[:, 1], np.empty((len(contact), len(self.electrodes)))
+        with single_threaded_blas():
+            for start in range(0, len(contact), CHUNK):
+                chunk = slice(start, start + CHUNK)
+                charge[chunk] = self._charges(at[chunk], contact[chunk, 2], orientation[chunk])
+        return charge
 
     def _charges(self, at: Complexes, force: Array, orientation: Array) -> Array:
         """Charges of one chunk of presses, shape (n, n_electrode)."""
@@ -249,14 +243,18 @@ class ForwardMap:
         return charge
 
 
-def _check_against_solves(forward_map: ForwardMap) -> float:
-    """Largest relative error of a charge over presses between the nodes and at the edge of the family."""
-    errors = []
-    for distance, angle, force, turn in forward_map.family.probes_between(CHECKS):
-        x, y = distance * np.cos(angle), distance * np.sin(angle)
-        solved = press(forward_map.sensor.film, forward_map.probe.turned(turn), (x, y), force, forward_map.settings)
-        direct = touch_charge(forward_map.sensor, solved)
-        mapped = forward_map.forward(np.array([x]), np.array([y]), np.array([force]), turn)[0]
-        scale = np.maximum(np.abs(direct), SMALL * np.abs(direct).max())
-        errors.append((np.abs(mapped - direct) / scale).max())
-    return float(np.max(errors))
+def relative_error(forward_map: ForwardMap, distance: float, angle: float, force: float, turn: float = 0.0) -> float:
+    """Largest error of a charge against a direct solve, relative to the charge or `SMALL` of the largest one.
+
+    Args:
+        forward_map: The map.
+        distance: Of the press from the centre, mm.
+        angle: Its direction from the centre, rad.
+        force: N.
+        turn: Further rotation of the probe, rad.
+    """
+    sensor, at = forward_map.sensor, (distance * float(np.cos(angle)), distance * float(np.sin(angle)))
+    direct = touch_charge(sensor, press(sensor.film, forward_map.probe.turned(turn), at, force, forward_map.settings))
+    mapped = forward_map.charges(np.array([[*at, force]]), turn)[0]
+    scale = np.maximum(np.abs(direct), SMALL * np.abs(direct).max())
+    return float((np.abs(mapped - direct) / scale).max())

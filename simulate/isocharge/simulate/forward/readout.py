@@ -21,7 +21,7 @@ from isocharge.simulate.numerics.quadrature import gauss_line, gauss_polygon, ga
 from isocharge.simulate.sensor.electrode import Electrode
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Readout, Sensor
-from isocharge.simulate.solver.equilibrium import Equilibrium
+from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
 
 DIRECT, FINE, COARSE = 20, 12, 4
 """Gauss points per side of an electrode: of one press; of many, near the probe and away from it.
@@ -29,8 +29,8 @@ DIRECT, FINE, COARSE = 20, 12, 4
 The stress has a kink on the footprint's edge; where that crosses an electrode 20 points leave 1e-5, 12 leave 8e-5.
 """
 
-NEAR = 3e-3
-"""Distance from the probe's edge to an electrode below which the fine rule is used, m."""
+NEAR = 3.0
+"""Distance from the probe's edge to an electrode below which the fine rule is used, mm."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class ReadoutPoints:
     """How charges follow from the stress at points of the film.
 
     Attributes:
-        points: (x, y), shape (n_electrode, n_point, 2), m.
-        weights: Charge per stress (s11, s22, s12), shape (n_electrode, n_point, 3), C/Pa.
+        points: (x, y), shape (n_electrode, n_point, 2), mm.
+        weights: Charge per stress (s11, s22, s12), shape (n_electrode, n_point, 3), pC/MPa.
     """
 
     points: Array
@@ -58,7 +58,7 @@ class ReadoutPoints:
         return cls(sensor.calibration.place(points), weights)
 
     def charge(self, stress: Array) -> Array:
-        """Charges, shape (..., n_electrode), C, from stress at the points, shape (..., n_electrode, n_point, 3), Pa."""
+        """Charges (..., n_electrode), pC, from stress at the points, shape (..., n_electrode, n_point, 3), MPa."""
         charge: Array = np.einsum("...epc,epc->...e", stress, self.weights)
         return charge
 
@@ -71,8 +71,8 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
         equilibrium: The solved press.
 
     Returns:
-        Shape (n_electrode,), C, in the order of `sensor.electrode_names`. Positive for tension along a direction with a
-        positive coefficient.
+        Shape (n_electrode,), pC, in the order of `sensor.electrode_names`; positive for tension along a direction with
+        a positive coefficient.
 
     Raises:
         SensorError: If the film is another one, or the sensor reads a surface and bending was left out.
@@ -85,14 +85,14 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
             "it with SolveSettings(theory=theory_for(sensor, probe, (force, force)))"
         )
     readout = ReadoutPoints.of(sensor, DIRECT)
-    stress = equilibrium.touch_stress(readout.points.reshape(-1, 2), sensor.surface)
+    stress = touch_stress(equilibrium, readout.points.reshape(-1, 2), sensor.surface)
     charge = readout.charge(stress.reshape(*readout.points.shape[:2], 3))
     charge += contact_charge(sensor, equilibrium.probe, equilibrium.at, equilibrium.force)
     return charge
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
-    """Charge of the contact pressure on the electrodes, d33 * s33 with s33 = -pressure, shape (n_electrode,), C.
+    """Charge of the contact pressure on the electrodes, d33 * s33 with s33 = -pressure, shape (n_electrode,), pC.
 
     Only the part of an electrode under the footprint counts; a negative d33, as PVDF has, gives a positive charge.
     """
@@ -104,7 +104,7 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
 
 
 def _covered(corners: Array, probe: Probe, at: complex) -> float:
-    """Area of an electrode under a footprint, m^2."""
+    """Area of an electrode under a footprint, mm^2."""
     electrode = corners @ np.array([1.0, 1j])
     if isinstance(probe, Circle):
         return area_in_disk(electrode, at, probe.radius)
@@ -112,24 +112,24 @@ def _covered(corners: Array, probe: Probe, at: complex) -> float:
 
 
 def pretension_charge(sensor: Sensor) -> Array:
-    """Reading without load, from the uniform pretension, shape (n_electrode,), C; touch charges are counted from it."""
+    """Reading without load, from the uniform pretension, shape (n_electrode,), pC; touch charges count from it."""
     per_area = (sensor.piezo.d31 + sensor.piezo.d32) * sensor.film.pretension
     return _per_area(sensor, per_area)
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:
-    """Pyroelectric charge of a uniform temperature step (K), shape (n_electrode,), C: the same on equal electrodes."""
+    """Pyroelectric charge of a uniform temperature step (K), shape (n_electrode,), pC: the same on equal electrodes."""
     return _per_area(sensor, sensor.piezo.pyro * step)
 
 
 def _per_area(sensor: Sensor, density: float) -> Array:
-    """Reading of a uniform charge density (C/m^2), shape (n_electrode,), C."""
+    """Reading of a uniform charge density (pC/mm^2), shape (n_electrode,), pC."""
     reading: Array = sensor.gains * np.array([electrode.area for electrode in sensor.electrodes]) * density
     return reading
 
 
 def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tuple[Array, Array]:
-    """Integration points, shape (n, 2), m, and the share of each in the mean of (s11, s22, s12), shape (n, 3)."""
+    """Integration points, shape (n, 2), mm, and the share of each in the mean of (s11, s22, s12), shape (n, 3)."""
     return _edge_rule(electrode, per_side) if readout == "edge" else _area_rule(electrode, per_side)
 
 

@@ -81,18 +81,12 @@ def _cautions(sensor: Sensor) -> Iterator[str]:
 
 def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
     """The tables of a sensor's file, ready for JSON: `sensor_from_dict` gives the sensor back to round-off."""
-    film, piezo, calibration = sensor.film, sensor.piezo, sensor.calibration
+    piezo, calibration = sensor.piezo, sensor.calibration
     return {
         "name": sensor.name,
         "readout": sensor.readout,
         "surface": sensor.surface,
-        "film": {
-            "radius_mm": _tidy(film.radius),
-            "thickness_um": _tidy(film.thickness * 1e3),
-            "young_GPa": _tidy(film.young * 1e-3),
-            "poisson": film.poisson,
-            "pretension_MPa": _tidy(film.pretension),
-        },
+        "film": film_to_dict(sensor.film),
         "piezo": {
             "d31": _tidy(piezo.d31),
             "d32": _tidy(piezo.d32),
@@ -105,6 +99,17 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
             "shift_mm": [_tidy(value) for value in calibration.shift],
             "rotation_deg": _tidy(float(np.rad2deg(calibration.rotation))),
         },
+    }
+
+
+def film_to_dict(film: Film) -> dict[str, float]:
+    """The table of a film in the sensor file."""
+    return {
+        "radius_mm": _tidy(film.radius),
+        "thickness_um": _tidy(film.thickness * 1e3),
+        "young_GPa": _tidy(film.young * 1e-3),
+        "poisson": film.poisson,
+        "pretension_MPa": _tidy(film.pretension),
     }
 
 
