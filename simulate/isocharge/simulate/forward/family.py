@@ -11,7 +11,7 @@ from isocharge.common.errors import SceneError
 from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.mechanics.stress import turn_stress
+from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film, Surface
@@ -22,7 +22,7 @@ from isocharge.simulate.solver.load_case import check_press
 from isocharge.simulate.solver.press import press
 from isocharge.simulate.solver.settings import SolveSettings
 
-TURNS = 7
+ROTATIONS = 7
 """Smallest number of orientations: only the first harmonics of the rim, far from the probe, reach the probe."""
 
 
@@ -34,84 +34,84 @@ class Family:
         domain: The presses that it covers.
         distance: Distances from the centre, Chebyshev nodes, shape (n_distance,), mm.
         force: Forces, Chebyshev nodes in the logarithm, shape (n_force,), N.
-        turn: Orientations against the direction of the press, evenly spread over a full turn, shape (n_turn,), rad.
+        rotation: Of the probe against the direction of the press, evenly spread over a turn, shape (n_rotation,), rad.
         folds: Order of the probe's rotational symmetry: how often it maps onto itself in a full turn.
     """
 
     domain: Domain
     distance: Array
     force: Array
-    turn: Array
+    rotation: Array
     folds: int
 
     @classmethod
-    def spread(cls, domain: Domain, count: tuple[int, int], period: float, turns: int = TURNS) -> "Family":
+    def spread(cls, domain: Domain, count: tuple[int, int], period: float, rotations: int = ROTATIONS) -> "Family":
         """Nodes for a probe.
 
         Args:
             domain: The presses to cover.
             count: Number of distances and of forces.
             period: Angle after which the probe looks the same, rad; 0 for a round one.
-            turns: Smallest number of orientations.
+            rotations: Smallest number of orientations.
         """
         low, high = np.log(domain.force_range)
         force = np.exp(chebyshev_nodes(count[1], low, high)) if high > low else np.array([domain.force_range[0]])
         folds = round(2.0 * np.pi / period) if period > 0.0 else 1
-        n_turn = folds * (-(-turns // folds)) if period > 0.0 else 1
-        turn = 2.0 * np.pi * np.arange(n_turn) / n_turn
-        return cls(domain, chebyshev_nodes(count[0], 0.0, domain.radius), force, turn, folds)
+        n_rotation = folds * (-(-rotations // folds)) if period > 0.0 else 1
+        rotation = 2.0 * np.pi * np.arange(n_rotation) / n_rotation
+        return cls(domain, chebyshev_nodes(count[0], 0.0, domain.radius), force, rotation, folds)
 
     @property
-    def solved_turns(self) -> Array:
+    def solved_rotations(self) -> Array:
         """Orientations that must be solved: one period of the probe."""
-        return self.turn[: self.turn.size // self.folds]
+        return self.rotation[: self.rotation.size // self.folds]
 
-    def weights(self, distance: Array, force: Array, turn: Array) -> Array:
-        """Interpolation weights for presses, shape (n, n_distance * n_force * n_turn)."""
+    def weights(self, distance: Array, force: Array, rotation: Array) -> Array:
+        """Interpolation weights for presses, shape (n, n_distance * n_force * n_rotation)."""
         by_distance = lagrange_values(self.distance, barycentric_weights(self.distance), distance)
         logs = np.log(self.force)
         by_force = lagrange_values(logs, barycentric_weights(logs), np.log(force))
         both = by_distance[:, :, None, None] * by_force[:, None, :, None]
-        weights: Array = (both * self._by_turn(turn)[:, None, None, :]).reshape(distance.size, -1)
+        weights: Array = (both * self._by_rotation(rotation)[:, None, None, :]).reshape(distance.size, -1)
         return weights
 
-    def _by_turn(self, turn: Array) -> Array:
-        """Trigonometric interpolation on an even spread: each weight is a Dirichlet kernel, shape (n, n_turn)."""
-        harmonics = np.arange(1, (self.turn.size - 1) // 2 + 1)
-        phase = (turn[:, None] - self.turn)[..., None] * harmonics
+    def _by_rotation(self, rotation: Array) -> Array:
+        """Trigonometric interpolation on an even spread: each weight is a Dirichlet kernel, shape (n, n_rotation)."""
+        harmonics = np.arange(1, (self.rotation.size - 1) // 2 + 1)
+        phase = (rotation[:, None] - self.rotation)[..., None] * harmonics
         kernel = 1.0 + 2.0 * np.cos(phase).sum(axis=-1)
-        if self.turn.size % 2 == 0:
-            kernel = kernel + np.cos(0.5 * self.turn.size * (turn[:, None] - self.turn))
-        by_turn: Array = kernel / self.turn.size
-        return by_turn
+        if self.rotation.size % 2 == 0:
+            kernel = kernel + np.cos(0.5 * self.rotation.size * (rotation[:, None] - self.rotation))
+        by_rotation: Array = kernel / self.rotation.size
+        return by_rotation
 
     def solve(self, sensor: Sensor, probe: Probe, settings: SolveSettings, executor: Executor | None) -> Array:
-        """Scaled stress at the nodes, as `unfold` takes it: (n_distance, n_solved_turn, n_force, ...).
+        """Scaled stress at the nodes, as `unfold` takes it: (n_distance, n_solved_rotation, n_force, ...).
 
         The settings give theory, mesh and width of the thin rings, the same for all members.
         """
         chains = [
-            _Chain(sensor.film, probe.turned(float(turn)), sensor.surface, float(distance), self.force, settings)
+            _Chain(sensor.film, probe.rotated(float(rotation)), sensor.surface, float(distance), self.force, settings)
             for distance in self.distance
-            for turn in self.solved_turns
+            for rotation in self.solved_rotations
         ]
         solved = track(in_order(executor, _solve_chain, chains), "solving the film", len(chains))
-        return np.stack(list(solved)).reshape(self.distance.size, self.solved_turns.size, self.force.size, -1)
+        return np.stack(list(solved)).reshape(self.distance.size, self.solved_rotations.size, self.force.size, -1)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
-        """Fields of all orientations from those that were solved, each node in its turned place.
+        """Fields of all orientations from those that were solved, each node in its rotated place.
 
         Args:
-            solved: Shape (n_distance, n_solved_turn, n_force, n_element * n_local * 3), in the probe's frame.
+            solved: Shape (n_distance, n_solved_rotation, n_force, n_element * n_local * 3), in the probe's frame.
             mesh: Their template.
 
         Returns:
-            Shape (n_distance * n_force * n_turn, n_element * n_local * 3), ordered as `weights`.
+            Shape (n_distance * n_force * n_rotation, n_element * n_local * 3), ordered as `weights`.
         """
-        n_distance, n_turn, n_force, _ = solved.shape
-        field = np.moveaxis(solved, 1, 2).reshape(n_distance, n_force, n_turn, mesh.n_element, -1, 3)
+        n_distance, n_rotation, n_force, _ = solved.shape
+        field = np.moveaxis(solved, 1, 2).reshape(n_distance, n_force, n_rotation, mesh.n_element, -1, 3)
         parts = [
-            turn_stress(field[..., mesh.turned(fold, self.folds), :, :], -2.0 * np.pi * fold / self.folds)
+            rotate_stress(field[..., mesh.rotated(fold, self.folds), :, :], -2.0 * np.pi * fold / self.folds)
             for fold in range(self.folds)
         ]
         unfolded: Array = np.concatenate(parts, axis=2).reshape(-1, solved.shape[-1])
@@ -151,7 +151,7 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
 
 @dataclass(frozen=True)
 class _Chain:
-    """Presses of one distance (mm) and orientation, in the order of their forces (N), by a probe turned as it is."""
+    """Presses of one distance (mm) and orientation, in the order of their forces (N), by a probe rotated as it is."""
 
     film: Film
     probe: Probe
@@ -167,5 +167,5 @@ def _solve_chain(chain: _Chain) -> Array:
     rows = []
     for force in chain.forces:
         start = press(chain.film, chain.probe, (chain.distance, 0.0), float(force), chain.settings, start=start)
-        rows.append(turn_stress(nodal_stress(start, chain.surface), -chain.probe.angle).ravel())
+        rows.append(rotate_stress(nodal_stress(start, chain.surface), -chain.probe.angle).ravel())
     return np.stack(rows)

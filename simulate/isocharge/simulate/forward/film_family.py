@@ -150,7 +150,7 @@ class FilmFamily:
             domain=Domain(self.limits["distance"][1] * a, (low * load, high * load)),
             distance=self.grid.distance * a,
             force=self.grid.load * load,
-            turn=np.zeros(1),
+            rotation=np.zeros(1),
             folds=1,
         )
         table = by_press @ self.modes

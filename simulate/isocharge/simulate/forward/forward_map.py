@@ -1,8 +1,8 @@
 """The forward map: charges for many presses from a few solves.
 
 Presses of one probe form a family in distance from the centre, force and, unless the probe is round, orientation; the
-angle of the position is a turn. Seen from the probe, the stress at the nodes of the template is a smooth function of
-all of them. It is solved on Chebyshev nodes in distance and the force's logarithm and on evenly spread orientations,
+angle of the position only rotates it. Seen from the probe, the stress at the nodes of the template is a smooth function of all of
+them. It is solved on Chebyshev nodes in distance and the force's logarithm and on evenly spread orientations,
 interpolated as a field, and the charge is integrated from the interpolated field again for every press: exact for the
 position of the electrode, also with the probe on it. Building a map compares it with direct solves.
 """
@@ -18,10 +18,10 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.forward.charge_map import Domain, differences
-from isocharge.simulate.forward.family import TURNS, Family, check_family
+from isocharge.simulate.forward.family import ROTATIONS, Family, check_family
 from isocharge.simulate.forward.readout import COARSE, FINE, NEAR, ReadoutPoints, contact_charge, touch_charge
 from isocharge.simulate.mechanics.scaling import amplitude_squared
-from isocharge.simulate.mechanics.stress import turn_stress
+from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mechanics.theory import Theory, theory_for
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.resolution import Resolution
@@ -57,8 +57,8 @@ class ForwardMap:
         theory: Which terms are modelled.
         resolution: Mesh of the solves.
         layer: Width of its thin rings at the rim over the film's radius.
-        table: Scaled stress C : E' at the nodes of every element, in a frame that turns with the probe; shape
-            (n_distance * n_force * n_turn, n_element * n_local * 3).
+        table: Scaled stress C : E' at the nodes of every element, in a frame that rotates with the probe; shape
+            (n_distance * n_force * n_rotation, n_element * n_local * 3).
         error: Largest relative error of a charge against the direct solves that the build compared with.
     """
 
@@ -108,8 +108,8 @@ class ForwardMap:
         resolution = needed_resolution(film, probe, (radius, 0.0), middle, settings)
         settings = replace(settings, resolution=resolution)
         error = np.inf
-        for count, turns in (((5, 3), TURNS), ((8, 5), 2 * TURNS), ((13, 8), 3 * TURNS)):
-            family = Family.spread(domain, count, probe.period, turns)
+        for count, rotations in (((5, 3), ROTATIONS), ((8, 5), 2 * ROTATIONS), ((13, 8), 3 * ROTATIONS)):
+            family = Family.spread(domain, count, probe.period, rotations)
             table = family.unfold(family.solve(sensor, probe, settings, executor), template_for(probe, resolution))
             forward_map = cls(sensor, probe, family, theory, resolution, layer, table, error)
             error = max(relative_error(forward_map, *press) for press in family.probes_between(CHECKS))
@@ -138,7 +138,7 @@ class ForwardMap:
     @property
     def solves(self) -> int:
         """Number of equilibria that were solved for the map."""
-        return self.family.distance.size * self.family.force.size * self.family.solved_turns.size
+        return self.family.distance.size * self.family.force.size * self.family.solved_rotations.size
 
     def charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
         """Touch charges.
@@ -184,22 +184,22 @@ class ForwardMap:
 
     def _charges(self, at: Complexes, force: Array, orientation: Array) -> Array:
         """Charges of one chunk of presses, shape (n, n_electrode)."""
-        turn = orientation - np.angle(at)
-        field = self.family.weights(np.abs(at), force, turn) @ self.table
+        rotation = orientation - np.angle(at)
+        field = self.family.weights(np.abs(at), force, rotation) @ self.table
         mesh = template_for(self.probe, self.resolution)
-        placement = Placement.of(mesh, self.probe, np.abs(at), self.sensor.film.radius, self.layer, turn)
+        placement = Placement.of(mesh, self.probe, np.abs(at), self.sensor.film.radius, self.layer, rotation)
         charge = np.empty((at.size, len(self.sensor.electrodes)))
         near, (fine, coarse) = self._near(at), self._readouts
         for readout, chosen in ((fine, near), (coarse, ~near)):
             press_index, electrode = np.nonzero(chosen)
             charge[press_index, electrode] = self._read(
-                readout, field, placement, at, turn + self.probe.angle, press_index, electrode
+                readout, field, placement, at, rotation + self.probe.angle, press_index, electrode
             )
         scale = self.sensor.film.young * amplitude_squared(self.sensor.film, force)
         scaled: Array = charge * scale[:, None]
         if self.sensor.piezo.d33 != 0.0:
             for i, e in zip(*np.nonzero(near), strict=True):
-                probe = self.probe.turned(float(orientation[i]))
+                probe = self.probe.rotated(float(orientation[i]))
                 scaled[i, e] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])[e]
         return scaled
 
@@ -238,12 +238,14 @@ class ForwardMap:
         nodal = field.reshape(len(field), mesh.n_element, -1, 3)[press_index[:, None], element]
         local = np.matmul(values[:, None, :], nodal.reshape(*values.shape, 3)).reshape(*position.shape, 3)
         local[mirrored, 2] *= -1.0
-        stress = turn_stress(local, (angle if mesh.half else angle + frame[press_index])[:, None])
+        stress = rotate_stress(local, (angle if mesh.half else angle + frame[press_index])[:, None])
         charge: Array = np.einsum("kpc,kpc->k", stress, readout.weights[electrode])
         return charge
 
 
-def relative_error(forward_map: ForwardMap, distance: float, angle: float, force: float, turn: float = 0.0) -> float:
+def relative_error(
+    forward_map: ForwardMap, distance: float, angle: float, force: float, rotation: float = 0.0
+) -> float:
     """Largest error of a charge against a direct solve, relative to the charge or `SMALL` of the largest one.
 
     Args:
@@ -251,10 +253,12 @@ def relative_error(forward_map: ForwardMap, distance: float, angle: float, force
         distance: Of the press from the centre, mm.
         angle: Its direction from the centre, rad.
         force: N.
-        turn: Further rotation of the probe, rad.
+        rotation: Further rotation of the probe, rad.
     """
     sensor, at = forward_map.sensor, (distance * float(np.cos(angle)), distance * float(np.sin(angle)))
-    direct = touch_charge(sensor, press(sensor.film, forward_map.probe.turned(turn), at, force, forward_map.settings))
-    mapped = forward_map.charges(np.array([[*at, force]]), turn)[0]
+    direct = touch_charge(
+        sensor, press(sensor.film, forward_map.probe.rotated(rotation), at, force, forward_map.settings)
+    )
+    mapped = forward_map.charges(np.array([[*at, force]]), rotation)[0]
     scale = np.maximum(np.abs(direct), SMALL * np.abs(direct).max())
     return float((np.abs(mapped - direct) / scale).max())

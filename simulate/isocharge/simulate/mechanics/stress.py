@@ -1,4 +1,4 @@
-"""Strain, stress, principal stresses, and a stress seen from a turned frame."""
+"""Strain, stress, principal stresses, and a stress seen from a rotated frame."""
 
 import numpy as np
 
@@ -43,8 +43,8 @@ def stress(strain: Array, poisson: float) -> Array:
     )
 
 
-def turn_stress(local: Array, angle: float | Array) -> Array:
-    """Stress (s11, s22, s12), shape (..., 3), of a frame turned by `angle` (rad) into the frame it was turned from."""
+def rotate_stress(local: Array, angle: float | Array) -> Array:
+    """Stress (s11, s22, s12), shape (..., 3), of a frame rotated by `angle` (rad), in the unrotated frame."""
     mean, half, shear = (
         0.5 * (local[..., 0] + local[..., 1]),
         0.5 * (local[..., 0] - local[..., 1]),

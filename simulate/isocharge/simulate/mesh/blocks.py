@@ -112,8 +112,8 @@ class Blocks:
         parts += [[a, b, void, void] for a, b in pairwise(self.boundary)]
         return np.array(parts)
 
-    def turned(self, fold: int, folds: int) -> Integers:
-        """For each element, the one that takes its place when the probe is turned by fold / folds of a full turn."""
+    def rotated(self, fold: int, folds: int) -> Integers:
+        """For each element, the one that takes its place when the probe is rotated by fold / folds of a full turn."""
         shift = fold * self.n_corner // folds
         quads = np.arange(self.n_quad).reshape(self.n_meshed, -1)
         sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)

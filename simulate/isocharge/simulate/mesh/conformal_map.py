@@ -69,8 +69,8 @@ def sector_angles(blocks: Blocks, corners: Complexes, centre: Array, radius: Arr
     along = (away * np.conj(ray)).real
     point = away + ray * (np.sqrt(along**2 + radius[..., None] ** 2 - np.abs(away) ** 2) - along)
     first = np.angle(point[..., :1])
-    turned = np.cumsum(np.mod(np.angle(point[..., 1:] / point[..., :-1]), 2.0 * np.pi), axis=-1)
-    return stretch_angles(np.concatenate([first, first + turned], axis=-1), (1.0 + pull) / (1.0 - pull))
+    rotated = np.cumsum(np.mod(np.angle(point[..., 1:] / point[..., :-1]), 2.0 * np.pi), axis=-1)
+    return stretch_angles(np.concatenate([first, first + rotated], axis=-1), (1.0 + pull) / (1.0 - pull))
 
 
 def rim_angles(angle: Array, c: Array, rho: Array) -> Array:

@@ -17,7 +17,7 @@ from isocharge.simulate.sensor.probe import Probe
 
 @dataclass(frozen=True, eq=False)
 class PlacedMesh:
-    """A template where it lies under one press, the press turned onto the positive x axis.
+    """A template where it lies under one press, the press rotated onto the positive x axis.
 
     Attributes:
         template: The template.
@@ -51,7 +51,7 @@ class PlacedMesh:
         return Geometry.build(self.template, self.points)
 
     def locate(self, points: Complexes) -> tuple[Integers, Array, Array, Booleans]:
-        """Element, xi and eta of film points, shape (n,), in film radii, the press turned onto the x axis.
+        """Element, xi and eta of film points, shape (n,), in film radii, the press rotated onto the x axis.
 
         And which points were mirrored into the half that is meshed.
         """
@@ -87,5 +87,5 @@ class PlacedMesh:
 def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> PlacedMesh:
     """Place the template of a probe under a press; `layer` is the width of the thin rings over the film's radius."""
     template = template_for(probe, resolution)
-    turned = probe.turned(-float(np.arctan2(at[1], at[0])))
-    return PlacedMesh(template, Placement.of(template, turned, np.array(np.hypot(*at)), film.radius, layer), layer)
+    rotated = probe.rotated(-float(np.arctan2(at[1], at[0])))
+    return PlacedMesh(template, Placement.of(template, rotated, np.array(np.hypot(*at)), film.radius, layer), layer)

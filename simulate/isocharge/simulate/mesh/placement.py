@@ -67,25 +67,31 @@ class Placement:
 
     @classmethod
     def of(
-        cls, blocks: Blocks, probe: Probe, distance: Array, film_radius: float, layer: float, turn: Array | float = 0.0
+        cls,
+        blocks: Blocks,
+        probe: Probe,
+        distance: Array,
+        film_radius: float,
+        layer: float,
+        rotation: Array | float = 0.0,
     ) -> Self:
         """Place a template under a press on the positive x axis.
 
         Args:
             blocks: The blocks; their number of corners must be the probe's.
-            probe: The footprint, turned as it is when the press lies on the x axis.
+            probe: The footprint, rotated as it is when the press lies on the x axis.
             distance: Distance of the footprint's centroid from the film's centre, mm, any shape.
             film_radius: mm.
             layer: Width of the thin rings at the rim over the film's radius.
-            turn: Further turn of the footprint, rad, the shape of `distance` or a number.
+            rotation: Further rotation of the footprint, rad, the shape of `distance` or a number.
         """
         at = np.asarray(distance, dtype=float) / film_radius
         if isinstance(probe, Circle):
             centre, radius = at, np.full(at.shape, probe.radius / film_radius)
             corners = at[..., None] + radius[..., None] * CORE * np.sqrt(2.0) * np.exp(1j * np.pi * DIAGONALS)
         else:
-            turned = np.exp(1j * np.broadcast_to(turn, at.shape))[..., None]
-            corners = at[..., None] + probe.outline / film_radius * turned
+            rotated = np.exp(1j * np.broadcast_to(rotation, at.shape))[..., None]
+            corners = at[..., None] + probe.outline / film_radius * rotated
             centre, radius = enclosing_circle(corners, at)
         corners = np.concatenate([corners, at[..., None]], axis=-1)
         c, rho = automorphism_onto(centre, radius)
@@ -199,9 +205,9 @@ class Placement:
         low, high = (np.take_along_axis(self.start, (sector + i)[:, None], axis=1)[:, 0] for i in (0, 1))
         for _ in range(NEWTON_STEPS):
             z = self.rho * np.exp(1j * (low + t * (high - low)))
-            turned = 1j * (high - low) * z * (1.0 - self.c**2) / (1.0 + self.c * z) ** 2
+            rotated = 1j * (high - low) * z * (1.0 - self.c**2) / (1.0 + self.c * z) ** 2
             outer = np.where(arc, (z + self.c) / (1.0 + self.c * z), c + t * (d - c))
-            by_t = (1.0 - v) * (b - a) + v * np.where(arc, turned, d - c)
+            by_t = (1.0 - v) * (b - a) + v * np.where(arc, rotated, d - c)
             inner = a + t * (b - a)
             by_v = outer - inner
             residual = inner + v * by_v - points

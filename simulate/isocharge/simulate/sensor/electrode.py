@@ -57,7 +57,7 @@ class Calibration:
     Attributes:
         gain: Charge read over charge collected, by electrode name; missing names count as 1.
         shift: Displacement of the electrodes from the layout, mm.
-        rotation: Angle by which they are turned about the film's centre before the shift, rad, anticlockwise.
+        rotation: Angle by which they are rotated about the film's centre before the shift, rad, anticlockwise.
     """
 
     gain: dict[str, float] = field(default_factory=dict)

@@ -1,7 +1,7 @@
 """The object that presses: its footprint and the notation for it.
 
 `circle:1.0` (radius), `rectangle:4.0x2.0` (along x and y), `triangle:4.0` (equilateral side, a corner to +y),
-`polygon:x,y;x,y;...` (convex), lengths in mm, each optionally turned: `@30` (degrees, anticlockwise). The position of
+`polygon:x,y;x,y;...` (convex), lengths in mm, each optionally rotated: `@30` (degrees, anticlockwise). The position of
 a probe is the centroid of its footprint.
 """
 
@@ -63,16 +63,16 @@ class Circle:
 
     @property
     def angle(self) -> float:
-        """Turn of the footprint, rad: zero for a circle."""
+        """Rotation of the footprint, rad: zero for a circle."""
         return 0.0
 
     @property
     def period(self) -> float:
-        """Smallest turn that maps the footprint onto itself, rad: a circle looks the same at every angle."""
+        """Smallest rotation that maps the footprint onto itself, rad: a circle looks the same at every angle."""
         return 0.0
 
-    def turned(self, _angle: float) -> "Circle":
-        """The footprint turned about its centroid."""
+    def rotated(self, _angle: float) -> "Circle":
+        """The footprint rotated about its centroid."""
         return self
 
 
@@ -81,8 +81,8 @@ class Polygon:
     """A convex polygonal footprint that presses uniformly.
 
     Attributes:
-        corners: (x, y) relative to the centroid, anticlockwise, mm, before turning.
-        angle: Turn about the centroid, anticlockwise, rad.
+        corners: (x, y) relative to the centroid, anticlockwise, mm, before the rotation.
+        angle: Rotation about the centroid, anticlockwise, rad.
         name: Kind of footprint: "rectangle", "triangle" or "polygon".
     """
 
@@ -149,13 +149,13 @@ class Polygon:
 
     @property
     def outline(self) -> Complexes:
-        """Corners as x + iy relative to the centroid, turned, anticlockwise, shape (n,), mm."""
+        """Corners as x + iy relative to the centroid, rotated, anticlockwise, shape (n,), mm."""
         outline: Complexes = np.array(self.corners) @ np.array([1.0, 1j]) * np.exp(1j * self.angle)
         return outline
 
     @property
     def period(self) -> float:
-        """Smallest turn that maps the footprint onto itself, rad."""
+        """Smallest rotation that maps the footprint onto itself, rad."""
         z = np.array(self.corners) @ np.array([1.0, 1j])
         for step in range(1, z.size):
             turn = np.exp(2j * np.pi * step / z.size)
@@ -163,8 +163,8 @@ class Polygon:
                 return float(math.tau * step / z.size)
         return math.tau
 
-    def turned(self, angle: float) -> "Polygon":
-        """The footprint turned about its centroid by a further angle (rad)."""
+    def rotated(self, angle: float) -> "Polygon":
+        """The footprint rotated about its centroid by a further angle (rad)."""
         return replace(self, angle=self.angle + angle)
 
 
@@ -181,7 +181,7 @@ def parse_probe(text: str) -> Probe:
     if match is None:
         raise SceneError(
             f"probe {cut(text)!r}: expected 'circle:R', 'rectangle:WxH', 'triangle:S' or 'polygon:X,Y;X,Y;X,Y' in mm, "
-            "each optionally turned as in 'triangle:4.0@30' (degrees)"
+            "each optionally rotated as in 'triangle:4.0@30' (degrees)"
         )
     for size in ("radius", "width", "height", "side"):
         if match[size] is not None and not 0.0 < float(match[size]) < np.inf:

@@ -1,6 +1,6 @@
 """The film at rest under a press, and its deflection and stress at any point.
 
-The film is round and its elasticity isotropic, so every press is solved on the positive x axis and turned when it is
+The film is round and its elasticity isotropic, so every press is solved on the positive x axis and rotated when it is
 read: one equilibrium serves all angles, electrode layouts and piezoelectric coefficients.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.mechanics.stress import principal_stresses, strain, stress, turn_stress
+from isocharge.simulate.mechanics.stress import principal_stresses, rotate_stress, strain, stress
 from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import tensor_values
@@ -33,8 +33,8 @@ class Equilibrium:
         at: Centroid of the footprint (x, y), mm.
         force: N.
         theory: Which terms were modelled.
-        mesh: The mesh, where it lies under the press turned onto the x axis.
-        field: Nodal (U1, U2, W), dimensionless, of the press turned onto the x axis; shape (n_node, 3).
+        mesh: The mesh, where it lies under the press rotated onto the x axis.
+        field: Nodal (U1, U2, W), dimensionless, of the press rotated onto the x axis; shape (n_node, 3).
         groups: Dimensionless groups of the press.
         status: "converged" or "failed".
         message: One sentence.
@@ -105,11 +105,11 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
         strained += _bent_strain(equilibrium, surface, gradient @ node_slope(equilibrium)[element, :, :, 2])
     local = equilibrium.film.young * groups.amplitude2 * stress(strained, groups.poisson)
     local[mirrored, 2] *= -1.0
-    return turn_stress(local, np.arctan2(equilibrium.at[1], equilibrium.at[0]))
+    return rotate_stress(local, np.arctan2(equilibrium.at[1], equilibrium.at[0]))
 
 
 def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array:
-    """Scaled touch stress C : E' at the nodes of every element, the press turned onto the x axis.
+    """Scaled touch stress C : E' at the nodes of every element, the press rotated onto the x axis.
 
     Shape (n_element, n_local, 3): (S11, S22, S12) over E_young A^2; see `touch_stress` for the surface.
     """
@@ -156,5 +156,5 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
     if off.any():
         first = points[np.argmax(off)]
         raise SceneError(f"point ({first[0]:.4g}, {first[1]:.4g}) mm is off the film of radius {radius:.4g} mm")
-    turned = (points[:, 0] + 1j * points[:, 1]) * np.exp(-1j * np.arctan2(y, x))
-    return equilibrium.mesh.locate(turned / radius)
+    rotated = (points[:, 0] + 1j * points[:, 1]) * np.exp(-1j * np.arctan2(y, x))
+    return equilibrium.mesh.locate(rotated / radius)

@@ -94,7 +94,7 @@ def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
         except ValueError as error:
             raise DatasetError(f"the dataset's probe {str(name)!r}: {error}") from error
         turned = turned or (np.ptp(angles) > 0.0 and probe.period > 0.0)
-        probes.append(probe if np.ptp(angles) > 0.0 else probe.turned(float(np.deg2rad(angles[0]))))
+        probes.append(probe if np.ptp(angles) > 0.0 else probe.rotated(float(np.deg2rad(angles[0]))))
     return tuple(probes), bool(turned)
 
 
