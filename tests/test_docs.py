@@ -13,5 +13,5 @@ def test_docstrings_are_ready_for_the_reference():
     builder = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(builder)
     names = builder.modules()
-    assert {"isocharge.simulate.solver.newton", "isocharge.serve.frames.binary", "isocharge.cli"} <= set(names)
+    assert {"isocharge.simulate.solver.newton", "isocharge.serve.frames.binary", "isocharge.cli.main"} <= set(names)
     builder.check_docstrings(names)
