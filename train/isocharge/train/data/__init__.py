@@ -1,4 +1,1 @@
-"""What a network learns from: presses, contact domain, fitted charge field, examples of misfit.
-
-May import: nothing else of isocharge.train.
-"""
+"""What a network learns from: presses, the series fitted to their charges, examples of misfit."""

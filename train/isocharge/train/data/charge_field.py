@@ -1,4 +1,4 @@
-"""The forward map as a short series fitted to a dataset: what charges a contact gives, with derivatives, cheaply.
+"""The map from contacts to charges as a short series fitted to a dataset.
 
 Without pretension Q = F^(2/3) g(x, y) nearly, with g smooth, so ln Q is expanded in Chebyshev polynomials
 
@@ -9,7 +9,7 @@ linear least squares. Training needs it to find the contact nearest to any charg
 does without. A dataset of several probes gives their mean.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,8 +18,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import TrainingError
+from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.numerics.statistics import rms
-from isocharge.train.data.domain import ContactDomain
+from isocharge.train.data.presses import LabelledPresses
 
 CANDIDATES = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
 """Degrees tried in turn, in position and in force."""
@@ -43,42 +44,46 @@ GOOD_ENOUGH = 1.5e-4
 
 @dataclass(frozen=True)
 class ChargeField:
-    """Charges as a function of the contact.
+    """A `ChargeMap` fitted to presses.
 
     Attributes:
         domain: Where it holds.
+        electrodes: Names, in the order of the charges.
         series: Coefficients of ln Q (Q in pC), shape (degree + 1, degree + 1, force_degree + 1, n_electrode).
-        error: Root-mean-square relative error on samples that the fit did not see.
+        error: Root-mean-square relative error on presses that the fit did not see.
     """
 
-    domain: ContactDomain
+    domain: Domain
+    electrodes: tuple[str, ...]
     series: Array
     error: float
 
     @classmethod
-    def fit(cls, domain: ContactDomain, contact: Array, charge_pC: Array, held: tuple[Array, Array]) -> "ChargeField":
-        """Least squares on (contact, charge), the degree chosen on `held`.
+    def fit(
+        cls, domain: Domain, electrodes: tuple[str, ...], presses: LabelledPresses, held: LabelledPresses
+    ) -> "ChargeField":
+        """Least squares on presses, the degree chosen on others.
 
         Args:
             domain: Where the contacts lie.
-            contact: (x_mm, y_mm, force_N), shape (n, 3).
-            charge_pC: Clean charges, shape (n, n_electrode), all positive.
-            held: Contacts and charges to measure the error on.
+            electrodes: Names.
+            presses: Clean, all charges positive.
+            held: Presses to measure the error on.
 
         Raises:
-            TrainingError: If there are too few samples for the smallest degree.
+            TrainingError: If there are too few presses for the smallest degree.
         """
         best: ChargeField | None = None
-        unit, target = domain.to_unit(contact), np.log(charge_pC)
+        unit, target = domain.to_unit(presses.contact), np.log(presses.charge)
         for degree, force_degree in CANDIDATES:
             count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
             if FEWEST_PER_TERM * count > len(unit):
                 break
             rows = slice(0, ROWS_PER_TERM * count)
-            field = cls(domain, _least_squares(unit[rows], target[rows], degree, force_degree), np.inf)
-            error = rms(field.charge_pC(held[0]) / held[1] - 1.0)
+            field = cls(domain, electrodes, _least_squares(unit[rows], target[rows], degree, force_degree), np.inf)
+            error = rms(field.charges(held.contact) / held.charge - 1.0)
             if best is None or error < best.error:
-                best = cls(domain, field.series, error)
+                best = replace(field, error=error)
             if error < GOOD_ENOUGH:
                 break
         if best is None:
@@ -87,10 +92,19 @@ class ChargeField:
             )
         return best
 
-    def charge_pC(self, contact: Array) -> Array:
-        """Charges of contacts (x_mm, y_mm, force_N): shape (n, 3) to (n, n_electrode)."""
-        charge: Array = np.exp(self.log_charge(self.domain.to_unit(contact))[:, 0])
-        return charge
+    def charges(self, contact: Array) -> Array:
+        """See `ChargeMap`."""
+        return self.linearised(contact)[0]
+
+    def derivatives(self, contact: Array) -> Array:
+        """See `ChargeMap`."""
+        return self.linearised(contact)[1]
+
+    def linearised(self, contact: Array) -> tuple[Array, Array]:
+        """Charges and derivatives at once, in half the time; see `ChargeMap`."""
+        logs = self.log_charge(self.domain.to_unit(contact))
+        charge = np.exp(logs[:, 0])
+        return charge, charge[:, :, None] * logs[:, 1:].swapaxes(1, 2) / self.domain.scale
 
     def log_charge(self, unit: Array) -> Array:
         """ln Q and its derivatives by the unit coordinates: contacts (n, 3) in them to (n, 4, n_electrode)."""

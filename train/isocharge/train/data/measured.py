@@ -1,4 +1,4 @@
-"""Measured presses as training takes them: what counts as measured, as a dataset, and which presses are held out.
+"""Measured presses as training takes them: as a dataset, and which of them are held out.
 
 There is one split for all: a fifth of the positions, chosen by their coordinates alone. So a model that was trained on
 a file of presses is judged, by whatever command, on presses of the file that it never saw.
@@ -25,17 +25,9 @@ FEWEST_HELD = 10
 FEWEST_MEASURED = 50
 """Measured presses at least for a training or a report."""
 
-SOLVER = "solver"
-"""Entry of the manifest that every simulated dataset has, and no measured one."""
-
-
-def is_measured(dataset: Dataset) -> bool:
-    """Whether a dataset was measured: its manifest has no settings of a simulator."""
-    return SOLVER not in dataset.manifest
-
 
 def held_out(contact: Array) -> Booleans:
-    """Which measured presses are held out, shape (n,), from contacts (x_mm, y_mm, force_N), shape (n, 3).
+    """Which measured presses are held out, shape (n,), from contacts (x, y, F), shape (n, 3), mm and N.
 
     Presses at one position are held out together: neighbours in force would tell too much. The order in which positions
     are taken follows from their coordinates, so that it is the same in every part of the presses.

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
-from isocharge.train.data.nearest_contact import CANDIDATES, NearestField, nearest_in_field, search_field
-from isocharge.train.data.noise import with_noise
-from isocharge.train.data.presses import LabelledPresses
+from isocharge.simulate.measuring_chain.noise_file import noise_model
+from isocharge.train.data.nearest_contact import CANDIDATES, nearest_contact, search_contact
+from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
 """Kinds of charges, and the share of the examples that each makes up, dimensionless."""
@@ -24,22 +24,27 @@ FAR = 6.0
 """Distance above which a press's own place may not be the nearest: searched as the others are."""
 
 
+def misfit_noise(noise: NoiseModel) -> NoiseModel:
+    """The unit of the misfit: the training's noise, or `reference` where that is none."""
+    return noise if noise.white > 0.0 else noise_model("reference")
+
+
 @dataclass(frozen=True)
 class MisfitExamples:
     """Charges and how far from any known contact they are.
 
     Attributes:
-        charge_pC: Shape (n, n_electrode), pC.
-        miss: (Q - Q(c)) / sigma at the nearest known contact c, shape (n, n_electrode).
+        charge: Shape (n, n_electrode), pC.
+        residual: (Q - Q(c)) / sigma at the nearest known contact c, shape (n, n_electrode).
     """
 
-    charge_pC: Array
-    miss: Array
+    charge: Array
+    residual: Array
 
 
 def draw_misfit_examples(
     presses: LabelledPresses,
-    field: NearestField,
+    charge_map: ChargeMap,
     noise: NoiseModel,
     count: int,
     seed: int,
@@ -50,45 +55,40 @@ def draw_misfit_examples(
 
     Args:
         presses: To start from.
-        field: The forward map that says what is known.
+        charge_map: What is known.
         noise: Noise of good presses, and the unit of distance.
         count: How many.
         seed: Of all that is drawn.
         candidates: Contacts among which searches start.
     """
     rng = np.random.default_rng(seed)
-    rows = rng.integers(len(presses), size=count)
-    chosen = presses[rows]
+    chosen = presses[rng.integers(len(presses), size=count)]
     kinds = np.array(list(KINDS))[rng.choice(len(KINDS), size=count, p=list(KINDS.values()))]
-    charge = np.empty_like(chosen.charge_pC)
+    charge = np.empty_like(chosen.charge)
     for kind in KINDS:
-        charge[kinds == kind] = _DRAW[kind](rng, chosen.charge_pC[kinds == kind], presses.charge_pC, noise)
-    charge = np.clip(charge, LOWEST_PC, HIGHEST_PC)
-    return MisfitExamples(charge, _misses(field, charge, noise, chosen, np.isin(kinds, ("noisy", "moved")), candidates))
+        charge[kinds == kind] = _DRAW[kind](rng, chosen.charge[kinds == kind], presses.charge, noise)
+    charge = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
+    near = np.isin(kinds, ("noisy", "moved"))
+    return MisfitExamples(charge, _residuals(charge_map, charge, noise.sigma(charge), chosen, near, candidates))
 
 
-def _misses(
-    field: NearestField,
-    charge: Array,
-    noise: NoiseModel,
-    chosen: LabelledPresses,
-    near: np.ndarray,
-    candidates: int,
+def _residuals(
+    charge_map: ChargeMap, charge: Array, sigma: Array, chosen: LabelledPresses, near: Booleans, candidates: int
 ) -> Array:
-    """Those `near` their own press start there, and the field is shifted to be right there; the others search."""
-    miss, at = np.zeros_like(charge), np.flatnonzero(near)
-    start = field.domain.to_unit(chosen.contact[at])
-    shift = np.log(chosen.charge_pC[at]) - field.log_charge(start)[:, 0]
-    miss[at] = nearest_in_field(field, charge[at], noise, start, shift)[1]
-    far = np.flatnonzero(~near | (np.linalg.norm(np.where(near[:, None], miss, 0.0), axis=1) > FAR))
-    searched = search_field(field, charge[far], noise, candidates=candidates)[1]
-    keep = near[far] & ((miss[far] ** 2).sum(axis=1) < (searched**2).sum(axis=1))
-    miss[far] = np.where(keep[:, None], miss[far], searched)
-    return miss
+    """Those `near` their own press start there, with the map scaled to be right there; the others search."""
+    residual, at = np.zeros_like(charge), np.flatnonzero(near)
+    start = chosen.contact[at]
+    scale = chosen.charge[at] / charge_map.charges(start)
+    residual[at] = nearest_contact(charge_map, charge[at] / scale, sigma[at] / scale, start)[1]
+    far = np.flatnonzero(~near | (np.linalg.norm(residual, axis=1) > FAR))
+    searched = search_contact(charge_map, charge[far], sigma[far], candidates=candidates)[1]
+    keep = near[far] & ((residual[far] ** 2).sum(axis=1) < (searched**2).sum(axis=1))
+    residual[far] = np.where(keep[:, None], residual[far], searched)
+    return residual
 
 
 def _noisy_press(rng: np.random.Generator, charge: Array, _: Array, noise: NoiseModel) -> Array:
-    return with_noise(charge, noise, rng)
+    return noise.add(charge, rng)
 
 
 def _moved(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
@@ -126,7 +126,7 @@ def _two_presses(rng: np.random.Generator, charge: Array, others: Array, _: Nois
 
 def _uniform_in_logs(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
     """Between what counts as nothing and 10 nC, or what counts as most."""
-    decades = np.where(rng.random((len(charge), 1)) < 0.3, np.log10(HIGHEST_PC), 4.0)
+    decades = np.where(rng.random((len(charge), 1)) < 0.3, np.log10(HIGHEST_CHARGE), 4.0)
     drawn: Array = 10.0 ** (decades * rng.random(charge.shape))
     return drawn
 

@@ -1,18 +1,16 @@
-"""The known contact nearest to any charges: what the misfit measures, searched for on the fitted forward map.
+"""The contact nearest to any charges: what the misfit measures.
 
-min over contacts c of the domain of |(Q - Q(c)) / sigma|,   sigma of the measured charges Q.
+    min over contacts c of the domain of |(Q - Q(c)) / sigma|,   sigma of the charges Q.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.stats import qmc
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.numerics.disk_least_squares import minimise
-from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.noise import sigma_pC
 
 CANDIDATES = 4096
 """Contacts among which starts are chosen: spread over the domain, and a quarter as many along its rim."""
@@ -21,58 +19,56 @@ CHUNK = 2048
 """Charges compared with all candidates at once."""
 
 
-class NearestField(Protocol):
-    """The forward map that is searched: a `ChargeField`, or another with the same two members."""
+@runtime_checkable
+class LinearisedMap(ChargeMap, Protocol):
+    """A charge map that has charges and derivatives at once."""
 
-    @property
-    def domain(self) -> ContactDomain:
-        """Where contacts are searched for."""
-
-    def log_charge(self, unit: Array) -> Array:
-        """ln Q and its derivatives by the unit coordinates: contacts (n, 3) in them to (n, 4, n_electrode)."""
+    def linearised(self, contact: Array) -> tuple[Array, Array]:
+        """What `charges` and `derivatives` give."""
 
 
-def nearest_in_field(
-    field: NearestField, charge_pC: Array, noise: NoiseModel, start: Array, shift: Array | None = None
-) -> tuple[Array, Array]:
+def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
+    """Charges and derivatives of contacts; see `ChargeMap`."""
+    if isinstance(charge_map, LinearisedMap):
+        return charge_map.linearised(contact)
+    return charge_map.charges(contact), charge_map.derivatives(contact)
+
+
+def nearest_contact(charge_map: ChargeMap, charge: Array, sigma: Array, start: Array) -> tuple[Array, Array]:
     """The contact that descent from a start leads to.
 
     Args:
-        field: The forward map.
-        charge_pC: Charges, shape (n, n_electrode), pC.
-        noise: For the unit of distance.
-        start: Contacts in unit coordinates, shape (n, 3).
-        shift: Added to ln Q of the field, shape (n, n_electrode): what a press's own charges are away from it.
+        charge_map: What is known.
+        charge: Shape (n, n_electrode), pC.
+        sigma: The unit of distance, shape (n, n_electrode), pC.
+        start: Contacts (x, y, F), shape (n, 3), mm and N.
 
     Returns:
-        Unit coordinates (n, 3) and (Q - Q(c)) / sigma, (n, n_electrode).
+        Contacts within the map's domain, shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
-    sigma = sigma_pC(noise, charge_pC)
-    shift = np.zeros_like(charge_pC) if shift is None else shift
+    domain = charge_map.domain
 
     def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
-        logs = field.log_charge(unit)
-        relative = np.exp(logs[:, 0] + shift[rows]) / sigma[rows]
-        return charge_pC[rows] / sigma[rows] - relative, -relative[:, None, :] * logs[:, 1:]
+        known, slopes = linearised(charge_map, domain.to_contact(unit))
+        by_unit = slopes * domain.scale / sigma[rows][:, :, None]
+        return (charge[rows] - known) / sigma[rows], -by_unit.swapaxes(1, 2)
 
-    return minimise(residuals, start)
+    unit, residual = minimise(residuals, domain.to_unit(start))
+    return domain.to_contact(unit), residual
 
 
-def search_field(
-    field: NearestField, charge_pC: Array, noise: NoiseModel, starts: int = 2, candidates: int = CANDIDATES
+def search_contact(
+    charge_map: ChargeMap, charge: Array, sigma: Array, starts: int = 2, candidates: int = CANDIDATES
 ) -> tuple[Array, Array]:
-    """The nearest contact from the best few of many starts; arguments and result as `nearest_in_field`."""
-    spread = _spread(candidates)
-    charges = np.exp(field.log_charge(spread)[:, 0])
-    nearest = np.concatenate([_nearest_rows(some, charges, noise, starts) for some in _chunks(charge_pC)])
-    answers = [nearest_in_field(field, charge_pC, noise, spread[rows]) for rows in nearest.T]
-    squares = np.stack([(miss**2).sum(axis=1) for _, miss in answers])
-    best = squares.argmin(axis=0), np.arange(len(charge_pC))
-    return np.stack([unit for unit, _ in answers])[best], np.stack([miss for _, miss in answers])[best]
-
-
-def _chunks(charge_pC: Array) -> list[Array]:
-    return np.array_split(charge_pC, len(charge_pC) // CHUNK + 1)
+    """The nearest contact from the best few of many starts; arguments and result as `nearest_contact`."""
+    spread = charge_map.domain.to_contact(_spread(candidates))
+    known = charge_map.charges(spread)
+    chunks = range(0, max(len(charge), 1), CHUNK)
+    nearest = [_nearest_rows(charge[k : k + CHUNK], sigma[k : k + CHUNK], known, starts) for k in chunks]
+    answers = [nearest_contact(charge_map, charge, sigma, spread[rows]) for rows in np.concatenate(nearest).T]
+    squares = np.stack([(residual**2).sum(axis=1) for _, residual in answers])
+    best = squares.argmin(axis=0), np.arange(len(charge))
+    return np.stack([contact for contact, _ in answers])[best], np.stack([residual for _, residual in answers])[best]
 
 
 def _spread(count: int) -> Array:
@@ -83,9 +79,9 @@ def _spread(count: int) -> Array:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), 2.0 * sobol[:, 2] - 1.0], axis=1)
 
 
-def _nearest_rows(charge_pC: Array, known_pC: Array, noise: NoiseModel, count: int) -> Integers:
+def _nearest_rows(charge: Array, sigma: Array, known: Array, count: int) -> Integers:
     """Numbers of the nearest candidates, shape (n, count): |Q - K|^2 multiplied out, one matrix product each."""
-    weight = sigma_pC(noise, charge_pC) ** -2
-    square = weight @ (known_pC**2).T - 2.0 * (charge_pC * weight) @ known_pC.T
+    weight = sigma**-2.0
+    square = weight @ (known**2).T - 2.0 * (charge * weight) @ known.T
     rows: Integers = np.argpartition(square, count - 1, axis=1)[:, :count]
     return rows

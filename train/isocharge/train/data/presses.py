@@ -1,4 +1,5 @@
-"""Which samples train and which measure: split by position, so that no press is seen twice under another force."""
+"""Presses to learn from and presses to measure errors on, split by position: no press is seen twice under another force.
+"""
 
 from dataclasses import dataclass
 
@@ -7,7 +8,15 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError
 from isocharge.simulate.dataset.shards import Dataset, Samples
-from isocharge.train.data.domain import ContactDomain
+from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+
+LOWEST_CHARGE, HIGHEST_CHARGE = 1.0, 1e6
+"""Charges are brought between these, pC, before the logarithm: what is negative or absurd still gives a finite answer.
+"""
+
+SOLVER = "solver"
+"""Entry of the manifest that every simulated dataset has, and no measured one."""
 
 FEWEST = 500
 """Presses below which a fit makes no sense."""
@@ -18,29 +27,53 @@ FEWEST_POSITIONS = 50
 
 @dataclass(frozen=True)
 class LabelledPresses:
-    """Contacts and their clean charges.
+    """Contacts and their charges.
 
     Attributes:
-        contact: (x_mm, y_mm, force_N), shape (n, 3).
-        charge_pC: Shape (n, n_electrode).
+        contact: (x, y, F), shape (n, 3), mm and N.
+        charge: Shape (n, n_electrode), pC.
+        measured: Whether the charges were measured, so that they have noise of their own.
     """
 
     contact: Array
-    charge_pC: Array
+    charge: Array
+    measured: bool = False
 
     @classmethod
-    def of(cls, samples: Samples) -> "LabelledPresses":
-        """From a dataset's columns."""
-        return cls(np.stack([samples.x_mm, samples.y_mm, samples.force_N], axis=1), samples.charge_pC)
+    def of(cls, dataset: Dataset) -> "LabelledPresses":
+        """All presses of a dataset, unchecked."""
+        samples = dataset.samples
+        contact = np.stack([samples.x_mm, samples.y_mm, samples.force_N], axis=1)
+        return cls(contact, samples.charge_pC, is_measured(dataset))
 
     def __getitem__(self, rows: np.ndarray) -> "LabelledPresses":
-        return LabelledPresses(self.contact[rows], self.charge_pC[rows])
+        return LabelledPresses(self.contact[rows], self.charge[rows], self.measured)
 
     def __len__(self) -> int:
         return len(self.contact)
 
+    def within(self, radius: float) -> "LabelledPresses":
+        """Those up to a distance from the centre, mm."""
+        return self[np.hypot(self.contact[:, 0], self.contact[:, 1]) <= radius]
 
-def domain_of(dataset: Dataset) -> ContactDomain:
+    def noisy(self, noise: NoiseModel, seed: int) -> Array:
+        """The charges with noise added, shape (n, n_electrode), pC."""
+        return noise.add(self.charge, np.random.default_rng(seed))
+
+
+def is_measured(dataset: Dataset) -> bool:
+    """Whether a dataset was measured: its manifest has no settings of a simulator."""
+    return SOLVER not in dataset.manifest
+
+
+def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array:
+    """Contacts (x, y, F), shape (count, 3), mm and N: uniform over the disk, forces log-uniform."""
+    radius, angle = domain.radius * np.sqrt(rng.random(count)), 2.0 * np.pi * rng.random(count)
+    force = np.exp(rng.uniform(*np.log(domain.force_range), count))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), force], axis=1)
+
+
+def domain_of(dataset: Dataset) -> Domain:
     """The working area and forces that the dataset covers: as its manifest says, or else as its samples show.
 
     Raises:
@@ -58,7 +91,7 @@ def domain_of(dataset: Dataset) -> ContactDomain:
             f"manifest ranges: radius_mm {radius:g} and force_N [{low:g}, {high:g}] do not hold the samples, which "
             f"reach {reach:g} mm and {forces[0]:g} to {forces[1]:g} N"
         )
-    return ContactDomain(radius, (low, high))
+    return Domain(radius, (low, high))
 
 
 def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tuple[LabelledPresses, LabelledPresses]:
@@ -80,18 +113,13 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
         DatasetError: If the dataset has too few presses or positions, fewer than three electrodes, or numbers that are
             not finite or charges that are not positive.
     """
-    presses = LabelledPresses.of(dataset.samples)
-    _check(presses, fewest)
-    return presses
-
-
-def _check(presses: LabelledPresses, fewest: int) -> None:
-    finite = np.isfinite(presses.charge_pC).all(axis=1) & np.isfinite(presses.contact).all(axis=1)
+    presses = LabelledPresses.of(dataset)
+    finite = np.isfinite(presses.charge).all(axis=1) & np.isfinite(presses.contact).all(axis=1)
     if not finite.all():
         row = int(np.argmin(finite))
         raise DatasetError(
             f"sample {row}: expected finite numbers, got the contact {presses.contact[row].tolist()} (mm, mm, N) and "
-            f"{presses.charge_pC[row].tolist()} pC"
+            f"{presses.charge[row].tolist()} pC"
         )
     positions = len(np.unique(np.round(presses.contact[:, :2], 3), axis=0))
     if len(presses) < fewest or positions < min(fewest, FEWEST_POSITIONS):
@@ -99,17 +127,18 @@ def _check(presses: LabelledPresses, fewest: int) -> None:
             f"expected at least {fewest} presses at {min(fewest, FEWEST_POSITIONS)} positions, got {len(presses)} at "
             f"{positions}; sweep or measure more (from 50 measured presses on, train on a CSV file with --sensor)"
         )
-    if presses.charge_pC.shape[1] < 3:
+    if presses.charge.shape[1] < 3:
         raise DatasetError(
-            f"expected at least three electrodes to find x, y and force, got {presses.charge_pC.shape[1]}"
+            f"expected at least three electrodes to find x, y and force, got {presses.charge.shape[1]}"
         )
-    wrong = np.flatnonzero((presses.charge_pC <= 0.0).any(axis=1) | (presses.contact[:, 2] <= 0.0))
+    wrong = np.flatnonzero((presses.charge <= 0.0).any(axis=1) | (presses.contact[:, 2] <= 0.0))
     if wrong.size:
         row = int(wrong[0])
         raise DatasetError(
             f"sample {row}: expected positive force and charges (the features are logarithms), got "
-            f"{presses.contact[row, 2]:g} N and {presses.charge_pC[row].tolist()} pC"
+            f"{presses.contact[row, 2]:g} N and {presses.charge[row].tolist()} pC"
         )
+    return presses
 
 
 def position_error(contact: Array, truth: Array) -> Array:

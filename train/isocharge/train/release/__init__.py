@@ -1,4 +1,1 @@
-"""From a trained network to a model folder: ONNX graph, measured errors, card, golden vectors.
-
-May import: training, data.
-"""
+"""From a fitted network to a model folder: measured errors, ONNX graph, card, golden vectors."""

@@ -3,24 +3,23 @@
 from collections.abc import Mapping
 
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.simulate.measuring_chain.noise_file import noise_model
-from isocharge.train.data.noise import misfit_noise
-from isocharge.train.release.measured import HELD_PRESSES, MeasuredTest
-from isocharge.train.training.fit import Fit
+from isocharge.train.data.misfit_charges import misfit_noise
+from isocharge.train.release.evaluate import HELD_PRESSES
+from isocharge.train.training.fit import Fitted
 
 
-def model_card(metadata: ModelMetadata, fit: Fit, test: MeasuredTest | None = None) -> str:
-    """The text of `card.md`; `test` has the measured presses that the errors are of, if they are."""
-    if test is None:
-        errors, truth = _errors(metadata.errors, len(fit.held)), SIMULATED_TRUTH
+def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
+    """The text of `card.md`."""
+    if fitted.test.measured:
+        errors, truth = fitted.provenance.card + _measured_errors(metadata.errors), MEASURED_TRUTH
     else:
-        errors, truth = test.origin + _measured_errors(metadata.errors), MEASURED_TRUTH
-    cautions = "".join(f"- {caution}.\n" for caution in fit.cautions)
+        errors, truth = _errors(metadata.errors, len(fitted.test)), SIMULATED_TRUTH
+    cautions = "".join(f"- {caution}.\n" for caution in fitted.cautions)
     limits = f"## Limits\n\n{truth}{cautions}{LIMITS}"
-    return "\n".join([_interface(metadata, fit), errors, _misfit(metadata, fit, test), limits, _command(metadata)])
+    return "\n".join([_interface(metadata, fitted), errors, _misfit(metadata, fitted), limits, _command(metadata)])
 
 
-def _interface(metadata: ModelMetadata, fit: Fit) -> str:
+def _interface(metadata: ModelMetadata, fitted: Fitted) -> str:
     (low, high), noise = metadata.force_range_N, metadata.noise
     electrodes = ", ".join(metadata.electrodes)
     return f"""# {metadata.name}, version {metadata.version}
@@ -31,7 +30,7 @@ Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of o
 |---|---|
 | input | `charge_pC`, float32 [n, {len(metadata.electrodes)}], touch charges of {electrodes} in pC |
 | outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each), `misfit` |
-| working area | within {fit.network.domain.radius_mm:g} mm of the centre{_folded(fit)} |
+| working area | within {fitted.domain.radius:g} mm of the centre{_folded(fitted)} |
 | forces | {low:g} to {high:g} N |
 | probes | {", ".join(metadata.probes)}{_unknown_probe(metadata)} |
 | trained for the noise | {noise["name"]}: {noise["white_pC"]:g} pC and {100 * float(noise["gain"]):g} % |
@@ -75,12 +74,12 @@ errors.
 """
 
 
-def _misfit(metadata: ModelMetadata, fit: Fit, test: MeasuredTest | None) -> str:
-    errors = metadata.errors
-    good = "measured presses" if fit.measured else "good presses" if test is None else "simulated good presses"
+def _misfit(metadata: ModelMetadata, fitted: Fitted) -> str:
+    errors, simulated = metadata.errors, "simulated good presses" if fitted.test.measured else "good presses"
+    good = "measured presses" if fitted.good.measured else simulated
     rare = f",\n0.1 % exceed {errors['misfit_p999']:g}" if "misfit_p999" in errors else ""
     return f"""\
-The misfit is the distance, in units of the noise{_unit(fit)}, of the charges from the nearest single contact that the
+The misfit is the distance, in units of the noise{_unit(fitted)}, of the charges from the nearest single contact that the
 model knows; a network gives it, learned from exact searches. 1 % of {good} exceed {errors["misfit_p99"]:g}{rare}.
 {_what_misfit_sees(metadata)}
 """
@@ -118,20 +117,19 @@ def _taught(metadata: ModelMetadata) -> str:
     return f"\nA small network that learned the answers of `{teacher}`." if teacher else ""
 
 
-def _folded(fit: Fit) -> str:
-    if fit.asked == fit.network.domain:
+def _folded(fitted: Fitted) -> str:
+    if fitted.asked == fitted.domain:
         return ""
-    return f" (of {fit.asked.radius_mm:g} mm asked for: beyond, two contacts give the same charges)"
+    return f" (of {fitted.asked.radius:g} mm asked for: beyond, two contacts give the same charges)"
 
 
 def _unknown_probe(metadata: ModelMetadata) -> str:
     return "; which of them presses is not known to the model" if len(metadata.probes) > 1 else ""
 
 
-def _unit(fit: Fit) -> str:
-    noise = noise_model(fit.config.training.noise)
-    unit = misfit_noise(noise)
-    return "" if unit == noise else f" `{unit.name}` (1 pC and 0.2 %)"
+def _unit(fitted: Fitted) -> str:
+    unit = misfit_noise(fitted.noise)
+    return "" if unit == fitted.noise else f" `{unit.name}` (1 pC and 0.2 %)"
 
 
 def _what_misfit_sees(metadata: ModelMetadata) -> str:

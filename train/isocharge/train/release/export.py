@@ -1,8 +1,4 @@
-"""A folded network as an ONNX graph, written node by node from its weights: what the model needs and nothing else.
-
-A test compares the graph with `InverseNetwork.forward` on clean, noisy and
-absurd charges.
-"""
+"""A folded network as an ONNX graph, written node by node from its weights: what the model needs and nothing else."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,8 +9,8 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from isocharge.serve.model.session import OUTPUTS
-from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
-from isocharge.train.release.folding import FoldedLayers, FoldedNetwork
+from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
+from isocharge.train.training.folding import FoldedLayers, FoldedNetwork
 from isocharge.train.training.network import MISFIT_UNIT
 
 OPSET, IR_VERSION = 17, 8
@@ -52,7 +48,7 @@ def export_onnx(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
     """The model as an ONNX file.
 
     Args:
-        network: The model, folded (`release.folding`).
+        network: The model, folded (`training.folding`).
         properties: Metadata, written into `metadata_props`.
 
     Returns:
@@ -60,7 +56,7 @@ def export_onnx(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
         `misfit` [n, 1], all float32.
     """
     build, n_electrode = GraphBuilder(), network.typical.size
-    within = build.add("Clip", "charge_pC", build.constant(LOWEST_PC), build.constant(HIGHEST_PC))
+    within = build.add("Clip", "charge_pC", build.constant(LOWEST_CHARGE), build.constant(HIGHEST_CHARGE))
     ratios = build.add("Mul", within, build.constant(1.0 / network.typical))
     answers = add_layers(build, build.add("Log", ratios), network.layers)
     plane, logs, vector = build.split(answers, ("plane", "logs", "misfit_vector"), (2, 4, n_electrode), axis=1)

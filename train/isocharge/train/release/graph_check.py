@@ -6,16 +6,11 @@ from isocharge.common.arrays import Singles
 from isocharge.common.errors import TrainingError
 from isocharge.serve.model.session import open_session, run
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain
-from isocharge.train.data.noise import noisy_charges
-from isocharge.train.data.presses import LabelledPresses
+from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 from isocharge.train.release.evaluate import Predict
 
 GOLDEN = 64
 """Golden vectors per model: half clean, a quarter noisy, a quarter absurd."""
-
-CORNERS = 64
-"""Corners of the polygon that stands for a round working area."""
 
 AGREEMENT = {
     "contact": (np.array([1.0, 1.0, 0.1]), 1e-5),
@@ -50,21 +45,11 @@ def check_graph(graph: bytes, exact: Predict, presses: LabelledPresses, noise: N
         TrainingError: If an answer is not finite, or file and network disagree.
     """
     good, absurd = _golden_charges(exact, presses, noise)
-    _check_finite(graph, presses.charge_pC.shape[1])
+    _check_finite(graph, presses.charge.shape[1])
     _compare(graph, exact, absurd, ABSURD)
     rows = np.arange(COMPARED) % len(presses)
-    _compare(graph, exact, noisy_charges(presses[rows], noise, seed=3).astype(np.float32), 1.0)
+    _compare(graph, exact, presses[rows].noisy(noise, seed=3).astype(np.float32), 1.0)
     return np.concatenate([good, absurd])
-
-
-def disk_polygon(domain: ContactDomain) -> tuple[tuple[float, float], ...]:
-    """The working area as a polygon that just contains the disk."""
-    angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
-    radius = domain.radius_mm / np.cos(np.pi / CORNERS)
-    return tuple(
-        (round(float(x), 4), round(float(y), 4))
-        for x, y in zip(radius * np.cos(angle), radius * np.sin(angle), strict=True)
-    )
 
 
 def _golden_charges(exact: Predict, presses: LabelledPresses, noise: NoiseModel) -> tuple[Singles, Singles]:
@@ -73,14 +58,14 @@ def _golden_charges(exact: Predict, presses: LabelledPresses, noise: NoiseModel)
     They are chosen where charges tell the position better than the median: where 0.2 % is a millimetre, the last digit
     of a float32 is 3e-5 mm, and no two runtimes agree to the tolerance of golden vectors.
     """
-    std = exact(presses.charge_pC)[1]
+    std = exact(presses.charge)[1]
     sure = presses[np.flatnonzero(std[:, 0] + std[:, 1] <= np.median(std[:, 0] + std[:, 1]))]
     clean = sure[np.linspace(0, len(sure) - 1, GOLDEN // 2).astype(int)]
     half = clean[np.arange(0, len(clean), 2)]
-    noisy = noisy_charges(half, noise, seed=2)
-    absurd = half.charge_pC * np.geomspace(1e-3, 1e3, len(half))[:, None]
+    noisy = half.noisy(noise, seed=2)
+    absurd = half.charge * np.geomspace(1e-3, 1e3, len(half))[:, None]
     absurd[0], absurd[1] = 0.0, -absurd[1]
-    return np.concatenate([clean.charge_pC, noisy]).astype(np.float32), absurd.astype(np.float32)
+    return np.concatenate([clean.charge, noisy]).astype(np.float32), absurd.astype(np.float32)
 
 
 def _check_finite(graph: bytes, n_electrode: int) -> None:
@@ -89,7 +74,7 @@ def _check_finite(graph: bytes, n_electrode: int) -> None:
     Raises:
         TrainingError: If one does not.
     """
-    ends = np.random.default_rng(4).choice([LOWEST_PC, HIGHEST_PC], (COMPARED, n_electrode)).astype(np.float32)
+    ends = np.random.default_rng(4).choice([LOWEST_CHARGE, HIGHEST_CHARGE], (COMPARED, n_electrode)).astype(np.float32)
     for name, rows in run(open_session(graph, "the exported graph"), ends).items():
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if bad.size:
@@ -99,10 +84,10 @@ def _check_finite(graph: bytes, n_electrode: int) -> None:
             )
 
 
-def _compare(graph: bytes, exact: Predict, charge_pC: Singles, slack: float) -> None:
+def _compare(graph: bytes, exact: Predict, charge: Singles, slack: float) -> None:
     """The file must answer as the network does."""
-    answers = run(open_session(graph, "the exported graph"), charge_pC)
-    for mine, (name, theirs) in zip(exact(charge_pC.astype(float)), answers.items(), strict=True):
+    answers = run(open_session(graph, "the exported graph"), charge)
+    for mine, (name, theirs) in zip(exact(charge.astype(float)), answers.items(), strict=True):
         unit, limit = AGREEMENT[name]
         apart = np.max(np.abs(mine - theirs) / np.maximum(np.abs(mine), unit), axis=1)
         nearly_all, all_of_them = float(np.quantile(apart, NEARLY_ALL)), float(apart.max())

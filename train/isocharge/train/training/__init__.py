@@ -1,4 +1,1 @@
-"""The network and how it is trained: configuration, optimisers, checkpoint.
-
-May import: data.
-"""
+"""The network and how it is fitted: configuration, optimisers, fit."""

@@ -1,44 +1,41 @@
-"""Training: a dataset in, a trained `InverseNetwork` out.
+"""Fit a network: presses in, an object that answers charges out.
 
 The contact network learns mean and standard deviation by maximum likelihood on charges with fresh noise in every step;
-the first steps learn the mean by least squares, because a likelihood with free deviations is slow to find it. Without
-noise Levenberg-Marquardt finishes the mean. The misfit network learns from charges of all kinds, whose distance from
-the nearest known contact is searched for beforehand.
-
-With a teacher the contact network learns the teacher's answers to those charges instead of the presses.
+the first steps learn the mean by least squares, because a likelihood with free deviations is slow to find it. With a
+teacher it learns the teacher's answers to those charges instead. The misfit network learns from charges of all kinds,
+whose distance from the nearest known contact is searched for beforehand.
 """
 
-import warnings
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from importlib import metadata
 
 import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
+from isocharge.common.arrays import Array
 from isocharge.common.errors import ConfigError, DatasetError
-from isocharge.common.progress import StageProgress, Warn
+from isocharge.common.resumable_run import ResumableRun
 from isocharge.simulate.dataset.shards import Dataset
+from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.measuring_chain.noise_file import noise_model
+from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.train.data.charge_field import ChargeField
-from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.fold_free import SMALLEST_SHARE, fold_free_domain, probable_fold_mm, twins_within
-from isocharge.train.data.measured import held_out, is_measured
-from isocharge.train.data.misfit_charges import MisfitExamples, draw_misfit_examples
-from isocharge.train.data.noise import misfit_noise, noisy_charges
-from isocharge.train.data.presses import LabelledPresses, domain_of, presses_of, split_by_position
-from isocharge.train.training.checkpoint import Checkpoint
+from isocharge.train.data.fold_free import SMALLEST_SHARE, ambiguous_pairs, fold_free_domain, probable_fold
+from isocharge.train.data.measured import held_out
+from isocharge.train.data.misfit_charges import MisfitExamples, draw_misfit_examples, misfit_noise
+from isocharge.train.data.presses import LabelledPresses, split_by_position
 from isocharge.train.training.config import FitConfig, TrainingConfig
-from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.levenberg_marquardt import FIRST, levenberg_marquardt
-from isocharge.train.training.misfit_data import WATCHED, MisfitData
-from isocharge.train.training.network import Features, InverseNetwork, Perceptron
-from isocharge.train.training.teacher import Teacher, teaching_loss
+from isocharge.train.training.descent import Descent, TrainingStage, tensor_bytes, tensors
+from isocharge.train.training.folding import FoldedNetwork, fold_network
+from isocharge.train.training.network import Features, InverseNetwork, Perceptron, compress_length
+from isocharge.train.training.source import Provenance, Teacher, TrainingData
+
+_log = logging.getLogger(__name__)
 
 WARM_UP = 0.15
 """Length of the first stage, which learns the mean by least squares, over all steps, dimensionless."""
@@ -46,133 +43,186 @@ WARM_UP = 0.15
 SETTLING = 0.25
 """Steps that the other weights are trained on for, once the hidden ones are rounded, over those before."""
 
+WATCHED = 0.5
+"""Ratio of the positions that are watched while a network trains to those that are held out."""
 
-@dataclass(frozen=True)
-class Fit:
-    """A trained model and what it was not shown.
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted:
+    """A fitted network, and what it is for.
 
     Attributes:
-        network: The model.
-        field: The forward map that the misfit was learned with.
-        held: Presses held out for measuring errors.
-        config: What it was trained with.
-        asked: The domain of the dataset; larger than the network's where the map folds.
-        measured: Whether the presses were measured, so that their charges have noise already.
-        cautions: What the user of the model should know, a sentence each.
+        network: The network as plain layers in NumPy.
+        sensor: The sensor whose charges it takes.
+        probes: Notations of the probes.
+        domain: The contacts that it knows.
+        noise: Noise that it was trained for.
+        test: Presses that it is judged by; it did not learn from them.
+        good: Presses of which 1 % may have a misfit above the alarm's.
+        sha256: Checksum of what it was fitted to.
+        provenance: For the release.
+        asked: The domain that was asked for; larger than the network's where the map folds.
+        cautions: What users of the network should know, a sentence each.
     """
 
-    network: InverseNetwork
-    field: ChargeField
-    held: LabelledPresses
-    config: FitConfig
-    asked: ContactDomain
-    measured: bool = False
+    network: FoldedNetwork
+    sensor: Sensor
+    probes: tuple[str, ...]
+    domain: Domain
+    noise: NoiseModel
+    test: LabelledPresses
+    good: LabelledPresses
+    sha256: str
+    provenance: Provenance
+    asked: Domain
     cautions: tuple[str, ...] = ()
 
+    def predict(self, charge: Array) -> tuple[Array, Array, Array]:
+        """Charges (n, n_electrode), pC, to contact (n, 3), mm and N, standard deviations (n, 3), and misfit (n, 1)."""
+        return self.network.predict(charge)
 
-def fit_network(
-    dataset: Dataset,
-    config: FitConfig,
-    progress: StageProgress | None = None,
-    *,
-    checkpoint: Checkpoint | None = None,
-    teacher: Teacher | None = None,
-    warn: Warn = warnings.warn,
-) -> Fit:
-    """Train on a dataset.
+
+def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run: ResumableRun | None = None) -> Fitted:
+    """Fit a network to presses.
 
     Args:
-        dataset: Clean charges, to which noise is added here; or measured ones, to which it is added as well while
-            training, against learning them by heart, and not to those held out.
-        config: Sizes, steps, seed.
-        progress: Called with steps done, all steps, and a text with the loss and errors on watched presses.
-        checkpoint: Keeps the state, so that a stopped run goes on.
-        teacher: A model whose answers are learned; the presses' contacts if absent.
-        warn: Called where the map folds, and where contacts far apart have the same charges.
+        source: A dataset, simulated or measured, or other training data: of a student, or of presses on a rig.
+        config: Sizes, steps, noise and seed; the defaults if absent.
+        run: Keeps the state, so that a killed fit goes on.
 
     Raises:
-        ConfigError: If the noise level is unknown.
-        DatasetError: If the dataset cannot train an inverse.
+        ConfigError: If a setting is out of its range, or for another number of electrodes.
+        DatasetError: If the presses cannot train an inverse.
         TrainingError: If the loss is not finite.
+
+    Warns the logger of this module where the map folds, and where contacts far apart have the same charges.
     """
-    training, cautions = config.training, list[str]()
-    noise_model(training.noise)  # an unknown level is said before the work
-    asked, presses = domain_of(dataset), presses_of(dataset)
-    _check_electrodes(dataset, config)
-    with threads_and_seed(training.threads, training.seed):
-        domain, presses = _without_folds(asked, presses, training, cautions.append)
-        for caution in cautions:
-            warn(caution)
-        trainable, held = _split(presses, training, is_measured(dataset))
+    data = source if isinstance(source, TrainingData) else TrainingData.of(source)
+    settings = (config or FitConfig()).checked()
+    trained = train_network(data, settings, run=run)
+    split, taught = trained.split, data.teacher
+    made_with = {
+        "config": settings.to_dict(),
+        "torch": torch.__version__,
+        **({"cautions": list(split.cautions)} if split.cautions else {}),
+        **({"teacher": taught.label} if taught else {}),
+        **data.provenance.made_with,
+    }
+    return Fitted(
+        network=fold_network(trained.network),
+        sensor=data.sensor,
+        probes=data.probes,
+        domain=split.domain,
+        noise=settings.training.noise_model,
+        test=split.held if data.test is None else data.test,
+        good=data.presses.within(split.domain.radius) if data.presses.measured else split.held,
+        sha256=data.sha256,
+        provenance=replace(data.provenance, made_with=made_with),
+        asked=data.domain,
+        cautions=split.cautions,
+    )
+
+
+def fit_identity(data: TrainingData, config: FitConfig) -> dict[str, object]:
+    """All that decides about the weights: the identity of a resumable run."""
+    return {
+        "dataset_sha256": data.sha256,
+        "noise": config.training.noise_model.to_dict(),
+        "config": config.to_dict(),
+        "isocharge": metadata.version("isocharge"),
+        "torch": torch.__version__,
+        **({"teacher_sha256": data.teacher.sha256} if data.teacher else {}),
+    }
+
+
+@dataclass(frozen=True)
+class Split:
+    """Presses for their purposes, where the map can be inverted.
+
+    Attributes:
+        domain: The contacts that the network will know.
+        train: To learn from.
+        watched: To stop by.
+        held: To measure errors on.
+        field: The map from contacts to charges.
+        cautions: About folds and ambiguous pairs, a sentence each.
+    """
+
+    domain: Domain
+    train: LabelledPresses
+    watched: LabelledPresses
+    held: LabelledPresses
+    field: ChargeField
+    cautions: tuple[str, ...]
+
+    @classmethod
+    def of(cls, data: TrainingData, training: TrainingConfig) -> "Split":
+        """Split presses by position, within the largest disk in which the map certainly does not fold."""
+        presses, names = data.presses, data.sensor.electrode_names
+        first = ChargeField.fit(data.domain, names, *split_by_position(presses, training.hold_out, training.seed))
+        domain, cautions = _without_folds(first, presses, misfit_noise(training.noise_model))
+        inside = presses if domain == data.domain else presses.within(domain.radius)
+        if presses.measured:
+            out = held_out(inside.contact)
+            trainable, held = inside[~out], inside[out]
+        else:
+            trainable, held = split_by_position(inside, training.hold_out, training.seed)
         train, watched = split_by_position(trainable, WATCHED * training.hold_out, training.seed + 1)
-        field = _field(domain, train, watched)
-        network = InverseNetwork(
-            domain, Features.fit(train.charge_pC), config.network.hidden, config.network.misfit_hidden
+        return cls(domain, train, watched, held, ChargeField.fit(domain, names, train, watched), tuple(cautions))
+
+
+def _without_folds(field: ChargeField, presses: LabelledPresses, noise: NoiseModel) -> tuple[Domain, list[str]]:
+    """The largest disk in which the map certainly does not fold, and sentences on what is known about it."""
+    asked, domain = field.domain, fold_free_domain(field, noise)
+    if domain.radius < SMALLEST_SHARE * asked.radius:
+        raise DatasetError(
+            f"the map from contacts to charges folds {domain.radius:g} mm from the centre, of {asked.radius:g} "
+            "mm asked for: beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
         )
-        _Training(network, field, train, watched, config, checkpoint or Checkpoint(), teacher, progress).run()
-    network.eval()
-    return Fit(network, field, held, config, asked, is_measured(dataset), tuple(cautions))
+    cautions = []
+    if domain != asked:
+        cautions.append(
+            f"the map from contacts to charges folds beyond {domain.radius:g} mm: two contacts give the same charges "
+            f"there; the model is trained for {domain.radius:g} mm, not {asked.radius:g} mm, on "
+            f"{len(presses.within(domain.radius))} of {len(presses)} presses"
+        )
+    elif np.isfinite(fold := probable_fold(field, noise)):
+        return domain, [
+            f"the map from contacts to charges seems to fold about {fold:.2g} mm from the centre, where two "
+            "contacts give the same charges; the presses cannot tell it for certain, and the model is trained "
+            f"across it, up to {asked.radius:g} mm; see 'isocharge simulate identify', then ask for a smaller "
+            "radius or add an electrode"
+        ]
+    if pairs := ambiguous_pairs(field, noise, domain.radius).summary:
+        which = "no model tells which of them it is; see 'isocharge simulate identify'"
+        cautions.append(f"{pairs[0].lower()}{pairs[1:-1]}; {which}")
+    return domain, cautions
 
 
-def _split(
-    presses: LabelledPresses, training: TrainingConfig, measured: bool
-) -> tuple[LabelledPresses, LabelledPresses]:
-    """Presses to train on, and those held out."""
-    if not measured:
-        return split_by_position(presses, training.hold_out, training.seed)
-    held = held_out(presses.contact)
-    return presses[~held], presses[held]
+@dataclass(frozen=True)
+class TrainedNetwork:
+    """A network as torch trained it, and the presses that it learned from."""
+
+    network: InverseNetwork
+    split: Split
 
 
-def _field(domain: ContactDomain, train: LabelledPresses, watched: LabelledPresses) -> ChargeField:
-    return ChargeField.fit(domain, train.contact, train.charge_pC, (watched.contact, watched.charge_pC))
-
-
-def _check_electrodes(dataset: Dataset, config: FitConfig) -> None:
-    names, expected = dataset.sensor.electrode_names, config.network.electrodes
+def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | None = None) -> TrainedNetwork:
+    """Train both perceptrons; arguments and errors as `fit`."""
+    names, expected, training = data.sensor.electrode_names, config.network.electrodes, config.training
     if expected and expected != len(names):
         raise ConfigError(
             f"network.electrodes: the configuration is for {expected} electrodes, the dataset of "
-            f"{dataset.sensor.name!r} has {len(names)} ({', '.join(names)}); use another dataset or leave the key out"
+            f"{data.sensor.name!r} has {len(names)} ({', '.join(names)}); use another dataset or leave the key out"
         )
-
-
-def _without_folds(
-    asked: ContactDomain, presses: LabelledPresses, training: TrainingConfig, warn: Warn
-) -> tuple[ContactDomain, LabelledPresses]:
-    """The largest disk in which the map certainly does not fold, and the presses in it."""
-    field = _field(asked, *split_by_position(presses, training.hold_out, training.seed))
-    noise = misfit_noise(noise_model(training.noise))
-    domain = fold_free_domain(field, noise)
-    if domain == asked:
-        if np.isfinite(fold_mm := probable_fold_mm(field, noise)):
-            warn(
-                f"the map from contacts to charges seems to fold about {fold_mm:.2g} mm from the centre, where two "
-                f"contacts give the same charges; the presses cannot tell it for certain, and the model is trained "
-                f"across it, up to {asked.radius_mm:g} mm; see 'isocharge simulate identify', then ask for a smaller "
-                "radius or add an electrode"
-            )
-        else:
-            _warn_of_twins(field, noise, asked, warn)
-        return asked, presses
-    if domain.radius_mm < SMALLEST_SHARE * asked.radius_mm:
-        raise DatasetError(
-            f"the map from contacts to charges folds {domain.radius_mm:g} mm from the centre, of {asked.radius_mm:g} "
-            "mm asked for: beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
-        )
-    inside = presses[np.hypot(presses.contact[:, 0], presses.contact[:, 1]) <= domain.radius_mm]
-    warn(
-        f"the map from contacts to charges folds beyond {domain.radius_mm:g} mm: two contacts give the same charges "
-        f"there; the model is trained for {domain.radius_mm:g} mm, not {asked.radius_mm:g} mm, on {len(inside)} of "
-        f"{len(presses)} presses"
-    )
-    _warn_of_twins(field, noise, domain, warn)
-    return domain, inside
-
-
-def _warn_of_twins(field: ChargeField, noise: NoiseModel, domain: ContactDomain, warn: Warn) -> None:
-    if twins := twins_within(field, noise, domain.radius_mm).words:
-        warn(f"{twins[0].lower()}{twins[1:-1]}; no model tells which of them it is; see 'isocharge simulate identify'")
+    with threads_and_seed(training.threads, training.seed):
+        split = Split.of(data, training)
+        for caution in split.cautions:
+            _log.warning("%s", caution)
+        features, sizes = Features.fit(split.train.charge), config.network
+        network = InverseNetwork(split.domain, features, sizes.hidden, sizes.misfit_hidden)
+        _Training(network, split, config, data.teacher, run).run()
+    return TrainedNetwork(network.eval(), split)
 
 
 @contextmanager
@@ -192,82 +242,60 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
 
 
 class _Training:
-    """One run: data as tensors, and the stages one after the other."""
+    """One training: data as tensors, and the stages one after the other."""
 
     def __init__(
         self,
         network: InverseNetwork,
-        field: ChargeField,
-        train: LabelledPresses,
-        watched: LabelledPresses,
+        split: Split,
         settings: FitConfig,
-        checkpoint: Checkpoint,
         teacher: Teacher | None,
-        progress: StageProgress | None,
+        run: ResumableRun | None,
     ) -> None:
-        self.network, self.field, self.train, self.watched = network, field, train, watched
+        self.network, self.split, self.teacher, self.resumable = network, split, teacher, run
         self.config, self.rounded = settings.training, settings.network.weights == "int8"
-        self.checkpoint, self.teacher, self.progress = checkpoint, teacher, progress
-        config = self.config
-        self.noise = noise_model(config.noise)
-        self.charge = torch.tensor(train.charge_pC).float()
-        self.unit = torch.tensor(field.domain.to_unit(train.contact)).float()
-        self.watched_charge = torch.tensor(noisy_charges(watched, self.noise, config.seed)).float()
-        self.watched_unit = torch.tensor(field.domain.to_unit(watched.contact)).float()
-        self.total = sum(map(self._steps, (config.steps, config.misfit_steps))) + config.finish_steps
-
-    def _steps(self, steps: int) -> int:
-        """All steps of a stage, those after rounding included."""
-        return steps + round(SETTLING * steps) * self.rounded
+        self.noise, self.warm_up = self.config.noise_model, round(WARM_UP * self.config.steps)
+        to_unit = split.domain.to_unit
+        self.charge = torch.tensor(split.train.charge).float()
+        self.unit = torch.tensor(to_unit(split.train.contact)).float()
+        self.watched_charge = torch.tensor(split.watched.noisy(self.noise, self.config.seed)).float()
+        self.watched_unit = torch.tensor(to_unit(split.watched.contact)).float()
 
     def run(self) -> None:
-        config = self.config
-        contact = TrainingStage(
-            "contact",
-            self.network.contact,
-            self._contact_loss,
-            self._contact_score,
-            config.steps,
-            round(WARM_UP * config.steps),
+        contact, config = self.network.contact, self.config
+        stage = TrainingStage(
+            "contact", contact, self._contact_loss, self._contact_score, config.steps, warm_up_steps=self.warm_up
         )
-        self._train_part(contact, self.network.contact, 0)
-        if config.finish_steps:
-            self._finish()
-        data = MisfitData.of(self.network, self._misfit_examples(), config)
-        misfit = TrainingStage("misfit", self.network.misfit_vector, data.loss, data.score, config.misfit_steps)
-        self._train_part(misfit, self.network.misfit_vector, self._steps(config.steps) + config.finish_steps)
+        self._train_part(stage, contact)
+        examples, vector = self._misfit_examples(), self.network.misfit_vector
+        data = _MisfitData.of(self.network, examples, config)
+        self._train_part(TrainingStage("misfit", vector, data.loss, data.score, config.misfit_steps), vector)
 
-    def _train_part(self, task: TrainingStage, part: Perceptron, before: int) -> None:
+    def _train_part(self, stage: TrainingStage, part: Perceptron) -> None:
         """Train a perceptron; where weights are rounded, round its hidden ones and train the others on."""
-        self._descend(task, before)
+        self._descend(stage)
         if self.rounded:
             part.round_hidden()
             settling = replace(
-                task,
-                name=f"{task.name}-rounded",
-                loss=lambda step, random: task.loss(task.steps + step, random),
-                steps=round(SETTLING * task.steps),
+                stage,
+                name=f"{stage.name}-rounded",
+                loss=lambda step, random: stage.loss(stage.steps + step, random),
+                steps=round(SETTLING * stage.steps),
                 warm_up_steps=0,
             )
-            self._descend(settling, before + task.steps)
+            self._descend(settling)
 
-    def _descend(self, task: TrainingStage, before: int) -> None:
-        descent = Descent(task, self.config.learning_rate, self.config.patience, self.config.seed)
-        descent.run(self.checkpoint, lambda step, text: self._report(before + step, text))
-
-    def _report(self, done: int, text: str) -> None:
-        if self.progress:
-            self.progress(done, self.total, text)
+    def _descend(self, stage: TrainingStage) -> None:
+        Descent(stage, self.config.learning_rate, self.config.patience, self.config.seed).run(self.resumable)
 
     def _contact_loss(self, step: int, random: torch.Generator) -> Tensor:
         rows = torch.randint(len(self.charge), (min(self.config.batch, len(self.charge)),), generator=random)
-        charge_pC = with_fresh_noise(self.charge[rows], self.noise, random)
-        mean, log_std = self.network.posterior(charge_pC)
-        warm_up = step < round(WARM_UP * self.config.steps)
+        charge = with_fresh_noise(self.charge[rows], self.noise, random)
+        mean, log_std = self.network.posterior(charge)
         if self.teacher is None:
-            return (start_loss if warm_up else likelihood_loss)(mean, log_std, self.unit[rows])
-        taught = self.teacher.posterior(charge_pC, self.network.domain)
-        return start_loss(mean, log_std, taught[0]) if warm_up else teaching_loss(mean, log_std, *taught)
+            return (start_loss if step < self.warm_up else likelihood_loss)(mean, log_std, self.unit[rows])
+        taught = self.teacher.posterior(charge, self.network.domain)
+        return start_loss(mean, log_std, taught[0]) if step < self.warm_up else teaching_loss(mean, log_std, *taught)
 
     def _contact_score(self) -> tuple[float, str]:
         with torch.no_grad():
@@ -277,57 +305,52 @@ class _Training:
         position, force = off[:, :2].sum(dim=1).mean().sqrt().item(), off[:, 2].mean().sqrt().item()
         return loss, f"{loss:.3f} on watched presses: {position:.4f} mm and {100.0 * force:.3f} % of force rms"
 
-    def _finish(self) -> None:
-        """Levenberg-Marquardt for the mean in double precision; the deviations are then those of watched presses."""
-        part = self.network.contact.double()
-        inputs, targets = self.network.inputs(self.charge).double(), self.unit.double()
-        state = self.checkpoint.load("finish") or {"step": 0, "damping": FIRST, "part": part.state_dict()}
-        part.load_state_dict(state["part"])
-        step = state["step"]
-        left = self.config.finish_steps - step
-        for square, damping in levenberg_marquardt(part, inputs, targets, left, state["damping"]):
-            step += 1
-            state = {"step": step, "damping": damping, "part": part.state_dict()}
-            self.checkpoint.save("finish", partial(_as_it_is, state))
-            self._report(self.config.steps + step, f"finish: {square:.3g}, {self._mean_off()}")
-        self.checkpoint.save("finish", lambda: {**state, "step": self.config.finish_steps}, now=True)
-        self._constant_deviations()
-        part.float()
-
-    def _mean_off(self) -> str:
-        with torch.no_grad():
-            mean = self.network.contact(self.network.inputs(self.watched_charge).double())[:, :3]
-            off = ((mean - self.watched_unit) * self.network.scale).double() ** 2
-        return f"{off[:, :2].sum(dim=1).mean().sqrt():.5f} mm and {100.0 * off[:, 2].mean().sqrt():.4f} % of force rms"
-
-    def _constant_deviations(self) -> None:
-        """Root-mean-square errors of the watched presses as the deviations, whatever the charges."""
-        last, skip = self.network.contact.layers()[-1], self.network.contact.skip
-        with torch.no_grad():
-            off = self.network.contact(self.network.inputs(self.watched_charge).double())[:, :3] - self.watched_unit
-            last.weight[3:] = skip.weight[3:] = 0.0
-            last.bias[3:] = 0.5 * (off**2).mean(dim=0).log()
-
     def _misfit_examples(self) -> MisfitExamples:
-        """Examples from the checkpoint, or drawn: the search for their nearest contacts takes long enough to store."""
-        if (stored := self.checkpoint.load("charges")) is not None:
-            return MisfitExamples(*(stored[name].numpy() for name in ("charge_pC", "miss")))
-        examples = draw_misfit_examples(
-            self.train, self.field, misfit_noise(self.noise), self.config.misfit_charges, self.config.seed
-        )
-        self.checkpoint.save(
-            "charges", lambda: {name: torch.tensor(getattr(examples, name)) for name in ("charge_pC", "miss")}, now=True
-        )
+        """Examples that the run kept, or drawn: the search for their nearest contacts takes long enough to keep."""
+        if self.resumable and (kept := self.resumable.load_as("misfit-charges", tensors)) is not None:
+            return MisfitExamples(*(values.numpy() for values in kept))
+        config, noise = self.config, misfit_noise(self.noise)
+        examples = draw_misfit_examples(self.split.train, self.split.field, noise, config.misfit_charges, config.seed)
+        if self.resumable:
+            kept = [torch.tensor(examples.charge), torch.tensor(examples.residual)]
+            self.resumable.save("misfit-charges", tensor_bytes(kept))
         return examples
 
 
-def _as_it_is(state: dict[str, Any]) -> dict[str, Any]:
-    return state
+@dataclass(frozen=True)
+class _MisfitData:
+    """The misfit network's data: inputs and compressed vectors, the last `watched` of them not trained on."""
+
+    network: InverseNetwork
+    inputs: Tensor
+    targets: Tensor
+    watched: int
+    batch: int
+
+    @classmethod
+    def of(cls, network: InverseNetwork, examples: MisfitExamples, config: TrainingConfig) -> "_MisfitData":
+        inputs = network.inputs(torch.tensor(examples.charge).float())
+        watched = round(WATCHED * config.hold_out * len(inputs))
+        return cls(network, inputs, compress_length(torch.tensor(examples.residual)).float(), watched, config.batch)
+
+    def loss(self, _: int, random: torch.Generator) -> Tensor:
+        rows = torch.randint(len(self.inputs) - self.watched, (self.batch,), generator=random)
+        return self._squares(self.inputs[rows], self.targets[rows]).mean()
+
+    def score(self) -> tuple[float, str]:
+        with torch.no_grad():
+            mean = self._squares(self.inputs[-self.watched :], self.targets[-self.watched :]).mean().item()
+        return mean, f"{mean:.4f} on watched charges"
+
+    def _squares(self, inputs: Tensor, targets: Tensor) -> Tensor:
+        squares: Tensor = ((self.network.misfit_vector(inputs) - targets) ** 2).sum(dim=1)
+        return squares
 
 
-def with_fresh_noise(charge_pC: Tensor, noise: NoiseModel, random: torch.Generator) -> Tensor:
-    sigma = torch.hypot(torch.tensor(1e12 * noise.white), noise.gain * charge_pC)
-    return charge_pC + sigma * torch.randn(charge_pC.shape, generator=random)
+def with_fresh_noise(charge: Tensor, noise: NoiseModel, random: torch.Generator) -> Tensor:
+    """Noisy readings of charges of any shape, pC."""
+    sigma = torch.hypot(torch.tensor(noise.white), noise.gain * charge)
+    return charge + sigma * torch.randn(charge.shape, generator=random)
 
 
 def start_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:
@@ -340,3 +363,9 @@ def start_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:
 def likelihood_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:
     """Negative logarithm of a Gaussian likelihood, but for a constant."""
     return (log_std + 0.5 * ((mean - unit) * torch.exp(-log_std)) ** 2).sum(dim=1).mean()
+
+
+def teaching_loss(mean: Tensor, log_std: Tensor, taught_mean: Tensor, taught_log_std: Tensor) -> Tensor:
+    """Kullback-Leibler divergence of a network's Gaussians from the teacher's, summed over (x, y, ln F)."""
+    squares = torch.exp(2.0 * taught_log_std) + (mean - taught_mean) ** 2
+    return (log_std - taught_log_std + 0.5 * (squares * torch.exp(-2.0 * log_std) - 1.0)).sum(dim=1).mean()

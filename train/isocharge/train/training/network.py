@@ -1,4 +1,4 @@
-"""The inverse: charges in; contact, standard deviations and misfit out. The torch twin of the exported graph.
+"""The inverse in torch: charges in; contact, standard deviations and misfit out.
 
 Features are whitened logarithms of the charges: a force multiplies all charges nearly alike, so ratios carry the
 position and the common factor the force. One perceptron gives mean and log standard deviation of (x, y, ln F). A second
@@ -19,7 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from isocharge.common.arrays import Array
-from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain
+from isocharge.simulate.forward.charge_map import Domain
+from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 
 MISFIT_UNIT = 5.0
 """Standard deviations up to which the misfit is learned about linearly; beyond, its logarithm is."""
@@ -44,9 +45,9 @@ class Features:
     matrix: Array
 
     @classmethod
-    def fit(cls, charge_pC: Array) -> "Features":
+    def fit(cls, charge: Array) -> "Features":
         """From clean charges, shape (n, n_electrode): zero mean, unit covariance along the principal axes."""
-        within = np.clip(charge_pC, LOWEST_PC, HIGHEST_PC)
+        within = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
         typical = 2.0 ** np.round(np.log2(within).mean(axis=0))
         logs = np.log(within / typical)
         mean = logs.mean(axis=0)
@@ -117,7 +118,7 @@ class InverseNetwork(nn.Module):
     whitening: Tensor
 
     def __init__(
-        self, domain: ContactDomain, features: Features, hidden: tuple[int, ...], misfit_hidden: tuple[int, ...]
+        self, domain: Domain, features: Features, hidden: tuple[int, ...], misfit_hidden: tuple[int, ...]
     ) -> None:
         super().__init__()
         n_electrode = features.typical.size
@@ -133,28 +134,28 @@ class InverseNetwork(nn.Module):
         ):
             self.register_buffer(name, torch.tensor(values).float())
 
-    def inputs(self, charge_pC: Tensor) -> Tensor:
+    def inputs(self, charge: Tensor) -> Tensor:
         """What both perceptrons see, finite for any charges (n, n_electrode), pC."""
-        logs = torch.log(charge_pC.clamp(LOWEST_PC, HIGHEST_PC) / self.typical)
+        logs = torch.log(charge.clamp(LOWEST_CHARGE, HIGHEST_CHARGE) / self.typical)
         return (logs - self.logs_mean) @ self.whitening
 
-    def posterior(self, charge_pC: Tensor) -> tuple[Tensor, Tensor]:
+    def posterior(self, charge: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation of the unit coordinates, each (n, 3)."""
-        out = self.contact(self.inputs(charge_pC))
+        out = self.contact(self.inputs(charge))
         return out[:, :3], out[:, 3:]
 
-    def forward(self, charge_pC: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
-        mean, log_std = self.posterior(charge_pC)
+        mean, log_std = self.posterior(charge)
         value, std = mean * self.scale + self.centre, torch.exp(log_std) * self.scale
         force = torch.exp(value[:, 2:])
         contact = torch.cat([value[:, :2], force], dim=1)
         contact_std = torch.cat([std[:, :2], std[:, 2:] * force], dim=1)
-        length = torch.linalg.vector_norm(self.misfit_vector(self.inputs(charge_pC)), dim=1, keepdim=True)
+        length = torch.linalg.vector_norm(self.misfit_vector(self.inputs(charge)), dim=1, keepdim=True)
         return contact, contact_std, MISFIT_UNIT * torch.sinh(length)
 
 
-def compress_length(miss: Tensor) -> Tensor:
-    """What the misfit network learns: `miss`, shape (n, n_electrode), its length brought to asinh(length / unit)."""
-    length: Tensor = torch.linalg.vector_norm(miss, dim=1, keepdim=True)
-    return miss * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=1e-9))
+def compress_length(residual: Tensor) -> Tensor:
+    """What the misfit network learns: residuals (..., n_electrode), their lengths brought to asinh(length / unit)."""
+    length: Tensor = torch.linalg.vector_norm(residual, dim=-1, keepdim=True)
+    return residual * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=1e-9))

@@ -12,7 +12,8 @@ from scipy.linalg import block_diag
 from torch import nn
 
 from isocharge.common.arrays import Array
-from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC, ContactDomain
+from isocharge.simulate.forward.charge_map import Domain
+from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 from isocharge.train.training.network import MISFIT_UNIT, InverseNetwork, Perceptron
 
 Layer = tuple[Array, Array]
@@ -94,9 +95,9 @@ class FoldedNetwork:
     layers: FoldedLayers
     typical: Array
 
-    def predict(self, charge_pC: Array) -> tuple[Array, Array, Array]:
+    def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
-        answers = self.layers.answers(np.log(np.clip(charge_pC, LOWEST_PC, HIGHEST_PC) / self.typical))
+        answers = self.layers.answers(np.log(np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE) / self.typical))
         contact = np.concatenate([answers[:, :2], np.exp(answers[:, 2:3])], axis=1)
         length = np.linalg.norm(answers[:, 6:], axis=1, keepdims=True)
         return contact, np.exp(answers[:, 3:6]), MISFIT_UNIT * np.sinh(length)
@@ -118,20 +119,20 @@ def fold_network(network: InverseNetwork) -> FoldedNetwork:
     return FoldedNetwork(FoldedLayers.of(perceptrons, whitening, mean, units), network.features.typical)
 
 
-def answer_units(domain: ContactDomain, turn: Array, offset: Array, n_electrode: int) -> Layer:
+def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer:
     """Matrix and shift from outputs of the perceptrons to answers.
 
     A force's deviation is relative to the force, so its logarithm adds ln F.
 
     Args:
         domain: Centre and scale of the unit coordinates.
-        turn: Matrix T, shape (3, 3), of the unit coordinates T u + o, u what the network gives.
+        rotation: Matrix T, shape (3, 3), of the unit coordinates T u + o, u what the network gives.
         offset: The vector o, shape (3,).
         n_electrode: Width of the misfit vector.
     """
     scale, shift = domain.scale, np.zeros(6 + n_electrode)
     matrix = np.eye(6 + n_electrode)
-    matrix[:3, :3] = turn.T * scale
+    matrix[:3, :3] = rotation.T * scale
     shift[:3], shift[3:6] = offset * scale + domain.centre, np.log(scale)
     matrix[:3, 5] = matrix[:3, 2]
     shift[5] += shift[2]

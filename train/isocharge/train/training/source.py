@@ -1,0 +1,94 @@
+"""What a network is fitted to: simulated presses, measured ones, or the answers of another model."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from isocharge.common.arrays import Array
+from isocharge.simulate.dataset.shards import Dataset
+from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.train.data.presses import LabelledPresses, domain_of, presses_of
+
+
+@dataclass(frozen=True)
+class Teacher:
+    """A model whose answers a smaller one learns.
+
+    A press says where it was, but not what its noisy charges tell; the answer of a good model is that, without the
+    scatter of single presses. So a small network learns faster from answers than from presses (Hinton et al. 2015).
+
+    Attributes:
+        label: Its name and version.
+        sha256: Of its file.
+        answer: Charges (n, n_electrode), pC, to contact (n, 3), mm and N, and standard deviations (n, 3).
+    """
+
+    label: str
+    sha256: str
+    answer: Callable[[Array], tuple[Array, Array]]
+
+    def posterior(self, charge: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
+        """Mean and log standard deviation of the domain's unit coordinates, each (n, 3)."""
+        contact, std = self.answer(charge.double().numpy())
+        relative = np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]]) / domain.scale
+        return torch.tensor(domain.to_unit(contact)).float(), torch.tensor(np.log(relative)).float()
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a released model says about its origin, beside what every model says.
+
+    Attributes:
+        card: A section for the card, in Markdown.
+        made_with: Entries for the metadata.
+        files: More files for the version folder, by name.
+    """
+
+    card: str = ""
+    made_with: Mapping[str, object] = field(default_factory=dict)
+    files: Mapping[str, bytes] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingData:
+    """What one network is fitted to, and what it is judged by.
+
+    Attributes:
+        sensor: What was pressed.
+        probes: Notations of the probes that pressed.
+        domain: The contacts that the network shall know; it knows fewer where the map folds.
+        presses: Simulated ones are clean, and noise is added while training. To measured ones it is added as well,
+            against learning them by heart.
+        sha256: Checksum of the presses.
+        test: Measured presses to judge by; by default a part of `presses` is held out.
+        teacher: A model whose answers are learned; by default the contacts of the presses are.
+        provenance: For the release.
+    """
+
+    sensor: Sensor
+    probes: tuple[str, ...]
+    domain: Domain
+    presses: LabelledPresses
+    sha256: str
+    test: LabelledPresses | None = None
+    teacher: Teacher | None = None
+    provenance: Provenance = Provenance()
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> "TrainingData":
+        """A dataset, simulated or measured.
+
+        Raises:
+            DatasetError: If it cannot train an inverse.
+        """
+        return cls(
+            sensor=dataset.sensor,
+            probes=tuple(sorted({str(probe) for probe in dataset.samples.probe})),
+            domain=domain_of(dataset),
+            presses=presses_of(dataset),
+            sha256=dataset.sha256,
+        )
