@@ -15,7 +15,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.forward.charge_map import ChargeMap, Domain
 from isocharge.simulate.forward.checks import check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
@@ -150,6 +150,16 @@ class ChargeSpline:
     def slopes(self, position: Array) -> Array:
         """Derivatives of `terms` by x and y, shape (n, n_term, n_electrode, 2), 1/mm."""
         return np.stack([self.table(position, nu=nu) for nu in ((1, 0), (0, 1))], axis=-1)
+
+
+def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
+    """A forward map as splines, which takes seconds; any other map as it is."""
+    return ChargeSpline.of(charge_map) if isinstance(charge_map, ForwardMap) else charge_map
+
+
+def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
+    """A forward map as splines, which takes seconds; any other map as it is."""
+    return ChargeSpline.of(charge_map) if isinstance(charge_map, ForwardMap) else charge_map
 
 
 def _force_nodes(forward_map: ForwardMap) -> Array:

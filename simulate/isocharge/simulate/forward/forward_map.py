@@ -1,8 +1,8 @@
 """The forward map: charges for many presses from a few solves.
 
 Presses of one probe form a family in distance from the centre, force and, unless the probe is round, orientation; the
-angle of the position only rotates it. Seen from the probe, the stress at the nodes of the template is a smooth function of all of
-them. It is solved on Chebyshev nodes in distance and the force's logarithm and on evenly spread orientations,
+angle of the position is a rotation. Seen from the probe, the stress at the template's nodes is a smooth function of all
+of them. It is solved on Chebyshev nodes in distance and the force's logarithm and on evenly spread orientations,
 interpolated as a field, and the charge is integrated from the interpolated field again for every press: exact for the
 position of the electrode, also with the probe on it. Building a map compares it with direct solves.
 """

@@ -11,6 +11,7 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.common.json_values import finite_or_none
 from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.checks import check_determined
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
@@ -19,7 +20,6 @@ from isocharge.simulate.identifiability.working_area import (
     ERROR,
     Bound,
     WorkingArea,
-    with_fast_derivatives,
     working_area,
 )
 from isocharge.simulate.measuring_chain.noise import NoiseModel

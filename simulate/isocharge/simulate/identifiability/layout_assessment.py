@@ -12,11 +12,12 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.charge_map import ChargeMap, within
+from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.checks import check_determined, check_forces, check_radius
 from isocharge.simulate.identifiability.ambiguous_pairs import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import Nuisance, limits_at
 from isocharge.simulate.identifiability.folds import find_folds
-from isocharge.simulate.identifiability.working_area import ERROR, with_fast_derivatives
+from isocharge.simulate.identifiability.working_area import ERROR
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings, square_grid
 

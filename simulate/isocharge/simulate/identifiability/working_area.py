@@ -7,9 +7,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap
-from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.checks import check_determined
-from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.ambiguous_pairs import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import find_folds
@@ -83,11 +82,6 @@ class WorkingArea:
         if self.bound == "search":
             parts.append(f"The search ended at {self.searched:.3g} mm.")
         return " ".join(parts)
-
-
-def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
-    """A forward map as splines, which takes seconds; any other map as it is."""
-    return ChargeSpline.of(charge_map) if isinstance(charge_map, ForwardMap) else charge_map
 
 
 def working_area(
