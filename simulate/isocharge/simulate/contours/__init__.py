@@ -1,4 +1,1 @@
-"""Isocharge contours and triangulation: from the field, and graphically as the paper does.
-
-May import: forward, sensor, numerics.
-"""
+"""Isocharge contours and triangulation: from the field, and graphically as the paper does."""

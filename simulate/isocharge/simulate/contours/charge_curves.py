@@ -6,19 +6,17 @@ to the charge along each line; `graphical_method` draws contours through their r
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.polynomial import Polynomial
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError
-from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.sensor.sensor import Sensor, electrode_index
 
-STEP, LENGTH, ANGLE_STEP, HALF_ANGLE = 4e-3, 20e-3, np.deg2rad(10.0), np.deg2rad(70.0)
-"""Distance between presses on a line, m; length of the lines, m; angle between lines, rad; largest angle to both
+STEP, LENGTH, ANGLE_STEP, HALF_ANGLE = 4.0, 20.0, np.deg2rad(10.0), np.deg2rad(70.0)
+"""Distance between presses on a line, mm; length of the lines, mm; angle between lines, rad; largest angle to both
 sides of the film's centre, rad. Step and angle are the paper's, the others our choice."""
 
 MOST_PRESSES = 100_000
@@ -31,9 +29,9 @@ class Mapping:
 
     Attributes:
         electrode: Name of the electrode that the lines leave from.
-        origin: Its centre (x, y), m.
+        origin: Its centre (x, y), mm.
         angle: Angle of each line from the drawn direction, anticlockwise, shape (n_line,), rad.
-        distance: Distances of the presses from the origin, ascending, the same on each line, shape (n_step,), m.
+        distance: Distances of the presses from the origin, ascending, the same on each line, shape (n_step,), mm.
     """
 
     electrode: str
@@ -58,8 +56,8 @@ class Mapping:
             electrode: Name of the electrode that the lines leave from.
             angles: First and last angle, rad; HALF_ANGLE to both sides of the film's centre if absent.
             angle_step: Angle between lines, rad.
-            step: Distance between presses on a line, and of the first from the electrode's centre, m.
-            length: Length of the lines, m.
+            step: Distance between presses on a line, and of the first from the electrode's centre, mm.
+            length: Length of the lines, mm.
 
         Raises:
             SensorError: If there is no such electrode.
@@ -76,14 +74,14 @@ class Mapping:
 
     @property
     def points(self) -> Array:
-        """Positions (x, y) of the presses, shape (n_line, n_step, 2), m."""
+        """Positions (x, y) of the presses, shape (n_line, n_step, 2), mm."""
         direction = np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
         points: Array = np.array(self.origin) + self.distance[None, :, None] * direction[:, None]
         return points
 
     @property
-    def reach(self) -> float:
-        """Distance of the farthest press from the film's centre, m; a forward map must cover it."""
+    def radius(self) -> float:
+        """Distance of the farthest press from the film's centre, mm: the domain that a charge map needs."""
         return float(np.linalg.norm(self.points, axis=-1).max())
 
     def finer(self, count: int) -> "Mapping":
@@ -98,9 +96,7 @@ def _check_lines(first: float, last: float, angle_step: float, step: float, leng
     if not (np.isfinite(angle_step) and angle_step > 0.0):
         raise SceneError(f"step of the angle: expected a positive number, got {np.rad2deg(angle_step):g} degrees")
     if not (np.isfinite([step, length]).all() and 0.0 < step <= length):
-        raise SceneError(
-            f"expected 0 < step <= length, got a step of {step * 1e3:g} mm and lines of {length * 1e3:g} mm"
-        )
+        raise SceneError(f"expected 0 < step <= length, got a step of {step:g} mm and lines of {length:g} mm")
     presses = ((last - first) / angle_step + 2.0) * length / step
     if presses > MOST_PRESSES:
         raise SceneError(f"expected at most {MOST_PRESSES} presses on the lines, got {presses:.3g}; take larger steps")
@@ -113,56 +109,35 @@ class Curves:
     Attributes:
         mapping: Where the presses are.
         electrodes: Names, in the order of the charges.
-        probe: The footprint.
         force: Force of each press, N.
-        charge: Touch charges, shape (n_line, n_step, n_electrode), C.
+        charge: Touch charges, shape (n_line, n_step, n_electrode), pC.
     """
 
     mapping: Mapping
     electrodes: tuple[str, ...]
-    probe: Probe
     force: float
     charge: Array
 
     @classmethod
-    def of(cls, forward_map: ForwardMap, mapping: Mapping, force: float) -> "Curves":
-        """Charges of a forward map on the lines.
+    def of(cls, charge_map: ChargeMap, mapping: Mapping, force: float) -> "Curves":
+        """Charges of a map on the lines.
 
         Raises:
             SceneError: If the map does not cover a press or the force.
         """
         points = mapping.points
-        x, y = points.reshape(-1, 2).T
-        charge = forward_map.forward(x, y, np.full(x.size, force)).reshape(*points.shape[:2], -1)
-        return cls(mapping, forward_map.electrode_names, forward_map.probe, force, charge)
+        at = points.reshape(-1, 2)
+        charge = charge_map.charges(np.column_stack([at, np.full(len(at), force)]))
+        return cls(mapping, charge_map.electrodes, force, charge.reshape(*points.shape[:2], -1))
 
     @property
     def own(self) -> Array:
-        """Charge of the electrode that the lines leave from, shape (n_line, n_step), C."""
+        """Charge of the electrode that the lines leave from, shape (n_line, n_step), pC."""
         charge: Array = self.charge[..., self.electrodes.index(self.mapping.electrode)]
         return charge
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON, in degrees, mm, pC and N."""
-        lines = zip(self.mapping.angle, self.mapping.points, self.charge, strict=True)
-        return {
-            "electrode": self.mapping.electrode,
-            "probe": self.probe.notation,
-            "force_N": self.force,
-            "lines": [
-                {
-                    "angle_deg": float(np.rad2deg(angle)),
-                    "distance_mm": (1e3 * self.mapping.distance).tolist(),
-                    "x_mm": (1e3 * points[:, 0]).tolist(),
-                    "y_mm": (1e3 * points[:, 1]).tolist(),
-                    "charge_pC": dict(zip(self.electrodes, (1e12 * charge.T).tolist(), strict=True)),
-                }
-                for angle, points, charge in lines
-            ],
-        }
-
     def polynomials(self, degree: int) -> Sequence[Polynomial]:
-        """The paper's fit: charge (C) of the mapping's electrode as a polynomial of the distance (m) on each line.
+        """The paper's fit: charge (pC) of the mapping's electrode as a polynomial of the distance (mm) on each line.
 
         Raises:
             SceneError: If a line has fewer presses than the polynomial has coefficients.

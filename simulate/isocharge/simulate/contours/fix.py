@@ -2,22 +2,21 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Integers
-from isocharge.common.errors import SensorError
+from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.errors import SceneError, SensorError
 
-TOLERANCE = 1e-3
-"""Largest distance of three crossings from their mean at which the contours count as meeting there, m."""
+TOLERANCE = 1.0
+"""Largest distance of three crossings from their mean at which the contours count as meeting there, mm."""
 
-APART = 0.2e-3
-"""Smallest distance between two meetings, m: nearer ones count as one."""
+APART = 0.2
+"""Smallest distance between two meetings, mm: nearer ones count as one."""
 
-AMBIGUOUS, RESOLVED = 2.0, 1e-5
+AMBIGUOUS, RESOLVED = 2.0, 0.01
 """A second meeting makes a fix ambiguous if its spread is at most AMBIGUOUS times that of the first (dimensionless), or
-below RESOLVED, m."""
+below RESOLVED, mm."""
 
 
 class Meeting(IntEnum):
@@ -29,12 +28,12 @@ class Meeting(IntEnum):
     twice = 3
 
     @property
-    def words(self) -> str:
+    def summary(self) -> str:
         """One sentence."""
         return {
             Meeting.met: "the contours meet",
-            Meeting.no_contour: "a charge that no contour reaches at this force, within the radius",
-            Meeting.apart: "the contours have no intersection: they do not meet within the tolerance",
+            Meeting.no_contour: "no press within the radius gives one of the charges",
+            Meeting.apart: "the contours do not meet within the tolerance",
             Meeting.twice: "the contours meet twice: two positions fit about as well",
         }[self]
 
@@ -44,40 +43,33 @@ class Fix:
     """Positions of presses; NaN for those without one, and `status` says why.
 
     Attributes:
-        x: Shape (n,), m.
-        y: Shape (n,), m.
-        force: Known or estimated, shape (n,), N.
+        contact: (x, y, F), shape (n, 3), mm and N; the force as it was given, or estimated.
         spread: Largest distance of a crossing from the mean of its triple, or, with the force unknown, root mean square
-            distance of the contours from the position; shape (n,), m.
+            distance of the contours from the position; shape (n,), mm.
         status: A `Meeting` for each press, shape (n,).
         triples: How many triples of electrodes the position is the average of; 0 with the force unknown; shape (n,).
     """
 
-    x: Array
-    y: Array
-    force: Array
+    contact: Array
     spread: Array
     status: Integers
     triples: Integers
 
     @property
-    def found(self) -> np.ndarray:
+    def found(self) -> Booleans:
         """Whether each press has a position, shape (n,)."""
-        found: np.ndarray = self.status == Meeting.met
+        found: Booleans = self.status == Meeting.met
         return found
 
-    def to_dict(self, press: int) -> dict[str, Any]:
-        """The fix of one press, for JSON; without a position `at_mm` is None."""
-        status = Meeting(int(self.status[press]))
-        position = [1e3 * float(self.x[press]), 1e3 * float(self.y[press])] if status is Meeting.met else None
-        return {"status": status.name, "words": status.words, "at_mm": position}
 
-
-def check_electrodes(electrode_names: tuple[str, ...]) -> None:
+def check_triangulation(electrodes: tuple[str, ...], tolerance: float) -> None:
     """Refuse fewer than three electrodes: two contours cross wherever they cross, nothing tells which crossing it is.
 
     Raises:
         SensorError: If there are fewer than three.
+        SceneError: If the tolerance (mm) is not positive.
     """
-    if len(electrode_names) < 3:
-        raise SensorError(f"triangulation needs at least three electrodes, got {electrode_names}")
+    if len(electrodes) < 3:
+        raise SensorError(f"triangulation needs at least three electrodes, got {electrodes}")
+    if not (np.isfinite(tolerance) and tolerance > 0.0):
+        raise SceneError(f"tolerance: expected a positive length, got {tolerance} mm")

@@ -11,18 +11,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, product
-from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.contours.charge_curves import Curves
-from isocharge.simulate.contours.fix import AMBIGUOUS, APART, TOLERANCE, Fix, Meeting, check_electrodes
+from isocharge.simulate.contours.fix import AMBIGUOUS, APART, TOLERANCE, Fix, Meeting, check_triangulation
 from isocharge.simulate.forward.checks import as_charges
 
 DEGREE = 4
 """Degree of the polynomial along a line: our choice, since lower degrees miss the charge near the electrode."""
+
+NOWHERE = np.full(2, np.nan)
+"""Position of a press whose contours do not meet."""
 
 PER_SPAN = 8
 """Number of chords of each span of the spline, on which crossings are located before they are refined."""
@@ -34,8 +36,8 @@ class DrawnContour:
 
     Attributes:
         electrode: Name of the electrode.
-        charge: Its charge on the contour, C.
-        knots: Roots on the lines, in the order of their angle, shape (n, 2), m; n >= 2.
+        charge: Its charge on the contour, pC.
+        knots: Roots on the lines, in the order of their angle, shape (n, 2), mm; n >= 2.
     """
 
     electrode: str
@@ -44,7 +46,7 @@ class DrawnContour:
 
     @property
     def points(self) -> Array:
-        """Points along the spline, shape (n, 2), m."""
+        """Points along the spline, shape (n, 2), mm."""
         points: Array = self._spline(self._parameters)
         return points
 
@@ -61,7 +63,7 @@ class DrawnContour:
         return parameters
 
     def crossings(self, other: "DrawnContour") -> Array:
-        """Positions where two contours cross, shape (n, 2), m."""
+        """Positions where two contours cross, shape (n, 2), mm."""
         starts = _chord_crossings(self.points, other.points)
         mine, theirs = self._parameters, other._parameters
         crossings = []
@@ -92,7 +94,7 @@ def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnCo
 
     Args:
         curves: Charges along the lines of a mapping.
-        charge: Charge on the contour, C.
+        charge: Charge on the contour, pC.
         degree: Degree of the polynomial along each line.
 
     Raises:
@@ -106,28 +108,8 @@ def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnCo
     return DrawnContour(mapping.electrode, charge, knots) if len(knots) > 1 else None
 
 
-def drawn_to_dicts(
-    charges: Map[str, Sequence[float]], contours: Map[str, Sequence[DrawnContour | None]]
-) -> list[dict[str, Any]]:
-    """Drawn contours for JSON, in mm and pC; `points_mm` is None where no contour could be drawn.
-
-    Args:
-        charges: Charges of each electrode, C.
-        contours: The contour of each of these charges, from `draw_contour`.
-    """
-    return [
-        {
-            "electrode": name,
-            "charge_pC": 1e12 * charge,
-            "points_mm": None if contour is None else (1e3 * contour.knots).tolist(),
-        }
-        for name in charges
-        for charge, contour in zip(charges[name], contours[name], strict=True)
-    ]
-
-
 def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) -> float:
-    """Smallest distance at which a line's polynomial has the charge, m; NaN if it has it nowhere.
+    """Smallest distance at which a line's polynomial has the charge, mm; NaN if it has it nowhere.
 
     Distances from half of the first press's count.
     """
@@ -144,7 +126,7 @@ class DrawnTriangulation:
     Attributes:
         curves: One set for each electrode, each from that electrode, in the order of the charges.
         degree: Degree of the polynomials.
-        tolerance: Largest distance of three crossings from their mean at which contours meet, m.
+        tolerance: Largest distance of three crossings from their mean at which contours meet, mm.
     """
 
     curves: Sequence[Curves]
@@ -152,46 +134,44 @@ class DrawnTriangulation:
     tolerance: float = TOLERANCE
 
     def __post_init__(self) -> None:
-        check_electrodes(self.electrode_names)
+        check_triangulation(self.electrodes, self.tolerance)
 
     @property
-    def electrode_names(self) -> tuple[str, ...]:
+    def electrodes(self) -> tuple[str, ...]:
         """Names of the electrodes, in the order of the charges."""
         return tuple(curves.mapping.electrode for curves in self.curves)
 
     def contours(self, charge: Array) -> tuple[DrawnContour | None, ...]:
-        """The contour of each charge, shape (n_electrode,), C."""
+        """The contour of each charge, shape (n_electrode,), pC."""
         return tuple(draw_contour(c, float(q), self.degree) for c, q in zip(self.curves, charge, strict=True))
 
     def locate(self, charge: Array) -> Fix:
         """Positions of presses; their force must be that of the curves.
 
         Args:
-            charge: Touch charges, shape (n, n_electrode), C.
+            charge: Touch charges, shape (n, n_electrode), pC.
 
         Raises:
             ChargeError: If the charges are not finite or not one for each electrode.
         """
-        charge = as_charges(charge, self.electrode_names)
-        fixes = [self._locate_one(row) for row in charge]
-        x, y, spread, status, triples = (np.array(column) for column in zip(*fixes, strict=True))
-        force = np.full(len(charge), self.curves[0].force)
-        return Fix(x, y, force, spread, status.astype(np.intp), triples.astype(np.intp))
+        charge = as_charges(charge, self.electrodes)
+        rows = [self._locate_one(row) for row in charge]
+        at, spread, status, triples = (np.array([row[i] for row in rows]) for i in range(4))
+        contact = np.column_stack([at.reshape(-1, 2), np.full(len(charge), self.curves[0].force)])
+        return Fix(contact, spread, status.astype(np.intp), triples.astype(np.intp))
 
-    def _locate_one(self, charge: Array) -> tuple[float, float, float, int, int]:
-        drawn = self.contours(charge)
-        if any(contour is None for contour in drawn):
-            return np.nan, np.nan, np.nan, int(Meeting.no_contour), 0
-        contours = [contour for contour in drawn if contour is not None]
+    def _locate_one(self, charge: Array) -> tuple[Array, float, Meeting, int]:
+        """Position, spread, whether the contours meet, and the number of triples that do."""
+        contours = [contour for contour in self.contours(charge) if contour is not None]
+        if len(contours) < len(charge):
+            return NOWHERE, np.nan, Meeting.no_contour, 0
         pairs = {(i, j): contours[i].crossings(contours[j]) for i, j in combinations(range(len(contours)), 2)}
         met = [self._meeting(pairs, triple) for triple in combinations(range(len(contours)), 3)]
-        means = [mean for mean, _, status in met if status is Meeting.met]
-        if not means:
+        good = [(mean, spread) for mean, spread, status in met if status is Meeting.met]
+        if not good:
             twice = any(status is Meeting.twice for _, _, status in met)
-            return np.nan, np.nan, np.nan, int(Meeting.twice if twice else Meeting.apart), 0
-        x, y = np.mean(means, axis=0)
-        spread = max(spread for _, spread, status in met if status is Meeting.met)
-        return float(x), float(y), spread, int(Meeting.met), len(means)
+            return NOWHERE, np.nan, Meeting.twice if twice else Meeting.apart, 0
+        return np.mean([mean for mean, _ in good], axis=0), max(spread for _, spread in good), Meeting.met, len(good)
 
     def _meeting(self, pairs: Map[tuple[int, int], Array], triple: tuple[int, ...]) -> tuple[Array, float, Meeting]:
         """Mean and spread of the crossings of three contours that lie together most closely."""
@@ -200,9 +180,9 @@ class DrawnTriangulation:
         spreads = [float(np.linalg.norm(c - m, axis=1).max()) for c, m in zip(corners, means, strict=True)]
         order = np.argsort(spreads)
         if not spreads or spreads[order[0]] > self.tolerance:
-            return np.full(2, np.nan), np.nan, Meeting.apart
+            return NOWHERE, np.nan, Meeting.apart
         best = order[0]
         rivals = [i for i in order[1:] if np.linalg.norm(means[i] - means[best]) > APART]
         if rivals and spreads[rivals[0]] <= AMBIGUOUS * spreads[best]:
-            return np.full(2, np.nan), np.nan, Meeting.twice
+            return NOWHERE, np.nan, Meeting.twice
         return means[best], spreads[best], Meeting.met
