@@ -157,11 +157,6 @@ def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
     return ChargeSpline.of(charge_map) if isinstance(charge_map, ForwardMap) else charge_map
 
 
-def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
-    """A forward map as splines, which takes seconds; any other map as it is."""
-    return ChargeSpline.of(charge_map) if isinstance(charge_map, ForwardMap) else charge_map
-
-
 def _force_nodes(forward_map: ForwardMap) -> Array:
     """Force nodes of the forward map, between which it is a polynomial; more of them with d33."""
     low, high = np.log(forward_map.domain.force_range)
