@@ -3,7 +3,7 @@
 A file's keys are the attributes of a `Settings` class, their types and bounds say what a value may be, and a key that
 is not there takes the attribute's default:
 
-    class FilmTable(Settings):
+    class FilmTable(Settings, frozen=True):
         radius_mm: Positive
         poisson: Annotated[float, Meta(gt=-1.0, le=0.5)] = 0.34
 
@@ -47,15 +47,18 @@ Text = Annotated[str, Meta(min_length=1, max_length=1000)]
 """Neither empty nor endless: names stand in messages, records and pages."""
 
 
-class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of a file; an unknown key is an error."""
+class Settings(Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of a file; an unknown key is an error. Type checkers want `frozen=True` again in each class."""
 
 
 class WrongKey(ValueError):
-    """Raised in the `__post_init__` of a struct: the value of a key does not go with those of others."""
+    """Raised in the `__post_init__` of a struct: the value of a key does not go with those of others.
 
-    def __init__(self, key: str, expected: str, got: object) -> None:
-        super().__init__(f"expected {expected}, got {shown(got)}")
+    Without an expectation, the key is missing beside those that are there.
+    """
+
+    def __init__(self, key: str, expected: str = "", got: object = None) -> None:
+        super().__init__(f"expected {expected}, got {shown(got)}" if expected else "")
         self.key = key
 
 
@@ -161,7 +164,8 @@ def _faults(value: object, kind: Any, path: str) -> Iterator[str]:
     except msgspec.ValidationError as error:
         wrong = error.__cause__
         if isinstance(wrong, WrongKey):
-            yield f"{_join(path, wrong.key)}: {wrong}"
+            name = _join(path, wrong.key)
+            yield f"{name}: {wrong}" if str(wrong) else f"key {name!r} is missing"
         elif wrong is not None:
             yield f"{_opening(path)}{wrong}"
         else:
@@ -206,7 +210,7 @@ def _faults_of_keys(table: Mapping[str, Any], kind: type[Struct], path: str) -> 
     known = {item.encode_name: hints[item.name] for item in msgspec.structs.fields(kind)}
     for key in table if config.forbid_unknown_fields else ():
         if key not in known and key != config.tag_field:
-            yield unknown_key(_join(path, key), key, known)
+            yield unknown_key(_join(path, key), key, [config.tag_field] * (config.tag is not None) + list(known))
     for item in msgspec.structs.fields(kind):
         if item.encode_name in table:
             yield from _faults(table[item.encode_name], known[item.encode_name], _join(path, item.encode_name))

@@ -14,13 +14,12 @@ from isocharge.serve.examination.port_check import Examination, examine
 from isocharge.serve.frames.autodetect import AutoParser
 from isocharge.serve.frames.binary import BinaryParser, encode_frame
 from isocharge.serve.frames.frame import Frame, FrameCounts, Parser
-from isocharge.serve.frames.frame_layout import FrameLayout, frame_layout
+from isocharge.serve.frames.frame_layout import FrameLayout
 from isocharge.serve.frames.layout_parser import DescribedParser
 from isocharge.serve.frames.sequence import SequenceGaps
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_encoder import encode_text
-from isocharge.serve.live.device import Device
-from isocharge.serve.live.device_file import device_from_table, load_device
+from isocharge.serve.live.device import Device, device_from_table, load_device
 from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
 from isocharge.serve.live.reading_stream import ReadingStream
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress, SteadyRule
@@ -101,7 +100,6 @@ __all__ = [
     "encode_text",
     "examine",
     "find_model",
-    "frame_layout",
     "load_device",
     "load_model",
     "open_source",

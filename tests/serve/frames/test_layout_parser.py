@@ -16,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import DeviceError
-from isocharge.serve import DescribedParser, Frame, frame_layout
+from isocharge.serve import DescribedParser, Frame
+from isocharge.serve.frames.formats import frame_layout
 from isocharge.serve.frames.layout_parser import described_parser
 
 FOLDER = Path(__file__).parents[2] / "data" / "frames"
@@ -189,10 +190,10 @@ def test_check_of_given_parameters():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"width": 12}, "width: expected 8, 16, 24 or 32"),
+        ({"width": 12}, "width: expected one of 8, 16, 24, 32"),
         ({"polynomial": "11021"}, "polynomial: expected a number of 16 bits in hexadecimal"),
         ({"polynomial": "x"}, "polynomial: expected a number of 16 bits"),
-        ({"poly": "1021"}, "unknown key 'frames.checksum.poly'"),
+        ({"poly": "1021"}, "unknown key 'checksum.poly'"),
         ({"reflected": 1}, "reflected: expected true or false"),
     ],
 )

@@ -29,8 +29,8 @@ from isocharge.serve import (
     TextParser,
     encode_frame,
     encode_text,
-    frame_layout,
 )
+from isocharge.serve.frames.formats import frame_layout
 from isocharge.serve.frames.layout_parser import described_parser
 from isocharge.serve.frames.text_encoder import TEXT_FORMATS
 from isocharge.serve.virtual_sensor.faults import corrupt

@@ -156,7 +156,7 @@ def test_invalid_frame_passes_no_stage(value, gain):
 
 def test_time_of_invalid_frames_counts_for_the_next():
     """A leak is undone over all the time since the last valid frame: exp(-0.5 s / 1 s) of the output is left."""
-    chain = Chain(tare=None, touch=None, leak=LeakRule(np.ones(3), learn=False))
+    chain = Chain(tare=None, touch=None, tau_s=np.ones(3), leak=LeakRule(learn=False))
     state = ChainState.start(3)
     for charge_pC, dt_s in ((0.0, 0.1), (0.0, 0.1), (100.0, 0.1), (np.nan, 0.05), (np.inf, 0.15)):
         state, _ = advance(chain, state, np.full(3, charge_pC), 0.0, dt_s)

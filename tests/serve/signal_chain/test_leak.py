@@ -25,9 +25,9 @@ def pressed(*presses, seconds=20.0):
     return charge
 
 
-def undo(output_pC, rule=None, every=1):
+def undo(output_pC, rule=None, every=1, tau_s=TAU_S):
     """Touch charges (n, 3) and contact (n,) of one output (n,) on three electrodes; only every so many frames come."""
-    chain = Chain(tare=TareRule(frames=20), leak=rule or LeakRule(np.full(3, TAU_S)))
+    chain = Chain(tare=TareRule(frames=20), tau_s=np.full(3, tau_s), leak=rule or LeakRule())
     state, charges, contact, last = ChainState.start(3), [], [], 0.0
     for k, v in enumerate(output_pC):
         if k % every:
@@ -57,7 +57,7 @@ def test_inflow_is_learned_out_of_contact():
     since_s = np.maximum(0.0, np.arange(charge.size) / RATE_HZ - 0.5)
     output = integrator(charge) + 5.0 * TAU_S * (1.0 - np.exp(-since_s / TAU_S))
     np.testing.assert_allclose(undo(output)[0][3550, 0], 300.0, atol=8.0)
-    assert undo(output, LeakRule(np.full(3, TAU_S), learn=False))[0][3550, 0] > 340.0
+    assert undo(output, LeakRule(learn=False))[0][3550, 0] > 340.0
 
 
 def test_two_presses_in_a_row_do_not_spoil_each_other():
@@ -79,7 +79,7 @@ def test_lost_frames_cost_little():
 def test_error_of_tau_costs_as_much_as_theory_says(error):
     """q' = q (1 + (tau / tau' - 1)(1 - exp(-t / tau))) in the limit of small steps, for a step held for t."""
     charge = pressed((3.0, 8.0, 400.0))
-    got, _ = undo(integrator(charge), LeakRule(np.full(3, TAU_S * (1 + error))))
+    got, _ = undo(integrator(charge), tau_s=TAU_S * (1 + error))
     expected = 400.0 * (1 + (1 / (1 + error) - 1) * (1 - np.exp(-7.0 / TAU_S)))
     assert got[2000, 0] == pytest.approx(expected, abs=1.0)
 
@@ -93,9 +93,9 @@ def test_slow_common_warming_is_no_touch():
 
 def leak_after(surplus_pC, noise_pC=1.0, **state):
     """What is known after one frame of 5 ms in which so much came, nothing touching."""
-    rule = LeakRule(np.full(3, TAU_S))
+    rule = LeakRule()
     leak = Leak.start(np.zeros(3))._replace(learned_s=10.0, **state)
-    return undo_leak(rule, leak, np.full(3, surplus_pC), np.full(3, noise_pC), 0.005, contact=False)
+    return undo_leak(rule, np.full(3, TAU_S), leak, np.full(3, surplus_pC), np.full(3, noise_pC), 0.005, contact=False)
 
 
 def test_spike_is_clipped_in_learning():
@@ -107,12 +107,12 @@ def test_spike_is_clipped_in_learning():
 
 def test_learning_pauses_after_a_release():
     """A finger that leaves takes the last twentieth of its charge after the release."""
-    rule = LeakRule(np.full(3, TAU_S))
+    rule = LeakRule()
     leak = Leak.start(np.zeros(3))._replace(learned_s=10.0)
-    leak = undo_leak(rule, leak, np.full(3, 40.0), np.ones(3), 0.005, contact=True)
+    leak = undo_leak(rule, np.full(3, TAU_S), leak, np.full(3, 40.0), np.ones(3), 0.005, contact=True)
     for k in range(99):
-        leak = undo_leak(rule, leak, np.full(3, 40.0 - 0.4 * k), np.ones(3), 0.005, contact=False)
+        leak = undo_leak(rule, np.full(3, TAU_S), leak, np.full(3, 40.0 - 0.4 * k), np.ones(3), 0.005, contact=False)
     assert not leak.inflow_pC_per_s.any()
     for k in range(20):
-        leak = undo_leak(rule, leak, np.full(3, -0.4 * k), np.ones(3), 0.005, contact=False)
+        leak = undo_leak(rule, np.full(3, TAU_S), leak, np.full(3, -0.4 * k), np.ones(3), 0.005, contact=False)
     assert leak.inflow_pC_per_s.any()

@@ -93,7 +93,7 @@ def test_reading_is_corrected_in_the_frame_of_the_estimate():
 def test_correction_goes_into_the_leak_if_there_is_one():
     output_pC = PRESS + 15.0
     state = in_contact(leak=Leak.start(output_pC)._replace(charge_pC=output_pC))
-    after, reading = step(state, 15.0, chain=Chain(leak=LeakRule(np.full(4, 1e9)), thermal=ThermalRule()))
+    after, reading = step(state, 15.0, chain=Chain(tau_s=np.full(4, 1e9), thermal=ThermalRule()))
     np.testing.assert_allclose(reading.charge_pC, PRESS + 15.0 - after.drift.charge_pC, atol=1e-3)
     np.testing.assert_array_equal(after.leak.charge_pC, reading.charge_pC)
     np.testing.assert_array_equal(after.tare.charge_pC, TARE.charge_pC)

@@ -142,7 +142,6 @@ def stream_command(
     from isocharge.serve import Policy, Predictor, Recorder, TouchStream, find_model, open_source
     from isocharge.serve.live.line_queue import LineQueue
     from isocharge.serve.live.recorded_stream import RecordedStream
-    from isocharge.serve.live.time_slice import ask_for_short_slices
 
     settings = page_settings(live_host, live_port, live_token, insecure, tls_cert, tls_key) if live_page else None
     predictor, board = Predictor(model, models=models), _board(device, offset_limit_pC)
@@ -154,7 +153,7 @@ def stream_command(
         stack.enter_context(until_stopped())
         stack.enter_context(log_to_stderr())
         page = None if settings is None else stack.enter_context(_page(settings, path, find_model(model, models)))
-        request = board.frames.request
+        request = board.request
         source = stack.enter_context(open_source(awaited(port, wait), baud=baud, reconnect=reconnect, request=request))
         stack.enter_context(on_signal("SIGUSR1", live.request_tare))
         renew = partial(live.request_model, partial(_load, model, models))
@@ -177,7 +176,6 @@ def stream_command(
         if recorder:
             stack.enter_context(recorder)
         records = stack.enter_context(closing(live.follow(source)))  # closed before the recorder
-        ask_for_short_slices()  # after the page's process was started, which should not have them
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
             write_records(islice(records, count), write, latencies)
@@ -197,7 +195,7 @@ def _page(settings: "PageSettings", touch: "TouchStream", model: Path) -> "Itera
 
 
 def _board(device: Path | None, offset_limit_pC: float | None) -> "Device":
-    from isocharge.serve.live.device_file import with_offset_limit
+    from isocharge.serve.live.device import with_offset_limit
 
     board = board_of(device)
     return board if offset_limit_pC is None else with_offset_limit(board, offset_limit_pC)

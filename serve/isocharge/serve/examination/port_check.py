@@ -13,8 +13,7 @@ from isocharge.serve.examination.channel_health import MAINS_HZ, ChannelHealth, 
 from isocharge.serve.examination.listening import BAUDS, Heard, listen
 from isocharge.serve.examination.proposal import Gain, Proposal, propose, unit_of
 from isocharge.serve.live.channels import position_of
-from isocharge.serve.live.device import ANY_BOARD, Device
-from isocharge.serve.live.device_file import device_from_table
+from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
 from isocharge.serve.port.request import Request
 from isocharge.serve.recognition.recognise import recognise
 from isocharge.serve.signal_chain.tare import TareRule
@@ -96,7 +95,7 @@ def examine(
         PortError: If the port cannot be opened.
         DeviceError: If the gain is wrong, or for other electrodes.
     """
-    heard = listen(url, bauds, seconds, request or device.frames.request, lambda part: _is_clear(part, device))
+    heard = listen(url, bauds, seconds, request or device.request, lambda part: _is_clear(part, device))
     if device is not ANY_BOARD:
         return _examination(heard, device, Proposal(dict(device.table), _unit(heard, device), electrodes))
     proposal = propose(heard, "board", electrodes, Gain(gain or {}))
@@ -104,8 +103,7 @@ def examine(
         return _examination(heard, device, Proposal({}, "pC", electrodes))
     table = {key: value for key, value in proposal.table.items() if not (key == "gain" and proposal.needs_gain)}
     proposed = device_from_table(table, "board")
-    if proposed.gain is not None:
-        proposed.gain.pC_per_unit(proposal.electrodes)  # refuses numbers for other electrodes
+    proposed.check_gain(proposal.electrodes)
     return _examination(heard, proposed, proposal)
 
 
@@ -210,10 +208,11 @@ def _missing(
             if channel.span_pC == 0.0
         )
     else:
-        yield from _missing_in_channels(channels, device.tare or TareRule())
-    if capture.frames[0].t_us is None and device.leak is not None:
+        yield from _missing_in_channels(channels, device.tare)
+    leaks = device.leak is not None and device.leak.on
+    if capture.frames[0].t_us is None and leaks:
         yield "a device clock (t_us, t_ms or t_s): without it the leak is undone by arrival times, which jitter"
-    if device.leak is None:
+    if not leaks:
         yield "the amplifier's time constants ([leak] tau_s in a device file): without them held presses fade"
 
 

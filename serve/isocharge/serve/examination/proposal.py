@@ -14,7 +14,7 @@ from isocharge.serve.examination.capture import Capture, read_frames
 from isocharge.serve.examination.listening import Heard
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.live.channels import electrode_of
-from isocharge.serve.live.device_file import device_from_table
+from isocharge.serve.live.device import device_from_table
 from isocharge.serve.recognition.recognise import recognise
 from isocharge.serve.recognition.series import noise_of, rest_of
 from isocharge.serve.signal_chain.tare import TareRule

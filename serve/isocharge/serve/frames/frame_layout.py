@@ -21,16 +21,15 @@ hexadecimal that a frame must have, such as its length. A field named `seq` is t
 """
 
 import struct
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import accumulate
-from typing import Any
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Annotated, Any, Literal
 
-from isocharge.common.errors import DeviceError
-from isocharge.common.tables import Table
+from msgspec import Meta, field
+
+from isocharge.common.structs import Finite, Settings, WrongKey
 from isocharge.serve.frames.checksums import CHECKSUMS, Checksum, Crc
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.frames.stuffing import STUFFINGS
 from isocharge.serve.frames.text_lines import SEQ, TIMES_US
 
 FLAGS = "flags"
@@ -49,36 +48,58 @@ PADDING = "pad"
 MOST_PADDING = 4096
 """Largest padding, bytes: what no real frame has, so that a typing error cannot ask for a gigabyte."""
 
-BYTE_ORDERS = {"little": "<", "big": ">"}
+FASTEST_HZ = 100_000.0
+"""Highest rate of requests, Hz."""
 
 SYNC, DATAGRAM = "sync", "datagram"
 """Framings without byte stuffing: a frame begins with its sync pattern, or where a datagram begins."""
 
-FRAMINGS = (SYNC, *STUFFINGS, DATAGRAM)
+Framing = Literal["sync", "cobs", "slip", "hdlc", "datagram"]
+ByteOrder = Literal["little", "big"]
+Hexadecimal = Annotated[
+    str, Meta(pattern=r"^\s*([0-9A-Fa-f]{2}\s*)+$", description="bytes in hexadecimal, as in '20 4E'")
+]
 
-FRAME_KEYS = ("framing", "sync", "length", "byte_order", "checksum", "checksum_from", "checksum_order", "fields")
-FIELD_KEYS = ("name", "type", "scale", "count", "value")
-CRC_KEYS = ("width", "polynomial", "start", "reflected", "final")
 
-
-@dataclass(frozen=True)
-class Field:
+class Field(Settings, frozen=True):
     """A field of a frame.
 
     Attributes:
-        name: Its meaning, or the channel's name.
         kind: Its type.
+        name: Its meaning, or the channel's name; empty for padding.
         scale: Value of one count in the unit of the channel or clock.
+        count: Bytes of padding.
+        value: Bytes that padding must have.
     """
 
-    name: str
-    kind: str
-    scale: float = 1.0
+    kind: Literal["pad", "u8", "u16", "u24", "u32", "i8", "i16", "i24", "i32", "f32", "f64"] = field(name="type")
+    name: Annotated[str, Meta(max_length=1000)] = ""
+    scale: Finite = 1.0
+    count: Annotated[int, Meta(ge=1, le=MOST_PADDING)] = 1
+    value: Hexadecimal | None = None
+
+    def __post_init__(self) -> None:
+        if self.scale == 0.0:
+            raise WrongKey("scale", "a finite number that is not 0", self.scale)
+        if self.kind == PADDING:
+            return
+        if not self.name:
+            raise WrongKey("name")
+        for key, value, default in (("count", self.count, 1), ("value", self.value, None)):
+            if value != default:
+                raise WrongKey(key, f"none, because only the type {PADDING} may have one", value)
+
+    @property
+    def letter(self) -> str:
+        """The type as `struct` writes it."""
+        if self.kind == PADDING:
+            return f"{len(bytes.fromhex(self.value)) if self.value else self.count}x"
+        return TYPES[self.kind]
 
     @property
     def size(self) -> int:
         """Bytes."""
-        return struct.calcsize(f"<{TYPES[self.kind]}")
+        return struct.calcsize(f"<{self.letter}")
 
     @property
     def is_float(self) -> bool:
@@ -95,47 +116,139 @@ class Field:
         """The number at which an unsigned counter of this size begins again."""
         return 1 << 8 * self.size
 
+    def fitting(self, value: float) -> int:
+        """A whole number that fits: counters and clocks wrap; a channel at its limit stays there, as a converter."""
+        if self.name in (SEQ, *TIMES_US):
+            return round(value) % self.modulus
+        low = 0 if self.kind[0] == "u" else -self.modulus // 2
+        return min(max(round(value), low), low + self.modulus - 1)
 
-@dataclass(frozen=True)
-class FrameLayout:
-    """A described frame.
+
+class CrcParameters(Settings, frozen=True):
+    """A cyclic redundancy check without a name; see `isocharge.serve.frames.checksums.Crc`."""
+
+    width: Literal[8, 16, 24, 32]
+    polynomial: str
+    start: str = "0"
+    reflected: bool = False
+    final: str = "0"
+
+    def __post_init__(self) -> None:
+        for key in ("polynomial", "start", "final"):
+            text = getattr(self, key)
+            if not 0 <= _hexadecimal(text) < 1 << self.width:
+                raise WrongKey(key, f"a number of {self.width} bits in hexadecimal, as in '1021'", text)
+
+    @property
+    def checksum(self) -> Checksum:
+        """How to compute it."""
+        polynomial, start, final = (_hexadecimal(text) for text in (self.polynomial, self.start, self.final))
+        return Checksum(Crc(self.width, polynomial, start, self.reflected, final), self.width // 8)
+
+
+def _hexadecimal(text: str) -> int:
+    """A number; -1 for a text that is none."""
+    try:
+        return int(text, 16) if text.isascii() and text.isalnum() else -1
+    except ValueError:
+        return -1
+
+
+class FrameSection(Settings, frozen=True, tag_field="format"):
+    """Keys that the section `[frames]` has for every format: what the board has to be asked.
 
     Attributes:
-        sync: The bytes with which it begins.
-        body: The bytes between sync and checksum.
-        fields: In the order of `body`, padding left out.
-        check: The checksum.
-        check_from: First byte that it covers.
-        check_order: Byte order of the checksum, "little" or "big".
-        byte_order: Of the fields.
-        framing: One of `FRAMINGS`.
-        constants: Positions and bytes that every frame has besides the sync.
+        request: Bytes in hexadecimal; None for a board that sends unasked.
+        request_Hz: Requests per second, at most.
+        echo: Whether the line brings the request back.
     """
 
-    sync: bytes
-    body: struct.Struct
-    fields: tuple[Field, ...]
-    check: Checksum
-    check_from: int
-    check_order: str
-    byte_order: str
-    framing: str = SYNC
-    constants: tuple[tuple[int, bytes], ...] = ()
+    request: Hexadecimal | None = None
+    request_Hz: Annotated[float, Meta(gt=0, le=FASTEST_HZ)] = 100.0
+    echo: bool = False
 
-    @property
-    def length(self) -> int:
-        """Bytes in a frame."""
-        return len(self.sync) + self.body.size + self.check.size
 
-    @property
+class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only=True):
+    """A described frame; the attributes are keys of the section `[frames]`.
+
+    Attributes:
+        length: Of the whole frame without stuffing, bytes.
+        entries: Its fields, padding included.
+        framing: How frames are told apart.
+        sync_bytes: With which each begins, hexadecimal.
+        byte_order: Of the fields.
+        checksum: Its name, or its parameters.
+        checksum_from: First byte that it covers.
+        checksum_order: Its byte order; that of the fields if None.
+    """
+
+    length: int
+    entries: tuple[Field, ...] = field(name="fields")
+    framing: Framing = "sync"
+    sync_bytes: Hexadecimal | None = field(name="sync", default=None)
+    byte_order: ByteOrder = "little"
+    checksum: str | CrcParameters = "none"
+    checksum_from: Annotated[int, Meta(ge=0)] = 0
+    checksum_order: ByteOrder | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse fields that do not make a frame, and a length or checksum that does not fit them."""
+        names = [field.name for field in self.fields]
+        if isinstance(self.checksum, str) and self.checksum not in CHECKSUMS:
+            raise WrongKey("checksum", f"one of {', '.join(CHECKSUMS)}, or the parameters of a CRC", self.checksum)
+        if self.framing == SYNC and self.sync_bytes is None:
+            raise WrongKey("sync")
+        if len(set(names)) < len(names):
+            raise WrongKey("fields", "names that differ", names)
+        if not self.channels:
+            raise WrongKey("fields", "one or more that are channels", names)
+        length = len(self.sync) + self.body.size + self.check.size
+        if self.length != length:
+            raise WrongKey("length", f"{length} for these fields", self.length)
+        if self.checksum_from >= length - self.check.size:
+            raise WrongKey(
+                "checksum_from", f"less than {length - self.check.size}, inside the frame", self.checksum_from
+            )
+
+    @cached_property
+    def sync(self) -> bytes:
+        """The bytes with which a frame begins."""
+        return bytes.fromhex(self.sync_bytes or "")
+
+    @cached_property
+    def body(self) -> struct.Struct:
+        """The bytes between sync and checksum."""
+        letters = "".join(entry.letter for entry in self.entries)
+        return struct.Struct(("<" if self.byte_order == "little" else ">") + letters)
+
+    @cached_property
+    def fields(self) -> tuple[Field, ...]:
+        """Fields in their order, padding left out."""
+        return tuple(entry for entry in self.entries if entry.kind != PADDING)
+
+    @cached_property
     def channels(self) -> tuple[Field, ...]:
         """The fields that are neither number, clock nor flags."""
         return tuple(field for field in self.fields if field.name not in {SEQ, FLAGS, *TIMES_US})
 
+    @cached_property
+    def check(self) -> Checksum:
+        """The checksum."""
+        return CHECKSUMS[self.checksum] if isinstance(self.checksum, str) else self.checksum.checksum
+
+    @cached_property
+    def constants(self) -> tuple[tuple[int, bytes], ...]:
+        """Positions and bytes that every frame has besides the sync."""
+        at, constants = len(self.sync), []
+        for entry in self.entries:
+            constants += [(at, bytes.fromhex(entry.value))] if entry.value else []
+            at += entry.size
+        return tuple(constants)
+
     def checked(self, data: bytes) -> bytes:
         """What follows `data`, a frame without its checksum: the checksum."""
-        value = self.check.compute(data[self.check_from :])
-        return value.to_bytes(self.check.size, "big" if self.check_order == "big" else "little")
+        value = self.check.compute(data[self.checksum_from :])
+        return value.to_bytes(self.check.size, self.checksum_order or self.byte_order)
 
     def counts(self, data: bytes) -> Sequence[Any]:
         """The numbers in the fields of a frame, without their scales."""
@@ -147,7 +260,7 @@ class FrameLayout:
     def _of_three(self, field: Field, number: Any) -> Any:
         if not field.is_triple:
             return number
-        return int.from_bytes(number, "big" if self.byte_order == "big" else "little", signed=field.kind == "i24")
+        return int.from_bytes(number, self.byte_order, signed=field.kind == "i24")
 
     def encode(self, frame: Frame) -> bytes:
         """The bytes of a frame without stuffing; its values go into the channels in their order.
@@ -168,122 +281,5 @@ class FrameLayout:
     def _packed(self, field: Field, value: float) -> float | bytes:
         if field.is_float:
             return value
-        count = _wrapped(round(value), field)
-        if not field.is_triple:
-            return count
-        return count.to_bytes(3, "big" if self.byte_order == "big" else "little", signed=field.kind == "i24")
-
-
-def _wrapped(value: int, field: Field) -> int:
-    """Counters and clocks wrap; a channel at its limit stays there, as a converter does."""
-    if field.name in {SEQ, *TIMES_US}:
-        return value % field.modulus
-    unsigned = field.kind[0] == "u"
-    low, high = (0, field.modulus - 1) if unsigned else (-field.modulus // 2, field.modulus // 2 - 1)
-    return min(max(value, low), high)
-
-
-def frame_layout(table: Mapping[str, Any], where: str) -> FrameLayout:
-    """Read the description of a frame.
-
-    Args:
-        table: The keys above, without `format`.
-        where: The file, for messages.
-
-    Raises:
-        DeviceError: If a key is missing, unknown or wrong, or the length is not that of the fields.
-    """
-    frames = Table(table, where, DeviceError, "frames").only(*FRAME_KEYS)
-    framing = frames.choice("framing", FRAMINGS, SYNC)
-    order = frames.choice("byte_order", tuple(BYTE_ORDERS), "little")
-    entries = frames.tables("fields")
-    letters = [_letter(entry) for entry in entries]
-    sync = _hexadecimal(frames, "sync") if framing == SYNC or "sync" in frames else b""
-    layout = FrameLayout(
-        sync=sync,
-        body=struct.Struct(BYTE_ORDERS[order] + "".join(letters)),
-        fields=tuple(_field(entry) for entry in entries if entry.get("type") != PADDING),
-        check=_checksum(frames),
-        check_from=frames.whole("checksum_from", 0, least=0),
-        check_order=frames.choice("checksum_order", tuple(BYTE_ORDERS), order),
-        byte_order=order,
-        framing=framing,
-        constants=tuple(_constants(entries, letters, len(sync))),
-    )
-    _check(layout, frames)
-    return layout
-
-
-def _check(layout: FrameLayout, frames: Table) -> None:
-    """Refuse fields that do not make a frame, and a length or checksum that does not fit them."""
-    names = [field.name for field in layout.fields]
-    if len(set(names)) < len(names):
-        frames.refuse("fields", "names that differ", names)
-    if not layout.channels:
-        frames.refuse("fields", "one or more that are channels", names)
-    if frames.whole("length") != layout.length:
-        frames.refuse("length", f"{layout.length} for these fields")
-    if layout.check_from >= layout.length - layout.check.size:
-        frames.refuse("checksum_from", f"less than {layout.length - layout.check.size}, inside the frame")
-
-
-def _checksum(frames: Table) -> Checksum:
-    """A checksum by its name, or a cyclic one by its parameters."""
-    if not isinstance(frames.get("checksum", "none"), Mapping):
-        return CHECKSUMS[frames.choice("checksum", tuple(CHECKSUMS), "none")]
-    table = frames.table("checksum").only(*CRC_KEYS)
-    width = table.whole("width", least=8, most=32)
-    if width % 8:
-        table.refuse("width", "8, 16, 24 or 32")
-    polynomial, start, final = (
-        _of_width(table, key, width, default) for key, default in (("polynomial", None), ("start", "0"), ("final", "0"))
-    )
-    return Checksum(Crc(width, polynomial, start, table.flag("reflected", False), final), width // 8)
-
-
-def _of_width(table: Table, key: str, width: int, default: str | None) -> int:
-    """A number in hexadecimal that fits a register."""
-    text = table.text(key) if default is None else table.text(key, default)
-    try:
-        number = int(text, 16) if text.isascii() and text.isalnum() else -1
-    except ValueError:
-        number = -1
-    if not 0 <= number < 1 << width:
-        table.refuse(key, f"a number of {width} bits in hexadecimal, as in '1021'")
-    return number
-
-
-def _hexadecimal(table: Table, key: str) -> bytes:
-    text = table.text(key)
-    try:
-        data = bytes.fromhex(text)
-    except ValueError:
-        data = b""
-    if not data:
-        table.refuse(key, "bytes in hexadecimal, as in '20 4E'")
-    return data
-
-
-def _letter(entry: Table) -> str:
-    """A field's type, or its padding, as `struct` writes it."""
-    kind = entry.only(*FIELD_KEYS).choice("type", (PADDING, *TYPES))
-    if kind == PADDING and "value" in entry:
-        return f"{len(_hexadecimal(entry, 'value'))}x"
-    if kind == PADDING:
-        return f"{entry.whole('count', 1, least=1, most=MOST_PADDING)}x"
-    for key, only in (("count", 1), ("value", None)):
-        if entry.get(key, only) != only:
-            entry.refuse(key, f"none, because only the type {PADDING} may have one")
-    return TYPES[kind]
-
-
-def _constants(entries: Sequence[Table], letters: Sequence[str], begin: int) -> list[tuple[int, bytes]]:
-    """Positions and bytes of padding that has a value."""
-    positions = accumulate((struct.calcsize(f"<{letter}") for letter in letters), initial=begin)
-    return [
-        (at, _hexadecimal(entry, "value")) for entry, at in zip(entries, positions, strict=False) if "value" in entry
-    ]
-
-
-def _field(entry: Table) -> Field:
-    return Field(entry.text("name"), entry.text("type"), entry.number("scale", 1.0, not_zero=True))
+        count = field.fitting(value)
+        return count.to_bytes(3, self.byte_order, signed=field.kind == "i24") if field.is_triple else count

@@ -1,184 +1,149 @@
-"""What is known about a board and its amplifier: its frames, its channels, and the rules of its signal chain."""
+"""The device file: what is known about a board and its amplifier, in TOML.
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+    name = "bench board 3"         # optional
 
+    [frames]                       # optional; without it the format is recognised
+    format = "described"           # or "auto", "binary", "text"; the keys of "described" are those of
+                                   # isocharge.serve.frames.frame_layout, of the others those of .formats
+    request = "3F 0A"              # what the board has to be asked, hexadecimal; optional
+
+    [channels]                     # electrode -> name or number in the frame; without it the same names, or the same
+    A = "adc0"                     # order
+
+    [gain]                         # optional; a number for all channels, or one for each electrode
+    offset = 8388608               # what the board shows without charge, in its unit; optional
+    pC_per_unit = {A = 0.0457, B = -0.0459, C = 0.0457}     # negative where the amplifier inverts; or
+    # V_per_unit = 0.000045        # with the amplifier's feedback capacitance:
+    # feedback_pF = 1000.0
+
+    [saturation]
+    limit_pC = 1500.0
+
+    [leak]
+    tau_s = {A = 10.0, B = 10.2, C = 9.9}
+
+`[hum]`, `[tare]`, `[leak]`, `[touch]` and `[common_mode]` take the settings of their rules (see
+`isocharge.serve.signal_chain`), and every stage `on = false`, which switches it off. Tare and touch are on without a
+section. An unknown key is an error.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
 import numpy as np
+from msgspec import field
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DeviceError
-from isocharge.serve.frames.autodetect import AutoParser
-from isocharge.serve.frames.binary import BinaryParser
+from isocharge.common.structs import Finite, Positive, Settings, WrongKey, convert, read_toml
+from isocharge.serve.frames.formats import AutoFrames, Frames
 from isocharge.serve.frames.frame import Parser
-from isocharge.serve.frames.frame_layout import FrameLayout
-from isocharge.serve.frames.layout_parser import described_parser
-from isocharge.serve.frames.text import TextParser
 from isocharge.serve.port.request import Request
 from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.signal_chain.contact import TouchRule
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
 
 LEAST_ELECTRODES_FOR_WARMING = 4
 """Number of electrodes from which warming can be separated from force: a contact alone has three unknowns."""
 
+AnyRule = TypeVar("AnyRule", bound=Rule)
 
-@dataclass(frozen=True)
-class ByElectrode:
-    """A setting that is one number for all electrodes, or one for each.
+
+class Gain(Rule, frozen=True, kw_only=True):
+    """From the unit of a board to charge; each setting is one number, or one for each electrode.
 
     Attributes:
-        value: The number, or the numbers by electrode.
-        name: File and key, for messages.
+        pC_per_unit: Charge of one unit, pC.
+        V_per_unit: In its place, the voltage of one unit, V, with the feedback capacitance of the amplifiers.
+        feedback_pF: That capacitance, pF: 1 V is that number of pC.
+        offset: What a board shows without charge, in its unit.
     """
 
-    value: float | Mapping[str, float]
-    name: str
+    pC_per_unit: Finite | dict[str, Finite] | None = None
+    V_per_unit: Finite | dict[str, Finite] | None = None
+    feedback_pF: Positive | dict[str, Positive] | None = None
+    offset: Finite | dict[str, Finite] | None = None
 
-    def array(self, electrodes: tuple[str, ...]) -> Array:
-        """The setting of each electrode, shape (electrodes,).
-
-        Raises:
-            DeviceError: If the numbers are those of other electrodes.
-        """
-        numbers = self.value if isinstance(self.value, Mapping) else dict.fromkeys(electrodes, self.value)
-        if set(numbers) != set(electrodes):
-            raise DeviceError(
-                f"{self.name}: expected a number, or one for each of the electrodes {electrodes}, got {self.value}"
+    def __post_init__(self) -> None:
+        if self.V_per_unit is not None and self.pC_per_unit is not None:
+            raise WrongKey("V_per_unit", "either pC_per_unit, or V_per_unit and feedback_pF", self.V_per_unit)
+        if self.V_per_unit is None and self.feedback_pF is not None:
+            raise WrongKey(
+                "feedback_pF", "no capacitance beside pC_per_unit: it belongs to V_per_unit", self.feedback_pF
             )
-        return np.array([numbers[name] for name in electrodes], dtype=float)
+        if self.V_per_unit is not None and self.feedback_pF is None:
+            raise WrongKey("feedback_pF")
+        if self.per_unit is None:
+            raise WrongKey("pC_per_unit")
+        key = "pC_per_unit" if self.V_per_unit is None else "V_per_unit"
+        if 0.0 in (self.per_unit.values() if isinstance(self.per_unit, dict) else (self.per_unit,)):
+            raise WrongKey(key, "a finite number that is not 0, or one for each electrode", self.per_unit)
 
-    def of(self, electrode: str, default: float) -> float:
-        """The setting of one electrode; the default if there is none for it."""
-        return self.value.get(electrode, default) if isinstance(self.value, Mapping) else self.value
-
-
-@dataclass(frozen=True)
-class FrameSettings:
-    """What a board sends.
-
-    Attributes:
-        format: "auto", "binary", "text" or "described".
-        columns: Names for the columns of a CSV.
-        meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the board has for it; of text.
-        layout: Of described frames.
-        request: What the board has to be asked; None if it sends unasked.
-    """
-
-    format: str = "auto"
-    columns: tuple[str, ...] = ()
-    meanings: Mapping[str, str] = field(default_factory=dict)
-    layout: FrameLayout | None = None
-    request: Request | None = None
-
-    def parser(self) -> Parser:
-        """A new parser."""
-        if self.layout is not None:
-            return described_parser(self.layout)
-        parsers: dict[str, Callable[[], Parser]] = {
-            "auto": lambda: AutoParser(self.columns, self.meanings),
-            "binary": BinaryParser,
-            "text": lambda: TextParser(self.columns, self.meanings),
-        }
-        return parsers[self.format]()
-
-
-@dataclass(frozen=True)
-class GainSettings:
-    """From the unit of a board to charge.
-
-    Attributes:
-        per_unit: Charge of one unit, pC; or voltage, V, where there is a feedback capacitance.
-        feedback_pF: Feedback capacitance of the amplifiers, pF, so that 1 V is that number of pC.
-        offset: What a board shows without charge, in its unit; None for 0.
-    """
-
-    per_unit: ByElectrode
-    feedback_pF: ByElectrode | None = None
-    offset: ByElectrode | None = None
-
-    def pC_per_unit(self, electrodes: tuple[str, ...]) -> Array:
-        """Charge of one unit with its sign, shape (electrodes,), pC.
-
-        Raises:
-            DeviceError: If the numbers are those of other electrodes.
-        """
-        per_unit = self.per_unit.array(electrodes)
-        return per_unit if self.feedback_pF is None else per_unit * self.feedback_pF.array(electrodes)
+    @property
+    def per_unit(self) -> float | dict[str, float] | None:
+        """Charge of one unit, pC; or its voltage, V, where there is a feedback capacitance."""
+        return self.pC_per_unit if self.V_per_unit is None else self.V_per_unit
 
     def charge_pC(self, electrode: str, values: Array) -> Array:
         """Values of one electrode, of any shape, as charges, pC; as they are where there is no setting for it."""
-        factor = self.per_unit.of(electrode, 1.0)
-        if self.feedback_pF is not None:
-            factor *= self.feedback_pF.of(electrode, 1.0)
-        return (values - (self.offset.of(electrode, 0.0) if self.offset else 0.0)) * factor
-
-    def zero(self, electrodes: tuple[str, ...]) -> Array | None:
-        """What is subtracted before the gain, shape (electrodes,), in the board's unit; None for nothing.
-
-        Raises:
-            DeviceError: If the numbers are those of other electrodes.
-        """
-        return None if self.offset is None else self.offset.array(electrodes)
+        per_unit, feedback, offset = (
+            setting.get(electrode, default) if isinstance(setting, dict) else default if setting is None else setting
+            for setting, default in ((self.per_unit, 1.0), (self.feedback_pF, 1.0), (self.offset, 0.0))
+        )
+        return (values - offset) * (per_unit * feedback)
 
 
-@dataclass(frozen=True)
-class LeakSettings:
-    """The amplifier's decay.
+class Saturation(Rule, frozen=True, kw_only=True):
+    """The converter's range: the largest charge that it can show, pC."""
 
-    Attributes:
-        tau_s: Time constant, s.
-        learning: The other settings of a `LeakRule` that the file has.
-    """
-
-    tau_s: ByElectrode
-    learning: Mapping[str, Any] = field(default_factory=dict)
-
-    def rule(self, electrodes: tuple[str, ...]) -> LeakRule:
-        """The rule for these electrodes.
-
-        Raises:
-            DeviceError: If the time constants are those of other electrodes.
-        """
-        return LeakRule(self.tau_s.array(electrodes), **self.learning)
+    limit_pC: Setting
 
 
-@dataclass(frozen=True)
-class Device:
-    """What is known about a board; a stage that is None is switched off.
+class LeakSection(LeakRule, frozen=True, kw_only=True):
+    """The amplifiers' decay: their time constant, s, one for all or one for each electrode."""
+
+    tau_s: Positive | dict[str, Positive]
+
+
+class DeviceSections(Settings, frozen=True):
+    """The content of a device file."""
+
+    name: str = "unnamed board"
+    frames: Frames = AutoFrames()
+    channels: dict[str, str] = field(default_factory=dict)
+    gain: Gain | None = None
+    saturation: Saturation | None = None
+    hum: HumRule | None = None
+    tare: TareRule = TareRule()
+    leak: LeakSection | None = None
+    touch: TouchRule = TouchRule()
+    common_mode: ThermalRule | None = None
+
+
+class Device(DeviceSections, frozen=True):
+    """What is known about a board; the other attributes are the sections of its file.
 
     Attributes:
-        name: For people.
-        frames: What it sends.
-        channels: Electrode to the channel's name in the frame; empty where nothing is known.
-        gain: From the board's unit to charge; None if it sends pC.
-        limit_pC: Largest charge that the converter can show, pC.
-        hum, tare, leak, touch: Rules of the stages.
-        common_mode: How warming of the film is followed.
-        table: The content of the device file; recordings keep it.
+        table: The content of the device file as it came; recordings keep it.
         where: The file, for messages.
     """
 
-    name: str = "any board"
-    frames: FrameSettings = field(default_factory=FrameSettings)
-    channels: Mapping[str, str] = field(default_factory=dict)
-    gain: GainSettings | None = None
-    limit_pC: float | None = None
-    hum: HumRule | None = None
-    tare: TareRule | None = field(default_factory=TareRule)
-    leak: LeakSettings | None = None
-    touch: TouchRule | None = field(default_factory=TouchRule)
-    common_mode: ThermalRule | None = None
     table: Mapping[str, Any] = field(default_factory=dict)
     where: str = "device"
 
     @property
-    def layout(self) -> FrameLayout | None:
-        """The layout of described frames; None for other formats."""
-        return self.frames.layout
+    def request(self) -> Request | None:
+        """What the board has to be asked; None if it sends unasked."""
+        frames = self.frames
+        return (
+            None if frames.request is None else Request(bytes.fromhex(frames.request), frames.request_Hz, frames.echo)
+        )
 
     def parser(self) -> Parser:
         """A new parser for its frames."""
@@ -190,22 +155,89 @@ class Device:
         Raises:
             DeviceError: If a setting is for other electrodes, or they are too few to follow warming.
         """
-        if self.common_mode is not None and len(electrodes) < LEAST_ELECTRODES_FOR_WARMING:
+        gain, leak, saturation, warming = _on(self.gain), _on(self.leak), _on(self.saturation), _on(self.common_mode)
+        if warming is not None and len(electrodes) < LEAST_ELECTRODES_FOR_WARMING:
             raise DeviceError(
                 f"{self.where}: common_mode: expected four electrodes or more, the model has {electrodes}; with three "
                 "every set of charges fits some contact, and warming cannot be separated from force: remove the section"
             )
         return Chain(
-            gain_pC=None if self.gain is None else self.gain.pC_per_unit(electrodes),
-            zero=None if self.gain is None else self.gain.zero(electrodes),
-            limit_pC=self.limit_pC,
-            hum=self.hum,
-            tare=self.tare,
-            leak=None if self.leak is None else self.leak.rule(electrodes),
-            touch=self.touch,
-            thermal=self.common_mode,
+            gain_pC=None if gain is None else self._gain_pC(gain, electrodes),
+            zero=None if gain is None else self._of_each("gain.offset", gain.offset, electrodes),
+            limit_pC=None if saturation is None else saturation.limit_pC,
+            hum=_on(self.hum),
+            tare=_on(self.tare),
+            tau_s=None if leak is None else self._of_each("leak.tau_s", leak.tau_s, electrodes),
+            leak=leak or LeakRule(),
+            touch=_on(self.touch),
+            thermal=warming,
         )
 
+    def check_gain(self, electrodes: tuple[str, ...]) -> None:
+        """Raise DeviceError if the gain is for other electrodes than these."""
+        if self.gain is not None:
+            self._gain_pC(self.gain, electrodes)
 
-ANY_BOARD = Device()
+    def _gain_pC(self, gain: Gain, electrodes: tuple[str, ...]) -> Array | None:
+        """Charge of one unit with its sign, shape (electrodes,), pC."""
+        if gain.V_per_unit is None:
+            return self._of_each("gain.pC_per_unit", gain.pC_per_unit, electrodes)
+        volts = self._of_each("gain.V_per_unit", gain.V_per_unit, electrodes)
+        feedback_pF = self._of_each("gain.feedback_pF", gain.feedback_pF, electrodes)
+        return None if volts is None or feedback_pF is None else volts * feedback_pF
+
+    def _of_each(
+        self, key: str, setting: float | Mapping[str, float] | None, electrodes: tuple[str, ...]
+    ) -> Array | None:
+        """A setting for each electrode, shape (electrodes,)."""
+        if setting is None:
+            return None
+        numbers = setting if isinstance(setting, Mapping) else dict.fromkeys(electrodes, setting)
+        if set(numbers) != set(electrodes):
+            raise DeviceError(
+                f"{self.where}: {key}: expected a number, or one for each of the electrodes {electrodes}, got {setting}"
+            )
+        return np.array([numbers[name] for name in electrodes], dtype=float)
+
+
+def _on(rule: AnyRule | None) -> AnyRule | None:
+    return rule if rule is not None and rule.on else None
+
+
+ANY_BOARD = Device(name="any board")
 """The board of which nothing is known."""
+
+
+def load_device(path: Path) -> Device:
+    """Read a device file.
+
+    Raises:
+        DeviceError: If it cannot be read, or a key is unknown, missing or wrong.
+    """
+    return device_from_table(read_toml(path, "a device file", DeviceError), str(path))
+
+
+def device_from_table(table: Mapping[str, Any], where: str) -> Device:
+    """Read the content of a device file.
+
+    Args:
+        table: Sections and keys as above.
+        where: The file, for messages.
+
+    Raises:
+        DeviceError: If a key is unknown, missing or wrong.
+    """
+    frames = table.get("frames")
+    tagged = {**table, "frames": {"format": "auto", **frames}} if isinstance(frames, Mapping) else table
+    sections = convert(tagged, DeviceSections, where, DeviceError)
+    return Device(**msgspec.structs.asdict(sections), table=table, where=where)
+
+
+def with_offset_limit(device: Device, offset_limit_pC: float) -> Device:
+    """A board with another `offset_limit_pC` of its tare, pC; in its table too, so that a recording keeps it.
+
+    Raises:
+        DeviceError: If the limit is out of its range.
+    """
+    tare = {**device.table.get("tare", {}), "offset_limit_pC": offset_limit_pC}
+    return device_from_table({**device.table, "tare": tare}, device.where)

@@ -42,7 +42,8 @@ class Chain:
         limit_pC: Largest charge that the converter can show, pC.
         hum: How mains hum is followed.
         tare: Which frames are quiet enough for a tare.
-        leak: The amplifier's decay.
+        tau_s: Time constant of each amplifier, shape (electrodes,), s; None where charges do not leak.
+        leak: How the amplifiers' offset is learned.
         touch: When something touches; without it, every tared frame is in contact.
         thermal: How warming of the film is followed.
         largest: Largest value of a valid reading, in the device's unit.
@@ -53,7 +54,8 @@ class Chain:
     limit_pC: float | None = None
     hum: HumRule | None = None
     tare: TareRule | None = field(default_factory=TareRule)
-    leak: LeakRule | None = None
+    tau_s: Array | None = None
+    leak: LeakRule = field(default_factory=LeakRule)
     touch: TouchRule | None = field(default_factory=TouchRule)
     thermal: ThermalRule | None = None
     largest: float = field(init=False, repr=False, compare=False)
@@ -197,19 +199,20 @@ def _look_for_tare(chain: Chain, state: ChainState, hum: Hum, quiet_pC: Array) -
 
 def _charge(chain: Chain, state: ChainState, tare: Tare, output_pC: Array, dt_s: float) -> tuple[Leak | None, Array]:
     """Touch charges: the output above tare, its leak undone if there is one."""
-    if chain.leak is None:
+    if chain.tau_s is None:
         return None, output_pC
     if state.leak is None:
         leak = Leak.start(output_pC)
     else:
-        leak = undo_leak(chain.leak, state.leak, output_pC, tare.noise_pC, dt_s, contact=state.touch.contact)
+        contact = state.touch.contact
+        leak = undo_leak(chain.leak, chain.tau_s, state.leak, output_pC, tare.noise_pC, dt_s, contact=contact)
     return leak, leak.charge_pC
 
 
 def _touch(chain: Chain, state: ChainState, charge_pC: Array, tare: Tare, dt_s: float) -> Touch:
     if chain.touch is None:
         return Touch(contact=True)
-    decay = 1.0 if chain.leak is None else math.exp(-dt_s / chain.leak.relax_s)
+    decay = 1.0 if chain.tau_s is None else math.exp(-dt_s / chain.leak.relax_s)
     return update_contact(chain.touch, state.touch, float(charge_pC.sum()), tare.noise_pC, decay)
 
 

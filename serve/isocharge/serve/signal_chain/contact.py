@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.serve.signal_chain.rule import Rule, Setting
 
 
-@dataclass(frozen=True, slots=True)
-class TouchRule:
+class TouchRule(Rule, frozen=True, kw_only=True):
     """When something touches.
 
     The smallest press we care about, 0.05 N on a 25 um film, gives 340 pC in total; reference noise makes the touch
@@ -25,9 +25,9 @@ class TouchRule:
         release_share: Release threshold as a share of the press's peak; it is at least half the touch threshold.
     """
 
-    sigmas: float = 6.0
-    floor_pC: float = 10.0
-    release_share: float = 0.05
+    sigmas: Setting = 6.0
+    floor_pC: Setting = 10.0
+    release_share: Setting = 0.05
 
 
 @dataclass(frozen=True, slots=True)

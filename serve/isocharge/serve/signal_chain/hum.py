@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isocharge.common.arrays import Array
+from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
 LEAST_TURN = 0.02
 """Smallest squared step of the unit phasor between two frames, dimensionless, from which hum can be learned."""
 
 
-@dataclass(frozen=True, slots=True)
-class HumRule:
+class HumRule(Rule, frozen=True, kw_only=True):
     """How hum is followed.
 
     Attributes:
@@ -30,9 +30,9 @@ class HumRule:
         limit_pC: Limit of a difference in learning, pC.
     """
 
-    frequency_Hz: float = 50.0
-    settle_s: float = 0.5
-    limit_pC: float = 5.0
+    frequency_Hz: Setting = 50.0
+    settle_s: TimeConstant = 0.5
+    limit_pC: Setting = 5.0
 
 
 @dataclass(frozen=True, slots=True)

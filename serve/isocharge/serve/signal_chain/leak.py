@@ -15,20 +15,18 @@ gives every electrode the same charge.
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
 
-@dataclass(frozen=True, slots=True)
-class LeakRule:
-    """The amplifier, and how its offset is learned.
+class LeakRule(Rule, frozen=True, kw_only=True):
+    """How the offset of the amplifiers is learned.
 
     Attributes:
-        tau_s: Time constant of each channel, shape (electrodes,), s.
         learn: Whether to learn the inflow b.
         settle_s: Time constant of learning, s.
         hold_off_s: Pause of learning after a release, s.
@@ -38,14 +36,13 @@ class LeakRule:
         look_back_s: Age of the inflow with which a touch begins, s; it may be up to twice as old.
     """
 
-    tau_s: Array
     learn: bool = True
-    settle_s: float = 3.0
-    hold_off_s: float = 0.5
-    clip_sigmas: float = 4.0
-    clip_pC: float = 0.1
-    relax_s: float = 1.0
-    look_back_s: float = 0.25
+    settle_s: TimeConstant = 3.0
+    hold_off_s: Setting = 0.5
+    clip_sigmas: Setting = 4.0
+    clip_pC: Setting = 0.1
+    relax_s: TimeConstant = 1.0
+    look_back_s: Setting = 0.25
 
 
 class Leak(NamedTuple):
@@ -78,18 +75,21 @@ class Leak(NamedTuple):
         return cls(nothing, output_pC, nothing, nothing, nothing)
 
 
-def undo_leak(rule: LeakRule, leak: Leak, output_pC: Array, noise_pC: Array, dt_s: float, *, contact: bool) -> Leak:
+def undo_leak(
+    rule: LeakRule, tau_s: Array, leak: Leak, output_pC: Array, noise_pC: Array, dt_s: float, *, contact: bool
+) -> Leak:
     """Charge and inflow after the next frame.
 
     Args:
-        rule: The amplifier.
+        rule: How the inflow is learned.
+        tau_s: Time constant of each amplifier, shape (electrodes,), s.
         leak: After the frame before.
         output_pC: The amplifier's output above tare, shape (electrodes,), pC.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
         dt_s: Since the frame before, s.
         contact: Whether something touched in the frame before.
     """
-    innovation_pC = output_pC - np.exp(-dt_s / rule.tau_s) * leak.output_pC
+    innovation_pC = output_pC - np.exp(-dt_s / tau_s) * leak.output_pC
     surplus_pC = innovation_pC - leak.inflow_pC_per_s * dt_s
     charge_pC = leak.charge_pC + surplus_pC
     if contact:

@@ -6,10 +6,10 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import TareError
+from isocharge.serve.signal_chain.rule import Count, Rule, Setting
 
 
-@dataclass(frozen=True, slots=True)
-class TareRule:
+class TareRule(Rule, frozen=True, kw_only=True):
     """Which frames are quiet enough for a tare.
 
     Attributes:
@@ -20,10 +20,10 @@ class TareRule:
         patience: Frames after which the search for quiet ones is given up; 0 for never.
     """
 
-    frames: int = 100
-    noise_limit_pC: float = 5.0
-    offset_limit_pC: float = 100.0
-    patience: int = 2000
+    frames: Count = 100
+    noise_limit_pC: Setting = 5.0
+    offset_limit_pC: Setting = 100.0
+    patience: Count = 2000
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Reals
+from isocharge.serve.signal_chain.rule import Rule, Setting
 
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
 """Changes of the common charge at which the misfit is evaluated, pC."""
@@ -27,8 +28,7 @@ Misfit = Callable[[Array], Reals]
 """Charges of shape (n, electrodes), pC, to misfits of shape (n,), in standard deviations."""
 
 
-@dataclass(frozen=True, slots=True)
-class ThermalRule:
+class ThermalRule(Rule, frozen=True, kw_only=True):
     """How warming is followed.
 
     Attributes:
@@ -39,11 +39,11 @@ class ThermalRule:
         tell_pC: Smallest |p| that is flagged `thermal`, pC.
     """
 
-    every_s: float = 0.05
-    wander_pC: float = 30.0
-    noise: float = 3.0
-    blind_pC: float = 60.0
-    tell_pC: float = 10.0
+    every_s: Setting = 0.05
+    wander_pC: Setting = 30.0
+    noise: Setting = 3.0
+    blind_pC: Setting = 60.0
+    tell_pC: Setting = 10.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,12 +4,13 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
+from msgspec import structs
 
 from isocharge.cli.shared.options import board_of
 from isocharge.cli.shared.terminal import log_to_stderr, say
@@ -147,7 +148,7 @@ def _events(bench: BenchPort, chosen: "SensorFilms") -> "Iterator[BenchEvents]":
     keyboard = None if machine or bench.yes else _keyboard()
     with ExitStack() as stack:
         stack.enter_context(log_to_stderr())
-        request = board.frames.request
+        request = board.request
         source = stack.enter_context(open_source(bench.url, baud=bench.baud, reconnect=not machine, request=request))
         yield stack.enter_context(BenchEvents(source, stream, PressWatch(sensor.electrode_names), keyboard))
 
@@ -157,7 +158,7 @@ def _board(device: Path | None) -> "Device":
     board = board_of(device)
     if board.common_mode is not None:
         say(f"{device}: [common_mode] is left out while calibrating: it needs the model that is being made")
-    return replace(board, common_mode=None)
+    return structs.replace(board, common_mode=None)
 
 
 def _keyboard() -> int:

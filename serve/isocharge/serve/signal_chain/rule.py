@@ -1,0 +1,25 @@
+"""What all rules of the signal chain share: they are sections of a device file, with bounds on each setting."""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+from isocharge.common.structs import Settings
+
+LARGEST = 1_000_000_000
+"""Largest setting, in its unit."""
+
+Setting = Annotated[float, Meta(ge=0, le=LARGEST)]
+Count = Annotated[int, Meta(ge=0, le=LARGEST)]
+TimeConstant = Annotated[float, Meta(ge=1e-3, le=LARGEST)]
+"""What the chain divides by, s."""
+
+
+class Rule(Settings, frozen=True):
+    """The settings of a stage.
+
+    Attributes:
+        on: Whether a device file switches the stage on.
+    """
+
+    on: bool = True
