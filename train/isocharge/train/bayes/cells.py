@@ -19,8 +19,8 @@ class Cells:
     Attributes:
         press: Number of the press, ascending, shape (n,).
         root: Number of the first cell that it was cut from, shape (n,).
-        centre: Shape (n, 2), m.
-        side: Of every cell, m.
+        centre: Shape (n, 2), mm.
+        side: Of every cell, mm.
     """
 
     press: Integers

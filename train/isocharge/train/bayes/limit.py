@@ -1,23 +1,18 @@
 """The Bayes limit: the errors of the posterior mean, which no estimator of x, y, F can beat on average.
 
-    scene = Scene(load_sensor("three-25um-biaxial"), Circle(1e-3), radius_mm=8.0, force_range_N=(0.05, 2.0))
-    print(bayes_limit(scene).position_rms_mm)
-
-Both functions store their results in the cache folder (`isocharge.train.bayes.cache`).
+problem = BayesProblem(load_sensor("three-25um-biaxial"), Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
+print(bayes_limit(problem).position_rms_mm)
 """
 
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.common.errors import ChargeError, InputError
-from isocharge.common.files import sha256_of
-from isocharge.common.progress import Progress
+from isocharge.common.errors import InputError
 from isocharge.simulate.dataset.sampling import Sweep
-from isocharge.simulate.execution.code_version import code_fingerprint
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.measuring_chain.noise import NoiseModel
@@ -25,51 +20,34 @@ from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.sensor.sensor_file import sensor_to_dict
-from isocharge.train.bayes.cache import cached
-from isocharge.train.bayes.posterior import CHUNK, STEP, Posterior
+from isocharge.train.bayes.posterior import Posterior
+from isocharge.train.data.presses import position_error
 
 PRESSES = 4000
 """Test presses of `bayes_limit`: the rms is then known to 3 %, its ratio to an estimator's on the same ones better."""
 
-METHOD = 1
-"""Version of the integration; results of an older version are computed again."""
-
 
 @dataclass(frozen=True)
-class Scene:
+class BayesProblem:
     """All that the limit depends on, besides the presses.
 
     Attributes:
         sensor: The sensor.
         probe: The footprint, in the orientation that it has.
-        radius_mm: Of the working area; positions are uniform in it.
-        force_range_N: Smallest and largest force; log-uniform.
+        radius: Of the working area, mm; positions are uniform in it.
+        force_range: Smallest and largest force, N; log-uniform.
         noise: Of the readings.
     """
 
     sensor: Sensor
     probe: Probe
-    radius_mm: float = 1e3 * DEFAULT_RADIUS
-    force_range_N: tuple[float, float] = DEFAULT_FORCE_RANGE
+    radius: float = DEFAULT_RADIUS
+    force_range: tuple[float, float] = DEFAULT_FORCE_RANGE
     noise: NoiseModel = field(default_factory=lambda: noise_model("reference"))
 
-    def forward_map(self) -> ForwardMap:
-        """The simulator's charges over the scene: some 5 s."""
-        return ForwardMap.build(self.sensor, self.probe, 1e-3 * self.radius_mm, self.force_range_N)
-
-    def key(self) -> dict[str, Any]:
-        """For the cache."""
-        return {
-            "sensor": sensor_to_dict(self.sensor),
-            "probe": f"{self.probe.notation}@{np.rad2deg(self.probe.angle):.12g}",
-            "radius_mm": self.radius_mm,
-            "force_range_N": list(self.force_range_N),
-            "noise": [self.noise.white, self.noise.gain],
-            "made_by": code_fingerprint(),
-            "method": METHOD,
-            "step": STEP,
-        }
+    def forward_map(self, executor: Executor | None = None) -> ForwardMap:
+        """The simulator's charges: some 5 s."""
+        return ForwardMap.build(self.sensor, self.probe, self.radius, self.force_range, executor=executor)
 
 
 @dataclass(frozen=True)
@@ -95,8 +73,8 @@ class BayesLimit:
 
     @classmethod
     def of(cls, contact: Array, std: Array, truth: Array) -> "BayesLimit":
-        """From estimates, their standard deviations and the true contacts (x_mm, y_mm, force_N), each (n, 3)."""
-        position = np.hypot(*(contact - truth)[:, :2].T)
+        """From estimates, their standard deviations and the true contacts (x, y, F), each (n, 3), mm and N."""
+        position = position_error(contact, truth)
         force = 100.0 * (contact[:, 2] / truth[:, 2] - 1.0)
         return cls(
             presses=len(truth),
@@ -115,90 +93,55 @@ class BayesLimit:
 
 
 def bayes_estimate(
-    scene: Scene,
-    charge_pC: Array,
+    problem: BayesProblem,
+    charge: Array,
     *,
-    forward_map: ForwardMap | ChargeSpline | None = None,
-    progress: Progress | None = None,
+    charge_map: ForwardMap | ChargeSpline | None = None,
+    executor: Executor | None = None,
 ) -> tuple[Array, Array]:
-    """Posterior means for noisy charges: some 15 ms for each, from the cache if the same charges were asked before.
+    """Posterior means for noisy charges: some 15 ms for each.
 
     Args:
-        scene: Sensor, probe, prior and noise.
-        charge_pC: Noisy touch charges, shape (n, n_electrode), pC.
-        forward_map: The scene's, if it exists; it may reach farther than the scene, with exactly the scene's forces.
-        progress: Called with the presses done and all presses.
+        problem: Sensor, probe, prior and noise.
+        charge: Noisy touch charges, shape (n, n_electrode), pC.
+        charge_map: The problem's, if it exists; it may reach farther, with exactly the problem's forces.
+        executor: Solves and integrates; None for this process. That of a `ResumableRun` keeps what is done.
 
     Returns:
-        Contact (x_mm, y_mm, force_N) and standard deviation of each, both (n, 3). The force is E[1/F] / E[1/F^2],
+        Contact (x, y, F), mm and N, and standard deviation of each, both (n, 3). The force is E[1/F] / E[1/F^2],
         which has the least mean square relative error.
 
     Raises:
-        ChargeError: If the charges are not finite or of another number of electrodes.
+        ChargeError: If there are no charges, or they are not finite or of another number of electrodes.
         InputError: If the noise is zero, or the map is of other forces or too small.
     """
-    charge = np.ascontiguousarray(charge_pC, dtype=float)
-    key = {**scene.key(), "charges": f"{charge.shape} {sha256_of(charge.tobytes())}"}
-
-    def compute() -> list[Any]:
-        posterior = Posterior(_spline(scene, forward_map), scene.noise, 1e-3 * scene.radius_mm)
-        mean, std = _in_chunks(posterior, 1e-12 * charge, progress)
-        return [np.round(part, 9).tolist() for part in (_in_millimetres(mean), _in_millimetres(std))]
-
-    contact, std = (np.array(part) for part in cached("bayes", key, compute))
-    return contact, std
+    charges = charge_map or problem.forward_map(executor)
+    if charges.domain.force_range != problem.force_range:
+        raise InputError(
+            f"forces of the map: expected the problem's, {problem.force_range} N, got {charges.domain.force_range} N"
+        )
+    spline = charges if isinstance(charges, ChargeSpline) else ChargeSpline.of(charges)
+    return Posterior(spline, problem.noise, problem.radius).mean_and_std(charge, executor)
 
 
 def bayes_limit(
-    scene: Scene,
+    problem: BayesProblem,
     presses: int = PRESSES,
     seed: int = 0,
     *,
     forward_map: ForwardMap | None = None,
-    progress: Progress | None = None,
+    executor: Executor | None = None,
 ) -> BayesLimit:
-    """The limit of a scene on presses drawn from its prior: a minute, then from the cache.
+    """The limit of a problem on presses drawn from its prior: a minute.
 
     Args:
-        scene: Sensor, probe, prior and noise.
+        problem: Sensor, probe, prior and noise.
         presses: Number of presses.
         seed: Of presses and noise.
-        forward_map: The scene's, if it exists.
-        progress: Called with the presses done and all presses.
+        forward_map: The problem's, if it exists.
+        executor: As for `bayes_estimate`.
     """
-
-    def compute() -> dict[str, Any]:
-        charges = forward_map or scene.forward_map()
-        sweep = Sweep(1e-3 * scene.radius_mm, scene.force_range_N, presses, seed, sampling="random")
-        x, y, force, _ = sweep.presses()
-        charge = scene.noise.add(charges.forward(x, y, force), np.random.default_rng([seed, 1]))
-        contact, std = bayes_estimate(scene, 1e12 * charge, forward_map=charges, progress=progress)
-        return BayesLimit.of(contact, std, np.stack([1e3 * x, 1e3 * y, force], axis=1)).to_dict()
-
-    return BayesLimit(**cached("bayes-limit", {**scene.key(), "presses": presses, "seed": seed}, compute))
-
-
-def _spline(scene: Scene, forward_map: ForwardMap | ChargeSpline | None) -> ChargeSpline:
-    charges = forward_map or scene.forward_map()
-    if charges.force_range != scene.force_range_N:
-        raise InputError(
-            f"forces of the map: expected the scene's, {scene.force_range_N} N, got {charges.force_range} N"
-        )
-    return charges if isinstance(charges, ChargeSpline) else ChargeSpline.of(charges)
-
-
-def _in_chunks(posterior: Posterior, charge: Array, progress: Progress | None) -> tuple[Array, Array]:
-    parts = []
-    for start in range(0, len(charge), CHUNK):
-        parts.append(posterior.mean_and_std(charge[start : start + CHUNK]))
-        if progress:
-            progress(min(start + CHUNK, len(charge)), len(charge))
-    if not parts:
-        raise ChargeError("expected charges of at least one press, got none")
-    mean, std = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return mean, std
-
-
-def _in_millimetres(values: Array) -> Array:
-    in_mm: Array = values * np.array([1e3, 1e3, 1.0])
-    return in_mm
+    charges = forward_map or problem.forward_map(executor)
+    contact = Sweep(problem.radius, problem.force_range, presses, seed, sampling="random").contacts()
+    charge = problem.noise.add(charges.charges(contact), np.random.default_rng([seed, 1]))
+    return BayesLimit.of(*bayes_estimate(problem, charge, charge_map=charges, executor=executor), contact)

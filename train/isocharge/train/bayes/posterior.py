@@ -13,6 +13,7 @@ of 1.25 standard deviations (Trefethen and Weideman 2014); only the edge of the 
 """
 
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +21,9 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import ChargeError, InputError
+from isocharge.common.progress import track
+from isocharge.simulate.execution.workers import in_order
+from isocharge.simulate.forward.charge_map import SLACK
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.identifiability.folds import singular_values
 from isocharge.simulate.identifiability.force_profile import ForceProfile
@@ -56,7 +60,7 @@ class Posterior:
     Attributes:
         charges: Charges of a contact.
         noise: Of the readings.
-        radius: Of the disk of the prior, m.
+        radius: Of the disk of the prior, mm.
         step: Largest side of a cell in standard deviations; half of it is the check.
     """
 
@@ -68,29 +72,34 @@ class Posterior:
     def __post_init__(self) -> None:
         if self.noise.white <= 0.0:
             raise InputError(f"noise: expected white noise above 0 pC, got {self.noise.name!r}: nothing to integrate")
-        if not 0.0 < self.radius <= self.charges.radius * (1.0 + 1e-9):
+        largest = self.charges.domain.radius
+        if not 0.0 < self.radius <= largest * SLACK:
             raise InputError(
-                f"radius: expected up to {self.charges.radius * 1e3:g} mm, where the charges are known, got "
-                f"{self.radius * 1e3:g} mm"
+                f"radius: expected up to {largest:g} mm, where the charges are known, got {self.radius:g} mm"
             )
 
-    def mean_and_std(self, charge: Array) -> tuple[Array, Array]:
-        """Mean and standard deviation of (x, y, F), m and N, each (n, 3), from noisy charges (n, n_electrode), C.
+    def mean_and_std(self, charge: Array, executor: Executor | None = None) -> tuple[Array, Array]:
+        """Mean and standard deviation of (x, y, F), mm and N, each (n, 3), from noisy charges (n, n_electrode), pC.
 
         The mean of the force is E[1/F] / E[1/F^2], of all estimates the one with the least mean square relative error.
+
+        Args:
+            charge: Noisy charges, shape (n, n_electrode), pC.
+            executor: Integrates `CHUNK` presses in a task; None for this process.
         """
-        charge = np.asarray(charge, dtype=float)
-        if charge.ndim != 2 or charge.shape[1] != self.charges.electrodes or not np.isfinite(charge).all():
+        charge, electrodes = np.asarray(charge, dtype=float), len(self.charges.electrodes)
+        if charge.ndim != 2 or charge.shape[1] != electrodes or not len(charge) or not np.isfinite(charge).all():
             raise ChargeError(
-                f"expected finite charges of shape (n, {self.charges.electrodes}), got shape {charge.shape}"
+                f"expected finite charges of shape (n, {electrodes}), n at least 1, got shape {charge.shape}"
             )
-        parts = [self._integrate(charge[start : start + CHUNK]) for start in range(0, len(charge), CHUNK)]
-        mean, std = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        chunks = [charge[start : start + CHUNK] for start in range(0, len(charge), CHUNK)]
+        moments = in_order(executor, self._integrate, chunks)
+        mean, std = np.concatenate(list(track(moments, "integrating the posterior", len(chunks))), axis=1)
         return mean, std
 
     @cached_property
     def _curve(self) -> ForceProfile:
-        return ForceProfile.of(self.charges.by_force, self.charges.force_range)
+        return ForceProfile.of(self.charges.by_force, self.charges.domain.force_range)
 
     @cached_property
     def _roots(self) -> tuple[Cells, Array, Array]:
@@ -105,7 +114,8 @@ class Posterior:
         steepest = np.linalg.norm(slopes, axis=-1).max(axis=1).reshape(len(centre), len(corner), -1).max(axis=1)
         return cells, self.charges.terms(onto_disk(centre, self.radius)), steepest
 
-    def _integrate(self, charge: Array) -> tuple[Array, Array]:
+    def _integrate(self, charge: Array) -> Array:
+        """Means and standard deviations, shape (2, n, 3)."""
         levels = list(self._cells(charge))
         side = np.concatenate([np.full(len(cells), cells.side) for cells in levels])
         press = np.concatenate([cells.press for cells in levels])
@@ -146,7 +156,7 @@ class Posterior:
             terms = self.charges.terms(onto_disk(cells.centre, self.radius))
 
     def _fit(self, terms: Array, logs: Array, charge: Array, steepest: Array) -> tuple[Array, Array]:
-        """Chi-squared at each cell, and how fast its root can change with the place at most, 1/m."""
+        """Chi-squared at each cell, and how fast its root can change with the place at most, 1/mm."""
         by_force = self.charges.by_force(logs)
         known = np.einsum("nk,nke->ne", by_force, terms)
         deviation = (charge - known) / self.noise.sigma(known)
@@ -177,8 +187,9 @@ class Posterior:
         return logs, np.log(weights * (high - low)[:, None]) - 0.5 * exponents
 
 
-def _moments(press: Integers, place: Array, logs: Array, weight: Array) -> tuple[Array, Array]:
-    """Mean and standard deviation of (x, y, F) of every press, from the points at its places, `press` ascending."""
+def _moments(press: Integers, place: Array, logs: Array, weight: Array) -> Array:
+    """Mean and standard deviation of (x, y, F) of every press, from the points at its places, `press` ascending; shape
+    (2, n, 3)."""
     first = np.flatnonzero(np.diff(press, prepend=-1))
     largest = np.maximum.reduceat(weight.max(axis=1), first)
     mass = np.exp(weight - np.repeat(largest, np.diff(first, append=press.size))[:, None])
@@ -189,4 +200,4 @@ def _moments(press: Integers, place: Array, logs: Array, weight: Array) -> tuple
     x, y, x2, y2, f, f2, inverse, inverse2 = (sums[:, 1:] / sums[:, :1]).T
     mean = np.stack([x, y, inverse / inverse2], axis=1)
     variance = np.stack([x2 - x**2, y2 - y**2, f2 - f**2], axis=1)
-    return mean, np.sqrt(np.maximum(variance, 0.0))
+    return np.stack([mean, np.sqrt(np.maximum(variance, 0.0))])

@@ -6,7 +6,7 @@ The simulator's search for folds and for contacts far apart with the same charge
 import numpy as np
 
 from isocharge.simulate.forward.charge_map import ChargeMap, Domain, within
-from isocharge.simulate.identifiability.ambiguities import AmbiguousPairs, find_ambiguous_pairs
+from isocharge.simulate.identifiability.ambiguous_pairs import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.charge_field import ChargeField
@@ -62,5 +62,5 @@ def _inner(field: ChargeField, radius: float) -> ChargeMap:
 
 
 def _fold_radius(field: ChargeField, noise: NoiseModel) -> float:
-    area = working_area(_inner(field, field.domain.radius), noise, twins=False)
-    return float(f"{area.unfolded:.6g}") if np.isfinite(area.fold_radius) else np.inf
+    area = working_area(_inner(field, field.domain.radius), noise, search_pairs=False)
+    return float(f"{area.unambiguous_radius:.6g}") if np.isfinite(area.fold_radius) else np.inf

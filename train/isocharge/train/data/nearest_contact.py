@@ -1,6 +1,6 @@
 """The contact nearest to any charges: what the misfit measures.
 
-    min over contacts c of the domain of |(Q - Q(c)) / sigma|,   sigma of the charges Q.
+min over contacts c of the domain of |(Q - Q(c)) / sigma|,   sigma of the charges Q.
 """
 
 from typing import Protocol, runtime_checkable

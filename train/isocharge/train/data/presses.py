@@ -1,5 +1,4 @@
-"""Presses to learn from and presses to measure errors on, split by position: no press is seen twice under another force.
-"""
+"""Presses to learn from and presses to measure by, split by position: none is seen twice under another force."""
 
 from dataclasses import dataclass
 
@@ -7,7 +6,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError
-from isocharge.simulate.dataset.shards import Dataset, Samples
+from isocharge.simulate.dataset.shards import Dataset
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
@@ -128,9 +127,7 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
             f"{positions}; sweep or measure more (from 50 measured presses on, train on a CSV file with --sensor)"
         )
     if presses.charge.shape[1] < 3:
-        raise DatasetError(
-            f"expected at least three electrodes to find x, y and force, got {presses.charge.shape[1]}"
-        )
+        raise DatasetError(f"expected at least three electrodes to find x, y and force, got {presses.charge.shape[1]}")
     wrong = np.flatnonzero((presses.charge <= 0.0).any(axis=1) | (presses.contact[:, 2] <= 0.0))
     if wrong.size:
         row = int(wrong[0])

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from isocharge.common.arrays import Array
-from isocharge.train.release.folding import PlainPerceptron
+from isocharge.train.training.folding import PlainPerceptron
 from isocharge.train.training.network import Trainable
 
 BASES = 6

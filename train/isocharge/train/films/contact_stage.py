@@ -9,10 +9,49 @@ from torch import Tensor
 from isocharge.common.arrays import Array
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.sensor.film_prior import REACH, SHARED
+from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 from isocharge.train.films.film_presses import D31, D32, FilmPresses, gains_of, part_factors
-from isocharge.train.films.inputs import FilmInputs
+from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.training.fit import likelihood_loss, start_loss, with_fresh_noise
 from isocharge.train.training.network import Trainable
+
+FITTED = 512
+"""Films that the whitening is taken from."""
+
+
+@dataclass(frozen=True)
+class FilmInputs:
+    """x = (ln clip(Q) - ln scale(film) - mean) @ whitening.
+
+    Attributes:
+        scaling: Exact scales and context of films.
+        mean: Of the logarithms (Q in pC), shape (n_electrode,).
+        whitening: Shape (n_electrode, n_electrode).
+    """
+
+    scaling: FilmScaling
+    mean: Array
+    whitening: Array
+
+    @classmethod
+    def fit(cls, scaling: FilmScaling, presses: FilmPresses) -> "FilmInputs":
+        """Zero mean and unit covariance along the principal axes, over clean charges of many films."""
+        some = presses[:FITTED]
+        logs = np.log(np.clip(some.charge(), LOWEST_CHARGE, HIGHEST_CHARGE))
+        logs = (logs - scaling.log_charge_scale(some.parameters)[:, None]).reshape(-1, logs.shape[-1])
+        mean = logs.mean(axis=0)
+        _, singular, axes = np.linalg.svd(logs - mean, full_matrices=False)
+        return cls(scaling, mean, axes.T * (np.sqrt(len(logs)) / np.maximum(singular, 1e-12)))
+
+    def values(self, charge: Tensor, parameters: Array) -> Tensor:
+        """Charges (n_film, n, n_electrode) of films (n_film, n_parameter) to inputs of the same shape."""
+        shift = torch.tensor(self.scaling.log_charge_scale(parameters) + self.mean).float()
+        logs = torch.log(charge.clamp(LOWEST_CHARGE, HIGHEST_CHARGE)) - shift[:, None]
+        return logs @ torch.tensor(self.whitening).float()
+
+    def context(self, parameters: Array) -> Tensor:
+        """Contexts of films, (n_film, n_parameter) to (n_film, n_context)."""
+        return torch.tensor(self.scaling.context(parameters)).float()
 
 
 @dataclass(frozen=True)
@@ -62,13 +101,13 @@ class ContactStage:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, log standard deviation and truth in unit coordinates, each (n, 3), of noisy charges."""
         scaling = self.inputs.scaling
-        parts = torch.from_numpy(self.presses.response_pC[of[:, None], rows])
+        parts = torch.from_numpy(self.presses.response[of[:, None], rows])
         factors = torch.tensor(part_factors(parameters)).float()[:, None, :, None]
         clean = (parts @ factors)[..., 0] * torch.tensor(gains_of(parameters)).float()[:, None]
         values = self.inputs.values(with_fresh_noise(clean, self.noise, random), parameters)
         out = self.part(values, self.inputs.context(parameters))
-        turn, offset = (torch.tensor(part(parameters)).float() for part in (scaling.turn, scaling.offset))
-        mean = torch.baddbmm(offset[:, None], out[..., :3], turn.transpose(1, 2))
+        rotation, offset = (torch.tensor(part(parameters)).float() for part in (scaling.rotation, scaling.offset))
+        mean = torch.baddbmm(offset[:, None], out[..., :3], rotation.transpose(1, 2))
         contact = self.presses.contact[of[:, None], rows].reshape(-1, 3)
         unit = torch.tensor(scaling.domain.to_unit(contact)).float()
         return mean.reshape(-1, 3), out[..., 3:].reshape(-1, 3), unit

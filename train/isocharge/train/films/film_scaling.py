@@ -1,10 +1,10 @@
-"""What a film's parameters do to charges and contacts: what divides out exactly, and what a network has to be told.
+"""What a film's parameters do to charges and contacts: what divides out exactly, and what a network has to know.
 
 With E h the stretching stiffness, d the geometric mean of d31 and d32, and g the gain of an electrode,
 
     Q / (g d E)  =  function of F / (E h), of the place in the frame of the electrodes, and of the context:
 
-the softened pretension over E, ln d31/d32, h, where the film's centre lies in that frame, how far it is turned, and the
+the softened pretension over E, ln d31/d32, h, where the film's centre lies in that frame, its rotation, and the
 probe's radius. The noise and the ends of the domain do not scale along, so the context also has the scales that were
 divided out: of all charges, of the force, and each gain about their mean.
 """
@@ -15,9 +15,9 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.film_grid import SOFTENING
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
-from isocharge.train.data.domain import ContactDomain
 
 DRAWS = 4096
 """Films drawn to standardise the context."""
@@ -33,7 +33,7 @@ class FilmScaling:
     """
 
     prior: FilmPrior
-    domain: ContactDomain
+    domain: Domain
 
     def log_charge_scale(self, parameters: Array) -> Array:
         """ln of the charges' exact factors, 1 for the described film: (..., n_parameter) to (..., n_electrode)."""
@@ -41,19 +41,19 @@ class FilmScaling:
         scale: Array = parameters[..., len(SHARED) :] + common[..., None]
         return scale
 
-    def turn(self, parameters: Array) -> Array:
-        """Matrix T of `to_film`, (..., n_parameter) to (..., 3, 3): the turn of the electrodes."""
-        turn = np.zeros((*parameters.shape[:-1], 3, 3))
-        turn[..., :2, :2] = _rotation(_of(parameters, "rotation"))
-        turn[..., 2, 2] = 1.0
-        return turn
+    def rotation(self, parameters: Array) -> Array:
+        """Matrix T of `to_film`, (..., n_parameter) to (..., 3, 3): the rotation of the electrodes."""
+        rotation = np.zeros((*parameters.shape[:-1], 3, 3))
+        rotation[..., :2, :2] = _rotation(_of(parameters, "rotation"))
+        rotation[..., 2, 2] = 1.0
+        return rotation
 
     def offset(self, parameters: Array) -> Array:
         """Offset o of `to_film`, (..., n_parameter) to (..., 3)."""
         described = np.array(self.prior.sensor.calibration.shift)
         moved = described + _shift(parameters) - _rotation(_of(parameters, "rotation")) @ described
         stiffness = _of(parameters, "young") + _of(parameters, "thickness")
-        offset: Array = np.concatenate([1e3 * moved, stiffness[..., None]], axis=-1) / self.domain.scale
+        offset: Array = np.concatenate([moved, stiffness[..., None]], axis=-1) / self.domain.scale
         return offset
 
     def to_film(self, parameters: Array, unit: Array) -> Array:
@@ -61,11 +61,11 @@ class FilmScaling:
 
         The place is carried along by the electrodes; the force grows with the stiffness.
         """
-        on_film: Array = (self.turn(parameters) @ unit[..., None])[..., 0] + self.offset(parameters)
+        on_film: Array = (self.rotation(parameters) @ unit[..., None])[..., 0] + self.offset(parameters)
         return on_film
 
     def context(self, parameters: Array) -> Array:
-        """What a network is told, standardised over the films: (..., n_parameter) to (..., 9 + n_electrode)."""
+        """What a network knows of a film, standardised over the films: (..., n_parameter) to (..., 9 + n_electrode)."""
         centre, spread = self.standard
         context: Array = (self._raw_context(parameters) - centre) / spread
         return context
@@ -107,6 +107,6 @@ def _shift(parameters: Array) -> Array:
 
 
 def _rotation(angle: Array) -> Array:
-    """Matrices of shape (..., 2, 2) that turn by angles (...), rad, anticlockwise."""
+    """Matrices of shape (..., 2, 2) for rotations by angles (...), rad, anticlockwise."""
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)

@@ -26,12 +26,12 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, ModelError
 from isocharge.common.files import read_whole
+from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
-from isocharge.train.data.domain import ContactDomain
 from isocharge.train.films.conditional_network import ConditionalWeights
 from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.films.films_model import FilmsModel
@@ -44,6 +44,12 @@ FORMAT = 1
 
 BITS = 12
 """Bits of a weight, its sign included: relative to the largest of its row."""
+
+FILE_UNITS = {"pretension": 1e6, "shift": 1e-3, "probe_radius": 1e-3}
+"""Factors to the spread in the file, which is in Pa and m."""
+
+FILE_PC = 1e-12
+"""Factor to white noise in the file, which is in C."""
 
 UNREADABLE = (
     OSError,
@@ -150,35 +156,39 @@ def _about(films: FilmsModel) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "sensor": sensor_to_dict(prior.sensor),
-        "probe_radius": prior.probe.radius,
-        "spread": asdict(prior.spread),
-        "radius_mm": films.domain.radius_mm,
-        "force_range_N": list(films.domain.force_range_N),
-        "noise": asdict(films.noise),
+        "probe_radius": _digits(FILE_UNITS["probe_radius"] * prior.probe.radius),
+        "spread": {name: _digits(FILE_UNITS.get(name, 1.0) * value) for name, value in asdict(prior.spread).items()},
+        "radius_mm": films.domain.radius,
+        "force_range_N": list(films.domain.force_range),
+        "noise": {**asdict(films.noise), "white": _digits(FILE_PC * films.noise.white)},
     }
 
 
 def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str) -> FilmsModel:
-    prior = FilmPrior(
-        sensor_from_dict(about["sensor"]), Circle(float(about["probe_radius"])), FilmSpread(**about["spread"])
-    )
+    spread = {name: _digits(value / FILE_UNITS.get(name, 1.0)) for name, value in about["spread"].items()}
+    probe = Circle(_digits(about["probe_radius"] / FILE_UNITS["probe_radius"]))
+    prior, noise = FilmPrior(sensor_from_dict(about["sensor"]), probe, FilmSpread(**spread)), about["noise"]
     low, high = about["force_range_N"]
-    domain = ContactDomain(float(about["radius_mm"]), (float(low), float(high)))
     model = FilmsModel(
         family=FilmFamily.from_arrays(_within(arrays, "family")),
-        scaling=FilmScaling(prior, domain),
+        scaling=FilmScaling(prior, Domain(float(about["radius_mm"]), (float(low), float(high)))),
         mean=arrays["mean"],
         whitening=arrays["whitening"],
         contact=_unpacked(_within(arrays, "contact")),
         misfit=_unpacked(_within(arrays, "misfit")),
-        noise=NoiseModel(**about["noise"]),
+        noise=NoiseModel(**{**noise, "white": _digits(noise["white"] / FILE_PC)}),
         sha256=sha256,
     )
     n_electrode = len(prior.sensor.electrodes)
     if model.mean.shape != (n_electrode,) or model.whitening.shape != (n_electrode, n_electrode):
         raise InputError(f"inputs of {model.mean.size} electrodes, a sensor with {n_electrode}")
-    model.fold(prior.mean)  # what does not fit together is said now
+    model.fold(prior.mean)  # what does not fit together is an error now
     return model
+
+
+def _digits(value: float) -> float:
+    """A number in another unit, without the rounding of the conversion."""
+    return float(f"{value:.15g}")
 
 
 def _within(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray]:

@@ -78,8 +78,9 @@ def _misfit(metadata: ModelMetadata, fitted: Fitted) -> str:
     errors, simulated = metadata.errors, "simulated good presses" if fitted.test.measured else "good presses"
     good = "measured presses" if fitted.good.measured else simulated
     rare = f",\n0.1 % exceed {errors['misfit_p999']:g}" if "misfit_p999" in errors else ""
+    unit = _unit(fitted)
     return f"""\
-The misfit is the distance, in units of the noise{_unit(fitted)}, of the charges from the nearest single contact that the
+The misfit is the distance, in units of the noise{unit}, of the charges from the nearest single contact that the
 model knows; a network gives it, learned from exact searches. 1 % of {good} exceed {errors["misfit_p99"]:g}{rare}.
 {_what_misfit_sees(metadata)}
 """

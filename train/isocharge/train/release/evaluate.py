@@ -36,8 +36,8 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
 
     Args:
         fitted: The network.
-        presses: To measure on; those that the network was not shown if absent. Measured ones count as they are, so that
-            what the rig does not know of places and forces is in the errors; to clean ones the network's noise is added.
+        presses: To measure on; those that the network was not shown if absent. Measured ones count as they are, what
+            the rig does not know of places and forces included; to clean ones the network's noise is added.
         seed: Of the noise.
 
     Returns:
