@@ -109,9 +109,9 @@ def most_workers(workers: int | None) -> int:
 
 
 def position_of(text: str) -> tuple[float, float]:
-    """Position (x, y), m, from `--at`."""
+    """Position (x, y), mm, from `--at`."""
     try:
-        x, y = (number_of(part.strip()) * 1e-3 for part in text.split(","))
+        x, y = (number_of(part.strip()) for part in text.split(","))
     except ValueError as error:
         raise InputError(f"--at: expected two numbers in mm like '3,-2', got {text!r}") from error
     return x, y

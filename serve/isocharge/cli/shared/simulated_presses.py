@@ -3,28 +3,18 @@
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
-from isocharge.cli.shared.terminal import progress
-
-if TYPE_CHECKING:
-    from isocharge.simulate import Dataset, Probe, Sensor
+from isocharge.simulate import Dataset, Probe, Sensor, Sweep, read_dataset, run_sweep
 
 SAMPLES = 24_000
 """Number of presses."""
 
 
-def simulated_presses(
-    sensor: "Sensor", probes: "Sequence[Probe]", radius: float, force: tuple[float, float]
-) -> "Dataset":
-    """A sweep within a radius (m) and a range of forces (N), else with its defaults, deleted once it is read.
+def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, force: tuple[float, float]) -> Dataset:
+    """A sweep within a radius (mm) and a range of forces (N), else with its defaults, deleted once it is read.
 
     It takes a few seconds, so one process is enough.
     """
-    from isocharge.simulate import Sweep, SweepCallbacks, read_dataset, run_sweep
-
-    with TemporaryDirectory() as folder, progress("solving the film") as advance:
+    with TemporaryDirectory() as folder:
         sweep = Sweep(radius, force, samples=SAMPLES)
-        return read_dataset(
-            run_sweep(Path(folder) / "presses", sensor, probes, sweep, callbacks=SweepCallbacks(advance))
-        )
+        return read_dataset(run_sweep(Path(folder) / "presses", sensor, probes, sweep))

@@ -5,7 +5,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 
 import typer
 
@@ -40,7 +40,9 @@ def log_to_stderr() -> AbstractContextManager[None]:
 @contextmanager
 def cautions_to_stderr() -> Iterator[None]:
     """Print warnings of simulation and training for people."""
-    with _printed("isocharge.simulate", "caution: %(message)s"), _printed("isocharge.train", "caution: %(message)s"):
+    with ExitStack() as stack:
+        for name in ("common", "simulate", "train"):
+            stack.enter_context(_printed(f"isocharge.{name}", "caution: %(message)s"))
         yield
 
 

@@ -1,4 +1,1 @@
-"""`isocharge simulate ...`: one file a command.
-
-May import: shared.
-"""
+"""`isocharge simulate ...`: one module a command."""

@@ -2,16 +2,17 @@
 
 import json as json_module
 from math import isfinite
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from isocharge.cli.shared.options import ForceOption, JsonOption, ProbeOption, SensorArgument, position_of
 from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError
-
-if TYPE_CHECKING:
-    from isocharge.simulate import Equilibrium
+from isocharge.simulate import Equilibrium, SolveSettings, load_sensor, parse_probe, press, touch_charge
+from isocharge.simulate.forward.readout import thermal_charge
+from isocharge.simulate.mechanics.theory import theory_by_name, theory_for
+from isocharge.simulate.solver.error_estimate import estimated_error, summary
 
 
 def point_command(
@@ -44,17 +45,6 @@ def point_command(
 
     Example: isocharge simulate point three-25um-biaxial --probe triangle:4.0@30 --at 3,-2 --force 1.0
     """
-    from isocharge.simulate import (
-        SolveSettings,
-        load_sensor,
-        parse_probe,
-        press,
-        theory_for,
-        thermal_charge,
-        touch_charge,
-    )
-    from isocharge.simulate.mechanics.theory import theory_by_name
-
     if not 1e-8 <= accuracy <= 1.0:
         raise InputError(f"--accuracy: expected a relative error from 1e-8 to 1, got {accuracy}")
     film_sensor, pressing = load_sensor(sensor), parse_probe(probe)
@@ -63,16 +53,16 @@ def point_command(
     settings = SolveSettings(accuracy=accuracy, theory=terms)
     equilibrium = press(film_sensor.film, pressing, position_of(at), force, settings)
     charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
-    charge_pC = dict(zip(film_sensor.electrode_names, (1e12 * charge).tolist(), strict=True))
-    report = {"charge_pC": charge_pC, **equilibrium.to_dict()}
+    charge_pC = dict(zip(film_sensor.electrode_names, charge.tolist(), strict=True))
+    report = {"charge_pC": charge_pC, **summary(equilibrium)}
     typer.echo(json_module.dumps(report) if json else _table(report))
     for warning in [*_cautions(equilibrium, accuracy), *report["warnings"]]:
         say(f"caution: {warning}")
 
 
-def _cautions(equilibrium: "Equilibrium", accuracy: float) -> list[str]:
+def _cautions(equilibrium: Equilibrium, accuracy: float) -> list[str]:
     """Sentences for an accuracy that was not reached."""
-    error = equilibrium.estimated_error
+    error = estimated_error(equilibrium)
     if not isfinite(error):
         return [f"a {equilibrium.theory.name} does not describe this film at all; leave --theory away"]
     if error > accuracy:

@@ -1,13 +1,12 @@
 """`isocharge simulate sweep`: a dataset of many presses."""
 
 import json as json_module
-from contextlib import AbstractContextManager
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import sweep_radius
+from isocharge.cli.shared.forward_maps import executor_for, sweep_radius
 from isocharge.cli.shared.options import (
     PROBE_HELP,
     ClusterOption,
@@ -17,17 +16,11 @@ from isocharge.cli.shared.options import (
     RadiusOption,
     SensorArgument,
     WorkersOption,
-    most_workers,
 )
-from isocharge.cli.shared.terminal import progress_rows, say
+from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.common.errors import InputError
-
-if TYPE_CHECKING:
-    from isocharge.simulate.execution.workers import Workers
-
-SWEEP_ROWS = (("solving the film", "solves"), ("pressing", "presses"))
-"""Titles and units of the progress bars of a sweep."""
+from isocharge.common.resumable_run import draft_of, refuse_finished
+from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
 
 
 class Orientation(StrEnum):
@@ -52,7 +45,7 @@ def sweep_command(
         list[str] | None,
         typer.Option("--probe", metavar="SHAPE", help=f"{PROBE_HELP} May be repeated. (default: circle:1.0)"),
     ] = None,
-    radius: RadiusOption = f"{1e3 * DEFAULT_RADIUS}",
+    radius: RadiusOption = f"{DEFAULT_RADIUS}",
     force: ForceRangeOption = DEFAULT_FORCE_RANGE,
     samples: Annotated[int, typer.Option("--samples", help="Number of presses, of all probes together.")] = 20_000,
     orientation: Annotated[
@@ -75,34 +68,15 @@ def sweep_command(
 
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
-    from isocharge.common.resumable_run import refuse_finished
-    from isocharge.simulate import Sweep, SweepCallbacks, load_sensor, parse_probe, run_sweep
-
-    if workers and cluster:
-        raise InputError("expected either --workers or --cluster, got both")
     film_sensor, probes = load_sensor(sensor), [parse_probe(text) for text in probe or ["circle:1.0"]]
     refuse_finished(output)
-    reach = sweep_radius(radius, film_sensor, probes, force)
-    sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)
     try:
-        with _workers(workers, cluster) as pool, progress_rows(*SWEEP_ROWS) as (solving, sampled):
-            run_sweep(
-                output,
-                film_sensor,
-                probes,
-                sweep,
-                workers=pool,
-                callbacks=SweepCallbacks(solving, sampled, say),
-                fresh=fresh,
-            )
+        with executor_for(workers, cluster) as executor, shown_progress():
+            reach = sweep_radius(radius, film_sensor, probes, force)
+            sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)
+            run_sweep(output, film_sensor, probes, sweep, executor=executor, fresh=fresh)
     except KeyboardInterrupt:
-        if (part := output.with_name(f"{output.name}.part")).exists():
+        if (part := draft_of(output)).exists():
             say(f"stopped; what is done is kept in {part}, and the same command goes on from there")
         raise
     say(f"{json_module.loads((output / 'manifest.json').read_text())['samples']} presses in {output}")
-
-
-def _workers(workers: int | None, cluster: str | None) -> AbstractContextManager["Workers"]:
-    from isocharge.simulate.execution.workers import dask_workers, local_workers
-
-    return dask_workers(cluster) if cluster else local_workers(most_workers(workers))
