@@ -1,4 +1,1 @@
-"""Pictures of a film, to scale, in mm and pC. The only package, besides paper, that imports matplotlib.
-
-May import: layout, contours, identifiability, forward, solver, sensor.
-"""
+"""Pictures of a film, to scale, in mm and pC. The only package that imports matplotlib."""

@@ -7,11 +7,11 @@ from matplotlib.patches import Circle as Disk
 from matplotlib.patches import Polygon as Patch
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.plots.figure import FELT, INK
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.solver.equilibrium import Equilibrium
+from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
 
 INNER = 0.999999
 """Share of the film's radius up to which its deflection is drawn: the rim itself may be outside by rounding."""
@@ -20,7 +20,7 @@ INNER = 0.999999
 def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool = True, ink: str = INK) -> None:
     """Outlines of the electrodes at their calibrated positions, with their names."""
     for electrode in sensor.electrodes:
-        corners = 1e3 * sensor.calibration.place(np.array(electrode.corners))
+        corners = sensor.calibration.place(np.array(electrode.corners))
         colour = FELT if electrode.name == highlight else ink
         axes.add_patch(Patch(corners, fill=False, ec=colour, lw=1.6, zorder=3))
         if names:
@@ -28,38 +28,43 @@ def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool 
 
 
 def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "", colour: str = FELT) -> None:
-    """The footprint of a press at (x, y), m."""
+    """The footprint of a press at (x, y), mm."""
     style: dict[str, Any] = {"fill": True, "fc": colour, "ec": colour, "alpha": 0.35, "zorder": 2}
     style["label"] = label or None
-    x, y = 1e3 * at[0], 1e3 * at[1]
+    x, y = at
     if isinstance(probe, Circle):
-        axes.add_patch(Disk((x, y), 1e3 * probe.radius, **style))
+        axes.add_patch(Disk(at, probe.radius, **style))
     else:
-        corners = 1e3 * probe.outline
+        corners = probe.outline
         axes.add_patch(Patch(np.stack([x + corners.real, y + corners.imag], axis=1), **style))
 
 
+def draw_circle(axes: Any, radius: float, **style: Any) -> None:
+    """A circle of `radius` (mm) about the centre."""
+    axes.add_patch(Disk((0, 0), radius, fill=False, **style))
+
+
 def draw_working_area(axes: Any, radius: float, label: str = "") -> None:
-    """A dotted circle of `radius` (m) about the centre."""
-    axes.add_patch(Disk((0, 0), 1e3 * radius, fill=False, ls=":", color=INK, label=label or None))
+    """A dotted circle of `radius` (mm) about the centre."""
+    draw_circle(axes, radius, ls=":", color=INK, label=label or None)
 
 
 def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> None:
-    """Axes in mm, to scale, that show all electrodes and a circle of `radius` (m) about the centre."""
+    """Axes in mm, to scale, that show all electrodes and a circle of `radius` (mm) about the centre."""
     corners = [corner for e in sensor.electrodes for corner in sensor.calibration.place(np.array(e.corners))]
-    reach = 1e3 * max(radius, *(float(np.hypot(*corner)) for corner in corners)) + 0.7
+    reach = max(radius, *(float(np.hypot(*corner)) for corner in corners)) + 0.7
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x, mm", ylabel="y, mm", aspect="equal")
     if title:
         axes.set_title(title)
 
 
-def draw_charge_map(axes: Any, forward_map: ForwardMap, number: int, force: float = 1.0, count: int = 81) -> None:
+def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float = 1.0, count: int = 81) -> None:
     """Shades and labelled contours of one electrode's charge over the position of a press."""
-    x, y = _polar_grid(forward_map.radius, count // 2, count)
-    charge = 1e12 * forward_map.forward(x.ravel(), y.ravel(), np.full(x.size, force))
-    values = charge[:, number].reshape(x.shape)
-    axes.contourf(1e3 * x, 1e3 * y, values, levels=30, cmap="YlGnBu")
-    lines = axes.contour(1e3 * x, 1e3 * y, values, levels=12, colors=INK, linewidths=0.8)
+    x, y = _polar_grid(charge_map.domain.radius, count // 2, count)
+    contact = np.stack([x.ravel(), y.ravel(), np.full(x.size, force)], axis=1)
+    values = charge_map.charges(contact)[:, number].reshape(x.shape)
+    axes.contourf(x, y, values, levels=30, cmap="YlGnBu")
+    lines = axes.contour(x, y, values, levels=12, colors=INK, linewidths=0.8)
     axes.clabel(lines, fmt="%.0f", fontsize=7)
 
 
@@ -67,10 +72,10 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
     """Deflection of the whole film as shades, seen from above."""
     radius = equilibrium.film.radius
     x, y = _polar_grid(INNER * radius, 240, 361)
-    deflection = equilibrium.deflection(np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
-    shades = axes.contourf(1e3 * x, 1e3 * y, 1e3 * deflection, levels=24, cmap="viridis_r")
+    depth = deflection(equilibrium, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
+    shades = axes.contourf(x, y, depth, levels=24, cmap="viridis_r")
     axes.figure.colorbar(shades, ax=axes, shrink=0.8, label="deflection, mm")
-    axes.add_patch(Disk((0, 0), 1e3 * radius, fill=False, color=INK))
+    draw_circle(axes, radius, color=INK)
     axes.set(title=f"the film under {equilibrium.force:g} N", xlabel="x, mm", ylabel="y, mm", aspect="equal")
 
 
@@ -80,20 +85,20 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     at = np.array(equilibrium.at)
     distance = float(np.linalg.norm(at))
     direction = at / distance if distance > 0.0 else np.array([1.0, 0.0])
-    deflection = 1e3 * equilibrium.deflection(along[:, None] * direction)
-    axes.plot(1e3 * along, -deflection, color=INK, lw=1.5)
-    centre, half = 1e3 * distance, 1e3 * equilibrium.probe.reach
-    axes.plot([centre - half, centre + half], [0.25, 0.25], color=FELT, lw=5, solid_capstyle="butt")
-    axes.annotate("", (centre, -deflection.max()), (centre, 0.2), arrowprops={"arrowstyle": "->", "color": FELT})
+    depth = deflection(equilibrium, along[:, None] * direction)
+    axes.plot(along, -depth, color=INK, lw=1.5)
+    half = equilibrium.probe.reach
+    axes.plot([distance - half, distance + half], [0.25, 0.25], color=FELT, lw=5, solid_capstyle="butt")
+    axes.annotate("", (distance, -depth.max()), (distance, 0.2), arrowprops={"arrowstyle": "->", "color": FELT})
     axes.set(
-        title=f"cut through probe and centre: {deflection.max():.2f} mm deep",
+        title=f"cut through probe and centre: {depth.max():.2f} mm deep",
         xlabel="along the cut, mm",
         ylabel="-deflection, mm (stretched)",
     )
 
 
 def _polar_grid(radius: float, rings: int, angles: int) -> tuple[Array, Array]:
-    """Points x and y on a disk, m, shape (rings, angles) each, with rings of equal area."""
+    """Points x and y on a disk, mm, shape (rings, angles) each, with rings of equal area."""
     distance = radius * np.sqrt(np.linspace(0.0, 1.0, rings))
     angle = np.linspace(0.0, 2.0 * np.pi, angles)
     return np.outer(distance, np.cos(angle)), np.outer(distance, np.sin(angle))

@@ -1,19 +1,16 @@
 """The picture of `isocharge simulate identify`: least possible errors over the film, folds, working area."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle as Disk
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from isocharge.common.arrays import Array
+from isocharge.simulate.identifiability.identification import Identification, LimitMap
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
-from isocharge.simulate.plots.film import draw_electrodes
-
-if TYPE_CHECKING:
-    from isocharge.simulate.identifiability.identification import Identification, LimitMap
+from isocharge.simulate.plots.film import draw_circle, draw_electrodes
 
 SMALLEST_MM, LARGEST_MM = 0.02, 5.0
 """Position errors at the ends of the colours, mm; smaller and larger ones have the colours of the ends."""
@@ -22,7 +19,7 @@ TICKS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Position errors that the colour bar names, mm."""
 
 
-def identification_picture(identification: "Identification") -> Figure:
+def identification_picture(identification: Identification) -> Figure:
     """Maps under the least and the greatest force, and the error against distance."""
     figure = new_figure(16.0, 5.2)
     weak, strong, curves = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
@@ -37,18 +34,18 @@ def identification_picture(identification: "Identification") -> Figure:
     return figure
 
 
-def draw_limit_map(axes: Any, identification: "Identification", limit_map: "LimitMap") -> Any:
+def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMap) -> Any:
     """Position errors under one force as colours, with folds, working area and electrodes to scale."""
-    position, error = 1e3 * _closed(limit_map.rings.position), 1e3 * _closed(limit_map.position)
+    position, error = _closed(limit_map.rings.position), _closed(limit_map.position)
     levels = np.geomspace(SMALLEST_MM, LARGEST_MM, 25)
     shown = np.clip(error, SMALLEST_MM, LARGEST_MM)
     shades = axes.contourf(position[..., 0], position[..., 1], shown, levels, norm=LogNorm(), cmap="viridis")
-    folds = 1e3 * identification.area.folds
+    folds = identification.area.folds
     axes.plot(*folds.T, ".", color=FELT, ms=3)
-    axes.add_patch(Disk((0, 0), 1e3 * identification.area.radius, fill=False, ls="--", lw=1.8, color="white"))
+    draw_circle(axes, identification.area.radius, ls="--", lw=1.8, color="white")
     draw_electrodes(axes, identification.sensor)
-    reach = 1e3 * identification.area.searched
-    title = f"{limit_map.force:g} N; dashed: working area, {1e3 * identification.area.radius:g} mm"
+    reach = identification.area.searched
+    title = f"{limit_map.force:g} N; dashed: working area, {identification.area.radius:g} mm"
     title += "; red: folds" if len(folds) else ""
     axes.set(title=title, xlabel="x, mm", ylabel="y, mm", aspect="equal")
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
@@ -62,32 +59,21 @@ def _closed(values: Array) -> Array:
     return np.concatenate([centre, around])
 
 
-def _draw_distance(axes: Any, identification: "Identification") -> None:
+def _draw_distance(axes: Any, identification: Identification) -> None:
     """Median and worst error of every ring against its distance from the centre."""
     area = identification.area
     for number, limit_map in enumerate(identification.maps):
         colour = ("#8fb8de", "#3a7ca5", INK)[number - len(identification.maps)]
-        distance = 1e3 * limit_map.rings.distance
-        axes.semilogy(
-            distance, 1e3 * np.median(limit_map.position, axis=1), color=colour, label=f"{limit_map.force:g} N"
-        )
-        axes.semilogy(distance, 1e3 * limit_map.position.max(axis=1), ":", color=colour)
+        distance = limit_map.rings.distance
+        axes.semilogy(distance, np.median(limit_map.position, axis=1), color=colour, label=f"{limit_map.force:g} N")
+        axes.semilogy(distance, limit_map.position.max(axis=1), ":", color=colour)
     axes.plot([], [], ":", color=INK, label="worst of the ring")
-    axes.axhline(1e3 * area.error, color=FELT, lw=0.8)
-    axes.axvline(
-        1e3 * area.radius,
-        ls="--",
-        color=INK,
-        label=f"working area, {1e3 * area.radius:g} mm",
-    )
+    axes.axhline(area.error, color=FELT, lw=0.8)
+    axes.axvline(area.radius, ls="--", color=INK, label=f"working area, {area.radius:g} mm")
     if np.isfinite(area.fold_radius):
-        axes.axvline(
-            1e3 * area.fold_radius,
-            color=FELT,
-            label=f"first fold, {1e3 * area.fold_radius:.1f} mm",
-        )
+        axes.axvline(area.fold_radius, color=FELT, label=f"first fold, {area.fold_radius:.1f} mm")
     axes.set(xlabel="distance from the centre, mm", ylabel="least position error (rms), mm", ylim=(0.005, 20.0))
-    axes.set(xlim=(0.0, 1e3 * area.searched))
+    axes.set(xlim=(0.0, area.searched))
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(ScalarFormatter())
     axes.yaxis.set_minor_formatter(NullFormatter())

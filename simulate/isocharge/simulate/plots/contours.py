@@ -13,12 +13,12 @@ from isocharge.simulate.plots.figure import FELT, INK, PRESSED, shades
 def draw_contours(axes: Any, contours: Sequence[Contour], colour: str, label: str = "", width: float = 1.2) -> None:
     """Pieces of contours, the first one labelled for the legend."""
     for number, contour in enumerate(contours):
-        axes.plot(*1e3 * contour.points.T, color=colour, lw=width, label=label if number == 0 else None)
+        axes.plot(*contour.points.T, color=colour, lw=width, label=label if number == 0 else None)
 
 
 def draw_mapping(axes: Any, mapping: Mapping, degrees: bool = True) -> None:
     """Lines and circles of a mapping scheme, and its presses."""
-    points = 1e3 * np.concatenate([np.broadcast_to(mapping.origin, (mapping.angle.size, 1, 2)), mapping.points], axis=1)
+    points = np.concatenate([np.broadcast_to(mapping.origin, (mapping.angle.size, 1, 2)), mapping.points], axis=1)
     for angle, line in zip(mapping.angle, points, strict=True):
         axes.plot(*line.T, color=PRESSED, lw=0.8)
         if degrees:
@@ -29,7 +29,7 @@ def draw_mapping(axes: Any, mapping: Mapping, degrees: bool = True) -> None:
     for number, distance in enumerate(mapping.distance):
         arc = np.linspace(mapping.angle[0], mapping.angle[-1], 90)
         circle = np.array(mapping.origin) + distance * np.stack([np.cos(arc), np.sin(arc)], axis=1)
-        axes.plot(*1e3 * circle.T, color=PRESSED, lw=0.6, ls="--", label="circles, every step" if number == 0 else None)
+        axes.plot(*circle.T, color=PRESSED, lw=0.6, ls="--", label="circles, every step" if number == 0 else None)
     axes.plot(*points[:, 1:].reshape(-1, 2).T, ".", color=FELT, ms=4, label="presses")
 
 
@@ -38,9 +38,9 @@ def draw_curves(axes: Any, points: Curves, lines: Curves | None = None, legend: 
     colours = shades(points.mapping.angle.size)
     for number, (angle, colour) in enumerate(zip(points.mapping.angle, colours, strict=True)):
         name = f"{np.rad2deg(angle):.0f}°"
-        axes.plot(1e3 * points.mapping.distance, 1e12 * points.own[number], "o", color=colour, ms=3.5)
+        axes.plot(points.mapping.distance, points.own[number], "o", color=colour, ms=3.5)
         smooth = lines or points
-        axes.plot(1e3 * smooth.mapping.distance, 1e12 * smooth.own[number], "-", color=colour, lw=1.1, label=name)
+        axes.plot(smooth.mapping.distance, smooth.own[number], "-", color=colour, lw=1.1, label=name)
     name = points.mapping.electrode
     axes.set(xlabel=f"distance from the centre of {name}, mm", ylabel=f"charge of {name}, pC")
     axes.grid(alpha=0.3)
