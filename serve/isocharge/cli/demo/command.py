@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from isocharge.cli.demo.live_film import show_live_film
-from isocharge.cli.shared.live_page import PORT, LivePortOption
 from isocharge.cli.shared.options import ConfigOption
 from isocharge.cli.shared.terminal import progress, say, this_command
 from isocharge.cli.shared.virtual_sensor import check_pseudo_terminals, virtual_sensor
@@ -80,7 +79,6 @@ def demo_command(
             "(default: all of it)",
         ),
     ] = False,
-    live_port: LivePortOption = PORT,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="With --live: open the page, or only say its address.")
     ] = True,
@@ -94,7 +92,7 @@ def demo_command(
     """
     check_pseudo_terminals()
     if live_page:
-        show_live_film(SENSOR, RATE_HZ, seed, live_port, seconds, browser)
+        show_live_film(SENSOR, RATE_HZ, seed, seconds, browser)
         return
     from isocharge.common.files import new_folder
     from isocharge.serve import Predictor

@@ -5,21 +5,26 @@ import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from isocharge.cli.serve.options import LogFormat
+from isocharge.cli.shared.live_page import TokenOption, given_token
 from isocharge.cli.shared.standard_streams import announce, write_stderr
 from isocharge.cli.shared.terminal import say
-from isocharge.common.defaults import BODY_BYTES, CONNECTIONS, HEADER_SECONDS, IDLE_SECONDS, MAX_BATCH
 from isocharge.common.errors import InputError
 from isocharge.common.extras import require
+from isocharge.serve.live.line_queue import LineQueue
+from isocharge.serve.network.address import Address, check_exposure
+from isocharge.serve.network.tls import Tls
+from isocharge.serve.network.token import Token
 
-if TYPE_CHECKING:
+with require("http"):
+    from isocharge.serve.network.http import App, HttpServer
+    from isocharge.serve.network.model_store import open_model_store
     from isocharge.serve.network.protocol import Handler
-    from isocharge.serve.network.tls import Tls
-    from isocharge.serve.network.token import Token
+    from isocharge.serve.network.request_log import RequestLog
     from isocharge.serve.network.traffic import Traffic
 
 
@@ -30,7 +35,12 @@ def http_command(
             "--models", metavar="DIR", help="Folder of the models to serve. (default: all in the usual places)"
         ),
     ] = None,
-    host: Annotated[str, typer.Option("--host", help="Name or IP address to listen on.")] = "127.0.0.1",
+    host: Annotated[
+        str,
+        typer.Option(
+            "--host", help="Name or IP address to listen on; one that other machines can reach needs --token."
+        ),
+    ] = "127.0.0.1",
     port: Annotated[
         int, typer.Option("--port", min=0, max=65535, help="TCP port for HTTP; 0 takes a free one.")
     ] = 8000,
@@ -44,17 +54,7 @@ def http_command(
         int | None,
         typer.Option("--grpc-port", min=0, max=65535, help="TCP port for gRPC; 0 takes a free one. (default: no gRPC)"),
     ] = None,
-    token: Annotated[
-        str | None,
-        typer.Option(
-            "--token",
-            envvar="ISOCHARGE_TOKEN",
-            help="Secret that clients must send as `Authorization: Bearer TOKEN`. (default: none)",
-        ),
-    ] = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Let other machines connect without a token. (default: refuse to start)")
-    ] = False,
+    token: TokenOption = None,
     tls_cert: Annotated[
         Path | None,
         typer.Option("--tls-cert", metavar="PEM", help="Certificate chain; turns TLS on. (default: no TLS)"),
@@ -63,21 +63,6 @@ def http_command(
         Path | None,
         typer.Option("--tls-key", metavar="PEM", help="Private key of it. (default: in the certificate's file)"),
     ] = None,
-    max_batch: Annotated[
-        int, typer.Option("--max-batch", min=1, help="Largest number of presses in one request.")
-    ] = MAX_BATCH,
-    max_body_bytes: Annotated[
-        int, typer.Option("--max-body-bytes", min=1, help="Largest body of a request, bytes.")
-    ] = BODY_BYTES,
-    max_connections: Annotated[
-        int, typer.Option("--max-connections", min=1, help="Largest number of connections at a time.")
-    ] = CONNECTIONS,
-    idle_s: Annotated[
-        float, typer.Option("--idle-s", min=0.1, help="Longest time between two requests of a connection, s.")
-    ] = IDLE_SECONDS,
-    header_s: Annotated[
-        float, typer.Option("--header-s", min=0.1, help="Longest time for the headers of a request, s.")
-    ] = HEADER_SECONDS,
     log: Annotated[
         LogFormat,
         typer.Option("--log", help="On stderr: sentences for people, or a line of JSON for each request and message."),
@@ -90,36 +75,18 @@ def http_command(
 
     Example: isocharge serve http --port 8000
     """
-    with require("http"):
-        from isocharge.serve.network.http import App, HttpServer
-    from isocharge.serve.network.address import Address, check_exposure
-    from isocharge.serve.network.limits import ServerLimits
-    from isocharge.serve.network.model_store import open_model_store
-    from isocharge.serve.network.protocol import Handler
-    from isocharge.serve.network.tls import Tls
-    from isocharge.serve.network.token import Token
-
-    if token is None:
-        token = os.environ.get("ISOCHARGE_TOKEN")  # the option takes an empty variable for none
-    address = Address(host, port, uds)
-    check_exposure(address if grpc_port is None else Address(host), token=token is not None, insecure=insecure)
+    token, address = given_token(token), Address(host, port, uds)
+    check_exposure(address if grpc_port is None else Address(host), has_token=token is not None)
     if tls_key is not None and tls_cert is None:
         raise InputError("--tls-key: expected --tls-cert too, got the key alone")
-    limits = ServerLimits(
-        batch=max_batch,
-        body_bytes=max_body_bytes,
-        connections=max_connections,
-        idle_seconds=idle_s,
-        header_seconds=header_s,
-    )
     secret = None if token is None else Token(token)
     tls = None if tls_cert is None else Tls(tls_cert, tls_key)
     with suppress(KeyboardInterrupt), _traffic(log, token) as traffic:
         store = open_model_store(models)
         for reason in store.refusals():
             _tell(traffic, "warning", "refused", reason)
-        handler = Handler(store, limits, traffic)
-        server = HttpServer(App(handler, secret), address, limits=limits, tls=tls)
+        handler = Handler(store, traffic=traffic)
+        server = HttpServer(App(handler, secret), address, limits=handler.limits, tls=tls)
         with closing(server), _grpc(handler, host, grpc_port, secret, tls) as grpc_url:
             _tell(traffic, "info", "serving", ", ".join(served.metadata.label for served in store.all()))
             for url in filter(None, (server.url, grpc_url)):
@@ -128,12 +95,8 @@ def http_command(
 
 
 @contextmanager
-def _traffic(log: LogFormat, token: str | None) -> Iterator["Traffic"]:
+def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
     """The counters of the servers, and their log on stderr; no request waits for whoever reads it."""
-    from isocharge.serve.live.line_queue import LineQueue
-    from isocharge.serve.network.request_log import RequestLog
-    from isocharge.serve.network.traffic import Traffic
-
     if log is LogFormat.text:
         yield Traffic()
         return
@@ -146,7 +109,7 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator["Traffic"]:
         yield traffic
 
 
-def _tell(traffic: "Traffic", level: str, event: str, message: str) -> None:
+def _tell(traffic: Traffic, level: str, event: str, message: str) -> None:
     """Say something about the server: a line of the log, or a sentence for people."""
     if traffic.log is None:
         say({"refused": f"refused: {message}", "serving": f"serving {message}; Ctrl-C stops"}[event])
@@ -155,7 +118,7 @@ def _tell(traffic: "Traffic", level: str, event: str, message: str) -> None:
 
 
 def _grpc(
-    handler: "Handler", host: str, port: int | None, token: "Token | None", tls: "Tls | None"
+    handler: Handler, host: str, port: int | None, token: Token | None, tls: Tls | None
 ) -> AbstractContextManager[str]:
     """The gRPC server next to the HTTP server; yields its address, empty without a port."""
     if port is None:

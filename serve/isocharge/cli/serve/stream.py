@@ -1,8 +1,7 @@
 """`isocharge serve stream`: prediction records from a port as they come."""
 
 from collections import deque
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -30,20 +29,7 @@ from isocharge.cli.serve.record_output import (
     summary,
     write_records,
 )
-from isocharge.cli.shared.live_page import (
-    PORT,
-    InsecureOption,
-    LiveHostOption,
-    LivePortOption,
-    LiveTokenOption,
-    PageRequests,
-    TlsCertOption,
-    TlsKeyOption,
-    answering,
-    one_page,
-    page_feed,
-    page_settings,
-)
+from isocharge.cli.shared.live_page import LiveOption, PageFeed, TokenOption, answering, live_page, page_address
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
 from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
 from isocharge.cli.shared.stopping import on_signal, stop_after, unless_hung_up, until_stopped
@@ -51,9 +37,7 @@ from isocharge.cli.shared.terminal import log_to_stderr, say
 from isocharge.common.errors import InputError, ModelError
 
 if TYPE_CHECKING:
-    from isocharge.serve import Device, Predictor, TouchStream
-    from isocharge.serve.viewer.link import ReaderEnd
-    from isocharge.serve.viewer.server import PageSettings
+    from isocharge.serve import Device, Predictor
 
 
 def stream_command(
@@ -117,18 +101,8 @@ def stream_command(
             help="Largest charge at rest that the tare accepts, pC. (default: 100, or as --device says)",
         ),
     ] = None,
-    live_page: Annotated[
-        bool,
-        typer.Option(
-            "--live", help="Show the film on a page for browsers; its address is said on stderr. (default: no)"
-        ),
-    ] = False,
-    live_port: LivePortOption = PORT,
-    live_host: LiveHostOption = "127.0.0.1",
-    live_token: LiveTokenOption = None,
-    insecure: InsecureOption = False,
-    tls_cert: TlsCertOption = None,
-    tls_key: TlsKeyOption = None,
+    live: LiveOption = None,
+    token: TokenOption = None,
 ) -> None:
     """Follow a sensor live: read its port, and print position (mm) and force (N) for every frame of charges.
 
@@ -143,29 +117,32 @@ def stream_command(
     from isocharge.serve.live.line_queue import LineQueue
     from isocharge.serve.live.recorded_stream import RecordedStream
 
-    settings = page_settings(live_host, live_port, live_token, insecure, tls_cert, tls_key) if live_page else None
+    address = None if live is None else page_address(live, token)
     predictor, board = Predictor(model, models=models), _board(device, offset_limit_pC)
     path = TouchStream(predictor, board, policy=Policy(policy.value), frame_id=_checked_name(name))
     latencies: deque[float] = deque(maxlen=LATENCIES)
     recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name or "") if record else None
-    live = RecordedStream(path, recorder)
+    recorded = RecordedStream(path, recorder)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
         stack.enter_context(log_to_stderr())
-        page = None if settings is None else stack.enter_context(_page(settings, path, find_model(model, models)))
+        page = None
+        if address is not None:
+            shown = live_page(address, token, path.frame_id, predictor.metadata, find_model(model, models))
+            page, _ = stack.enter_context(shown)
         request = board.request
         source = stack.enter_context(open_source(awaited(port, wait), baud=baud, reconnect=reconnect, request=request))
-        stack.enter_context(on_signal("SIGUSR1", live.request_tare))
-        renew = partial(live.request_model, partial(_load, model, models))
+        stack.enter_context(on_signal("SIGUSR1", recorded.request_tare))
+        renew = partial(recorded.request_model, partial(_load, model, models))
         stack.enter_context(on_signal("SIGHUP", unless_hung_up(renew)))
         stack.enter_context(stop_after(seconds))
         lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
         put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
         write = record_writer(stack, output, udp, predictor.metadata.electrodes, put)
         if page is not None:
-            header = (policy.value, board.table, name or "")
-            stack.enter_context(answering(PageRequests(page, live, header, recorder is not None)))
-            feed = page_feed(page, path, live, predictor.metadata.electrodes)
+            header = None if recorder else (policy.value, board.table, name or "")
+            stack.enter_context(answering(page, recorded, header))
+            feed = PageFeed(page, path, recorded)
             write = in_turn(write, lambda record, _: feed.put(record))
         mcap_output = (
             McapOutput(mcap, predictor.metadata.electrodes, mcap_records, source.is_live) if mcap is not None else None
@@ -175,7 +152,7 @@ def stream_command(
             write = in_turn(lambda _, line: put_line(line), write)
         if recorder:
             stack.enter_context(recorder)
-        records = stack.enter_context(closing(live.follow(source)))  # closed before the recorder
+        records = stack.enter_context(closing(recorded.follow(source)))  # closed before the recorder
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
             write_records(islice(records, count), write, latencies)
@@ -184,14 +161,6 @@ def stream_command(
             say(summary(path, latencies, lines.lost))
     if (recorder and recorder.failed) or (mcap_output and not mcap_output.is_whole):
         raise typer.Exit(1)
-
-
-@contextmanager
-def _page(settings: "PageSettings", touch: "TouchStream", model: Path) -> "Iterator[ReaderEnd]":
-    """The page of this stream; says where it is."""
-    with one_page(touch.frame_id, touch.predictor.metadata, model, settings) as (link, url):
-        say(f"live page: {url}")
-        yield link
 
 
 def _board(device: Path | None, offset_limit_pC: float | None) -> "Device":

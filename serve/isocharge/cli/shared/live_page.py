@@ -1,29 +1,29 @@
-"""The live page in commands: its options, and the link between a stream and the page."""
+"""The live page in commands: its options, and what a stream and its page tell each other."""
 
 import logging
 import os
 import threading
 import time
-import webbrowser
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.extras import require
-
-if TYPE_CHECKING:
-    from isocharge.serve import PredictionRecord, TouchStream
-    from isocharge.serve.live.recorded_stream import RecordedStream
-    from isocharge.serve.model.metadata import ModelMetadata
-    from isocharge.serve.viewer.link import Message, ReaderEnd
-    from isocharge.serve.viewer.server import FilmLink, PageSettings
+from isocharge.serve import PredictionRecord, Recorder, TouchStream
+from isocharge.serve.live.recorded_stream import RecordedStream
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.network.address import Address, check_exposure
+from isocharge.serve.port import recording
+from isocharge.serve.viewer.description import describe_film, find_field
+from isocharge.serve.viewer.link import ReaderEnd, make_link
+from isocharge.serve.viewer.messages import LiveRequest, Marker, Record, Tare
+from isocharge.serve.viewer.samples import SampleFormat
 
 RATE_RECORDS = 400
 """Records, the latest, over which the rate is taken."""
@@ -31,95 +31,70 @@ RATE_RECORDS = 400
 STATE_S = 0.25
 """Time between two messages with the counters, s."""
 
-PORT = 8001
-
-LivePortOption = Annotated[
-    int, typer.Option("--live-port", min=0, max=65535, help="TCP port of the live page; 0 takes a free one.")
-]
-
-LiveHostOption = Annotated[str, typer.Option("--live-host", help="Name or IP address on which the page listens.")]
-
-LiveTokenOption = Annotated[
+LiveOption = Annotated[
     str | None,
     typer.Option(
-        "--live-token",
-        envvar="ISOCHARGE_TOKEN",
-        help="Secret that viewers must know: the page asks for it, or takes it from #TOKEN in its address. "
-        "(default: none)",
+        "--live",
+        metavar="HOST:PORT",
+        help="Show the film on a page for browsers at this address, as 127.0.0.1:8001; port 0 takes a free one. An "
+        "address that other machines can reach needs --token. (default: no page)",
     ),
 ]
 
-InsecureOption = Annotated[
-    bool, typer.Option("--insecure", help="Let other machines see the page without a token. (default: refuse to start)")
-]
-
-TlsCertOption = Annotated[
-    Path | None,
-    typer.Option("--live-tls-cert", metavar="PEM", help="Certificate chain; turns TLS on. (default: no TLS)"),
-]
-
-TlsKeyOption = Annotated[
-    Path | None,
-    typer.Option("--live-tls-key", metavar="PEM", help="Private key of it. (default: in the certificate's file)"),
+TokenOption = Annotated[
+    str | None,
+    typer.Option(
+        "--token",
+        envvar="ISOCHARGE_TOKEN",
+        help="Secret that clients must send as `Authorization: Bearer TOKEN`; the live page asks for it, or takes it "
+        "from #TOKEN in its address. (default: none)",
+    ),
 ]
 
 
-def page_settings(
-    host: str,
-    port: int,
-    token: str | None,
-    insecure: bool,
-    tls_cert: Path | None,
-    tls_key: Path | None,
-    *,
-    is_recording: bool = False,
-) -> "PageSettings":
-    """Where the page is and who may see it.
+def given_token(token: str | None) -> str | None:
+    """The token of the option; of the environment also an empty one, which the option takes for none."""
+    return os.environ.get("ISOCHARGE_TOKEN") if token is None else token
+
+
+def page_address(live: str, token: str | None) -> Address:
+    """Where the page listens.
 
     Raises:
-        InputError: If others could see it by accident, or the options do not go together.
+        InputError: If it is no HOST:PORT, or others could see the page without a token.
     """
-    with require("http"):
-        from isocharge.serve.viewer.server import PageSettings
-    from isocharge.serve.network.address import Address, check_exposure
-    from isocharge.serve.network.tls import Tls
-
-    address = Address(host, port)
-    if token is None:
-        token = os.environ.get("ISOCHARGE_TOKEN")  # the option takes an empty variable for none
-    check_exposure(address, token=token is not None, insecure=insecure)
-    if tls_key is not None and tls_cert is None:
-        raise InputError("--live-tls-key: expected --live-tls-cert too, got the key alone")
-    return PageSettings(address, token, None if tls_cert is None else Tls(tls_cert, tls_key), is_recording)
-
-
-def film_link(name: str, metadata: "ModelMetadata", model: Path) -> "tuple[ReaderEnd, FilmLink]":
-    """A film for the page, and the reader's end of its link.
-
-    Args:
-        name: Of the stream, for people.
-        metadata: Of the model that answers.
-        model: Folder of its version.
-    """
-    with require("http"):
-        from isocharge.serve.viewer.server import FilmLink
-    from isocharge.serve.viewer.description import describe_film, find_field
-    from isocharge.serve.viewer.link import make_link
-
-    reader, page = make_link()
-    return reader, FilmLink(page, describe_film(name, metadata, find_field(model, metadata)))
+    host, _, port = live.rpartition(":")
+    if not (host and port.isdecimal() and int(port) < 1 << 16):
+        raise InputError(f"--live: expected HOST:PORT, as 127.0.0.1:8001, got {live!r}")
+    address = Address(host.removeprefix("[").removesuffix("]"), int(port))
+    check_exposure(address, has_token=given_token(token) is not None)
+    return address
 
 
 @contextmanager
-def one_page(
-    name: str, metadata: "ModelMetadata", model: Path, settings: "PageSettings"
-) -> "Iterator[tuple[ReaderEnd, str]]":
-    """The page of one film in a process of its own: the reader's end of the link, and the page's URL."""
-    from isocharge.serve.viewer.server import page_process
+def live_page(
+    address: Address, token: str | None, name: str, metadata: ModelMetadata, model: Path, *, is_recording: bool = False
+) -> Iterator[tuple[ReaderEnd, str]]:
+    """The page of a stream in a process of its own; says where it is. Yields the reader's end of the link, and the URL.
 
-    reader, film = film_link(name, metadata, model)
+    Args:
+        address: Where it listens.
+        token: As the option.
+        name: Of the stream, for people.
+        metadata: Of the model that answers.
+        model: Folder of its version.
+        is_recording: Whether the stream is a recording, which waits for its page.
+    """
+    with require("http"):
+        from isocharge.serve.viewer.process import Page, page_process
+
+    description = describe_film(name, metadata, find_field(model, metadata))
+    reader, end = make_link()
     try:
-        with page_process([film], settings) as url:
+        with page_process(Page(end, description, address, given_token(token), is_recording)) as url:
+            if is_recording:
+                reader.wait()
+            say(f"{'replay' if is_recording else 'live'} page: {url}")
             try:
                 yield reader, url
             finally:
@@ -128,35 +103,33 @@ def one_page(
         reader.close()
 
 
-@dataclass
 class PageFeed:
-    """What a stream tells the page: each record, and a few times a second its counters."""
+    """What a stream tells its page: each record, and a few times a second its counters."""
 
-    link: "ReaderEnd"
-    pack: "Callable[[PredictionRecord], bytes]"
-    touch: "TouchStream"
-    live: "RecordedStream | None" = None
-    ended: str = "the process of the live page has ended; the stream goes on without it"
-    _told_s: float = 0.0
-    _times: deque[float] = field(default_factory=lambda: deque(maxlen=RATE_RECORDS))
+    def __init__(self, link: ReaderEnd, touch: TouchStream, live: RecordedStream | None = None) -> None:
+        """Feed a page; `live` is the stream with its recording, None for a replay."""
+        self._link, self._touch, self._live = link, touch, live
+        self._pack = SampleFormat(touch.predictor.metadata.electrodes).pack
+        self._told_s = 0.0
+        self._times: deque[float] = deque(maxlen=RATE_RECORDS)
 
-    def put(self, record: "PredictionRecord") -> None:
+    def put(self, record: PredictionRecord) -> None:
         """Hand over a record; does not wait."""
-        was_open, now_s = self.link.is_open, time.monotonic()
-        self.link.put(self.pack(record))
+        was_open, now_s = self._link.is_open, time.monotonic()
+        self._link.put(self._pack(record))
         self._times.append(now_s)
-        if was_open and not self.link.is_open:
-            say(self.ended)
+        if was_open and not self._link.is_open:
+            say("the process of the live page has ended; the stream goes on without it")
         if now_s - self._told_s > STATE_S:
             self._told_s = now_s
             self._tell_state(record, now_s - self._times[0])
 
-    def _tell_state(self, record: "PredictionRecord", elapsed_s: float) -> None:
+    def _tell_state(self, record: PredictionRecord, elapsed_s: float) -> None:
         rate_Hz = (len(self._times) - 1) / elapsed_s if len(self._times) > 1 and elapsed_s > 0.0 else None
-        recorder = self.live.recorder if self.live else None
-        self.link.tell(
-            counters=self.touch.totals()._asdict()
-            | {"reconnects": self.touch.counts.outages, "not_shown": self.link.dropped},
+        recorder = self._live.recorder if self._live else None
+        more = {"reconnects": self._touch.counts.outages, "not_shown": self._link.dropped}
+        self._link.tell(
+            counters=self._touch.totals()._asdict() | more,
             rate_Hz=rate_Hz,
             model=record.model,
             tare_pC=record.tare_pC,
@@ -165,95 +138,50 @@ class PageFeed:
         )
 
 
-def page_feed(link: "ReaderEnd", touch: "TouchStream", live: "RecordedStream | None", electrodes: Any) -> PageFeed:
-    """The feed of a stream with these electrodes."""
-    from isocharge.serve.viewer.sample import SampleFormat
+@contextmanager
+def answering(link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str] | None) -> Iterator[None]:
+    """Do what the page asks of a live stream while the block runs, and show warnings of the live path on the page.
 
-    return PageFeed(link, SampleFormat(tuple(electrodes)).pack, touch, live)
-
-
-@dataclass
-class PageRequests:
-    """Does what the page asks of a live stream, in a thread of its own.
-
-    Attributes:
+    Args:
         link: The reader's end.
         live: The stream.
-        header: Policy, device table and the film's own name, for recordings that the page begins.
-        records_itself: Whether the command records by itself; then the page may not.
+        header: Policy, device table and name of the film, for recordings that the page begins; None forbids them.
     """
 
-    link: "ReaderEnd"
-    live: "RecordedStream"
-    header: tuple[str, Any, str]
-    records_itself: bool
-
-    def follow(self) -> None:
-        """Do what is asked until the page's process ends."""
-        while (request := self.link.request()) is not None:
+    def follow() -> None:
+        while (request := link.request()) is not None:
             try:
-                self._do(request)
+                _do(request, link, live, header)
             except IsochargeError as error:
-                self.link.tell(note=_note(str(error)))
+                _show(link, str(error))
 
-    def _do(self, request: "Message") -> None:
-        from isocharge.serve.port.recording import Marker
-
-        if request["do"] == "tare":
-            self.live.request_tare()
-        elif request["do"] == "marker":
-            marker = Marker(time.time(), request["text"])
-            self.live.request_marker(marker)
-            self.link.tell(marker=[*marker])
-        elif self.records_itself:
-            raise InputError("the command that runs the stream records it already (--record)")
-        else:
-            self._record(request["on"])
-
-    def _record(self, is_on: bool) -> None:
-        from isocharge.serve import Recorder
-
-        if not is_on:
-            self.live.request_recording(None)
-            return
-        label = self.live.predictor.metadata.label
-        path = Path(f"{label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
-        recorder = Recorder(path, label, *self.header)
-        self.live.request_recording(recorder.__enter__())
-
-
-@contextmanager
-def answering(requests: PageRequests) -> Iterator[None]:
-    """Do what the page asks while the block runs, and show the live path's warnings on the page, too."""
-    handler = _NoteHandler(requests.link)
+    handler = logging.Handler()
+    handler.emit = lambda record: _show(link, record.getMessage())  # type: ignore[method-assign]
     logger = logging.getLogger("isocharge.serve")
     logger.addHandler(handler)
-    threading.Thread(target=requests.follow, name="page requests", daemon=True).start()
+    threading.Thread(target=follow, name="page requests", daemon=True).start()
     try:
         yield
     finally:
         logger.removeHandler(handler)
 
 
-class _NoteHandler(logging.Handler):
-    """Shows warnings on the page."""
+def _do(request: LiveRequest, link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str] | None) -> None:
+    match request:
+        case Marker(text=text):
+            marker = recording.Marker(time.time(), text)
+            live.request_marker(marker)
+            link.tell(marker=[*marker])
+        case Record(on=is_on):
+            if header is None:
+                raise InputError("the command that runs the stream records it already (--record)")
+            label = live.predictor.metadata.label
+            path = Path(f"{label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
+            live.request_recording(Recorder(path, label, *header).__enter__() if is_on else None)
+        case Tare():
+            live.request_tare()
 
-    def __init__(self, link: "ReaderEnd") -> None:
-        super().__init__()
-        self._link = link
 
-    def emit(self, record: logging.LogRecord) -> None:
-        self._link.tell(note=_note(record.getMessage()))
-
-
-def _note(text: str) -> dict[str, Any]:
-    """A message for the page, which shows it for a while."""
-    return {"text": text, "at": time.time()}
-
-
-def open_in_browser(url: str) -> None:
-    """Open the page where there is a browser."""
-    with suppress(webbrowser.Error, OSError):
-        if webbrowser.open(url):
-            return
-    say(f"open {url} in a browser")
+def _show(link: ReaderEnd, text: str) -> None:
+    """Show a message on the page for a while."""
+    link.tell(note={"text": text, "at": time.time()})

@@ -1,13 +1,20 @@
 """Durations of calls, measured in turns, so that a machine that slows down slows down all of them."""
 
+import os
+import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import metadata
+from itertools import cycle
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Singles
+from isocharge.common.progress import track
+from isocharge.serve.prediction.predictor import Predictor
 
 Clock = Callable[[], int]
 """Time in ns."""
@@ -17,6 +24,12 @@ LEAST_CALLS = 3
 
 ROUNDS = 10
 """Turns of every contender; the first one warms up and does not count."""
+
+BATCHES = (16, 256, 4096)
+"""Presses in a batch; the last is the largest that a server takes by default."""
+
+CHARGES = 4096
+"""Presses that the calls cycle through."""
 
 
 class Contender(NamedTuple):
@@ -52,25 +65,19 @@ class Timing:
     presses_per_s: float
 
     @classmethod
-    def of(cls, name: str, presses: int, durations_ns: Array, in_parallel: int = 1) -> "Timing":
-        """From durations, shape (calls,), ns, of which so many ran at a time."""
+    def of(cls, name: str, presses: int, durations_ns: Array) -> "Timing":
+        """From durations, shape (calls,), ns."""
         p50, p99 = np.percentile(durations_ns, (50, 99)) / 1e3
-        rate = in_parallel * presses * len(durations_ns) / (float(durations_ns.sum()) / 1e9)
+        rate = presses * len(durations_ns) / (float(durations_ns.sum()) / 1e9)
         return cls(name, presses, len(durations_ns), float(p50), float(p99), rate)
 
 
-def take_turns(
-    contenders: Sequence[Contender],
-    seconds: float,
-    progress: Callable[[int, int], object] = lambda _done, _all: None,
-    clock: Clock = time.perf_counter_ns,
-) -> list[Timing]:
+def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = time.perf_counter_ns) -> list[Timing]:
     """Time all contenders, one after another in each of ROUNDS.
 
     Args:
         contenders: What to time.
         seconds: Time for all of it, s; contenders whose calls take long may take longer.
-        progress: Called with the rounds done and all rounds.
         clock: ns.
 
     Returns:
@@ -78,12 +85,11 @@ def take_turns(
     """
     turn_ns = round(seconds * 1e9 / (ROUNDS * max(len(contenders), 1)))
     durations: list[list[int]] = [[] for _ in contenders]
-    for number in range(ROUNDS):
+    for number in track(range(ROUNDS), "measuring", ROUNDS):
         for contender, of_contender in zip(contenders, durations, strict=True):
             turn = _turn(contender.call, turn_ns, clock)
             if number:
                 of_contender += turn
-        progress(number + 1, ROUNDS)
     return [
         Timing.of(contender.name, contender.presses, np.array(of, float))
         for contender, of in zip(contenders, durations, strict=True)
@@ -99,3 +105,45 @@ def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
         call()
         durations.append(clock() - begin)
     return durations
+
+
+def press_charges(golden_pC: Singles, seed: int = 0, presses: int = CHARGES) -> Singles:
+    """Presses drawn from the golden vectors of a model, shapes (presses, electrodes) from (n, electrodes), pC."""
+    charges: Singles = golden_pC[np.random.default_rng(seed).integers(0, len(golden_pC), presses)]
+    return charges
+
+
+def in_process_contenders(
+    predictor: Predictor, charge_pC: Singles, batches: Sequence[int] = BATCHES
+) -> list[Contender]:
+    """Every method of a predictor.
+
+    Args:
+        predictor: The model.
+        charge_pC: Shape (n, electrodes), pC; each call of one press takes the next row.
+        batches: Presses of the batches; those above n are left out.
+    """
+    rows, lists, out = cycle(charge_pC), cycle(charge_pC.tolist()), np.zeros(7, np.float32)
+    contenders = [
+        Contender("predict_into, float32 array", 1, lambda: predictor.predict_into(next(rows), out)),
+        Contender("predict, list of numbers", 1, lambda: predictor.predict(next(lists))),
+    ]
+    return contenders + [_batch(predictor, charge_pC[:n]) for n in batches if n <= len(charge_pC)]
+
+
+def _batch(predictor: Predictor, charge_pC: Singles) -> Contender:
+    return Contender(f"predict_batch, {len(charge_pC)}", len(charge_pC), lambda: predictor.predict_batch(charge_pC))
+
+
+def machine(packages: Sequence[str] = ("numpy", "onnxruntime")) -> dict[str, str]:
+    """Where figures were measured: processor, cores, system, Python, and the versions of packages."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text("utf-8").splitlines() if info.exists() else []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return {
+        "cpu": next(names, platform.processor()),
+        "cores": str(os.cpu_count()),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        **{name: metadata.version(name) for name in packages},
+    }

@@ -96,17 +96,14 @@ def is_address(host: str) -> bool:
     return True
 
 
-def check_exposure(address: Address, *, token: bool, insecure: bool) -> None:
-    """Refuse to serve others than this machine by accident.
+def check_exposure(address: Address, *, has_token: bool) -> None:
+    """Refuse to serve others than this machine without a token.
 
     Raises:
-        InputError: If the address is open to others and there is neither a token nor `insecure`.
+        InputError: If the address is open to others and there is no token.
     """
-    if not (address.is_private or token or insecure):
-        raise InputError(
-            f"--host {address.host} lets other machines in: give --token TOKEN, which they then must send, "
-            "or --insecure to let everybody load, unload and ask models; the default is 127.0.0.1"
-        )
+    if not (address.is_private or has_token):
+        raise InputError(f"{address.host} lets other machines in: give --token TOKEN, which they then must send")
 
 
 def _listen_tcp(host: str, port: int, backlog: int) -> socket.socket:

@@ -1,8 +1,8 @@
-"""The bounds of a server on requests, connections and time; default numbers are in `isocharge.common.defaults`."""
+"""The bounds of a server on requests, connections and time."""
 
 from dataclasses import dataclass
 
-from isocharge.common.defaults import BODY_BYTES, CONNECTIONS, HEADER_SECONDS, IDLE_SECONDS, MAX_BATCH
+from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import TooLarge
 
 
@@ -18,17 +18,15 @@ class ServerLimits:
         body_seconds: Time from there to the end of the body; and again until the client has taken the answer.
         idle_seconds: Time between requests.
         connections: Connections that are open at a time.
-        message_bytes: Size of a client's message over a WebSocket.
     """
 
     batch: int = MAX_BATCH
-    body_bytes: int = BODY_BYTES
+    body_bytes: int = 1 << 20
     header_bytes: int = 1 << 14
-    header_seconds: float = HEADER_SECONDS
+    header_seconds: float = 10.0
     body_seconds: float = 30.0
-    idle_seconds: float = IDLE_SECONDS
-    connections: int = CONNECTIONS
-    message_bytes: int = 1 << 12
+    idle_seconds: float = 75.0
+    connections: int = 1024
 
     def check_body(self, size: int) -> None:
         """Check the size of a body, or of as much of it as has arrived.

@@ -16,7 +16,7 @@ from isocharge.common.tables import Table
 from isocharge.serve.model.metadata import ModelMetadata
 
 FILE = "deflection.json"
-"""Name of the field in a model's version folder; `isocharge simulate deflection` writes one."""
+"""Name of the field in a model's version folder."""
 
 
 def find_field(model: Path, metadata: ModelMetadata) -> DeflectionField | None:

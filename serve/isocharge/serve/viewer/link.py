@@ -13,6 +13,10 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
 from typing import Any
 
+import msgspec
+
+from isocharge.serve.viewer.messages import LiveRequest
+
 PIPE_BYTES = 1 << 20
 """Room for samples that the page's process has not taken yet: some 10 s at 1 kHz."""
 
@@ -20,6 +24,8 @@ MOST_BYTES = 1 << 16
 """Largest message."""
 
 Message = dict[str, Any]
+
+REQUESTS: msgspec.json.Decoder[LiveRequest] = msgspec.json.Decoder(LiveRequest)
 
 
 @dataclass
@@ -60,13 +66,13 @@ class ReaderEnd:
             return False
         return True
 
-    def request(self) -> Message | None:
-        """Wait for a message from the page; None once its process has ended."""
+    def request(self) -> LiveRequest | None:
+        """Wait for what the page asks for; None once its process has ended."""
         try:
             data = self.messages.recv(MOST_BYTES)
         except OSError:
             return None
-        return json.loads(data) if data else None
+        return REQUESTS.decode(data) if data else None
 
     def close_here(self) -> None:
         """Close this process's copy of an end that another process has."""
@@ -118,10 +124,10 @@ class PageEnd:
                 messages.append(json.loads(data))
         return messages
 
-    def ask(self, **content: Any) -> bool:
+    def ask(self, request: LiveRequest) -> bool:
         """Send a request to the reader; False where it has ended, or takes none."""
         try:
-            self.messages.send(json.dumps(content).encode(), socket.MSG_DONTWAIT)
+            self.messages.send(msgspec.json.encode(request), socket.MSG_DONTWAIT)
         except OSError:
             return False
         return True

@@ -1,163 +1,238 @@
-"""The process of the page: a server of its own, beside the process that reads the port."""
+"""The page's server: its files and the description of the film over HTTP, samples by WebSocket.
+
+The server is that of the package `websockets`, one request of HTTP for each connection. It bounds the head of a request
+(8 KiB a line, 128 lines), the time for it, the size of a message, and asks each viewer for a sign of life. The rest is
+bounded here: how many viewers there are, how much they send, and how long they take nothing.
+"""
 
 import asyncio
-import os
-import signal
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+import contextlib
+import json
+import logging
+import secrets
+import socket
+import time
+from collections.abc import AsyncIterator, Sequence
+from http import HTTPStatus
+from importlib.resources import files
+from importlib.resources.abc import Traversable
 
-import uvloop
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request
+from websockets.http11 import Response as WebResponse
+from websockets.typing import Subprotocol
 
-from isocharge.common.errors import IsochargeError, ListenError
-from isocharge.serve.network.address import Address
-from isocharge.serve.network.http import HttpServer
-from isocharge.serve.network.http.websocket import bounded_websocket
-from isocharge.serve.network.limits import ServerLimits
-from isocharge.serve.network.tls import Tls
-from isocharge.serve.network.token import Token
-from isocharge.serve.viewer.access import Access
-from isocharge.serve.viewer.app import PageApp
-from isocharge.serve.viewer.hub import Hub, make_film
-from isocharge.serve.viewer.link import PageEnd
+from isocharge.common.errors import RequestError, TooMany, UnknownPath
+from isocharge.common.structs import parse_json
+from isocharge.serve.flags import MEANINGS
+from isocharge.serve.network.protocol import Response
+from isocharge.serve.network.protocol.page import PAGE_HEADERS
+from isocharge.serve.network.protocol.response import error_response, json_response, response_of
+from isocharge.serve.viewer.access import PROTOCOL, Access
+from isocharge.serve.viewer.hub import Hub, Viewer
+from isocharge.serve.viewer.messages import confirmed_number
+from isocharge.serve.viewer.samples import FLAG_BITS
 
-NICE = 10
-"""How much later than the reader the page's process gets its turn where both want the same core."""
+SESSION, LIVE = "/session.json", "/live"
+"""Paths of the description and of the WebSocket."""
 
-START_S, STOP_S = 60.0, 5.0
-"""Time to start and to stop, s."""
+VIEWERS = 32
+"""Browsers at a time."""
 
-CONNECTIONS = 128
-"""Connections at a time: a browser opens six."""
+BYTES_AT_ONCE, BYTES_PER_S = 1 << 16, 1 << 14
+"""What a connection may send at once and in the long run, 1/s: the page sends 1 kB/s, and no request is larger."""
 
+MESSAGE_BYTES = 1 << 12
+"""Largest message of a viewer."""
 
-class FilmLink(NamedTuple):
-    """A film for the page's process: the link to its reader, and its description."""
+REQUEST_S, SIGN_OF_LIFE_S, TAKE_S, CLOSE_S = 10.0, 20.0, 30.0, 2.0
+"""Time for a request; between signs of life, and for one; to take what was sent; to say goodbye, s."""
 
-    link: PageEnd
-    description: dict[str, Any]
+TYPES = {
+    ".html": b"text/html; charset=utf-8",
+    ".css": b"text/css; charset=utf-8",
+    ".js": b"text/javascript; charset=utf-8",
+    ".svg": b"image/svg+xml",
+    ".LICENSE": b"text/plain; charset=utf-8",
+}
+"""Content type by the end of a file's name."""
 
+POLICY = (
+    b"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
+    b"base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""What a browser may load: our own files, and nothing from anywhere else."""
 
-@dataclass(frozen=True)
-class PageSettings:
-    """Where the page is, and who may see it.
-
-    Attributes:
-        address: Where to listen.
-        token: The secret; None for none.
-        tls: Certificate and key; None for no TLS.
-        is_recording: Whether the films are recordings.
-    """
-
-    address: Address
-    token: str | None = None
-    tls: Tls | None = None
-    is_recording: bool = False
-
-
-@contextmanager
-def page_process(films: Sequence[FilmLink], settings: PageSettings) -> Iterator[str]:
-    """Run the page in a process of its own; yields its URL.
-
-    Raises:
-        InputError: If a TLS file or the token cannot be used.
-        ListenError: If the address is taken or impossible.
-    """
-    context = get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_run, args=(list(films), settings, theirs), name="page", daemon=True)
-    with _interrupts_ignored():
-        process.start()
-    theirs.close()
-    for film in films:
-        film.link.close_here()
-    try:
-        yield _url(ours)
-    finally:
-        process.join(STOP_S)
-        if process.is_alive():
-            process.terminate()
-            process.join()
+SILENT = logging.getLogger("isocharge.serve.viewer.websockets")
+"""Mistakes of clients are answered, not logged."""
+SILENT.setLevel(logging.CRITICAL)
 
 
-def run_page(films: Sequence[FilmLink], settings: PageSettings, announce: Any = None) -> None:
-    """Answer browsers in this process until all readers have ended, or SIGTERM or SIGINT comes.
+class Budget:
+    """How many bytes a client may still send: `at_once`, and `per_s` more each second."""
 
-    Args:
-        films: In their order on the page.
-        settings: Where, and for whom.
-        announce: Called with the URL once the server listens.
+    def __init__(self, at_once: float, per_s: float, now_s: float) -> None:
+        self._most = self._left = at_once
+        self._per_s, self._counted_s = per_s, now_s
 
-    Raises:
-        As `page_process`.
-    """
-    hub = Hub(
-        [
-            make_film(number, film.link, film.description, is_recording=settings.is_recording)
-            for number, film in enumerate(films)
-        ]
-    )
-    access = Access(None if settings.token is None else Token(settings.token), settings.address.host)
-    limits = ServerLimits(connections=CONNECTIONS)
-    server = HttpServer(
-        PageApp(hub, access), settings.address, limits=limits, tls=settings.tls, websocket=bounded_websocket(limits)
-    )
-    with closing(server), closing(hub):
-        if announce is not None:
-            announce(server.url)
-        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-            runner.run(_serve(server, hub))
+    def spend(self, count: int, now_s: float) -> bool:
+        """Count bytes; False if they are too many."""
+        self._left = min(self._most, self._left + max(now_s - self._counted_s, 0.0) * self._per_s) - count
+        self._counted_s = now_s
+        return self._left >= 0.0
 
 
-async def _serve(server: HttpServer, hub: Hub) -> None:
-    following = asyncio.create_task(hub.run())
-    following.add_done_callback(lambda _: server.stop())
-    await server.serve()
-    following.cancel()
-    with suppress(asyncio.CancelledError):
-        await following
+class PageConnection(ServerConnection):
+    """A connection that ends when its client sends too much: of every frame each byte counts, also of a ping."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin to count."""
+        self._budget = Budget(BYTES_AT_ONCE, BYTES_PER_S, time.monotonic())
+        super().connection_made(transport)
+
+    def data_received(self, data: bytes) -> None:
+        """Count, and take."""
+        if self._budget.spend(len(data), time.monotonic()):
+            super().data_received(data)
+        else:
+            self.transport.abort()
 
 
-def _run(films: list[FilmLink], settings: PageSettings, ready: Connection) -> None:
-    """The page's process: says the URL, or what is wrong."""
-    with suppress(OSError):
-        os.nice(NICE)
-    try:
-        run_page(films, settings, lambda url: ready.send(url))
-    except IsochargeError as error:
-        ready.send(error)
+class PageServer:
+    """Answers browsers."""
+
+    def __init__(self, hub: Hub, access: Access) -> None:
+        self._hub, self._access = hub, access
+        self._files = page_files()
+        self._id = secrets.token_hex(8)
+
+    @contextlib.asynccontextmanager
+    async def listening(self, listening: socket.socket) -> AsyncIterator[None]:
+        """Answer while the block runs."""
+        async with serve(
+            self._follow,
+            sock=listening,
+            process_request=self._answer,
+            select_subprotocol=_our_protocol,
+            compression=None,
+            server_header=None,
+            open_timeout=REQUEST_S,
+            ping_interval=SIGN_OF_LIFE_S,
+            ping_timeout=SIGN_OF_LIFE_S,
+            close_timeout=CLOSE_S,
+            max_size=MESSAGE_BYTES,
+            logger=SILENT,
+            create_connection=PageConnection,
+        ):
+            yield
+
+    def _answer(self, _connection: ServerConnection, request: Request) -> WebResponse | None:
+        """A file of the page, which everybody may have, or the description of the film; None lets a viewer in."""
+        try:
+            path = request.path.partition("?")[0]
+            if path in self._files:
+                return _to_send(self._files[path])
+            if path not in (SESSION, LIVE):
+                raise UnknownPath(f"nothing is served under {path[:200]!r}; the page is /")
+            headers = {name.lower().encode(): _bytes(value) for name, value in request.headers.raw_items()}
+            offered = ",".join(request.headers.get_all("Sec-WebSocket-Protocol")).split(",")
+            self._access.check(headers, map(str.strip, offered))
+            if path == SESSION:
+                return _to_send(self._session())
+            if len(self._hub.viewers) >= VIEWERS:
+                raise TooMany(f"all {VIEWERS} places for viewers are taken; close a page that nobody looks at")
+            return None
+        except Exception as error:  # whatever it is, one request fails and the log says why
+            return _to_send(error_response(error))
+
+    def _session(self) -> Response:
+        response = json_response(
+            {
+                "id": self._id,
+                "is_replay": self._hub.is_replay,
+                "film": self._hub.description,
+                "flags": [{"word": word, "bit": FLAG_BITS[word], "says": says} for word, says in MEANINGS.items()],
+            }
+        )
+        response.headers.append((b"cache-control", b"no-store"))
+        return response
+
+    async def _follow(self, connection: ServerConnection) -> None:
+        """Send samples to a viewer and take its requests until it goes."""
+        viewer = Viewer(self._hub)
+        self._hub.viewers.add(viewer)
+        sender = asyncio.create_task(self._send(viewer, connection))
+        try:
+            async for message in connection:
+                await self._take(viewer, connection, message)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._hub.viewers.discard(viewer)
+            sender.cancel()
+
+    async def _send(self, viewer: Viewer, connection: ServerConnection) -> None:
+        """Send what there is; a viewer that does not take it is left."""
+        try:
+            while not self._hub.has_ended:
+                await viewer.wake.wait()
+                viewer.wake.clear()
+                async with asyncio.timeout(TAKE_S):
+                    for message in viewer.messages(self._hub.clock()):
+                        await connection.send(message)
+            await connection.close(1012, "the stream has ended")
+        except TimeoutError:
+            connection.transport.abort()
+        except ConnectionClosed:
+            pass
+
+    async def _take(self, viewer: Viewer, connection: ServerConnection, message: str | bytes) -> None:
+        """Do what the page says; what is no request is answered with the reason."""
+        try:
+            if isinstance(message, bytes):
+                viewer.confirm(confirmed_number(message))
+                return
+            request = parse_json(message, "", RequestError, self._hub.requests)
+            if not self._hub.do(request, viewer):
+                raise RequestError("the stream has ended, or does not answer")
+        except RequestError as error:
+            await connection.send(json.dumps({"error": str(error)}))
 
 
-def _url(ready: Connection) -> str:
-    """The URL that the page's process says.
-
-    Raises:
-        IsochargeError: What it raised.
-        ListenError: If it says nothing.
-    """
-    try:
-        answer = ready.recv() if ready.poll(START_S) else None
-    except EOFError:
-        answer = None
-    if isinstance(answer, IsochargeError):
-        raise answer
-    if answer is None:
-        raise ListenError("the process of the live page did not start; run again without --live, and report this")
-    return str(answer)
+def _our_protocol(_connection: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+    return Subprotocol(PROTOCOL) if PROTOCOL in offered else None
 
 
-@contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    """A process that is started here does not see Ctrl-C: it ends with its readers."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+def _bytes(header: str) -> bytes:
+    return header.encode("ascii", "surrogateescape")
+
+
+def _to_send(response: Response) -> WebResponse:
+    """A response as `websockets` sends it, the last one of its connection."""
+    headers = Headers([(name.decode(), value.decode()) for name, value in response.headers])
+    headers["Connection"] = "close"
+    return WebResponse(response.status, HTTPStatus(response.status).phrase, headers, response.body)
+
+
+def page_files() -> dict[str, Response]:
+    """The answer to each path; `/` is the page."""
+    folder = files("isocharge.serve.viewer") / "page"
+    answers = {f"/{name}": _answer(file) for name, file in _walk(folder, "")}
+    return answers | {"/": answers["/index.html"]}
+
+
+def _walk(folder: Traversable, prefix: str) -> list[tuple[str, Traversable]]:
+    entries: list[tuple[str, Traversable]] = []
+    for entry in folder.iterdir():
+        name = prefix + entry.name
+        entries += _walk(entry, f"{name}/") if entry.is_dir() else [(name, entry)]
+    return entries
+
+
+def _answer(file: Traversable) -> Response:
+    response = response_of(200, TYPES["." + file.name.rpartition(".")[2]], file.read_bytes())
+    others = [header for header in PAGE_HEADERS if header[0] != b"content-security-policy"]
+    response.headers.extend([(b"content-security-policy", POLICY), (b"cache-control", b"no-cache"), *others])
+    return response

@@ -1,12 +1,14 @@
-"""The samples of a film by number: the latest ones of a live stream, or all of a recording."""
+"""The samples of a stream by number: the latest ones of a live stream, or all of a recording; and a place in that."""
 
 import tempfile
 from bisect import bisect_right
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from isocharge.serve.viewer.coalesce import Samples
+from isocharge.serve.viewer.messages import Pause, Play, ReplayRequest, Seek, Speed
+from isocharge.serve.viewer.samples import Samples
 
 LIVE_SAMPLES = 1 << 14
 """Samples that are kept of a live stream: 16 s at 1 kHz; a browser that is farther behind misses some."""
@@ -30,6 +32,9 @@ class LiveTape:
     def oldest(self) -> int:
         """Number of the oldest sample that is still there."""
         return max(0, self.total - len(self._ring))
+
+    def close(self) -> None:
+        """There is nothing to close."""
 
     def append(self, samples: Samples) -> None:
         """Add samples, and forget as many old ones as need be."""
@@ -131,3 +136,57 @@ Tape = LiveTape | RecordedTape
 
 def _first_after(tape: Tape, timestamp: float) -> int:
     return bisect_right(range(tape.total), timestamp, lo=tape.oldest, key=tape.timestamp)
+
+
+@dataclass
+class Playhead:
+    """Where a viewer is in a recording.
+
+    Attributes:
+        at_s: Time since the start of the recording, s.
+        speed: Times the recorded pace.
+        is_playing: Whether time goes on.
+        has_jumped: Whether the viewer sought another place, and has nothing of it yet.
+    """
+
+    at_s: float = 0.0
+    speed: float = 1.0
+    is_playing: bool = True
+    has_jumped: bool = True
+
+    def advance(self, step_s: float, end_s: float, *, is_complete: bool) -> bool:
+        """Let time go on.
+
+        Args:
+            step_s: Time that has passed, s.
+            end_s: How far the recording is known, s.
+            is_complete: Whether that is all of it.
+
+        Returns:
+            Whether the end has just been reached.
+        """
+        if not self.is_playing:
+            return False
+        self.at_s = min(self.at_s + step_s * self.speed, end_s)
+        if is_complete and self.at_s >= end_s:
+            self.is_playing = False
+            return True
+        return False
+
+    def apply(self, request: ReplayRequest, end_s: float) -> None:
+        """Do what the page asks for; at the end, playing begins anew."""
+        match request:
+            case Speed(value=value):
+                self.speed = value
+            case Seek(value=value):
+                self.at_s, self.has_jumped = min(value, end_s), True
+            case Pause():
+                self.is_playing = False
+            case Play():
+                self.is_playing = True
+                if self.at_s >= end_s:
+                    self.at_s, self.has_jumped = 0.0, True
+
+    def to_json(self) -> dict[str, float | bool]:
+        """For the page."""
+        return {"at_s": round(self.at_s, 3), "speed": self.speed, "is_playing": self.is_playing}

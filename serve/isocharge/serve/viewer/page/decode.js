@@ -1,22 +1,21 @@
-// Binary messages of samples; serve/isocharge/serve/viewer/messages.py and sample.py describe them.
+// Binary messages of samples; serve/isocharge/serve/viewer/messages.py and samples.py describe them.
 
 export const HEADER_BYTES = 24;
 export const CONTACT = 0x80000000;
 const SAMPLES = 1, BEGIN_ANEW = 1;
 
-/** @returns {{film, number, sent_s, missed, beginsAnew, samples}} null for a message of another kind or length */
-export function decode(buffer, electrodesOf) {
+/** @returns {{number, sent_s, missed, beginsAnew, samples}} null for a message of another kind or length */
+export function decode(buffer, electrodes) {
   if (buffer.byteLength < HEADER_BYTES) return null;
   const head = new DataView(buffer);
-  const film = head.getUint8(1), count = head.getUint16(2, true), electrodes = electrodesOf(film);
-  if (head.getUint8(0) !== SAMPLES || electrodes === undefined) return null;
+  const count = head.getUint16(2, true);
+  if (head.getUint8(0) !== SAMPLES) return null;
   const size = 8 * Math.ceil((48 + 4 * electrodes) / 8);
   if (buffer.byteLength !== HEADER_BYTES + count * size) return null;
   const samples = [];
   for (let k = 0; k < count; k++) samples.push(sample(head, HEADER_BYTES + k * size, electrodes));
   return {
-    film, samples,
-    number: head.getUint32(4, true), sent_s: head.getFloat64(8, true), missed: head.getUint32(16, true),
+    samples, number: head.getUint32(4, true), sent_s: head.getFloat64(8, true), missed: head.getUint32(16, true),
     beginsAnew: (head.getUint32(20, true) & BEGIN_ANEW) !== 0,
   };
 }

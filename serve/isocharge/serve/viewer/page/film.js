@@ -10,15 +10,16 @@ const COUNTERS = { frames: "frames", lost: "lost", repeated: "repeated", restart
   malformed: "malformed", bytes_dropped: "bytes dropped", resyncs: "resynchronised", reconnects: "reconnected", not_shown: "not shown here" };
 
 export class FilmView {
-  constructor(number, description, session, act) {
-    Object.assign(this, { number, description, act, isReplay: session.is_replay, state: {}, isPaused: false, missed: 0, arrivedMs: -Infinity, spokenMs: 0, recent: new Map() });
+  constructor(session, act) {
+    const description = session.film;
+    Object.assign(this, { description, act, isReplay: session.is_replay, state: {}, isPaused: false, missed: 0, arrivedMs: -Infinity, spokenMs: 0, recent: new Map() });
     this.words = new Map(session.flags.map(({ word, bit, says }) => [word, { bit, says }]));
-    this.root = document.getElementById("film").content.firstElementChild.cloneNode(true);
+    this.root = document.getElementById("film-template").content.firstElementChild.cloneNode(true);
     this.history = new History(description.electrodes.length, this.isReplay);
     this.find = (selector) => this.root.querySelector(selector);
     this.find(".name").textContent = description.name;
     this.showModel(description.model);
-    this.root.addEventListener("click", (event) => { const button = event.target.closest("[data-do]"); if (button) { act(button.dataset.do, this); if (event.detail) button.blur(); } });
+    this.root.addEventListener("click", (event) => { const button = event.target.closest("[data-do]"); if (button) { act(button.dataset.do); if (event.detail) button.blur(); } });
     if (this.isReplay) for (const button of this.root.querySelectorAll("[data-do]")) button.hidden = button.dataset.do !== "pause";
     this.latencies = [];
     this.ages = [];

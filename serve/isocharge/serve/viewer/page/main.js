@@ -1,4 +1,4 @@
-// The page: connects, hands samples to the films, draws, and takes keys and buttons.
+// The page: connects, hands samples to the film, draws, and takes keys and buttons.
 
 import { Connection } from "./connection.js";
 import { decode } from "./decode.js";
@@ -7,36 +7,33 @@ import { onTheme } from "./theme.js";
 import { Timeline } from "./timeline.js";
 
 const SLOW_MS = 500, PACE_MS = 20, RAREST = 8, LONGEST_MS = 80;
-const page = { films: [], chosen: 0, timeline: null, isPaused: false, unconfirmed: null, pictures: 0, cost: 0, pace: 16, every: 1, ages: [], starts: [] };
+const page = { film: null, timeline: null, isPaused: false, unconfirmed: null, pictures: 0, cost: 0, pace: 16, every: 1, ages: [], starts: [] };
 const connection = new Connection({ session, samples, message, state, door });
 const nowMs = () => performance.now();
 
 function session(content, isNew) {
   document.getElementById("door").hidden = true;
   if (!isNew) return;
-  const place = document.getElementById("films");
-  page.films = content.films.map((description, number) => new FilmView(number, description, content, act));
-  place.replaceChildren(...page.films.map((film) => film.root));
-  place.classList.toggle("several", page.films.length > 1);
-  for (const film of page.films) { film.start(); film.root.addEventListener("pointerdown", () => choose(film.number)); }
-  choose(0);
+  page.film = new FilmView(content, act);
+  document.getElementById("film").replaceChildren(page.film.root);
+  page.film.start();
   if (content.is_replay && !page.timeline) page.timeline = new Timeline(document.getElementById("timeline"), (request) => connection.request(request));
   if (page.isPaused) pause(false);
-  document.title = `${content.films.map((film) => film.name).join(", ")} · isocharge ${content.is_replay ? "replay" : "live"}`;
+  document.title = `${content.film.name} · isocharge ${content.is_replay ? "replay" : "live"}`;
 }
 
 function samples(buffer) {
-  const message = decode(buffer, (film) => page.films[film]?.description.electrodes.length);
+  const message = page.film && decode(buffer, page.film.description.electrodes.length);
   if (!message) return;
   page.unconfirmed = message.number;
-  page.films[message.film].take(message, nowMs());
+  page.film.take(message, nowMs());
   if (page.timeline && message.samples.length) page.timeline.at(message.samples.at(-1).t);
 }
 
-function message({ film, state: changed, play, error }) {
-  if (changed && page.films[film]) { page.films[film].update(changed); page.timeline?.update(changed); }
+function message({ state: changed, play, error }) {
+  if (changed && page.film) { page.film.update(changed); page.timeline?.update(changed); }
   if (play) page.timeline?.play(play);
-  if (error) setText(page.films[page.chosen].find(".note"), error);
+  if (error) setText(page.film.find(".note"), error);
 }
 
 function state(kind, words) {
@@ -55,11 +52,10 @@ function door(reason) {
   state("waiting", "a token, please");
 }
 
-function act(what, film) {
+function act(what) {
   if (what === "pause") return page.timeline ? page.timeline.toggle() : pause(!page.isPaused);
-  if (what === "tare") return connection.request({ do: "tare", film: film.number });
-  if (what === "record") return connection.request({ do: "record", film: film.number, on: !film.state.recording });
-  if (what === "marker") return connection.request({ do: "marker", film: film.number });
+  if (what === "record") return connection.request({ do: "record", on: !page.film.state.recording });
+  if (what === "tare" || what === "marker") return connection.request({ do: what });
   return undefined;
 }
 
@@ -72,23 +68,16 @@ function pause(isPaused) {
   state(...page.link);
 }
 
-function choose(number) {
-  if (!page.films[number]) return;
-  page.chosen = number;
-  page.films.forEach((film, k) => film.root.classList.toggle("chosen", k === number));
-}
-
 function key(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input:not([type=range]), select, dialog[open]")) return;
-  const film = page.films[page.chosen], name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   if (name === " " && event.target.closest("button, summary")) return;
   const live = page.timeline === null, action = {
-    t: live && (() => act("tare", film)), r: live && (() => act("record", film)), m: live && (() => act("marker", film)),
-    " ": () => act("pause", film), "?": () => document.getElementById("help").showModal(),
+    t: live && (() => act("tare")), r: live && (() => act("record")), m: live && (() => act("marker")),
+    " ": () => act("pause"), "?": () => document.getElementById("help").showModal(),
     ArrowLeft: !live && (() => page.timeline.step(-1)), ArrowRight: !live && (() => page.timeline.step(1)),
   }[name];
-  if (/^[1-9]$/.test(name)) choose(Number(name) - 1);
-  if (!action || !film) return;
+  if (!action || !page.film) return;
   action();
   event.preventDefault();
 }
@@ -105,7 +94,7 @@ function picture() {
     traces: isDue || number % Math.max(page.every, 2) === 0, relief: isDue || number % page.every === page.every >> 1,
   };
   if (heavy.traces) heavyMs = began;
-  if (!page.isPaused) for (const film of page.films) film.draw(began, heavy);
+  if (!page.isPaused) page.film?.draw(began, heavy);
   if (page.unconfirmed !== null) noteAge();
   if (began - slowMs > SLOW_MS) showSlow(began);
   page.cost += 0.1 * (nowMs() - began - page.cost);
@@ -116,14 +105,14 @@ function showSlow(began) {
   slowMs = began;
   if (page.pace > PACE_MS && page.every < RAREST) page.every *= 2;
   else if (page.pace < 0.9 * PACE_MS && page.every > 1) page.every /= 2;
-  if (!page.isPaused) for (const film of page.films) film.showSlow(began);
+  if (!page.isPaused) page.film?.showSlow(began);
 }
 
 /** What was drawn is confirmed, which asks for more; its age, where both clocks are the same machine's, is for tests. */
 function noteAge() {
   connection.confirm(page.unconfirmed);
   page.unconfirmed = null;
-  const latest = page.films[page.chosen]?.history.latest;
+  const { latest } = page.film.history;
   if (!latest || page.timeline) return;
   const channel = new MessageChannel();
   channel.port1.onmessage = () => {
@@ -134,8 +123,8 @@ function noteAge() {
 }
 
 addEventListener("keydown", key);
-onTheme(() => { for (const film of page.films) film.refresh(); });
-addEventListener("resize", () => { for (const film of page.films) film.refresh(); page.timeline?.drawTrack(); });
+onTheme(() => page.film?.refresh());
+addEventListener("resize", () => { page.film?.refresh(); page.timeline?.drawTrack(); });
 document.getElementById("help-button").addEventListener("click", () => document.getElementById("help").showModal());
 document.getElementById("door").addEventListener("submit", (event) => {
   event.preventDefault();

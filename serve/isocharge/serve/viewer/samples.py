@@ -1,5 +1,7 @@
 """A prediction record as a sample of fixed size: what goes to the process of the page, and on to browsers.
 
+Many samples are coalesced to as few as a browser can show.
+
     offset 0   timestamp, unix seconds, f64
            8   x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_std_N, misfit, latency_us, f32 each
           40   flags, u32: a bit for each word of `isocharge.serve.flags`, the highest one for contact
@@ -11,6 +13,7 @@ All little-endian; what is unknown is NaN.
 
 import math
 import struct
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -27,6 +30,9 @@ FLAG_BITS = {word: 1 << position for position, word in enumerate(MEANINGS)}
 CONTACT_BIT = 1 << 31
 
 LARGEST = float(np.finfo(np.float32).max)
+
+Samples = np.ndarray[Any, np.dtype[np.void]]
+"""Samples in their order, shape (n,), of a `SampleFormat`."""
 
 
 class SampleFormat:
@@ -63,3 +69,35 @@ class SampleFormat:
         except OverflowError:  # a number that no float32 can hold
             clipped = [[min(max(value, -LARGEST), LARGEST) for value in part] for part in (numbers, charge_pC)]
             return self._struct.pack(timestamp, *clipped[0], bits, 1, *clipped[1])
+
+
+def coalesce(samples: Samples, most: int) -> Samples:
+    """At most `most` samples that stand for all: each for a run of neighbours.
+
+    Of a run, the newest sample counts if it is a contact, else the hardest press: a tap between two pictures is shown.
+    Flags are those of the whole run, the latency its largest, and `records` add up.
+
+    Args:
+        samples: Shape (n,).
+        most: At least 1.
+    """
+    if len(samples) <= most:
+        return samples
+    edges = np.linspace(0, len(samples), most + 1).astype(int)
+    shown: Samples = samples[_shown_of_runs(samples, edges)]
+    starts = edges[:-1]
+    contact = shown["flags"] & CONTACT_BIT
+    shown["flags"] = np.bitwise_or.reduceat(samples["flags"], starts) & ~np.uint32(CONTACT_BIT) | contact
+    shown["records"] = np.add.reduceat(samples["records"], starts)
+    shown["latency_us"] = np.fmax.reduceat(samples["latency_us"], starts)
+    return shown
+
+
+def _shown_of_runs(samples: Samples, edges: np.ndarray) -> np.ndarray:
+    """The position of the sample that is shown of each run, shape (runs,)."""
+    touching = (samples["flags"] & CONTACT_BIT) != 0
+    force = np.where(touching, np.nan_to_num(samples["force_N"], nan=0.0), -1.0)
+    last = edges[1:] - 1
+    hardest = np.array([start + int(force[start:stop].argmax()) for start, stop in pairwise(edges)])
+    missed_tap = ~touching[last] & touching[hardest]
+    return np.where(missed_tap, hardest, last)
