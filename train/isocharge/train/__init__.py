@@ -15,21 +15,20 @@ from isocharge.common.versions import version_attribute
 
 with require("train"):
     from isocharge.train.bayes.limit import BayesLimit, BayesProblem, bayes_estimate, bayes_limit
-    from isocharge.train.calibration.calibrate import CalibrationProblem, CalibrationResult, EarlierFilm, calibrate
-    from isocharge.train.calibration.films_for import SensorFilms, films_for
+    from isocharge.train.calibration.calibrate import CalibrationResult, calibrate
+    from isocharge.train.calibration.contact_error import ProposedPress, next_presses
     from isocharge.train.calibration.folder import read_earlier, write_calibration
-    from isocharge.train.calibration.next_press import ProposedPress, next_presses
-    from isocharge.train.calibration.session import BenchSession
+    from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
+    from isocharge.train.calibration.session import PressSession
     from isocharge.train.data.presses import LabelledPresses
-    from isocharge.train.films.config import FilmsConfig
     from isocharge.train.films.films_file import read_films
     from isocharge.train.films.films_model import FilmsModel
-    from isocharge.train.films.fit import fit_films
+    from isocharge.train.films.fit import FilmsConfig, fit_films
     from isocharge.train.films.release import release_films
     from isocharge.train.release.evaluate import evaluate
     from isocharge.train.release.release import Release, release
     from isocharge.train.release.student import StudentCase, student_config, student_data
-    from isocharge.train.rig.train_rig import Rig, rig_data
+    from isocharge.train.rig.rig_data import Rig, rig_data
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
     from isocharge.train.training.fit import Fitted, fit
     from isocharge.train.training.source import Provenance, Teacher, TrainingData
@@ -37,21 +36,20 @@ with require("train"):
 __all__ = [
     "BayesLimit",
     "BayesProblem",
-    "BenchSession",
     "CalibrationProblem",
     "CalibrationResult",
-    "EarlierFilm",
+    "FilmEstimate",
     "FilmsConfig",
     "FilmsModel",
     "FitConfig",
     "Fitted",
     "LabelledPresses",
     "NetworkConfig",
+    "PressSession",
     "ProposedPress",
     "Provenance",
     "Release",
     "Rig",
-    "SensorFilms",
     "StudentCase",
     "Teacher",
     "TrainingConfig",
@@ -60,7 +58,6 @@ __all__ = [
     "bayes_limit",
     "calibrate",
     "evaluate",
-    "films_for",
     "fit",
     "fit_films",
     "load_config",

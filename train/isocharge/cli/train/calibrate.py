@@ -1,20 +1,24 @@
 """`isocharge train calibrate`: from a few measured presses to a model that is right about one film."""
 
 import json as json_module
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
 from isocharge.cli.shared.options import DeviceOption, FreshOption, JsonOption, ProbeOption
 from isocharge.cli.shared.terminal import say, this_command
-from isocharge.cli.train.bench.run import BenchPort, calibrate_at_port
+from isocharge.cli.train.press_session import PressPort, calibrate_at_port
 from isocharge.common.errors import InputError
-
-if TYPE_CHECKING:
-    from isocharge.serve import MeasuredPresses
-    from isocharge.train import Calibration, EarlierFilm, ProposedPress, SensorFilms
+from isocharge.common.json_values import plain_values
+from isocharge.simulate.sensor.probe import parse_probe
+from isocharge.simulate.sensor.sensor_file import load_sensor
+from isocharge.train.calibration.calibrate import calibrate
+from isocharge.train.calibration.contact_error import next_presses
+from isocharge.train.calibration.folder import SESSION, read_earlier, result_table, write_calibration
+from isocharge.train.calibration.problem import CalibrationProblem
 
 
 def calibrate_command(
@@ -61,7 +65,7 @@ def calibrate_command(
         typer.Option(
             "--port",
             metavar="URL",
-            help="Take the presses at the bench, one after the other, from this port of the sensor: device path or "
+            help="Take the presses one after the other from this port of the sensor: device path or "
             "pyserial URL. (default: from PRESSES.csv)",
         ),
     ] = None,
@@ -73,10 +77,10 @@ def calibrate_command(
         bool,
         typer.Option("--yes", help="With --port: presses are where they are proposed; ask nothing. (default: ask)"),
     ] = False,
-    script: Annotated[
+    press_list: Annotated[
         Path | None,
         typer.Option(
-            "--script",
+            "--press-list",
             metavar="FILE",
             help="With --port: presses that a machine makes, in their order, CSV with x_mm, y_mm, force_N; nothing is "
             "asked. (default: proposed presses)",
@@ -105,26 +109,30 @@ def calibrate_command(
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
-    _check_usage(file, output, next_count, port, at_bench=yes or script is not None or fresh or device is not None)
-    from isocharge.simulate import load_sensor, parse_probe
-    from isocharge.train import films_for
-
-    chosen = films_for(load_sensor(sensor), parse_probe(probe), models)
-    calibration = None
+    _check_usage(file, output, next_count, port, of_port=yes or press_list is not None or fresh or device is not None)
+    problem = CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models)
+    if earlier is not None:
+        problem = replace(problem, earlier=read_earlier(earlier, problem))
+    result = None
     if port is not None and output is not None:
-        bench = BenchPort(port, device, baud, yes, script, until, fresh)
-        std = position_std_mm, force_std
-        calibration = calibrate_at_port(bench, chosen, _before(chosen, earlier), output, std, json_lines=json)
+        where = PressPort(port, device, baud, yes, press_list, until, fresh, position_std_mm, force_std)
+        result = calibrate_at_port(where, problem, output, json_lines=json)
     elif file is not None:
-        names = chosen.films.prior.sensor.electrode_names
-        calibration = _calibrated(read_presses_of(file, names, position_std_mm, force_std), chosen, earlier)
-    if calibration is not None and output is not None:
-        _write(output, calibration, chosen, ends_session=port is not None)
-    proposed = _proposed(chosen, calibration, next_count, position_std_mm, force_std, earlier)
+        result = calibrate(read_presses_of(file, problem.electrodes, position_std_mm, force_std), problem)
+    for caution in result.cautions if result else ():
+        say(f"caution: {caution}")
+    if result is not None and output is not None:
+        version = write_calibration(result, output, this_command())
+        (output / SESSION).unlink(missing_ok=True)
+        say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
+    known = result.posterior if result else problem.before
+    proposed = next_presses(problem, next_count, known, position_std_mm=position_std_mm, force_std=force_std)
     if json:
-        typer.echo(json_module.dumps(_table(calibration, proposed), allow_nan=False))
+        table = result_table(result) if result else {}
+        values = plain_values(table | {"next": [vars(press) for press in proposed]})
+        typer.echo(json_module.dumps(values, allow_nan=False))
         return
-    for sentence in calibration.words if calibration else ():
+    for sentence in result.summary if result else ():
         typer.echo(sentence)
     for press in proposed:
         typer.echo(
@@ -133,79 +141,17 @@ def calibrate_command(
         )
 
 
-def _check_usage(file: Path | None, output: Path | None, next_count: int, port: str | None, *, at_bench: bool) -> None:
-    """Refuse arguments that contradict each other, before anything is loaded."""
+def _check_usage(file: Path | None, output: Path | None, next_count: int, port: str | None, *, of_port: bool) -> None:
+    """Refuse arguments that contradict each other, before anything is computed."""
     if port is not None and (file is not None or next_count):
         raise InputError(
             "--port: presses come from the port and are proposed one by one; leave out PRESSES.csv, --next"
         )
     if port is not None and output is None:
         raise InputError("--port: expected --output FOLDER for the presses and the model, got none")
-    if port is None and at_bench:
-        raise InputError("--yes, --script, --fresh and --device belong to --port; give the port of the sensor")
+    if port is None and of_port:
+        raise InputError("--yes, --press-list, --fresh and --device belong to --port; give the port of the sensor")
     if port is None and file is None and not next_count:
         raise InputError("expected PRESSES.csv, or --next K for presses to begin with, or --port URL, got none of them")
     if port is None and file is None and output is not None:
         raise InputError("--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out")
-
-
-def _before(chosen: "SensorFilms", earlier: Path | None) -> "EarlierFilm":
-    """What is known of the film before the presses."""
-    from isocharge.train import read_earlier
-
-    return read_earlier(earlier, chosen.scene) if earlier else chosen.described
-
-
-def _calibrated(presses: "MeasuredPresses", chosen: "SensorFilms", earlier: Path | None) -> "Calibration":
-    from isocharge.train import calibrate
-
-    return calibrate(presses, chosen.scene, _before(chosen, earlier), warn=lambda message: say(f"caution: {message}"))
-
-
-def _write(output: Path, calibration: "Calibration", chosen: "SensorFilms", *, ends_session: bool) -> None:
-    from isocharge.train import write_calibration
-    from isocharge.train.calibration.folder import end_session
-
-    version = write_calibration(output, calibration, chosen.films, this_command())
-    if ends_session:
-        end_session(output)
-    say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
-
-
-def _proposed(
-    chosen: "SensorFilms",
-    calibration: "Calibration | None",
-    count: int,
-    position_std_mm: float,
-    force_std: float,
-    earlier: Path | None,
-) -> "list[ProposedPress]":
-    from isocharge.train import next_presses
-
-    if not count:
-        return []
-    scene = chosen.scene
-    if calibration is not None:
-        parameters, covariance = calibration.posterior.parameters, calibration.posterior.covariance
-    else:
-        before = _before(chosen, earlier)
-        parameters, covariance = before.parameters, before.covariance
-    return next_presses(
-        scene.charges,
-        scene.domain,
-        scene.noise,
-        count,
-        parameters,
-        covariance,
-        position_std_mm=position_std_mm,
-        force_std=force_std,
-    )
-
-
-def _table(calibration: "Calibration | None", proposed: "list[ProposedPress]") -> dict[str, object]:
-    from isocharge.common.json_values import plain_values
-
-    table: dict[str, object] = dict(calibration.to_dict()) if calibration else {}
-    values = plain_values(table | {"next": [vars(press) for press in proposed]})
-    assert isinstance(values, dict)
-    return values

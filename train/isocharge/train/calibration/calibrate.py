@@ -1,37 +1,32 @@
 """From measured presses to the film they were made on, with what it leaves uncertain."""
 
-import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
-from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.common.progress import Warn
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
-from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity
-from isocharge.train.calibration.contacts import RigData
-from isocharge.train.calibration.diagnosis import check_before, explain, find_mistakes, outside, without
-from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.contacts import PressData
+from isocharge.train.calibration.diagnosis import check_before, explain, find_mistakes, outside
 from isocharge.train.calibration.film_fit import FilmPosterior, fit_film
-from isocharge.train.calibration.quantities import Quantity, in_words, quantities
-from isocharge.train.data.domain import ContactDomain
+from isocharge.train.calibration.problem import CalibrationProblem
+from isocharge.train.calibration.quantities import Quantity, quantities, summarise
+from isocharge.train.training.fit import Fitted
 
 UNEXPLAINED = 1e-6
-"""Chance of misses as large as these, below which no film explains the presses..."""
+"""Chance of residuals as large as these, below which no film explains the presses..."""
 
 FAR_OFF = 9.0
-"""...if the mean squared miss is also above this: three times the noise."""
+"""...if the mean squared residual is also above this: three times the noise."""
 
 UNCERTAIN = 0.01
-"""Chance of misses as large as these, below which the errors are given larger by their ratio."""
+"""Chance of residuals as large as these, below which the errors are given larger by their ratio."""
 
 STRAINED = 1e-7
 """Chance of a film as far from the described one as this, below which the presses are taken for wrongly written."""
@@ -43,77 +38,39 @@ FEW = 3
 """Fewer presses than this leave large errors: said, not refused."""
 
 CLOSE_MM = 1.0
-"""Presses that all lie within this distance of each other cannot tell places: said."""
-
-DRIFT = {"pretension": 0.35, "d31": 0.25, "d32": 0.25, "gain": 0.2}
-"""What may have changed since an earlier calibration, in standard deviations of the prior: creep of the pretension by
-0.3 MPa, ageing of the coefficients by 5 %, gains by 1 %; everything else by `REMOUNTED`."""
-
-REMOUNTED = 0.05
-"""See `DRIFT`."""
+"""Presses that all lie within this distance of each other do not identify places: said."""
 
 
 @dataclass(frozen=True)
-class CalibrationScene:
-    """What a calibration is about.
-
-    Attributes:
-        charges: The films that the sensor may be, and their charges.
-        domain: Where contacts shall be right.
-        noise: Of the charges.
-    """
-
-    charges: FilmCharges
-    domain: ContactDomain
-    noise: NoiseModel
-
-
-@dataclass(frozen=True)
-class EarlierFilm:
-    """What is known of a film before the presses.
-
-    Attributes:
-        parameters: Shape (n_parameter,).
-        covariance: Of the parameters over their prior standard deviations, shape (n_parameter, n_parameter).
-    """
-
-    parameters: Array
-    covariance: Array
-
-
-@dataclass(frozen=True)
-class Calibration:
+class CalibrationResult:
     """A film as presses show it.
 
     Attributes:
-        scene: What was asked.
+        problem: What was asked.
         presses: The presses that were fitted.
-        posterior: Best parameters, covariance, misses.
-        before: What was known before the presses.
+        posterior: Best parameters, covariance, residuals.
         cautions: What the user should know, a sentence each.
     """
 
-    scene: CalibrationScene
+    problem: CalibrationProblem
     presses: MeasuredPresses
     posterior: FilmPosterior
-    before: EarlierFilm
     cautions: tuple[str, ...]
 
-    @property
+    @cached_property
     def film(self) -> tuple[Sensor, Circle]:
         """The calibrated sensor and probe."""
-        return self.scene.charges.prior.film(self.posterior.parameters)
+        return self.problem.prior.film(self.posterior.parameters)
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
         """What is known of the film, by name, beside what its description alone says."""
-        described = np.eye(len(self.scene.charges.prior.names))
-        return quantities(self.scene.charges.prior, self.posterior.parameters, self.posterior.covariance, described)
+        return quantities(self.problem.prior, self.posterior)
 
     @cached_property
     def sensitivity(self) -> ContactSensitivity:
         """How contacts answer to noise and to a wrong film, at the calibrated film."""
-        return ContactSensitivity.at(self.scene.charges, self.posterior.parameters, self.scene.domain, self.scene.noise)
+        return ContactSensitivity.at(self.problem, self.posterior.parameters)
 
     @cached_property
     def left(self) -> ContactError:
@@ -123,168 +80,110 @@ class Calibration:
     @cached_property
     def left_before(self) -> ContactError:
         """The same before the presses."""
-        return self.sensitivity.left(self.before.covariance)
+        return self.sensitivity.left(self.problem.before.covariance)
+
+    @property
+    def fitted(self) -> Fitted:
+        """The network of this film, for `evaluate` and `release`; what the film leaves is in its deviations."""
+        left, noise = self.left, self.sensitivity.of_noise
+        widen = (
+            float(np.hypot(1.0, left.position_mm / noise.position_mm)),
+            float(np.hypot(1.0, left.force_percent / noise.force_percent)),
+        )
+        return self.problem.films.film(self.posterior.parameters, widen=widen)
 
     @property
     def reduced_chi2(self) -> float:
-        """Mean squared miss of the fitted presses over what noise and rig explain; about one."""
-        good = ~self.posterior.bad
-        freedom = self.posterior.freedom[good].sum()
-        return float(self.posterior.chi2[good].sum() / freedom) if freedom > 0.0 else np.nan
+        """Mean squared residual of the fitted presses over what noise and rig explain; about one."""
+        chi2, freedom = self.posterior.total
+        return chi2 / freedom if freedom > 0.0 else np.nan
 
     @property
     def bad_lines(self) -> tuple[int, ...]:
         """Lines of the presses that were left out because they fit no film that the others fit."""
-        return tuple(self.presses.lines[row] for row in np.flatnonzero(self.posterior.bad))
+        return self.presses[self.posterior.bad].lines
 
     @property
-    def words(self) -> tuple[str, ...]:
+    def summary(self) -> tuple[str, ...]:
         """The result in sentences."""
-        noise = self.sensitivity.of_noise()
+        noise, left, before = self.sensitivity.of_noise, self.left, self.left_before
         return (
-            f"Not knowing the film leaves {self.left.position_mm:.2g} mm and {self.left.force_percent:.2g} % of the "
-            f"force (root mean square); before these presses it was {self.left_before.position_mm:.2g} mm and "
-            f"{self.left_before.force_percent:.2g} %. Noise alone leaves {noise.position_mm:.2g} mm and "
+            f"Not knowing the film leaves {left.position_mm:.2g} mm and {left.force_percent:.2g} % of the "
+            f"force (root mean square); before these presses it was {before.position_mm:.2g} mm and "
+            f"{before.force_percent:.2g} %. Noise alone leaves {noise.position_mm:.2g} mm and "
             f"{noise.force_percent:.2g} %.",
-            *in_words(self.quantities),
+            *summarise(self.quantities),
             *self.cautions,
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: parameters with their errors and correlations, quantities, errors left, presses left out."""
-        prior, covariance = self.scene.charges.prior, self.posterior.covariance
-        std = np.sqrt(np.diag(covariance))
-        noise = self.sensitivity.of_noise()
-        return {
-            "format_version": 1,
-            "sensor": prior.sensor.name,
-            "probe": prior.probe.notation,
-            "presses": len(self.presses),
-            "left_out_lines": list(self.bad_lines),
-            "reduced_chi2": self.reduced_chi2,
-            "error_left": _error(self.left),
-            "error_left_before": _error(self.left_before),
-            "error_of_noise": _error(noise),
-            "quantities": {name: quantity.to_dict() for name, quantity in self.quantities.items()},
-            "parameters": {
-                name: {"value": float(value), "std": float(error)}
-                for name, value, error in zip(prior.names, self.posterior.parameters, std * prior.std, strict=True)
-            },
-            "correlations": np.round(covariance / np.outer(std, std), 6).tolist(),
-            "words": list(self.words),
-        }
 
-
-def _error(error: ContactError) -> dict[str, float]:
-    return {"position_mm": error.position_mm, "force_percent": error.force_percent}
-
-
-def calibrate(
-    presses: MeasuredPresses,
-    scene: CalibrationScene,
-    earlier: EarlierFilm | None = None,
-    *,
-    warn: Warn = warnings.warn,
-) -> Calibration:
+def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
     """The film on which presses were made.
 
     Args:
         presses: With place and force, or one of them; uncertain as they say.
-        scene: The films that it may be.
-        earlier: An earlier calibration of the same film, loosened by what may have drifted; the prior if absent.
-        warn: Called with sentences that the user should read; they are in the result, too.
+        problem: The films that it may be.
 
     Raises:
         PressError: If the presses cannot be what they say, or no film explains them; with the reason where it is found.
     """
-    charges, cautions = scene.charges, []
-    check_before(presses, charges)
-    far = outside(presses, charges)
-    if far.mean() > 0.5:
-        raise explain(presses, charges, np.inf) if len(presses) > 1 else _too_far(presses, far, charges)
+    presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
+    check_before(presses, problem.charges)
+    far, cautions = outside(presses, problem.charges), []
     if far.any():
-        cautions.append(_too_far(presses, far, charges).args[0] + "; left out")
-        presses = without(presses, far)
-    before = earlier or EarlierFilm(charges.prior.mean, np.eye(len(charges.prior.names)))
-    data = RigData.of(
-        presses.contact, presses.charge_pC, presses.position_std_mm, presses.force_std, scene.noise, charges
-    )
-    posterior = fit_film(charges, data, before.parameters, before.covariance)
-    _refuse_unexplained(presses, charges, posterior, before)
-    posterior, scattered = _with_real_scatter(posterior)
-    cautions += [*scattered, *_cautions(presses, posterior)]
-    for caution in cautions:
-        warn(caution)
-    return Calibration(scene, presses, posterior, before, tuple(cautions))
+        low, high = problem.charges.domain.force_range
+        too_far = (
+            f"{_lines(presses[far])}: a calibration takes presses within {problem.charges.domain.radius:.3g} mm of the "
+            f"centre and of {low:.2g} to {high:.2g} N"
+        )
+        if far.mean() > 0.5:
+            raise explain(presses, problem.charges, np.inf) if len(presses) > 1 else PressError(too_far)
+        cautions.append(f"{too_far}; left out")
+        presses = presses[~far]
+    posterior = fit_film(problem.charges, PressData.of(presses, problem.noise, problem.charges), problem.before)
+    _refuse_unexplained(presses, problem, posterior)
+    chi2, freedom = posterior.total
+    if freedom and chi2_distribution.sf(chi2, freedom) < UNCERTAIN:  # larger errors, by Birge's ratio (1932)
+        posterior = replace(posterior, covariance=posterior.covariance * (chi2 / freedom))
+        cautions.append(
+            f"the presses scatter {np.sqrt(chi2 / freedom):.2g} times as much as noise and rig are said to; the errors "
+            "are given larger by this factor: are places and forces as certain as assumed?"
+        )
+    return CalibrationResult(problem, presses, posterior, (*cautions, *_cautions(presses, posterior)))
 
 
-def _too_far(presses: MeasuredPresses, far: np.ndarray, charges: FilmCharges) -> PressError:
-    low, high = charges.force_range_N
-    lines = [presses.lines[row] for row in np.flatnonzero(far)]
-    return PressError(
-        f"{_lines(lines)}: a calibration takes presses within {charges.radius_mm:.3g} mm of the centre and of "
-        f"{low:.2g} to {high:.2g} N"
-    )
+def _lines(presses: MeasuredPresses) -> str:
+    listed = ", ".join(map(str, presses.lines[:10]))
+    return f"{'line' if len(presses) == 1 else 'lines'} {listed}{', ...' if len(presses) > 10 else ''}"
 
 
-def _lines(lines: list[int]) -> str:
-    listed = ", ".join(map(str, lines[:10]))
-    return f"{'line' if len(lines) == 1 else 'lines'} {listed}{', ...' if len(lines) > 10 else ''}"
-
-
-def _refuse_unexplained(
-    presses: MeasuredPresses, charges: FilmCharges, posterior: FilmPosterior, before: EarlierFilm
-) -> None:
-    good = ~posterior.bad
-    freedom, total = posterior.freedom[good].sum(), posterior.chi2[good].sum()
-    deviation = (posterior.parameters - before.parameters) / charges.prior.std
-    strain = float(deviation @ np.linalg.solve(before.covariance, deviation))
-    unexplained = freedom > 0.0 and total / freedom > FAR_OFF and chi2_distribution.sf(total, freedom) < UNEXPLAINED
+def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> None:
+    chi2, freedom = posterior.total
+    deviation = (posterior.parameters - problem.before.parameters) / problem.prior.std
+    strain = float(deviation @ np.linalg.solve(problem.before.covariance, deviation))
+    unexplained = freedom > 0.0 and chi2 / freedom > FAR_OFF and chi2_distribution.sf(chi2, freedom) < UNEXPLAINED
     chance = chi2_distribution.sf(strain, deviation.size)
     suspicious = posterior.bad.any() or chance < ODD  # a few presses written wrongly may still find a strange film
-    odd = suspicious and bool(find_mistakes(presses, charges))
+    odd = suspicious and bool(find_mistakes(presses, problem.charges))
     if unexplained or chance < STRAINED or odd:
-        raise explain(presses, charges, float(np.sqrt(max(total / max(freedom, 1.0), strain / deviation.size))))
+        worst = max(chi2 / max(freedom, 1.0), strain / deviation.size)
+        raise explain(presses, problem.charges, float(np.sqrt(worst)))
 
 
-def _with_real_scatter(posterior: FilmPosterior) -> tuple[FilmPosterior, list[str]]:
-    """Larger errors where the presses scatter by more than noise and rig are said to (Birge 1932)."""
-    good = ~posterior.bad
-    freedom, total = posterior.freedom[good].sum(), posterior.chi2[good].sum()
-    if not freedom or chi2_distribution.sf(total, freedom) >= UNCERTAIN:
-        return posterior, []
-    ratio = float(np.sqrt(total / freedom))
-    caution = (
-        f"the presses scatter {ratio:.2g} times as much as noise and rig are said to; the errors are given larger by "
-        "this factor: are places and forces as certain as assumed?"
-    )
-    return FilmPosterior(**(vars(posterior) | {"covariance": posterior.covariance * ratio**2})), [caution]
-
-
-def _cautions(presses: MeasuredPresses, posterior: FilmPosterior) -> list[str]:
-    cautions = []
+def _cautions(presses: MeasuredPresses, posterior: FilmPosterior) -> Iterator[str]:
     if posterior.bad.any():
-        lines = [presses.lines[row] for row in np.flatnonzero(posterior.bad)]
-        cautions.append(f"{_lines(lines)}: left out, since no film fits them and all others; look at them again")
-    good = presses[np.flatnonzero(~posterior.bad)]
+        lines = _lines(presses[posterior.bad])
+        yield f"{lines}: left out, since no film fits them and all others; look at them again"
+    good = presses[~posterior.bad]
     if len(good) < FEW:
-        cautions.append(f"only {len(good)} press{'es' if len(good) > 1 else ''}: three or more tell far more")
+        yield f"only {len(good)} press{'es' if len(good) > 1 else ''}: three or more tell far more"
     places = good.contact[np.isfinite(good.contact[:, 0]), :2]
     if len(places) > 1 and np.ptp(places, axis=0).max() < CLOSE_MM:
-        cautions.append(
+        yield (
             f"all presses lie within {np.ptp(places, axis=0).max():.2g} mm of each other: they cannot tell where the "
             "electrodes are, nor how the film answers elsewhere; press at places spread over the working area"
         )
     if not len(places):
-        cautions.append(
+        yield (
             "no place is known: positions will be right only up to the shift and the turn of the electrodes themselves"
         )
-    return cautions
-
-
-def loosened(scene: CalibrationScene, parameters: Array, covariance: Array) -> EarlierFilm:
-    """An earlier calibration as the prior of the next one: with what may have drifted since (`DRIFT`)."""
-    names = scene.charges.prior.names
-    drift = np.array([DRIFT.get(name.partition(" ")[0], REMOUNTED) for name in names])
-    low, high = scene.charges.prior.bounds
-    return EarlierFilm(np.clip(parameters, low, high), covariance + np.diag(drift**2))

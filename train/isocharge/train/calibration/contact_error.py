@@ -1,4 +1,4 @@
-"""The error of contacts that is left by not knowing the film: linearised, over the working area and the forces.
+"""The error of contacts that is left by not knowing the film, and the presses that would lower it most.
 
 An estimator that takes a film for another by dp errs by the contact that explains the difference of the charges best,
 
@@ -8,6 +8,9 @@ J and P the derivatives of the charges by contact and parameters, W one over the
 of the parameters the error left is G C G'; noise alone leaves (J' W J)^-1, the Cramer-Rao limit. To J' W J belongs what
 is known of a contact beforehand, that it lies in the working area and the range of forces: no estimator errs by more,
 also where the map folds.
+
+A press adds information about the film, however it turns out, so the best next press is known before it is made.
+Presses are chosen one after the other, each the best given those before (A-optimal design, greedily; Pukelsheim 1993).
 """
 
 from dataclasses import dataclass
@@ -15,78 +18,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.common.errors import PressError
+from isocharge.serve.prediction.measured_presses import FORCE_STD, POSITION_STD_MM
+from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.numerics.disk import sunflower
-from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.noise import sigma_pC
+from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 
 CONTACTS = 200
 """Contacts over which the error is taken."""
 
+PLACES = 80
+"""Places of presses that are compared."""
 
-def spread_contacts(domain: ContactDomain, count: int = CONTACTS) -> Array:
-    """Contacts (x_mm, y_mm, force_N) spread over a domain, shape (count, 3): forces even in the logarithm."""
-    at, (low, high) = domain.radius_mm * sunflower(count), domain.force_range_N
-    force = low * (high / low) ** ((0.5 + np.arange(count)) * 0.6180339887 % 1.0)
-    return np.column_stack([at.real, at.imag, force])
+FORCES = (0.15, 0.45, 0.95)
+"""Forces of presses that are compared, as shares of the range's logarithm from its lower end."""
 
+ROUND_MM, ROUND_N = 0.5, 0.05
+"""Proposed presses lie on this grid, so that a person can make them."""
 
-def _spread(domain: ContactDomain) -> Array:
-    """Standard deviations of (x_mm, y_mm, ln F) over a domain, shape (3,)."""
-    low, high = np.log(domain.force_range_N)
-    return np.array([0.5 * domain.radius_mm, 0.5 * domain.radius_mm, max(high - low, 0.1) / np.sqrt(12.0)])
-
-
-@dataclass(frozen=True)
-class ContactSensitivity:
-    """How contacts answer to noise and to a wrong film, linearised at one film.
-
-    Attributes:
-        contact: (x_mm, y_mm, force_N), shape (n, 3).
-        by_parameter: -G: (x_mm, y_mm, ln F) by the parameters over their prior standard deviations, shape
-            (n, 3, n_parameter).
-        noise: Covariance of (x_mm, y_mm, ln F) by noise alone, shape (n, 3, 3).
-    """
-
-    contact: Array
-    by_parameter: Array
-    noise: Array
-
-    @classmethod
-    def at(
-        cls, charges: FilmCharges, parameters: Array, domain: ContactDomain, noise: NoiseModel
-    ) -> "ContactSensitivity":
-        """At contacts spread over a domain, on one film."""
-        contact = spread_contacts(domain)
-        forward_map = charges.forward_map(parameters)
-        by_contact = charges.by_contact(forward_map, contact)
-        weight = 1.0 / sigma_pC(noise, charges.charge_pC(parameters, contact))[:, :, None]
-        slopes = weight * by_contact
-        information = np.einsum("nki,nkj->nij", slopes, slopes) + np.diag(_spread(domain) ** -2)
-        covariance = np.linalg.inv(information)
-        by_film = weight * charges.by_parameter(parameters, contact, by_contact)
-        answer = -np.einsum("nij,nkj,nkp->nip", covariance, slopes, by_film)
-        return cls(contact, answer, covariance)
-
-    def left(self, covariance: Array) -> "ContactError":
-        """The error left with a covariance of the parameters over their prior standard deviations."""
-        return ContactError.of(np.einsum("nip,pq,njq->nij", self.by_parameter, covariance, self.by_parameter))
-
-    def of_noise(self) -> "ContactError":
-        """The error that noise alone leaves."""
-        return ContactError.of(self.noise)
-
-    def cost(self) -> Array:
-        """Matrix S with mean relative squared error tr(S C), shape (n_parameter, n_parameter).
-
-        Position and force count in units of the error that noise alone leaves.
-        """
-        unit = self.of_noise()
-        scale = np.array([1.0 / unit.position_mm, 1.0 / unit.position_mm, 100.0 / unit.force_percent])
-        scaled = self.by_parameter * scale[:, None]
-        cost: Array = np.einsum("nip,niq->pq", scaled, scaled) / len(scaled)
-        return cost
+AVOIDED_MM = 1.0
+"""Distance from a place to avoid within which nothing is proposed, mm."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +56,163 @@ class ContactError:
 
     @classmethod
     def of(cls, covariance: Array) -> "ContactError":
-        """From covariances of (x_mm, y_mm, ln F), shape (n, 3, 3)."""
+        """From covariances of (x, y, ln F), shape (n, 3, 3)."""
         squares = covariance[:, 0, 0] + covariance[:, 1, 1]
         return cls(float(np.sqrt(squares.mean())), 100.0 * float(np.sqrt(covariance[:, 2, 2].mean())), np.sqrt(squares))
+
+
+@dataclass(frozen=True)
+class ContactSensitivity:
+    """How contacts answer to noise and to a wrong film, linearised at one film.
+
+    Attributes:
+        contact: (x, y, F), shape (n, 3), mm and N.
+        by_parameter: -G: (x, y, ln F) by the parameters over their prior standard deviations, shape
+            (n, 3, n_parameter).
+        noise: Covariance of (x, y, ln F) by noise alone, shape (n, 3, 3).
+    """
+
+    contact: Array
+    by_parameter: Array
+    noise: Array
+
+    @classmethod
+    def at(cls, problem: CalibrationProblem, parameters: Array) -> "ContactSensitivity":
+        """At contacts spread over the domain, on one film."""
+        domain = problem.domain
+        at, (low, high) = domain.radius * sunflower(CONTACTS), domain.force_range
+        force = low * (high / low) ** ((0.5 + np.arange(CONTACTS)) * 0.6180339887 % 1.0)
+        contact = np.column_stack([at.real, at.imag, force])
+        slopes, by_film = _whitened_slopes(problem, parameters, contact)
+        spread = np.array([0.5 * domain.radius, 0.5 * domain.radius, max(np.log(high / low), 0.1) / np.sqrt(12.0)])
+        covariance = np.linalg.inv(np.einsum("nki,nkj->nij", slopes, slopes) + np.diag(spread**-2))
+        return cls(contact, -np.einsum("nij,nkj,nkp->nip", covariance, slopes, by_film), covariance)
+
+    def left(self, covariance: Array) -> ContactError:
+        """The error left with a covariance of the parameters over their prior standard deviations."""
+        return ContactError.of(np.einsum("nip,pq,njq->nij", self.by_parameter, covariance, self.by_parameter))
+
+    @property
+    def of_noise(self) -> ContactError:
+        """The error that noise alone leaves."""
+        return ContactError.of(self.noise)
+
+    def cost(self) -> Array:
+        """Matrix S with mean relative squared error tr(S C), shape (n_parameter, n_parameter).
+
+        Position and force count in units of the error that noise alone leaves.
+        """
+        unit = self.of_noise
+        scale = np.array([1.0 / unit.position_mm, 1.0 / unit.position_mm, 100.0 / unit.force_percent])
+        scaled = self.by_parameter * scale[:, None]
+        cost: Array = np.einsum("nip,niq->pq", scaled, scaled) / len(scaled)
+        return cost
+
+
+def _whitened_slopes(problem: CalibrationProblem, parameters: Array, contact: Array) -> tuple[Array, Array]:
+    """Derivatives of the charges over their noise: by the contact, and by the parameters over their prior's."""
+    charges = problem.charges
+    by_contact = charges.by_contact(parameters, contact)
+    weight = 1.0 / problem.noise.sigma(charges.charges(parameters, contact))[:, :, None]
+    return weight * by_contact, weight * charges.by_parameter(parameters, contact, by_contact)
+
+
+def information_of(
+    problem: CalibrationProblem,
+    parameters: Array,
+    contact: Array,
+    position_std_mm: float = POSITION_STD_MM,
+    force_std: float = FORCE_STD,
+) -> Array:
+    """What each press says of the parameters over their prior standard deviations.
+
+    Args:
+        problem: The films.
+        parameters: Where the map is linearised, shape (n_parameter,).
+        contact: Presses (x, y, F), shape (n, 3), mm and N.
+        position_std_mm: How well a press's place is known, mm; infinite if not at all.
+        force_std: How well its force is known, share.
+
+    Returns:
+        Fisher information, shape (n, n_parameter, n_parameter).
+    """
+    slopes, by_film = _whitened_slopes(problem, parameters, contact)
+    rig = np.diag([position_std_mm**-2.0, position_std_mm**-2.0, force_std**-2.0])
+    normal = np.einsum("nki,nkj->nij", slopes, slopes) + rig
+    across = np.einsum("nki,nkp->nip", slopes, by_film)
+    at_known_contact: Array = np.einsum("nkp,nkq->npq", by_film, by_film)
+    information: Array = at_known_contact - np.einsum("nip,nij,njq->npq", across, np.linalg.inv(normal), across)
+    return information
+
+
+@dataclass(frozen=True)
+class ProposedPress:
+    """A press to make.
+
+    Attributes:
+        x_mm: Where.
+        y_mm: Where.
+        force_N: How hard.
+        position_mm: Root-mean-square position error that is expected to be left by the film after it, mm.
+        force_percent: The same of the force, %.
+    """
+
+    x_mm: float
+    y_mm: float
+    force_N: float
+    position_mm: float
+    force_percent: float
+
+    @property
+    def contact(self) -> Array:
+        """(x, y, F), shape (3,), mm and N."""
+        return np.array([self.x_mm, self.y_mm, self.force_N])
+
+
+def next_presses(
+    problem: CalibrationProblem,
+    count: int,
+    film: FilmEstimate | None = None,
+    *,
+    position_std_mm: float = POSITION_STD_MM,
+    force_std: float = FORCE_STD,
+    avoid_mm: Array | None = None,
+) -> list[ProposedPress]:
+    """The presses to make next, best first.
+
+    Args:
+        problem: The films.
+        count: How many.
+        film: What is known by now: the posterior of a result; what is known before the first press if absent.
+        position_std_mm: How well the presses' places will be known, mm.
+        force_std: How well their forces will be known, share.
+        avoid_mm: Places that cannot be pressed, shape (n, 2), mm; nothing within `AVOIDED_MM` of them is proposed.
+
+    Raises:
+        PressError: If every place is to be avoided.
+    """
+    film = film or problem.before
+    sensitivity = ContactSensitivity.at(problem, film.parameters)
+    candidates = _candidates(problem.domain, np.empty((0, 2)) if avoid_mm is None else avoid_mm)
+    offered = information_of(problem, film.parameters, candidates, position_std_mm, force_std)
+    cost, proposed, information = sensitivity.cost(), [], np.linalg.inv(film.covariance)
+    for _ in range(count):
+        after = np.linalg.inv(information + offered)
+        best = int(np.argmin(np.einsum("pq,nqp->n", cost, after)))
+        information = information + offered[best]
+        left = sensitivity.left(after[best])
+        proposed.append(ProposedPress(*candidates[best].tolist(), left.position_mm, left.force_percent))
+    return proposed
+
+
+def _candidates(domain: Domain, avoid_mm: Array) -> Array:
+    """Presses to compare, on a grid that a person can set, shape (n, 3)."""
+    at, (low, high) = domain.radius * sunflower(PLACES), domain.force_range
+    places = np.unique(np.round(np.column_stack([at.real, at.imag]) / ROUND_MM) * ROUND_MM, axis=0)
+    places = places[np.hypot(*places.T) <= domain.radius]
+    distance = np.hypot(*np.moveaxis(places[:, None] - avoid_mm, 2, 0))
+    places = places[(distance > AVOIDED_MM).all(axis=1)]
+    if not len(places):
+        raise PressError(f"no place within {domain.radius:.3g} mm of the centre is left to press; skip fewer")
+    forces = np.maximum(np.round(low * (high / low) ** np.array(FORCES) / ROUND_N) * ROUND_N, ROUND_N)
+    return np.array([(x, y, force) for x, y in places for force in np.unique(np.clip(forces, low, high))])

@@ -1,19 +1,19 @@
 """Where the presses of a calibration really were: each contact adjusted between what the rig and the charges say.
 
 A rig knows place and force of a press to its own uncertainty, or one of them not at all. For a given film the contact
-is the one that fits charges and rig best; what is left over of both speaks about the film.
+is the one that fits charges and rig best; the residuals of both speak about the film.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.common.arrays import Array
-from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.simulate.forward.charge_map import ChargeMap, differences
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
-from isocharge.train.calibration.film_charges import FilmCharges, charges_of
-from isocharge.train.data.noise import sigma_pC
+from isocharge.train.calibration.film_charges import CONTACT_STEPS, FilmCharges
 
 ROUNDS, STEPS = 8, 8
 """How often the slopes are computed at most, and how many Gauss-Newton steps they serve for at most."""
@@ -32,60 +32,54 @@ VAGUE_FORCE = 1.5
 
 
 @dataclass(frozen=True)
-class RigData:
+class PressData:
     """Measured presses as least squares takes them.
 
     Attributes:
-        charge_pC: Shape (n, n_electrode), 0 where unknown.
+        charge: Shape (n, n_electrode), pC, 0 where unknown.
         weight: One over the standard deviation of each charge, 1/pC, 0 where unknown.
-        contact: (x_mm, y_mm, ln F), shape (n, 3); the middle of the domain where unknown.
+        contact: (x, y, ln F), shape (n, 3); the middle of the domain where unknown.
         contact_weight: One over the standard deviation of each, shape (n, 3); small where unknown.
         known: Which charges and coordinates were measured, shape (n, n_electrode + 3).
     """
 
-    charge_pC: Array
+    charge: Array
     weight: Array
     contact: Array
     contact_weight: Array
-    known: np.ndarray
+    known: Booleans
 
     @classmethod
-    def of(
-        cls,
-        contact: Array,
-        charge_pC: Array,
-        position_std_mm: Array,
-        force_std: Array,
-        noise: NoiseModel,
-        charges: FilmCharges,
-    ) -> "RigData":
-        """From presses (x_mm, y_mm, force_N), NaN where unknown, and charges, NaN where unknown."""
-        seen = ~np.isnan(charge_pC)
-        charge = np.where(seen, charge_pC, 0.0)
-        low, high = np.log(charges.force_range_N)
-        logs = np.column_stack([contact[:, :2], np.log(contact[:, 2])])
+    def of(cls, presses: MeasuredPresses, noise: NoiseModel, charges: FilmCharges) -> "PressData":
+        """From presses on one of the films."""
+        seen, domain = ~np.isnan(presses.charge_pC), charges.domain
+        charge = np.where(seen, presses.charge_pC, 0.0)
+        logs = np.column_stack([presses.contact[:, :2], np.log(presses.contact[:, 2])])
+        rig_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
         known = ~np.isnan(logs)
-        middle = np.array([0.0, 0.0, 0.5 * (low + high)])
-        std = np.where(
-            known,
-            np.column_stack([position_std_mm, position_std_mm, force_std]),
-            [charges.radius_mm, charges.radius_mm, VAGUE_FORCE],
-        )
         return cls(
-            charge_pC=charge,
-            weight=np.where(seen, 1.0 / sigma_pC(noise, charge), 0.0),
-            contact=np.where(known, logs, middle),
-            contact_weight=1.0 / std,
+            charge=charge,
+            weight=np.where(seen, 1.0 / noise.sigma(charge), 0.0),
+            contact=np.where(known, logs, domain.centre),
+            contact_weight=1.0 / np.where(known, rig_std, [domain.radius, domain.radius, VAGUE_FORCE]),
             known=np.column_stack([seen, known]),
         )
 
-    def __getitem__(self, rows: np.ndarray) -> "RigData":
-        return RigData(
-            self.charge_pC[rows], self.weight[rows], self.contact[rows], self.contact_weight[rows], self.known[rows]
-        )
+    def __getitem__(self, rows: Integers | Booleans) -> "PressData":
+        return PressData(**{name: column[rows] for name, column in vars(self).items()})
 
     def __len__(self) -> int:
         return len(self.contact)
+
+    def residual(self, film: ChargeMap, contact: Array) -> Array:
+        """Residuals of charges and rig over their standard deviations at (x, y, ln F): (n, n_electrode + 3)."""
+        of_charge = self.weight * (film.charges(with_force(contact)) - self.charge)
+        return np.column_stack([of_charge, self.contact_weight * (contact - self.contact)])
+
+    def slopes(self, by_contact: Array) -> Array:
+        """Derivatives of the residual by the contact, from those of the charges, (n, n_electrode, 3)."""
+        of_rig = self.contact_weight[:, :, None] * np.eye(3)
+        return np.concatenate([self.weight[:, :, None] * by_contact, of_rig], axis=1)
 
 
 @dataclass(frozen=True)
@@ -93,8 +87,8 @@ class AdjustedContacts:
     """Contacts adjusted to one film.
 
     Attributes:
-        contact: (x_mm, y_mm, ln F), shape (n, 3).
-        residual: Whitened misses of charges and rig, shape (n, n_electrode + 3).
+        contact: (x, y, ln F), shape (n, 3).
+        residual: As `PressData.residual`, shape (n, n_electrode + 3).
         slopes: Derivatives of the residual by the contact, shape (n, n_electrode + 3, 3).
     """
 
@@ -104,7 +98,7 @@ class AdjustedContacts:
 
     @property
     def chi2(self) -> Array:
-        """Sum of squared misses of each press, shape (n,)."""
+        """Sum of squared residuals of each press, shape (n,)."""
         chi2: Array = (self.residual**2).sum(axis=1)
         return chi2
 
@@ -120,8 +114,13 @@ class AdjustedContacts:
         return projected
 
 
+def with_force(contact: Array) -> Array:
+    """(x, y, ln F), shape (n, 3), to (x, y, F)."""
+    return np.column_stack([contact[:, :2], np.exp(contact[:, 2])])
+
+
 def adjust_contacts(
-    charges: FilmCharges, parameters: Array, data: RigData, start: AdjustedContacts | Array
+    charges: FilmCharges, parameters: Array, data: PressData, start: AdjustedContacts | Array
 ) -> AdjustedContacts:
     """The contacts that fit charges and rig best on one film.
 
@@ -129,24 +128,29 @@ def adjust_contacts(
         charges: The films.
         parameters: The film, shape (n_parameter,).
         data: The presses.
-        start: Contacts (x_mm, y_mm, ln F), shape (n, 3), or those adjusted to a neighbouring film, whose slopes serve
-            for the first steps: charges alone are a seventh of the work.
+        start: Contacts (x, y, ln F), shape (n, 3), or those adjusted to a neighbouring film, whose slopes serve for the
+            first steps: charges alone are a seventh of the work.
     """
-    forward_map = charges.forward_map(parameters)
+    film = charges.forward_map(parameters)
+
+    def linearised(contact: Array) -> AdjustedContacts:
+        by_contact = differences(film.charges, with_force(contact), CONTACT_STEPS)
+        return AdjustedContacts(contact, data.residual(film, contact), data.slopes(by_contact))
+
     if isinstance(start, AdjustedContacts):
-        adjusted = replace(start, residual=_residual(forward_map, data, start.contact))
+        adjusted = replace(start, residual=data.residual(film, start.contact))
     else:
-        adjusted = linearised(charges, forward_map, data, _inside(charges, start))
+        adjusted = linearised(_inside(charges, start))
     for _ in range(ROUNDS):
-        adjusted, settled = _steps_with_these_slopes(charges, forward_map, data, adjusted)
+        adjusted, settled = _steps_with_these_slopes(charges, film, data, adjusted)
         if settled:
             break
-        adjusted = linearised(charges, forward_map, data, adjusted.contact)
+        adjusted = linearised(adjusted.contact)
     return adjusted
 
 
 def _steps_with_these_slopes(
-    charges: FilmCharges, forward_map: ForwardMap, data: RigData, adjusted: AdjustedContacts
+    charges: FilmCharges, film: ChargeMap, data: PressData, adjusted: AdjustedContacts
 ) -> tuple[AdjustedContacts, bool]:
     """Gauss-Newton steps that keep the slopes, as long as they help; whether the contacts have settled."""
     normal = np.einsum("nki,nkj->nij", adjusted.slopes, adjusted.slopes)
@@ -158,7 +162,7 @@ def _steps_with_these_slopes(
         size = np.maximum(np.hypot(step[:, 0], step[:, 1]) / LONGEST_MM, np.abs(step[:, 2]) / LONGEST_LOG)
         step *= (share / np.maximum(size, 1.0))[:, None]
         trial = _inside(charges, adjusted.contact + step)
-        residual = _residual(forward_map, data, trial)
+        residual = data.residual(film, trial)
         change = (residual**2).sum(axis=1) - adjusted.chi2
         better = change <= 1e-9 * (1.0 + adjusted.chi2)
         moved = np.where(better, np.abs((trial - adjusted.contact) * unit).max(axis=1), 0.0)
@@ -167,63 +171,37 @@ def _steps_with_these_slopes(
             contact=np.where(better[:, None], trial, adjusted.contact),
             residual=np.where(better[:, None], residual, adjusted.residual),
         )
-        if not better.all():
-            worse = ~better & (np.abs(step * unit).max(axis=1) > SETTLED)
-            if worse.any() and share.min() < 0.1:
-                return adjusted, False
+        worse = ~better & (np.abs(step * unit).max(axis=1) > SETTLED)
+        if worse.any():
+            if share.min() < 0.1:
+                break
             share = np.where(worse, 0.3 * share, share)
-            if worse.any():
-                continue
-        if moved.max() < SETTLED:
+        elif moved.max() < SETTLED:
             return adjusted, True
     return adjusted, False
 
 
 def _inside(charges: FilmCharges, contact: Array) -> Array:
-    """(x_mm, y_mm, ln F) moved into the domain of all films."""
-    inside = charges.into_domain(_with_force(np.clip(contact, -1e3, 1e2)))
+    """(x, y, ln F) moved into the domain of all films."""
+    inside = charges.into_domain(with_force(np.clip(contact, -1e3, 1e2)))
     return np.column_stack([inside[:, :2], np.log(inside[:, 2])])
 
 
-def linearised(charges: FilmCharges, forward_map: ForwardMap, data: RigData, contact: Array) -> AdjustedContacts:
-    """Misses and slopes at contacts (x_mm, y_mm, ln F), shape (n, 3), on one film."""
-    at = AdjustedContacts(contact, _residual(forward_map, data, contact), np.empty(0))
-    return with_slopes(at, data, charges.by_contact(forward_map, _with_force(contact)))
-
-
-def with_slopes(adjusted: AdjustedContacts, data: RigData, by_contact: Array) -> AdjustedContacts:
-    """The same contacts with slopes from the derivatives of the charges by the contact, (n, n_electrode, 3)."""
-    of_rig = data.contact_weight[:, :, None] * np.broadcast_to(np.eye(3), (len(data), 3, 3))
-    slopes = np.concatenate([data.weight[:, :, None] * by_contact, of_rig], axis=1)
-    return replace(adjusted, slopes=slopes)
-
-
-def _residual(forward_map: ForwardMap, data: RigData, contact: Array) -> Array:
-    by_charge = data.weight * (charges_of(forward_map, _with_force(contact)) - data.charge_pC)
-    return np.column_stack([by_charge, data.contact_weight * (contact - data.contact)])
-
-
-def _with_force(contact: Array) -> Array:
-    """(x_mm, y_mm, ln F) to (x_mm, y_mm, force_N)."""
-    return np.column_stack([contact[:, :2], np.exp(contact[:, 2])])
-
-
-def search_places(charges: FilmCharges, parameters: Array, data: RigData) -> Array:
-    """Where to start: (x_mm, y_mm, ln F), shape (n, 3); the place whose ratios of charges are nearest where unknown.
+def search_places(charges: FilmCharges, parameters: Array, data: PressData) -> Array:
+    """Where to start: (x, y, ln F), shape (n, 3); the place whose ratios of charges are nearest where unknown.
 
     Ratios hardly depend on the film's stiffness and coefficients, which are not known yet.
     """
     start, unknown = data.contact.copy(), ~data.known[:, -3:-1].all(axis=1)
     if not unknown.any():
         return start
-    lattice = charges.radius_mm * sunflower(PLACES)
+    lattice = charges.domain.radius * sunflower(PLACES)
     force = np.exp(np.median(data.contact[unknown, 2]))
     at = np.column_stack([lattice.real, lattice.imag, np.full(PLACES, force)])
-    candidates = np.log(charges.charge_pC(parameters, at))
+    candidates = np.log(charges.charges(parameters, at))
     for row in np.flatnonzero(unknown):
-        seen = data.known[row, : data.charge_pC.shape[1]]
-        measured = np.log(np.maximum(data.charge_pC[row, seen], 1.0))
+        seen = data.known[row, :-3]
+        measured = np.log(np.maximum(data.charge[row, seen], 1.0))
         ratios = (measured - measured.mean()) - (candidates[:, seen] - candidates[:, seen].mean(axis=1)[:, None])
-        best = int(np.argmin((ratios**2).sum(axis=1)))
-        start[row, :2] = at[best, :2]
+        start[row, :2] = at[int(np.argmin((ratios**2).sum(axis=1))), :2]
     return start

@@ -5,12 +5,12 @@ other units. What then explains them is named; the data are never mended silentl
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import combinations, permutations
+from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import PressError
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.train.calibration.film_charges import FilmCharges
@@ -56,13 +56,24 @@ AS_GOOD = 2.0
 """Other mistakes are named too if their misfit is at most this much larger."""
 
 
-@dataclass(frozen=True)
-class Mistake:
+AXES = (
+    ("they are turned by 90 degrees", np.array([[0.0, -1.0], [1.0, 0.0]])),
+    ("they are turned by 180 degrees", np.array([[-1.0, 0.0], [0.0, -1.0]])),
+    ("they are turned by -90 degrees", np.array([[0.0, 1.0], [-1.0, 0.0]])),
+    ("x is mirrored", np.array([[-1.0, 0.0], [0.0, 1.0]])),
+    ("y is mirrored", np.array([[1.0, 0.0], [0.0, -1.0]])),
+    ("x and y are exchanged", np.array([[0.0, 1.0], [1.0, 0.0]])),
+    ("x and y are exchanged and mirrored", np.array([[0.0, -1.0], [-1.0, 0.0]])),
+)
+"""In words, and the matrix from positions as written to positions on the film."""
+
+
+class Mistake(NamedTuple):
     """One way in which presses may have been written wrongly, and the presses put right."""
 
-    words: str
+    sentence: str
     contact: Array
-    charge_pC: Array
+    charge: Array
 
 
 def check_before(presses: MeasuredPresses, charges: FilmCharges) -> None:
@@ -71,25 +82,24 @@ def check_before(presses: MeasuredPresses, charges: FilmCharges) -> None:
     Raises:
         PressError: If a place is off the film, places are in metres, or a channel is dead or has the wrong sign.
     """
-    _check_places(presses, charges)
+    _check_places(presses, charges.prior.sensor.film.radius)
     _check_channels(presses, charges)
 
 
-def _check_places(presses: MeasuredPresses, charges: FilmCharges) -> None:
+def _check_places(presses: MeasuredPresses, radius: float) -> None:
     distance = np.hypot(presses.contact[:, 0], presses.contact[:, 1])
     known = np.isfinite(distance)
     if not known.any():
         return
-    radius_mm = 1e3 * charges.prior.sensor.film.radius
     worst = int(np.nanargmax(distance))
-    if distance[worst] >= radius_mm:
-        x_mm, y_mm, _ = presses.contact[worst]
+    if distance[worst] >= radius:
+        x, y, _ = presses.contact[worst]
         raise PressError(
-            f"line {presses.lines[worst]}: a press at ({x_mm:g}, {y_mm:g}) mm "
-            f"is off the film, whose radius is {radius_mm:g} mm; positions are in mm from the film's centre"
+            f"line {presses.lines[worst]}: a press at ({x:g}, {y:g}) mm "
+            f"is off the film, whose radius is {radius:g} mm; positions are in mm from the film's centre"
         )
     spread = np.ptp(presses.contact[known, :2], axis=0).max()
-    if 0.0 < spread < METRES_MM and known.sum() > 1:
+    if 0.0 < spread < METRES_MM:
         raise PressError(
             f"all places lie within {spread:.3g} mm of each other; positions are in mm: were they written in metres?"
         )
@@ -118,21 +128,23 @@ def _check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
 def _smallest_shares(presses: MeasuredPresses, charges: FilmCharges) -> Array:
     """Typical charge of each channel over that of the others, the smallest that films of some pretension give."""
-    placed = np.isfinite(presses.contact).all(axis=1)
-    shares = []
-    for share in PRETENSIONS if placed.any() else ():
-        typical = np.median(np.abs(_expected(charges, presses.contact[placed], share)), axis=0)
-        others = np.array([np.median(np.delete(typical, number)) for number in range(typical.size)])
-        shares.append(typical / others)
-    smallest: Array = np.min(shares, axis=0) if shares else np.ones(len(presses.electrodes))
+    placed = presses.contact[np.isfinite(presses.contact).all(axis=1)]
+    if not len(placed):
+        return np.ones(len(presses.electrodes))
+    typical = np.median(np.abs(_expected(charges, placed)), axis=1)
+    others = [np.median(np.delete(typical, number, axis=1), axis=1) for number in range(typical.shape[1])]
+    smallest: Array = np.min(typical / np.transpose(others), axis=0)
     return smallest
 
 
-def _expected(charges: FilmCharges, contact: Array, share: float) -> Array:
-    """Charges of contacts, (n, n_electrode), pC, on the prior's mean film with a share of its largest pretension."""
-    parameters = charges.prior.mean.copy()
-    parameters[0] = share * charges.prior.spread.pretension
-    return charges.charge_pC(parameters, charges.into_domain(contact))
+def _expected(charges: FilmCharges, contact: Array) -> Array:
+    """Charges of contacts on the prior's mean film with `PRETENSIONS`, shape (n_pretension, n, n_electrode), pC."""
+    contact, films = charges.into_domain(contact), []
+    for share in PRETENSIONS:
+        parameters = charges.prior.mean.copy()
+        parameters[0] = share * charges.prior.spread.pretension
+        films.append(charges.charges(parameters, contact))
+    return np.array(films)
 
 
 def _median(values: Array) -> float:
@@ -141,59 +153,49 @@ def _median(values: Array) -> float:
     return float(np.median(known)) if known.size else np.nan
 
 
-def outside(presses: MeasuredPresses, charges: FilmCharges) -> np.ndarray:
+def outside(presses: MeasuredPresses, charges: FilmCharges) -> Booleans:
     """Which presses lie beyond the radius or the forces that films are solved for, shape (n,)."""
-    low, high = charges.force_range_N
-    far = np.hypot(presses.contact[:, 0], presses.contact[:, 1]) > charges.radius_mm
-    beyond: np.ndarray = far | (presses.contact[:, 2] < low) | (presses.contact[:, 2] > high)
-    return beyond
+    x, y, force = presses.contact.T
+    low, high = charges.domain.force_range
+    return np.asarray((np.hypot(x, y) > charges.domain.radius) | (force < low) | (force > high))
 
 
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[Mistake]:
     """The mistakes that would explain presses far better than as they are written, best first; none if nothing does."""
-    placed = np.isfinite(presses.contact).all(axis=1)
-    if not placed.any():
+    placed = presses[np.isfinite(presses.contact).all(axis=1)]
+    if not len(placed):
         return []
-    some = presses[np.flatnonzero(placed)]
-    as_written = _misfit(charges, some.contact, some.charge_pC)
-    tried = [(mistake, _misfit(charges, mistake.contact, mistake.charge_pC)) for mistake in _mistakes(some)]
-    tried = sorted((pair for pair in tried if pair[1] < CLEARER * as_written), key=lambda pair: pair[1])
-    return [mistake for mistake, misfit in tried if misfit <= AS_GOOD * tried[0][1]]
+    as_written = _misfit(charges, placed.contact, placed.charge_pC)
+    tried = [(_misfit(charges, mistake.contact, mistake.charge), mistake) for mistake in _mistakes(placed)]
+    tried = sorted((pair for pair in tried if pair[0] < CLEARER * as_written), key=lambda pair: pair[0])
+    return [mistake for misfit, mistake in tried if misfit <= AS_GOOD * tried[0][0]]
 
 
-def _misfit(charges: FilmCharges, contact: Array, charge_pC: Array) -> float:
+def _misfit(charges: FilmCharges, contact: Array, charge: Array) -> float:
     """Mean squared logarithm of measured over expected charges, in units of what films differ by."""
     if (charges.into_domain(contact) != contact).any(axis=1).mean() > 0.2:
         return np.inf
-    misfits = []
-    for share in PRETENSIONS:
-        expected = _expected(charges, contact, share)
-        logs = np.log(np.maximum(charge_pC, 1e-3)) - np.log(np.maximum(expected, 1e-3))
-        common = np.nanmedian(logs)
-        misfits.append(np.nanmean(np.minimum((logs - common) ** 2, 4.0)) / SCATTER**2 + (common / OFFSET) ** 2)
-    return float(min(misfits))
+    logs = np.log(np.maximum(charge, 1e-3)) - np.log(np.maximum(_expected(charges, contact), 1e-3))
+    common = np.nanmedian(logs, axis=(1, 2))
+    own = np.nanmean(np.minimum((logs - common[:, None, None]) ** 2, 4.0), axis=(1, 2))
+    return float(np.min(own / SCATTER**2 + (common / OFFSET) ** 2))
 
 
 def _mistakes(presses: MeasuredPresses) -> Iterator[Mistake]:
     """Every mistake that is tried, one at a time."""
-    contact, charge_pC = presses.contact, presses.charge_pC
-    for order in _orders(len(presses.electrodes)):
-        names = ", ".join(presses.electrodes[number] for number in order)
-        yield Mistake(
-            f"the charge columns are swapped: those named {', '.join(presses.electrodes)} hold {names}",
-            contact,
-            charge_pC[:, np.argsort(order)],
-        )
-    for words, matrix in AXES:
-        turned = contact.copy()
-        turned[:, :2] = contact[:, :2] @ matrix.T
-        yield Mistake(f"the rig's axes are not the film's: {words}", turned, charge_pC)
+    contact, charge, electrodes = presses.contact, presses.charge_pC, presses.electrodes
+    for order in _orders(len(electrodes)):
+        swapped = f"those named {', '.join(electrodes)} hold {', '.join(electrodes[number] for number in order)}"
+        yield Mistake(f"the charge columns are swapped: {swapped}", contact, charge[:, np.argsort(order)])
+    for sentence, matrix in AXES:
+        rotated = np.column_stack([contact[:, :2] @ matrix.T, contact[:, 2]])
+        yield Mistake(f"the rig's axes are not the film's: {sentence}", rotated, charge)
     for unit, factor in FORCE_UNITS.items():
-        yield Mistake(f"the forces are in {unit}, not N", contact * [1.0, 1.0, factor], charge_pC)
+        yield Mistake(f"the forces are in {unit}, not N", contact * [1.0, 1.0, factor], charge)
     for unit, factor in PLACE_UNITS.items():
-        yield Mistake(f"the positions are in {unit}, not mm", contact * [factor, factor, 1.0], charge_pC)
+        yield Mistake(f"the positions are in {unit}, not mm", contact * [factor, factor, 1.0], charge)
     for unit, factor in CHARGE_UNITS.items():
-        yield Mistake(f"the charges are in {unit}, not pC", contact, charge_pC * factor)
+        yield Mistake(f"the charges are in {unit}, not pC", contact, charge * factor)
 
 
 def _orders(count: int) -> Iterator[tuple[int, ...]]:
@@ -202,23 +204,9 @@ def _orders(count: int) -> Iterator[tuple[int, ...]]:
     if count <= MOST_PERMUTED:
         yield from (order for order in permutations(identity) if order != identity)
         return
-    for first in range(count):
-        for second in range(first + 1, count):
-            order = list(identity)
-            order[first], order[second] = second, first
-            yield tuple(order)
-
-
-AXES = (
-    ("they are turned by 90 degrees", np.array([[0.0, -1.0], [1.0, 0.0]])),
-    ("they are turned by 180 degrees", np.array([[-1.0, 0.0], [0.0, -1.0]])),
-    ("they are turned by -90 degrees", np.array([[0.0, 1.0], [-1.0, 0.0]])),
-    ("x is mirrored", np.array([[-1.0, 0.0], [0.0, 1.0]])),
-    ("y is mirrored", np.array([[1.0, 0.0], [0.0, -1.0]])),
-    ("x and y are exchanged", np.array([[0.0, 1.0], [1.0, 0.0]])),
-    ("x and y are exchanged and mirrored", np.array([[0.0, -1.0], [-1.0, 0.0]])),
-)
-"""In words, and the matrix from positions as written to positions on the film."""
+    for pair in combinations(identity, 2):
+        exchanged = dict(zip(pair, pair[::-1], strict=True))
+        yield tuple(exchanged.get(number, number) for number in identity)
 
 
 def explain(presses: MeasuredPresses, charges: FilmCharges, times_noise: float) -> PressError:
@@ -227,22 +215,16 @@ def explain(presses: MeasuredPresses, charges: FilmCharges, times_noise: float) 
     Args:
         presses: As they are written.
         charges: The films.
-        times_noise: Root-mean-square miss of the best film over the noise; infinite if none was tried.
+        times_noise: Root-mean-square residual of the best film over the noise; infinite if none was tried.
     """
     best = f"the best misses them by {times_noise:.2g} times the noise"
     if not np.isfinite(times_noise):
         best = "most of them lie outside the places and forces of a calibration"
     begin = f"no film of {charges.prior.sensor.name!r} explains these {len(presses)} presses: {best}"
-    mistakes = find_mistakes(presses, charges)
-    if not mistakes:
-        return PressError(
-            f"{begin}; is it this layout and this probe ({charges.prior.probe.notation}), are places and forces those "
-            "of these rows, and are charges touch charges (reading under load minus reading without)?"
-        )
-    words = "; or ".join(mistake.words for mistake in mistakes[:3])
-    return PressError(f"{begin}, but it would explain them if {words}. Nothing was changed: put the file right")
-
-
-def without(presses: MeasuredPresses, rows: np.ndarray) -> MeasuredPresses:
-    """The presses but for those of a mask, shape (n,)."""
-    return replace(presses[np.flatnonzero(~rows)])
+    if mistakes := find_mistakes(presses, charges):
+        sentences = "; or ".join(mistake.sentence for mistake in mistakes[:3])
+        return PressError(f"{begin}, but it would explain them if {sentences}. Nothing was changed: put the file right")
+    return PressError(
+        f"{begin}; is it this layout and this probe ({charges.prior.probe.notation}), are places and forces those "
+        "of these rows, and are charges touch charges (reading under load minus reading without)?"
+    )

@@ -2,11 +2,11 @@
 
 The parameters minimise
 
-    sum over presses of  min over its contact of |misses of charges and rig|^2   +   |(p - mean) / std|^2,
+    sum over presses of  min over its contact of |residuals of charges and rig|^2   +   |(p - mean) / std|^2,
 
 by SciPy's trust region; the contacts are eliminated at every step (variable projection, Golub and Pereyra 1973), so
-that only the film's parameters are left. A press that misses by more than noise can explain is weighted down by its own
-miss (Student's t, Lange et al. 1989), so that one bad press does not move the film; what is then still too far
+that only the film's parameters are left. A press whose residual is larger than noise can explain is weighted down by
+it (Student's t, Lange et al. 1989), so that one bad press does not move the film; what is then still too far
 off is left out and named.
 """
 
@@ -17,8 +17,9 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_distribution
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.train.calibration.contacts import AdjustedContacts, RigData, adjust_contacts, search_places, with_slopes
+from isocharge.train.calibration.contacts import AdjustedContacts, PressData, adjust_contacts, search_places, with_force
 from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.problem import FilmEstimate
 
 HEAVY_TAILS = 4.0
 """Degrees of freedom of Student's t by which presses are weighted while bad ones may be among them."""
@@ -27,10 +28,10 @@ WEIGHTINGS = 6
 """Rounds of weighting at most."""
 
 BAD = 1e-4
-"""Chance that a good press misses by more than the one that is called bad, dimensionless."""
+"""Chance that a good press has a larger residual than the one that is called bad, dimensionless."""
 
 DOUBTFUL = 0.01
-"""Chance that good presses miss by more than these, below which bad ones are looked for."""
+"""Chance that good presses have larger residuals than these, below which bad ones are looked for."""
 
 LARGEST_BAD_SHARE = 0.34
 """Largest share of presses that may be called bad; beyond it, it is the rest that is wrong."""
@@ -49,114 +50,85 @@ MARGIN = 1e-3
 
 
 @dataclass(frozen=True)
-class FilmPosterior:
-    """What presses say of a film: mean and covariance of a Gaussian about the best parameters.
+class FilmPosterior(FilmEstimate):
+    """What presses say of a film.
 
     Attributes:
-        parameters: The best, shape (n_parameter,), as `FilmPrior` has them.
-        covariance: Of the parameters over their prior standard deviations, shape (n_parameter, n_parameter).
-        contact: The presses' contacts adjusted to this film, (x_mm, y_mm, force_N), shape (n, 3).
-        chi2: Sum of squared misses of each press, shape (n,); about `freedom` for good ones.
+        contact: The presses' contacts adjusted to this film, (x, y, F), shape (n, 3), mm and N.
+        chi2: Sum of squared residuals of each press, shape (n,); about `freedom` for good ones.
         freedom: Measured numbers beyond three for each press, shape (n,).
         bad: Which presses were left out, shape (n,).
-        evaluations: Calls of the residual function.
     """
 
-    parameters: Array
-    covariance: Array
     contact: Array
     chi2: Array
     freedom: Array
     bad: Booleans
-    evaluations: int
+
+    @property
+    def total(self) -> tuple[float, float]:
+        """Sum of squared residuals of the good presses, and their degrees of freedom."""
+        return float(self.chi2[~self.bad].sum()), float(self.freedom[~self.bad].sum())
 
 
-def fit_film(
-    charges: FilmCharges, data: RigData, mean: Array | None = None, covariance: Array | None = None
-) -> FilmPosterior:
-    """The film that explains presses.
-
-    Args:
-        charges: The films.
-        data: The presses.
-        mean: Of the prior, shape (n_parameter,); that of `charges.prior` if absent, an earlier calibration otherwise.
-        covariance: Of the prior, of parameters over their prior standard deviations; the identity if absent.
-    """
-    prior = charges.prior
-    problem = _Problem(charges, prior.mean if mean is None else mean, _root_information(covariance, len(prior.names)))
+def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate) -> FilmPosterior:
+    """The film that explains presses; `before` is what is known of it without them."""
+    fit = _FilmFit(charges, before)
     freedom = np.maximum(data.known.sum(axis=1) - 3.0, 0.0)
-    best, adjusted, evaluations = problem.solve(data, np.ones(len(data)), problem.mean)
+    best, adjusted = fit.solve(data, np.ones(len(data)), before.parameters)
     keep = np.ones(len(data), dtype=bool)
     if len(data) >= FEWEST_TO_JUDGE and _suspicious(adjusted.chi2, freedom):
-        keep, start, used = _good_presses(problem, data, best, adjusted.chi2, freedom)
-        best, _, again = problem.solve(data[keep], np.ones(int(keep.sum())), start)
-        adjusted = adjust_contacts(charges, best, data, search_places(charges, best, data))
-        evaluations += used + again
-    jacobian = problem.jacobian(best, data[keep], np.ones(int(keep.sum())))
-    inverse: Array = np.linalg.inv(jacobian.T @ jacobian).astype(float)
-    return FilmPosterior(
-        parameters=best,
-        covariance=inverse,
-        contact=np.column_stack([adjusted.contact[:, :2], np.exp(adjusted.contact[:, 2])]),
-        chi2=adjusted.chi2,
-        freedom=freedom,
-        bad=~keep,
-        evaluations=evaluations,
-    )
+        keep, start = _good_presses(fit, data, best, adjusted.chi2, freedom)
+        best, _ = fit.solve(data[keep], np.ones(int(keep.sum())), start)
+        adjusted = fit.adjusted(best, data)
+    jacobian = fit.jacobian(best, data[keep], np.ones(int(keep.sum())), fit.adjusted(best, data[keep]))
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    return FilmPosterior(best, covariance, with_force(adjusted.contact), adjusted.chi2, freedom, ~keep)
 
 
 def _suspicious(chi2: Array, freedom: Array) -> bool:
-    """Whether a press, or all of them, miss by more than noise explains."""
+    """Whether a press, or all of them, have larger residuals than noise explains."""
     alone = chi2_distribution.sf(chi2, np.maximum(freedom, 1.0)).min() * len(chi2)
     together = chi2_distribution.sf(chi2.sum(), max(freedom.sum(), 1.0))
     return bool(min(alone, together) < DOUBTFUL)
 
 
 def _good_presses(
-    problem: "_Problem", data: RigData, start: Array, chi2: Array, freedom: Array
-) -> tuple[Booleans, Array, int]:
-    """Which presses agree with the film that most of them agree on, that film, and the evaluations it took."""
-    weight, evaluations = np.ones(len(data)), 0
+    fit: "_FilmFit", data: PressData, start: Array, chi2: Array, freedom: Array
+) -> tuple[Booleans, Array]:
+    """Which presses agree with the film that most of them agree on, and that film."""
+    weight = np.ones(len(data))
     for _ in range(WEIGHTINGS):
         before, weight = weight, (HEAVY_TAILS + freedom) / (HEAVY_TAILS + chi2)
         if np.abs(weight / before - 1.0).max() < 0.1:
             break
-        start, adjusted, used = problem.solve(data, weight, start)
-        chi2, evaluations = adjusted.chi2, evaluations + used
-    limit = chi2_distribution.isf(BAD / len(data), np.maximum(freedom, 1.0))
-    keep = chi2 <= limit * _scatter(chi2, freedom)
+        start, adjusted = fit.solve(data, weight, start)
+        chi2 = adjusted.chi2
+    freedom = np.maximum(freedom, 1.0)
+    scatter = np.median(chi2 / np.maximum(chi2_distribution.median(freedom), 0.1))
+    keep = chi2 <= chi2_distribution.isf(BAD / len(data), freedom) * max(1.0, scatter)
     if np.mean(~keep) > LARGEST_BAD_SHARE:
         keep[:] = True
-    return keep, start, evaluations
+    return keep, start
 
 
-def _scatter(chi2: Array, freedom: Array) -> float:
-    """Variance of the misses over that of the noise, from the middle of the presses; at least one."""
-    spread = np.median(chi2 / np.maximum(chi2_distribution.median(np.maximum(freedom, 1.0)), 0.1))
-    return max(1.0, float(spread))
-
-
-def _root_information(covariance: Array | None, count: int) -> Array:
-    """Matrix L with L' L the inverse of a covariance, shape (count, count)."""
-    if covariance is None:
-        return np.eye(count)
-    root: Array = np.linalg.inv(np.linalg.cholesky(covariance))
-    return root
-
-
-@dataclass
-class _Problem:
-    """Least squares over the parameters, with the last contacts at hand."""
+@dataclass(frozen=True)
+class _FilmFit:
+    """Least squares over the parameters of a film."""
 
     charges: FilmCharges
-    mean: Array
-    root: Array
+    before: FilmEstimate
 
-    def solve(self, data: RigData, weight: Array, start: Array) -> tuple[Array, AdjustedContacts, int]:
-        """The best parameters from a start, the contacts adjusted to them, and the number of evaluations."""
+    def adjusted(self, parameters: Array, data: PressData) -> AdjustedContacts:
+        """The contacts that fit a film best."""
+        return adjust_contacts(self.charges, parameters, data, search_places(self.charges, parameters, data))
+
+    def solve(self, data: PressData, weight: Array, start: Array) -> tuple[Array, AdjustedContacts]:
+        """The best parameters from a start, and the contacts adjusted to them."""
         prior = self.charges.prior
         low, high = (bound / prior.std for bound in prior.bounds)
         place = search_places(self.charges, start, data)
+        root, mean = np.linalg.inv(np.linalg.cholesky(self.before.covariance)), self.before.parameters / prior.std
         last: list[tuple[Array, AdjustedContacts]] = []
 
         def adjusted_at(unit: Array) -> AdjustedContacts:
@@ -166,34 +138,28 @@ class _Problem:
             return last[-1][1]
 
         def residual(unit: Array) -> Array:
-            misses = adjusted_at(unit).residual * np.sqrt(weight)[:, None]
-            return np.concatenate([misses.ravel(), self.root @ (unit - self.mean / prior.std)])
-
-        def jacobian(unit: Array) -> Array:
-            return self.jacobian(unit * prior.std, data, weight, adjusted_at(unit))
+            of_presses = adjusted_at(unit).residual * np.sqrt(weight)[:, None]
+            return np.concatenate([of_presses.ravel(), root @ (unit - mean)])
 
         result = least_squares(
             residual,
             np.clip(start / prior.std, low + MARGIN, high - MARGIN),
-            jac=jacobian,
+            jac=lambda unit: self.jacobian(unit * prior.std, data, weight, adjusted_at(unit)),
             bounds=(low, high),
             x_scale=1.0,
             ftol=TOLERANCE,
             xtol=TOLERANCE,
             max_nfev=MOST_STEPS,
         )
-        return result.x * prior.std, adjusted_at(result.x), int(result.nfev)
+        return result.x * prior.std, adjusted_at(result.x)
 
-    def jacobian(
-        self, parameters: Array, data: RigData, weight: Array, adjusted: AdjustedContacts | None = None
-    ) -> Array:
+    def jacobian(self, parameters: Array, data: PressData, weight: Array, adjusted: AdjustedContacts) -> Array:
         """Derivatives of the residual by the parameters over their prior standard deviations."""
-        charges = self.charges
-        if adjusted is None:
-            adjusted = adjust_contacts(charges, parameters, data, search_places(charges, parameters, data))
-        at = np.column_stack([adjusted.contact[:, :2], np.exp(adjusted.contact[:, 2])])
-        by_contact = charges.by_contact(charges.forward_map(parameters), at)
-        by_charge = data.weight[:, :, None] * charges.by_parameter(parameters, at, by_contact)
+        at = with_force(adjusted.contact)
+        by_contact = self.charges.by_contact(parameters, at)
+        by_charge = data.weight[:, :, None] * self.charges.by_parameter(parameters, at, by_contact)
         by_parameter = np.concatenate([by_charge, np.zeros((len(data), 3, parameters.size))], axis=1)
-        rows = with_slopes(adjusted, data, by_contact).projected(by_parameter) * np.sqrt(weight)[:, None, None]
-        return np.concatenate([rows.reshape(-1, parameters.size), self.root])
+        here = AdjustedContacts(adjusted.contact, adjusted.residual, data.slopes(by_contact))
+        rows = here.projected(by_parameter) * np.sqrt(weight)[:, None, None]
+        root = np.linalg.inv(np.linalg.cholesky(self.before.covariance))
+        return np.concatenate([rows.reshape(-1, parameters.size), root])

@@ -3,11 +3,11 @@
     FOLDER/config.pbtxt            for Triton
     FOLDER/<version>/model.onnx    the model of this film, with golden.json and card.md as every model
     FOLDER/<version>/sensor.toml   the calibrated sensor
-    FOLDER/<version>/calibration.json    parameters, errors, correlations, what cannot be told
+    FOLDER/<version>/calibration.json    parameters, errors, correlations, what cannot be identified
     FOLDER/<version>/presses.csv   the presses
     FOLDER/<version>/calibration.png
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    of the last version
-    FOLDER/presses.part.csv        presses of a session at the bench that is not over
+    FOLDER/presses.part.csv        presses of a session that is not over
 
 A further calibration in the same folder is its next version: a server that watches it takes it with a reload, and
 nothing is lost.
@@ -15,6 +15,8 @@ nothing is lost.
 
 import io
 import json
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +26,20 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, PressError
 from isocharge.common.files import read_whole, write_whole
 from isocharge.common.json_values import plain_values
-from isocharge.common.tables import parse_json
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.repository import version_folders
-from isocharge.serve.prediction.measured_presses import MeasuredPresses, write_presses
+from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text, write_presses
+from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
-from isocharge.train.calibration.calibrate import Calibration, CalibrationScene, EarlierFilm, loosened
-from isocharge.train.calibration.card import calibration_card
+from isocharge.train.calibration.calibrate import CalibrationResult
+from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.picture import calibration_picture
-from isocharge.train.films.films_model import FilmsModel, write_film_model
+from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
+from isocharge.train.calibration.quantities import Quantity
+from isocharge.train.release.release import release
+from isocharge.train.training.source import Provenance
 
-RESULT, SENSOR, PRESSES, PICTURE = "calibration.json", "sensor.toml", "presses.csv", "calibration.png"
+RESULT, SENSOR, PRESSES, PICTURE, CARD = "calibration.json", "sensor.toml", "presses.csv", "calibration.png", "card.md"
 """Names of the files."""
 
 SESSION = "presses.part.csv"
@@ -43,10 +48,8 @@ SESSION = "presses.part.csv"
 DOTS_PER_INCH = 90
 """Of the picture: readable, and some 150 kB."""
 
-
-def next_version(folder: Path) -> int:
-    """Number of the version that a calibration in this folder gets: one more than the last."""
-    return max(version_folders(folder), default=0) + 1
+FILE_UNITS = {"pretension": 1e6, "shift_x": 1e-3, "shift_y": 1e-3, "probe_radius": 1e-3}
+"""Factors to the parameters in calibration.json, which are in Pa and m."""
 
 
 def check_calibration_folder(folder: Path) -> None:
@@ -63,21 +66,15 @@ def save_session(folder: Path, presses: MeasuredPresses) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         write_presses(folder / SESSION, presses)
     else:
-        end_session(folder)
+        (folder / SESSION).unlink(missing_ok=True)
 
 
-def end_session(folder: Path) -> None:
-    """Remove the presses of a session whose calibration is written: the version folder has them."""
-    (folder / SESSION).unlink(missing_ok=True)
-
-
-def write_calibration(folder: Path, calibration: Calibration, films: FilmsModel, command: str = "") -> Path:
+def write_calibration(result: CalibrationResult, folder: Path, command: str = "") -> Path:
     """Write a calibrated film as a version of a model folder, and copy its files for people to the top.
 
     Args:
+        result: What the presses say.
         folder: The folder; new, or one of an earlier calibration.
-        calibration: What the presses say.
-        films: The network for all films that the calibration's scene was made of.
         command: How to make this again, for the card.
 
     Returns:
@@ -88,88 +85,156 @@ def write_calibration(folder: Path, calibration: Calibration, films: FilmsModel,
         OutputError: If the file system refuses.
     """
     check_calibration_folder(folder)
-    further = {
-        RESULT: json.dumps(plain_values(calibration.to_dict()), indent=1, allow_nan=False).encode(),
-        SENSOR: sensor_to_toml(calibration.film[0]).encode(),
-        PRESSES: _presses_text(calibration),
-        PICTURE: _drawn(calibration),
+    picture = io.BytesIO()
+    calibration_picture(result).savefig(picture, dpi=DOTS_PER_INCH, format="png")
+    files = {
+        RESULT: json.dumps(plain_values(result_table(result)), indent=1, allow_nan=False).encode(),
+        SENSOR: sensor_to_toml(result.film[0]).encode(),
+        PRESSES: presses_text(result.presses).encode(),
+        PICTURE: picture.getvalue(),
     }
-
-    def card(about: ModelMetadata) -> str:
-        return calibration_card(calibration, about, PICTURE)
-
-    version = write_film_model(
-        films,
-        calibration.posterior.parameters,
+    version = release(
+        replace(result.fitted, provenance=Provenance(files=files)),
         folder,
-        card=card,
-        version=next_version(folder),
-        made_with={"command": command},
-        further=further,
-        widen=_widened(calibration),
-    )
-    for name in (SENSOR, PICTURE, "card.md", RESULT):
+        version=max(version_folders(folder), default=0) + 1,
+        command=command,
+        card=lambda about, _: _card(result, about),
+    ).folder
+    for name in (SENSOR, PICTURE, CARD, RESULT):
         write_whole(folder / name, (version / name).read_bytes())
     return version
 
 
-def _widened(calibration: Calibration) -> tuple[float, float]:
-    """Factors on the deviations of position and force: what the film leaves comes on top of noise."""
-    left, noise = calibration.left, calibration.sensitivity.of_noise()
-    return (
-        float(np.hypot(1.0, left.position_mm / noise.position_mm)),
-        float(np.hypot(1.0, left.force_percent / noise.force_percent)),
-    )
+def result_table(result: CalibrationResult) -> dict[str, Any]:
+    """A result for JSON: parameters with their errors and correlations, quantities, errors left, presses left out."""
+    prior, posterior = result.problem.prior, result.posterior
+    std = np.sqrt(np.diag(posterior.covariance))
+    units = _units(prior)
+    parameters = zip(prior.names, units * posterior.parameters, units * std * prior.std, strict=True)
+    return {
+        "format_version": 1,
+        "sensor": prior.sensor.name,
+        "probe": prior.probe.notation,
+        "presses": len(result.presses),
+        "left_out_lines": list(result.bad_lines),
+        "reduced_chi2": result.reduced_chi2,
+        "error_left": error_table(result.left),
+        "error_left_before": error_table(result.left_before),
+        "error_of_noise": error_table(result.sensitivity.of_noise),
+        "quantities": {name: quantity.to_dict() for name, quantity in result.quantities.items()},
+        "parameters": {name: {"value": float(value), "std": float(error)} for name, value, error in parameters},
+        "correlations": np.round(posterior.covariance / np.outer(std, std), 6).tolist(),
+        "words": list(result.summary),
+    }
 
 
-def _presses_text(calibration: Calibration) -> bytes:
-    text = io.StringIO()
-    write_presses(text, calibration.presses)
-    return text.getvalue().encode()
+def error_table(error: ContactError) -> dict[str, float]:
+    """An error of contacts for JSON."""
+    return {"position_mm": error.position_mm, "force_percent": error.force_percent}
 
 
-def _drawn(calibration: Calibration) -> bytes:
-    picture = io.BytesIO()
-    calibration_picture(calibration).savefig(picture, dpi=DOTS_PER_INCH, format="png")
-    return picture.getvalue()
-
-
-def read_earlier(folder: Path, scene: CalibrationScene) -> EarlierFilm:
-    """The film of an earlier calibration, loosened by what may have drifted since.
+def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
+    """The film of an earlier calibration, with what may have drifted since.
 
     Args:
         folder: As `write_calibration` made it, or one of its version folders.
-        scene: The films of the new calibration.
+        problem: The new calibration.
 
     Raises:
         PressError: If the folder has no calibration, or one of other parameters.
     """
-    path = folder / RESULT
+    path, prior = folder / RESULT, problem.prior
     try:
-        table: dict[str, Any] = parse_json(read_whole(path), str(path), PressError)
-        names, prior = tuple(table["parameters"]), scene.charges.prior
-        if names != prior.names or table["sensor"] != prior.sensor.name:
-            raise PressError(
-                f"{path}: a calibration of {table['sensor']!r} with the parameters {', '.join(names)}; expected "
-                f"{prior.sensor.name!r} with {', '.join(prior.names)}"
-            )
-        rows = [(float(entry["value"]), float(entry["std"])) for entry in table["parameters"].values()]
-        parameters, std = np.array(rows).T
+        table: dict[str, Any] = json.loads(read_whole(path))
+        names = tuple(table["parameters"])
+        parameters, std = np.array([[entry["value"], entry["std"]] for entry in table["parameters"].values()]).T
         correlations = np.array(table["correlations"], dtype=float)
-        return loosened(scene, parameters, _covariance(correlations, std / prior.std))
+        if not np.isfinite(correlations).all() or correlations.shape != (len(names), len(names)):
+            raise ValueError(f"correlations of shape {correlations.shape}")
+        sensor = table["sensor"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        if isinstance(error, PressError):
-            raise
         raise PressError(
             f"{path}: no calibration ({type(error).__name__}: {error}); expected the folder of `train calibrate`"
         ) from error
+    if names != prior.names or sensor != prior.sensor.name:
+        raise PressError(
+            f"{path}: a calibration of {sensor!r} with the parameters {', '.join(names)}; expected "
+            f"{prior.sensor.name!r} with {', '.join(prior.names)}"
+        )
+    units = _units(prior)
+    covariance = _positive(correlations * np.outer(std, std) / np.outer(units * prior.std, units * prior.std))
+    return FilmEstimate(parameters / units, covariance).drifted(prior)
 
 
-def _covariance(correlations: Array, std: Array) -> Array:
-    """Covariance from correlations and standard deviations, made positive definite against rounding."""
-    covariance = correlations * np.outer(std, std)
-    if covariance.shape != (std.size, std.size) or not np.isfinite(covariance).all():
-        raise ValueError(f"correlations of shape {correlations.shape}")
+def _units(prior: FilmPrior) -> Array:
+    return np.array([FILE_UNITS.get(name, 1.0) for name in prior.names])
+
+
+def _positive(covariance: Array) -> Array:
+    """A covariance made positive definite against rounding."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     repaired: Array = (vectors * np.maximum(values, 1e-10)) @ vectors.T
     return repaired
+
+
+def _card(result: CalibrationResult, about: ModelMetadata) -> str:
+    """The text of the card."""
+    sensor, probe = result.film
+    low, high = about.force_range_N
+    sentences = "\n".join(f"- {sentence}" for sentence in result.summary)
+    return f"""# {about.name}, version {about.version}: a calibrated film
+
+The sensor `{sensor.name}`, calibrated on {len(result.presses)} presses with `{probe.notation}` (radius as found).
+The model answers within {result.problem.domain.radius:g} mm of the centre, {low:g} to {high:g} N.
+
+{sentences}
+
+![error left, quantities, misses]({PICTURE})
+
+{_quantities(result.quantities)}
+## The model on this film
+
+On fresh simulated presses of the film as calibrated, with noise:
+
+| error | figure |
+|---|---|
+| position, median | {about.errors["position_median_mm"]:g} mm |
+| position, rms | {about.errors["position_rms_mm"]:g} mm |
+| force, rms | {about.errors["force_rms_percent"]:g} % |
+
+What not knowing the film leaves comes on top; `contact_std` has it in, as a common factor.
+
+{LIMITS}
+## Make it again
+
+```bash
+{about.made_with.get("command") or "(made by a program, see metadata)"}
+```
+"""
+
+
+def _quantities(table: Mapping[str, Quantity]) -> str:
+    rows = "\n".join(
+        f"| `{quantity.name}` | {quantity.meaning} | {quantity.value:.4g} | {quantity.std:.2g} | "
+        f"{quantity.before_std:.2g} | {'yes' if quantity.identified else 'no'} |"
+        for quantity in table.values()
+    )
+    return f"""## The film
+
+| quantity | what it is | value | standard deviation | before | identified |
+|---|---|---|---|---|---|
+{rows}
+
+Identified: the presses at least halved its standard deviation. `sensor.toml` has single parameters, of which only the
+combinations above are known; `calibration.json` has their correlations.
+"""
+
+
+LIMITS = """## Limits
+
+- The film's theory is the simulator's: clamped round its edge, flat, of even thickness. What a real film adds to that
+  (a loose rim, wrinkles, a seam under an electrode) shows as misses above 1 in the picture, not in the errors here.
+- Pretension creeps and coefficients age. Press a few times now and then and ask `isocharge serve check`; calibrate
+  again with `--from` this folder.
+- Positions refer to the rig's zero: an offset of the rig is taken for a shift of the electrodes.
+"""

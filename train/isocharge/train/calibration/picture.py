@@ -1,4 +1,4 @@
-"""The picture of a calibration: error left over the film before and after, quantities with their intervals, misses."""
+"""The picture of a calibration: error left over the film before and after, quantities with intervals, residuals."""
 
 from typing import Any
 
@@ -7,11 +7,11 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
-from isocharge.common.arrays import Array
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
-from isocharge.train.calibration.calibrate import Calibration
+from isocharge.train.calibration.calibrate import CalibrationResult
 from isocharge.train.calibration.contact_error import ContactError
+from isocharge.train.calibration.quantities import NORMAL_95
 
 LEVELS_MM = (0.02, 5.0)
 """Errors at the ends of the colours, mm."""
@@ -22,65 +22,53 @@ TICKS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 ASSUMED, FITTED = "#b9c4cf", "#3a7ca5"
 """Colours of what was assumed before the presses and of what they say."""
 
+NEIGHBOURS = 12
+"""Contacts that the map of the error is smoothed over: neighbours have different forces."""
 
-def calibration_picture(calibration: Calibration) -> Figure:
-    """Maps of the error that the film leaves, quantities in units of what was assumed, misses of the presses."""
+
+def calibration_picture(result: CalibrationResult) -> Figure:
+    """Maps of the error that the film leaves, quantities in units of what was assumed, residuals of the presses."""
     figure = new_figure(15.0, 9.4)
-    (before, after), (identified, misses) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
-    for axes, error, title in (
-        (before, calibration.left_before, "before the presses"),
-        (after, calibration.left, f"after {len(calibration.presses)} presses"),
-    ):
-        shades = _draw_error(axes, calibration, error)
-        axes.set_title(f"{title}: {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)")
-    _draw_presses(after, calibration)
+    (before, after), (identified, residuals) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
+    _draw_error(before, result, result.left_before, "before the presses")
+    shades = _draw_error(after, result, result.left, f"after {len(result.presses)} presses")
+    contact, bad = result.posterior.contact, result.posterior.bad
+    after.plot(*contact[~bad, :2].T, "o", color="white", mec=INK, ms=6, label="presses")
+    if bad.any():
+        after.plot(*contact[bad, :2].T, "X", color=FELT, mec=INK, ms=9, label="left out")
+    after.legend(loc="upper right", fontsize=8)
     figure.colorbar(
         shades, ax=[before, after], label="position error by not knowing the film (rms), mm", ticks=TICKS, format="%g"
     )
-    _draw_quantities(identified, calibration)
-    _draw_misses(misses, calibration)
-    figure.suptitle(f"calibration of {calibration.film[0].name}", fontsize=13)
+    _draw_quantities(identified, result)
+    _draw_residuals(residuals, result)
+    figure.suptitle(f"calibration of {result.film[0].name}", fontsize=13)
     return figure
 
 
-def _draw_error(axes: Any, calibration: Calibration, error: ContactError) -> Any:
-    x, y, _ = calibration.sensitivity.contact.T
+def _draw_error(axes: Any, result: CalibrationResult, error: ContactError, title: str) -> Any:
+    x, y, _ = result.sensitivity.contact.T
+    nearest = np.argsort(np.hypot(x[:, None] - x, y[:, None] - y), axis=1)[:, :NEIGHBOURS]
+    smooth = np.clip(np.sqrt((error.each_mm[nearest] ** 2).mean(axis=1)), *LEVELS_MM)
     levels = np.geomspace(*LEVELS_MM, 25)
-    smooth = _smoothed(np.column_stack([x, y]), error.each_mm)
-    shades = axes.tricontourf(Triangulation(x, y), np.clip(smooth, *LEVELS_MM), levels, norm=LogNorm(), cmap="viridis")
-    sensor, radius_mm = calibration.film[0], calibration.scene.domain.radius_mm
+    shades = axes.tricontourf(Triangulation(x, y), smooth, levels, norm=LogNorm(), cmap="viridis")
+    sensor, radius = result.film[0], result.problem.domain.radius
     draw_electrodes(axes, sensor)
-    draw_working_area(axes, 1e-3 * radius_mm)
-    frame_film(axes, sensor, 1e-3 * radius_mm)
+    draw_working_area(axes, radius)
+    frame_film(axes, sensor, radius)
+    axes.set_title(f"{title}: {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)")
     return shades
 
 
-def _smoothed(position: Array, values: Array, neighbours: int = 12) -> Array:
-    """Root mean square over the nearest contacts: neighbours have different forces."""
-    distance = np.hypot(*(position[:, None] - position[None, :]).T)
-    nearest = np.argsort(distance, axis=1)[:, :neighbours]
-    smoothed: Array = np.sqrt((values[nearest] ** 2).mean(axis=1))
-    return smoothed
-
-
-def _draw_presses(axes: Any, calibration: Calibration) -> None:
-    contact, bad = calibration.posterior.contact, calibration.posterior.bad
-    axes.plot(*contact[~bad, :2].T, "o", color="white", mec=INK, ms=6, label="presses")
-    if bad.any():
-        axes.plot(*contact[bad, :2].T, "X", color=FELT, mec=INK, ms=9, label="left out")
-    axes.legend(loc="upper right", fontsize=8)
-
-
-def _draw_quantities(axes: Any, calibration: Calibration) -> None:
+def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
     """95 % intervals after the presses within those before, each in units of the standard deviation before."""
-    quantities = list(calibration.quantities.values())[::-1]
+    quantities = list(result.quantities.values())[::-1]
     row = np.arange(len(quantities))
     axes.barh(row, 4.0, left=-2.0, color=ASSUMED, height=0.72, label="assumed before, 95 %")
-    before = calibration.before.parameters / calibration.scene.charges.prior.std
-    now = calibration.posterior.parameters / calibration.scene.charges.prior.std
+    change = (result.posterior.parameters - result.problem.before.parameters) / result.problem.prior.std
     for number, quantity in enumerate(quantities):
-        centre = float(quantity.weights @ (now - before)) / quantity.before_std
-        half = 1.96 * quantity.std / quantity.before_std
+        centre = float(quantity.weights @ change) / quantity.before_std
+        half = NORMAL_95 * quantity.std / quantity.before_std
         axes.plot([centre - half, centre + half], [number, number], color=FITTED if quantity.identified else INK, lw=5)
         axes.plot(centre, number, "|", color="white", ms=9)
         axes.annotate(
@@ -94,13 +82,12 @@ def _draw_quantities(axes: Any, calibration: Calibration) -> None:
     axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3)
 
 
-def _draw_misses(axes: Any, calibration: Calibration) -> None:
-    posterior = calibration.posterior
-    miss = np.sqrt(posterior.chi2 / np.maximum(posterior.freedom, 1.0))
+def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
+    posterior, lines = result.posterior, result.presses.lines
+    residual = np.sqrt(posterior.chi2 / np.maximum(posterior.freedom, 1.0))
     colours = [FELT if bad else FITTED for bad in posterior.bad]
-    axes.bar(np.arange(len(miss)), np.minimum(miss, 10.0), color=colours)
+    axes.bar(np.arange(len(lines)), np.minimum(residual, 10.0), color=colours)
     axes.axhline(1.0, color=INK, lw=0.8, ls="--")
-    lines = calibration.presses.lines
-    every = max(1, len(lines) // 20)
-    axes.set(xticks=np.arange(0, len(lines), every), xticklabels=[lines[i] for i in range(0, len(lines), every)])
-    axes.set(xlabel="line of the press", ylabel="miss over what noise and rig explain", title="how well the film fits")
+    ticks = np.arange(0, len(lines), max(1, len(lines) // 20))
+    axes.set(xticks=ticks, xticklabels=[lines[tick] for tick in ticks], xlabel="line of the press")
+    axes.set(ylabel="residual over what noise and rig explain", title="how well the film fits")

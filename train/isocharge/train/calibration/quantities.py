@@ -1,4 +1,4 @@
-"""What presses tell of a film, in quantities that can be told: products and ratios beside single parameters.
+"""What presses say of a film, in quantities that they can identify: products and ratios beside single parameters.
 
 Charges depend on Young's modulus, on the piezoelectric coefficients and on the gains almost only through their product,
 on modulus and thickness through E h. A single one of them may be as uncertain after the calibration as before while the
@@ -14,9 +14,10 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.sensor.film_prior import FilmPrior
+from isocharge.train.calibration.problem import FilmEstimate
 
 IDENTIFIED = 0.5
-"""Standard deviation after the presses over that before, below which a quantity counts as told, dimensionless."""
+"""Standard deviation after the presses over that before, below which a quantity counts as identified, dimensionless."""
 
 PERCENT = ", over the described one"
 """How quantities are given whose size is described, but not known."""
@@ -47,7 +48,7 @@ class Quantity:
 
     @property
     def identified(self) -> bool:
-        """Whether the presses have told it: its standard deviation at least halved."""
+        """Whether the presses have at least halved its standard deviation."""
         return self.std <= IDENTIFIED * self.before_std
 
     @property
@@ -62,96 +63,72 @@ class Quantity:
         return table | {"interval_95": list(self.interval_95), "identified": self.identified}
 
 
-def quantities(prior: FilmPrior, parameters: Array, covariance: Array, before: Array) -> dict[str, Quantity]:
-    """The quantities of a film by name.
+def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
+    """The quantities of a film by name, beside what the described sensor alone says."""
 
-    Args:
-        prior: What the parameters are.
-        parameters: The best, shape (n_parameter,).
-        covariance: After the presses, of the parameters over their prior standard deviations.
-        before: The same before the presses.
-    """
+    def std(row: Array, covariance: Array) -> float:
+        return float(np.sqrt(row @ covariance @ row))
+
     return {
         name: Quantity(
             name,
             meaning,
-            value=float(offset + row @ parameters),
-            std=_std(row * prior.std, covariance),
-            before_std=_std(row * prior.std, before),
+            value=float(offset + row @ film.parameters),
+            std=std(row * prior.std, film.covariance),
+            before_std=std(row * prior.std, np.eye(row.size)),
             weights=row * prior.std,
         )
         for name, (meaning, offset, row) in _rows(prior).items()
     }
 
 
-def _std(row: Array, covariance: Array) -> float:
-    return float(np.sqrt(row @ covariance @ row))
-
-
-def _rows(prior: FilmPrior) -> Mapping[str, tuple[str, float, Array]]:
+def _rows(prior: FilmPrior) -> dict[str, tuple[str, float, Array]]:
     """Name to meaning, value at parameters of zero, and weight of each parameter."""
-    names, electrodes = list(prior.names), prior.sensor.electrode_names
-    calibration = prior.sensor.calibration
+    unit = dict(zip(prior.names, np.eye(len(prior.names)), strict=True))
+    gains = {name: unit[f"gain {name}"] for name in prior.sensor.electrode_names}
+    mean_gain = sum(gains.values(), np.zeros(len(unit))) / len(gains)
+    response = 0.5 * (unit["d31"] + unit["d32"]) + mean_gain
+    of_slack_film = (unit["young"] - 2.0 * unit["thickness"]) / 3.0 + response
+    placed, degrees = prior.sensor.calibration, float(np.rad2deg(1.0))
 
-    def row(**weights: float) -> Array:
-        values = np.zeros(len(names))
-        for name, weight in weights.items():
-            values[names.index(name.replace("__", " "))] = weight
-        return values
+    def relative(meaning: str, weights: Array) -> tuple[str, float, Array]:
+        return f"{meaning}{PERCENT}, %", 0.0, 100.0 * weights
 
-    mean_gain = {f"gain__{name}": 1.0 / len(electrodes) for name in electrodes}
-    table = {
-        "pretension_MPa": ("pretension", 0.0, row(pretension=1e-6)),
-        "response_percent": (
-            f"charge of a press on the slack film, E^(1/3) h^(-2/3) sqrt(d31 d32) gain{PERCENT}, %",
-            0.0,
-            100.0 * row(young=1.0 / 3.0, thickness=-2.0 / 3.0, d31=0.5, d32=0.5, **mean_gain),
+    return {
+        "pretension_MPa": ("pretension", 0.0, unit["pretension"]),
+        "response_percent": relative(
+            "charge of a press on the slack film, E^(1/3) h^(-2/3) sqrt(d31 d32) gain", of_slack_film
         ),
-        "charge_scale_percent": (
-            f"product of Young's modulus, sqrt(d31 d32) and mean gain{PERCENT}, %",
-            0.0,
-            100.0 * row(young=1.0, d31=0.5, d32=0.5, **mean_gain),
+        "charge_scale_percent": relative(
+            "product of Young's modulus, sqrt(d31 d32) and mean gain", unit["young"] + response
         ),
-        "stiffness_percent": (
-            f"Young's modulus times thickness{PERCENT}, %",
-            0.0,
-            100.0 * row(young=1.0, thickness=1.0),
-        ),
-        "anisotropy_percent": (f"ratio of d31 to d32{PERCENT}, %", 0.0, 100.0 * row(d31=1.0, d32=-1.0)),
-        "shift_x_mm": ("shift of the electrodes along x", 1e3 * calibration.shift[0], row(shift_x=1e3)),
-        "shift_y_mm": ("shift of the electrodes along y", 1e3 * calibration.shift[1], row(shift_y=1e3)),
-        "rotation_deg": (
-            "turn of the electrodes",
-            float(np.rad2deg(calibration.rotation)),
-            row(rotation=float(np.rad2deg(1.0))),
-        ),
-        "probe_radius_mm": ("radius of the probe", 1e3 * prior.probe.radius, row(probe_radius=1e3)),
+        "stiffness_percent": relative("Young's modulus times thickness", unit["young"] + unit["thickness"]),
+        "anisotropy_percent": relative("ratio of d31 to d32", unit["d31"] - unit["d32"]),
+        "shift_x_mm": ("shift of the electrodes along x", placed.shift[0], unit["shift_x"]),
+        "shift_y_mm": ("shift of the electrodes along y", placed.shift[1], unit["shift_y"]),
+        "rotation_deg": ("turn of the electrodes", degrees * placed.rotation, degrees * unit["rotation"]),
+        "probe_radius_mm": ("radius of the probe", prior.probe.radius, unit["probe_radius"]),
+        **{
+            f"gain_{name}_percent": (f"gain of {name} over the mean of all gains, %", 0.0, 100.0 * (gain - mean_gain))
+            for name, gain in gains.items()
+        },
+        "young_percent": relative("Young's modulus by itself", unit["young"]),
+        "thickness_percent": relative("thickness by itself", unit["thickness"]),
+        "d31_percent": relative("d31 by itself", unit["d31"]),
+        "d32_percent": relative("d32 by itself", unit["d32"]),
+        "mean_gain_percent": relative("mean gain by itself", mean_gain),
     }
-    for name in electrodes:
-        among = mean_gain | {f"gain__{name}": 1.0 - 1.0 / len(electrodes)}
-        among = {key: value if key == f"gain__{name}" else -value for key, value in among.items()}
-        table[f"gain_{name}_percent"] = (f"gain of {name} over the mean of all gains, %", 0.0, 100.0 * row(**among))
-    alone = {
-        "young_percent": ("Young's modulus by itself", row(young=1.0)),
-        "thickness_percent": ("thickness by itself", row(thickness=1.0)),
-        "d31_percent": ("d31 by itself", row(d31=1.0)),
-        "d32_percent": ("d32 by itself", row(d32=1.0)),
-        "mean_gain_percent": ("mean gain by itself", row(**mean_gain)),
-    }
-    table |= {name: (f"{meaning}{PERCENT}, %", 0.0, 100.0 * weights) for name, (meaning, weights) in alone.items()}
-    return table
 
 
-def in_words(table: Mapping[str, Quantity]) -> tuple[str, ...]:
-    """What the presses tell and what they cannot, a sentence each."""
-    known = [quantity for quantity in table.values() if quantity.identified]
-    unknown = [quantity for quantity in table.values() if not quantity.identified]
-    sentences = [f"Known now: {_listed(known)}."] if known else []
+def summarise(table: Mapping[str, Quantity]) -> tuple[str, ...]:
+    """What the presses identify and what they cannot, a sentence each."""
+    known = [f"{name} {q.value:.3g} +- {q.std:.2g}" for name, q in table.items() if q.identified]
+    unknown = [q.meaning.removesuffix(", %").removesuffix(PERCENT) for q in table.values() if not q.identified]
+    sentences = [f"Known now: {', '.join(known)}."] if known else []
     if unknown:
         sentences.append(
-            "These presses cannot tell "
-            + ", ".join(quantity.meaning.removesuffix(", %").removesuffix(PERCENT) for quantity in unknown)
-            + "; what is given for them is hardly more than what was assumed before."
+            f"These presses cannot tell {', '.join(unknown)}; what is given for them is hardly more than what was "
+            "assumed before."
         )
     if not table["young_percent"].identified and table["response_percent"].identified:
         sentences.append(
@@ -159,7 +136,3 @@ def in_words(table: Mapping[str, Quantity]) -> tuple[str, ...]:
             f"charge of a press, is known to {table['response_percent'].std:.2g} %, and that is what contacts need."
         )
     return tuple(sentences)
-
-
-def _listed(known: list[Quantity]) -> str:
-    return ", ".join(f"{quantity.name} {quantity.value:.3g} +- {quantity.std:.2g}" for quantity in known)

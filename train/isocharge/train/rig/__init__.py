@@ -1,4 +1,1 @@
-"""Presses measured on a rig, to a model of the film under it: calibrated physics and a smooth correction.
-
-May import: calibration, films, release, training, data.
-"""
+"""Presses measured on a rig, to training data of the film under it: calibrated physics and a smooth correction."""

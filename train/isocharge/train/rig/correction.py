@@ -17,7 +17,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.linalg import cho_factor, cho_solve
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.simulate.forward.charge_map import Domain
 
 DEGREES = (1, 2, 3, 4, 6)
 """Degrees that are tried."""
@@ -46,7 +47,7 @@ class Residuals:
     """What a map leaves unexplained of measured presses.
 
     Attributes:
-        contact: As the rig read them, (x_mm, y_mm, force_N), shape (n, 3).
+        contact: As the rig read them, (x, y, F), shape (n, 3), mm and N.
         log_ratio: ln(measured charge / charge of the map), shape (n, n_electrode).
         covariance: Of the log ratios by noise and rig, shape (n, n_electrode, n_electrode).
     """
@@ -58,7 +59,7 @@ class Residuals:
     def __len__(self) -> int:
         return len(self.contact)
 
-    def __getitem__(self, rows: Integers) -> "Residuals":
+    def __getitem__(self, rows: Integers | Booleans) -> "Residuals":
         return Residuals(self.contact[rows], self.log_ratio[rows], self.covariance[rows])
 
     def chi2(self, correction: Array) -> Array:
@@ -73,16 +74,14 @@ class Correction:
     """Factors on charges, beyond the presses as at the nearest of them.
 
     Attributes:
-        radius_mm: Largest distance of a press.
-        force_range_N: Smallest and largest force of the presses.
+        domain: Distances and forces of the presses.
         degree: Largest degree.
         std: Standard deviation of the prior.
         coefficients: Shape (n_term, n_electrode).
         freedom: Effective number of coefficients: the prior holds the others.
     """
 
-    radius_mm: float
-    force_range_N: tuple[float, float]
+    domain: Domain
     degree: int
     std: float
     coefficients: Array
@@ -94,8 +93,8 @@ class Correction:
         return not self.coefficients.any()
 
     def log_factor(self, contact: Array) -> Array:
-        """What is added to ln Q at contacts (x_mm, y_mm, force_N), shape (n, 3): (n, n_electrode)."""
-        logs: Array = _terms(contact, self.radius_mm, self.force_range_N, self.degree) @ self.coefficients
+        """What is added to ln Q at contacts (x, y, F), shape (n, 3), mm and N: (n, n_electrode)."""
+        logs: Array = _terms(contact, self.domain, self.degree) @ self.coefficients
         return logs
 
 
@@ -106,49 +105,49 @@ def fit_correction(residuals: Residuals, seed: int = 0) -> Correction:
         residuals: Of at least `FOLDS` presses.
         seed: Of the parts.
     """
+    force = residuals.contact[:, 2]
+    reach = float(np.hypot(residuals.contact[:, 0], residuals.contact[:, 1]).max())
+    domain = Domain(reach, (float(force.min()), float(force.max())))
     part = np.random.default_rng(seed).permutation(np.arange(len(residuals)) % FOLDS)
     without = residuals.chi2(np.zeros_like(residuals.log_ratio))
-    tried = [(score.sum(), degree, std, score) for degree in DEGREES for std, score in _scores(residuals, part, degree)]
+    tried = [
+        (score.sum(), degree, std, score)
+        for degree in DEGREES
+        for std, score in _scores(residuals, part, domain, degree)
+    ]
     _, degree, std, score = min(tried, key=lambda entry: entry[:3])
     gain = without - score
     if gain.mean() <= CHANCE * gain.std() / np.sqrt(len(gain)):
-        none = np.zeros((len(_degrees(1)), residuals.log_ratio.shape[1]))
-        return Correction(*_reach(residuals.contact), 1, 0.0, none, 0.0)
-    normal, moment = _equations(residuals, residuals, degree)
+        return Correction(domain, 1, 0.0, np.zeros((len(_degrees(1)), residuals.log_ratio.shape[1])), 0.0)
+    normal, moment = _equations(residuals, domain, degree)
     freedom = float(np.trace(cho_solve(cho_factor(normal + _prior(len(moment), degree, std)), normal)))
-    return Correction(*_reach(residuals.contact), degree, std, _solve(normal, moment, degree, std), freedom)
+    return Correction(domain, degree, std, _solve(normal, moment, degree, std), freedom)
 
 
-def _reach(contact: Array) -> tuple[float, tuple[float, float]]:
-    force = contact[:, 2]
-    return float(np.hypot(contact[:, 0], contact[:, 1]).max()), (float(force.min()), float(force.max()))
-
-
-def _scores(residuals: Residuals, part: Integers, degree: int) -> Iterator[tuple[float, Array]]:
-    """Squared misses of the presses, each predicted by the parts that it is not in, for every width of the prior."""
-    parts = [_equations(residuals[np.flatnonzero(part == k)], residuals, degree) for k in range(FOLDS)]
+def _scores(residuals: Residuals, part: Integers, domain: Domain, degree: int) -> Iterator[tuple[float, Array]]:
+    """Squared residuals of the presses, each predicted by the parts that it is not in, for every width of the prior."""
+    parts = [_equations(residuals[part == k], domain, degree) for k in range(FOLDS)]
     normal, moment = (sum(entry[k] for entry in parts) for k in range(2))
+    terms = _terms(residuals.contact, domain, degree)
     for std in STDS:
         predicted = np.empty_like(residuals.log_ratio)
         for number, (own_normal, own_moment) in enumerate(parts):
-            coefficients = _solve(normal - own_normal, moment - own_moment, degree, std)
             rows = part == number
-            predicted[rows] = _terms(residuals.contact[rows], *_reach(residuals.contact), degree) @ coefficients
+            predicted[rows] = terms[rows] @ _solve(normal - own_normal, moment - own_moment, degree, std)
         yield std, residuals.chi2(predicted)
 
 
-def _equations(some: Residuals, all_of_them: Residuals, degree: int) -> tuple[Array, Array]:
-    """Normal matrix and moments of some presses: shapes (n_term n_electrode,) twice and once."""
-    reach = _reach(all_of_them.contact)
-    size = len(_degrees(degree)) * some.log_ratio.shape[1]
+def _equations(residuals: Residuals, domain: Domain, degree: int) -> tuple[Array, Array]:
+    """Normal matrix and moments: shapes (n_term n_electrode,) twice and once."""
+    size = len(_degrees(degree)) * residuals.log_ratio.shape[1]
     normal, moment = np.zeros((size, size)), np.zeros(size)
-    for start in range(0, len(some), CHUNK):
+    for start in range(0, len(residuals), CHUNK):
         rows = slice(start, start + CHUNK)
-        terms = _terms(some.contact[rows], *reach, degree)
-        whiten = np.linalg.inv(np.linalg.cholesky(some.covariance[rows]))
+        terms = _terms(residuals.contact[rows], domain, degree)
+        whiten = np.linalg.inv(np.linalg.cholesky(residuals.covariance[rows]))
         design = (terms[:, None, :, None] * whiten[:, :, None, :]).reshape(-1, size)
         normal += design.T @ design
-        moment += design.T @ np.einsum("nge,ne->ng", whiten, some.log_ratio[rows]).ravel()
+        moment += design.T @ np.einsum("nge,ne->ng", whiten, residuals.log_ratio[rows]).ravel()
     return normal, moment
 
 
@@ -160,9 +159,8 @@ def _solve(normal: Array, moment: Array, degree: int, std: float) -> Array:
 
 def _prior(size: int, degree: int, std: float) -> Array:
     """Inverse covariance of the coefficients, shape (size, size)."""
-    degrees = _degrees(degree)
-    widths = std * FADING ** degrees.sum(axis=1)
-    inverse: Array = np.diag(np.repeat(widths**-2.0, size // len(degrees)))
+    widths = std * FADING ** _degrees(degree).sum(axis=1)
+    inverse: Array = np.diag(np.repeat(widths**-2.0, size // len(widths)))
     return inverse
 
 
@@ -173,10 +171,10 @@ def _degrees(degree: int) -> Integers:
     return chosen
 
 
-def _terms(contact: Array, radius_mm: float, force_range_N: tuple[float, float], degree: int) -> Array:
+def _terms(contact: Array, domain: Domain, degree: int) -> Array:
     """Values of the terms, shape (n, n_term); beyond the presses those of the nearest contact among them."""
-    low, high = np.log(force_range_N)
-    inward = np.maximum(np.hypot(contact[:, 0], contact[:, 1]), radius_mm)
+    low, high = np.log(domain.force_range)
+    inward = np.maximum(np.hypot(contact[:, 0], contact[:, 1]), domain.radius)
     log_force = np.clip(np.log(contact[:, 2]), low, high)
     unit = (contact[:, 0] / inward, contact[:, 1] / inward, (2.0 * log_force - low - high) / max(high - low, 0.1))
     values = [chebyshev.chebvander(axis, degree) for axis in unit]

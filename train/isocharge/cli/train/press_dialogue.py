@@ -1,0 +1,379 @@
+"""The dialogue about presses at a port: says what to press, takes it when it is steady, asks whether it was there.
+
+A machine that makes the presses of a list is asked nothing: its presses are taken in their order.
+"""
+
+import sys
+import threading
+from collections.abc import Callable, Iterable
+from io import FileIO
+from queue import Empty, Queue
+from typing import NamedTuple, Protocol, Self
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.status import Status
+
+from isocharge.cli.shared.terminal import say
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError, PortLost, PressError
+from isocharge.serve.live.reading_stream import ReadingStream
+from isocharge.serve.live.steady_press import AWAY, Phase, PressWatch, SteadyPress, Watched
+from isocharge.serve.port.serial_port import Chunk
+from isocharge.train.calibration.session import Answer, PressSession, Reply, describe_press, read_answer
+
+SHOWN_S = 0.1
+"""Time between two readings that are passed on while nothing else changes, s."""
+
+POLL_S = 0.1
+"""How long to wait for an event before Ctrl-C is looked for, s."""
+
+PLAIN_S = 1.0
+"""Time between two lines of a settling press where there is no terminal, s."""
+
+PHASES = {
+    Phase.taring: "taring: leave the film alone",
+    Phase.lift: "lift the probe",
+    Phase.waiting: "waiting for the press",
+    Phase.settling: "hold it",
+}
+"""Phase of the press watch in words."""
+
+QUESTION = '   There, and as hard? Enter: yes; or type "x y force" (? is unknown), s: skip, u: undo, q: end'
+
+KEYS = "   (type s to skip this place, u to undo the last press, q to end)"
+
+Taken = Callable[[PressSession, SteadyPress], None]
+"""Called after each press that is in the session."""
+
+
+class Typed(NamedTuple):
+    """A line that was typed; None at the end of the input."""
+
+    text: str | None
+
+
+class Ended(NamedTuple):
+    """The port ends: with an error, or because a file is over."""
+
+    error: Exception | None
+
+
+class Stopped(Exception):
+    """The person ends the session, or the input or the port is over."""
+
+
+class Events(Protocol):
+    """As `PressEvents`."""
+
+    def arm(self) -> None:
+        """Take only presses that begin from now on."""
+
+    def next(self) -> Watched | Typed | Ended:
+        """The next event."""
+
+
+class PressEvents:
+    """Readings of a port and lines of the keyboard, in their order, from entering the context to leaving it.
+
+    The port is read also while a person answers and while a fit runs: nothing is lost, and a lift in between is seen.
+    `arm` forgets what has come so far: only presses that begin afterwards are passed on.
+    """
+
+    def __init__(
+        self, chunks: Iterable[Chunk], stream: ReadingStream, watch: PressWatch, keyboard: int | None = None
+    ) -> None:
+        """Set up; nothing is read yet.
+
+        Args:
+            chunks: An open port.
+            stream: From chunks to readings.
+            watch: From readings to steady presses.
+            keyboard: Descriptor of the keyboard; None for no keyboard.
+        """
+        self._chunks, self._stream, self._watch, self._keyboard = chunks, stream, watch, keyboard
+        self._queue: Queue[tuple[int, Watched | Typed | Ended]] = Queue()
+        self._stop, self._armed = threading.Event(), 0
+        self._reader = threading.Thread(target=self._read_port, name="press port", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Start to read."""
+        self._reader.start()
+        if self._keyboard is not None:
+            threading.Thread(target=self._read_keyboard, args=[self._keyboard], daemon=True).start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Stop reading; a port or a keyboard that is silent is left to its thread."""
+        self._stop.set()
+        self._reader.join(timeout=1.0)
+
+    def arm(self) -> None:
+        """From now on, take only a press that has not begun yet."""
+        self._armed += 1
+
+    def next(self) -> Watched | Typed | Ended:
+        """The next event; readings from before the last `arm` are left out."""
+        while True:
+            try:
+                armed, event = self._queue.get(timeout=POLL_S)
+            except Empty:
+                continue
+            if isinstance(event, Typed | Ended) or armed == self._armed:
+                return event
+
+    def _read_port(self) -> None:
+        error = None
+        try:
+            self._watch_port()
+        except Exception as reason:  # passed on to the thread that asks
+            error = reason
+        self._queue.put((self._armed, Ended(error)))
+
+    def _watch_port(self) -> None:
+        armed, last_phase, last_s = self._armed, None, -1.0
+        for chunk in self._chunks:
+            if self._stop.is_set():
+                return
+            if armed != self._armed:
+                armed, last_phase = self._armed, None
+                self._watch.arm()
+            for timed in self._stream.feed(chunk):
+                watched = self._watch.feed(timed)
+                if watched.phase is not last_phase or timed.time.clock_s - last_s >= SHOWN_S or watched.press:
+                    last_phase, last_s = watched.phase, timed.time.clock_s
+                    self._queue.put((armed, watched))
+        self._stream.finish()
+
+    def _read_keyboard(self, keyboard: int) -> None:
+        for line in FileIO(keyboard, closefd=False):  # unbuffered: no lock that is held when the program ends
+            self._queue.put((0, Typed(line.decode(errors="replace"))))
+        self._queue.put((0, Typed(None)))
+
+
+class Screen:
+    """What a person sees on stderr: sentences, and the charges as they settle, in one living line on a terminal."""
+
+    def __init__(self, electrodes: tuple[str, ...], live: bool | None = None) -> None:
+        """Set up.
+
+        Args:
+            electrodes: Names, in the order of the charges.
+            live: Whether to draw a living line; by default if stderr is a terminal.
+        """
+        self._electrodes = electrodes
+        self._live = sys.stderr.isatty() if live is None else live
+        self._status: Status | None = None
+        self._last: tuple[str, float] = ("", 0.0)
+
+    def say(self, sentence: str) -> None:
+        """A sentence; the living line gives way."""
+        self.rest()
+        say(sentence)
+
+    def rest(self) -> None:
+        """Take the living line away."""
+        if self._status is not None:
+            self._status.stop()
+        self._status, self._last = None, ("", 0.0)
+
+    def show(self, watched: Watched) -> None:
+        """The charges of a reading, and what the watch waits for."""
+        if watched.phase not in PHASES:
+            return
+        line = f"   {PHASES[watched.phase]}"
+        if watched.charge_pC is not None and watched.phase == Phase.settling:
+            line += f", {watched.held_s:.1f} s: {self._charges(watched.charge_pC)}"
+        line += f" ({watched.reason})" if watched.reason else ""
+        phase, shown_s = self._last
+        if self._live:
+            if self._status is None:
+                self._status = Console(stderr=True).status("")
+                self._status.start()
+            self._status.update(escape(line))
+        elif watched.phase != phase or watched.held_s - shown_s >= PLAIN_S:
+            self._last = watched.phase, watched.held_s
+            say(line)
+
+    def taken(self, press: SteadyPress) -> None:
+        """A press that was steady."""
+        flags = f" [{', '.join(press.flags)}]" if press.flags else ""
+        self.say(f"   steady after {press.held_s:.1f} s: {self._charges(press.charge_pC)}{flags}")
+
+    def _charges(self, charge_pC: Array) -> str:
+        """Charges as "A 812.3, B 401.0 pC"."""
+        return ", ".join(f"{name} {q:.1f}" for name, q in zip(self._electrodes, charge_pC, strict=True)) + " pC"
+
+
+class Dialogue:
+    """One session, from the first press to the last."""
+
+    def __init__(self, session: PressSession, events: Events, screen: Screen, taken: Taken) -> None:
+        """Put the parts together.
+
+        Args:
+            session: What is proposed and known.
+            events: Of port and keyboard.
+            screen: For people.
+            taken: Called after each press.
+        """
+        self._session, self._events, self._screen, self._taken = session, events, screen, taken
+
+    def with_person(self, *, asks: bool = True) -> None:
+        """Propose presses and take them until the film is known well enough, or the person ends.
+
+        Args:
+            asks: Whether to ask of each press whether it was where it should be; otherwise it was.
+        """
+        if asks:
+            self._screen.say(KEYS)
+        try:
+            while not self._session.enough:
+                self._one_press(asks=asks)
+        except Stopped:
+            return
+        self._screen.say("The film is known well enough; --until 0 goes on.")
+
+    def with_machine(self, contacts: Array) -> None:
+        """Take the presses that a machine makes, as they come.
+
+        Args:
+            contacts: (x, y, F), shape (n, 3), NaN where unknown; those in the session were made before.
+
+        Raises:
+            PortLost: If the port goes away: nobody knows then which press is next.
+            InputError: If the port ends before the last press.
+        """
+        first = _done(self._session, contacts)
+        try:
+            self._await_tare()
+            self._screen.say("the film is tared: let the machine begin")
+            for number, contact in enumerate(contacts[first:], start=first + 1):
+                self._screen.say(f"{number}. {describe_press(contact)}")
+                outcome = self._outcome()
+                if isinstance(outcome, SteadyPress):
+                    self._take(outcome, contact)
+                elif outcome == AWAY:
+                    raise PortLost(
+                        f"{AWAY}; let the machine go on with row {number} of its list, with the same command"
+                    )
+                else:
+                    self._screen.say(f"   row {number} is left out: {outcome}")
+        except Stopped as end:
+            raise InputError("the port ended before the last press of the list") from end
+
+    def _await_tare(self) -> None:
+        """Wait until the film is tared: a press before would be lost, and all after it be taken for others."""
+        while True:
+            event = self._next()
+            if isinstance(event, Watched):
+                if event.phase == Phase.waiting:
+                    return
+                self._screen.show(event)
+
+    def _next(self) -> Watched | Typed:
+        """The next event; Stopped at the end of the port or the input."""
+        event = self._events.next()
+        if isinstance(event, Ended):
+            raise event.error or Stopped
+        return event
+
+    def _outcome(self) -> SteadyPress | str | Answer:
+        """The next press, why it is refused, or what the person types meanwhile."""
+        while True:
+            event = self._next()
+            if isinstance(event, Typed):
+                if answer := self._read(event):
+                    return answer
+            elif event.press is not None:
+                self._screen.taken(event.press)
+                return event.press
+            elif event.phase == Phase.refused:
+                return event.reason
+            else:
+                self._screen.show(event)
+
+    def _one_press(self, *, asks: bool) -> None:
+        """Propose a press until one is taken, or something else is to be proposed."""
+        proposed = self._session.proposed
+        self._screen.say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")
+        while self._session.proposed is proposed:  # until it is skipped, or another press undone
+            self._events.arm()
+            outcome = self._outcome()
+            if isinstance(outcome, SteadyPress):
+                (self._ask if asks else self._take)(outcome, proposed.contact)
+                return
+            if isinstance(outcome, str):
+                self._screen.say(f"   not taken: {outcome}; press again")
+            elif outcome.reply == Reply.take:
+                self._screen.say("   press first: the question comes when the press is steady")
+            else:
+                self._obey(outcome)
+
+    def _ask(self, press: SteadyPress, proposed: Array) -> None:
+        """Ask whether the press was where it should be, until it is taken or given up."""
+        self._screen.say(QUESTION)
+        while True:
+            event = self._next()
+            answer = self._read(event) if isinstance(event, Typed) else None
+            if answer is None:
+                continue
+            if answer.reply == Reply.take:
+                if self._take(press, proposed if isinstance(answer.contact, str) else answer.contact):
+                    return
+            elif answer.reply == Reply.undo and answer.number == "last":
+                self._screen.say("   this press is not taken")
+                return
+            else:
+                self._obey(answer)
+                if answer.reply == Reply.skip:
+                    return
+
+    def _read(self, typed: Typed) -> Answer | None:
+        """What was typed; None, and said, if it is no answer."""
+        if typed.text is None:
+            raise Stopped
+        try:
+            return read_answer(typed.text)
+        except PressError as error:
+            self._screen.say(f"   {error}")
+            return None
+
+    def _obey(self, answer: Answer) -> None:
+        """Skip, undo or end."""
+        if answer.reply == Reply.quit:
+            raise Stopped
+        if answer.reply == Reply.skip:
+            self._session.skip()
+            return
+        try:
+            number = self._session.undo(answer.number)
+        except PressError as error:
+            self._screen.say(f"   {error}")
+            return
+        self._screen.say(f"   press {number} is taken back")
+        self._say_summary()
+
+    def _take(self, press: SteadyPress, contact: Array) -> bool:
+        """Whether the session takes a press."""
+        try:
+            self._session.take(press.charge_pC, contact)
+        except PressError as error:
+            self._screen.say(f"   {error}")
+            return False
+        self._taken(self._session, press)
+        self._say_summary()
+        return True
+
+    def _say_summary(self) -> None:
+        for sentence in self._session.summary:
+            self._screen.say(f"   {sentence}")
+
+
+def _done(session: PressSession, contacts: Array) -> int:
+    """Number of rows of a list that were made before: up to the last press of the session."""
+    if not len(session):
+        return 0
+    same = (np.isclose(contacts, session.presses.contact[-1], rtol=0.0, atol=1e-9, equal_nan=True)).all(axis=1)
+    return int(np.flatnonzero(same)[-1]) + 1 if same.any() else 0

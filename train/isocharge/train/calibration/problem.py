@@ -1,0 +1,158 @@
+"""What a calibration is about: the film as it is described, and the network for all films that fits its layout."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import ModelError, SceneError, SensorError
+from isocharge.serve.model.repository import find_model, model_names, repositories
+from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.sensor.film_prior import FilmPrior
+from isocharge.simulate.sensor.probe import Circle, Probe
+from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.films.films_file import FILE, read_films
+from isocharge.train.films.films_model import FilmsModel
+
+DRIFT = {"pretension": 0.35, "d31": 0.25, "d32": 0.25, "gain": 0.2}
+"""Standard deviations of what may have changed since an earlier calibration, over those of the prior: creep of the
+pretension by 0.3 MPa, ageing of the coefficients by 5 %, gains by 1 %; everything else by `REMOUNTED`."""
+
+REMOUNTED = 0.05
+"""See `DRIFT`."""
+
+
+@dataclass(frozen=True)
+class FilmEstimate:
+    """What is known of a film: a Gaussian about its best parameters.
+
+    Attributes:
+        parameters: As in `FilmPrior`, shape (n_parameter,).
+        covariance: Of the parameters over their prior standard deviations, shape (n_parameter, n_parameter).
+    """
+
+    parameters: Array
+    covariance: Array
+
+    def drifted(self, prior: FilmPrior) -> "FilmEstimate":
+        """What is left of an earlier estimate after the film may have drifted (`DRIFT`)."""
+        drift = np.array([DRIFT.get(name.partition(" ")[0], REMOUNTED) for name in prior.names])
+        return FilmEstimate(np.clip(self.parameters, *prior.bounds), self.covariance + np.diag(drift**2))
+
+
+@dataclass(frozen=True)
+class CalibrationProblem:
+    """Which films a sensor may be, and where contacts shall be right.
+
+    Attributes:
+        sensor: As described.
+        probe: As described.
+        films: The network for all films of the layout.
+        earlier: An earlier calibration of this film, as `read_earlier` gives it; what the sensor's file says if absent.
+        map_error: Error of the films' charges that is allowed for beside the noise, a share of the charge.
+
+    Example:
+        >>> problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))  # doctest: +SKIP
+        >>> result = calibrate(read_presses(Path("presses.csv")), problem)  # doctest: +SKIP
+        >>> write_calibration(result, Path("my-film"))  # doctest: +SKIP
+    """
+
+    sensor: Sensor
+    probe: Circle
+    films: FilmsModel
+    earlier: FilmEstimate | None = None
+    map_error: float = 0.0
+
+    @classmethod
+    def of(cls, sensor: Sensor, probe: Probe, models: Path | None = None) -> "CalibrationProblem":
+        """A sensor and a probe, with the installed network that fits them; arguments as `films_for`.
+
+        Raises:
+            SceneError: If the probe is not round.
+            ModelError: If no network was trained for this layout; the message says how to train one.
+        """
+        if not isinstance(probe, Circle):
+            raise SceneError(
+                f"probe {probe.notation}: expected a round one, such as circle:1.0, for its radius is calibrated as "
+                "well"
+            )
+        return cls(sensor, probe, films_for(sensor, probe, models))
+
+    @property
+    def electrodes(self) -> tuple[str, ...]:
+        """Names of the electrodes."""
+        return self.sensor.electrode_names
+
+    @property
+    def prior(self) -> FilmPrior:
+        """How films spread."""
+        return self.films.prior
+
+    @cached_property
+    def charges(self) -> FilmCharges:
+        """The films' charges."""
+        return FilmCharges(self.films.prior, self.films.family)
+
+    @property
+    def domain(self) -> Domain:
+        """Where contacts shall be right."""
+        return self.films.domain
+
+    @cached_property
+    def noise(self) -> NoiseModel:
+        """Of the charges, the error of the films' charges included."""
+        noise = self.films.noise
+        return NoiseModel(noise.name, noise.white, float(np.hypot(noise.gain, self.map_error)))
+
+    @cached_property
+    def before(self) -> FilmEstimate:
+        """What is known of the film before the presses."""
+        if self.earlier:
+            return self.earlier
+        parameters = self.prior.parameters_of(self.sensor, self.probe)
+        if parameters[0] <= 0.0:  # a sensor file that gives no pretension does not say that there is none
+            parameters[0] = self.prior.mean[0]
+        return FilmEstimate(parameters, np.eye(parameters.size))
+
+
+def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> FilmsModel:
+    """The network for all films of a sensor's layout, looked up by the electrodes, not by the name.
+
+    Args:
+        sensor: Its electrodes, radius and readout must be those of a network's; everything else may differ within the
+            spread of its films.
+        probe: What presses; its radius must be within the spread as well.
+        models: Folder of models that is searched first.
+
+    Raises:
+        ModelError: If no network was trained for this layout; the message says how to train one.
+    """
+    reasons = []
+    for folder in _folders(models, sensor.name):
+        films = read_films(folder)
+        try:
+            parameters = films.prior.parameters_of(sensor, probe)
+        except SensorError as error:
+            reasons.append(f"{folder.parent.name}: {error}")
+            continue
+        low, high = films.prior.bounds
+        outside = np.array(films.prior.names)[(parameters < low) | (parameters > high)]
+        if not outside.size:
+            return films
+        reasons.append(f"{folder.parent.name}: {', '.join(outside)}: farther from its films than it was trained for")
+    raise ModelError(
+        f"no network for all films fits the sensor {sensor.name!r} under {probe.notation} "
+        f"({'; '.join(reasons) or 'none is installed'}); train one first, once for a layout: "
+        f"isocharge train fit --films --sensor SENSOR -o models/{sensor.name}-films"
+    )
+
+
+def _folders(models: Path | None, name: str) -> list[Path]:
+    """Version folders with a films file, those named after the sensor first."""
+    folders = [find_model((root / model).resolve()) for root in repositories(models) for model in model_names(root)]
+    with_films = [folder for folder in folders if (folder / FILE).is_file()]
+    return sorted(with_films, key=lambda folder: not folder.parent.name.startswith(name))
