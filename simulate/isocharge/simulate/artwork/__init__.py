@@ -1,4 +1,1 @@
-"""Layouts as drawings for screen printing and etching: leads to the rim, SVG and DXF to scale.
-
-May import: sensor, numerics.
-"""
+"""A layout to scale, with straight leads, as DXF and SVG; and the folder of a design."""

@@ -1,4 +1,1 @@
-"""Where the electrodes should lie: charges of any layout from one solve, and the search for the best.
-
-May import: identifiability, forward, solver, mesh, mechanics, sensor, measuring_chain, execution, numerics.
-"""
+"""Where the electrodes should lie: the case, the table of charges, the error that is made small, the search."""

@@ -1,86 +1,78 @@
-"""The least position error that a layout allows, with what nobody knows as nuisances, and its derivatives.
+"""The least position error that a layout allows, with what nobody knows as nuisances.
 
 With A = d(charge) / d(x, y, ln F, nuisances) of all electrodes and W what one reading tells about its charge, the
-information about everything is A' W A + P, P what is known about the nuisances beforehand. The position's part of its
-inverse is the Cramer-Rao limit; that is the Schur complement in which the nuisances are marginalised.
+information about everything is A' W A + P, P what is known beforehand. The position's part of its inverse is the
+Cramer-Rao limit; that is the Schur complement in which the nuisances are marginalised. Electrodes add up in it, so one
+more changes the inverse B by a product of vectors (Sherman and Morrison 1950): with a = sqrt(w) of its row of A
 
-The derivative of the squared error e = tr(E I^-1) by A and W follows from dI: with B = I^-1 E I^-1,
-
-    de/dA = -2 W A B,   de/dW = -diag(A B A').
+    tr_xy (B^-1 + a a')^-1 = tr_xy B - |(B a)_xy|^2 / (1 + a' B a).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.layout.scene import Nuisances
+from isocharge.simulate.layout.case import Nuisances
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
-PRIOR = (0.05, 0.05, 10.0)
-"""Standard deviation of x and y (m) and ln F before anything is read: errors stay finite where charges say nothing."""
+PRIOR = (50.0, 50.0, 10.0)
+"""Standard deviation of x and y (mm) and ln F before anything is read: errors stay finite where charges say nothing."""
 
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """Squared position errors from rows.
+    """From rows of a `ChargeTable` to squared position errors.
 
     Attributes:
         noise: Noise of the readings, with what is unknown of the gains.
-        used: Columns of the rows that are parameters: x, y, ln F and the nuisances.
-        scale: One unit of each parameter, shape (n_parameter,): a prior standard deviation.
+        scale: Standard deviation of x, y, ln F and the nuisances before anything is read, shape (5,).
     """
 
     noise: NoiseModel
-    used: tuple[int, ...]
     scale: Array
 
     @classmethod
     def of(cls, noise: NoiseModel, nuisances: Nuisances) -> "ErrorModel":
         """Errors with these nuisances."""
-        unknown = [nuisances.probe_radius, nuisances.profile, nuisances.pretension]
-        used = (1, 2, 3, *(4 + i for i, std in enumerate(unknown) if std > 0.0))
-        scale = np.array([*PRIOR, *(std for std in unknown if std > 0.0)])
-        gains = NoiseModel(noise.name, noise.white, float(np.hypot(noise.gain, nuisances.gain)))
-        return cls(gains, used, scale)
+        gain = float(np.hypot(noise.gain, nuisances.gain))
+        return cls(replace(noise, gain=gain), np.array([*PRIOR, nuisances.probe_radius, nuisances.pretension]))
+
+    def sensitivity(self, rows: Array) -> Array:
+        """Rows (..., 6) to sqrt(W) A in units of the scale, shape (..., 5): how much each reading tells."""
+        weight = np.sqrt(self.noise.information(rows[..., 0]))
+        sensitivity: Array = rows[..., 1:] * self.scale * weight[..., None]
+        return sensitivity
 
     def squared(self, rows: Array) -> Array:
-        """Squared position error, shape (n_press,), m^2, from rows of shape (n_press, n_electrode, 7)."""
-        _, _, _, inverse = self._information(rows)
-        squared: Array = PRIOR[0] ** 2 * (inverse[:, 0, 0] + inverse[:, 1, 1])
-        return squared
-
-    def gradient(self, rows: Array) -> tuple[Array, Array]:
-        """Squared errors, and their derivatives by the rows, of the shape of the rows."""
-        a, weight, slope, inverse = self._information(rows)
-        squared = PRIOR[0] ** 2 * (inverse[:, 0, 0] + inverse[:, 1, 1])
-        b = PRIOR[0] ** 2 * np.matmul(inverse[:, :, :2], inverse[:, :2, :])
-        ab = np.matmul(a, b)
-        by_rows = np.zeros_like(rows)
-        by_rows[:, :, self.used] = -2.0 * weight[:, :, None] * ab * self.scale
-        by_rows[:, :, 0] = -(ab * a).sum(axis=2) * slope
-        return squared, by_rows
-
-    def displacement(self, rows: Array) -> Array:
-        """How a change of the charges moves the estimated position: shape (n_press, 2, n_electrode), m/C."""
-        a, weight, _, inverse = self._information(rows)
-        moved: Array = PRIOR[0] * np.matmul(inverse[:, :2], (a * weight[:, :, None]).swapaxes(1, 2))
-        return moved
-
-    def _information(self, rows: Array) -> tuple[Array, Array, Array, Array]:
-        """A in units of the scale, W, dW/dQ and the inverse of the information in these units."""
-        charge, a = rows[:, :, 0], rows[:, :, self.used] * self.scale
-        weight, slope = _weight(charge, self.noise)
-        information = np.matmul((a * weight[:, :, None]).swapaxes(1, 2), a) + np.eye(len(self.used))
-        return a, weight, slope, np.linalg.inv(information)
+        """Squared position errors, shape (n_press,), mm^2, from rows of shape (n_press, n_electrode, 6)."""
+        return position_variance(inverse_information(self.sensitivity(rows)))
 
 
-def _weight(charge: Array, noise: NoiseModel) -> tuple[Array, Array]:
-    """`NoiseModel.information` and its derivative by the charge."""
-    g2 = noise.gain**2
-    variance = noise.variance(charge)
-    by_charge = 2.0 * g2 * charge
-    term = 2.0 * (g2 * charge) ** 2 / variance
-    term_slope = 4.0 * g2**2 * charge / variance - term * by_charge / variance
-    weight = (1.0 + term) / variance
-    return weight, term_slope / variance - weight * by_charge / variance
+def inverse_information(sensitivity: Array) -> Array:
+    """Inverse of the information of electrodes, (n_press, n_electrode, 5) to (n_press, 5, 5), in units of the scale."""
+    inverse: Array = np.linalg.inv(np.matmul(sensitivity.swapaxes(1, 2), sensitivity) + np.eye(sensitivity.shape[2]))
+    return inverse
+
+
+def position_variance(inverse: Array) -> Array:
+    """Squared position error from the inverse information, shape (n_press,), mm^2."""
+    variance: Array = PRIOR[0] ** 2 * (inverse[:, 0, 0] + inverse[:, 1, 1])
+    return variance
+
+
+def with_one_more(sensitivity: Array, candidates: np.ndarray) -> Array:
+    """Squared errors with each of many candidates beside given electrodes.
+
+    Args:
+        sensitivity: Of the electrodes, shape (n_press, n_electrode, 5).
+        candidates: Of one more, shape (n_press, 5, n_candidate), single precision.
+
+    Returns:
+        Shape (n_press, n_candidate), mm^2.
+    """
+    inverse = inverse_information(sensitivity)
+    moved = inverse.astype(np.float32) @ candidates
+    gain = (moved[:, :2] ** 2).sum(axis=1) / (1.0 + (moved * candidates).sum(axis=1))
+    squared: Array = position_variance(inverse)[:, None] - PRIOR[0] ** 2 * gain
+    return squared

@@ -1,4 +1,4 @@
-"""Local cubic interpolation on even grids: four neighbours along each axis, values and slopes."""
+"""Local cubic interpolation on even grids: four neighbours along each axis."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ TAPS = np.arange(4)
 """Neighbours along one axis."""
 
 
-def cubic_weights(at: Array, count: int, periodic: bool = False) -> tuple[Integers, Array, Array]:
+def cubic_weights(at: Array, count: int, periodic: bool = False) -> tuple[Integers, Array]:
     """Weights of the four neighbours of places between the nodes 0, 1, ..., count - 1.
 
     Args:
@@ -17,7 +17,7 @@ def cubic_weights(at: Array, count: int, periodic: bool = False) -> tuple[Intege
         periodic: Whether node `count` is node 0 again.
 
     Returns:
-        Numbers of the neighbours, their weights and the derivatives of the weights, each of shape (..., 4).
+        Numbers of the neighbours and their weights, each of shape (..., 4).
     """
     first = np.floor(at).astype(np.intp) - 1
     if not periodic:
@@ -25,14 +25,6 @@ def cubic_weights(at: Array, count: int, periodic: bool = False) -> tuple[Intege
     t = (at - first)[..., None]
     a, b, c, d = t, t - 1.0, t - 2.0, t - 3.0
     weights = np.concatenate([-b * c * d / 6.0, a * c * d / 2.0, -a * b * d / 2.0, a * b * c / 6.0], axis=-1)
-    slopes = np.concatenate(
-        [
-            -(c * d + b * d + b * c) / 6.0,
-            (c * d + a * d + a * c) / 2.0,
-            -(b * d + a * d + a * b) / 2.0,
-            (b * c + a * c + a * b) / 6.0,
-        ],
-        axis=-1,
-    )
     number = first[..., None] + TAPS
-    return number % count if periodic else number, weights, slopes
+    return number % count if periodic else number, weights
+

@@ -1,0 +1,38 @@
+"""The folder of a design: sensor file, drawings, numbers and a picture."""
+
+import json
+from pathlib import Path
+
+from isocharge.common.files import new_folder, write_whole
+from isocharge.simulate.artwork.drawing import draw_layout, to_dxf, to_svg
+from isocharge.simulate.artwork.leads import straight_leads
+from isocharge.simulate.layout.design import Design
+from isocharge.simulate.plots.error_maps import error_maps_picture
+from isocharge.simulate.plots.figure import picture_bytes
+from isocharge.simulate.sensor.sensor_file import sensor_to_toml
+
+
+def write_design(design: Design, folder: Path) -> None:
+    """Write `sensor.toml`, `layout.svg`, `layout.dxf`, `design.json` and `design.png`; the same design, the same bytes.
+
+    Raises:
+        OutputExists: If the folder is already there.
+        OutputError: If the file system refuses.
+    """
+    case, errors, leads = design.case, design.after.to_dict()["with_nuisances"], straight_leads(design.sensor)
+    comment = [
+        f"Places searched for {case.electrodes} electrodes over {case.radius:g} mm, goal {case.goal_name}:",
+        f"least position error {errors['worst_mm']:.3f} mm at worst, {errors['rms_mm']:.3f} mm rms.",
+    ]
+    drawing = draw_layout(design.sensor, leads)
+    numbers = {**design.to_dict(), "leads": leads.summary}
+    files = {
+        "sensor.toml": sensor_to_toml(design.sensor, comment).encode(),
+        "layout.svg": to_svg(drawing).encode(),
+        "layout.dxf": to_dxf(drawing).encode(),
+        "design.json": (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode(),
+        "design.png": picture_bytes(error_maps_picture(design)),
+    }
+    with new_folder(folder) as draft:
+        for name, data in files.items():
+            write_whole(draft / name, data)
