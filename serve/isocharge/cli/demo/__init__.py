@@ -1,4 +1,1 @@
-"""`isocharge demo`: the whole path once, with pictures.
-
-May import: shared.
-"""
+"""`isocharge demo`: the whole path once, with pictures."""
