@@ -1,11 +1,17 @@
-"""The contact whose charges are nearest to given ones, in standard deviations of the noise."""
+"""The contact whose charges are nearest to given ones, in standard deviations of the noise.
+
+min over contacts c of the domain of |(Q - Q(c)) / sigma|
+"""
+
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+from scipy.stats import qmc
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.numerics.disk_least_squares import minimise
+from isocharge.simulate.numerics.disk_least_squares import MOST_STEPS, minimise
 
 STEPS = 8
 """Steps from a start that is near: most charges need five."""
@@ -13,9 +19,23 @@ STEPS = 8
 INSIDE = 1.0 - 1e-9
 """Radius that is searched, relative to the map's: rounding must not leave the disk."""
 
+CANDIDATES = 4096
+"""Contacts among which starts are chosen: spread over the domain, and a quarter as many along its rim."""
+
+CHUNK = 2048
+"""Charges compared with all candidates at once."""
+
+
+@runtime_checkable
+class LinearisedMap(ChargeMap, Protocol):
+    """A charge map that gives charges and derivatives at once, in less time."""
+
+    def linearised(self, contact: Array) -> tuple[Array, Array]:
+        """What `charges` and `derivatives` give."""
+
 
 def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, start: Array) -> tuple[Array, Array]:
-    """Contacts that explain charges best, by least squares from a start.
+    """Contacts that explain charges best, by least squares from a start that is near.
 
     Args:
         charge_map: The charges of contacts.
@@ -27,6 +47,26 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
         Contacts within the map's domain, shape (n, 3), and how far their charges are from those given, in standard
         deviations, shape (n,).
     """
+    contact, _ = explain(charge_map, charge, noise.sigma(charge), start, STEPS)
+    known = charge_map.charges(contact)
+    return contact, np.linalg.norm((known - charge) / noise.sigma(known), axis=1)
+
+
+def explain(
+    charge_map: ChargeMap, charge: Array, sigma: Array, start: Array, steps: int = MOST_STEPS
+) -> tuple[Array, Array]:
+    """The contacts that descent from a start leads to.
+
+    Args:
+        charge_map: The charges of contacts.
+        charge: To be explained, shape (n, n_electrode), pC.
+        sigma: The unit of distance, shape (n, n_electrode), pC.
+        start: Contacts (x, y, F), shape (n, 3), mm and N.
+        steps: Most steps.
+
+    Returns:
+        Contacts within the map's domain, shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
+    """
     radius, force_range = INSIDE * charge_map.domain.radius, charge_map.domain.force_range
     low, high = np.log(force_range)
     centre, scale = charge_map.domain.centre, np.array([radius, radius, 0.5 * (high - low)])  # one force: no width
@@ -36,12 +76,46 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
         return np.column_stack([logs[:, :2], np.clip(np.exp(logs[:, 2]), *force_range)])
 
     def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
-        contact = to_contact(unit)
-        known = charge_map.charges(contact)
-        sigma = noise.sigma(known)
-        slopes = charge_map.derivatives(contact) * scale / sigma[..., None]
-        return (known - charge[rows]) / sigma, slopes.swapaxes(1, 2)
+        known, slopes = _linearised(charge_map, to_contact(unit))
+        by_unit = slopes * scale / sigma[rows][:, :, None]
+        return (charge[rows] - known) / sigma[rows], -by_unit.swapaxes(1, 2)
 
     logs = np.column_stack([start[:, :2], np.log(start[:, 2])])
-    unit, residual = minimise(residuals, (logs - centre) / np.where(scale > 0.0, scale, 1.0), STEPS)
-    return to_contact(unit), np.linalg.norm(residual, axis=1)
+    unit, residual = minimise(residuals, (logs - centre) / np.where(scale > 0.0, scale, 1.0), steps)
+    return to_contact(unit), residual
+
+
+def _linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
+    if isinstance(charge_map, LinearisedMap):
+        return charge_map.linearised(contact)
+    return charge_map.charges(contact), charge_map.derivatives(contact)
+
+
+def search(
+    charge_map: ChargeMap, charge: Array, sigma: Array, *, starts: int = 2, candidates: int = CANDIDATES
+) -> tuple[Array, Array]:
+    """The nearest contacts from the best few of many starts; other arguments and result as `explain`."""
+    spread = charge_map.domain.to_contact(INSIDE * _spread(candidates))
+    known = charge_map.charges(spread)
+    chunks = range(0, max(len(charge), 1), CHUNK)
+    nearest = [_nearest_rows(charge[k : k + CHUNK], sigma[k : k + CHUNK], known, starts) for k in chunks]
+    answers = [explain(charge_map, charge, sigma, spread[rows]) for rows in np.concatenate(nearest).T]
+    squares = np.stack([(residual**2).sum(axis=1) for _, residual in answers])
+    best = squares.argmin(axis=0), np.arange(len(charge))
+    return np.stack([contact for contact, _ in answers])[best], np.stack([residual for _, residual in answers])[best]
+
+
+def _spread(count: int) -> Array:
+    """Contacts in unit coordinates, shape (count, 3)."""
+    sobol = qmc.Sobol(3, scramble=False).random(count)
+    radius, angle = np.sqrt(sobol[:, 0]), 2.0 * np.pi * sobol[:, 1]
+    radius[::4] = 1.0
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), 2.0 * sobol[:, 2] - 1.0], axis=1)
+
+
+def _nearest_rows(charge: Array, sigma: Array, known: Array, count: int) -> Integers:
+    """Numbers of the nearest candidates, shape (n, count): |Q - K|^2 multiplied out, one matrix product each."""
+    weight = sigma**-2.0
+    square = weight @ (known**2).T - 2.0 * (charge * weight) @ known.T
+    rows: Integers = np.argpartition(square, count - 1, axis=1)[:, :count]
+    return rows

@@ -12,9 +12,9 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.identifiability.nearest_contact import CANDIDATES, explain, search
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model
-from isocharge.train.data.nearest_contact import CANDIDATES, nearest_contact, search_contact
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
@@ -79,9 +79,9 @@ def _residuals(
     residual, at = np.zeros_like(charge), np.flatnonzero(near)
     start = chosen.contact[at]
     scale = chosen.charge[at] / charge_map.charges(start)
-    residual[at] = nearest_contact(charge_map, charge[at] / scale, sigma[at] / scale, start)[1]
+    residual[at] = explain(charge_map, charge[at] / scale, sigma[at] / scale, start)[1]
     far = np.flatnonzero(~near | (np.linalg.norm(residual, axis=1) > FAR))
-    searched = search_contact(charge_map, charge[far], sigma[far], candidates=candidates)[1]
+    searched = search(charge_map, charge[far], sigma[far], candidates=candidates)[1]
     keep = near[far] & ((residual[far] ** 2).sum(axis=1) < (searched**2).sum(axis=1))
     residual[far] = np.where(keep[:, None], residual[far], searched)
     return residual

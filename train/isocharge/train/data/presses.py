@@ -68,7 +68,8 @@ def is_measured(dataset: Dataset) -> bool:
 def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array:
     """Contacts (x, y, F), shape (count, 3), mm and N: uniform over the disk, forces log-uniform."""
     radius, angle = domain.radius * np.sqrt(rng.random(count)), 2.0 * np.pi * rng.random(count)
-    force = np.exp(rng.uniform(*np.log(domain.force_range), count))
+    low, high = np.log(domain.force_range)
+    force = np.exp(rng.uniform(low, high, count))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), force], axis=1)
 
 

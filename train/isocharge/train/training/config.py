@@ -18,7 +18,7 @@ MOST_ELECTRODES = 64
 """Largest number of electrodes that a configuration may ask for."""
 
 
-class NetworkConfig(Settings):
+class NetworkConfig(Settings, frozen=True):
     """Sizes of the two perceptrons.
 
     Attributes:
@@ -42,7 +42,7 @@ class NetworkConfig(Settings):
             raise WrongKey("electrodes", f"0 (as the dataset) or 3 to {MOST_ELECTRODES}", self.electrodes)
 
 
-class TrainingConfig(Settings):
+class TrainingConfig(Settings, frozen=True):
     """How to train.
 
     Attributes:
@@ -80,7 +80,7 @@ class TrainingConfig(Settings):
         return noise_model(self.noise) if isinstance(self.noise, str) else self.noise
 
 
-class FitConfig(Settings):
+class FitConfig(Settings, frozen=True):
     """Everything that fixes a fit, given what it is fitted to."""
 
     network: NetworkConfig = NetworkConfig()
