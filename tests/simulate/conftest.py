@@ -25,8 +25,8 @@ from isocharge.simulate import (
     Sweep,
     Theory,
     load_sensor,
-    write_sweep,
 )
+from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.elements import Geometry
 from isocharge.simulate.mesh.placed_mesh import place
@@ -34,7 +34,7 @@ from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template
 
 DATA = Path(__file__).parents[1] / "data"
-TURNED = Polygon.rectangle(4e-3, 2e-3, 0.3)
+TURNED = Polygon.rectangle(4.0, 2.0, 0.3)
 FULL = Theory(stretching=True, bending=True, pretensioned=False)
 
 
@@ -59,12 +59,12 @@ class ReferenceCase:
 
 
 def _probe(about: dict[str, Any]) -> Probe:
-    turn = np.deg2rad(about.get("turn_deg", 0.0))
+    angle = np.deg2rad(about.get("turn_deg", 0.0))
     if about["shape"] == "circle":
-        return Circle(about["radius_mm"] * 1e-3)
+        return Circle(about["radius_mm"])
     if about["shape"] == "rectangle":
-        return Polygon.rectangle(about["width_mm"] * 1e-3, about["height_mm"] * 1e-3, turn)
-    return Polygon.triangle(about["side_mm"] * 1e-3, turn)
+        return Polygon.rectangle(about["width_mm"], about["height_mm"], angle)
+    return Polygon.triangle(about["side_mm"], angle)
 
 
 def _read(name: str) -> list[ReferenceCase]:
@@ -73,17 +73,17 @@ def _read(name: str) -> list[ReferenceCase]:
     return [
         ReferenceCase(
             film=Film(
-                film["radius_mm"] * 1e-3,
-                case["thickness_um"] * 1e-6,
-                film["young_GPa"] * 1e9,
+                film["radius_mm"],
+                case["thickness_um"] * 1e-3,
+                film["young_GPa"] * 1e3,
                 film["poisson"],
-                case["pretension_MPa"] * 1e6,
+                case["pretension_MPa"],
             ),
             probe=_probe(case["probe"]),
-            at=(case["at_mm"][0] * 1e-3, case["at_mm"][1] * 1e-3),
+            at=tuple(case["at_mm"]),
             force=case["force_N"],
-            deflection=case["deflection_mm"] * 1e-3,
-            charges={key: 1e-12 * np.array(list(q.values())) for key, q in case["touch_charge_pC"].items()},
+            deflection=case["deflection_mm"],
+            charges={key: np.array(list(q.values())) for key, q in case["touch_charge_pC"].items()},
         )
         for case in document["cases"]
     ]
@@ -94,10 +94,10 @@ CASES, MORE_CASES = _read("film_cases.json"), _read("film_cases_skfem.json")
 
 def name_case(case: ReferenceCase) -> str:
     """A test id."""
-    x, y = (round(1e3 * value) for value in case.at)
+    x, y = (round(value) for value in case.at)
     turn = f"@{np.rad2deg(case.probe.angle):.0f}" if case.probe.angle else ""
     return (
-        f"{case.film.thickness * 1e6:.0f}um-{case.film.pretension * 1e-6:g}MPa-{case.probe.notation}{turn}"
+        f"{case.film.thickness * 1e3:.0f}um-{case.film.pretension:g}MPa-{case.probe.notation}{turn}"
         f"-at({x},{y})-{case.force:g}N"
     )
 
@@ -112,13 +112,13 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 @pytest.fixture(scope="session")
 def reference_cases() -> Callable[[float], list[ReferenceCase]]:
     """The reference cases of film_cases.json of a thickness in um."""
-    return lambda thickness_um: [case for case in CASES if round(case.film.thickness * 1e6) == thickness_um]
+    return lambda thickness_um: [case for case in CASES if round(case.film.thickness * 1e3) == thickness_um]
 
 
 @pytest.fixture(scope="session")
 def further_cases() -> Callable[[float], list[ReferenceCase]]:
     """Those of film_cases_skfem.json."""
-    return lambda thickness_um: [case for case in MORE_CASES if round(case.film.thickness * 1e6) == thickness_um]
+    return lambda thickness_um: [case for case in MORE_CASES if round(case.film.thickness * 1e3) == thickness_um]
 
 
 # Films and discrete problems
@@ -206,7 +206,7 @@ def made_up() -> Callable[..., Equilibrium]:
             at=at,
             force=1.0,
             theory=theory,
-            placed_mesh=mesh,
+            mesh=mesh,
             field=field(np.stack([mesh.node_points.real, mesh.node_points.imag], axis=1)),
             groups=DimensionlessGroups(amplitude2, 1.0, 0.0, 0.0, of.poisson),
             status="converged",
@@ -237,7 +237,7 @@ def skfem() -> ModuleType:
 @pytest.fixture(scope="session")
 def three_map() -> ForwardMap:
     """The forward map of the released model's sensor."""
-    return ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1e-3))
+    return ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0))
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ Green-Lagrange membrane strain, St. Venant-Kirchhoff plane stress, linear plate 
 spread uniformly over a convex footprint. All three displacements are continuous cubic triangles on an unstructured,
 graded mesh that follows the footprint's outline; bending is a C0 interior penalty method, which also clamps the slope.
 Electrodes are not meshed: their charge is integrated on a fine mesh of their own.
-SI units outside; newton, millimetre and MPa inside.
+Newton, millimetre and MPa throughout.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ PENALTY = 10.0
 
 def outline(footprint: ArrayLike, sides: int) -> Array:
     """Corners (n, 2) in mm, anticlockwise; a circle (x, y, r) becomes a regular polygon of the same area."""
-    corners = 1e3 * np.asarray(footprint, float)
+    corners = np.asarray(footprint, float)
     if corners.shape == (3,):
         turn = 2 * np.pi * np.arange(sides) / sides
         radius = corners[2] * np.sqrt(2 * np.pi / sides / np.sin(2 * np.pi / sides))
@@ -307,11 +307,11 @@ class Solution:
         return stress(deformation(gradient, self.unknown, self.basis.element_dofs[:, cells])[1])[:, 0]
 
     def deflection(self, point: ArrayLike) -> float:
-        """Deflection in m at a point in m."""
-        return 1e-3 * float((self.basis.probes(1e3 * np.asarray(point, float)[:, None]) @ self.unknown[2::3])[0])
+        """Deflection in mm at a point in mm."""
+        return float((self.basis.probes(np.asarray(point, float)[:, None]) @ self.unknown[2::3])[0])
 
     def charge(self, electrode: ArrayLike, d31: float, d32: float) -> float:
-        """Touch charge in C of a convex electrode, corners (n, 2) in m; d31 and d32 in C/N."""
+        """Touch charge in pC of a convex electrode, corners (n, 2) in mm; d31 and d32 in pC/N."""
         corners = outline(electrode, 64)
         around = np.arange(len(corners))
         fan = np.stack([around, np.roll(around, -1), np.full_like(around, len(corners))])
@@ -321,23 +321,20 @@ class Solution:
         return float(fine.dx.ravel() @ (d31 * tension[:, 0, 0] + d32 * tension[:, 1, 1]))
 
     def edge_charge(self, centre: ArrayLike, side: float, d31: float, d32: float) -> float:
-        """Touch charge in C of a square by its edges: s11 on the left and right, s22 on the lower and upper ones."""
+        """Touch charge in pC of a square by its edges: s11 on the left and right, s22 on the lower and upper ones."""
         along = (np.arange(400) + 0.5) / 400 - 0.5
         right = np.stack([np.full_like(along, 0.5), along], axis=1)
         edges = np.vstack([right, -right, right[:, ::-1], -right[:, ::-1]])
-        tension = self.touch_stress(1e3 * (np.asarray(centre, float) + side * edges))
-        return float(1e6 * side**2 * (d31 * tension[:800, 0, 0].mean() + d32 * tension[800:, 1, 1].mean()))
+        tension = self.touch_stress(np.asarray(centre, float) + side * edges)
+        return float(side**2 * (d31 * tension[:800, 0, 0].mean() + d32 * tension[800:, 1, 1].mean()))
 
 
-def solve(
-    thickness_m: float, pretension_pa: float, footprint: ArrayLike, force_n: float, refine: float = 1
-) -> Solution:
-    """Equilibrium under a convex footprint, corners (n, 2) or circle (x, y, r) in m; edges are 1/refine as long."""
-    thickness, pretension = 1e3 * thickness_m, 1e-6 * pretension_pa
+def solve(thickness: float, pretension: float, footprint: ArrayLike, force: float, refine: float = 1) -> Solution:
+    """Equilibrium under a convex footprint, corners (n, 2) or circle (x, y, r); edges are 1/refine as long."""
     corners = outline(footprint, 2 * round(8 * refine))
     across = np.sqrt(area(corners) / np.pi)  # radius of a circle as large
     margin = RADIUS - np.hypot(*corners.mean(axis=0))
-    tension = thickness * (pretension + 0.2 * (YOUNG * (force_n / thickness / margin) ** 2) ** (1 / 3))
+    tension = thickness * (pretension + 0.2 * (YOUNG * (force / thickness / margin) ** 2) ** (1 / 3))
     layer = np.sqrt(PLANE * thickness**3 / 12 / tension)  # length over which bending matters at the rim
     mesh = film_mesh(corners, 0.45 * across / refine, 0.3 / refine, 4.5 / refine, 0.7 * layer / refine)
     basis = Basis(mesh, ElementTriP3(), intorder=6)
@@ -345,7 +342,7 @@ def solve(
     if abs(pressed.sum() / area(corners) - 1) > 1e-9:
         raise RuntimeError("the mesh misses the footprint's outline")
     local = np.stack([np.sum(pressed * np.asarray(shape[0]), axis=1) for shape in basis.basis])
-    local *= force_n / area(corners)
+    local *= force / area(corners)
     load = np.zeros(3 * basis.N)
     load[2::3] = np.bincount(basis.element_dofs.ravel(), local.ravel(), basis.N)
     return Solution(basis, Film(basis, thickness, pretension, load).equilibrium())
