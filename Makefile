@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all attack docs bench soak release report proto clean
+.PHONY: demo test test-all attack docs bench soak release report paper proto clean
 
 # Tests that measure time, or wait for a port to come back: one at a time. All others share the cores, a file a worker;
 # some wait for processes that they started, so there is a worker more than the two cores that we count on.
@@ -67,6 +67,10 @@ report: $(VENV)/installed
 	$(BIN)/isocharge simulate sweep three-25um-biaxial --samples 24000 -o build/three-25um-biaxial
 	$(BIN)/isocharge simulate sweep four-25um-biaxial --radius auto --samples 24000 -o build/four-25um-biaxial
 	$(BIN)/isocharge train report build/three-25um-biaxial build/four-25um-biaxial -o report
+
+# The figures and numbers of Mirbagheri et al. (2007), ours beside them: paper/paper.md; five minutes on two cores.
+paper: $(VENV)/installed
+	$(BIN)/python simulate/examples/paper -o paper
 
 # The gRPC messages, compiled; a test compares them with their source.
 PROTO := serve/isocharge/serve/network/grpc

@@ -4,22 +4,23 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from choices import PAPER, Choices
+from entry import Entry, Row
 from matplotlib.figure import Figure
+from solves import FORCE, Solves
+from triangulation_errors import BEYOND, Accuracy
 
 from isocharge.common.arrays import Array
+from isocharge.simulate import ChargeSpline, Sensor
 from isocharge.simulate.contours.field_contours import ContourField
 from isocharge.simulate.contours.fix import Fix, Meeting
 from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTriangulation
-from isocharge.simulate.paper.choices import PAPER, Choices
-from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.solves import FORCE, Solves
-from isocharge.simulate.paper.triangulation_errors import BEYOND, Accuracy
-from isocharge.simulate.plots.curves import draw_contours
+from isocharge.simulate.plots.contours import draw_contours
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 
-LEVELS, AREA = 8, 11.5e-3
-"""Number of contours of each electrode in Fig. 11, and their largest distance from the centre, m: the far side of the
+LEVELS, AREA = 8, 11.5
+"""Number of contours of each electrode in Fig. 11, and their largest distance from the centre, mm: the far side of the
 electrodes."""
 
 
@@ -28,11 +29,11 @@ def fig_9(solves: Solves, accuracy: Accuracy) -> Entry:
     sensor = solves.choices.sensor("three")
     forward_map, at = solves.forward_map("triangle", sensor), solves.choices.shown
     charges = solves.charges("triangle", sensor, np.array([at]))[0]
-    field = ContourField.of(forward_map, FORCE, BEYOND * solves.choices.radius, solves.choices.spacing)
+    field = ContourField(ChargeSpline.of(forward_map, BEYOND * solves.choices.radius, solves.choices.spacing), FORCE)
     figure = new_figure(6.6, 7.0)
     axes = figure.subplots()
     for name, charge, colour in zip(sensor.electrode_names, charges, COLOURS, strict=False):
-        draw_contours(axes, field.contours(name, float(charge)), colour, f"{name}, {1e12 * charge:.0f} pC")
+        draw_contours(axes, field.contours(name, float(charge)), colour, f"{name}, {charge:.0f} pC")
     draw_electrodes(axes, sensor)
     draw_probe(axes, solves.choices.triangle, at, "probe")
     draw_working_area(axes, solves.choices.radius, "working area")
@@ -44,7 +45,7 @@ def fig_9(solves: Solves, accuracy: Accuracy) -> Entry:
     ours = f"median {errors.percentile(50):.1g} mm, 95 % {errors.percentile(95):.1g} mm"
     return Entry(
         "Fig. 9",
-        f"Isocharge contours of a press at ({1e3 * at[0]:g}, {1e3 * at[1]:g}) mm, 1 N, from the field.",
+        f"Isocharge contours of a press at ({at[0]:g}, {at[1]:g}) mm, 1 N, from the field.",
         figure,
         [
             Row(
@@ -65,7 +66,7 @@ def fig_10(solves: Solves, accuracy: Accuracy) -> Entry:
     triangulation = DrawnTriangulation(solves.scheme("triangle", sensor), solves.choices.degree)
     charge = solves.charges("triangle", sensor, np.array([at]))
     contours, fix = [c for c in triangulation.contours(charge[0]) if c is not None], triangulation.locate(charge)
-    error_mm = 1e3 * float(np.hypot(fix.x[0] - at[0], fix.y[0] - at[1]))
+    error_mm = float(np.hypot(*(fix.contact[0, :2] - at)))
     figure = new_figure(16.5, 5.6)
     whole, near, distribution = figure.subplots(1, 3)
     for axes in (whole, near):
@@ -74,7 +75,7 @@ def fig_10(solves: Solves, accuracy: Accuracy) -> Entry:
     draw_electrodes(whole, sensor)
     frame_film(whole, sensor, BEYOND * solves.choices.radius, "Fig. 10: contours as the paper draws them")
     whole.legend(fontsize=8)
-    _zoom(near, contours, at, (float(fix.x[0]), float(fix.y[0])))
+    _zoom(near, contours, at, (float(fix.contact[0, 0]), float(fix.contact[0, 1])))
     _distributions(distribution, accuracy, solves.choices.degree)
     return Entry(
         "Fig. 10",
@@ -92,9 +93,9 @@ def fig_10(solves: Solves, accuracy: Accuracy) -> Entry:
 def _draw_graphical_contours(axes: Any, contours: list[DrawnContour]) -> None:
     """Splines, and the roots on the lines that they join."""
     for contour, colour in zip(contours, COLOURS, strict=False):
-        label = f"{contour.electrode}, {1e12 * contour.charge:.0f} pC"
-        axes.plot(*1e3 * contour.points.T, color=colour, lw=1.3, label=label)
-        axes.plot(*1e3 * contour.knots.T, ".", color=colour, ms=5)
+        label = f"{contour.electrode}, {contour.charge:.0f} pC"
+        axes.plot(*contour.points.T, color=colour, lw=1.3, label=label)
+        axes.plot(*contour.knots.T, ".", color=colour, ms=5)
 
 
 def _rows_of_shown_press(fix: Fix, error_mm: float) -> list[Row]:
@@ -103,13 +104,13 @@ def _rows_of_shown_press(fix: Fix, error_mm: float) -> list[Row]:
         Row(
             "are the three contours concurrent?",
             "no",
-            f"no: {1e3 * fix.spread[0]:.3f} mm from the mean" if fix.found[0] else "no",
+            f"no: {fix.spread[0]:.3f} mm from the mean" if fix.found[0] else "no",
             "error of polynomial and spline",
         ),
         Row(
             "the shown press, distance from the mean of the crossings",
             "0.122 mm (place not given)",
-            f"{error_mm:.3f} mm" if fix.found[0] else Meeting(int(fix.status[0])).words,
+            f"{error_mm:.3f} mm" if fix.found[0] else Meeting(int(fix.status[0])).summary,
             "the place of the paper's press is not given",
         ),
     ]
@@ -140,11 +141,11 @@ def _zoom(axes: Any, drawn: list[DrawnContour], at: tuple[float, float], mean: t
         if len(points):
             crossings.append(points[np.argmin(np.linalg.norm(points - np.array(at), axis=1))])
     if crossings:
-        axes.plot(*1e3 * np.array(crossings).T, "o", mfc="none", color=INK, ms=8, label="crossings")
-    axes.plot(1e3 * mean[0], 1e3 * mean[1], "x", color=INK, ms=9, mew=2, label="their mean")
-    axes.plot(1e3 * at[0], 1e3 * at[1], "+", color=FELT, ms=12, mew=2, label="the press")
+        axes.plot(*np.array(crossings).T, "o", mfc="none", color=INK, ms=8, label="crossings")
+    axes.plot(mean[0], mean[1], "x", color=INK, ms=9, mew=2, label="their mean")
+    axes.plot(at[0], at[1], "+", color=FELT, ms=12, mew=2, label="the press")
     reach = 0.6
-    axes.set(xlim=(1e3 * at[0] - reach, 1e3 * at[0] + reach), ylim=(1e3 * at[1] - reach, 1e3 * at[1] + reach))
+    axes.set(xlim=(at[0] - reach, at[0] + reach), ylim=(at[1] - reach, at[1] + reach))
     axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="near the press")
     axes.legend(fontsize=8)
 
@@ -178,18 +179,18 @@ def _distributions(axes: Any, accuracy: Accuracy, degree: int) -> None:
 def fig_11(solves: Solves) -> Entry:
     """Contours of all four electrodes under a circle."""
     sensor = solves.choices.sensor("four")
-    field = ContourField.of(solves.forward_map("circle", sensor), FORCE, AREA, solves.choices.spacing)
-    reached_pC = {name: [1e12 * charge for charge in field.reach(name)] for name in sensor.electrode_names}
+    field = ContourField(ChargeSpline.of(solves.forward_map("circle", sensor), AREA, solves.choices.spacing), FORCE)
+    reached_pC = {name: list(field.reach(name)) for name in sensor.electrode_names}
     median, worst = _change_from_circle_to_triangle(solves)
     return Entry(
         "Fig. 11",
         "Isocharge contours of all four electrodes; on the right those of A with their charges.",
-        _draw_fig_11(solves.choices, field),
+        _draw_fig_11(solves.choices, sensor, field),
         [
             Row(
                 "charges met in the central area",
                 "in the figure",
-                f"{reached_pC['A'][0]:.0f} to {reached_pC['A'][1]:.0f} pC on A, within {1e3 * AREA:g} mm",
+                f"{reached_pC['A'][0]:.0f} to {reached_pC['A'][1]:.0f} pC on A, within {AREA:g} mm",
                 "E, d31, d32 are our choice; largest with the probe on the electrode",
             ),
             Row(
@@ -204,15 +205,14 @@ def fig_11(solves: Solves) -> Entry:
     )
 
 
-def _draw_fig_11(choices: Choices, field: ContourField) -> Figure:
+def _draw_fig_11(choices: Choices, sensor: Sensor, field: ContourField) -> Figure:
     """On the left the contours of all electrodes, on the right those of the first with their charges."""
-    sensor = field.forward_map.sensor
     figure = new_figure(12.6, 6.6)
     left, right = figure.subplots(1, 2)
     for name, colour in zip(sensor.electrode_names, COLOURS, strict=False):
         levels = field.even_charges(name, LEVELS)
         pieces = [piece for charge in levels for piece in field.contours(name, charge)]
-        draw_contours(left, pieces, colour, f"{name}, {1e12 * min(levels):.0f} to {1e12 * max(levels):.0f} pC", 0.9)
+        draw_contours(left, pieces, colour, f"{name}, {min(levels):.0f} to {max(levels):.0f} pC", 0.9)
     _one_electrode(right, field, sensor.electrode_names[0], COLOURS[0])
     for axes, title in ((left, "Fig. 11: all four electrodes, circle of 1 mm, 1 N"), (right, "electrode A alone, pC")):
         draw_electrodes(axes, sensor)
@@ -238,7 +238,7 @@ def _one_electrode(axes: Any, field: ContourField, name: str, colour: str) -> No
                 "ha": "center",
                 "va": "center",
             }
-            axes.annotate(f"{1e12 * charge:.0f}", 1e3 * end, **label)
+            axes.annotate(f"{charge:.0f}", end, **label)
 
 
 def _change_from_circle_to_triangle(solves: Solves) -> tuple[float, float]:

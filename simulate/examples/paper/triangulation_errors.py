@@ -1,19 +1,20 @@
 """Position errors of triangulation over the working area: by the graphical method and from the field."""
 
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
+from choices import PAPER
+from solves import FORCE, Solves, sample
 
 from isocharge.common.arrays import Array
-from isocharge.common.progress import Progress
+from isocharge.common.progress import track
+from isocharge.simulate import ChargeSpline, Triangulation
 from isocharge.simulate.contours.fix import Fix, Meeting
 from isocharge.simulate.contours.graphical_method import DrawnTriangulation
-from isocharge.simulate.contours.triangulation import Triangulation
-from isocharge.simulate.execution.workers import Workers
+from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.measuring_chain.noise_file import noise_model
-from isocharge.simulate.paper.choices import PAPER
-from isocharge.simulate.paper.solves import FORCE, Solves, sample
 
 LAYOUTS = ("three", "four")
 
@@ -32,7 +33,7 @@ class Errors:
 
     Attributes:
         fix: Triangulated positions.
-        at: True positions, shape (n, 2), m.
+        at: True positions, shape (n, 2), mm.
     """
 
     fix: Fix
@@ -41,7 +42,7 @@ class Errors:
     @property
     def found_mm(self) -> Array:
         """Position errors of the presses with a position, ascending, mm."""
-        errors = 1e3 * np.hypot(self.fix.x - self.at[:, 0], self.fix.y - self.at[:, 1])
+        errors = np.hypot(*(self.fix.contact[:, :2] - self.at).T)
         return np.sort(errors[self.fix.found])
 
     @property
@@ -88,31 +89,25 @@ class Accuracy:
     mistaken: Mapping[str, Errors]
 
     @classmethod
-    def of(cls, solves: Solves, workers: Workers, progress: Progress | None = None) -> "Accuracy":
-        """Triangulate; `progress` counts the finished methods."""
+    def of(cls, solves: Solves, executor: Executor | None) -> "Accuracy":
+        """Triangulate."""
         degrees = [degree for degree in DEGREES if degree <= solves.choices.degree]
         jobs = [(solves, layout, degree, False) for layout in LAYOUTS for degree in degrees]
         jobs += [(solves, layout, solves.choices.degree, True) for layout in LAYOUTS]
-        results = []
-        for errors in workers.in_order(_locate, [_graphical_job(*job) for job in jobs]):
-            results.append(errors)
-            if progress:
-                progress(len(results), len(jobs) + len(LAYOUTS))
+        located = in_order(executor, _locate, [_graphical_job(*job) for job in jobs])
+        results = list(track(located, "triangulating", len(jobs)))
         drawn = {(layout, degree): errors for (_, layout, degree, _), errors in zip(jobs[:-2], results, strict=False)}
         field, noisy, mistaken = {}, {}, {}
         for layout in LAYOUTS:
             forward_map = solves.forward_map("triangle", solves.choices.sensor(layout))
-            contours = Triangulation.from_map(
-                forward_map, radius=BEYOND * solves.choices.radius, spacing=solves.choices.spacing
-            )
+            radius, spacing = BEYOND * solves.choices.radius, solves.choices.spacing
+            contours = Triangulation(ChargeSpline.of(forward_map, radius, spacing))
             charge = solves.charges("triangle", forward_map.sensor, solves.places)
             field[layout] = Errors(contours.locate(charge, FORCE), solves.places)
             noisy[layout] = Errors(contours.locate(_noisy(charge), FORCE), solves.places)
             if layout == "three":
                 at = np.array(sample(solves.choices))
                 mistaken = {name: Errors(contours.locate(q[0], FORCE), at) for name, q in solves.variants.items()}
-            if progress:
-                progress(len(jobs) + len(field), len(jobs) + len(LAYOUTS))
         return cls(drawn, field, noisy, dict(zip(LAYOUTS, results[-2:], strict=True)), mistaken)
 
 

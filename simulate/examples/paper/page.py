@@ -3,9 +3,10 @@
 import json
 from collections.abc import Sequence
 
+from choices import Choices
+from entry import Entry
+
 from isocharge.common.json_values import plain_values
-from isocharge.simulate.paper.choices import Choices
-from isocharge.simulate.paper.entry import Entry
 
 INTRODUCTION = """# Mirbagheri et al. (2007), reproduced
 
@@ -23,9 +24,9 @@ def page(entries: Sequence[Entry], choices: Choices, seconds: float) -> str:
     film = choices.sensor("three").film
     probes = ", ".join(probe.notation for probe in (choices.triangle, choices.rectangle, choices.circle))
     settings = (
-        f"Film: radius {1e3 * film.radius:g} mm, {1e6 * film.thickness:g} um, E {1e-9 * film.young:g} GPa, nu "
+        f"Film: radius {film.radius:g} mm, {1e3 * film.thickness:g} um, E {1e-3 * film.young:g} GPa, nu "
         f"{film.poisson:g}, no pretension. Probes, mm: {probes}. Readout: {choices.readout} (eq. 3). Force 1 N. "
-        f"Working area: {1e3 * choices.radius:g} mm, up to {choices.presses} presses spread over it. Computed in "
+        f"Working area: {choices.radius:g} mm, up to {choices.presses} presses spread over it. Computed in "
         f"{seconds:.0f} s."
     )
     parts = [INTRODUCTION, settings, "\n## Table\n", _table(entries)]

@@ -41,10 +41,10 @@ class Paper:
 PAPER = Paper()
 
 
-TRIANGLE, RECTANGLE, CIRCLE = Polygon.triangle(4e-3), Polygon.rectangle(4e-3, 2e-3), Circle(1e-3)
+TRIANGLE, RECTANGLE, CIRCLE = Polygon.triangle(4.0), Polygon.rectangle(4.0, 2.0), Circle(1.0)
 """Probes: of the first two the paper gives the shape, of the third the size too."""
 
-OTHERS = (Polygon.triangle(2e-3), Polygon.triangle(6e-3), CIRCLE, RECTANGLE)
+OTHERS = (Polygon.triangle(2.0), Polygon.triangle(6.0), CIRCLE, RECTANGLE)
 """Probes to show what the size and the shape change."""
 
 
@@ -58,17 +58,17 @@ class Choices:
         circle: Fig. 11; the paper gives its radius.
         readout: The paper's eq. 3.
         degree: Of the polynomial along a line.
-        length: Of the lines of a mapping scheme, m.
-        printed_length: Of lines where B sits at 60 degrees, m: some of them lead away from the centre.
-        spacing: Of the knots that charges are tabled with, m.
-        radius: Of the working area, m.
+        length: Of the lines of a mapping scheme, mm.
+        printed_length: Of lines where B sits at 60 degrees, mm: some of them lead away from the centre.
+        spacing: Of the knots that charges are tabled with, mm.
+        radius: Of the working area, mm.
         presses: How many presses of the working area a distribution is made from.
-        thickness: Of the films that are compared, m.
-        pretension: Of them, Pa.
+        thickness: Of the films that are compared, mm.
+        pretension: Of them, MPa.
         force: At which they are solved, N.
-        shown: A press to show a triangulation with, m.
+        shown: A press to show a triangulation with, mm.
         probes: Other probes, to show what their size changes.
-        young: Moduli, Pa, to show what they change; and Poisson's ratios.
+        young: Moduli, MPa, to show what they change; and Poisson's ratios.
         poisson: See `young`.
     """
 
@@ -77,17 +77,17 @@ class Choices:
     circle: Probe = CIRCLE
     readout: Readout = "edge"
     degree: int = 4
-    length: float = 20e-3
-    printed_length: float = 12e-3
+    length: float = 20.0
+    printed_length: float = 12.0
     spacing: float = SPACING
-    radius: float = 8e-3
+    radius: float = 8.0
     presses: int = 300
-    thickness: tuple[float, ...] = (25e-6, 50e-6, 110e-6, 200e-6, 350e-6, 600e-6, 1000e-6)
-    pretension: tuple[float, ...] = (0.0, 0.5e6, 1.0e6, 1.5e6, 2.5e6, 5.0e6)
+    thickness: tuple[float, ...] = (0.025, 0.05, 0.11, 0.2, 0.35, 0.6, 1.0)
+    pretension: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.5, 5.0)
     force: tuple[float, ...] = (0.05, 0.1, 0.175, 0.25, 0.35, 0.5, 0.8, 1.3, 2.0)
-    shown: tuple[float, float] = (2e-3, 3e-3)
+    shown: tuple[float, float] = (2.0, 3.0)
     probes: tuple[Probe, ...] = OTHERS
-    young: tuple[float, ...] = (2e9, 4e9)
+    young: tuple[float, ...] = (2000.0, 4000.0)
     poisson: tuple[float, ...] = (0.25, 0.45)
 
     @classmethod
@@ -95,15 +95,15 @@ class Choices:
         """Fewer presses and films, shorter lines: every figure and number, most of them coarser."""
         return cls(
             degree=2,
-            length=12e-3,
-            printed_length=8e-3,
-            spacing=0.6e-3,
+            length=12.0,
+            printed_length=8.0,
+            spacing=0.6,
             presses=30,
-            thickness=(25e-6, 1000e-6),
-            pretension=(0.0, 1.5e6),
+            thickness=(0.025, 1.0),
+            pretension=(0.0, 1.5),
             force=(0.05, 0.25, 0.5, 1.0, 2.0),
             probes=OTHERS[:1],
-            young=(2e9,),
+            young=(2000.0,),
             poisson=(0.25,),
         )
 
@@ -115,7 +115,7 @@ class Choices:
         """Three electrodes with B and C at 60 and 120 degrees from x, as the paper's sentence has it, A at -y."""
         angles = dict(zip("ABC", np.deg2rad([-90.0, 60.0, 120.0]), strict=True))
         electrodes = tuple(
-            Electrode.of_square(name, (10e-3 * float(np.cos(a)), 10e-3 * float(np.sin(a))), 3e-3)
+            Electrode.of_square(name, (10.0 * float(np.cos(a)), 10.0 * float(np.sin(a))), 3.0)
             for name, a in angles.items()
         )
         return replace(self.sensor("three"), name="B and C at 60 and 120 degrees", electrodes=electrodes)

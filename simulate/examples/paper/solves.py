@@ -1,25 +1,26 @@
 """Everything that is solved for the page, once: forward maps and single presses, on all workers."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from time import process_time
 from typing import Any
 
 import numpy as np
+from choices import PAPER, Choices
 from scipy.optimize import least_squares
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SolveError
-from isocharge.common.progress import Progress
+from isocharge.common.progress import report
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
-from isocharge.simulate.execution.workers import Workers
+from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import touch_charge
 from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.numerics.disk import lattice
-from isocharge.simulate.paper.choices import PAPER, Choices
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
@@ -49,7 +50,7 @@ class SolveJob:
     Attributes:
         sensors: All with the same film.
         probe: The footprint.
-        at: (x, y) of each, m.
+        at: (x, y) of each, mm.
         force: Of each, N; each is started from the one before.
         accuracy: Target for the relative error of a charge.
     """
@@ -62,7 +63,7 @@ class SolveJob:
 
 
 def solve_presses(job: SolveJob) -> Array:
-    """Touch charges, shape (n_sensor, n_press, n_electrode), C; all sensors have as many electrodes."""
+    """Touch charges, shape (n_sensor, n_press, n_electrode), pC; all sensors have as many electrodes."""
     start: Equilibrium | None = None
     charge = []
     for at, force in zip(job.at, job.force, strict=True):
@@ -105,7 +106,7 @@ def solve_mesh(job: MeshJob) -> tuple[Array, int, float]:
     except SolveError:
         return np.full(len(job.sensor.electrodes), np.nan), 0, process_time() - began
     charge = touch_charge(job.sensor, solved)
-    return charge, 3 * solved.mesh.n_node, process_time() - began
+    return charge, 3 * solved.mesh.template.n_node, process_time() - began
 
 
 def run(job: tuple[Callable[[Any], Any], Any]) -> Any:
@@ -122,8 +123,8 @@ class Solves:
         choices: What the paper leaves open.
         maps: Forward maps at 1 N by probe ("triangle", "rectangle", "circle"); any layout, film direction and readout
             shares them, since they hold the film's stress.
-        eq_4: Position (x, y) of eq. 4's press, m, and the ratio of our charges to the paper's at this position.
-        chains: Charges of the films of `choices`, shape (n_thickness, n_pretension, n_force, 3), C.
+        eq_4: Position (x, y) of eq. 4's press, mm, and the ratio of our charges to the paper's at this position.
+        chains: Charges of the films of `choices`, shape (n_thickness, n_pretension, n_force, 3), pC.
         meshes: Of MESHES and FINEST: charges, unknowns, CPU seconds.
         variants: Charges of named variations, see `_variants`.
         shown: The film under one triangular press, for its mesh and stress.
@@ -148,32 +149,31 @@ class Solves:
         return tuple(Curves.of(forward_map, Mapping.lines(sensor, name, length=length), FORCE) for name in names)
 
     def charges(self, probe: str, sensor: Sensor, at: Array) -> Array:
-        """Touch charges of presses of 1 N at (x, y), shape (n, 2), m; (n, n_electrode), C."""
-        return self.forward_map(probe, sensor).forward(at[:, 0], at[:, 1], np.full(len(at), FORCE))
+        """Touch charges of presses of 1 N at (x, y), shape (n, 2), mm; (n, n_electrode), pC."""
+        return self.forward_map(probe, sensor).charges(np.column_stack([at, np.full(len(at), FORCE)]))
 
     @property
     def places(self) -> Array:
-        """Presses spread over the working area, shape (n, 2), m."""
+        """Presses spread over the working area, shape (n, 2), mm."""
         z = self.choices.radius * lattice(self.choices.presses) * np.exp(0.1j)  # off the lines of symmetry
         return np.stack([z.real, z.imag], axis=1)
 
 
-def solve_all(choices: Choices, workers: Workers, progress: Progress | None = None) -> Solves:
-    """Solve everything; `progress` counts the finished jobs."""
+def solve_all(choices: Choices, executor: Executor | None) -> Solves:
+    """Solve everything."""
     sensor = choices.sensor("three")
     first = _map_jobs(choices)
     variants = _variants(choices)
     meshes = [(solve_mesh, MeshJob(sensor, choices.triangle, choices.shown, mesh)) for mesh in (*MESHES, FINEST)]
     chains = len(choices.thickness) * len(choices.pretension)
-    bar = _Counter(len(first) + len(variants) + len(meshes) + chains, progress)
-    results = bar.over(
-        workers,
-        [*((build_map, job) for job in first.values()), *((solve_presses, j) for j in variants.values()), *meshes],
+    jobs = _Jobs(executor, len(first) + len(variants) + len(meshes) + chains)
+    results = jobs.run(
+        [*((build_map, job) for job in first.values()), *((solve_presses, j) for j in variants.values()), *meshes]
     )
     maps = dict(zip(first, results, strict=False))
     varied = dict(zip(variants, results[len(first) :], strict=False))
     eq_4 = find_eq_4(replace(maps["triangle"], sensor=sensor), choices)
-    chain_results = bar.over(workers, [(solve_presses, job) for job in _chain_jobs(choices, eq_4[0])])
+    chain_results = jobs.run([(solve_presses, job) for job in _chain_jobs(choices, eq_4[0])])
     charges = np.array(chain_results)[:, 0].reshape(
         len(choices.thickness), len(choices.pretension), len(choices.force), -1
     )
@@ -181,19 +181,18 @@ def solve_all(choices: Choices, workers: Workers, progress: Progress | None = No
     return Solves(choices, maps, eq_4, charges, tuple(results[len(first) + len(variants) :]), varied, shown)
 
 
-class _Counter:
+class _Jobs:
     """Runs jobs and counts those that are done."""
 
-    def __init__(self, total: int, progress: Progress | None) -> None:
-        self._done, self._total, self._progress = 0, total, progress
+    def __init__(self, executor: Executor | None, total: int) -> None:
+        self._executor, self._done, self._total = executor, 0, total
 
-    def over(self, workers: Workers, jobs: Sequence[tuple[Callable[[Any], Any], Any]]) -> list[Any]:
+    def run(self, jobs: Sequence[tuple[Callable[[Any], Any], Any]]) -> list[Any]:
         results = []
-        for result in workers.in_order(run, jobs):
+        for result in in_order(self._executor, run, jobs):
             results.append(result)
             self._done += 1
-            if self._progress:
-                self._progress(self._done, self._total)
+            report("solving", self._done, self._total)
         return results
 
 
@@ -201,9 +200,9 @@ def _map_jobs(choices: Choices) -> dict[str, MapJob]:
     sensor = choices.sensor("three")
     layouts = (sensor, choices.sensor("four"))
     lines = [Mapping.lines(s, name, length=choices.length) for s in layouts for name in s.electrode_names]
-    reach = SLACK * max(mapping.reach for mapping in lines)
+    reach = SLACK * max(mapping.radius for mapping in lines)
     ends = (np.deg2rad(PAPER.fig_8_deg[0]), np.deg2rad(PAPER.fig_8_deg[1]))
-    printed = SLACK * Mapping.lines(choices.as_printed(), "B", ends, length=choices.printed_length).reach
+    printed = SLACK * Mapping.lines(choices.as_printed(), "B", ends, length=choices.printed_length).radius
     return {
         "rectangle": MapJob(sensor, choices.rectangle, max(reach, printed)),
         "triangle": MapJob(sensor, choices.triangle, reach),
@@ -224,15 +223,15 @@ def _chain_jobs(choices: Choices, at: tuple[float, float]) -> list[SolveJob]:
     ]
 
 
-TAUT = 0.5e6
-"""Pretension of the film that the contours assume to be slack, Pa."""
+TAUT = 0.5
+"""Pretension of the film that the contours assume to be slack, MPa."""
 
 UNSUSPECTED = 24
 """Number of presses with each probe or film that the contours do not assume."""
 
 
 def sample(choices: Choices) -> tuple[tuple[float, float], ...]:
-    """Positions (x, y) of the presses of the variations, m."""
+    """Positions (x, y) of the presses of the variations, mm."""
     places = 0.9 * choices.radius * lattice(min(UNSUSPECTED, choices.presses)) * np.exp(0.1j)
     return tuple((float(z.real), float(z.imag)) for z in places)
 
@@ -245,24 +244,24 @@ def _variants(choices: Choices) -> dict[str, SolveJob]:
         return SolveJob((replace(sensor, film=film),), probe, at, (FORCE,) * len(at))
 
     jobs = {f"probe {probe.notation}": presses(sensor.film, probe) for probe in choices.probes}
-    jobs[f"pretension {TAUT * 1e-6:g} MPa"] = presses(replace(sensor.film, pretension=TAUT), choices.triangle)
+    jobs[f"pretension {TAUT:g} MPa"] = presses(replace(sensor.film, pretension=TAUT), choices.triangle)
     for young in choices.young:
-        jobs[f"E {young * 1e-9:g} GPa"] = presses(replace(sensor.film, young=young), choices.triangle)
+        jobs[f"E {young * 1e-3:g} GPa"] = presses(replace(sensor.film, young=young), choices.triangle)
     for poisson in choices.poisson:
         jobs[f"nu {poisson:g}"] = presses(replace(sensor.film, poisson=poisson), choices.triangle)
     return jobs
 
 
 def find_eq_4(forward_map: ForwardMap, choices: Choices) -> tuple[tuple[float, float], float]:
-    """Position (x, y) of eq. 4's press, m, from the ratios of its charges at 1 N; our charges over the paper's."""
+    """Position (x, y) of eq. 4's press, mm, from the ratios of its charges at 1 N; our charges over the paper's."""
     table = ChargeSpline.of(forward_map, 1.2 * choices.radius, choices.spacing)
-    papers = np.array([sum(cubic) for cubic in PAPER.cubics]) * 1e-12
+    papers = np.array([sum(cubic) for cubic in PAPER.cubics])
 
-    def log_ratio_misfit(at_mm: Array) -> Array:
-        charge = table.first_order(1e-3 * at_mm[None], FORCE)[0][0]
+    def log_ratio_misfit(at: Array) -> Array:
+        charge = table.first_order(at[None], FORCE)[0][0]
         misfit: Array = np.log(charge[1:] / charge[0]) - np.log(papers[1:] / papers[0])
         return misfit
 
-    position = least_squares(log_ratio_misfit, np.array([0.0, -4.0])).x * 1e-3
+    position = least_squares(log_ratio_misfit, np.array([0.0, -4.0])).x
     factor = table.first_order(position[None], FORCE)[0][0] / papers
     return (float(position[0]), float(position[1])), float(np.mean(factor))

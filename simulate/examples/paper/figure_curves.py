@@ -5,15 +5,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from choices import PAPER
+from entry import Entry, Row
 from matplotlib.figure import Figure
+from solves import FORCE, Solves
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from isocharge.simulate.contours.graphical_method import draw_contour
-from isocharge.simulate.paper.choices import PAPER
-from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.solves import FORCE, Solves
-from isocharge.simulate.plots.curves import draw_curves
+from isocharge.simulate.plots.contours import draw_curves
 from isocharge.simulate.plots.figure import COLOURS, PRESSED, new_figure
 from isocharge.simulate.sensor.film import Piezo
 from isocharge.simulate.sensor.sensor import Sensor
@@ -43,8 +43,8 @@ def curve_numbers(curves: Curves) -> dict[str, object]:
     """A set of curves for JSON."""
     return {
         "angle_deg": np.rad2deg(curves.mapping.angle).tolist(),
-        "distance_mm": (1e3 * curves.mapping.distance).tolist(),
-        "charge_pC": (1e12 * curves.own).tolist(),
+        "distance_mm": (curves.mapping.distance).tolist(),
+        "charge_pC": (curves.own).tolist(),
     }
 
 
@@ -89,10 +89,10 @@ def fig_6(solves: Solves) -> Entry:
 
 def _example(solves: Solves, at: Curves, smooth: Curves) -> tuple[Row, Array]:
     """The paper's example of a contour: distances (mm) at which the lines have 650 pC."""
-    contour = draw_contour(at, 1e-12 * PAPER.contour_pC, solves.choices.degree)
+    contour = draw_contour(at, PAPER.contour_pC, solves.choices.degree)
     knots = np.empty((0, 2)) if contour is None else contour.knots
-    distance = 1e3 * np.linalg.norm(knots - at.mapping.origin, axis=1)
-    exact = 1e3 * np.array([np.interp(-1e-12 * PAPER.contour_pC, -q, smooth.mapping.distance) for q in smooth.own])
+    distance = np.linalg.norm(knots - at.mapping.origin, axis=1)
+    exact = np.array([np.interp(-PAPER.contour_pC, -q, smooth.mapping.distance) for q in smooth.own])
     row = Row(
         f"{PAPER.contour_pC:g} pC, distance from A on lines of 35° to 90°",
         "x1 to x7, in the figure",
@@ -103,7 +103,7 @@ def _example(solves: Solves, at: Curves, smooth: Curves) -> tuple[Row, Array]:
 
 
 def _at_distances(curves: Curves, percent: Array) -> str:
-    return ", ".join(f"{p:.1f} % at {1e3 * d:g} mm" for p, d in zip(percent, curves.mapping.distance, strict=True))
+    return ", ".join(f"{p:.1f} % at {d:g} mm" for p, d in zip(percent, curves.mapping.distance, strict=True))
 
 
 def _spread(curves: Curves) -> Array:
@@ -143,7 +143,7 @@ def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
     mean = smooth.own.mean(axis=0)
     for angle, charge in zip(np.rad2deg(curves.mapping.angle), smooth.own, strict=True):
         colour, width, label = _line_style(float(angle))
-        right.plot(1e3 * smooth.mapping.distance, 100.0 * (charge / mean - 1.0), lw=width, color=colour, label=label)
+        right.plot(smooth.mapping.distance, 100.0 * (charge / mean - 1.0), lw=width, color=colour, label=label)
     right.set(xlabel="distance from the centre of B, mm", ylabel="charge over the mean of the lines, %")
     right.set_title("the same, against the mean of the lines")
     right.grid(alpha=0.3)
@@ -216,7 +216,7 @@ def _both_extremes(curves: Curves) -> str:
 def _best_ratio(solves: Solves) -> tuple[float, float]:
     """d32 over d31 with which the order of Fig. 8 holds at most distances, and the share of them."""
     sensor = solves.choices.sensor("three")
-    directions = (Piezo(d31=1e-12, d32=0.0), Piezo(d31=0.0, d32=1e-12))
+    directions = (Piezo(d31=1.0, d32=0.0), Piezo(d31=0.0, d32=1.0))
     sensors = [replace(sensor, piezo=piezo) for piezo in directions]
     parts = [curves_of(solves, "rectangle", taking, "B", PAPER.fig_8_deg)[0].own for taking in sensors]
     best = (0.0, 0.0)

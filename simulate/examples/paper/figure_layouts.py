@@ -4,20 +4,20 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from choices import PAPER
+from entry import Entry, Row
 from matplotlib.collections import LineCollection
+from solves import FINEST, FORCE, MESHES, Solves
 
 from isocharge.common.arrays import Array
+from isocharge.simulate import Equilibrium
 from isocharge.simulate.contours.charge_curves import Mapping
 from isocharge.simulate.forward.readout import contact_charge
 from isocharge.simulate.numerics.interpolation import tensor_values
-from isocharge.simulate.paper.choices import PAPER
-from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.solves import FINEST, FORCE, MESHES, Solves
-from isocharge.simulate.plots.curves import draw_mapping
+from isocharge.simulate.plots.contours import draw_mapping
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.solver.equilibrium import Equilibrium
 
 FIG_4_DEG, FIG_7_DEG = (35.0, 145.0), PAPER.fig_8_deg
 """Lines from A, the half that Fig. 6 shows and its mirror image; lines from B."""
@@ -32,17 +32,17 @@ def fig_1(solves: Solves) -> Entry:
     figure = new_figure(6.4, 6.0)
     axes = figure.subplots()
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
-    for name, centre, r, colour in zip("abc", 1e3 * centres, 1e3 * distance, COLOURS, strict=False):
+    for name, centre, r, colour in zip("abc", centres, distance, COLOURS, strict=False):
         axes.plot(*centre, "s", color=colour)
         axes.annotate(name, centre, xytext=(6, 6), textcoords="offset points", color=colour)
         circle = centre[:, None] + r * np.array([np.cos(angle), np.sin(angle)])
         axes.plot(*circle, color=colour, lw=1.0, label=f"{r:.2f} mm from {name}")
-    axes.plot(*1e3 * meeting, "o", color=INK, label="all three meet")
-    axes.plot(*1e3 * second, "x", color=INK, label="a and b meet again")
+    axes.plot(*meeting, "o", color=INK, label="all three meet")
+    axes.plot(*second, "x", color=INK, label="a and b meet again")
     axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="Fig. 1: position from three distances")
     axes.legend(fontsize=8)
-    error = 1e3 * float(np.linalg.norm(meeting - at))
-    again = f"twice, {1e3 * float(np.linalg.norm(second - at)):.2f} mm apart"
+    error = float(np.linalg.norm(meeting - at))
+    again = f"twice, {float(np.linalg.norm(second - at)):.2f} mm apart"
     return Entry(
         "Fig. 1",
         "Three distances from three known points give a position (eq. 1); two give two.",
@@ -80,8 +80,8 @@ def fig_2(solves: Solves) -> Entry:
     draw_electrodes(axes, sensor, highlight="A")
     axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="Fig. 2: mapping scheme")
     figure.legend(fontsize=8, loc="outside lower center", ncols=2)
-    step, turn = 1e3 * float(np.diff(mapping.distance)[0]), float(np.rad2deg(np.diff(mapping.angle)[0]))
-    length = f"{1e3 * mapping.distance[-1]:g} mm"
+    step, turn = float(np.diff(mapping.distance)[0]), float(np.rad2deg(np.diff(mapping.angle)[0]))
+    length = f"{mapping.distance[-1]:g} mm"
     return Entry(
         "Fig. 2",
         "Lines and circles about the centre of an electrode; a press at each intersection.",
@@ -101,7 +101,7 @@ def fig_3(solves: Solves) -> Entry:
     for axes, shown, title in ((left, sensor, "Fig. 3: layout, equilateral"), (right, printed, "as the text has it")):
         draw_electrodes(axes, shown)
         draw_working_area(axes, shown.film.radius, "clamped rim")
-        corners = 1e3 * np.array([e.centre for e in shown.electrodes] + [shown.electrodes[0].centre])
+        corners = np.array([e.centre for e in shown.electrodes] + [shown.electrodes[0].centre])
         axes.plot(*corners.T, color=FELT, lw=0.8, label="between the centres")
         axes.set(xlim=(-47, 47), ylim=(-47, 47), aspect="equal", xlabel="x (drawn), mm", ylabel="y, mm", title=title)
     left.legend(fontsize=8, loc="lower left")
@@ -128,7 +128,7 @@ def fig_3(solves: Solves) -> Entry:
 
 def _triangle(sensor: Sensor) -> tuple[list[float], list[float]]:
     """Sides AB, BC, CA (mm) and directions from A to B and C (degrees)."""
-    a, b, c = (1e3 * complex(*e.centre) for e in sensor.electrodes)
+    a, b, c = (complex(*e.centre) for e in sensor.electrodes)
     return [abs(b - a), abs(c - b), abs(a - c)], [float(np.rad2deg(np.angle(z - a))) for z in (b, c)]
 
 
@@ -144,9 +144,9 @@ def _scheme(solves: Solves, heading: str, electrode: str, angles: tuple[float, f
     axes = figure.subplots()
     draw_mapping(axes, mapping)
     draw_electrodes(axes, sensor, highlight=electrode)
-    draw_working_area(axes, solves.choices.radius, f"working area, {1e3 * solves.choices.radius:g} mm")
+    draw_working_area(axes, solves.choices.radius, f"working area, {solves.choices.radius:g} mm")
     draw_probe(axes, solves.choices.triangle, (float(mapping.points[3, 1, 0]), float(mapping.points[3, 1, 1])), "probe")
-    frame_film(axes, sensor, mapping.reach, f"{heading}: lines from {electrode}")
+    frame_film(axes, sensor, mapping.radius, f"{heading}: lines from {electrode}")
     figure.legend(fontsize=8, loc="outside lower center", ncols=4)
     over = touching(solves, sensor, mapping)
     overlap = dict(zip(sensor.electrode_names, over.sum(axis=0).tolist(), strict=True))
@@ -193,7 +193,7 @@ def fig_5(solves: Solves) -> Entry:
     whole, near, errors = figure.subplots(1, 3)
     for axes, reach, title in ((whole, 46.0, "Fig. 5: mesh, whole film"), (near, 8.0, "at the probe")):
         _draw_mesh(axes, solves)
-        x, y = (0.0, 0.0) if axes is whole else (1e3 * solves.shown.at[0], 1e3 * solves.shown.at[1])
+        x, y = (0.0, 0.0) if axes is whole else (solves.shown.at[0], solves.shown.at[1])
         draw_electrodes(axes, solves.choices.sensor("three"), names=axes is near, ink="#2e6f9e")
         axes.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", title=title)
         axes.set(xlabel="x, mm", ylabel="y, mm")
@@ -227,12 +227,12 @@ def _draw_mesh_errors(axes: Any, unknowns: Array, error: Array) -> None:
 def _rows_of_mesh(shown: Equilibrium, unknowns: Array, error: Array, seconds: Array) -> list[Row]:
     """How many elements, and whether they are enough."""
     enough = int(np.argmax(error < 1e-3))
-    order, count = shown.resolution.order, shown.mesh.nodes.shape[0]
+    order, count = shown.mesh.resolution.order, shown.mesh.template.nodes.shape[0]
     return [
         Row(
             "elements",
             f"{PAPER.elements[0]:,} to {PAPER.elements[1]:,} triangles",
-            f"{count} quadrilaterals of order {order}, {3 * shown.mesh.n_node} unknowns",
+            f"{count} quadrilaterals of order {order}, {3 * shown.mesh.template.n_node} unknowns",
             "high order on a mesh that follows the probe; the solution is smooth outside of it",
         ),
         Row(
@@ -256,7 +256,7 @@ def _draw_mesh(axes: Any, solves: Solves) -> None:
     shown = solves.shown
     along, one = np.linspace(-1.0, 1.0, 13), np.ones(13)
     xi, eta = np.concatenate([along, one, -along, -one]), np.concatenate([-one, along, one, -along])
-    turn = 1e3 * shown.film.radius * np.exp(1j * np.angle(complex(*shown.at)))
-    z = shown.placement.element_points(shown.mesh) @ tensor_values(shown.resolution.order, xi, eta).T * turn
+    turn = shown.film.radius * np.exp(1j * np.angle(complex(*shown.at)))
+    z = shown.mesh.points @ tensor_values(shown.mesh.resolution.order, xi, eta).T * turn
     axes.add_collection(LineCollection(list(np.stack([z.real, z.imag], axis=-1)), colors=INK, linewidths=0.5))
     draw_probe(axes, shown.probe, shown.at)

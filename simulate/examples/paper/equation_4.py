@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from choices import PAPER, normalised_cubic
+from entry import Entry, Row
 from scipy.interpolate import CubicSpline
+from solves import Solves
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.paper.choices import PAPER, normalised_cubic
-from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.solves import Solves
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure, shades
 
 RANGE, BAND = (0.25, 2.0), 0.02
@@ -31,9 +31,9 @@ class ChargeForce:
     """Charge on A against force of one film.
 
     Attributes:
-        thickness: m.
-        pretension: Pa.
-        logs: Spline of ln Q (C) in ln F (N).
+        thickness: mm.
+        pretension: MPa.
+        logs: Spline of ln Q (pC) in ln F (N).
     """
 
     thickness: float
@@ -41,7 +41,7 @@ class ChargeForce:
     logs: CubicSpline
 
     def charge(self, force: Array) -> Array:
-        """C, at forces of shape (n,), N."""
+        """pC, at forces of shape (n,), N."""
         charge: Array = np.exp(self.logs(np.log(force)))
         return charge
 
@@ -51,7 +51,7 @@ class ChargeForce:
 
     @property
     def at_1_N(self) -> float:
-        """C."""
+        """pC."""
         return float(self.charge(np.array([1.0]))[0])
 
     @property
@@ -117,14 +117,14 @@ def _rows_of_press(solves: Solves, films: list[list[ChargeForce]]) -> list[Row]:
     """Where eq. 4's press was, and how large its charges are."""
     (x, y), factor = solves.eq_4
     pC, thick = [sum(cubic) for cubic in PAPER.cubics], films[-1]
-    thick_pC, most = 1e12 * thick[0].at_1_N, 1e12 * max(film.at_1_N for film in thick)
-    angle, away = np.rad2deg(np.arctan2(y + 10e-3, x)), 1e3 * np.hypot(x, y + 10e-3)
+    thick_pC, most = thick[0].at_1_N, max(film.at_1_N for film in thick)
+    angle, away = np.rad2deg(np.arctan2(y + 10.0, x)), np.hypot(x, y + 10.0)
     ours = ", ".join(f"{factor * q:.0f}" for q in pC)
     return [
         Row(
             "where eq. 4's press was",
             "not given",
-            f"({1e3 * x:.2f}, {1e3 * y:.2f}) mm: {away:.2f} mm from A at {angle:.0f}°",
+            f"({x:.2f}, {y:.2f}) mm: {away:.2f} mm from A at {angle:.0f}°",
             "from the ratios of its three charges at 1 N, on our film of 25 um; the scheme's presses are 4 mm from A",
         ),
         Row(
@@ -134,7 +134,7 @@ def _rows_of_press(solves: Solves, films: list[list[ChargeForce]]) -> list[Row]:
             f"one factor of {factor:.2f} for all three (d31, E, probe): these are the charges of a film of 25 um",
         ),
         Row(
-            f"can a film of {1e3 * thick[0].thickness:g} mm give eq. 4's charges?",
+            f"can a film of {thick[0].thickness:g} mm give eq. 4's charges?",
             f"{pC[0]:.0f} pC on A at 1 N",
             f"no: {thick_pC:.1f} pC without pretension, at most {most:.1f} pC with it",
             f"{pC[0] / thick_pC:.0f} times too little: a thick film bends and hardly stretches",
@@ -151,10 +151,10 @@ def _rows_of_cubic(films: list[list[ChargeForce]]) -> list[Row]:
     verdict = "yes" if best_thick.misfit <= BAND else "no"
     return [
         Row(
-            f"can a film of {1e3 * thick[0].thickness:g} mm give eq. 4's shape?",
+            f"can a film of {thick[0].thickness:g} mm give eq. 4's shape?",
             cubic,
             f"{verdict}: {_poly(thick[0].cubic)} without pretension; nearest {best_thick.misfit:.2f} away, "
-            f"at {1e-6 * best_thick.pretension:g} MPa",
+            f"at {best_thick.pretension:g} MPa",
             "charge of A over its value at 1 N, a cubic of the force in N, 0.25 to 2 N",
         ),
         Row(
@@ -200,11 +200,11 @@ def _rows_of_line(films: list[list[ChargeForce]]) -> list[Row]:
 
 
 def _um(film: ChargeForce) -> str:
-    return f"{1e6 * film.thickness:g} um"
+    return f"{1e3 * film.thickness:g} um"
 
 
 def _name(film: ChargeForce) -> str:
-    return f"{_um(film)} at {1e-6 * film.pretension:g} MPa"
+    return f"{_um(film)} at {film.pretension:g} MPa"
 
 
 def _list(films: list[ChargeForce]) -> str:
@@ -230,14 +230,14 @@ def _linear_films(films: list[list[ChargeForce]]) -> str:
 def _numbers(solves: Solves, films: list[list[ChargeForce]]) -> dict[str, Any]:
     (x, y), factor = solves.eq_4
     return {
-        "press_of_eq_4_mm": [1e3 * x, 1e3 * y],
+        "press_of_eq_4_mm": [x, y],
         "our_charges_over_the_papers": factor,
         "force_N": list(solves.choices.force),
         "films": [
             {
-                "thickness_um": 1e6 * film.thickness,
-                "pretension_MPa": 1e-6 * film.pretension,
-                "charge_pC": (1e12 * solves.chains[i, k]).tolist(),
+                "thickness_um": 1e3 * film.thickness,
+                "pretension_MPa": film.pretension,
+                "charge_pC": (solves.chains[i, k]).tolist(),
                 "misfit": film.misfit,
                 "off_a_line_to_0.5_N": film.bent(PAPER.linear_N),
                 "cubic": film.cubic.tolist(),
@@ -251,7 +251,7 @@ def _numbers(solves: Solves, films: list[list[ChargeForce]]) -> dict[str, Any]:
 
 def _chosen(films: list[list[ChargeForce]]) -> list[ChargeForce]:
     """25 um, 110 um and 1 mm, as far as they were solved, without pretension."""
-    thicknesses = (25e-6, 110e-6, 1000e-6)
+    thicknesses = (0.025, 0.11, 1.0)
     return [row[0] for row in films if any(np.isclose(row[0].thickness, h) for h in thicknesses)]
 
 
@@ -269,7 +269,7 @@ def _draw_curves(axes: Any, films: list[list[ChargeForce]]) -> None:
             film.charge(force) / film.at_1_N,
             color=colour,
             lw=1.6,
-            label=f"{_name(film)}, {1e12 * film.at_1_N:.{0 if film.at_1_N > 1e-10 else 1}f} pC at 1 N",
+            label=f"{_name(film)}, {film.at_1_N:.{0 if film.at_1_N > 100.0 else 1}f} pC at 1 N",
         )
     axes.set(xlabel="force, N", ylabel="charge of A over its value at 1 N", title="Eq. 4: charge against force")
     axes.set_ylim(0, 3)
@@ -299,6 +299,6 @@ def _draw_grid(axes: Any, films: list[list[ChargeForce]], title: str, value: Any
             axes.annotate(
                 form.format(number), (k, i), ha="center", va="center", color="white" if pale else "black", fontsize=9
             )
-    axes.set_xticks(range(values.shape[1]), [f"{1e-6 * film.pretension:g}" for film in films[0]])
-    axes.set_yticks(range(values.shape[0]), [f"{1e6 * row[0].thickness:g}" for row in films])
+    axes.set_xticks(range(values.shape[1]), [f"{film.pretension:g}" for film in films[0]])
+    axes.set_yticks(range(values.shape[0]), [f"{1e3 * row[0].thickness:g}" for row in films])
     axes.set(xlabel="pretension, MPa", ylabel="thickness, um", title=title)

@@ -3,18 +3,19 @@
 from dataclasses import replace
 
 import numpy as np
+from choices import PAPER
+from entry import Entry, Row
+from figure_layouts import TOUCHED
+from solves import FORCE, Solves, sample
+from triangulation_errors import Accuracy, Errors, largest_change
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.contours.charge_curves import Mapping
 from isocharge.simulate.forward.readout import contact_charge, thermal_charge
-from isocharge.simulate.paper.choices import PAPER
-from isocharge.simulate.paper.entry import Entry, Row
-from isocharge.simulate.paper.figure_layouts import TOUCHED
-from isocharge.simulate.paper.solves import FORCE, Solves, sample
-from isocharge.simulate.paper.triangulation_errors import Accuracy, Errors, largest_change
+from isocharge.simulate.solver.equilibrium import principal_stress
 
-D33, PYRO, KELVIN = -30e-12, 30e-6, 0.1
-"""d33 (C/N) and pyroelectric coefficient (C/(m^2 K)) of PVDF, and a temperature step (K) that a finger makes easily."""
+D33, PYRO, KELVIN = -30.0, 30.0, 0.1
+"""d33 (pC/N) and pyroelectric coefficient (pC/(mm^2 K)) of PVDF, and a step (K) that a finger makes easily."""
 
 
 def claims(solves: Solves, accuracy: Accuracy) -> Entry:
@@ -43,7 +44,7 @@ def _edges(solves: Solves) -> tuple[Row, dict[str, object]]:
         "edge averages (eq. 3) give the charge",
         "\"precise\"",
         f"off the whole electrode's charge by {middle:.2f} % at the median, {most:.1f} % at 95 %, {worst:.1f} % most, "
-        f"within {1e3 * solves.choices.radius:g} mm",
+        f"within {solves.choices.radius:g} mm",
         "an electrode collects from all of its area; edges are a quadrature that misses the stress beside the probe",
     )  # fmt: skip
     return row, {"edge_against_area_percent": {"median": middle, "p95": most, "worst": worst}}
@@ -62,13 +63,13 @@ def _d33(solves: Solves) -> tuple[Row, dict[str, object]]:
     row = Row(
         "d33 where the probe overlaps an electrode",
         "no charge",
-        f"up to {1e12 * extra.max():.1f} pC, {100 * share.max():.1f} % of the charge there "
+        f"up to {extra.max():.1f} pC, {100 * share.max():.1f} % of the charge there "
         f"({over.any(axis=1).sum()} of {len(points)} presses of the scheme); "
-        f"{1e12 * whole:.0f} pC if the electrode carried all of the force",
-        f"a thin film does carry the probe's pressure; d33 = {1e12 * D33:g} pC/N. Small beside the stretching: leaving "
+        f"{whole:.0f} pC if the electrode carried all of the force",
+        f"a thin film does carry the probe's pressure; d33 = {D33:g} pC/N. Small beside the stretching: leaving "
         "it out is right, the reason given is not",
     )
-    return row, {"d33_pC": {"largest": 1e12 * extra.max(), "largest_share": share.max()}}
+    return row, {"d33_pC": {"largest": extra.max(), "largest_share": share.max()}}
 
 
 def _pyro(solves: Solves) -> tuple[Row, dict[str, object]]:
@@ -77,21 +78,21 @@ def _pyro(solves: Solves) -> tuple[Row, dict[str, object]]:
     row = Row(
         "pyroelectric charge",
         "can dominate; left out",
-        f"{1e12 * warm:.0f} pC on each electrode for {KELVIN:g} K",
-        f"{1e6 * PYRO:g} uC/(m^2 K) on {1e6 * sensor.electrodes[0].area:g} mm^2; the same on all, a press is not",
+        f"{warm:.0f} pC on each electrode for {KELVIN:g} K",
+        f"{PYRO:g} uC/(m^2 K) on {sensor.electrodes[0].area:g} mm^2; the same on all, a press is not",
     )
-    return row, {"pyro_pC_per_0.1_K": 1e12 * warm}
+    return row, {"pyro_pC_per_0.1_K": warm}
 
 
 def _stress(solves: Solves) -> tuple[Row, dict[str, object]]:
-    largest = solves.shown.principal_stress[1]
+    largest = principal_stress(solves.shown)[1]
     row = Row(
         "the material stays linear",
         f"up to {PAPER.linear_MPa:g} MPa",
-        f"{1e-6 * largest:.0f} MPa beside the triangle at 1 N",
-        "beyond its range beside the probe" if largest > 1e6 * PAPER.linear_MPa else "within its range",
+        f"{largest:.0f} MPa beside the triangle at 1 N",
+        "beyond its range beside the probe" if largest > PAPER.linear_MPa else "within its range",
     )
-    return row, {"largest_stress_MPa": 1e-6 * largest}
+    return row, {"largest_stress_MPa": largest}
 
 
 def _both(name: str, three: Errors, four: Errors) -> str:
@@ -139,7 +140,7 @@ def what_choices_change(solves: Solves, accuracy: Accuracy) -> Entry:
     rows = []
     film, piezo = solves.choices.sensor("three").film, solves.choices.sensor("three").piezo
     ours = {
-        "E": f"{film.young * 1e-9:g} GPa",
+        "E": f"{film.young * 1e-3:g} GPa",
         "nu": f"{film.poisson:g}",
         "probe": f"{solves.choices.triangle.notation} (side, mm)",
         "pretension": "0 MPa",
@@ -161,8 +162,8 @@ def what_choices_change(solves: Solves, accuracy: Accuracy) -> Entry:
         Row(
             "d31, d32",
             "not given",
-            f"charges are linear in them; biaxial {1e12 * piezo.d31:g} and {1e12 * piezo.d32:g} pC/N",
-            f"eq. 4 agrees with d31 = {1e12 * piezo.d31 / solves.eq_4[1]:.1f} pC/N, all else as ours",
+            f"charges are linear in them; biaxial {piezo.d31:g} and {piezo.d32:g} pC/N",
+            f"eq. 4 agrees with d31 = {piezo.d31 / solves.eq_4[1]:.1f} pC/N, all else as ours",
         )
     )
     numbers = {name: {"largest_change": largest_change(solves, name)} for name in solves.variants}
