@@ -1,44 +1,54 @@
-"""A training under a progress bar, and what it says when it ends or is stopped."""
+"""A fit that goes on after a kill, what it says when it ends or is stopped, and the options that its commands share."""
 
 import json as json_module
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Annotated, Any
 
 import typer
 
-from isocharge.cli.shared.terminal import progress, say, this_command
+from isocharge.cli.shared.terminal import say, shown_progress
+from isocharge.common.resumable_run import ResumableRun, draft_of, resume_parts
+from isocharge.train import Release
 
-if TYPE_CHECKING:
-    from isocharge.train import Release
+ModelFolderOption = Annotated[
+    Path,
+    typer.Option("--output", "-o", metavar="models/NAME", help="Model folder; its name becomes the model's name."),
+]
+
+VersionOption = Annotated[int, typer.Option("--version", min=1, help="Version of the model: the folder in NAME.")]
 
 
-def train_and_say(train: "Callable[..., Release]", output: Path, version: int, *, fresh: bool, json: bool) -> None:
-    """Run a training into a model folder and print its errors; stopped, say how to go on."""
+def release_resumably(
+    fit_and_release: Callable[[ResumableRun], Release],
+    identity: Mapping[str, Any],
+    target: Path,
+    *,
+    fresh: bool,
+    json: bool,
+) -> None:
+    """Fit into a version folder and print the errors; stopped, say how to go on.
+
+    Args:
+        fit_and_release: The work; it keeps its state in the run.
+        identity: All that decides about the weights.
+        target: The version folder.
+        fresh: Throw away what an earlier run left.
+        json: Print the folder and the errors as one JSON object.
+    """
     try:
-        with progress("training") as advance:
-            release = train(
-                output,
-                command=this_command(),
-                version=version,
-                fresh=fresh,
-                progress=advance,
-                warn=lambda message: say(f"caution: {message}"),
-            )
+        with resume_parts(target, identity, fresh=fresh) as run, shown_progress():
+            release = fit_and_release(run)
     except KeyboardInterrupt:
-        if (part := output / f"{version}.part").exists():
+        if (part := draft_of(target)).exists():
             say(f"stopped; what is done is kept in {part}, and the same command goes on from there")
         raise
-    if json:
-        typer.echo(json_module.dumps({"folder": str(release.folder), "errors": dict(release.metadata.errors)}))
-    say(_summary(release))
-
-
-def _summary(release: "Release") -> str:
     errors = release.metadata.errors
+    if json:
+        typer.echo(json_module.dumps({"folder": str(release.folder), "errors": dict(errors)}))
     measured = errors.get("measured_presses")
     presses = f"on {measured:.0f} measured presses that training never saw, " if measured else ""
-    return (
+    say(
         f"{release.folder}: {presses}position error {errors['position_median_mm']:g} mm median, "
         f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "
         f"force {errors['force_rms_percent']:g} % rms"

@@ -1,36 +1,34 @@
 """`isocharge train distil`: a model to a small student for microcontrollers."""
 
-from functools import partial
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from isocharge.cli.shared.measured_presses import ModelsOption
-from isocharge.cli.shared.options import ConfigOption, FreshOption, ModelArgument
+from isocharge.cli.shared.options import ConfigOption, FreshOption, JsonOption, ModelArgument
 from isocharge.cli.shared.simulated_presses import simulated_presses
-from isocharge.cli.shared.training_run import train_and_say
+from isocharge.cli.shared.terminal import shown_progress, this_command
+from isocharge.cli.shared.training_run import ModelFolderOption, VersionOption, release_resumably
 from isocharge.common.errors import InputError
-from isocharge.common.files import refuse_existing
+from isocharge.common.resumable_run import ResumableRun
+from isocharge.serve import find_model, load_model
+from isocharge.serve.model.model_folder import check_target
+from isocharge.train import Release, StudentCase, fit, load_config, release, student_config, student_data
+from isocharge.train.training.fit import fit_identity
 
 
 def distil_command(
     model: ModelArgument,
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="models/NAME", help="The student's folder; its name becomes its name."),
-    ],
+    output: ModelFolderOption,
     int8: Annotated[
         bool,
         typer.Option("--int8", help="Round the weights between hidden layers to 8 bits. (default: 32-bit floats)"),
     ] = False,
     config: ConfigOption = None,
     models: ModelsOption = None,
-    version: Annotated[int, typer.Option("--version", min=1, help="Version of the student: the folder in NAME.")] = 1,
+    version: VersionOption = 1,
     fresh: FreshOption = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the folder and the measured errors as one JSON object. (default: no)")
-    ] = False,
+    json: JsonOption = False,
 ) -> None:
     """Train a small network on the answers of MODEL, for microcontrollers: at most 6,000 weights and biases.
 
@@ -42,15 +40,17 @@ def distil_command(
 
     Example: isocharge train distil four-25um-biaxial -o models/four-25um-biaxial-student
     """
-    from isocharge.serve import find_model, load_model
-    from isocharge.train import TaughtScene, distil_model, load_config, student_config
-
     if config and int8:
         raise InputError('--int8: expected no --config beside it; write weights = "int8" under [network] in the file')
     folder = find_model(model, models)
-    refuse_existing(output / str(version))
     settings = load_config(config) if config else student_config("int8" if int8 else "float32")
-    scene = TaughtScene.of(load_model(folder).metadata)
-    presses = simulated_presses(scene.sensor, scene.probes, 1e-3 * scene.domain.radius_mm, scene.domain.force_range_N)
-    student = partial(distil_model, folder, presses, config=settings)
-    train_and_say(student, output, version, fresh=fresh, json=json)
+    case = StudentCase.of(load_model(folder).metadata)
+    check_target(output, version, case.sensor.electrode_names)
+    with shown_progress():
+        presses = simulated_presses(case.sensor, case.probes, case.domain.radius, case.domain.force_range)
+    data = student_data(folder, presses, settings.network)
+
+    def train(run: ResumableRun) -> Release:
+        return release(fit(data, settings, run=run), output, version=version, command=this_command())
+
+    release_resumably(train, fit_identity(data, settings), output / str(version), fresh=fresh, json=json)

@@ -1,37 +1,49 @@
-"""`isocharge train fit`: a dataset, or a sensor, to a model."""
+"""`isocharge train fit`: a dataset, measured presses, or a sensor, to a model."""
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from isocharge.cli.shared.forward_maps import sweep_radius
-from isocharge.cli.shared.measured_presses import (
-    ForceStdOption,
-    ModelsOption,
-    PositionStdOption,
-    films_or_none,
-    read_presses_of,
+from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
+from isocharge.cli.shared.options import (
+    PROBE_HELP,
+    ConfigOption,
+    FreshOption,
+    JsonOption,
+    RadiusOption,
+    most_workers,
+    radius_mm_of,
 )
-from isocharge.cli.shared.options import PROBE_HELP, ConfigOption, FreshOption, RadiusOption, radius_mm_of
 from isocharge.cli.shared.simulated_presses import simulated_presses
-from isocharge.cli.shared.training_run import train_and_say
-from isocharge.common.defaults import DEFAULT_RADIUS
+from isocharge.cli.shared.terminal import shown_progress, this_command
+from isocharge.cli.shared.training_run import ModelFolderOption, VersionOption, release_resumably
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
-
-if TYPE_CHECKING:
-    from isocharge.simulate import Dataset
-    from isocharge.train import Release
+from isocharge.common.resumable_run import ResumableRun
+from isocharge.serve.model.model_folder import check_target
+from isocharge.simulate import Circle, FilmPrior, load_sensor, local_workers, parse_probe, read_dataset
+from isocharge.train import (
+    FilmsConfig,
+    FitConfig,
+    Release,
+    Rig,
+    TrainingData,
+    fit,
+    fit_films,
+    load_config,
+    release,
+    release_films,
+    rig_data,
+)
+from isocharge.train.films.fit import films_identity
+from isocharge.train.training.fit import fit_identity
 
 
 def fit_command(
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="models/NAME", help="Model folder; its name becomes the model's name."),
-    ],
+    output: ModelFolderOption,
     dataset: Annotated[
         Path | None,
         typer.Argument(
@@ -55,7 +67,7 @@ def fit_command(
             "--probe", metavar="SHAPE", help=f"With --sensor: {PROBE_HELP} May be repeated. (default: circle:1.0)"
         ),
     ] = None,
-    radius: RadiusOption = f"{1e3 * DEFAULT_RADIUS}",
+    radius: RadiusOption = f"{DEFAULT_RADIUS}",
     films: Annotated[
         bool,
         typer.Option(
@@ -68,11 +80,9 @@ def fit_command(
     force_std: ForceStdOption = 0.01,
     models: ModelsOption = None,
     config: ConfigOption = None,
-    version: Annotated[int, typer.Option("--version", min=1, help="Version of the model: the folder in NAME.")] = 1,
+    version: VersionOption = 1,
     fresh: FreshOption = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the folder and the measured errors as one JSON object. (default: no)")
-    ] = False,
+    json: JsonOption = False,
 ) -> None:
     """Train a network on charges, measure its errors, and write a model folder: ONNX file, card, golden vectors.
 
@@ -92,102 +102,73 @@ def fit_command(
 
     Example: isocharge train fit presses.csv --sensor four-25um-biaxial -o models/rig
     """
-    measured = dataset is not None and not dataset.is_dir()
+    probes, target = probe or ["circle:1.0"], output / str(version)
     if films:
-        _refuse_with_films(dataset, config)
-    _check_source(dataset, sensor, measured)
-    refuse_existing(output / str(version))
-    if films:
-        train = _train_films(str(sensor), probe or ["circle:1.0"], radius)
-    elif dataset and measured:
-        stds = position_std_mm, force_std
-        train = _train_on_measured(dataset, str(sensor), probe or ["circle:1.0"], radius, stds, models, config)
-    else:
-        train = _train_on_presses(dataset, sensor, probe or ["circle:1.0"], radius, config)
-    train_and_say(train, output, version, fresh=fresh, json=json)
+        prior, sizes = _films(dataset, sensor, probes, radius, config)
+        check_target(output, version, prior.sensor.electrode_names)
+
+        def train_films(run: ResumableRun) -> Release:
+            with local_workers(most_workers(None)) as executor:
+                network = fit_films(prior, sizes, executor=executor, run=run)
+            return release_films(network, output, version=version, command=this_command())
+
+        release_resumably(train_films, films_identity(prior, sizes), target, fresh=fresh, json=json)
+        return
+    refuse_existing(target)
+    settings = load_config(config) if config else FitConfig()
+    with shown_progress():
+        if dataset and not dataset.is_dir():
+            rig = _rig(dataset, sensor, probes, radius, (position_std_mm, force_std))
+            data = rig_data(rig, rig.problem(models), seed=settings.training.seed)
+        else:
+            data = _presses(dataset, sensor, probes, radius)
+    check_target(output, version, data.sensor.electrode_names)
+
+    def train(run: ResumableRun) -> Release:
+        return release(fit(data, settings, run=run), output, version=version, command=this_command())
+
+    release_resumably(train, fit_identity(data, settings), target, fresh=fresh, json=json)
 
 
-def _check_source(dataset: Path | None, sensor: str | None, measured: bool) -> None:
-    if measured and dataset and not dataset.exists():
-        raise InputError(f"{dataset}: expected a dataset folder, or a CSV file of measured presses; there is neither")
-    if measured and sensor is None:
-        raise InputError(f"{dataset}: a file of measured presses needs --sensor SENSOR, which says what was pressed")
-    if not measured and (dataset is None) == (sensor is None):
+def _presses(dataset: Path | None, sensor: str | None, probes: list[str], radius: str) -> TrainingData:
+    """A dataset, read or simulated."""
+    if dataset and not sensor:
+        return TrainingData.of(read_dataset(dataset))
+    if dataset or not sensor:
         raise InputError(f"expected either a DATASET folder or --sensor SENSOR, got {'both' if dataset else 'neither'}")
+    film_sensor, pressing, forces = load_sensor(sensor), [parse_probe(text) for text in probes], DEFAULT_FORCE_RANGE
+    reach = sweep_radius(radius, film_sensor, pressing, forces)
+    return TrainingData.of(simulated_presses(film_sensor, pressing, reach, forces))
 
 
-def _train_on_measured(
-    file: Path,
-    sensor: str,
-    probes: list[str],
-    radius: str,
-    stds: tuple[float, float],
-    models: Path | None,
-    config: Path | None,
-) -> "Callable[..., Release]":
-    """Trains on a file of measured presses."""
-    from isocharge.simulate import load_sensor, parse_probe
-    from isocharge.train import Rig, load_config, train_rig
-
+def _rig(file: Path, sensor: str | None, probes: list[str], radius: str, stds: tuple[float, float]) -> Rig:
+    """Measured presses of a file."""
+    if not file.exists():
+        raise InputError(f"{file}: expected a dataset folder, or a CSV file of measured presses; there is neither")
+    if sensor is None:
+        raise InputError(f"{file}: a file of measured presses needs --sensor SENSOR, which says what was pressed")
     if radius == "auto":
         raise InputError("--radius: expected a number of mm with measured presses, got auto")
     if len(probes) != 1:
         raise InputError(f"--probe: expected the one that made the presses, got {', '.join(probes)}")
     described = load_sensor(sensor)
     presses = read_presses_of(file, described.electrode_names, *stds)
-    rig = Rig(presses, described, parse_probe(probes[0]), 1e-3 * radius_mm_of(radius))
-    settings = load_config(config) if config else None
-    return partial(train_rig, rig, films_or_none(sensor, probes[0], models), config=settings)
+    return Rig(presses, described, parse_probe(probes[0]), radius_mm_of(radius))
 
 
-def _train_on_presses(
+def _films(
     dataset: Path | None, sensor: str | None, probes: list[str], radius: str, config: Path | None
-) -> "Callable[..., Release]":
-    """Trains on a dataset, read or simulated."""
-    from isocharge.train import load_config, train_model
-
-    settings = load_config(config) if config else None
-    presses = _read(dataset) if dataset else _simulate(str(sensor), probes, radius)
-    return partial(train_model, presses, config=settings)
-
-
-def _refuse_with_films(dataset: Path | None, config: Path | None) -> None:
+) -> tuple[FilmPrior, FilmsConfig]:
+    """The films that a sensor may be, and how a network for all of them is fitted."""
     if dataset:
         raise InputError("--films: expected --sensor SENSOR alone, got presses, which are of one film")
     if config:
         raise InputError("--films: expected no --config: its settings are for one film; leave it out")
-
-
-def _train_films(sensor: str, probes: list[str], radius: str) -> "Callable[..., Release]":
-    """Trains on the films that a sensor may be, in a process for each core."""
-    from isocharge.simulate import Circle, FilmPrior, load_sensor, parse_probe
-    from isocharge.train import FilmsConfig
-
+    if sensor is None:
+        raise InputError("expected either a DATASET folder or --sensor SENSOR, got neither")
     if radius == "auto":
         raise InputError("--films: expected --radius in mm, got auto: the working area differs from film to film")
     pressing = [parse_probe(text) for text in probes]
     if len(pressing) != 1 or not isinstance(pressing[0], Circle):
         raise InputError(f"--films: expected one round probe (circle:RADIUS), got {', '.join(probes)}")
-    prior, config = FilmPrior(load_sensor(sensor), pressing[0]), FilmsConfig(radius=1e-3 * radius_mm_of(radius))
-    return partial(_train_films_with_workers, prior, config=config)
-
-
-def _train_films_with_workers(*arguments: Any, **options: Any) -> "Release":
-    from isocharge.simulate.execution.workers import cores, local_workers
-    from isocharge.train import train_films
-
-    with local_workers(cores()) as workers:
-        return train_films(*arguments, **options, map_jobs=workers.in_order)
-
-
-def _read(folder: Path) -> "Dataset":
-    from isocharge.simulate import read_dataset
-
-    return read_dataset(folder)
-
-
-def _simulate(sensor: str, probes: list[str], radius: str) -> "Dataset":
-    from isocharge.simulate import Sweep, load_sensor, parse_probe
-
-    film_sensor, pressing, forces = load_sensor(sensor), [parse_probe(text) for text in probes], Sweep().force_range
-    return simulated_presses(film_sensor, pressing, sweep_radius(radius, film_sensor, pressing, forces), forces)
+    return FilmPrior(load_sensor(sensor), pressing[0]), FilmsConfig(radius=radius_mm_of(radius))
