@@ -22,7 +22,7 @@ from isocharge.common.tables import (
     read_json,
     read_toml,
 )
-from isocharge.simulate.execution.checkpointed_map import CheckpointedMap
+from isocharge.simulate.execution.workers import in_order
 from isocharge.train.training.checkpoint import Checkpoint
 
 
@@ -133,16 +133,15 @@ GARBAGE = [b"", b"garbage", b"\x93NUMPY\x01\x00", b"PK\x03\x04", b"\x80\x02."]
 
 
 @pytest.mark.parametrize("data", GARBAGE)
-def test_a_part_that_is_garbage_is_computed_again(tmp_path, data):
+def test_a_part_that_is_garbage_is_computed_again(tmp_path, data, caplog):
     """Its checksum fits: somebody else wrote it."""
-    warnings = []
-    with resume_folder(tmp_path / "target", {"a": 1}, warn=warnings.append) as run:
-        run.save("solve-00-0000.npy", data)
-        results = list(CheckpointedMap(run, "solve", map)(lambda job: np.full(2, job), [1.0, 2.0]))
+    with resume_folder(tmp_path / "target", {"a": 1}) as run:
+        run.save("solve-0000.npy", data)
+        results = list(in_order(run.keeping("solve"), lambda job: np.full(2, job), [1.0, 2.0]))
         np.testing.assert_array_equal(results, [[1.0, 1.0], [2.0, 2.0]])
         run.save("weights", data)
         assert Checkpoint(run).load("weights") is None
-    assert ["computed again" in warning for warning in warnings] == [True, True]
+    assert ["computed again" in record.message for record in caplog.records] == [True, True]
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "", "\xff", '{"a": ' * 500])

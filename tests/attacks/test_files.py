@@ -27,7 +27,7 @@ from isocharge.serve import (
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.virtual_sensor.script import read_script
 from isocharge.simulate import Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
-from isocharge.simulate.execution.checkpointed_map import CheckpointedMap
+from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train.training.checkpoint import Checkpoint
 from isocharge.train.training.config import load_config
@@ -311,11 +311,11 @@ def test_parts_of_runs_with_faults(tmp_path, attack, faults):
     array, state = io.BytesIO(), io.BytesIO()
     np.save(array, np.arange(12.0).reshape(3, 4))
     torch.save({"step": 3, "weights": torch.zeros(3)}, state)
-    with resume_folder(tmp_path / "target", {"a": 1}, warn=lambda _: None) as run:
+    with resume_folder(tmp_path / "target", {"a": 1}) as run:
 
         def read_array(data):
-            run.save("solve-00-0000.npy", data)
-            assert len(list(CheckpointedMap(run, "solve", map)(lambda job: np.zeros(job), [2]))) == 1
+            run.save("solve-0000.npy", data)
+            assert len(list(in_order(run.keeping("solve"), lambda job: np.zeros(job), [2]))) == 1
 
         def read_state(data):
             run.save("weights", data)
