@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import DeviceError, TareError
-from isocharge.serve import Predictor
+from isocharge.serve import Predictor, device_from_table
 from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
-from isocharge.serve.live.device_file import device_from_table
 from isocharge.serve.signal_chain.chain import ChainState, advance
 from isocharge.train.export_c.device_header import device_header
 
@@ -138,8 +137,3 @@ def test_a_film_that_is_never_quiet_is_said_at_the_same_frame(build):
 def test_a_tare_that_no_state_holds_is_refused():
     with pytest.raises(DeviceError, match=r"board: tare.frames: expected a whole number from 1 to 10000.*got 50000"):
         device_header(device_from_table({"tare": {"frames": 50_000}}, "board"), ("A", "B", "C"))
-
-
-def test_a_board_of_other_electrodes_is_refused():
-    with pytest.raises(DeviceError, match="expected a number, or one for each of the electrodes"):
-        device_header(device_from_table({"leak": {"tau_s": {"A": 1.0}}}, "board"), ("A", "B", "C"))

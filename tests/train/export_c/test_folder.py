@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.common.errors import ModelError, OutputExists
 from isocharge.serve import (
     BinaryParser,
     Chunk,
@@ -71,13 +70,6 @@ def test_no_folder_is_left_of_what_cannot_be_written(command, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["board.toml", "damaged"]
 
 
-def test_in_python_errors_are_ours(tmp_path):
-    with pytest.raises(ModelError):
-        export_c(tmp_path, tmp_path / "c")
-    with pytest.raises(OutputExists):
-        export_c(find_model("three-25um-biaxial"), tmp_path)
-
-
 def test_the_readme_says_what_works(exports, shell, tmp_path, compile_c):
     """Its lines compile, its C compiles, and its table names every file."""
     folder = Path(shutil.copytree(exports[0], tmp_path / "c"))
@@ -94,24 +86,12 @@ def test_the_readme_says_what_works(exports, shell, tmp_path, compile_c):
         assert path.stem in text or path.name == "README.md"
 
 
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_headers_are_for_cpp_too(compiler, exports, tmp_path):
-    if shutil.which(compiler) is None:
-        pytest.skip(f"{compiler} is not installed")
-    (tmp_path / "all.cpp").write_text(
-        '#include "isocharge_chain.h"\n#include "isocharge_frames.h"\nint main() { return 0; }\n'
-    )
-    words = [compiler, "-Wall", "-Wextra", "-Werror", "-c", "-I", exports[1], "all.cpp"]
-    assert subprocess.run(words, cwd=tmp_path, check=False).returncode == 0
-
-
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
-@pytest.mark.parametrize("option", ["-O2", "-DISOCHARGE_CHAIN_FLOAT"])
-def test_all_stages_compile_strictly(compiler, option, compile_c, tmp_path):
-    table = {"gain": {"pC_per_unit": 2.0}, "saturation": {"limit_pC": 900.0}, "leak": {"tau_s": 5.0}}
-    board = device_from_table(table | {"hum": {}, "common_mode": {}}, "board")
-    export = export_c(find_model("four-25um-biaxial"), tmp_path / "c", board)
-    compile_c(compiler, export, tmp_path / "host", *EXAMPLE, options=(option,))
+def test_headers_are_for_cpp_too(exports, tmp_path):
+    if shutil.which("g++") is None:
+        pytest.skip("g++ is not installed")
+    (tmp_path / "all.cpp").write_text('#include "isocharge_chain.h"\n#include "isocharge_frames.h"\nint main() {}\n')
+    words = ["g++", "-Wall", "-Wextra", "-Werror", "-c", "-I", exports[1], "all.cpp"]
+    subprocess.run(words, cwd=tmp_path, check=True)
 
 
 @pytest.fixture(scope="module")
@@ -163,23 +143,18 @@ def test_a_recording_gives_our_records_frame_by_frame(host, start_command, tmp_p
 
 
 def test_host_example_follows_a_port(exports, compile_c, start_command, tmp_path):
-    """Contacts of the virtual sensor at the places of its script."""
-    steps = {0.0: 0.0, 0.8: 0.0, 0.801: 0.5, 1.4: 0.5, 1.401: 0.0}
-    steps |= {1.7: 0.0, 1.701: 1.0, 2.3: 1.0, 2.301: 0.0, 60.0: 0.0}
-    rows = [f"{t},{3.0 if t < 1.6 else -4.0},{-2.0 if t < 1.6 else 1.0},{force}" for t, force in steps.items()]
+    """Contacts of the virtual sensor at the place of its script."""
+    rows = ["0,3,-2,0", "0.8,3,-2,0", "0.801,3,-2,0.5", "60,3,-2,0.5"]
     (tmp_path / "script.csv").write_text("\n".join(["seconds,x_mm,y_mm,force_N", *rows]) + "\n")
-    words = ("--noise", "clean", "--script", tmp_path / "script.csv")
     program = compile_c("gcc", exports[0], tmp_path / "host", *EXAMPLE)
-    sensor = start_command("serve", "virtual", "three-25um-biaxial", *words)
-    code, records, err = played(program, sensor.stdout.readline().strip(), 480)
-    assert (code, err, len(records)) == (0, "", 480)
-    touching = [record for record in records if record["contact"] and record["force_N"] > 0.4]
-    first = [record for record in touching if record["x_mm"] > 0]
-    second = [record for record in touching if record["x_mm"] < 0]
-    for press, (x, y, force) in ((first, (3.0, -2.0, 0.5)), (second, (-4.0, 1.0, 1.0))):
-        assert len(press) > 80
-        middle = np.median([[record["x_mm"], record["y_mm"], record["force_N"]] for record in press], axis=0)
-        np.testing.assert_allclose(middle, [x, y, force], atol=0.3)
+    sensor = start_command(
+        "serve", "virtual", "three-25um-biaxial", "--noise", "clean", "--script", tmp_path / "script.csv"
+    )
+    code, records, err = played(program, sensor.stdout.readline().strip(), 300)
+    assert (code, err, len(records)) == (0, "", 300)
+    press = [[record["x_mm"], record["y_mm"], record["force_N"]] for record in records if record["contact"]]
+    assert len(press) > 80
+    np.testing.assert_allclose(np.median(press, axis=0), [3.0, -2.0, 0.5], atol=0.3)
 
 
 def test_host_example_says_what_is_wrong(host, tmp_path):

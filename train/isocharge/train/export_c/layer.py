@@ -25,7 +25,7 @@ LARGEST_INT8 = 127
 Block = tuple[slice, slice]
 """Rows and columns, each from a first."""
 
-WHOLE = (slice(0, None), slice(0, None))
+WHOLE: Block = (slice(0, None), slice(0, None))
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ def blocks_of(weights: Sequence[Singles], answers: int) -> list[tuple[Block, ...
         weights: Of each layer but the first, whose inputs both perceptrons share.
         answers: Columns of the last that the first perceptron gives.
     """
-    blocks, column = [], answers
+    blocks: list[tuple[Block, ...]] = []
+    column = answers
     for matrix in reversed(weights):
         row = int(matrix[:, column:].any(axis=1).argmax())  # the first that the second perceptron has
         if row == 0 or matrix[row:, :column].any():

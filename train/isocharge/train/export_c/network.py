@@ -13,8 +13,7 @@ import onnx
 from numpy.typing import NDArray
 
 from isocharge.common.arrays import Singles
-from isocharge.common.errors import ModelError
-from isocharge.common.tables import cut
+from isocharge.common.errors import ModelError, cut
 from isocharge.serve.model.session import INPUT, OUTPUTS
 
 OPSET = 17
@@ -29,7 +28,7 @@ CONSTANT = ""
 
 @dataclass(frozen=True)
 class Network:
-    """What a model computes from the logarithms of its charges, all float32.
+    """What a model computes from the logarithms of its charges; arrays are float32.
 
     Attributes:
         low, high: Bounds of the charges, pC.
@@ -40,13 +39,13 @@ class Network:
         misfit_unit: Factor on the hyperbolic sine of the misfit vector's length.
     """
 
-    low: Singles
-    high: Singles
+    low: float
+    high: float
     factor: Singles
     hidden: tuple[tuple[Singles, Singles], ...]
     last: Singles
     skip: tuple[Singles, Singles]
-    misfit_unit: Singles
+    misfit_unit: float
 
 
 def read_network(onnx_model: bytes, where: str) -> Network:
@@ -89,7 +88,7 @@ def read_network(onnx_model: bytes, where: str) -> Network:
     found = [contact, contact_std, misfit, *parts[0].tolist(), *powers[0].tolist(), nodes.coming(1)]
     if found != [*OUTPUTS, PLANE, LOGS, n, 1, LOGS - 1, []]:
         nodes.refuse(f"expected the outputs {', '.join(OUTPUTS)} from {PLANE}, {LOGS} and {n} answers, got {found}")
-    network = Network(low, high, factor, tuple(hidden), last, (skip[0], skip[1]), unit)
+    network = Network(low.item(), high.item(), factor, tuple(hidden), last, (skip[0], skip[1]), unit.item())
     nodes.check_shapes(network)
     return network
 

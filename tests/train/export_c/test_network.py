@@ -1,0 +1,195 @@
+"""The network in C against onnxruntime and against the network in double precision; graphs that are refused."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+from onnx import helper, numpy_helper
+
+from isocharge.common.errors import ModelError
+from isocharge.serve import find_model, write_model
+from isocharge.serve.model.model_folder import load_model
+from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
+from isocharge.train.export_c.network import read_network
+from isocharge.train.release.export import export_onnx
+from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, PlainPerceptron
+
+FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0])
+"""mm and N, and the floor that golden vectors have for the misfit."""
+
+MODELS = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial-films", "four-25um-biaxial-student")
+
+
+def answers(model, charge_pC):
+    """What onnxruntime answers, shape (n, 7), one press at a time as a host program asks."""
+    session = load_model(find_model(model)).session
+    return np.array([np.concatenate(session.run(None, {"charge_pC": row[np.newaxis]}), axis=1)[0] for row in charge_pC])
+
+
+def check_agreement(mine, theirs, limit=1e-5):
+    assert np.all(np.abs(mine - theirs) <= limit * np.maximum(np.abs(theirs), FLOORS))
+
+
+@pytest.mark.first_cases(1)
+@pytest.mark.parametrize("model", ["three-25um-biaxial", "four-25um-biaxial"])
+def test_ten_thousand_noisy_presses_agree_with_onnxruntime(model, build):
+    metadata = load_model(find_model(model)).metadata
+    film = ForwardMap.build(load_sensor(metadata.frame_id), Circle(1.0), 8.0, (0.1, 2.0))
+    rng = np.random.default_rng(0)
+    r, angle = 7.9 * np.sqrt(rng.random(10_000)), 2 * np.pi * rng.random(10_000)
+    contact = np.column_stack([r * np.cos(angle), r * np.sin(angle), 0.1 * 20.0 ** rng.random(10_000)])
+    charge_pC = noise_model("reference").add(film.charges(contact), rng).astype(np.float32)
+    check_agreement(build(model).predict(charge_pC), answers(model, charge_pC))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_absurd_charges_are_finite_as_in_onnxruntime_and_nan_is_nan(model, build):
+    """Zeros, negative and huge charges, denormal numbers and infinities; the misfit there is the sinh of tens."""
+    exported = build(model)
+    values = (0.0, -1.0, -3e38, 1e-45, 1.0, 800.0, 1e6, 3e38, np.inf, -np.inf)
+    corners = np.array(list(itertools.product(values, repeat=exported.electrodes)), np.float32)[::7]
+    mine = exported.predict(corners)
+    assert np.isfinite(mine).all()
+    # The logarithms go far beyond any press there, and with them the exponentials: 4e-7 in tanh are 1e-4 here.
+    check_agreement(mine, answers(model, corners), 1e-3)
+    charge_pC = np.where(np.eye(exported.electrodes, dtype=bool), np.nan, 800.0)
+    assert np.isnan(exported.predict(charge_pC)).all()
+
+
+def perceptron(rng, *widths):
+    """A perceptron of random weights."""
+    layers = tuple(
+        (rng.standard_normal((a, b)) / np.sqrt(a), 0.3 * rng.standard_normal(b)) for a, b in itertools.pairwise(widths)
+    )
+    return PlainPerceptron(layers, 0.1 * rng.standard_normal((widths[0], widths[-1])))
+
+
+def random_network(electrodes, contact, misfit, *, int8=False):
+    """A network as ours are, of any widths and number of electrodes."""
+    rng = np.random.default_rng(0)
+    parts = [perceptron(rng, electrodes, *contact, 6), perceptron(rng, electrodes, *misfit, electrodes)]
+    units = np.diag([8.0, 8.0, *[1.0] * (4 + electrodes)]), np.zeros(6 + electrodes)
+    layers = FoldedLayers.of(parts, np.eye(electrodes), np.zeros(electrodes), units)
+    if int8:
+        first, (weights, bias) = layers.hidden
+        scale = np.abs(weights).max(axis=0) / 127.0
+        layers = replace(layers, hidden=(first, (np.round(weights / scale) * scale, bias)))
+    return FoldedNetwork(layers, np.full(electrodes, 512.0))
+
+
+def written(folder, network):
+    """A model folder of a network."""
+    names = tuple(f"E{number} */" for number in range(network.typical.size))
+    about = replace(load_model(find_model(MODELS[0])).metadata, name=folder.name, version=1, electrodes=names)
+    charges = np.random.default_rng(1).uniform(100.0, 3000.0, (64, len(names))).astype(np.float32)
+    return write_model(folder, export_onnx(network, about.to_props()), about, charges, "card")
+
+
+@pytest.mark.parametrize(
+    ("electrodes", "contact", "misfit", "int8", "arrays"),
+    [
+        (3, (32, 32), (24, 24), False, ["float layer_1_weights_0[1024]", "float layer_1_weights_1[576]"]),
+        (4, (5, 7), (9, 3), True, ["signed char layer_1_weights_0[35]", "signed char layer_1_weights_1[27]"]),
+        (5, (48, 48, 48), (33, 17, 8), False, ["float layer_2_weights_1[136]", "float last_weights_1[40]"]),
+        (8, (24,), (16,), False, ["float layer_0_weights_0[320]", "float last_weights_0[144]"]),
+    ],
+)
+def test_any_width_and_number_of_electrodes(electrodes, contact, misfit, int8, arrays, build, tmp_path):
+    """Against the network in double precision; zeros beside the two perceptrons are left out, 8 bits are a byte."""
+    network = random_network(electrodes, contact, misfit, int8=int8)
+    exported = build(written(tmp_path / "random", network))
+    charge_pC = np.random.default_rng(2).uniform(50.0, 5000.0, (500, electrodes)).astype(np.float32)
+    check_agreement(exported.predict(charge_pC), np.concatenate(network.predict(charge_pC.astype(float)), axis=1))
+    assert all(f"static const {array}" in exported.source for array in arrays)
+    assert ("signed char" in exported.source) == int8
+
+
+def test_differences_of_logarithms_reduce_the_rounding(build):
+    """The position in C is nearer to the graph in double precision than that of onnxruntime in single precision."""
+    folder = find_model("four-25um-uniaxial")
+    graph = onnx.load(folder / "model.onnx").graph
+    low, high, factor, w1, b1, w2, b2, w3, b3, skip, bias, last = (
+        numpy_helper.to_array(tensor).astype(float) for tensor in graph.initializer[:12]
+    )
+    rng = np.random.default_rng(0)
+    charge_pC = rng.uniform(0.7, 1.3, (20_000, len(factor))) * np.geomspace(60.0, 3000.0, 20_000)[:, np.newaxis]
+    charge_pC = charge_pC.astype(np.float32)
+    logs = np.log(np.clip(charge_pC.astype(float), low, high) * factor)
+    value = logs
+    for weight, shift in ((w1, b1), (w2, b2), (w3, b3)):
+        value = np.tanh(value @ weight + shift)
+    exact = (value @ last + logs @ skip + bias)[:, :2]
+    theirs = load_model(folder).session.run(["contact"], {"charge_pC": charge_pC})[0][:, :2]
+    mine = build("four-25um-uniaxial").predict(charge_pC)[:, :2]
+    error, others = (np.sqrt(np.mean((found - exact) ** 2)) for found in (mine, theirs))
+    assert error < 0.7 * others
+
+
+def changed(change):
+    """A graph of ours after a change."""
+    model = onnx.load_model_from_string(export_onnx(random_network(3, (8, 8), (8, 8)), {}))
+    change(model)
+    return model.SerializeToString()
+
+
+def relu(model):
+    model.graph.node[4].op_type = "Relu"
+
+
+def scaled(model):
+    model.graph.node[3].attribute.append(helper.make_attribute("alpha", 2.0))
+
+
+def rewired(model):
+    model.graph.node[5].input[0] = model.graph.node[3].output[0]
+
+
+def other_parts(model):
+    """y as a logarithm: every shape fits."""
+    sizes = [tensor for tensor in model.graph.initializer if tensor.data_type == onnx.TensorProto.INT64]
+    for tensor, values in zip(sizes, ([1, 5, 3], [2, 3]), strict=True):
+        tensor.CopyFrom(numpy_helper.from_array(np.array(values), tensor.name))
+
+
+def not_finite(model):
+    bias = model.graph.initializer[4]
+    bias.CopyFrom(numpy_helper.from_array(np.full(16, np.nan, np.float32), bias.name))
+
+
+def narrow(model):
+    bias = model.graph.initializer[4]
+    bias.CopyFrom(numpy_helper.from_array(np.zeros(1, np.float32), bias.name))
+
+
+def newer(model):
+    model.opset_import[0].version = 16
+
+
+def longer(model):
+    model.graph.node.append(helper.make_node("Exp", ["misfit"], ["more"]))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (relu, r"node Gemm \['t3'\]: expected|node Relu .*expected \('Tanh'"),
+        (scaled, "'alpha': 2.0"),
+        (rewired, "node Gemm"),
+        (other_parts, r"expected the outputs contact, contact_std, misfit from 2, 4 and 3 answers"),
+        (not_finite, "expected finite constants"),
+        (narrow, r"a bias for each column"),
+        (newer, "operators of version 17 alone, got {'': 16}"),
+        (longer, r"expected the outputs .*\['Exp'\]"),
+    ],
+)
+def test_a_graph_that_is_not_ours_is_refused_by_the_node(change, message):
+    read_network(changed(lambda _: None), "f")
+    with pytest.raises(ModelError, match=f"^f: .*({message}).*; this is not a graph of isocharge"):
+        read_network(changed(change), "f")
+
+
+def test_a_file_that_is_no_graph_is_refused():
+    with pytest.raises(ModelError, match="f: not a valid ONNX file"):
+        read_network(b"nonsense", "f")
