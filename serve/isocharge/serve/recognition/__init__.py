@@ -1,7 +1,5 @@
 """What a board sends, from its bytes alone: framing, checksum, fields, columns, number and clock.
 
-May import: frames.
-
 Bytes in, a table for the section `[frames]` of a device file out. Nothing is known beforehand; of several descriptions
 that fit, the one is taken in which the bytes need the fewest bits.
 """

@@ -46,20 +46,17 @@ class Windows:
         stream: All bytes, shape (n,).
         starts: Where windows begin, shape (frames,).
         length: Bytes in each.
-        turns: Bytes by which the begin of a frame may lie behind that of its window.
     """
 
     framing: str
     stream: Bytes
     starts: NDArray[np.int64]
     length: int
-    turns: tuple[int, ...] = (0,)
 
-    def rows(self, turn: int = 0, extra: int = 0) -> Bytes:
-        """The bytes of the windows from `turn` on, shape (frames, length + extra)."""
-        size = self.length + extra
-        starts = self.starts[self.starts + turn + size <= len(self.stream)] + turn
-        rows: Bytes = self.stream[starts[:, None] + np.arange(size)]
+    def rows(self, turn: int = 0) -> Bytes:
+        """The bytes of the windows from `turn` on, shape (frames, length)."""
+        starts = self.starts[self.starts + turn + self.length <= len(self.stream)] + turn
+        rows: Bytes = self.stream[starts[:, None] + np.arange(self.length)]
         return rows
 
 
@@ -117,7 +114,7 @@ def _synchronised(data: bytes) -> Iterator[Windows]:
         positions = np.flatnonzero((pairs if is_pair else stream) == code)
         follows = np.flatnonzero(np.diff(positions) == length)
         if len(follows) >= FEWEST - 1:
-            yield Windows(SYNC, stream, positions[follows].astype(np.int64), length, tuple(range(length)))
+            yield Windows(SYNC, stream, positions[follows].astype(np.int64), length)
 
 
 def _coverages(codes: NDArray[np.int64]) -> Iterator[tuple[int, int, float]]:

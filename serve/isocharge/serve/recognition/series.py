@@ -16,12 +16,23 @@ COUNTING_SHARE = 0.9
 CLOCK_SPREAD = (0.3, 1.7)
 """Smallest and largest usual step of a clock, in its median step."""
 
+UNITS_HZ = {"t_s": 1.0, "t_ms": 1e3, "t_us": 1e6}
+"""Ticks per second of a clock by the name of its field, Hz."""
+
+USUAL_HZ = (100.0, 1e4, 1e5, 1024.0, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6)
+"""Other rates at which clocks of boards tick, Hz."""
+
+TOLERANCE = 0.06
+"""Largest relative difference of a clock's rate from a usual one, dimensionless: frames arrive in bursts."""
+
 BITS_OF_SIGN = 1.5
 """What a value that varies needs besides the size of its steps, bits: sign and fraction."""
 
 PLAUSIBLE = (1e-7, 1e8)
 """Smallest and largest magnitude of a plausible floating-point value other than 0."""
 
+PLAUSIBLE_SHARE = 0.95
+"""Share of values that are plausible, dimensionless: some may be damaged."""
 
 LEAST_NOISE = 1e-5
 """Smallest step of a floating-point value that varies, in its magnitude, dimensionless: converters have 20 bits."""
@@ -29,12 +40,9 @@ LEAST_NOISE = 1e-5
 
 def steps(values: Series, bits: int) -> Series:
     """Steps of an unsigned counter of some bits, taken over its wraps, shape (n - 1,), int64; up to half its range."""
-    modulus = 1 << bits
-    if bits == 64:
-        return np.diff(values.astype(np.uint64)).astype(np.int64)
+    half = 1 << (bits - 1)
     difference: Series = np.diff(values.astype(np.int64))
-    wrapped = difference % modulus
-    return np.where(wrapped >= modulus // 2, wrapped - modulus, wrapped)
+    return (difference + half) % (2 * half) - half
 
 
 def is_counter(step: Series) -> bool:
@@ -51,6 +59,22 @@ def clock_step(step: Series) -> float | None:
     return float(step[usual].mean()) if float(np.mean(usual)) >= COUNTING_SHARE else None
 
 
+def clock_of(step: Series, rate_Hz: float) -> tuple[str, float] | None:
+    """The name of a clock's field, and the value of one tick in the unit that the name says; None if it is no clock.
+
+    Args:
+        step: From frame to frame, shape (n,).
+        rate_Hz: Frames per second, Hz.
+    """
+    if (ticks := clock_step(step)) is None:
+        return None
+    for name, unit_Hz in UNITS_HZ.items():
+        if abs(ticks * rate_Hz / unit_Hz - 1.0) < TOLERANCE:
+            return name, 1.0
+    usual = (usual_Hz for usual_Hz in USUAL_HZ if abs(ticks * rate_Hz / usual_Hz - 1.0) < TOLERANCE)
+    return next((("t_us", UNITS_HZ["t_us"] / usual_Hz) for usual_Hz in usual), None)
+
+
 def bits_of_steps(step: Series) -> float:
     """Mean number of bits that steps need; 0 for a constant."""
     if not step.any():
@@ -59,7 +83,7 @@ def bits_of_steps(step: Series) -> float:
 
 
 def bits_of_floats(values: Series, integers: Series, mantissa: int) -> float | None:
-    """Mean number of bits that floating-point values need; None if they are not plausible.
+    """Mean number of bits that floating-point values need; None if too many are not plausible.
 
     Args:
         values: The values, shape (n,).
@@ -69,14 +93,16 @@ def bits_of_floats(values: Series, integers: Series, mantissa: int) -> float | N
     low, high = PLAUSIBLE
     with np.errstate(invalid="ignore"):
         magnitude = np.abs(values.astype(float))
-        if not np.all(np.isfinite(magnitude) & ((magnitude == 0) | ((magnitude > low) & (magnitude < high)))):
-            return None
+    plausible = (magnitude == 0) | ((magnitude > low) & (magnitude < high))
+    if float(np.mean(plausible)) < PLAUSIBLE_SHARE:
+        return None
+    values, integers, magnitude = values[plausible], integers[plausible], magnitude[plausible]
     used = int(np.bitwise_or.reduce(integers)) & ((1 << mantissa) - 1)
     zeros = min(mantissa - 1, (used & -used).bit_length() - 1 if used else mantissa)  # values that came from few bits
     typical = float(np.median(magnitude)) or float(magnitude.max())
     quantum = typical * 2.0 ** (zeros - mantissa) or 1.0
     step = np.diff(values.astype(float))
-    if step.any() and float(np.abs(step).mean()) < LEAST_NOISE * typical:
+    if step.any() and float(np.median(np.abs(step))) < LEAST_NOISE * typical:
         return None
     return bits_of_steps(step / quantum)
 

@@ -1,0 +1,230 @@
+"""Which bytes of a frame are its sync, its number, its clock and its channels.
+
+Every way to part the bytes into fields has a score, in bits: what the steps of its values need, and `Weights` for what
+each part is. The lowest score wins: of two ways that explain the bytes alike the simpler one, above all channels of one
+type side by side. `tests/benchmarks/fit_recognition.py` fits the weights on random boards.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cache
+
+import numpy as np
+
+from isocharge.serve.frames.frame_layout import ByteOrder
+from isocharge.serve.recognition.framing import Bytes
+from isocharge.serve.recognition.series import Series, bits_of_floats, bits_of_steps, clock_of, is_counter, steps
+
+FLOATS = {4: ("f4", "i4", 24), 8: ("f8", "i8", 53)}
+"""Floating-point values by size: NumPy's letters for them and for integers of that size, bits of the fraction."""
+
+CONSTANT_SHARE = 0.98
+"""Share of frames in which a constant byte has its value, dimensionless: some may be damaged."""
+
+LONGEST_SYNC = 6
+"""Longest sync, bytes: what follows may be constant for a while only."""
+
+DULL = (0x00, 0x80, 0xFF)
+"""Bytes that are often the high ones of a number, and seldom of a sync."""
+
+CLOCK_RESOLUTION = 1e-3
+"""Finest jitter of a floating-point clock that counts, in its step."""
+
+FULL_RANGE_BITS = 1.3
+"""Values that need more bits than their size less this fill their range: noise or a checksum."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What a part of a frame adds to the score, bits.
+
+    Attributes:
+        row: A row of channels of one type.
+        channel: A channel, besides the bits of its steps.
+        dead: A channel that never varies, in a row with others.
+        level: A bit of a channel's distance from zero.
+        counter: A number or a clock.
+        sync: A byte of the sync.
+        unusual: Something that boards seldom have: a sync of one byte, or with a byte that is dull; a clock of three
+            bytes, for each of them; a number whose high half stands still and is not 0; two byte orders.
+        constant: A byte that is always the same and nothing else.
+        noise: A byte that varies and is nothing else; a byte of the stream outside all frames.
+        float_byte: Taken off for a byte of a floating-point number: few other bytes are plausible ones.
+        check_byte: Taken off for a byte of the checksum.
+        no_check: Frames without a checksum.
+    """
+
+    row: float = 1.5
+    channel: float = 0.15
+    dead: float = 1.0
+    level: float = 0.03
+    counter: float = 0.2
+    sync: float = 0.05
+    unusual: float = 0.8
+    constant: float = 0.4
+    noise: float = 8.3
+    float_byte: float = 0.6
+    check_byte: float = 1.0
+    no_check: float = 4.0
+
+
+class Role(StrEnum):
+    """What a part of a frame is."""
+
+    sync = "sync"
+    pad = "pad"
+    seq = "seq"
+    clock = "clock"
+    channel = "channel"
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a frame.
+
+    Attributes:
+        role: What it is.
+        at, size: Its first byte, and its bytes.
+        score: What it adds, bits, without the row that a channel may begin.
+        is_float: Whether it is a floating-point number.
+        is_dead: Whether it is a channel that never varies.
+    """
+
+    role: Role
+    at: int
+    size: int
+    score: float = 0.0
+    is_float: bool = False
+    is_dead: bool = False
+
+    @property
+    def row(self) -> tuple[int, bool] | None:
+        """What channels of one row have in common; None for other parts."""
+        return (self.size, self.is_float) if self.role is Role.channel else None
+
+
+@dataclass(frozen=True)
+class Split:
+    """A frame in parts, and its score in bits."""
+
+    score: float
+    parts: tuple[Part, ...]
+    order: ByteOrder
+
+
+def number_values(rows: Bytes, part: Part, order: ByteOrder) -> Series:
+    """The numbers of a part in all frames, unsigned unless floating-point, shape (n,)."""
+    cut = np.ascontiguousarray(rows[:, part.at : part.at + part.size])
+    if part.is_float:
+        return cut.view(("<" if order == "little" else ">") + FLOATS[part.size][0])[:, 0]
+    powers = 256 ** np.arange(part.size, dtype=np.int64)
+    values: Series = cut @ (powers if order == "little" else powers[::-1])
+    return values
+
+
+def split_frame(
+    rows: Bytes, end: int, rate_Hz: float, weights: Weights, *, needs_sync: bool, order: ByteOrder | None = None
+) -> Split | None:
+    """The way to part frames with the lowest score, of both byte orders; None if they cannot be parted.
+
+    Args:
+        rows: Frames from their first byte on, shape (n, length).
+        end: Bytes before the checksum.
+        rate_Hz: Frames per second, Hz; a clock ticks at a usual rate.
+        weights: Of the score.
+        needs_sync: Whether a frame has to begin with a constant byte.
+        order: The byte order of the checksum.
+    """
+    usual = np.array([np.bincount(column, minlength=256).argmax() for column in rows[:, :end].T], np.uint8)
+    constant = (rows[:, :end] == usual).mean(axis=0) >= CONSTANT_SHARE
+    begins = dict(_syncs(usual, constant, weights)) if needs_sync else {0: 0.0}
+    best: Split | None = None
+    for way in ("little", "big"):
+        fields = [list(_fields_at(rows, at, end, way, rate_Hz, constant, weights)) for at in range(end)]
+        for begin, score in begins.items():
+            tail, parts = _cheapest(fields, begin, weights)
+            score += tail + weights.unusual * (order not in (None, way))
+            if best is None or score < best.score:
+                best = Split(score, (Part(Role.sync, 0, begin), *parts)[not begin :], way)
+    return best
+
+
+def _syncs(usual: Bytes, constant: Series, weights: Weights) -> Iterator[tuple[int, float]]:
+    """(length of a sync, its score)."""
+    score = 0.0
+    for size, (is_constant, byte) in enumerate(zip(constant, usual.tolist(), strict=True), start=1):
+        if not is_constant or size > LONGEST_SYNC:
+            return
+        score += weights.sync + weights.unusual * (byte in DULL)
+        yield size, score + weights.unusual * (size == 1)
+
+
+def _cheapest(fields: list[list[Part]], begin: int, weights: Weights) -> tuple[float, tuple[Part, ...]]:
+    """The lowest score of the bytes from one on, and their parts."""
+
+    @cache
+    def lowest(at: int, row: tuple[int, bool] | None) -> tuple[float, Part | None]:
+        """The score from a byte on, after a channel of a row, and the part that begins there."""
+        if at == len(fields):
+            return 0.0, None
+        options = [
+            (part.score + weights.row * (part.row not in (None, row)) + lowest(at + part.size, part.row)[0], part)
+            for part in fields[at]
+            if part.row == row or not part.is_dead
+        ]
+        return min(options, key=lambda option: option[0])
+
+    score, part = lowest(begin, None)
+    parts: list[Part] = []
+    while part is not None:
+        parts.append(part)
+        _, part = lowest(part.at + part.size, part.row)
+    return score, tuple(parts)
+
+
+def _fields_at(
+    rows: Bytes, at: int, end: int, order: ByteOrder, rate_Hz: float, constant: Series, weights: Weights
+) -> Iterator[Part]:
+    """The numbers, clocks and channels that may begin at a byte; the byte alone, without a meaning, first."""
+    yield Part(Role.pad, at, 1, weights.constant if constant[at] else weights.noise)
+    for size in range(1, min(4, end - at) + 1):
+        values = number_values(rows, Part(Role.channel, at, size), order)
+        step, half = steps(values, 8 * size), 4 * size
+        stands = int(values.min()) >> half == int(values.max()) >> half != 0
+        unusual = weights.counter + weights.unusual * ((size == 4 and stands) + 3 * (size == 3))
+        if is_counter(step):
+            yield Part(Role.seq, at, size, unusual)
+        elif size > 1 and clock_of(step, rate_Hz) is not None:
+            yield Part(Role.clock, at, size, unusual + bits_of_steps(step - float(np.median(step))))
+        if constant[at : at + size].all():
+            yield Part(Role.channel, at, size, weights.dead + weights.channel, is_dead=True)
+        elif (bits := bits_of_steps(step) + weights.level * _level(values, size)) <= 8 * size - FULL_RANGE_BITS:
+            yield Part(Role.channel, at, size, bits + weights.channel)
+    for size in FLOATS:
+        if at + size <= end:
+            yield from _float_at(rows, at, size, order, rate_Hz, weights)
+
+
+def _level(values: Series, size: int) -> float:
+    """Bits of a channel's distance from zero, of integers with a sign, without, or offset by half."""
+    level, half = float(np.median(values)), float(1 << (8 * size - 1))
+    return float(np.log2(1.0 + min(level, abs(level - half), 2.0 * half - level)))
+
+
+def _float_at(rows: Bytes, at: int, size: int, order: ByteOrder, rate_Hz: float, weights: Weights) -> Iterator[Part]:
+    values = number_values(rows, Part(Role.channel, at, size, is_float=True), order)
+    _, letter, mantissa = FLOATS[size]
+    bits = bits_of_floats(values, np.ascontiguousarray(values).view(values.dtype.byteorder + letter), mantissa)
+    if bits is None:
+        return
+    step = np.diff(values.astype(float))
+    if not step.any():
+        yield Part(Role.channel, at, size, weights.dead + weights.channel, is_float=True, is_dead=True)
+        return
+    if (clock := clock_of(step, rate_Hz)) is not None and clock[1] == 1.0:
+        typical = float(np.median(step))
+        jitter = bits_of_steps((step - typical) / (CLOCK_RESOLUTION * typical))
+        yield Part(Role.clock, at, size, weights.counter + jitter, is_float=True)
+    score = max(1.0, bits - weights.float_byte * size) + weights.channel
+    yield Part(Role.channel, at, size, score, is_float=True)
