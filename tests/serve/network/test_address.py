@@ -93,15 +93,14 @@ def test_places_that_are_taken(handler, start_http, tmp_path):
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
 def test_other_machines_need_a_token(host):
-    with pytest.raises(InputError, match=f"--host {host} lets other machines in: give --token TOKEN"):
-        check_exposure(Address(host), token=False, insecure=False)
-    check_exposure(Address(host), token=True, insecure=False)
-    check_exposure(Address(host), token=False, insecure=True)
+    with pytest.raises(InputError, match=f"{host} lets other machines in: give --token TOKEN"):
+        check_exposure(Address(host), has_token=False)
+    check_exposure(Address(host), has_token=True)
 
 
 @pytest.mark.parametrize("address", [Address(), Address("127.0.0.2"), Address("::1"), Address("localhost")])
 def test_this_machine_needs_none(address):
-    check_exposure(address, token=False, insecure=False)
+    check_exposure(address, has_token=False)
 
 
 def test_a_file_in_the_place_of_the_socket_stays(handler, tmp_path):

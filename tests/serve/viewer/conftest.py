@@ -13,28 +13,27 @@ from isocharge.serve.network.address import Address
 from isocharge.serve.viewer.description import describe_film
 from isocharge.serve.viewer.link import make_link
 from isocharge.serve.viewer.messages import HEADER
-from isocharge.serve.viewer.sample import SampleFormat
-from isocharge.serve.viewer.server import FilmLink, PageSettings, run_page
+from isocharge.serve.viewer.process import Page, run_page
+from isocharge.serve.viewer.samples import SampleFormat
 
 NAMES = ("A", "B", "C")
 
 
-class Page:
-    """A running page with one film or several.
+class RunningPage:
+    """A running page.
 
     Attributes:
-        readers: The readers' ends of the links.
+        reader: The reader's end of the link.
         url: Of the page.
         form: Of the samples.
     """
 
-    def __init__(self, metadata, films, **settings):
+    def __init__(self, metadata, **settings):
         self.form = SampleFormat(NAMES)
-        ends = [make_link() for _ in range(films)]
-        self.readers = [reader for reader, _ in ends]
-        links = [FilmLink(page, describe_film(f"film {k}", metadata, None)) for k, (_, page) in enumerate(ends)]
+        self.reader, end = make_link()
+        page = Page(end, describe_film("a film", metadata, None), Address(), **settings)
         self.url, self._listens = "", Event()
-        self._thread = Thread(target=run_page, args=(links, PageSettings(Address(), **settings), self._announce))
+        self._thread = Thread(target=run_page, args=(page, self._announce))
         self._thread.start()
         assert self._listens.wait(20)
 
@@ -52,8 +51,7 @@ class Page:
             return answer.status, answer.headers, answer.read()
 
     def stop(self):
-        for reader in self.readers:
-            reader.close()
+        self.reader.close()
         self._thread.join(timeout=20)
         assert not self._thread.is_alive()
 
@@ -63,8 +61,8 @@ def start_page(film):
     """Start pages; they are stopped when the test ends."""
     started = []
 
-    def start(films=1, **settings):
-        started.append(Page(film.metadata(), films, **settings))
+    def start(**settings):
+        started.append(RunningPage(film.metadata(), **settings))
         return started[-1]
 
     yield start

@@ -3,6 +3,7 @@
 import time
 
 from isocharge.serve.viewer.link import make_link
+from isocharge.serve.viewer.messages import Marker, Tare
 
 SAMPLE = bytes(range(64))
 
@@ -37,8 +38,8 @@ def test_a_reader_does_not_wait_for_a_page_that_takes_nothing():
 
 def test_requests_and_the_end():
     reader, page = make_link()
-    assert page.ask(do="tare")
-    assert reader.request() == {"do": "tare"}
+    assert page.ask(Marker("here"))
+    assert reader.request() == Marker("here")
     page.close_here()
     assert reader.request() is None
     reader.put(SAMPLE)
@@ -54,5 +55,5 @@ def test_the_page_sees_the_reader_end():
     assert page.take(64) == SAMPLE
     assert page.take(64) == b""
     assert not page.is_open
-    assert not page.ask(do="tare")
+    assert not page.ask(Tare())
     page.close_here()

@@ -7,32 +7,41 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from isocharge.common.errors import RequestError
-from isocharge.serve.viewer.messages import LIVE_ACTIONS, REPLAY_ACTIONS, PageRequest, confirmed_number, parse_request
+from isocharge.common.structs import parse_json
+from isocharge.serve.viewer.messages import (
+    LiveRequest,
+    Marker,
+    Record,
+    ReplayRequest,
+    Seek,
+    Speed,
+    Tare,
+    confirmed_number,
+)
 
-ACTIONS = LIVE_ACTIONS + REPLAY_ACTIONS
+
+def parse(text, kind=LiveRequest | ReplayRequest):
+    return parse_json(text, "", RequestError, kind)
 
 
 @pytest.mark.parametrize(
     ("text", "request_"),
     [
-        ('{"do": "tare"}', PageRequest("tare", 0)),
-        ('{"do": "record", "film": 1, "on": true}', PageRequest("record", 1, is_on=True)),
-        ('{"do": "marker", "text": "here"}', PageRequest("marker", 0, text="here")),
-        ('{"do": "seek", "value": 12.5}', PageRequest("seek", 0, value=12.5)),
-        ('{"do": "speed", "value": 24}', PageRequest("speed", 0, value=24.0)),
+        ('{"do": "tare"}', Tare()),
+        ('{"do": "record", "on": true}', Record(on=True)),
+        ('{"do": "marker", "text": "here"}', Marker("here")),
+        ('{"do": "seek", "value": 12.5}', Seek(12.5)),
+        ('{"do": "speed", "value": 24}', Speed(24.0)),
     ],
 )
 def test_requests_are_read(text, request_):
-    assert parse_request(text, ACTIONS, 2) == request_
+    assert parse(text) == request_
 
 
 @pytest.mark.parametrize(
     "content",
     [
         {"do": "shutdown"},
-        {"do": "tare", "film": 2},
-        {"do": "tare", "film": -1},
-        {"do": "tare", "film": 0.5},
         {"do": "record"},
         {"do": "record", "on": 1},
         {"do": "marker", "text": "x" * 81},
@@ -47,12 +56,12 @@ def test_requests_are_read(text, request_):
 )
 def test_other_requests_are_refused(content):
     with pytest.raises(RequestError):
-        parse_request(json.dumps(content), ACTIONS, 2)
+        parse(json.dumps(content))
 
 
 def test_a_live_page_does_not_seek():
     with pytest.raises(RequestError, match="one of tare, record, marker"):
-        parse_request('{"do": "seek", "value": 1}', LIVE_ACTIONS, 1)
+        parse('{"do": "seek", "value": 1}', LiveRequest)
 
 
 @given(st.text() | st.recursive(st.none() | st.text() | st.floats(), st.lists, max_leaves=5).map(json.dumps))
@@ -61,7 +70,7 @@ def test_a_live_page_does_not_seek():
 @example('{"do": "seek", "value": 1' + "0" * 4000 + "}")
 def test_no_text_breaks_it(text):
     with pytest.raises(RequestError):
-        parse_request(text, ACTIONS, 1)
+        parse(text)
 
 
 def test_confirmations_have_four_bytes():

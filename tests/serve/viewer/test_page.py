@@ -12,26 +12,17 @@ import pytest
 
 from isocharge.common.deflection_field import points_mm, read_deflection_field
 from isocharge.serve.viewer.messages import samples_message
-from isocharge.serve.viewer.sample import SampleFormat
+from isocharge.serve.viewer.samples import SampleFormat
 
 VIEWER = Path(str(files("isocharge.serve.viewer")))
 FILES = [path for folder in ("page", "fields") for path in (VIEWER / folder).rglob("*") if path.is_file()]
 OWN = [path for path in FILES if "vendor" not in path.parts and path.suffix in (".js", ".html", ".css")]
 
 
-def test_all_parts_together_are_small():
-    assert sum(path.stat().st_size for path in FILES) <= 150_000
-
-
 @pytest.mark.parametrize("path", OWN, ids=lambda path: path.name)
 def test_nothing_is_fetched_from_elsewhere(path):
     text = path.read_text("utf-8").replace("http://www.w3.org", "")
     assert not re.search(r"https?://|//[a-z]+\.[a-z]|@import|url\([\"']", text)
-
-
-def test_the_licence_is_beside_what_it_is_for():
-    assert "MIT License" in (VIEWER / "page/vendor/uPlot.LICENSE").read_text("utf-8")
-    assert "uPlot" in (VIEWER / "page/vendor/uPlot.iife.min.js").read_text("utf-8")[:200]
 
 
 def node(script):
@@ -51,12 +42,12 @@ def test_the_page_reads_what_the_server_writes(record):
         "latency_us": 9.0,
     }
     data = form.pack(record(**changes)) + form.pack(record(contact=False, x_mm=None, flags=()))
-    message = samples_message(0, 77, 123.5, np.frombuffer(data, form.dtype), 4, begin_anew=True)
+    message = samples_message(77, 123.5, np.frombuffer(data, form.dtype), 4, begin_anew=True)
     got = node(
         f"""import {{ decode }} from "{(VIEWER / "page/decode.js").as_uri()}";
         const bytes = Uint8Array.from([{",".join(map(str, message))}]);
-        console.log(JSON.stringify([decode(bytes.buffer, () => 3), decode(bytes.buffer.slice(0, 90), () => 3),
-          decode(new ArrayBuffer(3), () => 3), decode(bytes.buffer, () => undefined)]));"""
+        console.log(JSON.stringify([decode(bytes.buffer, 3), decode(bytes.buffer.slice(0, 90), 3),
+          decode(new ArrayBuffer(3), 3), decode(bytes.buffer, 6)]));"""
     )
     whole, *broken = got
     assert broken == [None, None, None]

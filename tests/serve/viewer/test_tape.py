@@ -5,7 +5,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from isocharge.serve.viewer.sample import SampleFormat
+from isocharge.serve.viewer.samples import SampleFormat
 from isocharge.serve.viewer.tape import PIECES, LiveTape, RecordedTape
 
 FORM = SampleFormat(("A",))

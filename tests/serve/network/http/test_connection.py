@@ -3,11 +3,10 @@
 import asyncio
 
 import pytest
-import uvicorn
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve.network.http.connection import bounded
+from isocharge.serve.network.http.connection import Connection
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol.response import response_of
 
@@ -18,9 +17,6 @@ class Echo:
     """Answers with what it was asked."""
 
     def blocks(self, _path):
-        return False
-
-    def has_websocket(self, _path):
         return False
 
     def answer(self, method, path, headers, body, _client=None):
@@ -81,18 +77,14 @@ REQUESTS = st.builds(
 def connect():
     """A function that gives a fresh connection and its wire."""
     with asyncio.Runner() as runner:
-        loop = runner.get_loop()
-        config = uvicorn.Config(Echo(), ws="none", lifespan="off", log_config=None)
-        config.load()
-        state = uvicorn.server.ServerState()
 
-        def make():
-            protocol = bounded(Echo(), ServerLimits())(config, state, {}, loop)
+        def start():
+            connection = Connection(Echo(), ServerLimits(), set(), runner.get_loop())
             wire = Wire()
-            protocol.connection_made(wire)
-            return protocol, wire
+            connection.connection_made(wire)
+            return connection, wire
 
-        yield make
+        yield start
 
 
 def answers(connect, pieces):
@@ -146,26 +138,32 @@ def test_blank_lines_are_no_requests(connect, blank):
     assert sent.count(b"HTTP/1.1 200") == 1
 
 
-def test_a_head_is_parsed_once(connect, monkeypatch):
-    protocol, wire = connect()
-    protocol.data_received(INNER)
-    monkeypatch.setattr(protocol, "parser", ParsedAlready(protocol.parser))
-    protocol.data_received(INNER.replace(b"abc", b"xyz"))
-    assert b"b'abc'" in wire.sent
-    assert b"b'xyz'" in wire.sent
+def test_trailers_are_no_headers(connect):
+    """Of a request that is answered, and of the next one."""
+    trailed = (
+        b"POST /one HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n3\r\nabc\r\n0\r\nHost: y\r\nA: b\r\n\r\n"
+    )
+    sent, _ = answers(connect, [trailed, INNER])
+    assert sent.count(b"HTTP/1.1 200") == 2
+    assert b"b'y'" not in sent
+    assert b"b'a'" not in sent
 
 
-@pytest.mark.parametrize("other", [INNER.replace(b"/one", b"/two"), INNER.replace(b"POST", b"HEAD"), INNER + b" "])
-def test_another_head_is_parsed(connect, monkeypatch, other):
-    protocol, _ = connect()
-    protocol.data_received(INNER)
-    monkeypatch.setattr(protocol, "parser", ParsedAlready(protocol.parser))
-    with pytest.raises(AttributeError):
-        protocol.data_received(other)
+TRAILED = b"POST /one HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n3\r\nabc\r\n"
 
 
-class ParsedAlready:
-    """A parser that cannot parse."""
+@pytest.mark.parametrize(
+    "endless",
+    [TRAILED + b"0\r\n" + b"a: b\r\n" * 9000, TRAILED + b"0\r\na: " + b"b" * 50_000, TRAILED + b"1;" + b"x" * 50_000],
+    ids=["trailers", "one trailer", "chunk extension"],
+)
+@pytest.mark.parametrize("piece", [1, 100, 4096, 1 << 20])
+def test_what_goes_with_a_body_is_bounded_as_headers(connect, endless, piece):
+    sent, closed = answers(connect, [endless[at : at + piece] for at in range(0, len(endless), piece)])
+    assert (sent[:12], closed) == (b"HTTP/1.1 431", True)
 
-    def __init__(self, parser):
-        self.get_method, self.should_keep_alive = parser.get_method, parser.should_keep_alive
+
+def test_many_small_chunks_are_a_body(connect):
+    data = TRAILED[: TRAILED.index(b"3\r\n")] + b"1\r\nx\r\n" * 20_000 + b"0\r\n\r\n"
+    sent, _ = answers(connect, [data[at : at + 4096] for at in range(0, len(data), 4096)])
+    assert b"x" * 20_000 in sent

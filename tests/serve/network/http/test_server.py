@@ -1,6 +1,5 @@
 """The HTTP server on real sockets: bounds, slow and rude clients, token, TLS, Unix socket, a graceful stop."""
 
-import asyncio
 import http.client
 import json
 import os
@@ -8,7 +7,7 @@ import socket
 import ssl
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from threading import Event, Thread
 
@@ -252,6 +251,19 @@ def test_a_client_that_hangs_up_in_the_middle(server):
     assert post(server)[0] == 200
 
 
+@pytest.mark.parametrize("token", [None, Token("open sesame")])
+def test_trailers_without_end(store, start_http, token):
+    """They are refused as headers are, before any token is looked at, and cost no memory."""
+    server = start_http(Handler(store), token=token)
+    head = b"POST %s HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\n" % INFER.encode()
+    for endless in (b"a: b\r\n", b"a: " + b"b" * 1000):
+        with connect(server) as connection:
+            with suppress(OSError):
+                connection.sendall(head + endless * (10_000_000 // len(endless)))
+            with suppress(ConnectionResetError):
+                assert refused(everything(connection))[0] == 431
+
+
 def test_a_token(store, start_http):
     server = start_http(Handler(store), token=Token("open sesame"))
     assert post(server, Authorization="Bearer open sesame")[0] == 200
@@ -355,45 +367,6 @@ def test_stopping_waits_for_a_request_that_has_begun(handler):
     server.close()
     assert data.startswith(b"HTTP/1.1 200")
     assert b"connection: close" in data
-
-
-async def through_asgi(app, method, path, messages):
-    """What an ASGI application sends in answer to a request that comes in these messages."""
-    sent, coming = [], iter(messages)
-
-    async def receive():
-        return next(coming)
-
-    async def send(message):
-        sent.append(message)
-
-    await app({"type": "http", "method": method, "path": path, "headers": []}, receive, send)
-    return sent
-
-
-def pieces(*bodies, last=True):
-    return [
-        {"type": "http.request", "body": body, "more_body": number < len(bodies) or not last}
-        for number, body in enumerate(bodies, start=1)
-    ]
-
-
-def test_as_an_asgi_application(store):
-    """Any ASGI server may run it; a body may come in pieces, never end, or break off."""
-    app = App(Handler(store, ServerLimits(body_bytes=1000)), Token("a"))
-    ready, body = asyncio.run(through_asgi(app, "GET", "/v2/health/ready", pieces(b"")))
-    assert (ready["status"], body["body"]) == (200, b'{"ready":true}')
-    start, _ = asyncio.run(through_asgi(app, "GET", "/v2", pieces(b"")))
-    assert start["status"] == 401
-    app = App(Handler(store, ServerLimits(body_bytes=1000)))
-    start, body = asyncio.run(through_asgi(app, "POST", INFER, pieces(BODY[:9], BODY[9:20], BODY[20:])))
-    assert (start["status"], json.loads(body["body"])["model_name"]) == (200, "linear")
-    start, _ = asyncio.run(through_asgi(app, "POST", INFER, pieces(*[bytes(300)] * 9, last=False)))
-    assert (start["status"], (b"connection", b"close") in start["headers"]) == (413, True)
-    broken = [*pieces(b"{", last=False), {"type": "http.disconnect"}]
-    assert asyncio.run(through_asgi(app, "POST", INFER, broken)) == []
-    load = "/v2/repository/models/linear/load"
-    assert asyncio.run(through_asgi(app, "POST", load, pieces(b"")))[1]["body"] == b"{}"
 
 
 def test_a_load_holds_nobody_up(server, store, monkeypatch):
