@@ -29,7 +29,7 @@ from isocharge.serve.virtual_sensor.script import read_script
 from isocharge.simulate import Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
-from isocharge.train.training.checkpoint import Checkpoint
+from isocharge.train.training.descent import tensors
 from isocharge.train.training.config import load_config
 
 ROOT = Path(__file__).parents[2]
@@ -319,7 +319,7 @@ def test_parts_of_runs_with_faults(tmp_path, attack, faults):
 
         def read_state(data):
             run.save("weights", data)
-            Checkpoint(run).load("weights")
+            run.load_as("weights", tensors)
 
         attack("files part", read_array, lambda rng: mutated(rng, array.getvalue()), 2_000)
         attack("files checkpoint", read_state, lambda rng: mutated(rng, state.getvalue()), 2_000)

@@ -10,11 +10,11 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Polygon, Sweep
 from isocharge.simulate.numerics.disk import lattice
 
-PROBES = (Circle(1e-3), Polygon.rectangle(4e-3, 2e-3), Polygon.triangle(4e-3))
+PROBES = (Circle(1.0), Polygon.rectangle(4.0, 2.0), Polygon.triangle(4.0))
 
 sweeps = st.builds(
     Sweep,
-    radius=st.floats(1e-4, 4e-2),
+    radius=st.floats(0.1, 40.0),
     force_range=st.tuples(st.floats(1e-5, 10.0), st.floats(1e-5, 10.0)).map(lambda pair: (min(pair), max(pair))),
     samples=st.integers(3, 700),
     seed=st.integers(0, 2**40),
@@ -29,15 +29,12 @@ def test_every_press_is_inside_and_the_count_is_right(sweep, count):
     probes = PROBES[:count]
     presses = sweep.over(probes)
     low, high = sweep.force_range
-    assert np.hypot(presses.x, presses.y).max() <= sweep.radius * (1.0 + 1e-15)
-    assert presses.force.min() >= low
-    assert presses.force.max() <= high
-    assert presses.turn.min() >= 0.0
-    assert presses.turn.max() < 2.0 * np.pi
-    assert sweep.orientation == "random" or not presses.turn.any()
-    assert {len(column) for column in (presses.probe, presses.x, presses.y, presses.force, presses.turn)} == {
-        len(presses)
-    }
+    x, y, force = presses.contact.T
+    assert np.hypot(x, y).max() <= sweep.radius * (1.0 + 1e-15)
+    assert low <= force.min() <= force.max() <= high
+    assert 0.0 <= presses.rotation.min() <= presses.rotation.max() < 2.0 * np.pi
+    assert sweep.orientation == "random" or not presses.rotation.any()
+    assert len(presses) == len(presses.contact) == len(presses.rotation)
     per_probe = np.bincount(presses.probe, minlength=count)
     if sweep.sampling == "grid":
         assert np.all(per_probe <= sweep.samples // count)
@@ -57,8 +54,8 @@ def test_the_same_sweep_draws_the_same_presses(sweep):
 @pytest.mark.parametrize("sampling", ["sobol", "random"])
 def test_presses_are_uniform_over_the_disk(sampling):
     """The square of the distance and the angle are uniform, and independent of each other."""
-    x, y, _, _ = Sweep(samples=4000, seed=1, sampling=sampling).presses()
-    squared, angle = (x**2 + y**2) / 8e-3**2, np.arctan2(y, x)
+    x, y, _ = Sweep(samples=4000, seed=1, sampling=sampling).contacts().T
+    squared, angle = (x**2 + y**2) / 64.0, np.arctan2(y, x)
     assert stats.kstest(squared, "uniform").pvalue > 0.05
     assert stats.kstest(angle, "uniform", args=(-np.pi, 2 * np.pi)).pvalue > 0.05
     counts = np.histogram2d(squared, angle, bins=(8, 8))[0]
@@ -67,13 +64,15 @@ def test_presses_are_uniform_over_the_disk(sampling):
 
 @pytest.mark.parametrize("sampling", ["sobol", "random"])
 def test_forces_are_uniform_in_the_logarithm(sampling):
-    _, _, force, _ = Sweep(samples=4000, seed=2, force_range=(0.05, 2.0), sampling=sampling).presses()
+    force = Sweep(samples=4000, seed=2, force_range=(0.05, 2.0), sampling=sampling).contacts()[:, 2]
     assert stats.kstest(np.log(force), "uniform", args=(np.log(0.05), np.log(40.0))).pvalue > 0.05
 
 
-def test_force_place_and_turn_are_independent():
-    x, y, force, turn = Sweep(samples=4000, seed=3, orientation="random").presses()
-    correlation = np.corrcoef([x, y, np.hypot(x, y), np.log(force), turn])
+def test_force_place_and_rotation_are_independent():
+    presses = Sweep(samples=4000, seed=3, orientation="random").over(PROBES[:1])
+    x, y, force = presses.contact.T
+    assert stats.kstest(presses.rotation, "uniform", args=(0.0, 2 * np.pi)).pvalue > 0.05
+    correlation = np.corrcoef([x, y, np.hypot(x, y), np.log(force), presses.rotation])
     assert np.abs(np.triu(correlation, 1)[:, 3:]).max() < 0.05
 
 
@@ -83,61 +82,49 @@ def test_sobol_presses_fill_gaps_better_than_chance(probes):
     presses = Sweep(samples=1024 * probes, seed=4).over(PROBES[:probes])
     chance = np.random.default_rng(4).random((1024, 2))
     for number in range(probes):
-        mine = presses[np.flatnonzero(presses.probe == number)]
-        angle = np.mod(np.arctan2(mine.y, mine.x) / (2 * np.pi), 1.0)
-        unit = np.stack([(mine.x**2 + mine.y**2) / 8e-3**2, angle], axis=1)
+        x, y, _ = presses.contact[presses.probe == number].T
+        angle = np.mod(np.arctan2(y, x) / (2 * np.pi), 1.0)
+        unit = np.stack([(x**2 + y**2) / 64.0, angle], axis=1)
         assert stats.qmc.discrepancy(unit) < 0.1 * stats.qmc.discrepancy(chance)
 
 
 @pytest.mark.parametrize("sampling", ["sobol", "random"])
 def test_seed_and_probe_decide(sampling):
-    first, again, other = (Sweep(samples=100, seed=seed, sampling=sampling).presses() for seed in (5, 5, 6))
-    for a, b, c in zip(first[:3], again[:3], other[:3], strict=True):
-        np.testing.assert_array_equal(a, b)
-        assert np.all(a != c)
-    two = Sweep(samples=100, sampling=sampling).over((Circle(1e-3), Circle(1e-3)))
-    assert np.all(two.x[::2] != two.x[1::2])
+    first, again, other = (Sweep(samples=100, seed=seed, sampling=sampling).contacts() for seed in (5, 5, 6))
+    np.testing.assert_array_equal(first, again)
+    assert np.all(first != other)
+    two = Sweep(samples=100, sampling=sampling).over((Circle(1.0), Circle(1.0))).contact
+    assert np.all(two[::2] != two[1::2])
 
 
 def test_one_probe_of_a_sweep_is_the_sweep():
-    alone, _, _, _ = Sweep(samples=100, seed=3).presses()
-    np.testing.assert_array_equal(Sweep(samples=100, seed=3).over(PROBES[:1]).x, alone)
-    np.testing.assert_array_equal(Sweep(samples=300, seed=3).over(PROBES).x[::3], alone)
-
-
-def test_random_turns_are_uniform():
-    turned = Sweep(samples=4000, orientation="random").presses()[3]
-    assert stats.kstest(turned, "uniform", args=(0.0, 2 * np.pi)).pvalue > 0.05
+    alone = Sweep(samples=100, seed=3).contacts()
+    np.testing.assert_array_equal(Sweep(samples=100, seed=3).over(PROBES[:1]).contact, alone)
+    np.testing.assert_array_equal(Sweep(samples=300, seed=3).over(PROBES).contact[::3], alone)
 
 
 def test_one_force_is_exact():
     for sampling in ("sobol", "random", "grid"):
-        assert set(Sweep(samples=50, force_range=(0.3, 0.3), sampling=sampling).presses()[2].tolist()) == {0.3}
+        assert set(Sweep(samples=50, force_range=(0.3, 0.3), sampling=sampling).contacts()[:, 2].tolist()) == {0.3}
 
 
 # Grid
 
 
-def test_a_grid_is_every_force_and_turn_at_every_place():
+def test_a_grid_is_every_force_and_rotation_at_every_place():
     sweep = Sweep(samples=3000, orientation="random", sampling="grid")
     presses = sweep.over(PROBES)
     for number, probe in enumerate(PROBES):
         mine = presses[np.flatnonzero(presses.probe == number)]
-        places = np.unique(mine.x + 1j * mine.y)
-        forces, turns = np.unique(mine.force), np.unique(mine.turn)
-        assert len(np.unique(np.stack([mine.x, mine.y, mine.force, mine.turn]), axis=1).T) == len(mine)
-        assert places.size * forces.size * turns.size == len(mine)
+        places = np.unique(mine.contact[:, :2], axis=0)
+        forces, rotations = np.unique(mine.contact[:, 2]), np.unique(mine.rotation)
+        assert len(np.unique(np.column_stack([mine.contact, mine.rotation]), axis=0)) == len(mine)
+        assert len(places) * forces.size * rotations.size == len(mine)
         np.testing.assert_allclose(np.diff(np.log(forces)), np.log(40.0) / (forces.size - 1))
         assert (forces[0], forces[-1]) == pytest.approx(sweep.force_range, rel=1e-14)
-        np.testing.assert_allclose(turns, probe.period * np.arange(turns.size) / turns.size)
-        assert np.abs(places).max() == pytest.approx(sweep.radius, rel=1e-12)
-
-
-def test_a_round_probe_is_not_turned_in_a_grid():
-    """It would only press the same again."""
-    presses = Sweep(samples=1000, orientation="random", sampling="grid").over(PROBES[:1])
-    assert not presses.turn.any()
-    assert len(presses) > 900
+        np.testing.assert_allclose(rotations, probe.period * np.arange(rotations.size) / rotations.size)
+        assert np.hypot(*places.T).max() == pytest.approx(sweep.radius, rel=1e-12)
+    assert not presses.rotation[presses.probe == 0].any()  # a circle would only press the same again
 
 
 def test_a_lattice_has_one_spacing_and_as_many_points_as_fit():
@@ -152,22 +139,22 @@ def test_a_lattice_has_one_spacing_and_as_many_points_as_fit():
 # Refused
 
 
-@pytest.mark.parametrize("samples", [0, -3])
-def test_no_samples_is_an_error(samples):
-    with pytest.raises(SceneError, match=f"samples: expected at least 1, got {samples}"):
-        Sweep(samples=samples)
-
-
-def test_too_many_samples():
-    with pytest.raises(SceneError, match="samples: expected at most 10000000, got 10000001"):
-        Sweep(samples=10_000_001)
-
-
-def test_unknown_words():
-    with pytest.raises(SceneError, match="orientation: expected 'fixed' or 'random', got 'Random'"):
-        Sweep(orientation="Random")
-    with pytest.raises(SceneError, match="sampling: expected 'sobol', 'random' or 'grid', got 'polar'"):
-        Sweep(sampling="polar")
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"samples": 0}, "samples: expected at least 1, got 0"),
+        ({"samples": 10_000_001}, "samples: expected at most 10000000, got 10000001"),
+        ({"orientation": "Random"}, "orientation: expected 'fixed' or 'random', got 'Random'"),
+        ({"sampling": "polar"}, "sampling: expected 'sobol', 'random' or 'grid', got 'polar'"),
+        ({"force_range": (0.0, 1.0)}, "force: expected 0 < smallest <= largest force"),
+        ({"force_range": (2.0, 1.0)}, "force: expected 0 < smallest <= largest force"),
+        ({"force_range": (1.0, np.inf)}, "force: expected 0 < smallest <= largest force"),
+        ({"force_range": (np.nan, 1.0)}, "force: expected 0 < smallest <= largest force"),
+    ],
+)
+def test_impossible_sweeps_are_refused(settings, message):
+    with pytest.raises(SceneError, match=message):
+        Sweep(**settings)
 
 
 def test_probes_are_needed():
@@ -175,10 +162,3 @@ def test_probes_are_needed():
         Sweep().over(())
     with pytest.raises(SceneError, match="samples: expected at least one for each of 3 probes, got 2"):
         Sweep(samples=2, sampling="grid").over(PROBES)
-
-
-@pytest.mark.parametrize("force_range", [(0.0, 0.0), (0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (1.0, np.inf), (np.nan, 1.0)])
-def test_forces_that_cannot_be(force_range):
-    """Said before a logarithm is taken of them."""
-    with pytest.raises(SceneError, match="force: expected 0 < smallest <= largest force"):
-        Sweep(force_range=force_range)

@@ -1,62 +1,79 @@
 """The same bytes whoever does the work, a worker that dies included; and workers that do not outlive their sweep."""
 
+import multiprocessing
 import os
 import re
 import signal
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from isocharge.common.errors import InputError, MissingExtra, WorkersLost
-from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, SweepCallbacks, Theory, load_sensor, run_sweep
+from isocharge.common.progress import listening
+from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, Theory, load_sensor, run_sweep
 from isocharge.simulate.execution import workers as module
-from isocharge.simulate.execution.workers import Workers, dask_workers, local_workers
+from isocharge.simulate.execution.workers import dask_workers, in_order, local_workers
 
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
-SWEEP = Sweep(radius=3e-3, force_range=(1.0, 1.0), samples=60, seed=7, orientation="random")
+SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, orientation="random")
 
 
-def sweep_with(workers: Workers, target: Path, **called) -> dict[str, bytes]:
+def sweep_with(executor: Executor | None, target: Path) -> dict[str, bytes]:
     """The files of a small sweep of two probes in shards of ten."""
-    probes = (Circle(1e-3), Circle(2e-3))
-    run_sweep(target, SENSOR, probes, SWEEP, QUICK, workers=workers, callbacks=SweepCallbacks(**called), shard=10)
+    run_sweep(target, SENSOR, (Circle(1.0), Circle(2.0)), SWEEP, QUICK, executor=executor, shard=10)
     return {path.name: path.read_bytes() for path in target.iterdir()}
 
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory) -> dict[str, bytes]:
     """What one process writes."""
-    with local_workers(1) as workers:
-        assert workers.executor is None
-        return sweep_with(workers, tmp_path_factory.mktemp("one") / "presses")
+    with local_workers(1) as executor:
+        assert executor is None
+        return sweep_with(executor, tmp_path_factory.mktemp("one") / "presses")
 
 
 def test_bytes_from_two_processes_are_the_same(tmp_path, expected):
-    with local_workers(2) as workers:
-        assert sweep_with(workers, tmp_path / "presses") == expected
+    with local_workers(2) as executor:
+        assert sweep_with(executor, tmp_path / "presses") == expected
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_bytes_from_threads_are_the_same(tmp_path, expected, count):
-    with ThreadPoolExecutor(count) as pool:
-        assert sweep_with(Workers(pool), tmp_path / "presses") == expected
+@pytest.mark.parametrize(
+    "pool",
+    [
+        lambda: ThreadPoolExecutor(3),
+        pytest.param(
+            lambda: ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("forkserver")),
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["threads", "forkserver"],
+)
+def test_bytes_from_a_pool_of_ones_own_are_the_same(tmp_path, expected, pool):
+    with pool() as executor:
+        assert sweep_with(executor, tmp_path / "presses") == expected
 
 
 def test_worker_process_that_dies_is_an_error_and_the_run_can_go_on(tmp_path, expected):
-    def kill(_done, _total, killed=[]):  # noqa: B006
-        if not killed:
-            killed.append(workers.executor.submit(os.getpid).result())
+    killed = []
+
+    def kill(title: str, *_) -> None:
+        if title == "pressing" and not killed:
+            killed.append(executor.submit(os.getpid).result())
             os.kill(killed[0], signal.SIGKILL)
 
-    with pytest.raises(WorkersLost, match="a worker process ended by itself"), local_workers(2) as workers:
-        sweep_with(workers, tmp_path / "presses", sampled=kill)
+    with (
+        pytest.raises(WorkersLost, match="a worker process ended by itself"),
+        local_workers(2) as executor,
+        listening(kill),
+    ):
+        sweep_with(executor, tmp_path / "presses")
     assert not (tmp_path / "presses").exists()
-    assert sweep_with(Workers(), tmp_path / "presses") == expected
+    assert sweep_with(None, tmp_path / "presses") == expected
 
 
 def test_workers_end_with_an_interrupt_even_in_the_middle_of_a_task():
@@ -67,10 +84,10 @@ def test_workers_end_with_an_interrupt_even_in_the_middle_of_a_task():
 
 
 def interrupt_workers() -> None:
-    with local_workers(2) as workers:
-        assert workers.executor is not None
-        assert workers.executor.submit(os.getpid).result() != os.getpid()
-        task = workers.executor.submit(time.sleep, 600.0)
+    with local_workers(2) as executor:
+        assert executor is not None
+        assert executor.submit(os.getpid).result() != os.getpid()
+        task = executor.submit(time.sleep, 600.0)
         while not task.running():
             time.sleep(0.01)
         raise KeyboardInterrupt
@@ -85,9 +102,9 @@ def test_results_come_in_order_and_tasks_are_drawn_as_they_are_needed():
             yield 0.002 * (number % 3)
 
     with ThreadPoolExecutor(4) as pool:
-        results = Workers(pool, ahead=5).in_order(waited, jobs())
+        results = in_order(pool, waited, jobs(), ahead=5)
         assert next(results) == 0.0
-        assert len(drawn) == 5
+        assert len(drawn) <= 5
         assert [0.0, *results] == [0.002 * (number % 3) for number in range(20)]
 
 
@@ -122,22 +139,22 @@ def pids(cluster) -> list[int]:
 
 
 def test_bytes_from_dask_are_the_same(cluster, tmp_path, expected):
-    with dask_workers(cluster.scheduler_address) as workers:
-        assert sweep_with(workers, tmp_path / "presses") == expected
+    with dask_workers(cluster.scheduler_address) as executor:
+        assert sweep_with(executor, tmp_path / "presses") == expected
 
 
-@pytest.mark.parametrize("phase", ["solved", "sampled"])
+@pytest.mark.parametrize("phase", ["solving", "pressing"])
 def test_dask_worker_killed_half_way_is_replaced(cluster, tmp_path, expected, phase):
     """In the middle of the solves, and between two shards."""
     killed = []
 
-    def kill(done: int, _total: int) -> None:
-        if done >= 2 and not killed:
+    def kill(title: str, done: int, *_) -> None:
+        if title.startswith(phase) and done >= 2 and not killed:
             killed.append(pids(cluster)[0])
             os.kill(killed[0], signal.SIGKILL)
 
-    with dask_workers(cluster.scheduler_address) as workers:
-        assert sweep_with(workers, tmp_path / "presses", **{phase: kill}) == expected
+    with dask_workers(cluster.scheduler_address) as executor, listening(kill):
+        assert sweep_with(executor, tmp_path / "presses") == expected
     assert killed
     assert killed[0] not in pids(cluster)
 

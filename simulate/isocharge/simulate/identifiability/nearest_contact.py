@@ -3,6 +3,7 @@
 min over contacts c of the domain of |(Q - Q(c)) / sigma|
 """
 
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -47,9 +48,8 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
         Contacts within the map's domain, shape (n, 3), and how far their charges are from those given, in standard
         deviations, shape (n,).
     """
-    contact, _ = explain(charge_map, charge, noise.sigma(charge), start, STEPS)
-    known = charge_map.charges(contact)
-    return contact, np.linalg.norm((known - charge) / noise.sigma(known), axis=1)
+    contact, residual = _descent(charge_map, charge, lambda _, known: noise.sigma(known), start, STEPS)
+    return contact, np.linalg.norm(residual, axis=1)
 
 
 def explain(
@@ -67,6 +67,13 @@ def explain(
     Returns:
         Contacts within the map's domain, shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
+    return _descent(charge_map, charge, lambda rows, _: sigma[rows], start, steps)
+
+
+def _descent(
+    charge_map: ChargeMap, charge: Array, sigma_of: Callable[[Integers, Array], Array], start: Array, steps: int
+) -> tuple[Array, Array]:
+    """As `explain`; the unit of distance is a function of the rows of charges and of the charges that explain them."""
     radius, force_range = INSIDE * charge_map.domain.radius, charge_map.domain.force_range
     low, high = np.log(force_range)
     centre, scale = charge_map.domain.centre, np.array([radius, radius, 0.5 * (high - low)])  # one force: no width
@@ -77,8 +84,8 @@ def explain(
 
     def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
         known, slopes = _linearised(charge_map, to_contact(unit))
-        by_unit = slopes * scale / sigma[rows][:, :, None]
-        return (charge[rows] - known) / sigma[rows], -by_unit.swapaxes(1, 2)
+        sigma = sigma_of(rows, known)
+        return (charge[rows] - known) / sigma, -(slopes * scale / sigma[..., None]).swapaxes(1, 2)
 
     logs = np.column_stack([start[:, :2], np.log(start[:, 2])])
     unit, residual = minimise(residuals, (logs - centre) / np.where(scale > 0.0, scale, 1.0), steps)
