@@ -123,8 +123,8 @@ def test_bad_starts(start, models, tmp_path):
         cases = [
             (start("--port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port}: another program listens"),
             (start("--port", 0, "--grpc-port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port} for gRPC"),
-            (start("--host", "0.0.0.0"), 2, "InputError: --host 0.0.0.0 lets other machines in: give --token TOKEN"),
-            (start("--uds", "x", "--host", "0.0.0.0", "--grpc-port", 0), 2, "InputError: --host 0.0.0.0 lets other"),
+            (start("--host", "0.0.0.0"), 2, "InputError: 0.0.0.0 lets other machines in: give --token TOKEN"),
+            (start("--uds", "x", "--host", "0.0.0.0", "--grpc-port", 0), 2, "InputError: 0.0.0.0 lets other"),
             (start("--token", ""), 2, "InputError: token: expected printable ASCII"),
             (start("--tls-key", "x"), 2, "InputError: --tls-key: expected --tls-cert too"),
             (start("--tls-cert", tmp_path / "cert.pem"), 2, f"InputError: {tmp_path}/cert.pem: not a certificate"),

@@ -12,6 +12,8 @@ from isocharge.serve.network.protocol.response import response_of
 
 INNER = b"POST /one HTTP/1.1\r\nHost: x\r\nContent-Length: 3\r\n\r\nabc"
 
+TRAILED = b"POST /one HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n3\r\nabc\r\n"
+
 
 class Echo:
     """Answers with what it was asked."""
@@ -140,16 +142,10 @@ def test_blank_lines_are_no_requests(connect, blank):
 
 def test_trailers_are_no_headers(connect):
     """Of a request that is answered, and of the next one."""
-    trailed = (
-        b"POST /one HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n3\r\nabc\r\n0\r\nHost: y\r\nA: b\r\n\r\n"
-    )
-    sent, _ = answers(connect, [trailed, INNER])
+    sent, _ = answers(connect, [TRAILED + b"0\r\nHost: y\r\nA: b\r\n\r\n", INNER])
     assert sent.count(b"HTTP/1.1 200") == 2
     assert b"b'y'" not in sent
     assert b"b'a'" not in sent
-
-
-TRAILED = b"POST /one HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n3\r\nabc\r\n"
 
 
 @pytest.mark.parametrize(
@@ -157,7 +153,7 @@ TRAILED = b"POST /one HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n3
     [TRAILED + b"0\r\n" + b"a: b\r\n" * 9000, TRAILED + b"0\r\na: " + b"b" * 50_000, TRAILED + b"1;" + b"x" * 50_000],
     ids=["trailers", "one trailer", "chunk extension"],
 )
-@pytest.mark.parametrize("piece", [1, 100, 4096, 1 << 20])
+@pytest.mark.parametrize("piece", [1, 100, 4096])
 def test_what_goes_with_a_body_is_bounded_as_headers(connect, endless, piece):
     sent, closed = answers(connect, [endless[at : at + piece] for at in range(0, len(endless), piece)])
     assert (sent[:12], closed) == (b"HTTP/1.1 431", True)
