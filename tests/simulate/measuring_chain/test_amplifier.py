@@ -12,12 +12,12 @@ CLEAN, RATE = noise_model("clean"), 200.0
 
 
 def measure(amplifier, charge, seed=0, rate=RATE, blocks=1):
-    """Readings of charges (n, electrodes), C, taken in so many blocks."""
+    """Readings of charges (n, electrodes), pC, taken in so many blocks."""
     process = amplifier.start(charge.shape[1], rate, np.random.default_rng(seed))
     return np.concatenate([process(block) for block in np.array_split(charge, blocks)]), process
 
 
-def step(n=2000, at=200, height=400e-12, electrodes=3):
+def step(n=2000, at=200, height=400.0, electrodes=3):
     charge = np.zeros((n, electrodes))
     charge[at:] = height
     return charge
@@ -27,82 +27,77 @@ def step(n=2000, at=200, height=400e-12, electrodes=3):
 def test_held_step_decays_by_the_closed_form(tau):
     readings, _ = measure(Amplifier(noise=CLEAN, tau=tau), step())
     t = np.arange(1800) / RATE
-    np.testing.assert_allclose(readings[200:, 0], 400e-12 * np.exp(-t / tau), rtol=1e-9)
+    np.testing.assert_allclose(readings[200:, 0], 400.0 * np.exp(-t / tau), rtol=1e-9)
     np.testing.assert_array_equal(readings[:200], 0.0)
 
 
-def test_step_held_for_five_seconds_keeps_61_percent():
-    readings, _ = measure(Amplifier(noise=CLEAN, tau=10.0), step())
-    assert readings[200 + 1000, 0] / 400e-12 == pytest.approx(0.6065, abs=1e-4)
-
-
 def test_bias_current_settles_at_current_times_tau():
-    readings, process = measure(Amplifier(noise=CLEAN, tau=2.0, bias=0.5e-12), np.zeros((1000, 3)))
+    readings, process = measure(Amplifier(noise=CLEAN, tau=2.0, bias=0.5), np.zeros((1000, 3)))
     np.testing.assert_allclose(readings, np.broadcast_to(process.bias * 2.0, readings.shape), rtol=2e-3)
 
 
 def test_without_a_leak_nothing_decays():
     readings, _ = measure(load_amplifier("clean"), step())
-    np.testing.assert_allclose(readings, step(), atol=1e-24)
+    np.testing.assert_allclose(readings, step(), atol=1e-12)
 
 
 def test_reference_is_the_memoryless_model():
-    readings, _ = measure(load_amplifier("reference"), np.full((20_000, 2), 500e-12))
-    np.testing.assert_allclose(readings.std(axis=0), np.hypot(1e-12, 1e-12), rtol=0.03)
-    np.testing.assert_allclose(readings.mean(axis=0), 500e-12, atol=0.05e-12)
+    readings, _ = measure(load_amplifier("reference"), np.full((20_000, 2), 500.0))
+    np.testing.assert_allclose(readings.std(axis=0), np.hypot(1.0, 1.0), rtol=0.03)
+    np.testing.assert_allclose(readings.mean(axis=0), 500.0, atol=0.05)
 
 
 def test_blocks_do_not_matter_for_what_is_not_drawn():
     part = replace(load_amplifier("bench"), noise=CLEAN, temperature_rms=0.0)
     whole, many = (measure(part, step(), blocks=blocks)[0] for blocks in (1, 37))
-    np.testing.assert_allclose(whole, many, atol=0.046e-12)  # one step of the converter
+    np.testing.assert_allclose(whole, many, atol=0.046)  # one step of the converter
 
 
 def test_hum_has_its_amplitude_and_frequency():
-    readings, _ = measure(Amplifier(noise=CLEAN, hum=1e-12), np.zeros((2000, 1)), rate=1000.0)
+    readings, _ = measure(Amplifier(noise=CLEAN, hum=1.0), np.zeros((2000, 1)), rate=1000.0)
     spectrum = np.abs(np.fft.rfft(readings[:, 0])) * 2 / 2000
     assert np.argmax(spectrum) / 2.0 == 50.0
-    assert spectrum.max() == pytest.approx(1e-12, rel=1e-6)
+    assert spectrum.max() == pytest.approx(1.0, rel=1e-6)
 
 
 def test_film_warms_smoothly_and_alike_on_all_electrodes():
     part = Amplifier(noise=CLEAN, temperature_rms=0.05, temperature_time=20.0)
     readings, _ = measure(part, np.zeros((400_000, 3)), rate=20.0)
-    np.testing.assert_allclose(readings, readings[:, :1] * np.ones(3), atol=1e-20)
+    np.testing.assert_allclose(readings, readings[:, :1] * np.ones(3), atol=1e-8)
     change = readings[:, 0] + 0.0
-    assert change.std() == pytest.approx(0.05 * 270e-12, rel=0.15)
+    assert change.std() == pytest.approx(0.05 * 270.0, rel=0.15)
     rate_of_change = np.diff(change)[::10] * 20.0
-    assert rate_of_change.std() == pytest.approx(0.05 * 270e-12 / 20.0, rel=0.1)  # rms / time: a lag behind a lag
+    assert rate_of_change.std() == pytest.approx(0.05 * 270.0 / 20.0, rel=0.1)  # rms / time: a lag behind a lag
 
 
 def test_temperature_step_gives_its_pyroelectric_charge():
     part = Amplifier(noise=CLEAN, step=0.5, step_at=2.0, step_time=5.0)
     readings, _ = measure(part, np.zeros((2000, 3)))
     assert readings[400 - 1, 0] == 0.0
-    np.testing.assert_allclose(readings[900, :], 0.25 * 270e-12)
-    np.testing.assert_allclose(readings[-1, :], 135e-12)
+    np.testing.assert_allclose(readings[900, :], 0.25 * 270.0)
+    np.testing.assert_allclose(readings[-1, :], 135.0)
 
 
 def test_converter_clips_and_has_steps_of_16_bits():
-    part = Amplifier(noise=CLEAN, limit=1500e-12, bits=16)
-    readings, _ = measure(part, np.linspace(-2000e-12, 2000e-12, 5000)[:, None])
-    assert readings.min() == pytest.approx(-1500e-12)
-    assert 1499.9e-12 < readings.max() < 1500e-12
+    part = Amplifier(noise=CLEAN, limit=1500.0, bits=16)
+    readings, _ = measure(part, np.linspace(-2000.0, 2000.0, 5000)[:, None])
+    assert readings.min() == pytest.approx(-1500.0)
+    assert 1499.9 < readings.max() < 1500.0
     steps = np.diff(np.unique(readings))
-    assert steps.min() == pytest.approx(3000e-12 / 65536)  # 0.046 pC
+    assert steps.min() == pytest.approx(3000.0 / 65536)  # 0.046 pC
 
 
 def test_mismatch_is_drawn_once_for_each_channel():
     process = load_amplifier("bench").start(20_000, RATE, np.random.default_rng(0))
     assert process.gain.std() == pytest.approx(0.01, rel=0.03)
     assert process.tau.std() == pytest.approx(0.5, rel=0.03)
-    assert process.offset.std() == pytest.approx(2e-12, rel=0.03)
-    assert set(np.abs(process.bias)) == {0.5e-12}
+    assert process.offset.std() == pytest.approx(2.0, rel=0.03)
+    assert set(np.abs(process.bias)) == {0.5}
 
 
 def test_surgery_is_bench_but_worse():
     bench, surgery = load_amplifier("bench"), load_amplifier("surgery")
-    assert (surgery.noise.white, surgery.hum, surgery.step, surgery.step_time) == (1e-12, 5e-12, 0.5, 5.0)
+    assert (surgery.noise.white, surgery.hum, surgery.step, surgery.step_time) == (1.0, 5.0, 0.5, 5.0)
     assert replace(surgery, noise=bench.noise, hum=bench.hum, step=0.0) == bench
 
 
@@ -110,14 +105,14 @@ def test_file_changes_what_it_says(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('like = "bench"\nwhite_pC = 0.5\ntau_s = 1\ngain_mismatch = 0.002\nbits = 12\n')
     part = load_amplifier(str(path))
-    assert (part.noise.name, part.noise.white, part.tau) == ("mine", 0.5e-12, 1.0)
-    assert (part.gain_mismatch, part.bits, part.hum, part.limit) == (0.002, 12, 1e-12, 1500e-12)
+    assert (part.noise.name, part.noise.white, part.tau) == ("mine", 0.5, 1.0)
+    assert (part.gain_mismatch, part.bits, part.hum, part.limit) == (0.002, 12, 1.0, 1500.0)
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("tau = 1", "unknown key 'tau'; known are"),
+        ("tau = 1", "unknown key 'tau'; did you mean 'tau_s'"),
         ("tau_s = 0", "tau_s: expected a positive number or inf, got 0"),
         ("hum_pC = -1", "hum_pC: expected"),
         ("bits = 1.5", "bits: expected"),
@@ -142,9 +137,9 @@ def test_infinity_is_no_leak_and_no_limit(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('like = "bench"\ntau_s = inf\nlimit_pC = inf\nbits = 0\n')
     part = load_amplifier(str(path))
-    readings = part.start(3, 100.0, np.random.default_rng(1))(np.full((50, 3), 5e-9))
+    readings = part.start(3, 100.0, np.random.default_rng(1))(np.full((50, 3), 5e3))
     assert np.isfinite(readings).all()
-    assert readings[-1].min() > 4.5e-9
+    assert readings[-1].min() > 4.5e3
 
 
 def test_unknown_level_is_refused():

@@ -10,30 +10,21 @@ from hypothesis import strategies as st
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Polygon, Probe, parse_probe
 
-SIZES = st.floats(1e-6, 1e3)
+SIZES = st.floats(0.05, 1e6)
 COMMON = settings(derandomize=True)
-HOUSE = np.array([(0.0, 0.0), (2e-3, 0.0), (2e-3, 1e-3), (1e-3, 2e-3), (0.0, 1e-3)])
+HOUSE = np.array([(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 2.0), (0.0, 1.0)])
 
 
 @pytest.mark.parametrize(
     ("text", "radius"),
-    [
-        ("circle:1.0", 1e-3),
-        ("circle:1", 1e-3),
-        ("circle:.5", 0.5e-3),
-        ("circle:2.", 2e-3),
-        ("circle:5e-1", 0.5e-3),
-        (" circle:1.5 ", 1.5e-3),
-        ("circle:1.0@30", 1e-3),
-        ("circle:1.0@-12.5", 1e-3),
-    ],
+    [("circle:1", 1.0), ("circle:.5", 0.5), ("circle:2.", 2.0), ("circle:5e-1", 0.5), (" circle:1.5@-12.5 ", 1.5)],
 )
 def test_circle(text, radius):
-    assert parse_probe(text).radius == pytest.approx(radius, rel=1e-12)
+    assert parse_probe(text) == Circle(radius)
 
 
 @pytest.mark.parametrize(
-    ("text", "outline_mm"),
+    ("text", "outline"),
     [
         ("rectangle:4.0x2.0", [2 + 1j, -2 + 1j, -2 - 1j, 2 - 1j]),
         ("rectangle:4x2@90", [-1 + 2j, -1 - 2j, 1 - 2j, 1 + 2j]),
@@ -43,9 +34,9 @@ def test_circle(text, radius):
         ("polygon:-1,-1;1,-1;1,1;-1,1@45", np.sqrt(2) * np.array([-1j, 1, 1j, -1])),
     ],
 )
-def test_corners(text, outline_mm):
-    """About the centroid, anticlockwise, turned by the angle after the @."""
-    np.testing.assert_allclose(1e3 * parse_probe(text).outline, outline_mm, atol=1e-12)
+def test_corners(text, outline):
+    """About the centroid, anticlockwise, rotated by the angle after the @."""
+    np.testing.assert_allclose(parse_probe(text).outline, outline, atol=1e-12)
 
 
 def again(probe: Probe) -> Probe:
@@ -53,53 +44,46 @@ def again(probe: Probe) -> Probe:
     return parse_probe(f"{probe.notation}@{np.rad2deg(probe.angle):.15g}")
 
 
-@given(radius=SIZES)
-@COMMON
-def test_circle_round_trip(radius):
-    """To twelve digits, and stable: reading and writing again changes nothing."""
-    assert again(Circle(radius)).radius == pytest.approx(radius, rel=1e-11)
-    assert again(Circle(radius)).notation == Circle(radius).notation
-
-
 @given(width=SIZES, height=SIZES, angle=st.floats(-10.0, 10.0))
 @COMMON
-def test_rectangle_and_triangle_round_trip(width, height, angle):
-    for probe in (Polygon.rectangle(width, height, angle), Polygon.triangle(width, angle)):
+def test_round_trip(width, height, angle):
+    """To twelve digits, and stable: reading and writing again changes nothing."""
+    for probe in (Polygon.rectangle(width, height, angle), Polygon.triangle(width, angle), Circle(width)):
         read = again(probe)
-        assert (read.name, read.notation) == (probe.name, probe.notation)
-        np.testing.assert_allclose(read.outline, probe.outline, rtol=0.0, atol=1e-10 * probe.reach)
+        assert read.notation == probe.notation
+        assert read.reach == pytest.approx(probe.reach, rel=1e-11)
+        if isinstance(probe, Polygon):
+            np.testing.assert_allclose(read.outline, probe.outline, rtol=0.0, atol=1e-10 * probe.reach)
 
 
 @given(
     gaps=st.lists(st.floats(0.3, 1.0), min_size=3, max_size=20),
-    size=st.floats(1e-5, 1e-1),
+    size=st.floats(0.05, 100.0),
     angle=st.floats(-10.0, 10.0),
     x=st.floats(-1.0, 1.0),
     y=st.floats(-1.0, 1.0),
 )
 @COMMON
 def test_polygon_round_trip(gaps, size, angle, x, y):
-    turn = 2.0 * np.pi * np.cumsum(gaps) / np.sum(gaps)
-    corners = size * np.stack([x + np.cos(turn), y + np.sin(turn)], axis=1)
-    if np.max(np.diff(turn, append=turn[0] + 2.0 * np.pi)) > 0.95 * np.pi:
+    direction = 2.0 * np.pi * np.cumsum(gaps) / np.sum(gaps)
+    corners = size * np.stack([x + np.cos(direction), y + np.sin(direction)], axis=1)
+    if np.max(np.diff(direction, append=direction[0] + 2.0 * np.pi)) > 0.95 * np.pi:
         return
     probe = Polygon.of(corners, angle)
     np.testing.assert_allclose(again(probe).outline, probe.outline, rtol=0.0, atol=1e-8 * probe.reach)
-    assert again(probe).area == pytest.approx(probe.area, rel=1e-7)
 
 
 def test_notation_is_in_mm():
-    assert Circle(1e-3).notation == "circle:1.0"
-    assert Circle(0.3e-3).notation == "circle:0.3"
-    assert Polygon.rectangle(4e-3, 2e-3, 1.0).notation == "rectangle:4.0x2.0"
-    assert Polygon.triangle(4e-3).notation == "triangle:4.0"
+    assert Circle(0.3).notation == "circle:0.3"
+    assert Polygon.rectangle(4.0, 2.0, 1.0).notation == "rectangle:4.0x2.0"
+    assert Polygon.triangle(4.0).notation == "triangle:4.0"
     assert parse_probe("polygon:0,0;3,0;0,3").notation == "polygon:-1.0,-1.0;2.0,-1.0;-1.0,2.0"
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "circle", "circle:", "circle:1x2", "circle:one", "circle:1.0mm", "Circle:1", "circle:1@", "circle:nan", "1.0",
-     "rectangle:4", "rectangle:4x", "rectangle:4X2", "triangle:4x2", "polygon:1,2", "polygon:0,0;1,0;1", "square:1"],
+    ["", "circle:", "circle:1x2", "circle:1.0mm", "Circle:1", "circle:1@", "circle:nan", "1.0",
+     "rectangle:4", "rectangle:4X2", "triangle:4x2", "polygon:1,2", "polygon:0,0;1,0;1", "square:1"],
 )  # fmt: skip
 def test_wrong_notation_is_shown(text):
     with pytest.raises(SceneError, match=f"probe '{text}': expected 'circle:R', 'rectangle:WxH', 'triangle:S'"):
@@ -116,27 +100,33 @@ def test_any_text_is_a_probe_or_a_scene_error(text):
         assert parse_probe(text).reach > 0.0
 
 
-@pytest.mark.parametrize("size", [0.0, -1e-3, np.nan, np.inf])
+@pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
 def test_impossible_sizes(size):
     with pytest.raises(SceneError, match=f"probe radius: expected a positive number, got {size}"):
         Circle(size)
     with pytest.raises(SceneError, match=f"probe height: expected a positive number, got {size}"):
-        Polygon.rectangle(1e-3, size)
-    with pytest.raises(SceneError, match=f"probe side: expected a positive number, got {size}"):
-        Polygon.triangle(size)
+        Polygon.rectangle(1.0, size)
 
 
-@pytest.mark.parametrize("text", ["circle:0", "circle:1e999", "rectangle:0x1", "triangle:-1", "polygon:0,0;0,0;0,0"])
-def test_impossible_size_in_the_notation(text):
-    with pytest.raises(SceneError, match="probe"):
-        parse_probe(text)
+def test_sizes_in_metres_are_refused():
+    with pytest.raises(SceneError, match=r"probe radius: expected at least 0\.02 mm, got 0\.001 mm; 0\.001 m are 1 mm"):
+        Circle(1e-3)
+    with pytest.raises(SceneError, match=r"probe reach: expected at least 0\.02 mm, got 0\.0025 mm; .* are 2\.5 mm"):
+        Polygon.rectangle(4e-3, 3e-3)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [("circle:-1", "radius"), ("rectangle:4x-1", "height"), ("rectangle:-1x4", "width")]
+    ("text", "message"),
+    [
+        ("circle:-1", "^probe radius: expected a positive number, got -1 mm in 'circle:-1'$"),
+        ("rectangle:4x-1", "^probe height: expected a positive number, got -1 mm"),
+        ("triangle:1e999", "^probe side: expected a positive number, got 1e999 mm"),
+        ("polygon:0,0;0,0;0,0", "convex polygon"),
+        ("polygon:0,0;1e999,0;0,1", "expected finite corners"),
+    ],
 )
-def test_a_size_is_shown_as_it_was_written(text, said):
-    with pytest.raises(SceneError, match=f"^probe {said}: expected a positive number, got -1 mm in '{text}'$"):
+def test_impossible_size_in_the_notation(text, message):
+    with pytest.raises(SceneError, match=message):
         parse_probe(text)
 
 
@@ -144,27 +134,23 @@ def test_a_size_is_shown_as_it_was_written(text, said):
     ("corners", "message"),
     [
         (HOUSE[::-1], r"convex polygon with its corners anticlockwise, got \[\["),
-        (HOUSE[[0, 2, 1, 3, 4]], "convex polygon"),
-        (np.array([(0, 0), (2e-3, 0), (0.5e-3, 0.5e-3), (0, 2e-3)]), "convex polygon"),
-        (np.array([(0, 0), (1e-3, 0), (2e-3, 0), (0, 1e-3)]), "convex polygon"),
+        (np.array([(0, 0), (2, 0), (0.5, 0.5), (0, 2)]), "convex polygon"),
+        (np.array([(0, 0), (1, 0), (2, 0), (0, 1)]), "convex polygon"),
         (HOUSE[:2], "expected 3 to 64 corners"),
-        (np.array([(0, 0), (1e-3, 0), (np.nan, 1e-3)]), "expected 3 to 64 corners"),
-        (1e-3 * np.stack([np.cos(np.arange(65) / 11), np.sin(np.arange(65) / 11)], axis=1), "expected 3 to 64 corners"),
+        (np.array([(0, 0), (1, 0), (np.nan, 1)]), "expected 3 to 64 corners"),
+        (np.stack([np.cos(np.arange(65) / 11), np.sin(np.arange(65) / 11)], axis=1), "expected 3 to 64 corners"),
     ],
-)  # fmt: skip
+)
 def test_impossible_polygons(corners, message):
     with pytest.raises(SceneError, match=message):
         Polygon.of(corners)
 
 
-def test_corners_must_be_about_the_centroid():
+def test_corners_are_about_the_centroid_and_angles_finite():
     with pytest.raises(SceneError, match=r"expected corners relative to their centroid, got .*; use Polygon\.of"):
         Polygon(tuple((float(x), float(y)) for x, y in HOUSE))
-
-
-def test_impossible_angle():
     with pytest.raises(SceneError, match="probe angle: expected a finite number, got nan"):
-        Polygon.triangle(1e-3, np.nan)
+        Polygon.triangle(1.0, np.nan)
 
 
 @pytest.mark.parametrize(
@@ -174,18 +160,17 @@ def test_impossible_angle():
         (Polygon.rectangle(4.0, 2.0), 8.0, np.sqrt(5.0), np.pi),
         (Polygon.rectangle(2.0, 2.0), 4.0, np.sqrt(2.0), np.pi / 2),
         (Polygon.triangle(2.0), np.sqrt(3.0), 2.0 / np.sqrt(3.0), 2 * np.pi / 3),
-        (Polygon.of(HOUSE), 3e-6, None, 2 * np.pi),
-        (Polygon.of(np.array([(0.0, 0.0), (3.0, 0.0), (4.0, 1.0), (1.0, 1.0)])), 3.0, None, np.pi),
+        (Polygon.of(HOUSE), 3.0, None, 2 * np.pi),
     ],
 )
 def test_measures(probe, area, reach, period):
-    """Closed forms; a turn changes none of them, and a turn by the period not even the outline, as a set of corners."""
+    """Closed forms; a rotation changes none of them, one by the period not even the outline, as a set of corners."""
     assert probe.area == pytest.approx(area, rel=1e-12)
     assert reach is None or probe.reach == pytest.approx(reach, rel=1e-12)
     assert probe.period == pytest.approx(period)
-    turned = probe.turned(0.3)
-    assert (turned.area, turned.reach, turned.period) == (probe.area, probe.reach, probe.period)
+    rotated = probe.rotated(0.3)
+    assert (rotated.area, rotated.reach, rotated.period) == (probe.area, probe.reach, probe.period)
     if isinstance(probe, Polygon):
-        full = probe.turned(probe.period).outline
+        full = probe.rotated(probe.period).outline
         assert np.abs(full[:, None] - probe.outline).min(axis=0).max() < 1e-12 * probe.reach
-        np.testing.assert_allclose(turned.outline, probe.outline * np.exp(0.3j), atol=1e-15)
+        np.testing.assert_allclose(rotated.outline, probe.outline * np.exp(0.3j), atol=1e-15)

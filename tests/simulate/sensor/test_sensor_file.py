@@ -1,10 +1,11 @@
-"""The sensor file: built-in sensors as designed, and one clear error for every way to be wrong."""
+"""The sensor file: built-in sensors as designed, one clear error for every way to be wrong, and nothing lost."""
 
 import copy
 import json
 import re
 import tomllib
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib import resources
 from typing import Any
 
@@ -13,15 +14,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.common.errors import SensorError
+from isocharge.common.errors import OutputExists, SensorError
 from isocharge.simulate import (
     Calibration,
+    Electrode,
+    Film,
+    Piezo,
+    Sensor,
     built_in_sensors,
     load_sensor,
-    sensor_from_dict,
-    sensor_to_dict,
-    sensor_to_toml,
+    write_sensor,
 )
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict, sensor_to_toml
 
 WHOLE = """
 name = "mine"
@@ -82,62 +86,34 @@ CLOSED = [path for path in tables(whole()) if path not in (("electrodes",), ("ca
 KEYS = [(*path, key) for path in tables(whole()) for key in at(whole(), path)]
 
 
-# The built-in sensors: design, section 3
+# Reading
 
 LAYOUTS = {
-    "three": {"A": (0.0, -10e-3), "B": (8.660254e-3, 5e-3), "C": (-8.660254e-3, 5e-3)},
-    "four": {"A": (10e-3, 0.0), "B": (0.0, 10e-3), "C": (-10e-3, 0.0), "D": (0.0, -10e-3)},
+    "three": {"A": (0.0, -10.0), "B": (8.660254, 5.0), "C": (-8.660254, 5.0)},
+    "four": {"A": (10.0, 0.0), "B": (0.0, 10.0), "C": (-10.0, 0.0), "D": (0.0, -10.0)},
 }
 
 
 @pytest.mark.parametrize("layout", ["three", "four"])
-@pytest.mark.parametrize(("kind", "d31", "d32"), [("biaxial", 8e-12, 8e-12), ("uniaxial", 20e-12, 2e-12)])
+@pytest.mark.parametrize(("kind", "d31", "d32"), [("biaxial", 8.0, 8.0), ("uniaxial", 20.0, 2.0)])
 def test_built_in_sensor(layout, kind, d31, d32):
-    sensor = load_sensor(f"{layout}-25um-{kind}")
-    assert sensor.name == f"{layout}-25um-{kind}"
-    assert (sensor.readout, sensor.surface) == ("area", "middle")
-    film, piezo = sensor.film, sensor.piezo
-    assert (film.radius, film.thickness, film.young, film.poisson, film.pretension) == pytest.approx(
-        (45e-3, 25e-6, 3e9, 0.34, 0.0)
-    )
-    assert (piezo.d31, piezo.d32, piezo.d33, piezo.pyro) == pytest.approx((d31, d32, 0.0, 0.0))
-    assert sensor.electrode_names == tuple(LAYOUTS[layout])
-    for electrode in sensor.electrodes:
-        assert electrode.square
-        assert electrode.area == pytest.approx(9e-6)
-        assert electrode.centre == pytest.approx(LAYOUTS[layout][electrode.name], abs=1e-12)
-        assert np.hypot(*electrode.centre) == pytest.approx(10e-3, rel=1e-6)
-    assert sensor.calibration == Calibration()
+    name = f"{layout}-25um-{kind}"
+    electrodes = tuple(Electrode.of_square(*place, 3.0) for place in LAYOUTS[layout].items())
+    assert load_sensor(name) == Sensor(name, Film(45.0, 0.025, 3000.0, 0.34), Piezo(d31, d32), electrodes)
 
 
-def test_names_of_the_built_in_sensors():
-    assert built_in_sensors() == (
-        "four-25um-biaxial",
-        "four-25um-biaxial-15mm",
-        "four-25um-uniaxial",
-        "three-25um-biaxial",
-        "three-25um-biaxial-12mm",
-        "three-25um-uniaxial",
-    )
-
-
-# Reading
-
-
-def test_every_key_arrives_in_si_units(tmp_path):
+def test_every_key_arrives(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(WHOLE)
-    sensor = load_sensor(path)
-    film, piezo, calibration = sensor.film, sensor.piezo, sensor.calibration
-    assert (sensor.name, sensor.readout, sensor.surface) == ("mine", "edge", "top")
-    assert (film.radius, film.thickness, film.young, film.poisson, film.pretension) == pytest.approx(
-        (30e-3, 9e-6, 2.5e9, 0.34, 0.5e6)
+    assert load_sensor(path) == Sensor(
+        "mine",
+        Film(30.0, 9 * 1e-3, 2500.0, 0.34, 0.5),
+        Piezo(20.0, 2.0, -30.0, 30.0),
+        (Electrode.of_square("A", (0.0, -10.0), 3.0), Electrode.of_square("B", (8.660254, 5.0), 3.0)),
+        "edge",
+        "top",
+        Calibration({"A": 1.02}, (0.1, -0.2), float(np.deg2rad(5.0))),
     )
-    assert (piezo.d31, piezo.d32, piezo.d33, piezo.pyro) == pytest.approx((20e-12, 2e-12, -30e-12, 30e-6))
-    assert sensor.electrodes[1].centre == pytest.approx((8.660254e-3, 5e-3))
-    assert calibration.gain == {"A": 1.02}
-    assert calibration.shift == pytest.approx((0.1e-3, -0.2e-3))
-    assert calibration.rotation == pytest.approx(np.deg2rad(5.0))
 
 
 def test_optional_keys_may_be_left_out():
@@ -150,42 +126,17 @@ def test_optional_keys_may_be_left_out():
     assert (sensor.piezo.d33, sensor.piezo.pyro, sensor.calibration) == (0.0, 0.0, Calibration())
 
 
-def test_polygon_electrodes():
-    table = whole() | {"readout": "area"}
-    table["electrodes"]["T"] = {"polygon_mm": [[-12, 4], [-8, 4], [-10, 8.0]]}
-    triangle = sensor_from_dict(table).electrodes[2]
-    assert not triangle.square
-    assert triangle.corners == pytest.approx(np.array([[-12e-3, 4e-3], [-8e-3, 4e-3], [-10e-3, 8e-3]]))
-
-
-def test_side_is_not_needed_for_polygons_alone():
-    table = whole() | {"readout": "area", "electrodes": {"T": {"polygon_mm": [[-12, 4], [-8, 4], [-10, 8]]}}}
+def test_polygons_need_no_side():
+    table = whole() | {"readout": "area", "electrodes": {"T": {"polygon_mm": [[-12, 4], [-8, 4], [-10, 8.0]]}}}
     table["calibration"] = {}
-    assert sensor_from_dict(table).electrode_names == ("T",)
-
-
-# Writing
-
-
-def test_table_of_a_sensor_is_the_file():
-    table = sensor_to_dict(sensor_from_dict(whole()))
-    assert table == whole()
-
-
-def test_a_written_file_reads_as_the_design_has_it():
-    sections = sensor_to_toml(sensor_from_dict(whole())).split("\n\n")
-    assert [section.splitlines()[0] for section in sections] == [
-        *('name = "mine"', "[film]", "[piezo]", "[electrodes]", "[calibration]"),
-    ]
-    assert sections[3].splitlines()[1:] == ["side_mm = 3.0", "A = [0.0, -10.0]", "B = [8.660254, 5.0]"]
-    assert "gain = {A = 1.02}" in sections[4]
+    assert sensor_from_dict(table).electrodes == (Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0))),)
 
 
 # Errors
 
 
 @given(path=st.sampled_from(CLOSED), key=st.text(min_size=1, max_size=12))
-@settings(derandomize=True, max_examples=200)
+@settings(derandomize=True, max_examples=100)
 def test_unknown_key_is_named(path, key):
     table = whole()
     if key in at(table, path):
@@ -193,14 +144,7 @@ def test_unknown_key_is_named(path, key):
     at(table, path)[key] = 1.0
     with pytest.raises(SensorError) as caught:
         sensor_from_dict(table, "mine.toml")
-    assert str(caught.value).startswith(f"mine.toml: unknown key {'.'.join((*path, key))!r}; known are ")
-
-
-def test_unknown_key_of_an_electrode_is_named():
-    table = whole()
-    table["electrodes"]["A"] = {"polygon_mm": [[0, 0], [1, 0], [0, 1]], "colour": "red"}
-    with pytest.raises(SensorError, match=r"unknown key 'electrodes\.A\.colour'; known are polygon_mm"):
-        sensor_from_dict(table)
+    assert str(caught.value).startswith(f"mine.toml: unknown key {'.'.join((*path, key))!r}; ")
 
 
 @pytest.mark.parametrize("path", [p for p in KEYS if p[-1] not in OPTIONAL], ids=".".join)
@@ -211,46 +155,48 @@ def test_missing_key_is_named(path):
         sensor_from_dict(table, "mine.toml")
 
 
-WRONG = (None, "3.0", True, [], [1.0], [1.0, 2.0, 3.0], [1.0, "2"], {}, {"x": 1.0}, float("nan"), float("inf"))
+WRONG = (None, "3.0", True, [1.0], [1.0, "2"], {}, {"x": 1.0}, float("nan"), float("inf"))
 
 
 @pytest.mark.parametrize("path", KEYS, ids=".".join)
-@pytest.mark.parametrize("value", WRONG, ids=repr)
-def test_wrong_type_is_named(path, value):
+def test_wrong_type_is_named(path):
     """Every key with every kind of wrong value: a SensorError that names the key, never another exception."""
-    table = whole()
-    at(table, path[:-1])[path[-1]] = copy.deepcopy(value)
-    harmless = (path == ("calibration",) and value == {}) or (path == ("calibration", "gain") and value == {})
-    harmless |= path == ("name",) and value == "3.0"
-    if harmless:
-        sensor_from_dict(table)
-        return
-    with pytest.raises(SensorError) as caught:
-        sensor_from_dict(table, "mine.toml")
-    assert path[-1] in str(caught.value) or path == ("electrodes",)
+    for value in WRONG:
+        if (path[-1] in ("calibration", "gain") and value == {}) or (path == ("name",) and value == "3.0"):
+            continue
+        table = whole()
+        at(table, path[:-1])[path[-1]] = copy.deepcopy(value)
+        with pytest.raises(SensorError) as caught:
+            sensor_from_dict(table, "mine.toml")
+        assert path[-1] in str(caught.value) or path == ("electrodes",)
 
 
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
         (("film", "poisson"), 0.5, "film poisson: expected 0 <= poisson < 0.5, got 0.5"),
-        (("film", "thickness_um"), 0.0, r"film\.thickness_um: expected a positive number, got 0\.0"),
         (("film", "thickness_um"), -25.0, r"film\.thickness_um: expected a positive number, got -25\.0"),
-        (("film", "radius_mm"), -45, r"film\.radius_mm: expected a number above 0 and at most 1e\+06, got -45"),
         (("film", "radius_mm"), 1e300, r"film\.radius_mm: expected a number above 0 and at most 1e\+06, got 1e\+300"),
-        (("film", "young_GPa"), -3, r"film\.young_GPa: expected a positive number, got -3"),
+        (("film", "radius_mm"), 0.03, r"film radius: expected at least 1 mm, .* 0\.03 m are 30 mm"),
         (("film", "pretension_MPa"), -1, r"film\.pretension_MPa: expected a number from 0, got -1"),
-        (("film", "thickness_um"), 3000.3, r"film thickness: .* radius \(30\.0 mm\), got 3000\.3 um"),
-        (("electrodes", "side_mm"), 0.0, "electrodes.side_mm: expected a positive number, got 0.0"),
+        (("film", "thickness_um"), 3000.3, r"film thickness: .* radius \(30 mm\), got 3\.0003 mm"),
+        (("electrodes", "side_mm"), 0.0, "electrodes.side_mm: expected a number above 0"),
         (("electrodes", "A"), [8.0, 5.0], "electrodes 'A' and 'B' overlap"),
         (("calibration", "gain"), {"A": 0.0}, "calibration.gain.A: expected a positive number, got 0.0"),
         (("calibration", "gain"), {"Z": 1.0}, "calibration gain: no electrode named"),
-        (("readout",), "mean", r"readout: expected one of area, edge, got 'mean'"),
         (("surface",), "inside", r"surface: expected one of middle, top, bottom, got 'inside'"),
-        (("name",), "", "name: expected a text, got ''"),
-        (("electrodes", "A"), {"polygon_mm": 3}, r"electrodes\.A\.polygon_mm: expected a list of \[x, y\], got 3"),
-        (("electrodes", "A"), {"polygon_mm": [3]}, r"electrodes\.A\.polygon_mm: expected \[x, y\] in mm, got 3"),
+        (("name",), "", "name: expected a text"),
+        (
+            ("electrodes", "A"),
+            {"polygon_mm": [3]},
+            r"electrodes\.A\.polygon_mm\[1\]: expected \[x, y\] in mm",
+        ),
         (("electrodes", "A"), {"polygon_mm": []}, "electrode 'A': expected at least three corners"),
+        (
+            ("electrodes", "B"),
+            [25.0, 25.0],
+            r"electrode 'B' lies outside the film: .* film radius 30\.0 mm",
+        ),
     ],
 )
 def test_impossible_values(path, value, message):
@@ -260,88 +206,48 @@ def test_impossible_values(path, value, message):
         sensor_from_dict(table, "mine.toml")
 
 
-def file_with(tmp_path, changes):
-    """A sensor file with other lines."""
-    text = WHOLE
-    for line, other in changes.items():
-        assert line in text
-        text = text.replace(line, other)
-    path = tmp_path / "mine.toml"
-    path.write_text(text)
-    return path
-
-
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("line", "other", "said"),
     [
-        ({"d31 = 20.0": "d31 = 1e-12"}, r"piezo\.d31 is 1e-12 pC/N, beside 2 pC/N: expected 1 to 30 pC/N"),
-        ({"d32 = 2.0": "d32 = -2e-12"}, r"piezo\.d32 is -2e-12 pC/N, beside 20 pC/N"),
-        ({"d31 = 20.0": "d31 = 20e-12", "d32 = 2.0": "d32 = 0.0"}, r"piezo\.d31 is 2e-11 pC/N, beside 0 pC/N"),
-        ({"B = [8.660254, 5.0]\n": ""}, r"one electrode \('A'\): .* three electrodes or more do"),
+        ("d32 = 2.0", "d32 = -2e-4", r"piezo\.d32 is -0\.0002 pC/N, beside 20 pC/N: expected 1 to 30 pC/N"),
+        ("B = [8.660254, 5.0]\n", "", r"one electrode \('A'\): .* three electrodes or more do"),
+        ("d31 = 20.0", "d31 = 0.0", None),
+        ("d32 = 2.0", "d32 = -0.03", None),
     ],
 )
-def test_what_can_hardly_be_meant_gets_a_warning(tmp_path, changes, said, command, caplog):
-    path = file_with(tmp_path, changes)
+def test_what_can_hardly_be_meant_gets_a_warning(tmp_path, line, other, said, command, caplog):
+    path = tmp_path / "mine.toml"
+    path.write_text(WHOLE.replace(line, other))
     load_sensor(path)
-    (message,) = caplog.messages
-    assert re.match(f"{path}: {said}", message)
-    code, out, err = command("simulate", "point", path, "--at", "1,2", "--json")
-    assert code == 0
-    assert json.loads(out)["status"] == "converged"
-    (caution,) = (line for line in err.splitlines() if str(path) in line)
-    assert re.match(rf"caution: {path}: {said}", caution)
+    assert len(caplog.messages) == bool(said)
+    if said:
+        assert re.match(f"{path}: {said}", caplog.messages[0])
+        code, out, err = command("simulate", "point", path, "--at", "1,2", "--json")
+        assert (code, json.loads(out)["status"]) == (0, "converged")
+        assert re.search(rf"{path}: {said}", err)
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"d31 = 20.0": "d31 = 0.0"}, {"d32 = 2.0": "d32 = 0"}, {"d32 = 2.0": "d32 = -0.03"}]
+    ("data", "message"),
+    [
+        (b"[film\nradius_mm = 45", "not a TOML file: .*line 1"),
+        (b"\xff\xfe\x00name", "not a TOML file: not text"),
+    ],
 )
-def test_what_is_unusual_gets_no_warning(tmp_path, changes, caplog):
-    load_sensor(file_with(tmp_path, changes))
-    assert caplog.messages == []
-
-
-def test_electrode_off_the_film_in_a_file(tmp_path):
-    """Word for word as in the style guide."""
+def test_file_that_is_not_toml(tmp_path, data, message):
     path = tmp_path / "mine.toml"
-    path.write_text(WHOLE.replace("[8.660254, 5.0]", "[40.0, 25.0]").partition("[calibration]")[0])
-    with pytest.raises(SensorError) as caught:
+    path.write_bytes(data)
+    with pytest.raises(SensorError, match=rf"^{path}: {message}"):
         load_sensor(path)
-    assert str(caught.value) == (
-        f"{path}: electrode 'B' lies outside the film: centre (40.0, 25.0) mm, half side 1.5 mm, film radius 30.0 mm"
-    )
 
 
-def test_no_such_sensor(tmp_path):
-    with pytest.raises(
-        SensorError, match=r"no sensor 'five': it is neither a built-in name \(four-25um-.*\) nor a file"
-    ):
+def test_no_such_sensor():
+    with pytest.raises(SensorError, match=r"no sensor 'five': it is neither a built-in name .* nor a file"):
         load_sensor("five")
-    with pytest.raises(SensorError, match="nor a file"):
-        load_sensor(tmp_path)
-
-
-def test_file_that_is_not_toml(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text("[film\nradius_mm = 45")
-    with pytest.raises(SensorError, match=rf"^{path}: not a TOML file: .*line 1"):
-        load_sensor(path)
-
-
-def test_file_that_is_not_text(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_bytes(b"\xff\xfe\x00name")
-    with pytest.raises(SensorError, match=rf"^{path}: not a TOML file: not text in UTF-8"):
-        load_sensor(str(path))
-
-
-@pytest.mark.parametrize("table", [None, [], "film", 3])
-def test_value_that_is_no_table_is_refused(table):
-    with pytest.raises(SensorError, match=r"^sensor: expected a table, got "):
-        sensor_from_dict(table)
 
 
 @pytest.mark.timeout(20)
-@pytest.mark.parametrize("count", [65, 1000, 200_000])
+@pytest.mark.parametrize("count", [65, 200_000])
 def test_too_many_electrodes_are_refused_at_once(tmp_path, count):
     path = tmp_path / "sensor.toml"
     good = (resources.files("isocharge.simulate") / "sensors/three-25um-biaxial.toml").read_text("utf-8")
@@ -350,3 +256,109 @@ def test_too_many_electrodes_are_refused_at_once(tmp_path, count):
     with pytest.raises(SensorError, match=r"larger than|at most 64") as caught:
         load_sensor(path)
     assert len(str(caught.value)) < 500
+
+
+# Writing
+
+
+def test_a_written_file_reads_as_the_design_has_it():
+    assert sensor_to_dict(sensor_from_dict(whole())) == whole()
+    sections = sensor_to_toml(sensor_from_dict(whole())).split("\n\n")
+    assert [section.splitlines()[0] for section in sections] == [
+        *('name = "mine"', "[film]", "[piezo]", "[electrodes]", "[calibration]"),
+    ]
+    assert sections[3].splitlines()[1:] == ["side_mm = 3.0", "A = [0.0, -10.0]", "B = [8.660254, 5.0]"]
+    assert "gain = {A = 1.02}" in sections[4]
+
+
+@pytest.mark.parametrize("name", built_in_sensors())
+def test_a_written_file_is_the_built_in_sensor(name, tmp_path):
+    path = tmp_path / "mine.toml"
+    write_sensor(load_sensor(name), path, ["as delivered", "", "pretension\nunknown"])
+    assert path.read_text("utf-8").startswith("# as delivered\n#\n# pretension\n# unknown\n\nname = ")
+    assert load_sensor(path) == load_sensor(name)
+    with pytest.raises(OutputExists, match="is already there"):
+        write_sensor(load_sensor(name), path)
+
+
+def test_squares_of_two_sizes_survive_as_polygons():
+    """The file has one side for all squares."""
+    base = load_sensor("three-25um-biaxial")
+    squares = (Electrode.of_square("A", (0.0, 0.0), 3.0), Electrode.of_square("B", (6.0, 0.0), 2.0))
+    again = sensor_from_dict(sensor_to_dict(replace(base, electrodes=squares)))
+    assert [electrode.area for electrode in again.electrodes] == pytest.approx([9.0, 4.0])
+    with pytest.raises(SensorError, match=r"all squares have one side: got \{'A': 3\.0, 'B': 2\.0\} mm"):
+        sensor_to_dict(replace(base, electrodes=squares, readout="edge"))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("", "name: expected a text"), ("\ud800", "no text that UTF-8 can hold")]
+)
+def test_a_sensor_that_no_file_can_hold(tmp_path, name, message):
+    with pytest.raises(SensorError, match=message):
+        write_sensor(replace(load_sensor("three-25um-biaxial"), name=name), tmp_path / "mine.toml")
+    assert list(tmp_path.iterdir()) == []
+
+
+NAMES = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6) | st.sampled_from(
+    ["a.b", "#", '"', "'", "\\", "\x7f", "\n", "[x]", "\u2028", "\U0001f600", " ", "gain", "name", "1e3", "=", "\ufeff"]
+)
+
+
+@st.composite
+def electrodes(draw: st.DrawFn) -> tuple[Electrode, ...]:
+    """Squares, of one side or of several, and convex polygons, none of which overlap; any names."""
+    names = draw(st.lists(NAMES.filter(lambda name: name != "side_mm"), min_size=1, max_size=5, unique=True))
+    places = draw(st.permutations([(x, y) for x in (-6.0, 0.0, 6.0) for y in (-6.0, 0.0, 6.0)]))
+    shapes = []
+    for name, (x, y) in zip(names, places, strict=False):
+        x, y, size = x + draw(st.floats(-1.0, 1.0)), y + draw(st.floats(-1.0, 1.0)), draw(st.floats(0.5, 1.5))
+        corners = draw(st.integers(2, 9))
+        if corners == 2:
+            shapes.append(Electrode.of_square(name, (x, y), draw(st.sampled_from([2.0, size]))))
+        else:
+            angles = draw(st.floats(0.0, 6.0)) + 2.0 * np.pi * np.arange(corners) / corners
+            points = zip(x + size * np.cos(angles), y + size * np.sin(angles), strict=True)
+            shapes.append(Electrode(name, tuple((float(a), float(b)) for a, b in points)))
+    return tuple(shapes)
+
+
+def numbers(table: object) -> list[float]:
+    """All numbers of nested tables, in their order."""
+    if isinstance(table, dict):
+        return [number for value in table.values() for number in numbers(value)]
+    if isinstance(table, list | tuple):
+        return [number for value in table for number in numbers(value)]
+    return [float(table)] if isinstance(table, float | int) else []
+
+
+@given(
+    name=NAMES,
+    shapes=electrodes(),
+    film=st.builds(
+        Film,
+        radius=st.floats(15.0, 200.0),
+        thickness=st.floats(1e-3, 1.0),
+        young=st.floats(1.0, 1e5),
+        poisson=st.floats(0.0, 0.499),
+        pretension=st.floats(0.0, 10.0),
+    ),
+    piezo=st.tuples(*[st.floats(1.0, 100.0)] * 3),
+    gains=st.lists(st.none() | st.floats(0.01, 100.0), min_size=5, max_size=5),
+    rotation=st.floats(-np.pi, np.pi),
+    shift=st.tuples(*[st.floats(-1.0, 1.0)] * 2),
+    surface=st.sampled_from(["middle", "top", "bottom"]),
+)
+@settings(derandomize=True, max_examples=100, deadline=None)
+def test_what_is_written_is_loaded(name, shapes, film, piezo, gains, rotation, shift, surface, tmp_path_factory):
+    gain = {shape.name: value for shape, value in zip(shapes, gains, strict=False) if value is not None}
+    calibration = Calibration(gain, shift, rotation)
+    sensor = Sensor(name, film, Piezo(2.0, *piezo), shapes, surface=surface, calibration=calibration)
+    path = tmp_path_factory.mktemp("sensor") / "mine.toml"
+    write_sensor(sensor, path)
+    again, table = load_sensor(path), sensor_to_dict(sensor)
+    assert tomllib.loads(path.read_text("utf-8")) == table
+    assert (again.name, again.surface, again.electrode_names) == (name, surface, sensor.electrode_names)
+    corners = [[shape.corners for shape in each.electrodes] for each in (again, sensor)]
+    np.testing.assert_allclose(numbers(corners[0]), numbers(corners[1]), rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(numbers(sensor_to_dict(again)), numbers(table), rtol=1e-11)

@@ -1,40 +1,57 @@
 """Noise and amplifiers by the name of their level or from a TOML file."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, structs
 
 from isocharge.common.errors import InputError
-from isocharge.common.tables import Table, read_toml
+from isocharge.common.structs import Finite, NotNegative, Positive, Settings, read_toml
 from isocharge.simulate.measuring_chain.amplifier import Amplifier
 from isocharge.simulate.measuring_chain.levels import AMPLIFIER_LEVELS, NOISE_LEVELS
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
-NOT_NEGATIVE: dict[str, Any] = {"least": 0}
-POSITIVE: dict[str, Any] = {"above": 0.0}
-POSITIVE_OR_INFINITE: dict[str, Any] = {"above": 0.0, "or_infinite": True}
-ANY: dict[str, Any] = {}
+PositiveOrInfinite = Annotated[float, Meta(gt=0.0, description="a positive number or inf")]
 
-KEYS: dict[str, tuple[str, dict[str, Any]]] = {
-    "tau_s": ("tau", POSITIVE_OR_INFINITE),
-    "tau_mismatch": ("tau_mismatch", NOT_NEGATIVE),
-    "gain_mismatch": ("gain_mismatch", NOT_NEGATIVE),
-    "hum_pC": ("hum", NOT_NEGATIVE),
-    "hum_Hz": ("hum_frequency", POSITIVE),
-    "offset_pC": ("offset", NOT_NEGATIVE),
-    "bias_pA": ("bias", NOT_NEGATIVE),
-    "pyro_pC_per_K": ("pyro", NOT_NEGATIVE),
-    "temperature_rms_K": ("temperature_rms", NOT_NEGATIVE),
-    "temperature_time_s": ("temperature_time", POSITIVE),
-    "temperature_step_K": ("step", ANY),
-    "temperature_step_at_s": ("step_at", ANY),
-    "temperature_step_time_s": ("step_time", POSITIVE),
-    "limit_pC": ("limit", POSITIVE_OR_INFINITE),
+KEYS = {
+    "tau": "tau_s",
+    "hum": "hum_pC",
+    "hum_frequency": "hum_Hz",
+    "offset": "offset_pC",
+    "bias": "bias_pA",
+    "pyro": "pyro_pC_per_K",
+    "temperature_rms": "temperature_rms_K",
+    "temperature_time": "temperature_time_s",
+    "step": "temperature_step_K",
+    "step_at": "temperature_step_at_s",
+    "step_time": "temperature_step_time_s",
+    "limit": "limit_pC",
 }
-"""Numbers of a TOML file: the attribute of `Amplifier` and the bounds of the number."""
+"""Keys of the file that are not called as the attributes of `Amplifier`."""
 
-OTHER_KEYS = ("like", "white_pC", "proportional", "bits")
+
+class AmplifierFile(Settings, frozen=True, rename=KEYS):
+    """The file: noise, and the attributes of `Amplifier`; what is None is that of the level `like`."""
+
+    like: Literal["clean", "reference", "bench", "surgery"] = "clean"
+    white_pC: NotNegative | None = None
+    proportional: NotNegative | None = None
+    tau: PositiveOrInfinite | None = None
+    tau_mismatch: NotNegative | None = None
+    gain_mismatch: NotNegative | None = None
+    hum: NotNegative | None = None
+    hum_frequency: Positive | None = None
+    offset: NotNegative | None = None
+    bias: NotNegative | None = None
+    pyro: NotNegative | None = None
+    temperature_rms: NotNegative | None = None
+    temperature_time: Positive | None = None
+    step: Finite | None = None
+    step_at: Finite | None = None
+    step_time: Positive | None = None
+    limit: PositiveOrInfinite | None = None
+    bits: Annotated[int, Meta(ge=0, le=32)] | None = None
 
 
 def load_amplifier(level: str) -> Amplifier:
@@ -52,22 +69,14 @@ def load_amplifier(level: str) -> Amplifier:
         return AMPLIFIER_LEVELS[level]
     if not level.endswith(".toml"):
         raise InputError(f"noise level: expected one of {', '.join(AMPLIFIER_LEVELS)}, or a TOML file, got {level!r}")
-    return _amplifier(read_toml(Path(level), "the description of noise", InputError), level)
-
-
-def _amplifier(values: Mapping[str, Any], where: str) -> Amplifier:
-    table = Table(values, where, InputError).only(*KEYS, *OTHER_KEYS)
-    like = AMPLIFIER_LEVELS[table.choice("like", tuple(AMPLIFIER_LEVELS), "clean")]
-    noise = NoiseModel(
-        Path(where).stem,
-        table.number("white_pC", like.noise.white, least=0),
-        table.number("proportional", like.noise.gain, least=0),
-    )
-    changes = {attribute: table.number(key, **bounds) for key, (attribute, bounds) in KEYS.items() if key in table}
+    file = read_toml(Path(level), "the description of noise", InputError, AmplifierFile)
+    given: dict[str, Any] = {name: value for name, value in structs.asdict(file).items() if value is not None}
+    like = AMPLIFIER_LEVELS[given.pop("like")]
+    white, gain = given.pop("white_pC", like.noise.white), given.pop("proportional", like.noise.gain)
     try:
-        return replace(like, noise=noise, bits=table.whole("bits", like.bits, least=0, most=32), **changes)
+        return replace(like, noise=NoiseModel(Path(level).stem, white, gain), **given)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(f"{level}: {error}") from error
 
 
 def noise_model(level: str) -> NoiseModel:

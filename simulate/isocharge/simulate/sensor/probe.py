@@ -13,8 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
-from isocharge.common.errors import SceneError
-from isocharge.common.tables import cut
+from isocharge.common.errors import SceneError, cut
 from isocharge.simulate.numerics.polygon import area_of, centroid_of, is_convex
 from isocharge.simulate.sensor.size_check import check_millimetres
 

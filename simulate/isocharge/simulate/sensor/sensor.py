@@ -9,8 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import SensorError
-from isocharge.common.tables import cut, shown
+from isocharge.common.errors import SensorError, cut, shown
 from isocharge.simulate.numerics.polygon import overlap
 from isocharge.simulate.sensor.electrode import Calibration, Electrode, check_electrode
 from isocharge.simulate.sensor.film import Film, Piezo, Surface

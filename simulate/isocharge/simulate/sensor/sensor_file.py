@@ -4,13 +4,24 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta, field
 
 from isocharge.common.errors import SensorError
 from isocharge.common.files import refuse_existing, write_whole
-from isocharge.common.tables import Table, parse_toml, read_toml
+from isocharge.common.structs import (
+    Finite,
+    NotNegative,
+    Positive,
+    Settings,
+    Text,
+    WrongKey,
+    convert,
+    parse_toml,
+    read_toml,
+)
 from isocharge.common.toml_text import to_toml
 from isocharge.simulate.sensor.electrode import Calibration, Electrode
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
@@ -24,7 +35,66 @@ TINY = 1e-3
 
 log = logging.getLogger(__name__)
 
-SECTIONS = ("name", "readout", "surface", "film", "piezo", "electrodes", "calibration")
+SIDE = "side_mm"
+"""Key of the squares' side, among the names of the electrodes."""
+
+Coordinate = Annotated[float, Meta(ge=-FARTHEST_MM, le=FARTHEST_MM)]
+Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm, each at most {FARTHEST_MM:g}")]
+
+
+class FilmTable(Settings, frozen=True):
+    """The section `film`."""
+
+    radius_mm: Annotated[float, Meta(gt=0.0, le=FARTHEST_MM)]
+    thickness_um: Positive
+    young_GPa: Positive
+    poisson: Finite
+    pretension_MPa: NotNegative = 0.0
+
+
+class PiezoTable(Settings, frozen=True):
+    """The section `piezo`: coefficients in pC/N."""
+
+    d31: Finite
+    d32: Finite
+    d33: Finite = 0.0
+    pyro_uC_per_m2_K: Finite = 0.0
+
+
+class PolygonTable(Settings, frozen=True):
+    """An electrode that is no square."""
+
+    polygon_mm: tuple[Point, ...]
+
+
+class CalibrationTable(Settings, frozen=True):
+    """The section `calibration`."""
+
+    gain: dict[str, Positive] = field(default_factory=dict)
+    shift_mm: Point = (0.0, 0.0)
+    rotation_deg: Finite = 0.0
+
+
+class SensorTable(Settings, frozen=True):
+    """A sensor file; `electrodes` has places of squares and polygons by name, and the squares' side."""
+
+    name: Text
+    film: FilmTable
+    piezo: PiezoTable
+    electrodes: dict[str, float | Point | PolygonTable]
+    readout: Readout = "area"
+    surface: Surface = "middle"
+    calibration: CalibrationTable = CalibrationTable()
+
+    def __post_init__(self) -> None:
+        for name, value in self.electrodes.items():
+            if name != SIDE and isinstance(value, float):
+                raise WrongKey(f"electrodes.{name}", "[x, y] in mm or a table", value)
+        side = self.electrodes.get(SIDE)
+        if side is not None and not (isinstance(side, float) and 0.0 < side <= FARTHEST_MM):
+            raise WrongKey(f"electrodes.{SIDE}", f"a number above 0 and at most {FARTHEST_MM:g}", side)
+        if side is None and any(isinstance(value, tuple) for value in self.electrodes.values()):
+            raise WrongKey(f"electrodes.{SIDE}")
 
 
 def built_in_sensors() -> tuple[str, ...]:
@@ -57,8 +127,9 @@ def load_sensor(sensor: str | Path) -> Sensor:
 
 def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
     """Build a sensor from the tables of its file (units in the keys); `where` opens the error messages."""
+    file = convert(table, SensorTable, where, SensorError)
     try:
-        return _build(Table(table, "", SensorError).only(*SECTIONS))
+        return _build(file)
     except SensorError as error:
         raise SensorError(f"{where}: {error}") from error
 
@@ -166,59 +237,23 @@ def _tidy(value: float) -> float:
     return float(f"{value:.12g}")
 
 
-def _build(file: Table) -> Sensor:
-    film = file.table("film").only("radius_mm", "thickness_um", "young_GPa", "poisson", "pretension_MPa")
-    piezo = file.table("piezo").only("d31", "d32", "d33", "pyro_uC_per_m2_K")
+def _build(file: SensorTable) -> Sensor:
+    film, piezo, calibration = file.film, file.piezo, file.calibration
     return Sensor(
-        name=file.text("name"),
-        film=Film(
-            radius=film.number("radius_mm", above=0.0, most=FARTHEST_MM),
-            thickness=film.number("thickness_um", above=0.0) * 1e-3,
-            young=film.number("young_GPa", above=0.0) * 1e3,
-            poisson=film.number("poisson"),
-            pretension=film.number("pretension_MPa", 0.0, least=0.0),
-        ),
-        piezo=Piezo(
-            d31=piezo.number("d31"),
-            d32=piezo.number("d32"),
-            d33=piezo.number("d33", 0.0),
-            pyro=piezo.number("pyro_uC_per_m2_K", 0.0),
-        ),
-        electrodes=_electrodes(file.table("electrodes")),
-        readout=cast(Readout, file.choice("readout", get_args(Readout), "area")),
-        surface=cast(Surface, file.choice("surface", get_args(Surface), "middle")),
-        calibration=_calibration(file.table("calibration", {})),
+        name=file.name,
+        film=Film(film.radius_mm, film.thickness_um * 1e-3, film.young_GPa * 1e3, film.poisson, film.pretension_MPa),
+        piezo=Piezo(piezo.d31, piezo.d32, piezo.d33, piezo.pyro_uC_per_m2_K),
+        electrodes=tuple(_electrodes(file.electrodes)),
+        readout=file.readout,
+        surface=file.surface,
+        calibration=Calibration(calibration.gain, calibration.shift_mm, float(np.deg2rad(calibration.rotation_deg))),
     )
 
 
-def _electrodes(table: Table) -> tuple[Electrode, ...]:
-    return tuple(_electrode(table, name) for name in table if name != "side_mm")
-
-
-def _electrode(table: Table, name: str) -> Electrode:
-    if isinstance(table.get(name), Mapping):
-        polygon = table.table(name).only("polygon_mm")
-        corners = polygon.sequence("polygon_mm", of="[x, y]")
-        return Electrode(name, tuple(_point(polygon, "polygon_mm", corner) for corner in corners))
-    side = table.number("side_mm", above=0.0)
-    if side > FARTHEST_MM:
-        table.refuse("side_mm", f"at most {FARTHEST_MM:g}")
-    return Electrode.of_square(name, _point(table, name, table.get(name)), side)
-
-
-def _point(table: Table, key: str, point_mm: object) -> tuple[float, float]:
-    """A point of the plane, mm."""
-    x_mm, y_mm = table.as_numbers(key, point_mm, count=2, of="[x, y] in mm")
-    if max(abs(x_mm), abs(y_mm)) > FARTHEST_MM:
-        table.refuse(key, f"[x, y] in mm, each at most {FARTHEST_MM:g}", point_mm)
-    return x_mm, y_mm
-
-
-def _calibration(table: Table) -> Calibration:
-    table.only("gain", "shift_mm", "rotation_deg")
-    gain = table.table("gain", {})
-    return Calibration(
-        gain={name: gain.number(name, above=0.0) for name in gain},
-        shift=_point(table, "shift_mm", table.get("shift_mm", [0.0, 0.0])),
-        rotation=float(np.deg2rad(table.number("rotation_deg", 0.0))),
-    )
+def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:
+    side = table.get(SIDE)
+    for name, value in table.items():
+        if isinstance(value, PolygonTable):
+            yield Electrode(name, value.polygon_mm)
+        elif isinstance(value, tuple) and isinstance(side, float):
+            yield Electrode.of_square(name, value, side)
