@@ -25,12 +25,12 @@ def lazy_group(summary: str, commands: Commands) -> typer.Typer:
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             name, command, rest = super().resolve_command(ctx, args)
-            return name, load_command(*commands[name]) if name in commands else command, rest
+            return name, load_command(commands[str(name)][0]) if name in commands else command, rest
 
     return typer.Typer(cls=LazyGroup, no_args_is_help=True, pretty_exceptions_enable=False, help=summary)
 
 
-def load_command(place: str, _: str = "") -> TyperCommand:
+def load_command(place: str) -> TyperCommand:
     """The command of a function, "package.module:function"."""
     module, _, function = place.partition(":")
     one = typer.Typer(add_completion=False)
