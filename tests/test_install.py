@@ -83,11 +83,11 @@ def test_a_missing_extra_says_how_to_get_it(fresh, tmp_path):
 @pytest.mark.parametrize(
     ("extras", "present", "absent"),
     [
-        (("base",), ("onnxruntime", "serial", "typer"), ("scipy", "matplotlib", "torch", "uvicorn", "grpc", "dask")),
-        (("simulate",), ("scipy", "matplotlib"), ("torch", "sklearn", "onnx", "uvicorn", "dask")),
-        (("train",), ("scipy", "torch", "onnx"), ("uvicorn", "grpc", "dask")),
-        (("http",), ("uvicorn",), ("scipy", "grpc")),
-        (("grpc",), ("uvicorn", "grpc"), ("scipy", "torch")),
+        (("base",), ("onnxruntime", "serial", "typer"), ("scipy", "matplotlib", "torch", "uvloop", "grpc", "dask")),
+        (("simulate",), ("scipy", "matplotlib"), ("torch", "sklearn", "onnx", "uvloop", "dask")),
+        (("train",), ("scipy", "torch", "onnx"), ("uvloop", "grpc", "dask")),
+        (("http",), ("uvloop",), ("scipy", "grpc")),
+        (("grpc",), ("uvloop", "grpc"), ("scipy", "torch")),
         (("all",), ("scipy", "torch", "grpc", "dask"), ()),
     ],
 )

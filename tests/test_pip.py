@@ -26,7 +26,7 @@ LINES = sorted(
 )
 """What the pages tell people to install of ours."""
 
-NEEDED = {"": "isocharge.serve", "http": "uvicorn", "grpc": "grpc", "simulate": "isocharge.simulate"}
+NEEDED = {"": "isocharge.serve", "http": "uvloop", "grpc": "grpc", "simulate": "isocharge.simulate"}
 NEEDED |= {"train": "isocharge.train", "all": "isocharge.train", "cluster": "distributed"}
 """What can be imported once an extra is installed."""
 

@@ -68,7 +68,7 @@ def main() -> None:
         port, log = Path(name) / "film", Path(name) / "log"
         sensor = start("virtual", MODEL, "--link", port, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         with log.open("w") as output:
-            words = ("stream", MODEL, "--port", port, "--wait", "60", "--output", "none", "--live", "--live-port", "0")
+            words = ("stream", MODEL, "--port", port, "--wait", "60", "--output", "none", "--live", "127.0.0.1:0")
             stream = start(*words, stderr=output)
         try:
             while "tared" not in log.read_text():

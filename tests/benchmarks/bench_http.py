@@ -1,8 +1,8 @@
-"""HTTP: ours against a bare route, an idiomatic FastAPI service, Triton and MLServer; all serve the same model file.
+"""HTTP: ours against a bare route, an idiomatic FastAPI service and Triton; all serve the same model file.
 
     python tests/benchmarks/bench_http.py [--environments DIR] [--rounds 12] [--requests 400] [--seconds 4] [--json]
 
-FastAPI, Triton and MLServer get environments of their own in `--environments`, made once; one that cannot be installed
+FastAPI and Triton get environments of their own in `--environments`, made once; one that cannot be installed
 or does not start is left out, and stderr says why. Client and servers share the cores; the client is a plain socket,
 the same for all. Latency: one request at a time over one open connection, contenders take turns within each round.
 Throughput: 32 connections, each with one request under way. Ratios come from the same rounds. A batch of 1024 is
@@ -35,9 +35,8 @@ from isocharge.serve.model.session import OUTPUTS
 HERE = Path(__file__).parent
 DEPLOY = HERE.parents[1] / "serve" / "deploy"
 PACKAGES = {
-    "fastapi": ["fastapi", "uvicorn[standard]", "onnxruntime"],
+    "fastapi": ["fastapi", "uvicorn[standard]", "onnxruntime", "orjson"],
     "triton": ["nvidia-pytriton", "onnxruntime"],
-    "mlserver": ["mlserver", "onnxruntime"],
 }
 CONNECTIONS = 32
 
@@ -121,7 +120,7 @@ def free_port() -> int:
 
 
 def python_of(name: str, environments: Path) -> Path:
-    """The interpreter of a rival's environment, made if it is not there; absolute, as the rival has its own folder.
+    """The interpreter of a rival's environment, made if it is not there; absolute, whatever folder the rival runs in.
 
     Raises:
         NotStarted: If its packages cannot be installed.
@@ -159,7 +158,7 @@ def running(command: list[str | Path], address: Address, **options: Any) -> Iter
 
 
 def _wait_for(process: subprocess.Popen[bytes], address: Address, output: IO[bytes]) -> None:
-    """Wait until something listens, and a moment more: MLServer listens before it has loaded its model."""
+    """Wait until something listens, and a moment more: a rival may listen before it has loaded its model."""
     for _ in range(600):
         try:
             Connection(address).close()
@@ -175,16 +174,15 @@ def _wait_for(process: subprocess.Popen[bytes], address: Address, output: IO[byt
 
 
 def start(stack: ExitStack, model: str, environments: Path | None) -> Contenders:
-    """Start every contender; without `environments`, only ours and the bare route."""
+    """Start every contender; without `environments`, only ours."""
     folder = find_model(model).resolve()
     path = f"/v2/models/{load_model(folder).metadata.name}/infer"
     tcp, uds = _local_address(), str(_temporary_folder(stack) / "isocharge.sock")
     ours = [Path(sys.executable).with_name("isocharge"), "serve", "http", "--models", folder.parents[1]]
     stack.enter_context(running([*ours, "--port", str(tcp[1])], tcp))
     stack.enter_context(running([*ours, "--uds", uds], uds))
-    bare = _start_script(stack, Path(sys.executable), "bare_app.py", folder / "model.onnx")
-    contenders = {"isocharge": (tcp, path), "isocharge, Unix socket": (uds, path), "bare route": (bare, path)}
-    rivals = {"FastAPI": _start_fastapi, "Triton": _start_triton, "MLServer tuned": _start_mlserver}
+    contenders: Contenders = {"isocharge": (tcp, path), "isocharge, Unix socket": (uds, path)}
+    rivals = {"bare route": _start_bare, "FastAPI": _start_fastapi, "Triton": _start_triton}
     for name, start_rival in rivals.items() if environments else ():
         try:
             contenders[name] = start_rival(stack, environments, folder / "model.onnx", path)
@@ -208,24 +206,20 @@ def _start_script(stack: ExitStack, python: Path, script: str, model: Path) -> A
     return address
 
 
+def _start_bare(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
+    return _start_script(stack, python_of("fastapi", environments), "bare_app.py", model), path
+
+
 def _start_fastapi(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
     return _start_script(stack, python_of("fastapi", environments), "fastapi_app.py", model), path
 
 
 def _start_triton(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
-    return _start_host(stack, python_of("triton", environments), "triton", model), path
-
-
-def _start_mlserver(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
-    return _start_host(stack, python_of("mlserver", environments), "mlserver", model), path
-
-
-def _start_host(stack: ExitStack, python: Path, host: str, model: Path) -> Address:
-    """Start a server of the folder `serve/deploy` on the models as they stand."""
+    """Start Triton on the models as they stand."""
     address = _local_address()
-    command = [python, DEPLOY / host / "start.py", model.parents[2], "--port", str(address[1])]
-    stack.enter_context(running(command, address))
-    return address
+    command = [python_of("triton", environments), DEPLOY / "triton/start.py", model.parents[2]]
+    stack.enter_context(running([*command, "--port", str(address[1])], address))
+    return address, path
 
 
 def latencies(address: Address, request: bytes, count: int) -> np.ndarray:
@@ -334,26 +328,6 @@ def rows(durations: dict[str, np.ndarray], against: str) -> Iterator[dict[str, A
         }
 
 
-def counting_cost(address: Address, request: bytes, rounds: int, number: int) -> dict[str, np.ndarray]:
-    """Durations with the counters of `/metrics` and without, shape (rounds, number), us: one process, one connection.
-
-    The two take turns ten requests at a time; the first round only warms up.
-    """
-    connection, clock = Connection(address), time.perf_counter_ns
-    durations = {"off": np.empty((rounds + 1, number)), "on": np.empty((rounds + 1, number))}
-    for i in range((rounds + 1) * number // 10):
-        for switch in ("off", "on") if i % 2 else ("on", "off"):
-            connection.send(http_request(f"/counting/{switch}", b""))
-            connection.receive()
-            for j in range(10 * i, 10 * i + 10):
-                begin = clock()
-                connection.send(request)
-                connection.receive()
-                durations[switch].flat[j] = clock() - begin
-    connection.close()
-    return {f"counters {switch}": of[1:] / 1e3 for switch, of in durations.items()}
-
-
 def stock_client(address: tuple[str, int], name: str, charges: np.ndarray, count: int) -> dict[str, np.ndarray]:
     """Arrays in, arrays out through Triton's HTTP client, shape (1, count), us: its own coding included."""
     client = tritonclient.http.InferenceServerClient(f"{address[0]}:{address[1]}")
@@ -387,11 +361,7 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
                 rows(stock_client(address, path.split("/")[3], charges, asked.requests // 4), "JSON")
             ),
         }
-        switched = _start_script(stack, Path(sys.executable), "counted_app.py", find_model(asked.model) / "model.onnx")
-        cost = counting_cost(switched, one["isocharge"][1], 2 * asked.rounds, 10 * (asked.requests // 10))
-        tables["one press, what the counters of /metrics cost"] = list(rows(cost, "counters off"))
         tables["one core of the server"] = list(core_seconds(address, path, charges, asked.seconds))
-        # MLServer's queues drain between turns: each contender is measured alone, twice.
         counts = {name: [throughput(*target, asked.seconds) for _ in range(2)] for name, target in one.items()}
     ours = np.mean(counts["isocharge"])
     tables["32 connections"] = [
@@ -409,7 +379,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", default="three-25um-biaxial", help="model name or path, three electrodes")
     parser.add_argument("--environments", type=Path, default=Path("build/bench-environments"), metavar="DIR")
-    parser.add_argument("--without-rivals", action="store_true", help="only ours and the bare route")
+    parser.add_argument("--without-rivals", action="store_true", help="only ours")
     parser.add_argument("--rounds", type=int, default=12)
     parser.add_argument("--requests", type=int, default=400, help="of each contender in a round")
     parser.add_argument("--seconds", type=float, default=4.0, help="of each throughput measurement")

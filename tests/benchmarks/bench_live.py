@@ -7,11 +7,6 @@ the newest sample when a viewer has it, and the memory of the processes. With --
 viewers and says how old its pictures are and how many a second it draws.
 
     python tests/benchmarks/bench_live.py --rounds 4 --seconds 10 [--browser] [--rate-Hz 1000]
-
-With --soak there is one long round with viewers and no recording, and the memory of each process over it. As many
-samples as a board of 200 Hz sends in four hours, in ten minutes:
-
-    python tests/benchmarks/bench_live.py --soak --browser --rate-Hz 4800 --seconds 600
 """
 
 import argparse
@@ -24,7 +19,6 @@ import struct
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,7 +28,7 @@ from websockets.asyncio.client import connect
 
 from isocharge.serve import Predictor, Recording, Script, VirtualSensor, wander
 from isocharge.serve.viewer.messages import HEADER
-from isocharge.serve.viewer.sample import SampleFormat
+from isocharge.serve.viewer.samples import SampleFormat
 
 MODEL = "three-25um-biaxial"
 CHROMIUM = "/usr/bin/chromium"
@@ -44,8 +38,9 @@ ARGUMENTS = [
 ]
 
 
-def charge_pC(x_mm, y_mm, force_N):
+def charges(contact):
     """A film of no great likeness: what matters here is that it is pressed."""
+    x_mm, y_mm, force_N = contact.T
     electrodes = np.array([[0.0, -10.0], [8.660254, 5.0], [-8.660254, 5.0]])
     distance = np.hypot(x_mm[:, None] - electrodes[:, 0], y_mm[:, None] - electrodes[:, 1])
     return 850.0 * force_N[:, None] ** (2 / 3) * 10.0 / (2.0 + 0.8 * distance)
@@ -60,7 +55,7 @@ def presses(rate_Hz):
 
 def play(rate_Hz, url, stop, counts):
     """The board, in a process of its own."""
-    with VirtualSensor(charge_pC, presses(rate_Hz)) as sensor:
+    with VirtualSensor(charges, presses(rate_Hz)) as sensor:
         url.send(sensor.url)
         stop.wait()
         counts.send((sensor.sent, sensor.withheld))
@@ -168,7 +163,7 @@ def watched(url, viewers, seconds):
 def one_round(port, viewers, seconds, folder, name, in_browser):
     """Follow the port for a while: latencies (us), lost frames, ages (s), memory (MB, start and end), browser."""
     path = folder / f"{name}.rec"
-    words = ["--live", "--live-port", "0"] if viewers else []
+    words = ["--live", "127.0.0.1:0"] if viewers else []
     with following(port, folder, name, "--record", path, *words) as (process, url):
         pids = [process.pid, *children(process.pid)]
         memory = [memory_MB(*pids)]
@@ -179,36 +174,6 @@ def one_round(port, viewers, seconds, folder, name, in_browser):
     lines = (json.loads(line) for line in path.open() if line.startswith('{"timestamp"'))
     seq = np.array([line["seq"] for line in lines])
     return latencies, int(((np.diff(seq) - 1) % 65536).sum()), ages, memory, browsed
-
-
-def soak(port, seconds, folder, in_browser):
-    """Memory of reader, page process and browser's page over one long round, MB: rows by name."""
-    with following(port, folder, "soak", "--live", "--live-port", "0") as (process, url):
-        (page,) = (pid for pid in children(process.pid) if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text())
-        memory, over = {"reader": [], "page process": []}, threading.Event()
-
-        def sample():
-            while not over.wait(2.0):
-                for name, pid in zip(memory, (process.pid, page), strict=True):
-                    memory[name].append(memory_MB(pid))
-
-        sampling = threading.Thread(target=sample)
-        with watched(url, 3 - in_browser, seconds) as ages:
-            sampling.start()
-            browsed = browse(url, seconds) if in_browser else time.sleep(seconds)
-            over.set()
-            sampling.join()
-    if browsed is not None:
-        memory["page in the browser"] = browsed[2]
-    return memory, ages
-
-
-def report_soak(memory, ages):
-    """Print medians of the tenths of the round: what grows, grows from one to the next."""
-    for name, sizes in memory.items():
-        tenths = [f"{np.median(part):.1f}" for part in np.array_split(sizes, 10)]
-        print(f"{name}, MB, median of each tenth: {' '.join(tenths)}")
-    print(f"age ms {percentiles(ages, 1e3)}")
 
 
 def percentiles(values, scale=1.0):
@@ -225,7 +190,6 @@ def main():
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rate-Hz", type=float, default=1000.0)
     parser.add_argument("--browser", action="store_true")
-    parser.add_argument("--soak", action="store_true")
     options = parser.parse_args()
     context = multiprocessing.get_context("spawn")
     (url, their_url), (counts, their_counts) = context.Pipe(duplex=False), context.Pipe(duplex=False)
@@ -237,9 +201,7 @@ def main():
         f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {options.rate_Hz:g} Hz, {options.seconds:g} s a round"
     )
     with tempfile.TemporaryDirectory() as name:
-        if options.soak:
-            report_soak(*soak(port, options.seconds, Path(name), options.browser))
-        for number in range(0 if options.soak else options.rounds):
+        for number in range(options.rounds):
             for viewers in (0, 3) if number % 2 == 0 else (3, 0):
                 in_browser = options.browser and viewers > 0
                 latencies, lost, ages, memory, browsed = one_round(
@@ -262,10 +224,9 @@ def main():
                         f"  Chromium: age of a picture ms {percentiles(pictures)}; pictures/s "
                         f"{np.median(rates):.1f}; heap MB {heap[0]:.1f} -> {heap[-1]:.1f}, most {max(heap):.1f}"
                     )
-    if not options.soak:
-        ratios = np.array(p99[3]) / np.array(p99[0])
-        spread = f"median {np.median(ratios):.2f}, {ratios.min():.2f} to {ratios.max():.2f}"
-        print(f"p99 with three viewers over without: {spread}")
+    ratios = np.array(p99[3]) / np.array(p99[0])
+    spread = f"median {np.median(ratios):.2f}, {ratios.min():.2f} to {ratios.max():.2f}"
+    print(f"p99 with three viewers over without: {spread}")
     stop.set()
     sent, withheld = counts.recv()
     print(f"board: {sent} frames sent, {withheld} withheld while nobody followed")
