@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle
-from isocharge.train.data.measured import dataset_of, held_out, is_measured
+from isocharge.train.data.measured import dataset_of, held_out
+from isocharge.train.data.presses import is_measured
 
 
 def contacts(count: int, seed: int) -> np.ndarray:
@@ -45,13 +46,13 @@ def test_presses_held_out_of_all_are_first_to_be_held_out_of_a_part():
 
 def test_a_simulated_dataset_is_not_measured(dataset, sensor):
     assert not is_measured(dataset)
-    assert is_measured(dataset_of(presses(contacts(60, 2), np.ones((60, 3))), sensor, Circle(1e-3)))
+    assert is_measured(dataset_of(presses(contacts(60, 2), np.ones((60, 3))), sensor, Circle(1.0)))
 
 
 def test_unknown_places_and_charges_do_not_count(sensor):
     contact, charge = contacts(55, 3), np.ones((55, 3))
     contact[0, 2] = charge[1, 0] = np.nan
-    assert len(dataset_of(presses(contact, charge), sensor, Circle(1e-3)).samples) == 53
+    assert len(dataset_of(presses(contact, charge), sensor, Circle(1.0)).samples) == 53
     contact[2:7, :2] = np.nan
     with pytest.raises(PressError, match=r"at least 50 presses .* got 48 of 55.*train calibrate"):
-        dataset_of(presses(contact, charge), sensor, Circle(1e-3))
+        dataset_of(presses(contact, charge), sensor, Circle(1.0))
