@@ -25,12 +25,12 @@ from isocharge.serve import (
     read_charges,
 )
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.virtual_sensor.script import read_script
+from isocharge.serve.virtual_sensor.script import load_script
 from isocharge.simulate import Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
-from isocharge.train.training.descent import tensors
 from isocharge.train.training.config import load_config
+from isocharge.train.training.descent import tensors
 
 ROOT = Path(__file__).parents[2]
 
@@ -86,7 +86,7 @@ def _write(folder):
         "device": ("device.toml", _load_device),
         "noise": ("noise.toml", lambda path: load_amplifier(str(path))),
         "configuration": ("config.toml", load_config),
-        "script": ("script.csv", _read_script),
+        "script": ("script.toml", load_script),
         "charges": ("charges.csv", _read_charges),
         "recording": ("touch.rec", lambda path: list(Recording(path).events())),
     }
@@ -96,11 +96,6 @@ def _load_device(path):
     device = load_device(path)
     device.parser().feed(b"\xa5\x5a123456")
     device.chain(("A", "B", "C", "D"))
-
-
-def _read_script(path):
-    with path.open(encoding="utf-8", errors="surrogateescape") as lines:
-        read_script(lines, 200.0, "script")
 
 
 def _read_charges(path):

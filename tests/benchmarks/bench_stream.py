@@ -36,10 +36,11 @@ def linear_film(electrodes: int) -> Any:
     """Charges of a film on which they are proportional to the force."""
     direction = np.exp(2j * np.pi * np.arange(electrodes) / electrodes)
 
-    def charge_pC(x_mm: np.ndarray, y_mm: np.ndarray, force_N: np.ndarray) -> np.ndarray:
-        return 800.0 * force_N[:, None] * (1.0 + ((x_mm + 1j * y_mm)[:, None] * direction.conj()).real / 20.0)
+    def charges(contact: np.ndarray) -> np.ndarray:
+        x, y, force = contact.T
+        return 800.0 * force[:, None] * (1.0 + ((x + 1j * y)[:, None] * direction.conj()).real / 20.0)
 
-    return charge_pC
+    return charges
 
 
 def board(pipe: Connection, electrodes: int, rate_Hz: float, faults: Faults, seed: int) -> None:

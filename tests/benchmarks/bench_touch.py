@@ -226,7 +226,7 @@ def plug_and_pull(
     script = Script(np.zeros(200), np.zeros(200), np.r_[np.zeros(199), 1e-9], 200.0)
     for _ in range(times + 1):
         plugged.append(time.monotonic())
-        with VirtualSensor(lambda *contact: np.zeros((len(contact[2]), electrodes)), script, link=link):
+        with VirtualSensor(lambda contact: np.zeros((len(contact), electrodes)), script, link=link):
             if stop.wait(4.0):
                 return
         time.sleep(float(rng.uniform(0.2, 3.0)))

@@ -43,6 +43,9 @@ class LinearFilm:
         lever = np.column_stack([x_mm, y_mm]) @ self.directions.T / LEVER_MM
         return PC_PER_N * np.asarray(force_N)[:, None] * (1.0 + lever)
 
+    def charges(self, contact: np.ndarray) -> np.ndarray:
+        return self.charge_pC(*contact.T)
+
     def metadata(self, **changes: object) -> ModelMetadata:
         angle = 2 * np.pi * np.arange(64) / 64
         values = {

@@ -17,7 +17,7 @@ def follow(film, predictor, n):
     # Charges are proportional to the force: below a twentieth of a press's peak the chain would see a release.
     script = wander(seed=11, force_range_N=(0.2, 2.0))
     parser, gaps = BinaryParser(), SequenceGaps()
-    with VirtualSensor(film.charge_pC, script, noise=reference_noise) as sensor, Port(sensor.url) as port:
+    with VirtualSensor(film.charges, script, noise=reference_noise) as sensor, Port(sensor.url) as port:
         records = stream(port, predictor, parser=parser, gaps=gaps)
         pairs = [(record, sensor.truth(record.seq)) for record in islice(records, n)]
         return pairs, parser.counts, gaps, sensor.withheld

@@ -139,7 +139,7 @@ def test_the_node_publishes_what_an_mcap_file_holds(rclpy, film, models, monkeyp
 
     monkeypatch.setattr(module, "stream", remembered)
     monkeypatch.setattr(module, "Predictor", lambda model: Predictor(model, models=models))
-    with VirtualSensor(film.charge_pC, wander(seed=2, seconds=20.0)) as sensor:
+    with VirtualSensor(film.charges, wander(seed=2, seconds=20.0)) as sensor:
         module.main("linear", sensor.url)
     assert rclpy.calls == ["init", "node isocharge", "destroy", "shutdown"]
     expected = []

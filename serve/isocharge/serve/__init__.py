@@ -43,8 +43,7 @@ from isocharge.serve.signal_chain.contact import TouchRule
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.tare import Tare, TareRule
-from isocharge.serve.virtual_sensor.faults import Faults
-from isocharge.serve.virtual_sensor.script import Script, read_script, wander
+from isocharge.serve.virtual_sensor.script import Faults, Script, wander
 from isocharge.serve.virtual_sensor.sensor import Truth, VirtualSensor
 
 __all__ = [
@@ -105,7 +104,6 @@ __all__ = [
     "open_source",
     "read_charges",
     "read_presses",
-    "read_script",
     "stream",
     "table_records",
     "wander",

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 from typer.testing import CliRunner
 
-from isocharge.cli.serve.app import serve_app
+from isocharge.cli.main import app
 from isocharge.serve import VirtualSensor, wander
 
 
@@ -23,7 +23,7 @@ def run():
     """A function that runs a command in this process; an error of ours is raised."""
 
     def invoke(*arguments, stdin=None):
-        result = CliRunner().invoke(serve_app, [str(a) for a in arguments], input=stdin)
+        result = CliRunner().invoke(app, ["serve", *map(str, arguments)], input=stdin)
         if result.exception is not None and not isinstance(result.exception, SystemExit):
             raise result.exception
         return result
@@ -38,5 +38,5 @@ def start(start_command):
 
 @pytest.fixture
 def sensor(film):
-    with VirtualSensor(film.charge_pC, wander(seed=2, seconds=20.0)) as sensor:
+    with VirtualSensor(film.charges, wander(seed=2, seconds=20.0)) as sensor:
         yield sensor

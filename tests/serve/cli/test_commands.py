@@ -201,7 +201,7 @@ def test_stream_without_a_port(models, run):
 
 
 def test_stream_of_a_port_that_vanishes(film, models, start):
-    with VirtualSensor(film.charge_pC, wander(seed=2)) as sensor:
+    with VirtualSensor(film.charges, wander(seed=2)) as sensor:
         process = start("stream", "linear", "--port", sensor.url, "--models", models, "--no-reconnect")
         process.stdout.readline()
     _, err = process.communicate(timeout=20)
@@ -260,7 +260,7 @@ def test_a_recording_that_was_interrupted_is_readable(sensor, models, start, tmp
 
 
 def test_a_new_tare_is_asked_for_by_a_signal(film, models, start):
-    with VirtualSensor(film.charge_pC, rest(seconds=60.0), offset_pC=[5.0, 6.0, 7.0]) as sensor:
+    with VirtualSensor(film.charges, rest(seconds=60.0), offset_pC=[5.0, 6.0, 7.0]) as sensor:
         process = start("stream", "linear", "--port", sensor.url, "--models", models)
         records = (json.loads(process.stdout.readline()) for _ in range(600))
         next(record for record in records if record["tare_pC"])
@@ -278,7 +278,7 @@ def rest(seconds, rate_Hz=200.0):
 
 def test_doctor_in_words(film, models, run):
     hum = lambda q, rng: q + rng.normal(0.0, 0.3, q.shape)  # noqa: E731
-    with VirtualSensor(film.charge_pC, rest(60.0), noise=hum, offset_pC=[5.0, -6.0, 150.0]) as sensor:
+    with VirtualSensor(film.charges, rest(60.0), noise=hum, offset_pC=[5.0, -6.0, 150.0]) as sensor:
         result = run("doctor", "--port", sensor.url, "--seconds", 1.5, "--model", "linear", "--models", models)
     assert "at 115200 baud: binary frames of isocharge" in result.stdout
     assert "0 bad pieces" in result.stdout
@@ -288,7 +288,7 @@ def test_doctor_in_words(film, models, run):
 
 
 def test_doctor_as_json(film, run):
-    with VirtualSensor(film.charge_pC, rest(60.0), offset_pC=[5.0, -6.0, 7.0]) as sensor:
+    with VirtualSensor(film.charges, rest(60.0), offset_pC=[5.0, -6.0, 7.0]) as sensor:
         found = json.loads(run("doctor", "--port", sensor.url, "--seconds", 1.0, "--json").stdout)
     assert found["rate_Hz"] == pytest.approx(200.0, rel=0.02)
     assert [round(channel["offset_pC"], 3) for channel in found["channels"]] == [5.0, -6.0, 7.0]
@@ -305,7 +305,7 @@ def test_doctor_writes_a_file_that_works(film, models, command, tmp_path, run):
     path = tmp_path / "board.toml"
     encode = lambda frame: b"%d;" % frame.seq + b";".join(b"%.3f" % q for q in frame.values) + b"\n"  # noqa: E731
     noise = lambda q, rng: q + rng.normal(0.0, 0.3, q.shape)  # noqa: E731
-    with VirtualSensor(film.charge_pC, rest(60.0), noise=noise, encode=encode) as sensor:
+    with VirtualSensor(film.charges, rest(60.0), noise=noise, encode=encode) as sensor:
         words = ["--port", sensor.url, "--seconds", 1, "--model", "linear", "--models", models]
         code, _, err = command("serve", "doctor", *words, "--write", path)
         assert (code, f"{path} written" in err) == (0, True)
@@ -320,7 +320,7 @@ def test_doctor_writes_a_file_that_works(film, models, command, tmp_path, run):
 
 def test_doctor_waits_for_its_port(film, command, tmp_path):
     link = tmp_path / "film"
-    with VirtualSensor(film.charge_pC, rest(60.0)) as sensor:
+    with VirtualSensor(film.charges, rest(60.0)) as sensor:
         plugging = threading.Timer(0.3, link.symlink_to, (sensor.url,))
         plugging.start()
         code, out, _ = command("serve", "doctor", "--port", link, "--wait", 10, "--seconds", 0.5)
@@ -339,6 +339,6 @@ def test_doctor_waits_for_its_port(film, command, tmp_path):
     ],
 )
 def test_doctor_refuses_with_the_reason(film, command, words, said):
-    with VirtualSensor(film.charge_pC, rest(60.0)) as sensor:
+    with VirtualSensor(film.charges, rest(60.0)) as sensor:
         code, _, err = command("serve", "doctor", "--port", sensor.url, "--seconds", 0.5, *words)
     assert (code, said in err) == (2, True), err

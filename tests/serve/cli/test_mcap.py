@@ -92,7 +92,7 @@ def test_a_recording_of_another_age_is_refused_with_the_reason(command, frames, 
 
 def test_a_live_stream_that_is_stopped_ends_its_file(film, models, start_command, tmp_path):
     path = tmp_path / "touch.mcap"
-    with VirtualSensor(film.charge_pC, wander(seed=2, seconds=20.0)) as sensor:
+    with VirtualSensor(film.charges, wander(seed=2, seconds=20.0)) as sensor:
         process = start_command("serve", "stream", "linear", "--port", sensor.url, "--models", models, "--mcap", path)
         lines = [process.stdout.readline() for _ in range(150)]
         process.send_signal(signal.SIGINT)

@@ -25,7 +25,7 @@ def repository(film, tmp_path):
 
 @pytest.fixture
 def sensor(film):
-    with VirtualSensor(film.charge_pC, wander(seed=2, seconds=60.0), offset_pC=[5.0, 6.0, 7.0]) as sensor:
+    with VirtualSensor(film.charges, wander(seed=2, seconds=60.0), offset_pC=[5.0, 6.0, 7.0]) as sensor:
         yield sensor
 
 

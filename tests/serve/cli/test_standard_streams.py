@@ -140,7 +140,7 @@ def test_memory_of_a_long_table(models, presses, tmp_path, output):
 def test_a_slow_reader_stops_neither_chain_nor_recording(models, film, tmp_path):
     """It takes nothing for seconds: what it missed is counted, and the recording has everything."""
     recording, words = tmp_path / "touch.rec", tmp_path / "stderr"
-    with VirtualSensor(film.charge_pC, wander(seed=2, seconds=60.0, rate_Hz=2000.0)) as sensor:
+    with VirtualSensor(film.charges, wander(seed=2, seconds=60.0, rate_Hz=2000.0)) as sensor:
         command = f"{ISOCHARGE} serve stream linear --port {sensor.url} --models {models} --record {recording}"
         with (
             words.open("w") as err,
@@ -167,7 +167,7 @@ def test_a_slow_reader_stops_neither_chain_nor_recording(models, film, tmp_path)
 
 
 def test_a_reader_who_never_reads_does_not_keep_the_stream(models, film):
-    with VirtualSensor(film.charge_pC, wander(seed=2, seconds=30.0, rate_Hz=2000.0)) as sensor:
+    with VirtualSensor(film.charges, wander(seed=2, seconds=30.0, rate_Hz=2000.0)) as sensor:
         process = subprocess.Popen(
             f"{ISOCHARGE} serve stream linear --port {sensor.url} --models {models} --seconds 2".split(),
             stdout=subprocess.PIPE,

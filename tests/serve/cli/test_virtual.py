@@ -32,7 +32,7 @@ def test_virtual_sensor_plays_and_cleans_up(start, tmp_path):
 
 
 def test_virtual_sensor_for_a_time(start):
-    process = start("virtual", "three-25um-biaxial", "--seconds", "0.3", "--rate-Hz", "100")
+    process = start("virtual", "three-25um-biaxial", "--seconds", "0.3", "--rate", "100")
     out, err = process.communicate(timeout=60)
     assert (process.returncode, out.startswith("/dev/")) == (0, True)
     assert 25 < int(err.splitlines()[-1].split()[0]) < 100
@@ -53,8 +53,8 @@ def test_virtual_sensor_that_is_unknown(run):
 
 def test_scripted_presses_as_text_are_felt(start, tmp_path, run):
     link = tmp_path / "film"
-    script = tmp_path / "presses.csv"
-    script.write_text("seconds,x_mm,y_mm,force_N\n0,0,0,0\n1.2,0,0,0\n1.3,1,2,0.5\n9,1,2,0.5\n")
+    script = tmp_path / "play.toml"
+    script.write_text("presses = [[0, 0, 0, 0], [1.2, 0, 0, 0], [1.3, 1, 2, 0.5], [9, 1, 2, 0.5]]\n")
     words = ["--link", link, "--frames", "teleplot", "--script", script, "--force-max", "0.5", "--noise", "clean"]
     process = start("virtual", "three-25um-biaxial", *words)
     process.stdout.readline()
@@ -65,8 +65,8 @@ def test_scripted_presses_as_text_are_felt(start, tmp_path, run):
 
 def test_presses_beyond_the_usual_radius(start, tmp_path, run):
     """A script may go as far as it says."""
-    link, script = tmp_path / "film", tmp_path / "presses.csv"
-    script.write_text("seconds,x_mm,y_mm,force_N\n0,14,0,0\n1.2,14,0,0\n1.3,14,0,0.5\n9,14,0,0.5\n")
+    link, script = tmp_path / "film", tmp_path / "play.toml"
+    script.write_text("presses = [[0, 14, 0, 0], [1.2, 14, 0, 0], [1.3, 14, 0, 0.5], [9, 14, 0, 0.5]]\n")
     model, words = "four-25um-biaxial-15mm", ["--link", link, "--force-max", "0.5", "--noise", "clean"]
     process = start("virtual", model, "--script", script, *words)
     process.stdout.readline()
@@ -75,26 +75,27 @@ def test_presses_beyond_the_usual_radius(start, tmp_path, run):
 
 
 @pytest.mark.parametrize(
-    ("words", "radius_mm"), [((), 8.0), (("--radius", 15), 15.0), (("--script", "far.csv"), 13.0), (("--film", 1), 8.0)]
+    ("words", "radius_mm"),
+    [((), 8.0), (("--radius", 15), 15.0), (("--script", "far.toml"), 13.0), (("--film", 1), 8.0)],
 )
 def test_a_virtual_film_is_solved_as_far_as_it_is_pressed(tmp_path, monkeypatch, words, radius_mm, run):
     def build(*_, radius, **__):
-        raise InputError(f"asked for {radius:.6f} m")
+        raise InputError(f"asked for {radius:.3f} mm")
 
-    (tmp_path / "far.csv").write_text("seconds,x_mm,y_mm,force_N\n0,5,12,0\n1,5,12,0\n2,5,12,1\n3,5,12,1\n4,5,12,0\n")
+    (tmp_path / "far.toml").write_text("presses = [[0, 5, 12, 0], [1, 5, 12, 0], [2, 5, 12, 1], [4, 5, 12, 0]]\n")
     monkeypatch.setattr(ForwardMap, "build", build)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=f"asked for {1e-3 * radius_mm:.6f} m"):
+    with pytest.raises(InputError, match=f"asked for {radius_mm:.3f} mm"):
         run("virtual", "four-25um-biaxial-15mm", *words)
 
 
-HELD = "seconds,x_mm,y_mm,force_N\n0,0,0,0\n0.5,0,0,0\n0.501,1,2,0.5\n60,1,2,0.5\n"
+HELD = "presses = [[0, 0, 0, 0], [0.5, 0, 0, 0], [0.501, 1, 2, 0.5], [60, 1, 2, 0.5]]\n"
 """A script: half a second without touch, then one press that is held."""
 
 
 def held_charge_pC(start, folder, sensor, film):
     """The touch charges of HELD that the command plays, pC, and what it says on stderr."""
-    link, script = folder / f"film{film}", folder / "held.csv"
+    link, script = folder / f"film{film}", folder / "held.toml"
     script.write_text(HELD)
     words = ["--link", link, "--script", script, "--force-max", "0.5", "--noise", "clean", "--film", film]
     process = start("virtual", sensor, *words)
@@ -114,9 +115,9 @@ def held_charge_pC(start, folder, sensor, film):
 
 def charge_of_film_pC(sensor, seed):
     """The same from a forward map of the film that the seed draws."""
-    film, probe = virtual_film(load_sensor(sensor), Circle(1e-3), seed)
-    forward_map = ForwardMap.build(film, probe, 3e-3, (0.2, 0.5))
-    return 1e12 * forward_map.forward(np.array([1e-3]), np.array([2e-3]), np.array([0.5]))[0]
+    film, probe = virtual_film(load_sensor(sensor), Circle(1.0), seed)
+    forward_map = ForwardMap.build(film, probe, 3.0, (0.2, 0.5))
+    return forward_map.charges(np.array([[1.0, 2.0, 0.5]]))[0]
 
 
 def test_virtual_film_plays_the_charges_of_its_film_and_does_not_tell_it(start, tmp_path):
@@ -124,8 +125,8 @@ def test_virtual_film_plays_the_charges_of_its_film_and_does_not_tell_it(start, 
     sensor = "three-25um-biaxial"
     charge_pC, err = held_charge_pC(start, tmp_path, sensor, 9)
     np.testing.assert_allclose(charge_pC, charge_of_film_pC(sensor, 9), rtol=2e-3)
-    described = ForwardMap.build(load_sensor(sensor), Circle(1e-3), 3e-3, (0.2, 0.5))
-    described_pC = 1e12 * described.forward(np.array([1e-3]), np.array([2e-3]), np.array([0.5]))[0]
+    described = ForwardMap.build(load_sensor(sensor), Circle(1.0), 3.0, (0.2, 0.5))
+    described_pC = described.charges(np.array([[1.0, 2.0, 0.5]]))[0]
     assert np.abs(charge_pC / described_pC - 1.0).max() > 0.02
     first, last = err.splitlines()
     assert first == "playing film 9 of three-25um-biaxial at 200 Hz; Ctrl-C stops"
@@ -157,7 +158,7 @@ def test_virtual_film_of_a_seed_is_one_draw(monkeypatch, run):
     for words in ((), ("--film", 3), ("--film", 3, "--seed", 8), ("--film", 4)):
         with pytest.raises(InputError, match="not solved"):
             run("virtual", "four-25um-biaxial", "--probe", "circle:1.5", *words)
-    described = load_sensor("four-25um-biaxial"), Circle(1.5e-3)
+    described = load_sensor("four-25um-biaxial"), Circle(1.5)
     assert solved[0] == described
     assert solved[1] == solved[2] == virtual_film(*described, 3)
     assert solved[3] == virtual_film(*described, 4) != solved[1]
@@ -177,8 +178,10 @@ def test_virtual_sensor_of_described_frames_with_faults(start, tmp_path, run):
         '{name = "A", type = "i16", scale = 0.1}, {name = "B", type = "i16", scale = 0.1},'
         '{name = "C", type = "i16", scale = 0.1}]\n'
     )
-    words = ["--link", link, "--device", device, "--lose", "0.05", "--corrupt", "0.001", "--force-max", "0.5"]
-    process = start("virtual", "three-25um-biaxial", *words, "--unplug-every", "1.4")
+    script = tmp_path / "play.toml"
+    script.write_text("[faults]\nlose_share = 0.05\ncorrupt_share = 0.001\nunplug_every_s = 1.4\n")
+    words = ["--link", link, "--device", device, "--script", script, "--force-max", "0.5"]
+    process = start("virtual", "three-25um-biaxial", *words)
     process.stdout.readline()
     result = run("stream", "three-25um-biaxial", "--port", link, "--device", device, "--seconds", 3)
     lines = [json.loads(line) for line in result.stdout.splitlines()]

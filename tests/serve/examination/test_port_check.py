@@ -23,7 +23,7 @@ def idle(n=400, rate_Hz=200.0):
 
 
 def board(film, **options):
-    return VirtualSensor(film.charge_pC, idle(), offset_pC=[5.0, -6.0, 7.0], **options)
+    return VirtualSensor(film.charges, idle(), offset_pC=[5.0, -6.0, 7.0], **options)
 
 
 def test_check_of_a_healthy_board(film):

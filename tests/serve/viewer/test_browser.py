@@ -63,7 +63,7 @@ def presses(film):
     places = [
         np.concatenate([np.concatenate([pause * np.nan, place[axis] * press]) for place in PRESSES]) for axis in (0, 1)
     ]
-    with VirtualSensor(film.charge_pC, Script(*places, force_N, RATE_HZ)) as sensor:
+    with VirtualSensor(film.charges, Script(*places, force_N, RATE_HZ)) as sensor:
         yield sensor
 
 

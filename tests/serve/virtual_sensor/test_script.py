@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SceneError
-from isocharge.serve import Script, read_script, wander
+from isocharge.serve import Faults, Script, wander
+from isocharge.serve.virtual_sensor.script import load_script
 
 
 @pytest.fixture(scope="module")
@@ -84,27 +85,39 @@ def test_script_arrays_agree():
         Script(np.zeros(2), np.zeros(2), np.zeros(2), 0.0)
 
 
-def test_script_from_a_file():
-    lines = ["seconds,x_mm,y_mm,force_N", "0,1,2,0", "1,1,2,0", "1.1,1,2,0.5", "2.1,3,2,0.5", "2.2,3,2,0"]
-    script = read_script(lines, 100.0, "presses.csv")
+PRESSES = "presses = [[0, 1, 2, 0], [1, 1, 2, 0], [1.1, 1, 2, 0.5], [2.1, 3, 2, 0.5], [2.2, 3, 2, 0]]\n"
+
+
+def test_script_from_a_file(tmp_path):
+    path = tmp_path / "play.toml"
+    path.write_text(PRESSES + "limit_pC = 900\n[faults]\nlose_share = 0.1\n")
+    play = load_script(path)
+    assert (play.faults, play.limit_pC, play.temperature_step_K) == (Faults(lose_share=0.1), 900.0, None)
+    script = play.script(100.0)
     assert (len(script), script.rate_Hz) == (220, 100.0)
     assert not script.touching[:101].any()
     assert np.isnan(script.x_mm[50])
     assert (script.x_mm[160], script.y_mm[160], script.force_N[160]) == pytest.approx((2.0, 2.0, 0.5))
     assert script.force_N[105] == pytest.approx(0.25)
+    path.write_text("")
+    assert load_script(path).script(100.0) is None
+    with pytest.raises(SceneError, match=r"expected at most 2000000 frames, got 2\.2 s at 1e"):
+        play.script(1e6)
 
 
 @pytest.mark.parametrize(
-    "lines",
+    ("text", "message"),
     [
-        ["seconds,x_mm,y_mm", "0,1,2"],
-        ["seconds,x_mm,y_mm,force_N", "0,1,2,x"],
-        ["seconds,x_mm,y_mm,force_N", "0,1,2,1"],
-        ["seconds,x_mm,y_mm,force_N", "1,1,2,1", "0,1,2,1"],
-        ["seconds,x_mm,y_mm,force_N", "0,1,2,1", "1,1,2,-1"],
-        [],
+        ("presses = [[0, 1, 2]]", r"presses\[1\]: expected \[seconds, x_mm, y_mm, force_N\] with a force from 0, got"),
+        ("presses = [[0, 1, 2, 1], [1, 1, 2, -1]]", r"presses\[2\]\[4\]: expected a number from 0, got -1"),
+        ("presses = [[0, 1, 2, 1]]", "presses: expected two rows or more with growing seconds, got"),
+        ("presses = [[1, 1, 2, 1], [0, 1, 2, 1]]", "presses: expected two rows or more with growing seconds, got"),
+        ("[faults]\nlose_share = 1.1", r"faults.lose_share: expected a number from 0 to 1, got 1\.1"),
+        ("[faults]\nlose_shar = 0.1", "unknown key 'faults.lose_shar'; did you mean 'lose_share'"),
     ],
 )
-def test_scripts_that_are_wrong(lines):
-    with pytest.raises(SceneError, match=r"presses.csv: expected"):
-        read_script(lines, 100.0, "presses.csv")
+def test_scripts_that_are_wrong(text, message, tmp_path):
+    path = tmp_path / "play.toml"
+    path.write_text(text)
+    with pytest.raises(SceneError, match=message):
+        load_script(path)

@@ -126,7 +126,8 @@ def check_records(records, expected):
 def test_a_recording_gives_our_records_frame_by_frame(host, start_command, tmp_path):
     """Bytes of the virtual sensor with a leak, drift, lost frames and damaged bytes, in C and in Python."""
     program, board = host
-    words = ("--noise", "bench", "--rate-Hz", "400", "--corrupt", "0.0005", "--lose", "0.01", "--force-max", "0.5")
+    (tmp_path / "play.toml").write_text("[faults]\ncorrupt_share = 0.0005\nlose_share = 0.01\n")
+    words = ("--noise", "bench", "--rate", "400", "--script", tmp_path / "play.toml", "--force-max", "0.5")
     sensor = start_command("serve", "virtual", "three-25um-biaxial", *words)
     stream, data, expected = TouchStream(Predictor("three-25um-biaxial"), board), b"", []
     with Port(sensor.stdout.readline().strip()) as port:
@@ -144,11 +145,11 @@ def test_a_recording_gives_our_records_frame_by_frame(host, start_command, tmp_p
 
 def test_host_example_follows_a_port(exports, compile_c, start_command, tmp_path):
     """Contacts of the virtual sensor at the place of its script."""
-    rows = ["0,3,-2,0", "0.8,3,-2,0", "0.801,3,-2,0.5", "60,3,-2,0.5"]
-    (tmp_path / "script.csv").write_text("\n".join(["seconds,x_mm,y_mm,force_N", *rows]) + "\n")
+    rows = [[0, 3, -2, 0], [0.8, 3, -2, 0], [0.801, 3, -2, 0.5], [60, 3, -2, 0.5]]
+    (tmp_path / "script.toml").write_text(f"presses = {rows}\n")
     program = compile_c("gcc", exports[0], tmp_path / "host", *EXAMPLE)
     sensor = start_command(
-        "serve", "virtual", "three-25um-biaxial", "--noise", "clean", "--script", tmp_path / "script.csv"
+        "serve", "virtual", "three-25um-biaxial", "--noise", "clean", "--script", tmp_path / "script.toml"
     )
     code, records, err = played(program, sensor.stdout.readline().strip(), 300)
     assert (code, err, len(records)) == (0, "", 300)

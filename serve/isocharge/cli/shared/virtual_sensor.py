@@ -5,6 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from isocharge.common.arrays import Array
     from isocharge.serve import Script, VirtualSensor
     from isocharge.simulate import Amplifier, ForwardMap
 
@@ -46,11 +47,11 @@ def virtual_sensor(
         seed=seed,
         seconds=SCRIPT_S,
         rate_Hz=rate_Hz,
-        radius_mm=forward_map.radius * 1e3,
-        force_range_N=forward_map.force_range,
+        radius_mm=forward_map.domain.radius,
+        force_range_N=forward_map.domain.force_range,
     )
     return VirtualSensor(
-        partial(_charge_pC, forward_map),
+        partial(_charges, forward_map),
         presses,
         noise=_measuring(amplifier, rate_Hz),
         seed=seed,
@@ -58,11 +59,13 @@ def virtual_sensor(
     )
 
 
-def _charge_pC(forward_map: "ForwardMap", x_mm: Any, y_mm: Any, force_N: Any) -> Any:
-    """Charges of presses; below the map's smallest force they fall with force to the 2/3, as those of a membrane do."""
-    low = forward_map.force_range[0]
-    share = (force_N.clip(max=low) / low) ** (2.0 / 3.0)
-    return forward_map.forward(x_mm * 1e-3, y_mm * 1e-3, force_N.clip(min=low)) * share[:, None] * 1e12
+def _charges(forward_map: "ForwardMap", contact: "Array") -> "Array":
+    """Charges of contacts; below the map's smallest force they fall with force to the 2/3, as those of a membrane."""
+    low, force = forward_map.domain.force_range[0], contact[:, 2]
+    share = (force.clip(max=low) / low) ** (2.0 / 3.0)
+    within = contact.copy()
+    within[:, 2] = force.clip(min=low)
+    return forward_map.charges(within) * share[:, None]
 
 
 def _measuring(amplifier: "Amplifier", rate_Hz: float) -> Callable[..., Any]:
@@ -72,6 +75,6 @@ def _measuring(amplifier: "Amplifier", rate_Hz: float) -> Callable[..., Any]:
     def measure(charge_pC: Any, rng: Any) -> Any:
         if not states:
             states.append(amplifier.start(charge_pC.shape[1], rate_Hz, rng))
-        return states[0](charge_pC * 1e-12) * 1e12
+        return states[0](charge_pC)
 
     return measure

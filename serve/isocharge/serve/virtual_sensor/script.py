@@ -1,16 +1,18 @@
-"""Scripts of a virtual sensor: position and force of the press in each frame."""
+"""Scripts of a virtual sensor: position and force of the press in each frame, and the faults on the way to a reader."""
 
-import csv
-from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError
-from isocharge.common.number_text import number_of
+from isocharge.common.structs import Finite, NotNegative, Settings, WrongKey, read_toml
 
 REST_S = 1.0
 """Rest at the start of a script, s: time for a tare."""
@@ -24,6 +26,10 @@ PAUSE_S = (0.6, 1.2)
 RAMP_S = 0.15
 """Time in which the force rises from the smallest to that of the press, or falls back, s."""
 
+
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+ROW = "[seconds, x_mm, y_mm, force_N] with a force from 0"
 
 MOST_FRAMES = 2_000_000
 """Longest script from a file, frames: nearly three hours at 200 Hz."""
@@ -60,35 +66,82 @@ class Script:
         return self.force_N > 0.0
 
 
-def read_script(lines: Iterable[str], rate_Hz: float, where: str) -> Script:
-    """A script from a CSV with the columns seconds, x_mm, y_mm, force_N; values between rows are interpolated linearly.
+class Faults(Settings, frozen=True, kw_only=True):
+    """Faults between board and reader; by default there is none.
 
-    Nothing touches where the force is 0; the position of a row without force matters only next to a row with one.
+    Attributes:
+        lose_share: Share of frames that are not sent, dimensionless.
+        corrupt_share: Share of bytes that are flipped, dropped or followed by a random one, dimensionless.
+        gap_every_s, gap_s: Interval and length of the gaps in which nothing is sent, s; interval 0 for no gaps.
+        unplug_every_s, unplug_s: Interval and length of the outages of the port, s; interval 0 for no outages.
+        clock_ppm: Excess of the device's clock rate over the true one, parts per million.
+    """
 
-    Args:
-        lines: Lines of the file.
-        rate_Hz: Frames per second.
-        where: The file, for messages.
+    lose_share: Share = 0.0
+    corrupt_share: Share = 0.0
+    gap_every_s: NotNegative = 0.0
+    gap_s: NotNegative = 0.1
+    unplug_every_s: NotNegative = 0.0
+    unplug_s: NotNegative = 0.5
+    clock_ppm: Annotated[float, Meta(gt=-1e6, lt=1e6)] = 0.0
+
+    def in_gap(self, t_s: float) -> bool:
+        """Whether nothing is sent at this time, s from the start; the first gap comes after one interval."""
+        return self.gap_every_s > 0.0 and t_s >= self.gap_every_s and t_s % self.gap_every_s < self.gap_s
+
+    def unplugged(self, t_s: float) -> bool:
+        """Whether the port is away at this time, s from the start."""
+        return self.unplug_every_s > 0.0 and t_s >= self.unplug_every_s and t_s % self.unplug_every_s < self.unplug_s
+
+
+class VirtualScript(Settings, frozen=True):
+    """The file of `isocharge serve virtual --script`.
+
+    Attributes:
+        presses: Rows (seconds, x_mm, y_mm, force_N), interpolated linearly; nothing touches where the force is 0.
+            Without rows, presses are random.
+        faults: Between board and reader.
+        temperature_step_K: Temperature step of the film after 10 s, K; None leaves it to the amplifier.
+        drift_pC_per_s: Drift from the bias current, pC/s; likewise.
+        limit_pC: Largest charge that the converter reads, pC; likewise.
+    """
+
+    presses: tuple[Annotated[tuple[Finite, Finite, Finite, NotNegative], Meta(description=ROW)], ...] = ()
+    faults: Faults = Faults()
+    temperature_step_K: Finite | None = None
+    drift_pC_per_s: NotNegative | None = None
+    limit_pC: Annotated[float, Meta(ge=1.0)] | None = None
+
+    def __post_init__(self) -> None:
+        seconds = [row[0] for row in self.presses]
+        if self.presses and (len(seconds) < 2 or any(a >= b for a, b in pairwise(seconds))):
+            raise WrongKey("presses", "two rows or more with growing seconds", self.presses)
+
+    def script(self, rate_Hz: float) -> Script | None:
+        """The presses at a rate, Hz; None if they are random.
+
+        Raises:
+            SceneError: If there are too many frames.
+        """
+        if not self.presses:
+            return None
+        seconds, x_mm, y_mm, force_N = np.array(self.presses).T
+        if not (seconds[-1] - seconds[0]) * rate_Hz <= MOST_FRAMES:
+            raise SceneError(
+                f"script: expected at most {MOST_FRAMES} frames, got {seconds[-1] - seconds[0]:g} s at {rate_Hz:g} Hz"
+            )
+        times = np.arange(seconds[0], seconds[-1], 1.0 / rate_Hz)
+        x, y, force = (np.interp(times, seconds, values) for values in (x_mm, y_mm, force_N))
+        return Script(np.where(force > 0, x, np.nan), np.where(force > 0, y, np.nan), force, rate_Hz)
+
+
+def load_script(path: Path) -> VirtualScript:
+    """Read a script, TOML.
 
     Raises:
-        SceneError: If a column is missing, a cell is no number, a force is negative or the seconds do not grow.
+        SceneError: If it cannot be read, or a key is unknown or wrong.
     """
-    names = ("seconds", "x_mm", "y_mm", "force_N")
-    try:
-        rows = [[number_of(row[name]) for name in names] for row in csv.DictReader(lines)]
-    except (csv.Error, KeyError, TypeError, ValueError) as error:
-        raise SceneError(f"{where}: expected numbers in the columns {', '.join(names)} ({error})") from error
-    seconds, x_mm, y_mm, force_N = np.array(rows).reshape(-1, 4).T
-    if not (len(rows) > 1 and np.isfinite(rows).all() and (np.diff(seconds) > 0).all() and force_N.min() >= 0):
-        raise SceneError(f"{where}: expected two rows or more, growing seconds and forces from 0, got {rows!r:.200}")
-    if not (seconds[-1] - seconds[0]) * rate_Hz <= MOST_FRAMES:
-        raise SceneError(
-            f"{where}: expected at most {MOST_FRAMES} frames, got {seconds[-1] - seconds[0]:g} s at {rate_Hz:g} Hz; "
-            "shorten the script, it is repeated"
-        )
-    t = np.arange(seconds[0], seconds[-1], 1.0 / rate_Hz)
-    x, y, force = (np.interp(t, seconds, values) for values in (x_mm, y_mm, force_N))
-    return Script(np.where(force > 0, x, np.nan), np.where(force > 0, y, np.nan), force, rate_Hz)
+    return read_toml(path, "a script of a virtual sensor", SceneError, VirtualScript)
 
 
 def wander(
@@ -96,7 +149,7 @@ def wander(
     seed: int,
     seconds: float = 60.0,
     rate_Hz: float = 200.0,
-    radius_mm: float = 1e3 * DEFAULT_RADIUS,
+    radius_mm: float = DEFAULT_RADIUS,
     force_range_N: tuple[float, float] = DEFAULT_FORCE_RANGE,
 ) -> Script:
     """A script of random presses that wander over the film: a second of rest, then presses of 1 to 3 s with pauses.
@@ -151,3 +204,16 @@ def _force_level(rng: np.random.Generator, t: Array, duration: float) -> Array:
 def _smooth_step(s: Array) -> Array:
     s = np.clip(s, 0.0, 1.0)
     return s * s * (3.0 - 2.0 * s)
+
+
+def corrupt(data: bytes, share: float, rng: np.random.Generator) -> bytes:
+    """Damage a share of bytes: a third each is flipped in one bit, dropped, or followed by a random byte."""
+    positions = np.flatnonzero(rng.random(len(data)) < share)
+    if not positions.size:
+        return data
+    damaged = [bytes([byte]) for byte in data]
+    for position in positions.tolist():
+        kind, extra = int(rng.integers(3)), int(rng.integers(256))
+        flipped = bytes([data[position] ^ 1 << extra % 8])
+        damaged[position] = (flipped, b"", bytes([data[position], extra]))[kind]
+    return b"".join(damaged)

@@ -3,7 +3,7 @@
 The touch charges of the whole script are computed before it plays; the amplifier, which has a memory, processes them
 block by block. Frames are written at absolute deadlines, so the rate does not drift. The writer never waits for a
 reader: a frame that does not fit into the port's buffer is withheld whole and counted, and the reader sees a gap in the
-frame numbers. Faults on request: `isocharge.serve.virtual_sensor.faults`.
+frame numbers.
 """
 
 import itertools
@@ -22,12 +22,11 @@ from isocharge.common.errors import PortError, SceneError
 from isocharge.serve.frames.binary import encode_frame
 from isocharge.serve.frames.frame import T_US_MODULUS, Frame
 from isocharge.serve.frames.sequence import SEQ_MODULUS
-from isocharge.serve.virtual_sensor.faults import Faults, corrupt
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
-from isocharge.serve.virtual_sensor.script import Script
+from isocharge.serve.virtual_sensor.script import Faults, Script, corrupt
 
-ForwardMap = Callable[[Array, Array, Array], Array]
-"""`charge_pC(x_mm, y_mm, force_N)`: arrays of shape (n,) to touch charges of shape (n, electrodes), pC."""
+Charges = Callable[[Array], Array]
+"""Contacts (x, y, F), shape (n, 3), mm and N, to touch charges, shape (n, electrodes), pC: `charges` of a ChargeMap."""
 
 Noise = Callable[[Array, np.random.Generator], Array]
 """`noise(charge_pC, rng)`: charges to the output of an amplifier, both of shape (n, electrodes), pC.
@@ -78,7 +77,7 @@ class VirtualSensor:
 
     def __init__(
         self,
-        charge_pC: ForwardMap,
+        charges: Charges,
         script: Script,
         *,
         noise: Noise | None = None,
@@ -91,7 +90,7 @@ class VirtualSensor:
         """Compute the charges of the script.
 
         Args:
-            charge_pC: Forward map; called once, for the frames in which something touches.
+            charges: Forward map; called once, for the frames in which something touches.
             script: The presses.
             noise: The amplifier; None for clean charges.
             offset_pC: Constant charge on each electrode, pC, which the reader tares away; by default drawn at random
@@ -108,7 +107,7 @@ class VirtualSensor:
         self._rng = np.random.default_rng(seed)
         self._script, self._noise, self._encode = script, noise, encode
         self._faults, self._link = faults or Faults(), link
-        self._clean_pC = _clean_charges(charge_pC, script)
+        self._clean_pC = _clean_charges(charges, script)
         electrodes = self._clean_pC.shape[1]
         random_pC = self._rng.uniform(-20.0, 20.0, electrodes)
         self._offset_pC = random_pC if offset_pC is None else np.asarray(offset_pC)
@@ -249,10 +248,10 @@ class VirtualSensor:
         return self._port
 
 
-def _clean_charges(charge_pC: ForwardMap, script: Script) -> Array:
+def _clean_charges(forward: Charges, script: Script) -> Array:
     """Touch charges of a whole script, shape (n, electrodes), pC; zero where nothing touches."""
     touching = script.touching
-    pressed = charge_pC(script.x_mm[touching], script.y_mm[touching], script.force_N[touching])
+    pressed = forward(np.column_stack([script.x_mm, script.y_mm, script.force_N])[touching])
     if pressed.ndim != 2 or len(pressed) != touching.sum() or not np.isfinite(pressed).all():
         raise SceneError(
             f"forward map: expected finite charges of shape ({touching.sum()}, electrodes), got shape "
