@@ -2,7 +2,7 @@
 
 A message says what was expected, what was got, where, and what to do. The command line maps the tree to exit codes in
 `isocharge.cli` (wrong input is 2, everything else is 1), the servers to HTTP and gRPC statuses in
-`isocharge.serve.network.protocol.status`.
+`isocharge.serve.network.protocol.response`.
 """
 
 LONGEST_VALUE = 200

@@ -1,6 +1,5 @@
 """Where a server listens and whom it lets in: addresses, Unix sockets, tokens, certificate files."""
 
-import datetime
 import os
 import socket
 import stat
@@ -10,9 +9,8 @@ import trustme
 
 from isocharge.common.errors import InputError, ListenError, TokenError
 from isocharge.serve.network.address import Address, check_exposure
+from isocharge.serve.network.credentials import Tls, Token
 from isocharge.serve.network.http import App, HttpServer
-from isocharge.serve.network.tls import Tls
-from isocharge.serve.network.token import Token
 
 
 @pytest.fixture(scope="module")
@@ -121,24 +119,6 @@ def test_another_server_s_socket_stays(handler, tmp_path):
     assert path.is_socket()
     second.close()
     assert not path.exists()
-
-
-def test_a_link_that_leads_nowhere(tmp_path):
-    path = tmp_path / "touch.sock"
-    path.symlink_to(tmp_path / "nowhere")
-    with pytest.raises(ListenError, match="found a symbolic link that leads nowhere"):
-        Address(uds=path).listen(1)
-    assert path.is_symlink()
-
-
-@pytest.mark.parametrize(("days", "said"), [((-9, -1), "expired"), ((1, 9), "not yet valid")])
-def test_a_certificate_out_of_date(tmp_path, days, said):
-    now = datetime.datetime.now(datetime.UTC)
-    begin, end = (now + datetime.timedelta(days=day) for day in days)
-    issued = trustme.CA().issue_cert("127.0.0.1", not_before=begin, not_after=end)
-    issued.private_key_and_cert_chain_pem.write_to_path(tmp_path / "both.pem")
-    with pytest.raises(InputError, match=rf"both\.pem: expected a certificate that is valid today.*{said}.*renew it"):
-        Tls(tmp_path / "both.pem").context()
 
 
 @pytest.mark.timeout(20)

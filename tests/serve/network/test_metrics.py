@@ -16,12 +16,12 @@ from prometheus_client.parser import text_string_to_metric_families
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.flags import MISFIT
 from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.network.credentials import Token
 from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.http import App
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.statistics import LATENCY_NS, Statistics
-from isocharge.serve.network.token import Token
 from isocharge.serve.prediction.validity import Domain
 
 INFER = "/v2/models/linear/infer"

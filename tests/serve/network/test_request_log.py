@@ -10,13 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from isocharge.serve.network.credentials import Token
 from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.http import App
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.request_log import LONGEST_TEXT, RequestLog
-from isocharge.serve.network.token import Token
-from isocharge.serve.network.traffic import Traffic
+from isocharge.serve.network.traffic import LONGEST_TEXT, RequestLog, Traffic
 
 SECRET = 'open "sesame"'
 NAMES = {"time", "level", "event", "transport", "route", "status", "model", "error", "duration_us", "bytes_in"}

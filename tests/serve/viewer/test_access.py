@@ -5,7 +5,7 @@ import base64
 import pytest
 
 from isocharge.common.errors import OriginError, TokenError
-from isocharge.serve.network.token import Token
+from isocharge.serve.network.credentials import Token
 from isocharge.serve.viewer.access import Access
 
 

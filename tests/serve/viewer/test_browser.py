@@ -25,7 +25,7 @@ PRESSES = [
 ]
 
 DRAWN = """() => {
-  const film = isocharge.page.films[0], plan = film.plan, canvas = plan.canvas;
+  const film = isocharge.page.film, plan = film.plan, canvas = plan.canvas;
   const g = canvas.getContext("2d"), { data } = g.getImageData(0, 0, canvas.width, canvas.height);
   const lens = plan.lens ?? { x: 1e9, y: 1e9, size: 0 }, mm = plan.pixel, css = canvas.width / canvas.clientWidth;
   let [count, x, y, left, right, top, bottom] = [0, 0, 0, Infinity, 0, Infinity, 0];
@@ -82,7 +82,7 @@ def start_stream(presses, models, free_port, start_command, tmp_path, monkeypatc
     def start():
         process = start_command(
             *("serve", "stream", "linear", "--models", models, "--port", presses.url, "--output", "none"),
-            *("--live", "--live-port", free_port),
+            *("--live", f"127.0.0.1:{free_port}"),
         )
         while "live page" not in (line := process.stderr.readline()):
             assert line, "the page did not start"
@@ -102,7 +102,7 @@ def open_page(chromium, free_port):
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
         page.goto(f"http://127.0.0.1:{free_port}/")
-        wait_for(page, "isocharge.page.films.length > 0 && isocharge.page.films[0].history.latest !== null")
+        wait_for(page, "isocharge.page.film?.history.latest != null")
         return page
 
     yield start
@@ -122,7 +122,7 @@ def wait_for(page, expression, timeout_s=40.0):
 def test_ten_presses_appear_where_and_as_hard_as_they_are(start_stream, open_page):
     start_stream()
     page = open_page()
-    wait_for(page, "isocharge.page.films[0].drawnKind === 'none'")
+    wait_for(page, "isocharge.page.film.drawnKind === 'none'")
     radius_of = {}
     end = time.monotonic() + 120.0
     while len(radius_of) < len(PRESSES) and time.monotonic() < end:
@@ -144,27 +144,27 @@ def test_ten_presses_appear_where_and_as_hard_as_they_are(start_stream, open_pag
 def test_tare_pause_record_and_marker(start_stream, open_page, tmp_path):
     start_stream()
     page = open_page()
-    wait_for(page, "isocharge.page.films[0].drawnKind === 'contact'")
+    wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
     page.get_by_role("button", name="Tare").click()
-    wait_for(page, "isocharge.page.films[0].drawnKind === 'tare'")
-    wait_for(page, "isocharge.page.films[0].drawnKind === 'contact'")
+    wait_for(page, "isocharge.page.film.drawnKind === 'tare'")
+    wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
 
-    picture = "isocharge.page.films[0].find('.trace.force canvas').toDataURL()"
+    picture = "isocharge.page.film.find('.trace.force canvas').toDataURL()"
     page.keyboard.press("Space")
     wait_for(page, "document.querySelector('[data-do=pause]').getAttribute('aria-pressed') === 'true'")
-    before, end = page.evaluate(picture), page.evaluate("isocharge.page.films[0].history.end")
+    before, end = page.evaluate(picture), page.evaluate("isocharge.page.film.history.end")
     page.wait_for_timeout(1500)
     assert page.evaluate(picture) == before
-    assert page.evaluate("isocharge.page.films[0].history.end") > end  # the stream does not pause
+    assert page.evaluate("isocharge.page.film.history.end") > end  # the stream does not pause
     page.keyboard.press("Space")
     wait_for(page, f"{picture} !== {before!r}")
 
     page.get_by_role("button", name="Record").click()
-    wait_for(page, "isocharge.page.films[0].state.recording")
+    wait_for(page, "isocharge.page.film.state.recording")
     page.keyboard.press("m")
-    wait_for(page, "isocharge.page.films[0].history.markers.length === 1")
+    wait_for(page, "isocharge.page.film.history.markers.length === 1")
     page.keyboard.press("r")
-    wait_for(page, "!isocharge.page.films[0].state.recording")
+    wait_for(page, "!isocharge.page.film.state.recording")
     (path,) = tmp_path.glob("linear-1-*.rec")
     assert '{"marker":' in path.read_text()
 
@@ -182,7 +182,7 @@ def test_nothing_that_breaks_breaks_the_page(start_stream, open_page):
       connection.socket.send("nonsense");
       for (const size of [0, 3, 24, 500]) connection.on.samples(new ArrayBuffer(size));
       connection.socket.onmessage({ data: "{" });
-      connection.socket.onmessage({ data: '{"film": 9, "state": {}}' });
+      connection.socket.onmessage({ data: '{"state": {}}' });
     }""")
     wait_for(page, "document.querySelector('.note').textContent.includes('expected JSON')")
     for ending in ("lost connection", "restart"):
@@ -196,7 +196,7 @@ def test_nothing_that_breaks_breaks_the_page(start_stream, open_page):
             page.wait_for_timeout(1000)
             start_stream()
         wait_for(page, "document.getElementById('link').dataset.state === 'live'")
-        wait_for(page, "isocharge.page.films[0].drawnKind === 'contact'")
+        wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 820), (390, 844), (820, 1180)])
@@ -204,7 +204,7 @@ def test_nothing_that_breaks_breaks_the_page(start_stream, open_page):
 def test_it_fits_every_screen(start_stream, open_page, width, height, scheme, tmp_path):
     start_stream()
     page = open_page(width, height, scheme)
-    wait_for(page, "isocharge.page.films[0].drawnKind === 'contact'")
+    wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
     assert page.evaluate("document.documentElement.scrollWidth") == width
     plan = page.locator(".plan canvas").bounding_box()
     assert plan["y"] + plan["height"] <= height  # the film is seen without scrolling

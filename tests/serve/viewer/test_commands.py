@@ -30,7 +30,7 @@ def sensor(film):
     script = Script(
         np.where(touching, 3.0, np.nan), np.where(touching, -2.0, np.nan), np.where(touching, 1.0, 0.0), rate_Hz=200.0
     )
-    with VirtualSensor(film.charge_pC, script) as playing:
+    with VirtualSensor(film.charges, script) as playing:
         yield playing
 
 

@@ -130,7 +130,13 @@ def test_a_viewer_that_takes_nothing_is_left(start_page, viewer, monkeypatch):
 
     with pytest.raises(ConnectionClosedError, match="no close frame"):
         viewer(page, stall)
-    assert viewer(page, lambda client: client.text("state"))["number"] == 199
+    page.reader.tell(number="last")
+
+    async def wait_for_last(client):
+        while (await client.text("state"))["number"] != "last":
+            pass
+
+    viewer(page, wait_for_last)
 
 
 def test_requests_reach_the_reader(page, viewer):

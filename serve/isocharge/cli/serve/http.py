@@ -17,15 +17,13 @@ from isocharge.common.errors import InputError
 from isocharge.common.extras import require
 from isocharge.serve.live.line_queue import LineQueue
 from isocharge.serve.network.address import Address, check_exposure
-from isocharge.serve.network.tls import Tls
-from isocharge.serve.network.token import Token
+from isocharge.serve.network.credentials import Tls, Token
 
 with require("http"):
     from isocharge.serve.network.http import App, HttpServer
     from isocharge.serve.network.model_store import open_model_store
     from isocharge.serve.network.protocol import Handler
-    from isocharge.serve.network.request_log import RequestLog
-    from isocharge.serve.network.traffic import Traffic
+    from isocharge.serve.network.traffic import RequestLog, Traffic
 
 
 def http_command(

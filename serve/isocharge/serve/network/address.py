@@ -40,7 +40,8 @@ class Address:
     @property
     def is_private(self) -> bool:
         """Whether only this machine can connect."""
-        return self.uds is not None or is_loopback(self.host)
+        address = ip_address(self.host)
+        return self.uds is not None or self.host == "localhost" or (address is not None and address.is_loopback)
 
     def listen(self, backlog: int) -> socket.socket:
         """A listening socket.
@@ -79,21 +80,12 @@ class Address:
         return f"{'https' if secure else 'http'}://{host}:{listening.getsockname()[1]}"
 
 
-def is_loopback(host: str) -> bool:
-    """Whether a host is this machine and nothing else can reach it."""
+def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    """The IP address that a host is; None for a name."""
     try:
-        return ipaddress.ip_address(host).is_loopback
+        return ipaddress.ip_address(host)
     except ValueError:
-        return host == "localhost"
-
-
-def is_address(host: str) -> bool:
-    """Whether a host is an IP address and no name."""
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
+        return None
 
 
 def check_exposure(address: Address, *, has_token: bool) -> None:
@@ -143,11 +135,6 @@ def _remove_stale(path: Path) -> None:
         ListenError: If the path is something else, or a server listens there.
     """
     if not path.exists():
-        if path.is_symlink():
-            raise ListenError(
-                f"{path}: expected nothing or a left-over socket, found a symbolic link that leads nowhere; "
-                "remove it or choose another path"
-            )
         return
     if not stat.S_ISSOCK(path.stat().st_mode):
         raise ListenError(f"{path}: expected nothing or a left-over socket, found a file; choose another path")

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 from isocharge.common.errors import OriginError
-from isocharge.serve.network.address import is_address
-from isocharge.serve.network.token import Token
+from isocharge.serve.network.address import ip_address
+from isocharge.serve.network.credentials import Token
 
 PROTOCOL = "isocharge.live.1"
 """The subprotocol of the page."""
@@ -54,7 +54,7 @@ class Access:
     def _check_origin(self, headers: Mapping[bytes, bytes]) -> None:
         host = headers.get(b"host", b"").decode("latin-1").lower()
         name = _name(f"//{host}")
-        if self.token is None and not (is_address(name) or name in ("localhost", self.host.lower(), "")):
+        if self.token is None and not (ip_address(name) or name in ("localhost", self.host.lower(), "")):
             raise OriginError(f"expected a request to this machine's address, got one to {host!r}; open the address")
         origin = headers.get(b"origin")
         if origin is not None and origin.decode("latin-1").lower().partition("://")[2] != host:

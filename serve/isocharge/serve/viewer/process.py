@@ -15,7 +15,7 @@ import uvloop
 
 from isocharge.common.errors import IsochargeError, ListenError
 from isocharge.serve.network.address import Address
-from isocharge.serve.network.token import Token
+from isocharge.serve.network.credentials import Token
 from isocharge.serve.viewer.access import Access
 from isocharge.serve.viewer.hub import Hub
 from isocharge.serve.viewer.link import PageEnd

@@ -8,11 +8,11 @@ from threading import Event
 import grpc
 import pytest
 
+from isocharge.serve.network.credentials import Token
 from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.token import Token
 
 
 @pytest.fixture

@@ -14,12 +14,11 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from tritonclient.grpc import service_pb2
 
 from isocharge.common.errors import InputError, ListenError
+from isocharge.serve.network.credentials import Tls, Token
 from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.tls import Tls
-from isocharge.serve.network.token import Token
 
 PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inference.proto"
 

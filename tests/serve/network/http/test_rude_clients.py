@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import trustme
 
+from isocharge.serve.network.credentials import Tls
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.tls import Tls
 
 BODY = json.dumps(
     {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}]}

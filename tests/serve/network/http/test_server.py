@@ -17,11 +17,10 @@ import trustme
 
 from isocharge.serve import Predictor
 from isocharge.serve.network.address import Address
+from isocharge.serve.network.credentials import Tls, Token
 from isocharge.serve.network.http import App, HttpServer
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.tls import Tls
-from isocharge.serve.network.token import Token
 
 INFER = "/v2/models/linear/infer"
 BODY = json.dumps(

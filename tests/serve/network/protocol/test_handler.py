@@ -16,7 +16,7 @@ from isocharge.common.errors import InputError, ModelNotFound, TokenError
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.encoding import compress, decompress
-from isocharge.serve.network.protocol.status import grpc_status, http_status
+from isocharge.serve.network.protocol.response import grpc_status, http_status
 
 INFER = "/v2/models/linear/infer"
 

@@ -14,11 +14,10 @@ import grpc.aio
 import uvloop
 
 from isocharge.common.errors import ListenError
+from isocharge.serve.network.credentials import Tls, Token
 from isocharge.serve.network.grpc.service import Service, handlers
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.tls import Tls
-from isocharge.serve.network.token import Token
 
 GRACE_SECONDS = 10
 """Time that requests which have begun get when the server stops, s."""

@@ -13,15 +13,14 @@ from google.protobuf.json_format import ParseDict
 from google.protobuf.message import DecodeError
 
 from isocharge.common.errors import ModelNotFound, RequestError
-from isocharge.serve.network.grpc.messages import METHODS, SERVICE
+from isocharge.serve.network.credentials import Token
+from isocharge.serve.network.grpc.messages import METHODS, SERVICE, read_infer, write_answer
 from isocharge.serve.network.grpc.open_calls import OpenCalls
-from isocharge.serve.network.grpc.tensors import read_infer, write_answer
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler, describe
 from isocharge.serve.network.protocol.infer import answer_inference
-from isocharge.serve.network.protocol.status import client_message, grpc_status
-from isocharge.serve.network.request_log import Exchange
-from isocharge.serve.network.token import Token
+from isocharge.serve.network.protocol.response import client_message, grpc_status
+from isocharge.serve.network.traffic import Exchange
 
 OPEN = ("ServerLive", "ServerReady")
 """Methods that need no token."""

@@ -4,11 +4,11 @@ import time
 from collections.abc import Callable
 
 from isocharge.common.errors import TokenError
+from isocharge.serve.network.credentials import Token
 from isocharge.serve.network.protocol import Handler, Response
 from isocharge.serve.network.protocol.handler import Headers
 from isocharge.serve.network.protocol.response import error_response
-from isocharge.serve.network.request_log import Client, Exchange
-from isocharge.serve.network.token import Token
+from isocharge.serve.network.traffic import Client, Exchange
 
 OPEN = ("/v2/health/live", "/v2/health/ready")
 """Paths that need no token: programs that start and watch servers have none."""

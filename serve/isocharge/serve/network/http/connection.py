@@ -28,7 +28,7 @@ from isocharge.serve.network.http.app import App
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Response
 from isocharge.serve.network.protocol.response import error_response, refusal
-from isocharge.serve.network.request_log import Client
+from isocharge.serve.network.traffic import Client
 
 UNSENT_BYTES = 1 << 22
 """Answers that may wait for a client that sends requests and reads none, bytes; then the connection is closed."""

@@ -9,10 +9,10 @@ from functools import partial
 import uvloop
 
 from isocharge.serve.network.address import Address
+from isocharge.serve.network.credentials import Tls
 from isocharge.serve.network.http.app import App
 from isocharge.serve.network.http.connection import Connection, close_overdue
 from isocharge.serve.network.limits import ServerLimits
-from isocharge.serve.network.tls import Tls
 
 GRACE_SECONDS = 10.0
 """Time that requests which have begun get when the server stops, s."""

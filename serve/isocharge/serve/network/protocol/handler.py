@@ -13,12 +13,11 @@ from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.metrics import CONTENT_TYPE, Metrics
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol import describe
-from isocharge.serve.network.protocol.answer import write_answer
+from isocharge.serve.network.protocol.body import read_infer, read_object, write_answer
 from isocharge.serve.network.protocol.encoding import compress, decompress
 from isocharge.serve.network.protocol.infer import answer_inference
 from isocharge.serve.network.protocol.openapi import openapi
 from isocharge.serve.network.protocol.page import PAGE_HEADERS, page
-from isocharge.serve.network.protocol.request import read_infer, read_object
 from isocharge.serve.network.protocol.response import Response, error_response, json_response, response_of
 from isocharge.serve.network.traffic import Traffic
 
