@@ -1,0 +1,19 @@
+"""The same dataset from a process pool and from a Dask cluster: both are a `concurrent.futures.Executor`."""
+
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+from isocharge.simulate import Circle, Sweep, dask_workers, load_sensor, read_dataset, run_sweep
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    sensor, probes, sweep = load_sensor("three-25um-biaxial"), (Circle(1.0),), Sweep(radius=6.0, samples=2000, seed=1)
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        dataset = read_dataset(run_sweep(folder / "pool", sensor, probes, sweep, executor=pool))
+    print(f"{len(dataset.samples)} presses, charges up to {dataset.samples.charge_pC.max():.0f} pC")
+    if len(sys.argv) > 2:  # the address of a Dask scheduler, like tcp://10.0.0.1:8786
+        with dask_workers(sys.argv[2]) as cluster:
+            other = read_dataset(run_sweep(folder / "cluster", sensor, probes, sweep, executor=cluster))
+        print("the same charges:", bool((other.samples.charge_pC == dataset.samples.charge_pC).all()))
