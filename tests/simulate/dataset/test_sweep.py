@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.common.errors import OutputError, OutputExists, SceneError
+from isocharge.common.errors import OutputError, SceneError
+from isocharge.common.progress import listening
 from isocharge.simulate import (
     Circle,
     ForwardMap,
@@ -16,7 +17,6 @@ from isocharge.simulate import (
     Sensor,
     SolveSettings,
     Sweep,
-    SweepCallbacks,
     Theory,
     load_sensor,
     parse_probe,
@@ -24,9 +24,9 @@ from isocharge.simulate import (
     read_dataset,
     run_sweep,
     touch_charge,
-    write_sweep,
 )
-from isocharge.simulate.dataset.sweep import SHARD, TASK
+from isocharge.simulate.dataset.sweep import SHARD, TASK, write_sweep
+from isocharge.simulate.execution.workers import in_order
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
@@ -35,12 +35,12 @@ QUICK = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
 
 
 def small(samples: int = 60, **changes) -> Sweep:
-    return Sweep(**{"radius": 3e-3, "force_range": (1.0, 1.0), "samples": samples, "seed": 7} | changes)
+    return Sweep(**{"radius": 3.0, "force_range": (1.0, 1.0), "samples": samples, "seed": 7} | changes)
 
 
 @dataclass(frozen=True)
 class Spy:
-    """In place of a forward map: its charges are what it was asked for, in pC."""
+    """In place of a forward map: its charges are what it was asked for."""
 
     probe: Circle | Polygon
     sensor: Sensor = SENSOR
@@ -49,8 +49,12 @@ class Spy:
     solves: int = 3
     error: float = 1e-4
 
-    def forward(self, x, y, _force, orientation):
-        return 1e-12 * np.stack([1e3 * x, 1e3 * y, np.rad2deg(orientation)], axis=1)
+    @property
+    def electrodes(self):
+        return self.sensor.electrode_names
+
+    def charges(self, contact, orientation):
+        return np.column_stack([contact[:, :2], np.rad2deg(orientation)])
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -62,14 +66,13 @@ def files(folder: Path) -> dict[str, bytes]:
 
 def test_samples_are_the_presses_and_their_charges(small_dataset):
     read = read_dataset(small_dataset)
-    x, y, force, _ = Sweep(samples=500, seed=7).presses()
-    np.testing.assert_allclose(read.samples.x_mm, x * 1e3, rtol=1e-14)
-    np.testing.assert_allclose(read.samples.y_mm, y * 1e3, rtol=1e-14)
-    np.testing.assert_array_equal(read.samples.force_N, force)
+    x, y, force = Sweep(samples=500, seed=7).contacts().T
+    for column, expected in ((read.samples.x_mm, x), (read.samples.y_mm, y), (read.samples.force_N, force)):
+        np.testing.assert_array_equal(column, expected)
     assert set(read.samples.probe) == {"circle:1.0"}
     for i in (0, 123, 499):
-        solved = press(read.sensor.film, Circle(1e-3), (x[i], y[i]), force[i])
-        np.testing.assert_allclose(read.samples.charge_pC[i], 1e12 * touch_charge(read.sensor, solved), rtol=1e-3)
+        solved = press(read.sensor.film, Circle(1.0), (x[i], y[i]), force[i])
+        np.testing.assert_allclose(read.samples.charge_pC[i], touch_charge(read.sensor, solved), rtol=1e-3)
 
 
 def test_manifest_of_a_sweep(small_dataset, three_map):
@@ -94,17 +97,17 @@ def test_same_seed_same_bytes(small_dataset, three_map, tmp_path):
     assert read_dataset(other).sha256 != read_dataset(again).sha256
 
 
-def test_a_run_writes_what_its_maps_write(tmp_path):
+def test_a_run_writes_what_its_maps_write_and_reports_both_phases(tmp_path):
     """Whether or not a draft is kept on the way."""
-    maps = [
-        ForwardMap.build(
-            SENSOR, Circle(1e-3), 3e-3, (1.0, 1.0), SolveSettings(theory=MEMBRANE, resolution=QUICK.resolution)
-        )
-    ]
-    plain = write_sweep(tmp_path / "a" / "presses", maps, small())
-    drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (Circle(1e-3),), small(), QUICK)
-    assert files(plain) == files(drafted)
+    reports: dict[str, list] = {}
+    with listening(lambda title, done, total, _: reports.setdefault(title, []).append((done, total))):
+        drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (Circle(1.0),), small(), QUICK)
+    maps = [ForwardMap.build(SENSOR, Circle(1.0), 3.0, (1.0, 1.0), QUICK)]
+    assert files(drafted) == files(write_sweep(tmp_path / "a" / "presses", maps, small()))
     assert [path.name for path in drafted.parent.iterdir()] == ["presses"]
+    assert reports["pressing"] == [(0, 60), (60, 60)]
+    done, total = reports["solving the film"][-1]
+    assert done == total
 
 
 def test_orientation_is_the_whole_turn_against_the_notation(tmp_path):
@@ -127,82 +130,53 @@ def test_orientation_is_the_whole_turn_against_the_notation(tmp_path):
 def test_shards_and_tasks_keep_the_order(tmp_path, probes):
     """More than a shard, more than a task in one, and each press with its own charges."""
     sweep = Sweep(samples=SHARD + 10, orientation="random")
-    maps = [Spy(Polygon.rectangle(side * 1e-3, 2e-3)) for side in (3.0, 4.0, 5.0)[:probes]]
+    maps = [Spy(Polygon.rectangle(side, 2.0)) for side in (3.0, 4.0, 5.0)[:probes]]
     read = read_dataset(write_sweep(tmp_path / "large", maps, sweep))
     assert SHARD > TASK
     assert [shard["samples"] for shard in read.manifest["shards"]] == [SHARD, 10]
     presses = sweep.over([made.probe for made in maps])
-    np.testing.assert_allclose(read.samples.x_mm, 1e3 * presses.x)
-    np.testing.assert_allclose(read.samples.charge_pC[:, 0], 1e3 * presses.x)
-    np.testing.assert_allclose(read.samples.charge_pC[:, 1], 1e3 * presses.y)
-    np.testing.assert_allclose(read.samples.charge_pC[:, 2], np.rad2deg(presses.turn))
+    np.testing.assert_array_equal(read.samples.x_mm, presses.contact[:, 0])
+    np.testing.assert_array_equal(read.samples.charge_pC[:, :2], presses.contact[:, :2])
+    np.testing.assert_allclose(read.samples.charge_pC[:, 2], np.rad2deg(presses.rotation))
 
 
 def test_probes_take_turns(tmp_path):
     """Each with its own charges; an odd number of samples, and a probe that gets none."""
-    probes, sweep = (Circle(1e-3), Circle(2e-3)), small(5)
+    probes, sweep = (Circle(1.0), Circle(2.0)), small(5)
     read = read_dataset(run_sweep(tmp_path / "two", SENSOR, probes, sweep, QUICK))
     assert read.samples.probe.tolist() == ["circle:1.0", "circle:2.0", "circle:1.0", "circle:2.0", "circle:1.0"]
     assert read.manifest["probes"] == ["circle:1.0", "circle:2.0"]
     for i in (0, 3):
-        at = (1e-3 * read.samples.x_mm[i], 1e-3 * read.samples.y_mm[i])
+        at = (read.samples.x_mm[i], read.samples.y_mm[i])
         solved = press(SENSOR.film, probes[i % 2], at, read.samples.force_N[i], SolveSettings(theory=MEMBRANE))
-        np.testing.assert_allclose(read.samples.charge_pC[i], 1e12 * touch_charge(SENSOR, solved), rtol=1e-3)
+        np.testing.assert_allclose(read.samples.charge_pC[i], touch_charge(SENSOR, solved), rtol=1e-3)
     one = read_dataset(write_sweep(tmp_path / "one", [Spy(probe) for probe in probes], small(1)))
     assert one.samples.probe.tolist() == ["circle:1.0"]
 
 
 def test_a_grid_on_disk(tmp_path):
     sweep = small(500, sampling="grid", force_range=(0.5, 1.0))
-    read = read_dataset(write_sweep(tmp_path / "grid", [Spy(Circle(1e-3))], sweep))
-    assert len(read.samples) == len(sweep.presses()[0]) < 500
+    read = read_dataset(write_sweep(tmp_path / "grid", [Spy(Circle(1.0))], sweep))
+    assert len(read.samples) == len(sweep.contacts()) < 500
     assert read.manifest["samples"] == len(read.samples)
     assert read.manifest["sampling"].startswith("grid: square lattice")
-
-
-def test_progress_of_both_phases_is_told(tmp_path):
-    solved, sampled = [], []
-    run_sweep(
-        tmp_path / "presses", SENSOR, (Circle(1e-3),), small(25), QUICK, shard=10,
-        callbacks=SweepCallbacks(
-            solved=lambda done, total: solved.append((done, total)),
-            sampled=lambda done, total: sampled.append((done, total)),
-        ),
-    )  # fmt: skip
-    assert solved[-1] == (len(solved), len(solved))
-    assert sampled == [(0, 25), (10, 25), (20, 25), (25, 25)]
 
 
 # Refused, and failed
 
 
-def test_existing_folder_is_refused_before_any_work(tmp_path):
-    (tmp_path / "presses").mkdir()
-    with pytest.raises(OutputExists):
-        run_sweep(
-            tmp_path / "presses",
-            SENSOR,
-            (Circle(1e-3),),
-            Sweep(),
-            callbacks=SweepCallbacks(lambda done, total: pytest.fail(f"worked: {done} of {total}")),
-        )
-    assert [path.name for path in tmp_path.iterdir()] == ["presses"]
-
-
 @pytest.mark.parametrize(
     ("sweep", "message"),
     [
-        ({"radius": 44.5e-3}, "leave the film of radius 45 mm"),
-        ({"radius": -1e-3}, "radius: expected a positive number"),
+        ({"radius": 44.5}, "leave the film of radius 45 mm"),
+        ({"radius": -1.0}, "radius: expected a positive number"),
         ({"radius": float("nan")}, "radius: expected a positive number"),
-        ({"force_range": (-0.1, 1.0)}, "force: expected 0 < smallest"),
-        ({"force_range": (1.0, float("inf"))}, "force: expected 0 < smallest"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # drawn before they are looked at
 def test_impossible_sweeps_leave_nothing(tmp_path, sweep, message):
     with pytest.raises(SceneError, match=message):
-        run_sweep(tmp_path / "new" / "presses", SENSOR, (Circle(1e-3),), Sweep(**sweep))
+        run_sweep(tmp_path / "new" / "presses", SENSOR, (Circle(1.0),), Sweep(**sweep))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -216,7 +190,7 @@ def test_no_probes(tmp_path):
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OutputError, match="file/presses cannot be written: Not a directory; choose another output"):
-        run_sweep(tmp_path / "file" / "presses", SENSOR, (Circle(1e-3),), small(), QUICK)
+        run_sweep(tmp_path / "file" / "presses", SENSOR, (Circle(1.0),), small(), QUICK)
     assert (tmp_path / "file").read_text() == "mine"
 
 
@@ -224,8 +198,9 @@ def test_a_folder_that_cannot_be_written(tmp_path):
 def _spied(monkeypatch):
     """Sweeps solve nothing: a build is four jobs whose results do not matter."""
 
-    def build(_sensor, probe, *_ranges, map_jobs, **_options):
-        assert [float(result.sum()) for result in map_jobs(lambda n: np.full(n, n), range(1, 5))] == [1, 4, 9, 16]
+    def build(_sensor, probe, *_ranges, executor, **_options):
+        results = in_order(executor, lambda n: np.full(n, n), range(1, 5))
+        assert [float(result.sum()) for result in results] == [1, 4, 9, 16]
         return Spy(probe)
 
     monkeypatch.setattr(ForwardMap, "build", build)
@@ -234,7 +209,7 @@ def _spied(monkeypatch):
 @pytest.mark.usefixtures("_spied")
 def test_a_full_disk_loses_nothing_that_was_done(tmp_path, monkeypatch):
     """The n-th file is refused, for every n: a clear error, no dataset; with room again, the same call goes on."""
-    probes = (Circle(1e-3), Circle(2e-3))
+    probes = (Circle(1.0), Circle(2.0))
     complete = files(run_sweep(tmp_path / "whole" / "presses", SENSOR, probes, small(), shard=10))
     for failing in range(1, 100):
         target, calls = tmp_path / str(failing) / "presses", []
