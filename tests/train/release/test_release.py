@@ -1,4 +1,4 @@
-"""From a dataset to a model folder, and what its outputs mean."""
+"""From a fitted network to a model folder, and what the outputs of released models mean."""
 
 import json
 from dataclasses import replace
@@ -12,15 +12,18 @@ from scipy.stats import halfnorm
 from isocharge.common.errors import OutputExists
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.model.repository import model_names
-from isocharge.simulate import Circle, Sweep, noise_model, sensor_from_dict, solve_maps
-from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, train_model
+from isocharge.simulate import Circle, Domain, ForwardMap, noise_model
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict
+from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit, release
 from isocharge.train.data.measured import held_out
-from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.release.evaluate import measure_errors
+from isocharge.train.data.presses import draw_contacts
+from isocharge.train.release.evaluate import simulated_errors
 
 QUICK = FitConfig(
-    NetworkConfig((24, 24), (24, 24)), TrainingConfig(steps=200, misfit_steps=50, misfit_charges=2_000, batch=256)
+    network=NetworkConfig(hidden=(24, 24), misfit_hidden=(24, 24)),
+    training=TrainingConfig(steps=200, misfit_steps=50, misfit_charges=2_000, batch=256),
 )
+REFERENCE = noise_model("reference")
 MODELS = Path(__file__).parents[3] / "models"
 LOW, HIGH, RADIUS = 0.05, 2.0, 8.0
 LARGEST = {
@@ -31,8 +34,8 @@ LARGEST = {
 
 
 @pytest.fixture(scope="module")
-def release(dataset, tmp_path_factory):
-    return train_model(dataset, tmp_path_factory.mktemp("models") / "mine", QUICK, command="make it")
+def released(fitted, tmp_path_factory):
+    return release(fitted, tmp_path_factory.mktemp("models") / "mine", command="make it")
 
 
 def _measured_here(name):
@@ -53,78 +56,67 @@ def known(touch, film):
     radius = np.cos(np.pi / len(area)) * np.hypot(*area[0])
     sensor = sensor_from_dict(dict(touch.metadata.sensor))
     ready = radius <= RADIUS and sensor.film == film.sensor.film
-    wide = film if ready else solve_maps(sensor, (Circle(1e-3),), Sweep(radius=1e-3 * max(radius, RADIUS)))[0]
+    wide = film if ready else ForwardMap.build(sensor, Circle(1.0), max(radius, RADIUS))
     return replace(wide, sensor=sensor), radius
 
 
 def presses(film, count, seed, within=RADIUS):
     """Contacts that no training saw, and the simulator's charges."""
-    rng = np.random.default_rng(seed)
-    radius, angle = within * np.sqrt(rng.uniform(size=count)), rng.uniform(-np.pi, np.pi, count)
-    force = np.exp(rng.uniform(np.log(LOW), np.log(HIGH), count))
-    contact = np.stack([radius * np.cos(angle), radius * np.sin(angle), force], axis=1)
-    return LabelledPresses(contact, 1e12 * film.forward(1e-3 * contact[:, 0], 1e-3 * contact[:, 1], force))
+    contact = draw_contacts(np.random.default_rng(seed), Domain(within, (LOW, HIGH)), count)
+    return LabelledPresses(contact, film.charges(contact))
 
 
 def predict(touch):
-    def answers(charge_pC):
-        found = np.stack(touch.predict_batch(charge_pC), axis=1).astype(float)
+    def answers(charge):
+        found = np.stack(touch.predict_batch(charge), axis=1).astype(float)
         return found[:, :3], found[:, 3:6], found[:, 6:]
 
     return answers
 
 
-def test_the_folder_is_complete_and_loads(release, dataset):
-    assert sorted(path.name for path in release.folder.iterdir()) == ["card.md", "golden.json", "model.onnx"]
-    assert (release.folder.parent / "config.pbtxt").is_file()
-    metadata = Predictor(release.folder).metadata
-    assert metadata == release.metadata
+def test_the_folder_is_complete_and_says_what_it_holds(released, dataset, sensor):
+    assert sorted(path.name for path in released.folder.iterdir()) == ["card.md", "golden.json", "model.onnx"]
+    assert (released.folder.parent / "config.pbtxt").is_file()
+    metadata = Predictor(released.folder).metadata
+    assert metadata == released.metadata
     assert metadata.electrodes == ("A", "B", "C")
     assert metadata.dataset_sha256 == dataset.sha256
     assert metadata.probes == ("circle:1.0",)
     assert metadata.force_range_N == (LOW, HIGH)
     assert metadata.noise == {"name": "reference", "white_pC": 1.0, "gain": 0.002}
-    assert metadata.made_with["command"] == "make it"
-
-
-def test_the_whole_sensor_travels_with_the_model(release, sensor):
-    assert sensor_from_dict(json.loads(json.dumps(release.metadata.sensor))) == sensor
-
-
-def test_the_working_area_just_holds_the_disk(release):
-    corners = np.array(release.metadata.working_area_mm)
+    assert sensor_from_dict(json.loads(json.dumps(metadata.sensor))) == sensor
+    corners = np.array(metadata.working_area_mm)
     middle = 0.5 * (corners + np.roll(corners, -1, axis=0))
     assert np.hypot(*middle.T).min() == pytest.approx(RADIUS, abs=1e-3)
-
-
-def test_the_card_gives_the_figures_and_the_command(release):
-    card = (release.folder / "card.md").read_text()
-    assert f"{release.metadata.errors['position_median_mm']:g} mm" in card
+    card = (released.folder / "card.md").read_text()
+    assert f"{metadata.errors['position_median_mm']:g} mm" in card
     assert "make it" in card
 
 
-def test_an_existing_version_stops_before_the_work(release, dataset):
-    calls = []
+def test_what_is_evaluated_is_what_is_served(fitted, released):
+    """The file's errors are those of the fitted network, whose figures follow from their definitions."""
+    errors = evaluate(fitted)
+    assert released.metadata.errors == errors
+    noisy = fitted.test.noisy(REFERENCE, seed=1)
+    contact = np.stack(Predictor(released.folder).predict_batch(noisy), axis=1)[:, :3]
+    off = np.hypot(*(contact - fitted.test.contact)[:, :2].T)
+    assert errors["position_rms_mm"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-3)
+    assert errors["force_p99_percent"] == pytest.approx(
+        100.0 * np.percentile(np.abs(contact[:, 2] / fitted.test.contact[:, 2] - 1.0), 99), rel=1e-3
+    )
+    half = fitted.test.within(4.0)
+    assert evaluate(fitted, half)["position_rms_mm"] < errors["position_rms_mm"]
+
+
+def test_versions_go_side_by_side_and_none_is_replaced(released, fitted):
     with pytest.raises(OutputExists, match="is already there"):
-        train_model(dataset, release.folder.parent, QUICK, progress=lambda *call: calls.append(call))
-    assert calls == []
-
-
-def test_a_second_version_goes_beside_the_first(release, dataset):
-    second = train_model(dataset, release.folder.parent, QUICK, version=2)
-    assert second.folder.name == "2"
-    assert Predictor(release.folder.parent).metadata.version == 2
-
-
-def test_a_failed_training_leaves_nothing(dataset, tmp_path):
-    broken = replace(dataset, samples=replace(dataset.samples, charge_pC=dataset.samples.charge_pC[:, :2]))
-    with pytest.raises(ValueError, match="three electrodes"):
-        train_model(broken, tmp_path / "models" / "mine", QUICK)
-    assert list(tmp_path.iterdir()) == []
+        release(fitted, released.folder.parent)
+    assert release(fitted, released.folder.parent, version=2).folder.name == "2"
+    assert Predictor(released.folder.parent).metadata.version == 2
 
 
 def test_the_card_holds_on_other_presses(known, touch):
-    errors = measure_errors(predict(touch), presses(*known_presses(known, 6000, 78)), noise_model("reference"), seed=6)
+    errors = simulated_errors(predict(touch), presses(*known_presses(known, 6000, 78)), REFERENCE, seed=6)
     for name in ("position_median_mm", "position_rms_mm", "force_rms_percent", "misfit_p99"):
         assert errors[name] == pytest.approx(touch.metadata.errors[name], rel=0.15, abs=0.02 * (name == "misfit_p99"))
 
@@ -135,7 +127,7 @@ def known_presses(known, count, seed):
 
 
 def test_the_released_models_reach_what_they_should(known, touch):
-    errors = measure_errors(predict(touch), presses(*known_presses(known, 6000, 77)), noise_model("reference"), seed=5)
+    errors = simulated_errors(predict(touch), presses(*known_presses(known, 6000, 77)), REFERENCE, seed=5)
     largest_median, largest_rms, largest_clean, percent = LARGEST.get(touch.metadata.name, (0.10, 0.20, 0.18, 0.8))
     assert errors["position_median_mm"] <= largest_median
     assert errors["position_rms_mm"] <= largest_rms
@@ -149,7 +141,7 @@ def test_the_released_models_reach_what_they_should(known, touch):
 def test_the_deviations_are_honest(known, touch):
     """68 % and 95 % intervals cover what they say, per coordinate and in every third of force and radius."""
     truth = presses(*known_presses(known, 12_000, 79))
-    charge = 1e12 * noise_model("reference").add(1e-12 * truth.charge_pC, np.random.default_rng(7))
+    charge = truth.noisy(REFERENCE, seed=7)
     contact, std, _ = predict(touch)(charge)
     deviation = np.abs(contact - truth.contact) / std
     assert np.all(np.abs(np.mean(deviation < 1.0, axis=0) - 0.68) < 0.025)
@@ -164,14 +156,14 @@ def test_the_deviations_are_honest(known, touch):
 
 def nearest_by_search(film, within, charge, rng):
     """min over c of |(Q - Q(c)) / sigma| by random search and Nelder-Mead on the simulator's forward map."""
-    sigma = noise_model("reference").sigma(1e-12 * charge) * 1e12
+    sigma = REFERENCE.sigma(charge)
     tried = presses(film, 4000, int(rng.integers(1 << 30)), within)
-    distance = np.linalg.norm((tried.charge_pC - charge) / sigma, axis=1)
+    distance = np.linalg.norm((tried.charge - charge) / sigma, axis=1)
 
     def squared(point):
         x, y = point[:2] * min(1.0, within / max(np.hypot(*point[:2]), 1e-9))
         force = np.exp(np.clip(point[2], np.log(LOW), np.log(HIGH)))
-        known = 1e12 * film.forward(np.array([1e-3 * x]), np.array([1e-3 * y]), np.array([force]))[0]
+        known = film.charges(np.array([[x, y, force]]))[0]
         return float(np.sum(((charge - known) / sigma) ** 2))
 
     best = np.inf
@@ -189,7 +181,7 @@ def test_the_misfit_is_the_distance_to_the_nearest_known_contact(known, touch, g
     rng, (film, radius) = np.random.default_rng(11), known
     gains = np.full(len(touch.metadata.electrodes), gain if gain == 3.0 else 1.0)
     gains[1] = gain
-    charges = presses(film, 8, 80, radius).charge_pC * gains
+    charges = presses(film, 8, 80, radius).charge * gains
     searched = np.array([nearest_by_search(film, radius, charge, rng) for charge in charges])
     misfit = touch.predict_batch(charges).misfit
     near = np.abs(misfit - searched) <= 0.5 + 0.25 * searched
@@ -202,8 +194,8 @@ def test_four_electrodes_have_one_check_to_spare(known, touch):
     if len(touch.metadata.electrodes) != 4:
         pytest.skip("three charges always fit some contact")
     truth = presses(*known_presses(known, 6000, 4))
-    truth = truth[np.hypot(*truth.contact[:, :2].T) < 0.9 * known[1]]
-    charge = 1e12 * noise_model("reference").add(1e-12 * truth.charge_pC, np.random.default_rng(3))
+    truth = truth.within(0.9 * known[1])
+    charge = truth.noisy(REFERENCE, seed=3)
     good, off = touch.predict_batch(charge).misfit, 0.4 if touch.metadata.name.endswith("-student") else 0.15
     for share in (0.5, 0.9, 0.95, 0.99):
         assert np.quantile(good, share) == pytest.approx(halfnorm.ppf(share), rel=off)
@@ -214,11 +206,11 @@ def test_a_model_of_measured_presses_is_judged_by_them_and_says_so(dataset, tmp_
     rng = np.random.default_rng(3)
     charge = 1.2 * dataset.samples.charge_pC * np.exp(0.03 * rng.standard_normal(dataset.samples.charge_pC.shape))
     measured = replace(dataset, samples=replace(dataset.samples, charge_pC=charge), manifest={})
-    release = train_model(measured, tmp_path / "models" / "mine", QUICK, warn=lambda _: None)
-    errors, card = release.metadata.errors, (release.folder / "card.md").read_text("utf-8")
+    model = release(fit(measured, QUICK), tmp_path / "models" / "mine")
+    errors, card = model.metadata.errors, (model.folder / "card.md").read_text("utf-8")
     contact = np.column_stack([dataset.samples.x_mm, dataset.samples.y_mm, dataset.samples.force_N])
     held = held_out(contact)
-    off = np.stack(Predictor(release.folder).predict_batch(charge[held]), axis=1)[:, :2] - contact[held, :2]
+    off = np.stack(Predictor(model.folder).predict_batch(charge[held]), axis=1)[:, :2] - contact[held, :2]
     assert errors["measured_presses"] == held.sum()
     assert errors["position_median_mm"] == pytest.approx(np.median(np.hypot(*off.T)), rel=1e-3)
     assert f"## Errors on {held.sum()} measured presses that training never saw" in card

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from msgspec import Meta, to_builtins
+from msgspec import Meta, json
 
 from isocharge.common.errors import ConfigError
 from isocharge.common.structs import Settings, WrongKey, convert, read_toml
@@ -88,7 +88,7 @@ class FitConfig(Settings, frozen=True):
 
     def to_dict(self) -> dict[str, Any]:
         """As the tables of the file, ready for JSON."""
-        table: dict[str, Any] = to_builtins(self)
+        table: dict[str, Any] = json.decode(json.encode(self))
         return table
 
     def checked(self) -> "FitConfig":
