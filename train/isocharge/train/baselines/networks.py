@@ -1,256 +1,152 @@
-"""Networks of several sizes, trained by the usual pipeline, and what carries them: torch, ONNX Runtime, NumPy.
+"""Networks of several sizes, trained by the usual pipeline, and the released model.
 
-The other methods give a contact and nothing else, so the contact network runs alone, without deviations and misfit; the
-released model, `ReleasedModel`, gives all seven numbers.
+The other methods give a contact and nothing else, so these networks run without deviations and misfit as well.
 """
 
-import io
-import pickle
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import onnx.utils
+import onnx
 import onnxruntime as ort
-import torch
+from onnx.utils import Extractor
+from sklearn.base import BaseEstimator, RegressorMixin
 
 from isocharge.common.arrays import Array
 from isocharge.serve import Predictor
-from isocharge.serve.model.session import open_session
-from isocharge.simulate.dataset.shards import Dataset
-from isocharge.train.baselines.estimator import Fitted, FittingTask
-from isocharge.train.data.domain import HIGHEST_PC, LOWEST_PC
+from isocharge.serve.model.session import INPUT, open_session
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 from isocharge.train.release.export import GraphBuilder, add_layers, make_model
-from isocharge.train.release.folding import FoldedLayers, contact_alone
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
-from isocharge.train.training.fit import fit_network
-from isocharge.train.training.network import InverseNetwork
-
-
-@dataclass(frozen=True)
-class Network:
-    """A network of one size.
-
-    Attributes:
-        dataset: What it learns from; split by position with the task's seed and share.
-        hidden: Widths.
-        steps: Optimiser steps.
-        hold_out: Share of the positions that the task holds back.
-    """
-
-    dataset: Dataset
-    hidden: tuple[int, ...] = (64, 64, 64)
-    steps: int = 4_000
-    hold_out: float = 0.1
-
-    @property
-    def name(self) -> str:
-        """With its widths."""
-        return f"network {'-'.join(map(str, self.hidden))}"
-
-    def fit(self, task: FittingTask) -> tuple[Fitted, ...]:
-        """Train, and give the contact network in torch, ONNX Runtime (session.run, iobinding) and NumPy."""
-        training = TrainingConfig(
-            steps=self.steps,
-            misfit_steps=1,
-            misfit_charges=1000,
-            hold_out=self.hold_out,
-            seed=task.seed,
-            noise=task.noise.name,
-        )
-        sizes = NetworkConfig(hidden=self.hidden, misfit_hidden=(8,) * len(self.hidden))
-        network = fit_network(self.dataset, FitConfig(sizes, training), warn=lambda _: None).network
-        choice, layers = f"{self.steps} steps", contact_alone(network)
-        graph = contact_graph(layers)
-        return (
-            TorchNetwork(network, choice, self.name),
-            SessionNetwork(graph, choice, self.name),
-            BoundNetwork(graph, choice, self.name),
-            NumpyNetwork(layers, choice, self.name),
-        )
-
-
-def contact_graph(layers: FoldedLayers) -> bytes:
-    """An ONNX graph with the input `charge_pC` [n, n_electrode] and the output `contact` [n, 3], float32."""
-    build = GraphBuilder()
-    within = build.add("Clip", "charge_pC", build.constant(LOWEST_PC), build.constant(HIGHEST_PC))
-    value = add_layers(build, build.add("Log", within), layers)
-    plane, log_force = build.split(value, ("plane", "log_force"), (2, 1), axis=1)
-    build.add("Concat", plane, build.add("Exp", log_force), to="contact", axis=1)
-    return bytes(make_model(build, "contact", len(layers.skip), {"contact": 3}).SerializeToString())
-
-
-@dataclass(frozen=True)
-class TorchNetwork(Fitted):
-    """In torch, as it was trained."""
-
-    network: InverseNetwork
-    choice: str
-    name: str
-    form: str = "torch"
-
-    def predict(self, charge_pC: Array) -> Array:
-        """See `Fitted.predict`."""
-        return self._contacts(torch.tensor(charge_pC).float()).double().numpy()
-
-    def _contacts(self, charge_pC: torch.Tensor) -> torch.Tensor:
-        with torch.inference_mode():
-            value = self.network.posterior(charge_pC)[0] * self.network.scale + self.network.centre
-            return torch.cat([value[:, :2], torch.exp(value[:, 2:])], dim=1)
-
-    def one(self, charge_pC: Array) -> Callable[[], object]:
-        """See `Fitted.one`."""
-        row = torch.tensor(charge_pC).float()[None]
-        return lambda: self._contacts(row)
-
-    @property
-    def memory(self) -> int:
-        """See `Fitted.memory`: the contact network and its normalisation."""
-        buffer = io.BytesIO()
-        names = ("typical", "logs_mean", "whitening", "scale", "centre")
-        parts = {name: getattr(self.network, name) for name in names}
-        torch.save({**self.network.contact.state_dict(), **parts}, buffer)
-        return buffer.tell()
-
-
-@dataclass(frozen=True)
-class SessionNetwork(Fitted):
-    """In ONNX Runtime, one `session.run` per call."""
-
-    graph: bytes
-    choice: str
-    name: str
-    form: str = "ONNX Runtime"
-
-    @cached_property
-    def session(self) -> ort.InferenceSession:
-        """One thread, no spinning."""
-        return open_session(self.graph, self.name)
-
-    def predict(self, charge_pC: Array) -> Array:
-        """See `Fitted.predict`."""
-        contact: Array = self.session.run(None, {"charge_pC": charge_pC.astype(np.float32)})[0].astype(float)
-        return contact
-
-    def one(self, charge_pC: Array) -> Callable[[], object]:
-        """See `Fitted.one`."""
-        feed = {"charge_pC": charge_pC.astype(np.float32)[None]}
-        return partial(self.session.run, None, feed)
-
-    @property
-    def memory(self) -> int:
-        """See `Fitted.memory`: the file."""
-        return len(self.graph)
-
-
-@dataclass(frozen=True)
-class BoundNetwork(SessionNetwork):
-    """In ONNX Runtime, buffers bound once."""
-
-    form: str = "ONNX Runtime, bound"
-
-    @cached_property
-    def _bound(self) -> "_Bound":
-        return _Bound(self.session, self.session.get_inputs()[0].shape[1])
-
-    def one(self, charge_pC: Array) -> Callable[[], object]:
-        """See `Fitted.one`: charges into the bound input, run, answers out of the bound output."""
-        bound, charge, out = self._bound, charge_pC.astype(np.float32), np.zeros(3, np.float32)
-
-        def compute() -> object:
-            bound.charges[:] = charge
-            bound.run()
-            out[:] = bound.answers
-            return out
-
-        return compute
-
-
-class _Bound:
-    """Input and output memory of one press."""
-
-    def __init__(self, session: ort.InferenceSession, electrodes: int) -> None:
-        charges, answers = np.zeros((1, electrodes), np.float32), np.zeros((1, 3), np.float32)
-        binding = session.io_binding()
-        binding.bind_input("charge_pC", "cpu", 0, np.float32, charges.shape, charges.ctypes.data)
-        binding.bind_output("contact", "cpu", 0, np.float32, answers.shape, answers.ctypes.data)
-        self.charges, self.answers = charges[0], answers[0]
-        self.run: Callable[[], None] = partial(session.run_with_iobinding, binding)
-
-
-@dataclass(frozen=True)
-class NumpyNetwork(Fitted):
-    """In NumPy, float64."""
-
-    layers: FoldedLayers
-    choice: str
-    name: str
-    form: str = "NumPy"
-
-    def predict(self, charge_pC: Array) -> Array:
-        """See `Fitted.predict`."""
-        value = logs = np.log(np.minimum(np.maximum(charge_pC, LOWEST_PC), HIGHEST_PC))
-        for weight, bias in self.layers.hidden:
-            value = np.tanh(value @ weight + bias)
-        contact: Array = value @ self.layers.last[0] + logs @ self.layers.skip + self.layers.last[1]
-        contact[..., 2] = np.exp(contact[..., 2])
-        return contact
-
-    def one(self, charge_pC: Array) -> Callable[[], object]:
-        """See `Fitted.one`."""
-        return partial(self.predict, np.array(charge_pC, dtype=float))
-
-    @property
-    def memory(self) -> int:
-        """See `Fitted.memory`."""
-        return len(pickle.dumps(self.layers))
-
+from isocharge.train.training.fit import train_network
+from isocharge.train.training.folding import FoldedLayers, contact_alone
+from isocharge.train.training.source import TrainingData
 
 RELEASED = "released network"
 """Name of the released model among the methods."""
 
 
-def contact_of(model: bytes) -> bytes:
-    """The part of a released model's graph that gives the contact, without standard deviations and misfit."""
-    graph = onnx.load_model_from_string(model)
-    return bytes(onnx.utils.Extractor(graph).extract_model(["charge_pC"], ["contact"]).SerializeToString())
+class OnnxContact(BaseEstimator, RegressorMixin):  # type: ignore[misc]
+    """A graph with the input `charge_pC` and the output `contact` in ONNX Runtime, as `Predictor` runs it.
+
+    Attributes:
+        graph: The ONNX file.
+    """
+
+    def __init__(self, graph: bytes) -> None:
+        self.graph = graph
+
+    def fit(self, charge: Array, contact: Array) -> "OnnxContact":
+        """It is fitted already."""
+        del charge, contact
+        return self
+
+    def predict(self, charge: Array) -> Array:
+        """Contacts, shape (n, 3)."""
+        contact: Array = self._session.run(["contact"], {INPUT: charge.astype(np.float32)})[0].astype(float)
+        return contact
+
+    def single(self, charge: Array) -> Callable[[], object]:
+        """One press, shape (n_electrode,), ready to be computed: into the bound input, run, out of the bound output."""
+        row, answers, out = charge.astype(np.float32), np.zeros((1, 3), np.float32), np.zeros(3, np.float32)
+        bound, binding = row[None].copy(), self._session.io_binding()
+        binding.bind_input(INPUT, "cpu", 0, np.float32, bound.shape, bound.ctypes.data)
+        binding.bind_output("contact", "cpu", 0, np.float32, answers.shape, answers.ctypes.data)
+
+        def compute() -> object:
+            bound[0] = row
+            self._session.run_with_iobinding(binding)
+            out[:] = answers[0]
+            return out
+
+        return compute
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"graph": self.graph}
+
+    @cached_property
+    def _session(self) -> ort.InferenceSession:
+        return open_session(self.graph, "the contact's graph")
 
 
-@dataclass(frozen=True)
-class ReleasedModel(Fitted):
-    """A model folder through `Predictor`: contact, standard deviations and misfit."""
+class TrainedNetwork(OnnxContact):
+    """The contact network alone, of one size.
 
-    folder: Path
-    name: str = RELEASED
-    choice: str = "as released"
-    form: str = "Predictor"
+    Attributes:
+        data: For sensor and domain; the presses are those of `fit`.
+        hidden: Widths.
+        steps: Optimiser steps.
+        noise: On the charges while it trains.
+        seed: Of weights, batches and noise.
+    """
+
+    def __init__(self, data: TrainingData, hidden: tuple[int, ...], steps: int, noise: NoiseModel, seed: int) -> None:
+        self.data, self.hidden, self.steps, self.noise, self.seed = data, hidden, steps, noise, seed
+
+    def fit(self, charge: Array, contact: Array) -> "TrainedNetwork":
+        """Train on clean presses."""
+        training = TrainingConfig(
+            steps=self.steps, misfit_steps=1, misfit_charges=1000, hold_out=0.05, seed=self.seed, noise=self.noise
+        )
+        sizes = NetworkConfig(hidden=self.hidden, misfit_hidden=(8,) * len(self.hidden))
+        data = replace(self.data, presses=LabelledPresses(contact, charge, self.data.presses.measured))
+        self.graph = contact_graph(contact_alone(train_network(data, FitConfig(sizes, training)).network))
+        return self
+
+
+class ReleasedModel(BaseEstimator, RegressorMixin):  # type: ignore[misc]
+    """A model folder through `Predictor`: contact, standard deviations and misfit.
+
+    Attributes:
+        folder: The version folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def fit(self, charge: Array, contact: Array) -> "ReleasedModel":
+        """It is as released."""
+        del charge, contact
+        return self
+
+    def predict(self, charge: Array) -> Array:
+        """Contacts, shape (n, 3)."""
+        return self.answer(charge)[0]
+
+    def answer(self, charge: Array) -> tuple[Array, Array, Array]:
+        """Contact (n, 3), standard deviations (n, 3) and misfit (n, 1)."""
+        columns = np.stack(self.predictor.predict_batch(charge), axis=1).astype(float)
+        return columns[:, :3], columns[:, 3:6], columns[:, 6:]
+
+    def single(self, charge: Array) -> Callable[[], object]:
+        """One press, ready to be computed: `Predictor.predict_into`."""
+        return partial(self.predictor.predict_into, charge.astype(np.float32), np.zeros(7, np.float32))
 
     @cached_property
     def predictor(self) -> Predictor:
         """The loaded model."""
         return Predictor(self.folder)
 
-    def predict(self, charge_pC: Array) -> Array:
-        """See `Fitted.predict`."""
-        return self.answer(charge_pC)[0]
-
-    def contact_only(self) -> BoundNetwork:
-        """Its contact alone, which is all that the other methods give."""
-        graph = contact_of((self.folder / "model.onnx").read_bytes())
-        return BoundNetwork(graph, "as released, its contact alone", f"{self.name}, contact only")
-
-    def answer(self, charge_pC: Array) -> tuple[Array, Array, Array]:
-        """Contact (n, 3), standard deviations (n, 3) and misfit (n, 1)."""
-        columns = np.stack(self.predictor.predict_batch(charge_pC), axis=1).astype(float)
-        return columns[:, :3], columns[:, 3:6], columns[:, 6:]
-
-    def one(self, charge_pC: Array) -> Callable[[], object]:
-        """See `Fitted.one`: `Predictor.predict_into`."""
-        return partial(self.predictor.predict_into, charge_pC.astype(np.float32), np.zeros(7, np.float32))
-
     @property
-    def memory(self) -> int:
-        """See `Fitted.memory`: the file."""
-        return (self.folder / "model.onnx").stat().st_size
+    def graph(self) -> bytes:
+        """The ONNX file."""
+        return (self.folder / "model.onnx").read_bytes()
+
+    def contact_only(self) -> OnnxContact:
+        """Its contact alone, which is all that the other methods give."""
+        part = Extractor(onnx.load_model_from_string(self.graph)).extract_model([INPUT], ["contact"])
+        return OnnxContact(part.SerializeToString())
+
+
+def contact_graph(layers: FoldedLayers) -> bytes:
+    """An ONNX graph with the input `charge_pC` [n, n_electrode] and the output `contact` [n, 3], float32."""
+    build = GraphBuilder()
+    within = build.add("Clip", INPUT, build.constant(LOWEST_CHARGE), build.constant(HIGHEST_CHARGE))
+    value = add_layers(build, build.add("Log", within), layers)
+    plane, log_force = build.split(value, ("plane", "log_force"), (2, 1), axis=1)
+    build.add("Concat", plane, build.add("Exp", log_force), to="contact", axis=1)
+    return bytes(make_model(build, "contact", len(layers.skip), {"contact": 3}).SerializeToString())

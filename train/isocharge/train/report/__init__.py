@@ -1,7 +1,5 @@
 """The report on speed against error: every method on the same presses, with the limits drawn in.
 
-May import: baselines, bayes, data.
-
 from isocharge.train.report import write_report
 
 write_report(Path("report"), [(read_dataset(Path("presses")), find_model("three-25um-biaxial"))])

@@ -2,85 +2,59 @@
 
 import json
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import ModelError
-from isocharge.common.files import new_folder, write_whole
-from isocharge.common.progress import StageProgress
+from isocharge.common.files import write_whole
+from isocharge.common.progress import track
+from isocharge.common.resumable_run import resume_folder
 from isocharge.serve import ModelMetadata, Predictor
 from isocharge.serve.benchmark import machine
-from isocharge.simulate import Dataset, Samples, SolveSettings, sensor_to_dict
-from isocharge.train.baselines import (
-    Fitted,
-    FittingTask,
-    ReleasedModel,
-    boosting,
-    gauss_newton,
-    linear_band,
-    polynomial,
-    table,
-)
-from isocharge.train.data.domain import inner_radius
-from isocharge.train.data.measured import check_enough, held_out, is_measured
-from isocharge.train.data.presses import LabelledPresses, domain_of
+from isocharge.simulate import ChargeSpline, Dataset, Samples
+from isocharge.simulate.plots.figure import save_picture
+from isocharge.simulate.sensor.sensor_file import sensor_to_dict
+from isocharge.train.baselines.networks import RELEASED, ReleasedModel, TrainedNetwork
+from isocharge.train.baselines.rival import FittingTask, Rival
+from isocharge.train.baselines.rivals import BOOSTING, GAUSS_NEWTON, LINEAR_BAND, POLYNOMIAL, TABLE, rivals
+from isocharge.train.data.measured import check_enough, held_out
+from isocharge.train.data.presses import LabelledPresses, domain_of, is_measured, presses_of, split_by_position
+from isocharge.train.release.release import model_domain
 from isocharge.train.report import effects, maps, pictures
-from isocharge.train.report.bench import EvaluationScene, press_on
-from isocharge.train.report.limits import BAYES, CRAMER_RAO, ErrorBounds, error_bounds
-from isocharge.train.report.measures import MethodRecord, Plot, rounded
-from isocharge.train.report.methods import (
-    EvaluationPresses,
-    Method,
-    all_methods,
-    fit_all,
-    fit_those_that_can,
-    records_of,
-    task_of,
-    timed,
-)
+from isocharge.train.report.case import EvaluationCase, press_on
+from isocharge.train.report.limits import BAYES, ErrorBounds
+from isocharge.train.report.measures import rounded
+from isocharge.train.report.methods import by_name, fit_all, records_of
 from isocharge.train.report.page import page
 from isocharge.train.report.settings import Settings
-from isocharge.train.report.speed import AXES, speed_plot
 from isocharge.train.report.timing import one_thread
 from isocharge.train.report.verdict import verdict
+from isocharge.train.training.source import TrainingData
 
 FORMAT_VERSION = 1
 
 MEASURED_WITH = ("isocharge", "numpy", "scipy", "scikit-learn", "torch", "onnxruntime")
 """Packages whose versions belong to the figures."""
 
-COMPARED = (gauss_newton.NAME, polynomial.NAME, table.INTERPOLATED, boosting.NAME, linear_band.NAME)
-"""Methods in the pictures of effects next to the released model; of their forms the last, the plain one."""
+COMPARED = (GAUSS_NEWTON, POLYNOMIAL, TABLE, BOOSTING, LINEAR_BAND)
+"""Methods in the pictures of effects next to the released model."""
 
+TEST_NOISE = 4242
+"""Seed of the noise on the test presses, relative to the case's."""
 
-@dataclass
-class Steps:
-    """Counts what is done.
+FEWEST_LEARNT = 30
+"""Measured presses that methods are fitted to at least, once the test presses are held out."""
 
-    Attributes:
-        total: Steps in all, as far as is known.
-        tell: Called with steps done, all steps, and a text.
-        done: Steps done.
-    """
+SLACK = 1.0 + 1e-6
+"""By how much a range may be passed: rounding."""
 
-    total: int
-    tell: StageProgress | None
-    done: int = 0
-
-    def __call__(self, text: str) -> None:
-        """One more step begins."""
-        self.done += 1
-        self.total = max(self.total, self.done)
-        self.say(text)
-
-    def say(self, text: str) -> None:
-        """A text about the present step."""
-        if self.tell:
-            self.tell(self.done - 1, self.total, text)
+Drawings = dict[str, Callable[[], Figure]]
 
 
 def write_report(
@@ -90,9 +64,12 @@ def write_report(
     *,
     students: Sequence[Path] = (),
     command: str = "",
-    progress: StageProgress | None = None,
+    fresh: bool = False,
 ) -> dict[str, Any]:
     """Measure every method on every dataset and write `report.md`, `report.json` and the pictures.
+
+    A measured dataset (`is_measured`) is judged by its own presses: a fifth is held out and scored as measured. Solves
+    and limits of a report that was killed are kept in FOLDER.part, and the same call goes on.
 
     Args:
         folder: Where; must not exist yet.
@@ -100,7 +77,7 @@ def write_report(
         settings: How much work; the full report if absent.
         students: Version folders of small models, each compared on the datasets of its sensor.
         command: How to make this report again, for the page.
-        progress: Called with steps done, all steps, and the step that begins.
+        fresh: Throw away what a killed report kept.
 
     Returns:
         The record, as in `report.json`.
@@ -110,39 +87,32 @@ def write_report(
         DatasetError: If a dataset cannot teach the methods.
         ModelError: If a model is for another layout or knows less than its dataset.
         PressError: If there are too few measured presses.
-
-    A measured dataset (`is_measured`) is judged by its own presses: a fifth is held out and scored as measured.
     """
     settings = settings or Settings()
-    small = [ReleasedModel(student, Predictor(student).metadata.name) for student in dict.fromkeys(students)]
-    prepared = [_Subject.of(dataset, model, settings, small) for dataset, model in subjects]
-    steps = Steps(sum(subject.steps for subject in prepared), progress)
-    with new_folder(folder) as draft, one_thread():
-        sections = [subject.measure(draft, stem, steps) for stem, subject in _stems(prepared)]
-        record = {
-            "format_version": FORMAT_VERSION,
-            "command": command,
-            "machine": machine(MEASURED_WITH),
-            "settings": settings.to_dict(),
-            "datasets": sections,
-        }
-        plain = {**record, "datasets": [_plain_section(section) for section in sections]}
-        write_whole(draft / "report.json", (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())
-        write_whole(draft / "report.md", page(record).encode())
-    return plain
+    prepared = [_Subject.of(dataset, model, students, settings) for dataset, model in subjects]
+    about = {
+        "format_version": FORMAT_VERSION,
+        "command": command,
+        "machine": machine(MEASURED_WITH),
+        "settings": settings.to_dict(),
+    }
+    identity = {**about, "datasets": [subject.identity() for subject in prepared]}
+    with resume_folder(folder, identity, fresh=fresh) as run, one_thread():
+        sections = [subject.measure(run.data, stem, run.keeping(stem)) for stem, subject in _stems(prepared).items()]
+        write_whole(run.data / "report.md", page({**about, "datasets": sections}).encode())
+        plain = [{**section, "methods": [method.to_dict() for method in section["methods"]]} for section in sections]
+        record = {**about, "datasets": plain}
+        write_whole(run.data / "report.json", (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
+    return record
 
 
-def _plain_section(section: dict[str, Any]) -> dict[str, Any]:
-    return {**section, "methods": [method.to_dict() for method in section["methods"]]}
-
-
-def _stems(subjects: "list[_Subject]") -> "list[tuple[str, _Subject]]":
+def _stems(subjects: "Sequence[_Subject]") -> "dict[str, _Subject]":
     """Names for the pictures: the sensor's, with a number where two datasets share it."""
-    names = [subject.bench.sensor.name for subject in subjects]
-    return [
-        (name if names.count(name) == 1 else f"{name}-{number}", subject)
+    names = [subject.case.sensor.name for subject in subjects]
+    return {
+        name if names.count(name) == 1 else f"{name}-{number}": subject
         for number, (name, subject) in enumerate(zip(names, subjects, strict=True), start=1)
-    ]
+    }
 
 
 @dataclass(frozen=True)
@@ -154,127 +124,171 @@ class _Subject:
 
     dataset: Dataset
     released: ReleasedModel
-    students: tuple[ReleasedModel, ...]
+    students: tuple[Path, ...]
     task: FittingTask
-    bench: EvaluationScene
+    case: EvaluationCase
     settings: Settings
     held: LabelledPresses | None = None
 
     @classmethod
-    def of(cls, dataset: Dataset, model: Path, settings: Settings, small: Sequence[ReleasedModel]) -> "_Subject":
-        released = ReleasedModel(model)
-        students = tuple(each for each in small if each.predictor.metadata.sensor == released.predictor.metadata.sensor)
-        if is_measured(dataset):
-            return cls._of_measured(dataset, released, students, settings)
-        dataset = _known_to(released.predictor.metadata, dataset)
-        if len(dataset.samples) > settings.learn_from:
-            dataset = replace(dataset, samples=_rows(dataset.samples, np.arange(settings.learn_from)))
-        bench = EvaluationScene.of(dataset, settings.presses, settings.seed)
-        task = task_of(dataset, bench, settings)
-        return cls(dataset, released, students, task, bench, settings)
+    def of(cls, dataset: Dataset, model: Path, students: Sequence[Path], settings: Settings) -> "_Subject":
+        """Presses that the model knows, split."""
+        about, measured, held = Predictor(model).metadata, is_measured(dataset), None
+        dataset = _measured_known_to(about, dataset) if measured else _known_to(about, dataset)
+        case = EvaluationCase.of(dataset, settings.presses, settings.seed)
+        if measured:
+            presses = LabelledPresses.of(dataset)
+            out = held_out(presses.contact)
+            held, dataset = presses[out], _rows(dataset, ~out)
+        dataset = _rows(dataset, np.arange(len(dataset.samples)) < settings.learn_from)
+        learnt = presses_of(dataset, FEWEST_LEARNT) if measured else presses_of(dataset)
+        train, validation = split_by_position(learnt, settings.hold_out, settings.seed)
+        task = FittingTask(train, validation, case.domain, case.noise, settings.seed, settings.quick)
+        own = tuple(path for path in dict.fromkeys(students) if Predictor(path).metadata.sensor == about.sensor)
+        return cls(dataset, ReleasedModel(model), own, task, case, settings, held)
 
-    @classmethod
-    def _of_measured(
-        cls, dataset: Dataset, released: ReleasedModel, students: tuple[ReleasedModel, ...], settings: Settings
-    ) -> "_Subject":
-        dataset = _measured_known_to(released.predictor.metadata, dataset)
-        presses = LabelledPresses.of(dataset.samples)
-        held = held_out(presses.contact)
-        bench = EvaluationScene.of(dataset, settings.presses, settings.seed)
-        others = replace(dataset, samples=_rows(dataset.samples, np.flatnonzero(~held)[: settings.learn_from]))
-        return cls(others, released, students, task_of(others, bench, settings), bench, settings, presses[held])
+    def identity(self) -> dict[str, Any]:
+        """What its figures depend on, beside the settings."""
+        return {"dataset_sha256": self.dataset.sha256, "models": [str(self.released.folder), *map(str, self.students)]}
 
-    @property
-    def steps(self) -> int:
-        """Number of steps that progress is called with, roughly."""
-        remaining = 0 if len(self.bench.sensor.electrodes) < 4 else len(self.bench.sensor.electrodes)
-        return 22 + len(self.settings.sizes) + 2 * self.settings.rounds + len(self.settings.shapes) + remaining
-
-    @property
-    def _given(self) -> tuple[ReleasedModel, ...]:
-        """The models that are compared as they are, the released one first."""
-        return self.released, *self.students
-
-    def measure(self, folder: Path, stem: str, steps: Steps) -> dict[str, Any]:
+    def measure(self, folder: Path, stem: str, executor: Executor) -> dict[str, Any]:
         """Everything about this dataset: its section of the record, its pictures written."""
-        if self.held is not None:
-            return self._measured(folder, stem, EvaluationPresses.measured(self.held), steps)
-        settings, bench = self.settings, self.bench
-        steps("solving the film for limits and contours")
-        forward_maps = bench.forward_maps(further=1.0, settings=SolveSettings(accuracy=settings.accuracy))
-        steps("solving the film for the test presses")
-        test_maps = forward_maps if settings.quick else bench.forward_maps()
-        test = EvaluationPresses.of(bench, press_on(test_maps, bench.sweep()))
-        steps("integrating the Bayes limit")
-        limits = error_bounds(bench, forward_maps, test.presses, test.charge_pC, settings.limited, steps.say)
-        methods = fit_all(all_methods(self.dataset, forward_maps[0], settings), self._given, self.task, test, steps)
-        methods = timed(methods, test, settings, steps)
-        section = self._section(test, limits, methods, steps)
-        section["pictures"] = _draw(folder, stem, section, self._draws(test), bench, settings, steps)
+        section, drawings = self._measured() if self.held is not None else self._simulated(executor)
+        limits = pictures.limit_lines(section["limits"])
+        for plot in pictures.AXES:
+            drawings[plot] = lambda plot=plot: pictures.speed_plot(section["methods"], plot, limits)  # type: ignore[misc]
+        section["pictures"] = {name: [f"{stem}-{name}.{kind}" for kind in ("png", "svg")] for name in drawings}
+        for name, draw in track(drawings.items(), "drawing"):
+            figure = draw()
+            for file in section["pictures"][name]:
+                save_picture(figure, folder / file)
         return section
 
-    def _measured(self, folder: Path, stem: str, test: EvaluationPresses, steps: Steps) -> dict[str, Any]:
-        """The same of measured presses, as they are: what needs a simulator is left out."""
-        estimators = all_methods(self.dataset, None, self.settings)
-        methods, refused = fit_those_that_can(estimators, self._given, self.task, test, steps)
-        records = records_of(timed(methods, test, self.settings, steps), test, None)
+    def _simulated(self, executor: Executor) -> tuple[dict[str, Any], Drawings]:
+        case, settings, released = self.case, self.settings, self.released
+        exact = case.forward_maps(further=1.0, accuracy=settings.accuracy, executor=executor)
+        test_maps = exact if settings.quick else case.forward_maps(executor=executor)
+        clean = press_on(test_maps, case.sweep())
+        test = replace(clean, charge=clean.noisy(case.noise, case.seed + TEST_NOISE))
+        charges = ChargeSpline.of(exact[0])
+        limits = ErrorBounds.of(case, charges, clean, test.charge[: settings.limited], executor)
+        methods, _ = fit_all([*self._models(), *rivals(self.task, charges), *self._networks()], self.task, test)
+        records, fitted = records_of(methods, test, settings, limits.bayes), by_name(methods)
+        draws = maps.Draws.of(released, clean, case, settings.draws)
+        threshold = effects.threshold_of(released, clean, case, settings.draws)
+        compared = [fitted[name].rival for name in COMPARED]
+        contacts = {name: fitted[name].contact for name in (RELEASED, *COMPARED)}
+        lines = contacts if limits.bayes is None else {BAYES: limits.bayes, **contacts}
+        different = [
+            effects.measured(deviation, RELEASED, released, compared, threshold)
+            for deviation in effects.deviations(case, clean, settings, executor)
+        ]
         section = {
-            **self._about(test),
+            **self._about(len(test)),
+            "limits": limits.record(test.contact),
+            "methods": records,
+            "verdict": verdict(records),
+            "by_force": maps.by_force(case.domain, test.contact, lines, limits.cramer_rao.position),
+            "worst_regions": maps.worst_regions(
+                case.domain, draws, limits.bayes, fitted[RELEASED].contact, test.contact
+            ),
+            "calibration": maps.calibration(case.domain, draws),
+            "alarm_threshold": rounded(threshold),
+            "cases": different,
+            "without_one": effects.without_one_electrode(self.task, case, clean),
+        }
+        return section, _drawings(section, case, draws)
+
+    def _measured(self) -> tuple[dict[str, Any], Drawings]:
+        """The same of measured presses, as they are: what needs a simulator is left out."""
+        test = self.held or self.task.validation
+        methods, refused = fit_all([*self._models(), *rivals(self.task), *self._networks()], self.task, test)
+        records = records_of(methods, test, self.settings)
+        section = {
+            **self._about(len(test)),
             "limits": {"bayes": None, "cramer_rao": None},
             "methods": records,
             "verdict": verdict(records),
             "left_out": refused,
         }
-        drawings = _speed_drawings(section, {}, self.settings)
-        return section | {"pictures": pictures.draw_all(folder, stem, drawings, steps)}
+        return section, {}
 
-    def _about(self, test: EvaluationPresses) -> dict[str, Any]:
+    def _models(self) -> list[Rival]:
+        """The models that are compared as they are, the released one first."""
+        models = {RELEASED: self.released}
+        models |= {Predictor(path).metadata.name: ReleasedModel(path) for path in self.students}
+        rows = []
+        for name, model in models.items():
+            rows.append(Rival(name, "network", "Predictor", model, choice="as released"))
+            contact, choice = model.contact_only(), "as released, its contact alone"
+            rows.append(Rival(f"{name}, contact only", "network", "ONNX Runtime, bound", contact, choice=choice))
+        return rows
+
+    def _networks(self) -> list[Rival]:
+        """Networks of several sizes."""
+        case, noise, steps = self.case, self.case.noise, self.settings.steps
+        data = TrainingData(
+            sensor=case.sensor,
+            probes=tuple(probe.notation for probe in case.probes),
+            domain=case.domain,
+            presses=self.task.train,
+            sha256=self.dataset.sha256,
+        )
+        return [
+            Rival(
+                f"network {'-'.join(map(str, hidden))}",
+                "network",
+                "ONNX Runtime, bound",
+                TrainedNetwork(data, hidden, steps, noise, self.settings.seed),
+                choice=f"{steps} steps",
+            )
+            for hidden in self.settings.sizes
+        ]
+
+    def _about(self, tested: int) -> dict[str, Any]:
         """Sensor, contacts, noise, numbers of presses, model."""
-        bench = self.bench
+        case, model = self.case, self.released.predictor.metadata
         return {
-            "sensor": bench.sensor.name,
+            "sensor": case.sensor.name,
             "measured": self.held is not None,
-            "electrodes": list(bench.sensor.electrode_names),
-            "probes": [probe.notation for probe in bench.probes],
-            "radius_mm": bench.domain.radius_mm,
-            "force_N": list(bench.domain.force_range_N),
-            "noise": bench.noise.to_dict(),
+            "electrodes": list(case.sensor.electrode_names),
+            "probes": [probe.notation for probe in case.probes],
+            "radius_mm": case.domain.radius,
+            "force_N": list(case.domain.force_range),
+            "noise": case.noise.to_dict(),
             "dataset_sha256": self.dataset.sha256,
-            "presses": {
-                "train": len(self.task.train),
-                "validation": len(self.task.validation),
-                "test": len(test.presses),
+            "presses": {"train": len(self.task.train), "validation": len(self.task.validation), "test": tested},
+            "model": {
+                "label": model.label,
+                "probes": list(model.probes),
+                "noise": model.noise["name"],
+                "dataset_sha256": model.dataset_sha256,
+                "card_errors": dict(model.errors),
             },
-            "model": _model_record(self.released),
         }
 
-    def _section(
-        self, test: EvaluationPresses, limits: ErrorBounds, methods: list[Method], steps: Steps
-    ) -> dict[str, Any]:
-        bench, truth = self.bench, test.presses.contact
-        records = records_of(methods, test, limits.bayes)
-        draws = self._draws(test)
-        threshold = effects.threshold_of(self.released, test.presses, bench, self.settings.draws)
-        cases = effects.cases(bench, test.presses, self.settings, steps)
-        return {
-            **self._about(test),
-            "limits": limits.record(truth),
-            "methods": records,
-            "verdict": verdict(records),
-            "by_force": maps.by_force(bench.domain, truth, _lines(methods, limits), limits.position_mm),
-            "worst_regions": maps.worst_regions(bench.domain, draws, limits.bayes, methods[0].contact, truth),
-            "calibration": maps.calibration(bench.domain, draws),
-            "alarm_threshold": rounded(threshold),
-            "cases": effects.measure(cases, self.released, _compared(methods), threshold),
-            "without_one": effects.without_one_electrode(self.task, bench, test.presses, steps),
-        }
 
-    def _draws(self, test: EvaluationPresses) -> maps.Draws:
-        return maps.Draws(self.released, test.presses, self.bench, self.settings.draws)
+def _drawings(section: dict[str, Any], case: EvaluationCase, draws: maps.Draws) -> Drawings:
+    """The pictures of a simulated dataset beside those of speed."""
+    force, nominal = section["by_force"], section["methods"][0].errors.position_rms_mm
+    noise = [deviation for deviation in section["cases"] if deviation["group"] == "noise"]
+    lines = {name: [level["errors"][name]["position_rms_mm"] for level in noise] for name in noise[0]["errors"]}
+    return {
+        "maps": lambda: pictures.error_maps(case.sensor, case.domain, draws),
+        "force": lambda: pictures.error_lines(force["force_N"], force["position_rms_mm"], RELEASED, "force, N"),
+        "calibration": lambda: pictures.calibration(section["calibration"]),
+        "noise": lambda: pictures.error_lines(effects.LEVELS, lines, RELEASED, "noise over reference"),
+        "effects": lambda: pictures.mismatch_effect(section["cases"], RELEASED, nominal),
+    }
 
 
-def _rows(samples: Samples, rows: np.ndarray) -> Samples:
-    return Samples(**{name: column[rows] for name, column in samples.columns().items()})
+def _rows(dataset: Dataset, rows: Booleans) -> Dataset:
+    """Some presses of a dataset."""
+    if rows.all():
+        return dataset
+    return replace(
+        dataset, samples=Samples(**{name: values[rows] for name, values in dataset.samples.columns().items()})
+    )
 
 
 def _known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
@@ -291,34 +305,18 @@ def _known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
             f"another {', '.join(keys)}; choose its own model with --model, or train one"
         )
     domain, (low, high) = domain_of(dataset), model.force_range_N
-    least, most = domain.force_range_N
+    least, most = domain.force_range
     if least * SLACK < low or most > high * SLACK:
         raise ModelError(
             f"model {model.label}: knows forces from {low:g} to {high:g} N, the dataset reaches from {least:.4g} to "
             f"{most:.4g} N; sweep within that, or train one"
         )
-    radius = inner_radius(model.working_area_mm)
-    if domain.radius_mm <= radius * SLACK:
+    radius = model_domain(model).radius
+    if domain.radius <= radius * SLACK:
         return dataset
-    inside = np.hypot(dataset.samples.x_mm, dataset.samples.y_mm) <= radius
     ranges = {**dataset.manifest.get("ranges", {}), "radius_mm": radius}
-    samples = _rows(dataset.samples, np.flatnonzero(inside))
-    return replace(dataset, samples=samples, manifest={**dataset.manifest, "ranges": ranges})
-
-
-SLACK = 1.0 + 1e-6
-"""By how much a range may be passed: rounding."""
-
-
-def _model_record(released: ReleasedModel) -> dict[str, Any]:
-    metadata = released.predictor.metadata
-    return {
-        "label": metadata.label,
-        "probes": list(metadata.probes),
-        "noise": metadata.noise["name"],
-        "dataset_sha256": metadata.dataset_sha256,
-        "card_errors": dict(metadata.errors),
-    }
+    inside = _rows(dataset, _distance(dataset) <= radius)
+    return replace(inside, manifest={**dataset.manifest, "ranges": ranges})
 
 
 def _measured_known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
@@ -334,56 +332,13 @@ def _measured_known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
             f"{model.electrodes}; choose their own model with --model, or train one"
         )
     samples, (low, high) = dataset.samples, model.force_range_N
-    inside = (np.hypot(samples.x_mm, samples.y_mm) <= inner_radius(model.working_area_mm) * SLACK) & (
-        (samples.force_N * SLACK >= low) & (samples.force_N <= high * SLACK)
-    )
-    rows = np.flatnonzero(inside & (samples.charge_pC > 0.0).all(axis=1))
-    check_enough(len(rows), len(samples), dataset.sensor.name)
-    return replace(dataset, samples=_rows(samples, rows), manifest={})
+    inside = (_distance(dataset) <= model_domain(model).radius * SLACK) & (samples.charge_pC > 0.0).all(axis=1)
+    inside &= (samples.force_N * SLACK >= low) & (samples.force_N <= high * SLACK)
+    check_enough(int(inside.sum()), len(samples), dataset.sensor.name)
+    return replace(_rows(dataset, inside), manifest={})
 
 
-def _compared(methods: list[Method]) -> list[Fitted]:
-    """One form of each method that the effects are shown for; its last is the plain one."""
-    last = {method.fitted.name: method.fitted for method in methods}
-    return [last[name] for name in COMPARED if name in last]
-
-
-def _lines(methods: list[Method], limits: ErrorBounds) -> dict[str, Array]:
-    """Contacts for the picture of error against force."""
-    last = {method.fitted.name: method.contact for method in methods}
-    lines = {BAYES: limits.bayes} if limits.bayes is not None else {}
-    released = methods[0].fitted.name
-    return {**lines, released: methods[0].contact, **{name: last[name] for name in COMPARED if name in last}}
-
-
-def _draw(
-    folder: Path,
-    stem: str,
-    section: dict[str, Any],
-    draws: maps.Draws,
-    bench: EvaluationScene,
-    settings: Settings,
-    steps: Steps,
-) -> dict[str, list[str]]:
-    released: MethodRecord = section["methods"][0]
-    known = {BAYES: section["limits"]["bayes"], CRAMER_RAO: section["limits"]["cramer_rao"]}
-    limits = {name: limit["position_rms_mm"] for name, limit in known.items() if limit}
-
-    drawings: dict[str, Callable[[], Any]] = {
-        **_speed_drawings(section, limits, settings),
-        "maps": lambda: pictures.error_maps(bench.sensor, bench.domain, draws),
-        "force": lambda: pictures.against_force(section["by_force"], released.name),
-        "calibration": lambda: pictures.calibration(section["calibration"]),
-        "noise": lambda: pictures.noise_effect(section["cases"], released.name),
-        "effects": lambda: pictures.mismatch_effect(section["cases"], released.name, released.errors.position_rms_mm),
-    }
-    return pictures.draw_all(folder, stem, drawings, steps)
-
-
-def _speed_drawings(
-    section: dict[str, Any], limits: dict[str, float], settings: Settings
-) -> dict[str, Callable[[], Any]]:
-    def speed(plot: Plot) -> Callable[[], Any]:
-        return lambda: speed_plot(section["methods"], plot, limits, settings.batch)
-
-    return {plot: speed(plot) for plot in AXES}
+def _distance(dataset: Dataset) -> Array:
+    """Of every press from the centre, mm."""
+    distance: Array = np.hypot(dataset.samples.x_mm, dataset.samples.y_mm)
+    return distance

@@ -1,29 +1,29 @@
 """Errors where the film differs from what the model assumes: noise, probe, pretension, gains, a dead electrode."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import IsochargeError
-from isocharge.common.progress import Announce
-from isocharge.simulate import Sensor, SolveSettings, parse_probe
-from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.train.baselines import Fitted, FittingTask, GaussNewton, PolynomialRidge, ReleasedModel
-from isocharge.train.data.alarms import about_1_N, alarm_threshold
-from isocharge.train.data.noise import noisy_charges
+from isocharge.simulate import NoiseModel, parse_probe
+from isocharge.train.baselines.networks import ReleasedModel
+from isocharge.train.baselines.rival import FittingTask, Rival
+from isocharge.train.baselines.rivals import gauss_newton, polynomial_ridge
 from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.report.bench import EvaluationScene, press_on
+from isocharge.train.release.evaluate import about_1_N, alarm_threshold
+from isocharge.train.report.case import EvaluationCase, press_on
 from isocharge.train.report.measures import Errors, rounded
 from isocharge.train.report.settings import Settings
 
 LEVELS = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Factors on the noise, dimensionless."""
 
-PRETENSION_OFF = 0.2e6
-"""Pretension that the models do not know of, Pa."""
+PRETENSION_OFF = 0.2
+"""Pretension that the models do not know of, MPa."""
 
 GAIN_OFF, GAIN_WRONG = 0.01, 0.2
 """Standard deviation of unknown gains, and the gain that is plainly wrong."""
@@ -38,149 +38,125 @@ FARTHEST = 50.0
 """Answers farther from zero, mm or N, are cut to this: polynomials explode outside of what they know."""
 
 NOISE_SEED = 515
-"""Seed of the noise on every case's charges, relative to the scene's."""
+"""Seed of the noise on every deviation's charges, relative to the case's."""
 
 
 @dataclass(frozen=True)
-class Case:
+class Deviation:
     """Presses that differ from what the models assume.
 
     Attributes:
         group: "noise", "probe", "pretension", "gain", "dead electrode" or "elsewhere".
         name: What is different.
-        presses: Clean presses.
-        charge_pC: What is measured, shape (n, n_electrode).
+        truth: Contacts, shape (n, 3), mm and N.
+        charge: What is measured, shape (n, n_electrode), pC.
         known: Whether a model could answer: false for presses that it has no answer for.
     """
 
     group: str
     name: str
-    presses: LabelledPresses
-    charge_pC: Array
+    truth: Array
+    charge: Array
     known: bool = True
 
 
-def cases(bench: EvaluationScene, clean: LabelledPresses, settings: Settings, progress: Announce) -> Iterator[Case]:
-    """Every case, from clean test presses of the bench."""
-    sweep = bench.sweep()
-
-    def noisy(presses: LabelledPresses) -> Array:
-        return noisy_charges(presses, bench.noise, bench.seed + NOISE_SEED)
-
+def deviations(
+    case: EvaluationCase, clean: LabelledPresses, settings: Settings, executor: Executor | None = None
+) -> Iterator[Deviation]:
+    """Every deviation, from clean test presses of the case."""
+    seed, truth, rough = case.seed + NOISE_SEED, clean.contact, max(ROUGH, settings.accuracy)
     for level in LEVELS:
-        yield Case("noise", f"x {level:g}", clean, _with_louder_noise(clean, bench, level))
+        louder = NoiseModel(f"x {level:g}", level * case.noise.white, level * case.noise.gain)
+        yield Deviation("noise", louder.name, truth, clean.noisy(louder, seed))
     for notation in settings.shapes:
-        progress(f"solving the film under {notation}")
-        rough = SolveSettings(accuracy=max(ROUGH, settings.accuracy))
-        presses = press_on(bench.forward_maps(probes=(parse_probe(notation),), settings=rough), sweep)
-        yield Case("probe", notation, presses, noisy(presses))
+        maps = case.forward_maps(probes=(parse_probe(notation),), accuracy=rough, executor=executor)
+        presses = press_on(maps, case.sweep())
+        yield Deviation("probe", notation, presses.contact, presses.noisy(case.noise, seed))
     if settings.mismatch_cases:
-        progress("solving a film with more pretension")
-        forward_maps = bench.forward_maps(
-            sensor=_with_more_pretension(bench.sensor), settings=SolveSettings(accuracy=ROUGH)
-        )
-        presses = press_on(forward_maps, sweep)
-        yield Case("pretension", f"+{1e-6 * PRETENSION_OFF:g} MPa", presses, noisy(presses))
-    yield from _wrong_gains(bench, clean, noisy(clean))
+        film = replace(case.sensor.film, pretension=case.sensor.film.pretension + PRETENSION_OFF)
+        maps = case.forward_maps(sensor=replace(case.sensor, film=film), accuracy=ROUGH, executor=executor)
+        presses = press_on(maps, case.sweep())
+        name = f"+{PRETENSION_OFF:g} MPa"
+        yield Deviation("pretension", name, presses.contact, presses.noisy(case.noise, seed))
+    yield from _wrong_gains(case, truth, clean.noisy(case.noise, seed))
     if settings.mismatch_cases:
-        progress("solving the film outside of the working area")
-        yield from _outside(bench, noisy)
+        yield from _outside(case, executor)
 
 
-def _with_more_pretension(sensor: Sensor) -> Sensor:
-    return replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension + PRETENSION_OFF))
-
-
-def _with_louder_noise(clean: LabelledPresses, bench: EvaluationScene, level: float) -> Array:
-    louder = NoiseModel(f"x {level:g}", level * bench.noise.white, level * bench.noise.gain)
-    return noisy_charges(clean, louder, bench.seed + NOISE_SEED)
-
-
-def _wrong_gains(bench: EvaluationScene, clean: LabelledPresses, noisy: Array) -> Iterator[Case]:
+def _wrong_gains(case: EvaluationCase, truth: Array, noisy: Array) -> Iterator[Deviation]:
     """Gains off by some 1 %, each sensor differently; one off by 20 %; one dead."""
-    rng = np.random.default_rng(bench.seed + NOISE_SEED)
+    rng, names = np.random.default_rng(case.seed + NOISE_SEED), case.sensor.electrode_names
     gains = 1.0 + GAIN_OFF * rng.standard_normal(noisy.shape)
-    yield Case("gain", f"each off by {100 * GAIN_OFF:g} % rms", clean, gains * noisy)
-    for number, name in enumerate(bench.sensor.electrode_names):
-        affected = np.arange(noisy.shape[1]) == number
-        yield Case(
-            "gain",
-            f"{name} off by {100 * GAIN_WRONG:g} %",
-            clean,
-            np.where(affected, (1.0 + GAIN_WRONG) * noisy, noisy),
-        )
-    silence = 1e12 * bench.noise.white * rng.standard_normal(noisy.shape)
-    for number, name in enumerate(bench.sensor.electrode_names):
-        affected = np.arange(noisy.shape[1]) == number
-        yield Case("dead electrode", f"{name} dead", clean, np.where(affected, silence, noisy))
+    yield Deviation("gain", f"each off by {100 * GAIN_OFF:g} % rms", truth, gains * noisy)
+    silence = case.noise.white * rng.standard_normal(noisy.shape)
+    affected = np.eye(len(names), dtype=bool)
+    for name, electrode in zip(names, affected, strict=True):
+        charge = np.where(electrode, (1.0 + GAIN_WRONG) * noisy, noisy)
+        yield Deviation("gain", f"{name} off by {100 * GAIN_WRONG:g} %", truth, charge)
+    for name, electrode in zip(names, affected, strict=True):
+        yield Deviation("dead electrode", f"{name} dead", truth, np.where(electrode, silence, noisy))
 
 
-def _outside(bench: EvaluationScene, noisy: Callable[[LabelledPresses], Array]) -> Iterator[Case]:
+def _outside(case: EvaluationCase, executor: Executor | None) -> Iterator[Deviation]:
     """Presses beyond the working area, where the film is large enough."""
     try:
-        forward_maps = bench.forward_maps(further=OUTSIDE, settings=SolveSettings(accuracy=ROUGH))
+        maps = case.forward_maps(further=OUTSIDE, accuracy=ROUGH, executor=executor)
     except IsochargeError:
         return
-    low, high = bench.domain.force_range_N
-    presses = press_on(forward_maps, replace(bench.sweep(OUTSIDE), force_range=(low, high)))
-    beyond = np.hypot(*presses.contact[:, :2].T) > bench.domain.radius_mm
-    presses = presses[np.flatnonzero(beyond)]
-    reach = f"up to {(OUTSIDE - 1.0) * bench.domain.radius_mm:.2g} mm outside the working area"
-    yield Case("elsewhere", reach, presses, noisy(presses), known=False)
+    presses = press_on(maps, replace(case.sweep(OUTSIDE), force_range=case.domain.force_range))
+    presses = presses[np.hypot(*presses.contact[:, :2].T) > case.domain.radius]
+    reach = f"up to {(OUTSIDE - 1.0) * case.domain.radius:.2g} mm outside the working area"
+    noisy = presses.noisy(case.noise, case.seed + NOISE_SEED)
+    yield Deviation("elsewhere", reach, presses.contact, noisy, known=False)
 
 
-def measure(
-    every: Iterator[Case], released: ReleasedModel, rivals: list[Fitted], threshold: float
-) -> list[dict[str, Any]]:
-    """Errors of several methods in every case, and how often the released model's misfit gives the alarm."""
-    return [_measured(case, released, rivals, threshold) for case in every]
-
-
-def _measured(case: Case, released: ReleasedModel, rivals: list[Fitted], threshold: float) -> dict[str, Any]:
-    truth = case.presses.contact
-    contact, std, misfit = released.answer(case.charge_pC)
-    alarm = misfit[:, 0] > threshold
-    about = about_1_N(truth[:, 2])
-    with np.errstate(over="ignore"):
-        answers = {rival.name: np.clip(rival.predict(case.charge_pC), -FARTHEST, FARTHEST) for rival in rivals}
-    contacts = {released.name: contact, **answers} if case.known else {}
+def measured(
+    deviation: Deviation, name: str, released: ReleasedModel, rivals: Sequence[Rival], threshold: float
+) -> dict[str, Any]:
+    """Errors of the released model, by its name, and of others, and how often its misfit gives the alarm."""
+    truth, about = deviation.truth, about_1_N(deviation.truth[:, 2])
+    contact, std, misfit = released.answer(deviation.charge)
+    alarm, errors = misfit[:, 0] > threshold, None
+    if deviation.known:
+        with np.errstate(over="ignore"):
+            answers = {rival.name: rival.regressor.predict(deviation.charge) for rival in rivals}
+        clipped = {rival: np.clip(answer, -FARTHEST, FARTHEST) for rival, answer in answers.items()}
+        errors = {rival: Errors.of(answer, truth).to_dict() for rival, answer in {name: contact, **clipped}.items()}
     return {
-        "group": case.group,
-        "case": case.name,
+        "group": deviation.group,
+        "case": deviation.name,
         "presses": len(truth),
-        "alarms_percent": rounded(100.0 * float(np.mean(alarm)), 3),
-        "alarms_percent_about_1N": rounded(100.0 * float(np.mean(alarm[about])), 3) if about.any() else None,
-        "coverage_68": rounded(float(np.mean(np.abs(contact - truth) < std)), 3) if case.known else None,
-        "errors": {name: Errors.of(answer, truth).to_dict() for name, answer in contacts.items()} or None,
+        "alarms_percent": _percent(alarm),
+        "alarms_percent_about_1N": _percent(alarm[about]) if about.any() else None,
+        "coverage_68": rounded(float(np.mean(np.abs(contact - truth) < std)), 3) if deviation.known else None,
+        "errors": errors,
     }
 
 
-def threshold_of(released: ReleasedModel, clean: LabelledPresses, bench: EvaluationScene, draws: int) -> float:
+def _percent(alarm: Booleans) -> float | None:
+    return rounded(100.0 * float(np.mean(alarm)), 3)
+
+
+def threshold_of(released: ReleasedModel, clean: LabelledPresses, case: EvaluationCase, draws: int) -> float:
     """The misfit that 1 % of good test presses exceed."""
-    seeds = range(bench.seed + NOISE_SEED + 1, bench.seed + NOISE_SEED + 1 + draws)
-    misfits = [released.answer(noisy_charges(clean, bench.noise, seed))[2] for seed in seeds]
-    return alarm_threshold(np.concatenate(misfits))
+    seeds = range(case.seed + NOISE_SEED + 1, case.seed + NOISE_SEED + 1 + draws)
+    return alarm_threshold(np.concatenate([released.answer(clean.noisy(case.noise, seed))[2] for seed in seeds]))
 
 
-def without_one_electrode(
-    task: FittingTask, bench: EvaluationScene, clean: LabelledPresses, progress: Announce
-) -> list[dict[str, Any]]:
+def without_one_electrode(task: FittingTask, case: EvaluationCase, clean: LabelledPresses) -> list[dict[str, Any]]:
     """A known dead electrode: methods fitted again to the charges that remain. Empty where fewer than three remain."""
-    names = bench.sensor.electrode_names
+    names, records = case.sensor.electrode_names, []
     if len(names) < 4:
         return []
-    noisy, records = noisy_charges(clean, bench.noise, bench.seed + NOISE_SEED), []
+    noisy = clean.noisy(case.noise, case.seed + NOISE_SEED)
     for number, name in enumerate(names):
-        progress(f"fitting without electrode {name}")
-        alive = np.arange(len(names)) != number
-        fewer = replace(task, train=_only(task.train, alive), validation=_only(task.validation, alive))
-        forms = [
-            estimator.fit(fewer)[-1] for estimator in (PolynomialRidge(degrees=(8, 10), alphas=(1e-11,)), GaussNewton())
-        ]
-        errors = {form.name: Errors.of(form.predict(noisy[:, alive]), clean.contact).to_dict() for form in forms}
-        records.append({"without": name, "errors": errors})
+        train, validation = (
+            replace(presses, charge=np.delete(presses.charge, number, axis=1))
+            for presses in (task.train, task.validation)
+        )
+        fewer = replace(task, train=train, validation=validation)
+        fitted = [rival.fit(fewer) for rival in (polynomial_ridge(fewer), gauss_newton(fewer))]
+        charge = np.delete(noisy, number, axis=1)
+        errors = {rival.name: Errors.of(rival.regressor.predict(charge), clean.contact) for rival in fitted}
+        records.append({"without": name, "errors": {rival: error.to_dict() for rival, error in errors.items()}})
     return records
-
-
-def _only(presses: LabelledPresses, electrodes: np.ndarray) -> LabelledPresses:
-    return LabelledPresses(presses.contact, presses.charge_pC[:, electrodes])

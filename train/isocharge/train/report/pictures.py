@@ -1,201 +1,170 @@
-"""The report's pictures of errors, calibration and effects, and the colours and lines of all its pictures."""
+"""The report's pictures: error against time, throughput and memory, film and force; calibration; effects."""
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
-from isocharge.common.arrays import Integers
-from isocharge.simulate import Sensor
+from isocharge.simulate import Domain, Sensor
 from isocharge.simulate.numerics.statistics import rms
-from isocharge.simulate.plots.figure import FELT, INK, new_figure, save_picture
+from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
-from isocharge.train.data.alarms import FALSE_ALARMS
-from isocharge.train.data.domain import ContactDomain
+from isocharge.train.baselines.networks import RELEASED
+from isocharge.train.release.evaluate import FALSE_ALARMS
 from isocharge.train.report.limits import BAYES, CRAMER_RAO
 from isocharge.train.report.maps import COORDINATES, Draws
+from isocharge.train.report.measures import MethodRecord, Plot
 
-GREY, RELEASED = "#8a95a5", FELT
-"""Colours of secondary lines, and of the released model."""
+GREY = "#8a95a5"
+"""Colour of secondary lines."""
 
 LINES = ("#2b6cb0", "#2f7f6f", "#c47f17", "#7a5195", "#8c564b", "#4c9be8")
 """Colours of methods where kinds do not tell them apart."""
 
+KINDS = {"paper": "#7a5195", "learnt": "#2f7f6f", "fitted map": "#c47f17", "network": "#2b6cb0"}
+"""Colours of the kinds of methods."""
+
+MARKERS = "osv^DPX<>h"
+"""Markers of the methods of one kind."""
+
 LIMIT_STYLES = {BAYES: "-", CRAMER_RAO: ":"}
 """How the limits are drawn."""
 
+AXES: dict[Plot, str] = {
+    "latency": "time of one prediction, median, us",
+    "throughput": "predictions per second in batches",
+    "memory": "memory of the method, bytes",
+}
+"""Label of each plot's horizontal axis."""
 
-def error_maps(sensor: Sensor, domain: ContactDomain, draws: Draws) -> Figure:
-    """Root-mean-square errors of the released model over the film."""
-    figure = new_figure(11.5, 5.0)
-    for axes, values, label in zip(
-        figure.subplots(1, 2),
-        (draws.position_mm, draws.force_percent),
-        ("position error, rms, mm", "relative force error, rms, %"),
-        strict=True,
-    ):
-        cells = axes.hexbin(*draws.truth[:, :2].T, values, gridsize=22, reduce_C_function=rms, cmap="viridis", lw=0.1)
-        cells.set_clip_path(Circle((0, 0), domain.radius_mm, transform=axes.transData))
-        cells.set_clim(*np.percentile(np.ma.compressed(cells.get_array()), (0.5, 99.5)))
-        axes.figure.colorbar(cells, ax=axes, shrink=0.85, label=label)
-        draw_electrodes(axes, sensor)
-        draw_working_area(axes, 1e-3 * domain.radius_mm)
-        frame_film(axes, sensor, 1e-3 * domain.radius_mm)
+
+def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: Mapping[str, float]) -> Figure:
+    """Position error against latency, throughput or memory, one point for each method.
+
+    Args:
+        records: Of the methods.
+        plot: Which of AXES.
+        limits: Name to position error, mm, of what is drawn as a line, unless every method is below it.
+    """
+    figure = new_figure(10.5, 6.0)
+    axes = figure.subplots()
+    shown = [record for record in records if record.errors.position_rms_mm]
+    markers = {kind: cycle(MARKERS) for kind in KINDS}
+    for record in sorted(shown, key=lambda record: record.error_mm):
+        colour, hollow = KINDS[record.kind], record.force_given or record.errors.answered < 1.0
+        style: dict[str, Any] = {"color": colour, "mfc": "white" if hollow else colour, "marker": next(markers[record.kind]), "ms": 7}
+        if record.name == RELEASED:
+            style |= {"color": FELT, "mfc": FELT, "marker": "*", "ms": 14}
+        axes.plot(record.cost(plot), record.error_mm, ls="", label=f"{record.name}, {record.error_mm:.3g} mm", **style)
+    front = sorted((record.cost(plot), record.error_mm) for record in shown if plot in record.best_on)
+    step = "steps-pre" if plot == "throughput" else "steps-post"
+    axes.plot(*zip(*front, strict=True), ls="--", color=INK, lw=1.0, drawstyle=step, zorder=1, label="unbeaten")
+    highest = max(record.error_mm for record in shown if not record.force_given)
+    for name, value in limits.items():
+        if value <= highest:  # unbiased near a fold: centimetres
+            axes.axhline(value, color=INK, ls=LIMIT_STYLES[name], zorder=1, label=f"{name}, {value:.3g} mm")
+    _logarithmic(axes, AXES[plot], "position error, rms, mm")
+    axes.xaxis.set_major_formatter("{x:,g}")
+    if plot == "throughput":
+        axes.invert_xaxis()
+    figure.legend(loc="outside right center", fontsize=8, frameon=False)
     return figure
 
 
-def against_force(lines: dict[str, Any], released: str) -> Figure:
-    """Position error of several methods, and the limits, against the force."""
+def _logarithmic(axes: Any, x: str, y: str) -> None:
+    """Logarithmic axes with plain numbers."""
+    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
+    axes.grid(alpha=0.25, which="both", lw=0.5)
+
+
+def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Figure:
+    """Root-mean-square errors of the released model over the film."""
+    figure = new_figure(11.5, 5.0)
+    labels = {"position error, rms, mm": draws.position, "relative force error, rms, %": draws.force_percent}
+    for axes, (label, values) in zip(figure.subplots(1, 2), labels.items(), strict=True):
+        cells = axes.hexbin(*draws.truth[:, :2].T, values, gridsize=22, reduce_C_function=rms, cmap="viridis", lw=0.1)
+        cells.set_clip_path(Circle((0, 0), domain.radius, transform=axes.transData))
+        cells.set_clim(*np.percentile(np.ma.compressed(cells.get_array()), (0.5, 99.5)))
+        figure.colorbar(cells, ax=axes, shrink=0.85, label=label)
+        draw_electrodes(axes, sensor)
+        draw_working_area(axes, domain.radius)
+        frame_film(axes, sensor, domain.radius)
+    return figure
+
+
+def error_lines(x: Sequence[float], lines: Mapping[str, Sequence[float | None]], released: str, label: str) -> Figure:
+    """Position errors of several methods, and the limits, against what `label` says."""
     figure = new_figure(8.0, 5.0)
     axes = figure.subplots()
-    colours = iter(LINES)
-    for name, values in lines["position_rms_mm"].items():
-        style: dict[str, Any] = {"lw": 1.4, "marker": ".", "color": None}
-        if name in LIMIT_STYLES:
-            style = {"lw": 2.0, "ls": LIMIT_STYLES[name], "color": INK}
-        elif name == released:
-            style = {"lw": 2.0, "marker": "*", "ms": 9, "color": RELEASED}
-        else:
-            style["color"] = next(colours, GREY)
-        axes.plot(lines["force_N"], np.array(values, dtype=float), label=name, **style)
-    axes.set(xscale="log", yscale="log", xlabel="force, N", ylabel="position error, rms, mm")
-    _plain_ticks(axes)
-    axes.grid(alpha=0.25, which="both", lw=0.5)
+    for (name, values), style in zip(lines.items(), _styles(lines, released), strict=True):
+        axes.plot(x, np.array(values, dtype=float), label=name, **style)
+    _logarithmic(axes, label, "position error, rms, mm")
     axes.legend(fontsize=8)
     return figure
 
 
-def _plain_ticks(axes: Any) -> None:
-    plain = FuncFormatter(lambda value, _: f"{value:g}")
-    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        steps = [step * 10.0**power for power in range(-3, 4) for step in (1, 1.5, 2, 3, 5, 7)]
-        axis.set_major_locator(FixedLocator([step for step in steps if low <= step <= high]))
-        axis.set_major_formatter(plain)
-        axis.set_minor_formatter(NullFormatter())
+def _styles(names: Mapping[str, Any], released: str) -> list[dict[str, Any]]:
+    """A style for each method; the released model and the limits have their own."""
+    colours = cycle(LINES)
+    own = {released: {"color": FELT, "marker": "*", "ms": 10, "lw": 2.0, "zorder": 3}}
+    own |= {name: {"color": INK, "ls": style, "lw": 2.0} for name, style in LIMIT_STYLES.items()}
+    return [own.get(name) or {"color": next(colours), "marker": "o", "ms": 4, "lw": 1.3} for name in names]
 
 
-def calibration(record: dict[str, Any]) -> Figure:
+def calibration(record: Mapping[str, Any]) -> Figure:
     """Coverage of the released model's intervals against their nominal level, and the difference of both."""
     figure = new_figure(9.5, 4.4)
     left, right = figure.subplots(1, 2)
     level = 100.0 * np.array(record["levels"])
-    for axes in (left, right):
-        axes.axhline(0.0, color=GREY, lw=1.0) if axes is right else axes.plot([0, 100], [0, 100], color=GREY, lw=1.0)
-    for name, colour in zip(COORDINATES, (LINES[0], LINES[1], RELEASED), strict=True):
+    left.axline((0.0, 0.0), slope=1.0, color=GREY, lw=1.0)
+    right.axhspan(-2.0, 2.0, color=GREY, alpha=0.15, lw=0)
+    for name, colour in zip(COORDINATES, (LINES[0], LINES[1], FELT), strict=True):
         covered = 100.0 * np.array(record["coverage"][name])
         left.plot(level, covered, ".-", color=colour, label=name)
-        right.plot(level, covered - level, ".-", color=colour, label=name)
+        right.plot(level, covered - level, ".-", color=colour)
     left.set(xlabel="nominal level, %", ylabel="truths inside, %", aspect="equal", xlim=(0, 100), ylim=(0, 100))
     right.set(xlabel="nominal level, %", ylabel="inside minus nominal, percentage points", xlim=(0, 100))
-    reach = max(3.5, 1.15 * float(np.abs(right.get_ylim()).max()))
-    right.set_ylim(-reach, reach)
-    right.axhspan(-2.0, 2.0, color=GREY, alpha=0.15, lw=0)
     left.legend()
     for axes in (left, right):
         axes.grid(alpha=0.25, lw=0.5)
     return figure
 
 
-def noise_effect(cases: Sequence[dict[str, Any]], released: str) -> Figure:
-    """Position error against the level of the noise."""
-    some = [case for case in cases if case["group"] == "noise"]
-    levels = [float(case["case"].removeprefix("x ")) for case in some]
-    lines = {name: [case["errors"][name]["position_rms_mm"] for case in some] for name in some[0]["errors"]}
-    figure = new_figure(8.0, 4.6)
-    axes = figure.subplots()
-    _method_lines(axes, levels, lines, released)
-    axes.set(xscale="log", yscale="log", xlabel="noise over reference", ylabel="position error, rms, mm")
-    _plain_ticks(axes)
-    axes.grid(alpha=0.25, which="both", lw=0.5)
-    axes.legend(fontsize=8)
-    return figure
-
-
-def _method_lines(axes: Any, x: Sequence[float], lines: dict[str, list[float]], released: str) -> None:
-    colours = iter(LINES)
-    for name, values in lines.items():
-        mine = name == released
-        axes.plot(
-            x,
-            values,
-            marker="*" if mine else ".",
-            ms=9 if mine else 5,
-            lw=2.0 if mine else 1.3,
-            color=RELEASED if mine else next(colours, GREY),
-            label=name,
-        )
-
-
-def mismatch_effect(cases: Sequence[dict[str, Any]], released: str, nominal: float | None) -> Figure:
+def mismatch_effect(cases: Sequence[Mapping[str, Any]], released: str, nominal: float | None) -> Figure:
     """Errors and alarms where the film, probe or chain is not as the models assume."""
     some = [case for case in cases if case["group"] != "noise"]
+    labels = [f"{case['group']}: {case['case']}" for case in some]
     figure = new_figure(11.5, 1.9 + 0.36 * len(some))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1.0))
-    height = np.arange(len(some))[::-1]
-    _error_dots(left, some, height, released)
+    rows = [(label, case["errors"]) for label, case in zip(labels, some, strict=True) if case["errors"]]
+    names = rows[0][1]
+    for name, style in zip(names, _styles(names, released), strict=True):
+        errors = [error[name]["position_rms_mm"] for _, error in rows]
+        left.plot(errors, [label for label, _ in rows], **{**style, "ls": ""}, label=name)
     if nominal:
-        left.axvline(nominal, color=RELEASED, lw=0.9, ls="--")
-        left.annotate(
-            "as assumed", (nominal, 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=8
-        )
-    right.barh(height, [case["alarms_percent"] for case in some], color=RELEASED, alpha=0.8, height=0.6)
-    for y, case in zip(height, some, strict=True):
-        right.annotate(
-            f"{case['alarms_percent']:g}",
-            (case["alarms_percent"], y),
-            xytext=(3, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-        )
+        left.axvline(nominal, color=FELT, lw=0.9, ls="--", label="as assumed")
+    bars = right.barh(labels, [case["alarms_percent"] for case in some], color=FELT, alpha=0.8, height=0.6)
+    right.bar_label(bars, fmt="{:g}", padding=3, fontsize=8)
     right.axvline(100.0 * FALSE_ALARMS, color=INK, lw=0.9, ls="--")
-    left.set(
-        xlabel="position error, rms, mm",
-        xscale="log",
-        yticks=height,
-        yticklabels=[_case_label(case) for case in some],
-        ylim=(-0.7, len(some) - 0.3),
-    )
+    left.set(xlabel="position error, rms, mm", xscale="log")
+    left.invert_yaxis()
     right.set(xlabel="presses with an alarm from the misfit, %", xlim=(0, 112))
-    left.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    left.xaxis.set_major_formatter("{x:g}")
     left.grid(alpha=0.25, lw=0.5)
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", fontsize=8, ncol=6, frameon=False)
+    figure.legend(loc="outside lower center", fontsize=8, ncol=6, frameon=False)
     return figure
 
 
-def _error_dots(axes: Any, cases: Sequence[dict[str, Any]], height: Integers, released: str) -> None:
-    known = [(y, case["errors"]) for y, case in zip(height, cases, strict=True) if case["errors"]]
-    colours = iter(LINES)
-    for name in known[0][1]:
-        mine = name == released
-        axes.plot(
-            [errors[name]["position_rms_mm"] for _, errors in known],
-            [y for y, _ in known],
-            "*" if mine else "o",
-            ms=12 if mine else 5,
-            color=RELEASED if mine else next(colours, GREY),
-            label=name,
-            zorder=3 if mine else 2,
-        )
-
-
-def _case_label(case: dict[str, Any]) -> str:
-    return f"{case['group']}: {case['case']}" if case["group"] in ("probe", "pretension", "gain") else str(case["case"])
-
-
-def draw_all(
-    folder: Path, stem: str, drawings: dict[str, Callable[[], Figure]], progress: Callable[[str], None]
-) -> dict[str, list[str]]:
-    """Draw and write every picture; name to files."""
-    files = {}
-    for name, draw in drawings.items():
-        progress(f"drawing: {name}")
-        figure = draw()
-        files[name] = [f"{stem}-{name}.{kind}" for kind in ("png", "svg")]
-        for file in files[name]:
-            save_picture(figure, folder / file)
-    return files
+def limit_lines(limits: Mapping[str, Any]) -> dict[str, float]:
+    """Names of the limits in a section's record, and their position errors, mm."""
+    known = {BAYES: limits["bayes"], CRAMER_RAO: limits["cramer_rao"]}
+    return {name: limit["position_rms_mm"] for name, limit in known.items() if limit}

@@ -1,7 +1,7 @@
-"""How long predictions take: one at a time, and many.
+"""How long predictions take.
 
-Machines are noisy, so the contenders take turns: rounds of a few milliseconds each, the first thrown away. A round of a
-contender begins with calls that only warm up, because another one has just used the cache.
+Machines are noisy, so the contenders take turns: rounds of a few milliseconds each, the first thrown away. A turn
+begins with calls that only warm up, because another contender has just used the cache.
 """
 
 import time
@@ -13,10 +13,13 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array
-from isocharge.common.progress import Progress
+from isocharge.common.progress import track
 
 WARM_UP = 0.2
-"""Share of a round's calls that only warm up."""
+"""Share of a turn's calls that only warm up."""
+
+MOST_CALLS = 2000
+"""Calls in a turn at most."""
 
 Call = Callable[[], object]
 
@@ -36,37 +39,33 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def latencies(
+def durations(
     contenders: Mapping[str, Sequence[Call]],
     rounds: int,
     round_ms: float,
-    progress: Progress,
+    least: int = 3,
     clock: Clock = time.perf_counter_ns,
 ) -> dict[str, Array]:
-    """Durations of single predictions.
+    """Durations of calls.
 
     Args:
-        contenders: For each, calls that predict one press each, of several presses.
+        contenders: For each, calls that are made in turn.
         rounds: How often each has its turn; one more to warm up.
-        round_ms: Length of a turn, ms; at least three calls.
-        progress: Called with the rounds done and all rounds.
+        round_ms: Length of a turn, ms.
+        least: Calls in a turn at least.
         clock: ns.
 
     Returns:
         For each contender shape (rounds, calls), us.
     """
-    counts = {name: _calls_in(calls, round_ms, clock) for name, calls in contenders.items()}
-    durations: dict[str, list[Array]] = {name: [] for name in contenders}
-    for number in range(rounds + 1):
+    counts, taken = {}, {name: list[Array]() for name in contenders}
+    for name, calls in contenders.items():
+        first = np.median(_durations(calls, least, clock))
+        counts[name] = int(np.clip(1e3 * round_ms / first, least, MOST_CALLS))
+    for _ in track(range(rounds + 1), "timing"):
         for name, calls in contenders.items():
-            durations[name].append(_durations(calls, counts[name], clock))
-        progress(number + 1, rounds + 1)
-    return {name: np.array(taken[1:]) for name, taken in durations.items()}
-
-
-def _calls_in(calls: Sequence[Call], milliseconds: float, clock: Clock) -> int:
-    first = _durations(calls, 5, clock)
-    return int(np.clip(1e3 * milliseconds / np.median(first), 3, 2000))
+            taken[name].append(_durations(calls, counts[name], clock))
+    return {name: np.array(turns[1:]) for name, turns in taken.items()}
 
 
 def _durations(calls: Sequence[Call], count: int, clock: Clock) -> Array:
@@ -79,43 +78,3 @@ def _durations(calls: Sequence[Call], count: int, clock: Clock) -> Array:
         call()
         taken[number] = clock() - begin
     return taken[warm_up:] / 1e3
-
-
-def throughputs(
-    contenders: Mapping[str, Callable[[Array], object]],
-    charge_pC: Array,
-    rounds: int,
-    longest_s: float,
-    progress: Progress,
-    clock: Clock = time.perf_counter_ns,
-) -> dict[str, float]:
-    """Predictions per second in batches.
-
-    Args:
-        contenders: Functions of a batch of charges.
-        charge_pC: The batch, shape (n, n_electrode).
-        rounds: Turns of each; the median counts, the first only warms up.
-        longest_s: Where one batch takes longer than this, its first rows are timed instead.
-        progress: Called with the rounds done and all rounds.
-        clock: ns.
-    """
-    rows = {name: _rows_within(predict, charge_pC, longest_s, clock) for name, predict in contenders.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for number in range(rounds + 1):
-        for name, predict in contenders.items():
-            seconds[name].append(_seconds(predict, charge_pC[: rows[name]], clock))
-        progress(number + 1, rounds + 1)
-    return {name: rows[name] / float(np.median(taken[1:])) for name, taken in seconds.items()}
-
-
-def _rows_within(predict: Callable[[Array], object], charge_pC: Array, longest_s: float, clock: Clock) -> int:
-    """All rows, or a 64th of them where a first try says that all take longer than `longest_s`."""
-    few = max(1, len(charge_pC) // 64)
-    taken = min(_seconds(predict, charge_pC[:few], clock) for _ in range(2))
-    return len(charge_pC) if taken * len(charge_pC) / few <= longest_s else few
-
-
-def _seconds(predict: Callable[[Array], object], charge_pC: Array, clock: Clock) -> float:
-    begin = clock()
-    predict(charge_pC)
-    return 1e-9 * (clock() - begin)
