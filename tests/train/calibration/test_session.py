@@ -1,38 +1,31 @@
-"""A session at the bench: proposals that follow the film, every change on disk first, undo, skip, bad presses."""
+"""A session of presses: proposals that follow the film, every change on disk first, undo, skip, bad presses."""
 
 import numpy as np
 import pytest
+from tests.train.calibration.conftest import presses_of
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses
-from isocharge.train import BenchSession, calibrate, next_presses
-from isocharge.train.calibration.session import Answer, Reply, read_answer
+from isocharge.train import PressSession, calibrate, next_presses
+from isocharge.train.calibration.session import Reply, read_answer
 
 
 class Bench:
     """A film that a seed draws, a rig that is as exact as it says, and a session about them."""
 
-    def __init__(self, layout, plan, count=0, **options):
+    def __init__(self, problem, plan, count=0, **options):
         """Go on with the first `count` presses of a plan."""
-        self.scene, self.charges = layout.scene, layout.scene.charges
-        self.rng = np.random.default_rng(5)
-        self.parameters = self.charges.prior.draw(self.rng, 1)[0]
+        self.problem, self.rng = problem, np.random.default_rng(5)
+        self.parameters = problem.prior.draw(self.rng, 1)[0]
         self.saved: list[MeasuredPresses] = []
-        contact = np.array([press.contact for press in plan[:count]]).reshape(-1, 3)
-        charge = np.array([self.charge(row) for row in contact]).reshape(-1, 4)
-        self.session = BenchSession(
-            layout.scene,
-            layout.described,
-            save=self.saved.append,
-            presses=presses_of(contact, charge, ("A", "B", "C", "D")) if count else None,
-            **options,
-        )
+        contact = np.array([press.contact for press in plan[:count]])
+        presses = presses_of(problem, contact, np.array([self.charge(row) for row in contact])) if count else None
+        self.session = PressSession(problem, save=self.saved.append, presses=presses, **options)
 
     def charge(self, contact):
         """Charges of a press that is read as this contact, but made beside it by the errors of the rig."""
         real = contact + self.rng.standard_normal(3) * [0.1, 0.1, 0.01 * contact[2]]
-        charge = self.charges.charge_pC(self.parameters, real[None])[0]
-        return charge + np.hypot(1.0, 0.002 * charge) * self.rng.standard_normal(charge.size)
+        return self.problem.noise.add(self.problem.charges.charges(self.parameters, real[None])[0], self.rng)
 
     def press(self, count=1):
         for _ in range(count):
@@ -40,74 +33,60 @@ class Bench:
             self.session.take(self.charge(contact), contact)
 
 
-def presses_of(contact, charge, names):
-    """On the lines 2, 3, ... of a file."""
-    count = len(contact)
-    std = np.full(count, 0.1), np.full(count, 0.01)
-    return MeasuredPresses(contact, charge, *std, names, tuple(range(2, count + 2)))
-
-
 @pytest.fixture(scope="module")
-def plan(four):
+def plan(problem):
     """Eight presses that tell most of the film as described."""
-    return next_presses(four.scene.charges, four.scene.domain, four.scene.noise, 8)
+    return next_presses(problem, 8)
 
 
-@pytest.fixture
-def bench(four, plan):
-    return Bench(four, plan)
-
-
-def test_five_presses_make_a_film_known_as_well_as_their_plan_says(bench, plan):
+def test_five_presses_make_a_film_known_as_well_as_their_plan_says(problem, plan):
     """The plan is linearised at the described film; the errors are those of the contacts on the film that was drawn."""
+    bench = Bench(problem, plan)
     bench.press(5)
-    left, noise = bench.session.calibration.left, bench.session.calibration.sensitivity.of_noise()
-    assert left.position_mm < 2.0 * plan[4].position_mm
-    deviation = bench.session.calibration.posterior.parameters - bench.parameters
-    unit = deviation / bench.charges.prior.std
-    covariance = bench.session.calibration.posterior.covariance
-    assert unit @ np.linalg.solve(covariance, unit) < 40.0  # 14 parameters: one film in 4000 is farther
-    assert f"{left.position_mm:.2g} mm and {left.force_percent:.2g} % are left" in bench.session.words[0]
-    assert f"noise alone is {noise.position_mm:.2g} mm" in bench.session.words[0]
+    result, session = bench.session.result, bench.session
+    assert result.left.position_mm < 2.0 * plan[4].position_mm
+    unit = (result.posterior.parameters - bench.parameters) / problem.prior.std
+    assert unit @ np.linalg.solve(result.posterior.covariance, unit) < 40.0  # 13 parameters: one film in 4000 is farther
+    assert f"{result.left.position_mm:.2g} mm and {result.left.force_percent:.2g} % are left" in session.summary[0]
+    alone = calibrate(bench.saved[-1], problem)
+    np.testing.assert_array_equal(alone.posterior.parameters, result.posterior.parameters)
+    assert [presses.lines for presses in bench.saved[:3]] == [(1,), (1, 2), (1, 2, 3)]
+    for until in (1.0, 0.05, 0.0):
+        again = PressSession(problem, save=bench.saved.append, presses=bench.saved[4], until=until)
+        assert (again.presses, again.summary, again.proposed) == (session.presses, session.summary, session.proposed)
+        assert again.enough == (until == 1.0)
 
 
-def test_a_session_is_its_presses(bench):
-    """What a session knows is what `calibrate` says of the presses in its file."""
-    bench.press(3)
-    alone = calibrate(bench.saved[-1], bench.scene, bench.session.before)
-    np.testing.assert_array_equal(alone.posterior.parameters, bench.session.calibration.posterior.parameters)
-    assert [len(presses) for presses in bench.saved] == [1, 2, 3]
-    assert bench.saved[-1].lines == (1, 2, 3)
-
-
-def test_every_change_is_saved_before_anything_is_computed(four, plan):
+def test_every_change_is_saved_before_anything_is_computed(problem, plan):
     """A disk that is full is an error of the press that is lost, and of no other."""
-    bench = Bench(four, plan, 1)
-    bench.session._save = lambda _: (_ for _ in ()).throw(OSError("no space"))
+
+    def full(_):
+        raise OSError("no space")
+
+    session = PressSession(problem, save=full, presses=Bench(problem, plan, 1).session.presses)
     with pytest.raises(OSError, match="no space"):
-        bench.press()
-    assert len(bench.session) == 1
+        session.take(np.full(4, 500.0), plan[1].contact)
+    assert len(session) == 1
 
 
-def test_undo_takes_back_the_last_press_or_any(four, plan):
-    bench = Bench(four, plan, 3)
-    first, _, third = bench.session.presses.charge_pC
-    assert bench.session.undo(2) == 2
-    np.testing.assert_array_equal(bench.session.presses.charge_pC, [first, third])
-    assert bench.session.undo() == 2
+def test_undo_takes_back_the_last_press_or_any(problem, plan):
+    bench = Bench(problem, plan, 3)
+    session, (first, _, third) = bench.session, bench.session.presses.charge_pC
+    assert session.undo(2) == 2
+    np.testing.assert_array_equal(session.presses.charge_pC, [first, third])
+    assert session.undo() == 2
     np.testing.assert_array_equal(bench.saved[-1].charge_pC, [first])
-    assert bench.session.presses.lines == (1,)
-    bench.session.undo()
-    assert (len(bench.saved[-1]), bench.session.words, bench.session.calibration) == (0, (), None)
-    with pytest.raises(PressError, match="no press to undo yet"):
-        bench.session.undo()
-    bench.press()
+    assert session.presses.lines == (1,)
     with pytest.raises(PressError, match="there is no press 4 to undo: 1 is taken"):
-        bench.session.undo(4)
+        session.undo(4)
+    session.undo()
+    assert (len(bench.saved[-1]), session.summary, session.result) == (0, (), None)
+    with pytest.raises(PressError, match="no press to undo yet"):
+        session.undo()
 
 
-def test_a_place_that_is_skipped_is_not_proposed_again(bench):
-    skipped = []
+def test_a_place_that_is_skipped_is_not_proposed_again(problem, plan):
+    bench, skipped = Bench(problem, plan), []
     for _ in range(4):
         proposed = bench.session.proposed
         assert all(np.hypot(proposed.x_mm - x, proposed.y_mm - y) > 1.0 for x, y in skipped)
@@ -117,43 +96,23 @@ def test_a_place_that_is_skipped_is_not_proposed_again(bench):
     assert all(np.hypot(*(bench.session.presses.contact[:, :2] - at).T).min() > 1.0 for at in skipped)
 
 
-def test_a_stopped_session_goes_on_where_it_was(four, plan):
-    bench = Bench(four, plan, 1)
-    bench.press()
-    again = BenchSession(four.scene, four.described, save=bench.saved.append, presses=bench.saved[-1])
-    assert again.presses == bench.session.presses
-    assert again.proposed == bench.session.proposed
-    assert again.words == bench.session.words
-
-
-def test_it_is_enough_at_the_share_that_was_asked_for(four, plan):
-    for until, enough in ((1.0, True), (0.05, False), (0.0, False)):
-        bench = Bench(four, plan, 5, until=until)
-        left, noise = bench.session.calibration.left, bench.session.calibration.sensitivity.of_noise()
-        assert (left.position_mm <= until * noise.position_mm) == bench.session.enough == enough
-
-
-def test_a_press_at_another_place_than_said_is_named(four, plan):
-    bench = Bench(four, plan, 7)
-    wrong = np.array([5.0, 0.0, 1.0])
-    bench.session.take(bench.charge(np.array([2.0, 3.0, 1.0])), wrong)
-    assert bench.session.calibration.bad_lines == (8,)
-    assert bench.session.words[1].startswith("Press 8, 1.00 N at (5.0, 0.0) mm, fits no film that the others fit")
-    bench.session.undo()
-    assert len(bench.session.words) == 1
+def test_a_press_at_another_place_than_said_is_named(problem, plan):
+    bench = Bench(problem, plan, 7)
+    bench.session.take(bench.charge(np.array([2.0, 3.0, 1.0])), np.array([5.0, 0.0, 1.0]))
+    assert bench.session.result.bad_lines == (8,)
+    assert bench.session.summary[1].startswith("Press 8, 1.00 N at (5.0, 0.0) mm, fits no film that the others fit")
 
 
 @pytest.mark.slow
-def test_presses_that_no_film_explains_end_no_session(four, plan, bench):
+def test_presses_that_no_film_explains_end_no_session(problem, plan):
     """Columns swapped: said, the presses stay, others are proposed, and undo helps."""
+    bench = Bench(problem, plan)
     contact = np.array([press.contact for press in plan[:7]])
     swapped = np.array([bench.charge(row) for row in contact])[:, [2, 1, 0, 3]]
-    presses = presses_of(contact, swapped, ("A", "B", "C", "D"))
-    session = BenchSession(four.scene, four.described, save=bench.saved.append, presses=presses)
-    assert session.calibration is None
-    assert "swapped" in session.problem
-    assert session.words[0].startswith("No film explains these presses")
-    assert not session.enough
+    session = PressSession(problem, save=bench.saved.append, presses=presses_of(problem, contact, swapped))
+    assert (session.result, session.enough) == (None, False)
+    assert "swapped" in session.refusal
+    assert session.summary[0].startswith("No film explains these presses")
     np.testing.assert_allclose(session.proposed.contact, plan[7].contact)  # as if the presses had been good
     assert session.undo() == 7
     assert len(bench.saved[-1]) == 6
@@ -167,19 +126,19 @@ def test_presses_that_no_film_explains_end_no_session(four, plan, bench):
         ((1.0, np.nan, 1.0), "both x and y"),
     ],
 )
-def test_a_press_that_cannot_be_is_refused_and_nothing_is_taken(bench, contact, message):
+def test_a_press_that_cannot_be_is_refused_and_nothing_is_taken(problem, plan, contact, message):
+    bench = Bench(problem, plan)
     with pytest.raises(PressError, match=message):
         bench.session.take(np.full(4, 500.0), np.array(contact))
     assert (len(bench.session), bench.saved) == (0, [])
 
 
-def test_presses_of_unknown_place_or_force_are_taken(four, plan):
+def test_presses_of_unknown_place_or_force_are_taken(problem, plan):
     """Dead weights, place unknown; and a stage without a load cell."""
-    bench = Bench(four, plan, 2)
-    contact = plan[2].contact
-    bench.session.take(bench.charge(contact), np.array([np.nan, np.nan, contact[2]]))
-    bench.session.take(bench.charge(contact), np.array([contact[0], contact[1], np.nan]))
-    assert bench.session.calibration.posterior.bad.tolist() == [False] * 4
+    bench, (x, y, force) = Bench(problem, plan, 2), plan[2].contact
+    for contact in ([np.nan, np.nan, force], [x, y, np.nan]):
+        bench.session.take(bench.charge(plan[2].contact), np.array(contact))
+    assert bench.session.result.posterior.bad.tolist() == [False] * 4
     assert np.isnan(bench.saved[-1].contact).sum() == 3
 
 
@@ -187,39 +146,27 @@ NAN = float("nan")
 
 
 @pytest.mark.parametrize(
-    ("text", "answer"),
+    ("text", "reply", "details"),
     [
-        ("", (Reply.take, None, None)),
-        ("  \r", (Reply.take, None, None)),
-        ("3.1 -2.5 1.7", (Reply.take, (3.1, -2.5, 1.7), None)),
-        ("3.1, -2.5, 1.7", (Reply.take, (3.1, -2.5, 1.7), None)),
-        ("? ? .5e0", (Reply.take, (NAN, NAN, 0.5), None)),
-        (",,1", (Reply.take, (NAN, NAN, 1.0), None)),
-        ("3 2,", None),
-        ("?", (Reply.take, (NAN, NAN, NAN), None)),
-        ("u", (Reply.undo, None, None)),
-        ("U 12", (Reply.undo, None, 12)),
-        ("undo", (Reply.undo, None, None)),
-        ("s", (Reply.skip, None, None)),
-        ("quit", (Reply.quit, None, None)),
-        ("3,1 2,5 1,7", None),
-        ("1 2", None),
-        ("1 2 3 4", None),
-        ("1 2 nan", None),
-        ("1 2 1e999", None),
-        ("1_0 2 3", None),
-        ("yes", None),
-        ("u -1", None),
+        ("  \r", Reply.take, {}),
+        ("3.1 -2.5 1.7", Reply.take, {"contact": (3.1, -2.5, 1.7)}),
+        ("3.1, -2.5, 1.7", Reply.take, {"contact": (3.1, -2.5, 1.7)}),
+        ("? ? .5e0", Reply.take, {"contact": (NAN, NAN, 0.5)}),
+        (",,1", Reply.take, {"contact": (NAN, NAN, 1.0)}),
+        ("?", Reply.take, {"contact": (NAN, NAN, NAN)}),
+        ("u", Reply.undo, {}),
+        ("U 12", Reply.undo, {"number": 12}),
+        ("s", Reply.skip, {}),
+        ("quit", Reply.quit, {}),
     ],
 )
-def test_answers(text, answer):
-    if answer is None:
-        with pytest.raises(PressError, match="expected"):
-            read_answer(text)
-        return
-    got: Answer = read_answer(text)
-    assert (got.reply, got.number) == (answer[0], answer[2])
-    if answer[1] is None:
-        assert got.contact is None
-    else:
-        np.testing.assert_array_equal(got.contact, answer[1])
+def test_answers(text, reply, details):
+    answer, expected = read_answer(text), {"contact": "as proposed", "number": "last"} | details
+    assert (answer.reply, answer.number) == (reply, expected["number"])
+    np.testing.assert_array_equal(answer.contact, expected["contact"])
+
+
+@pytest.mark.parametrize("text", ["3,1 2,5 1,7", "3 2,", "1 2", "1 2 3 4", "1 2 nan", "1 2 1e999", "yes", "u -1"])
+def test_what_is_no_answer_is_said(text):
+    with pytest.raises(PressError, match="expected"):
+        read_answer(text)

@@ -66,8 +66,9 @@ class CsvNumbers:
             error: If a required column is missing, or one of these is there twice.
         """
         present = [*required, *(name for name in optional if name in self.header)]
-        for what, wrong in (("missing", lambda count: count == 0), ("repeated", lambda count: count > 1)):
-            names = [shown(name) for name in present if wrong(self.header.count(name))]
+        missing = [shown(name) for name in present if name not in self.header]
+        repeated = [shown(name) for name in present if self.header.count(name) > 1]
+        for what, names in (("missing", missing), ("repeated", repeated)):
             if names:
                 more = f" and {len(names) - 10} more" if len(names) > 10 else ""
                 self._refuse_header(f"{what}: {', '.join(names[:10])}{more}")

@@ -88,6 +88,11 @@ class MeasuredPresses:
         columns = {name: getattr(self, name)[chosen] for name in names}
         return replace(self, **columns, lines=tuple(self.lines[row] for row in chosen))
 
+    @property
+    def placed(self) -> Booleans:
+        """Presses of which place and force are known, shape (n,)."""
+        return np.asarray(np.isfinite(self.contact).all(axis=1))
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, MeasuredPresses):
             return NotImplemented

@@ -126,7 +126,8 @@ def calibrate_command(
         (output / SESSION).unlink(missing_ok=True)
         say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
     known = result.posterior if result else problem.before
-    proposed = next_presses(problem, next_count, known, position_std_mm=position_std_mm, force_std=force_std)
+    std = {"position_std_mm": position_std_mm, "force_std": force_std}
+    proposed = next_presses(problem, next_count, known, **std) if next_count else []
     if json:
         table = result_table(result) if result else {}
         values = plain_values(table | {"next": [vars(press) for press in proposed]})

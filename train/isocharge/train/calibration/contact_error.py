@@ -201,7 +201,8 @@ def next_presses(
         best = int(np.argmin(np.einsum("pq,nqp->n", cost, after)))
         information = information + offered[best]
         left = sensitivity.left(after[best])
-        proposed.append(ProposedPress(*candidates[best].tolist(), left.position_mm, left.force_percent))
+        x, y, force = candidates[best].tolist()
+        proposed.append(ProposedPress(x, y, force, left.position_mm, left.force_percent))
     return proposed
 
 

@@ -128,7 +128,7 @@ def _check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
 def _smallest_shares(presses: MeasuredPresses, charges: FilmCharges) -> Array:
     """Typical charge of each channel over that of the others, the smallest that films of some pretension give."""
-    placed = presses.contact[np.isfinite(presses.contact).all(axis=1)]
+    placed = presses.contact[presses.placed]
     if not len(placed):
         return np.ones(len(presses.electrodes))
     typical = np.median(np.abs(_expected(charges, placed)), axis=1)
@@ -162,7 +162,7 @@ def outside(presses: MeasuredPresses, charges: FilmCharges) -> Booleans:
 
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[Mistake]:
     """The mistakes that would explain presses far better than as they are written, best first; none if nothing does."""
-    placed = presses[np.isfinite(presses.contact).all(axis=1)]
+    placed = presses[presses.placed]
     if not len(placed):
         return []
     as_written = _misfit(charges, placed.contact, placed.charge_pC)

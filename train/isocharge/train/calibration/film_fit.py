@@ -82,7 +82,7 @@ def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate) -> Fil
         best, _ = fit.solve(data[keep], np.ones(int(keep.sum())), start)
         adjusted = fit.adjusted(best, data)
     jacobian = fit.jacobian(best, data[keep], np.ones(int(keep.sum())), fit.adjusted(best, data[keep]))
-    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    covariance = np.linalg.inv(jacobian.T @ jacobian).astype(float)
     return FilmPosterior(best, covariance, with_force(adjusted.contact), adjusted.chi2, freedom, ~keep)
 
 

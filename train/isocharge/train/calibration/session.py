@@ -133,6 +133,9 @@ class PressSession:
         self.problem, self._save, self._until = problem, save, until
         self._std = {"position_std_mm": position_std_mm, "force_std": force_std}
         self._skipped: list[tuple[float, float]] = []
+        self._proposed: ProposedPress | None = None
+        self.result: CalibrationResult | None = None
+        self.presses, self.refusal = none, ""
         self._fit(presses or none)
 
     def __len__(self) -> int:
@@ -152,7 +155,7 @@ class PressSession:
 
     def _planned(self) -> FilmEstimate:
         """What would be known if presses that no film explains said what presses at their places say."""
-        placed, before = self.presses.contact[np.isfinite(self.presses.contact).all(axis=1)], self.problem.before
+        placed, before = self.presses.contact[self.presses.placed], self.problem.before
         if not len(placed):
             return before
         information = information_of(self.problem, before.parameters, placed, **self._std).sum(axis=0)
@@ -182,7 +185,8 @@ class PressSession:
                 taken,
                 contact=np.vstack([taken.contact, contact]),
                 charge_pC=np.vstack([taken.charge_pC, charge]),
-                **{name: np.append(getattr(taken, name), std) for name, std in self._std.items()},
+                position_std_mm=np.append(taken.position_std_mm, self._std["position_std_mm"]),
+                force_std=np.append(taken.force_std, self._std["force_std"]),
                 lines=(*taken.lines, len(taken) + 1),
             )
         )
@@ -224,9 +228,7 @@ class PressSession:
 
     def _fit(self, presses: MeasuredPresses) -> None:
         self.presses = replace(presses, lines=tuple(range(1, len(presses) + 1)))
-        self.result: CalibrationResult | None = None
-        self.refusal = ""
-        self._proposed: ProposedPress | None = None
+        self.result, self.refusal, self._proposed = None, "", None
         try:
             self.result = calibrate(self.presses, self.problem) if len(presses) else None
         except PressError as error:

@@ -142,14 +142,14 @@ def _film(rig: Rig, problem: CalibrationProblem | None, presses: MeasuredPresses
 def _dataset(film: RigFilm, count: int, seed: int) -> Dataset:
     """Presses of the corrected map."""
     contact = draw_contacts(np.random.default_rng(seed), film.domain, count)
-    charge = film.charges(contact)
+    (x, y, force), charge = contact.T, film.charges(contact)
     probe = np.full(count, film.forward_map.probe.notation)
     manifest = {
         "ranges": {"radius_mm": film.domain.radius, "force_N": list(film.domain.force_range)},
         SOLVER: {"map": "forward map of the film, corrected by measured presses"},
     }
     checksum = sha256_of(np.ascontiguousarray(contact).tobytes() + np.ascontiguousarray(charge).tobytes())
-    samples = Samples(*contact.T, probe, np.zeros(count), charge)
+    samples = Samples(x, y, force, probe, np.zeros(count), charge)
     return Dataset(film.forward_map.sensor, samples, manifest, checksum)
 
 
