@@ -11,8 +11,6 @@ import pytest
 
 from isocharge.serve import Script, VirtualSensor
 
-pytestmark = pytest.mark.slow
-
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = [
     *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"),
@@ -119,6 +117,7 @@ def wait_for(page, expression, timeout_s=40.0):
         page.wait_for_timeout(20)
 
 
+@pytest.mark.slow
 def test_ten_presses_appear_where_and_as_hard_as_they_are(start_stream, open_page):
     start_stream()
     page = open_page()
@@ -141,10 +140,12 @@ def test_ten_presses_appear_where_and_as_hard_as_they_are(start_stream, open_pag
         assert radius == pytest.approx(5.0 + 15.0 * np.sqrt(PRESSES[number][2] / 2.0), abs=1.5), PRESSES[number]
 
 
-def test_tare_pause_record_and_marker(start_stream, open_page, tmp_path):
+def test_numbers_tare_pause_record_and_marker(start_stream, open_page, tmp_path):
     start_stream()
     page = open_page()
     wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
+    x, y, force = page.evaluate(DRAWN)["shown"]
+    assert min(np.hypot(px - x, py - y) + abs(pressed - force) for px, py, pressed in PRESSES) < 0.3
     page.get_by_role("button", name="Tare").click()
     wait_for(page, "isocharge.page.film.drawnKind === 'tare'")
     wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
@@ -174,6 +175,7 @@ def test_tare_pause_record_and_marker(start_stream, open_page, tmp_path):
     assert not page.locator("dialog").is_visible()
 
 
+@pytest.mark.slow
 def test_nothing_that_breaks_breaks_the_page(start_stream, open_page):
     process = start_stream()
     page = open_page()
@@ -199,8 +201,10 @@ def test_nothing_that_breaks_breaks_the_page(start_stream, open_page):
         wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
 
 
-@pytest.mark.parametrize(("width", "height"), [(1280, 820), (390, 844), (820, 1180)])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("width", "height", "scheme"), [(1280, 820, "light"), (390, 844, "dark"), (820, 1180, "light")]
+)
 def test_it_fits_every_screen(start_stream, open_page, width, height, scheme, tmp_path):
     start_stream()
     page = open_page(width, height, scheme)
