@@ -6,14 +6,13 @@ import pytest
 from isocharge.simulate import press, touch_charge
 from isocharge.train.films.film_scaling import FilmScaling
 
-AT_MM, FORCE_N = (3.0, -4.0), 0.3
-DOUBLED = np.log(2.0)
+AT, FORCE = (3.0, -4.0), 0.3
 
 
-def solved(prior, parameters, at_mm, force_N):
+def solved(prior, parameters, at, force):
     """Charges of one solve, pC."""
     sensor, probe = prior.film(parameters)
-    return 1e12 * touch_charge(sensor, press(sensor.film, probe, tuple(1e-3 * np.array(at_mm)), force_N))
+    return touch_charge(sensor, press(sensor.film, probe, at, force))
 
 
 def changed(prior, **values):
@@ -28,19 +27,19 @@ def changed(prior, **values):
     [
         {"gain_B": 0.1},
         {"d31": 0.3, "d32": 0.3},
-        {"young": 0.4, "pretension": 1.5e6 * np.exp(0.4)},
+        {"young": 0.4, "pretension": 1.5 * np.exp(0.4)},
         {"rotation": 0.2},
-        {"rotation": -0.1, "young": -0.2, "pretension": 1.5e6 * np.exp(-0.2), "d31": 0.1, "d32": 0.1, "gain_A": 0.05},
+        {"rotation": -0.1, "young": -0.2, "pretension": 1.5 * np.exp(-0.2), "d31": 0.1, "d32": 0.1, "gain_A": 0.05},
     ],
 )
-def test_charges_scale_and_places_turn_exactly(films, film):
+def test_charges_scale_and_places_rotate_exactly(films, film):
     """The film's charge is the mean film's at the place and force that it stands for, times the exact factors."""
     prior, scaling = films.prior, FilmScaling(films.prior, films.domain)
     parameters = changed(prior, **film)
-    unit = scaling.domain.to_unit(np.array([[*AT_MM, FORCE_N]]))
+    unit = scaling.domain.to_unit(np.array([[*AT, FORCE]]))
     x, y, force = scaling.domain.to_contact(scaling.to_film(parameters, unit))[0]
     factor = np.exp(scaling.log_charge_scale(parameters) - scaling.log_charge_scale(prior.mean))
-    expected = factor * solved(prior, prior.mean, AT_MM, FORCE_N)
+    expected = factor * solved(prior, prior.mean, AT, FORCE)
     np.testing.assert_allclose(solved(prior, parameters, (x, y), force), expected, rtol=2e-4)
 
 
@@ -48,23 +47,21 @@ def test_thickness_scales_the_force_but_for_bending(films):
     """A twentieth thicker, the force a twentieth larger: what is left is the bending, some parts in a thousand."""
     prior, scaling = films.prior, films.scaling
     parameters = changed(prior, thickness=0.05)
-    unit = scaling.domain.to_unit(np.array([[*AT_MM, FORCE_N]]))
+    unit = scaling.domain.to_unit(np.array([[*AT, FORCE]]))
     force = scaling.domain.to_contact(scaling.to_film(parameters, unit))[0, 2]
-    assert force == pytest.approx(FORCE_N * np.exp(0.05))
-    np.testing.assert_allclose(
-        solved(prior, parameters, AT_MM, force), solved(prior, prior.mean, AT_MM, FORCE_N), rtol=2e-3
-    )
+    assert force == pytest.approx(FORCE * np.exp(0.05))
+    np.testing.assert_allclose(solved(prior, parameters, AT, force), solved(prior, prior.mean, AT, FORCE), rtol=2e-3)
 
 
 def test_the_electrodes_carry_the_place_along(films):
     """The frame in which the network works is the electrodes': they stand where `place` puts them."""
     prior, scaling = films.prior, films.scaling
-    parameters = changed(prior, shift_x=4e-4, shift_y=-2e-4, rotation=0.1)
+    parameters = changed(prior, shift_x=0.4, shift_y=-0.2, rotation=0.1)
     sensor, _ = prior.film(parameters)
     centres = np.array([electrode.centre for electrode in prior.sensor.electrodes])
-    units = np.column_stack([1e3 * centres / scaling.domain.radius_mm, np.zeros(len(centres))])
-    moved = scaling.to_film(parameters, units)[:, :2] * 1e-3 * scaling.domain.radius_mm
-    np.testing.assert_allclose(moved, sensor.calibration.place(centres), atol=1e-12)
+    units = np.column_stack([centres / scaling.domain.radius, np.zeros(len(centres))])
+    moved = scaling.to_film(parameters, units)[:, :2] * scaling.domain.radius
+    np.testing.assert_allclose(moved, sensor.calibration.place(centres), atol=1e-9)
 
 
 def test_the_context_leaves_out_what_is_exact_but_for_its_scales(films):

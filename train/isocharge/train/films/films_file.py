@@ -156,17 +156,17 @@ def _about(films: FilmsModel) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "sensor": sensor_to_dict(prior.sensor),
-        "probe_radius": _digits(FILE_UNITS["probe_radius"] * prior.probe.radius),
-        "spread": {name: _digits(FILE_UNITS.get(name, 1.0) * value) for name, value in asdict(prior.spread).items()},
+        "probe_radius": _converted(prior.probe.radius, FILE_UNITS["probe_radius"]),
+        "spread": {name: _converted(value, FILE_UNITS.get(name, 1.0)) for name, value in asdict(prior.spread).items()},
         "radius_mm": films.domain.radius,
         "force_range_N": list(films.domain.force_range),
-        "noise": {**asdict(films.noise), "white": _digits(FILE_PC * films.noise.white)},
+        "noise": {**asdict(films.noise), "white": _converted(films.noise.white, FILE_PC)},
     }
 
 
 def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str) -> FilmsModel:
-    spread = {name: _digits(value / FILE_UNITS.get(name, 1.0)) for name, value in about["spread"].items()}
-    probe = Circle(_digits(about["probe_radius"] / FILE_UNITS["probe_radius"]))
+    spread = {name: _converted(value, 1.0 / FILE_UNITS.get(name, 1.0)) for name, value in about["spread"].items()}
+    probe = Circle(_converted(about["probe_radius"], 1.0 / FILE_UNITS["probe_radius"]))
     prior, noise = FilmPrior(sensor_from_dict(about["sensor"]), probe, FilmSpread(**spread)), about["noise"]
     low, high = about["force_range_N"]
     model = FilmsModel(
@@ -176,7 +176,7 @@ def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str)
         whitening=arrays["whitening"],
         contact=_unpacked(_within(arrays, "contact")),
         misfit=_unpacked(_within(arrays, "misfit")),
-        noise=NoiseModel(**{**noise, "white": _digits(noise["white"] / FILE_PC)}),
+        noise=NoiseModel(**{**noise, "white": _converted(noise["white"], 1.0 / FILE_PC)}),
         sha256=sha256,
     )
     n_electrode = len(prior.sensor.electrodes)
@@ -186,9 +186,9 @@ def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str)
     return model
 
 
-def _digits(value: float) -> float:
+def _converted(value: float, factor: float) -> float:
     """A number in another unit, without the rounding of the conversion."""
-    return float(f"{value:.15g}")
+    return value if factor == 1.0 else float(f"{factor * value:.15g}")
 
 
 def _within(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray]:
