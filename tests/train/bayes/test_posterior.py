@@ -7,10 +7,11 @@ import pytest
 from scipy import stats
 
 from isocharge.common.errors import ChargeError, InputError
-from isocharge.simulate import ChargeSpline, NoiseModel, noise_model
+from isocharge.simulate import ChargeSpline, Domain, NoiseModel, noise_model
 from isocharge.train.bayes.posterior import Posterior
+from isocharge.train.data.presses import draw_contacts
 
-REFERENCE = noise_model("reference")
+REFERENCE, UNIT = noise_model("reference"), Domain(1.0, (1.0, 1.0 + 1e-9))
 
 
 @dataclass(frozen=True)
@@ -20,12 +21,11 @@ class Straight:
     offset: np.ndarray
     linear: np.ndarray
     quadratic: np.ndarray
-    radius: float = 1.0
-    force_range: tuple[float, float] = (1.0, 1.0 + 1e-9)
+    domain: Domain = UNIT
 
     @property
     def electrodes(self):
-        return self.offset.size
+        return tuple(map(str, range(self.offset.size)))
 
     def by_force(self, logs):
         return np.exp(logs)[..., None]
@@ -43,13 +43,11 @@ def straight(seed: int, electrodes: int = 4) -> Straight:
     return Straight(100.0 + rng.random(electrodes), rng.normal(size=(2, electrodes)), np.zeros((2, electrodes)))
 
 
-def spread(made, count, seed):
-    """Presses from the prior (m, N) and their noisy charges (C)."""
+def spread(charges, count, seed):
+    """Presses from the prior and their noisy charges."""
     rng = np.random.default_rng(seed)
-    at = made.radius * np.sqrt(rng.random(count)) * np.exp(2j * np.pi * rng.random(count))
-    force = np.exp(rng.uniform(*np.log(made.force_range), count))
-    contact = np.stack([at.real, at.imag, force], axis=1)
-    return contact, REFERENCE.add(made.charge(contact), rng)
+    contact = draw_contacts(rng, charges.domain, count)
+    return contact, REFERENCE.add(charges.charges(contact), rng)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +67,7 @@ def test_linear_charges_in_white_noise_give_the_textbook_gaussian(seed):
 
 
 def test_at_the_edge_of_the_disk_the_gaussian_is_cut_off():
-    made = Straight(np.array([100.0, 100.0]), np.eye(2), np.zeros((2, 2)), radius=1000.0)
+    made = Straight(np.array([100.0, 100.0]), np.eye(2), np.zeros((2, 2)), domain=Domain(1000.0, (1.0, 1.0 + 1e-9)))
     noisy = np.array([[1100.0, 100.0]])  # x is 1000, y is 0: on an edge that is all but straight
     mean, std = Posterior(made, NoiseModel("white", 1.0, 0.0), 1000.0).mean_and_std(noisy)
     half = stats.halfnorm()
@@ -90,14 +88,14 @@ def brute_force(charges, noise, charge, centre, reach, count):
     """Mean and deviation of (x, y, F) by a plain sum over a box, cut off at the prior's edges."""
     low, high = centre - reach, centre + reach
     low[2], high[2] = (
-        np.maximum(low[2], np.log(charges.force_range[0])),
-        np.minimum(high[2], np.log(charges.force_range[1])),
+        np.maximum(low[2], np.log(charges.domain.force_range[0])),
+        np.minimum(high[2], np.log(charges.domain.force_range[1])),
     )
     axes = [a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, count, strict=True)]
     x, y, logs = (axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
-    inside = np.hypot(x, y) <= charges.radius
+    inside = np.hypot(x, y) <= charges.domain.radius
     contact = np.stack([x, y, np.exp(logs)], axis=1)[inside]
-    known = charges.charge(contact)
+    known = charges.charges(contact)
     likelihood = stats.norm.logpdf(charge, known, noise.sigma(known)).sum(axis=1)
     mass = np.exp(likelihood - likelihood.max())
     mass /= mass.sum()
@@ -109,12 +107,12 @@ def brute_force(charges, noise, charge, centre, reach, count):
 
 @pytest.mark.parametrize(
     "contact",
-    [(2e-3, -3e-3, 1.0), (-7.9e-3, 0.4e-3, 0.3), (1e-3, 6e-3, 0.0503), (7.2e-3, 3.4e-3, 0.06), (1e-4, 0.0, 1.995)],
+    [(2.0, -3.0, 1.0), (-7.9, 0.4, 0.3), (1.0, 6.0, 0.0503), (7.2, 3.4, 0.06), (0.1, 0.0, 1.995)],
     ids=["within", "at the rim", "least force", "rim, small force", "centre, most force"],
 )
 def test_as_brute_force(charges, contact):
-    charge = REFERENCE.add(charges.charge(np.array([contact])), np.random.default_rng(1))
-    mean, std = Posterior(charges, REFERENCE, charges.radius).mean_and_std(charge)
+    charge = REFERENCE.add(charges.charges(np.array([contact])), np.random.default_rng(1))
+    mean, std = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)
     centre, reach = mean[0].copy(), 7.0 * std[0]
     centre[2], reach[2] = np.log(mean[0, 2]), 7.0 * std[0, 2] / mean[0, 2]
     expected_mean, expected_std = brute_force(charges, REFERENCE, charge[0], centre, reach, (240, 240, 24))
@@ -124,9 +122,9 @@ def test_as_brute_force(charges, contact):
 
 def test_noise_that_grows_with_the_charge_speaks_for_small_ones(charges):
     """The likelihood's 1 / sigma counts: it moves the mean by a tenth of a deviation here."""
-    loud = NoiseModel("loud", 1e-12, 0.05)
-    charge = charges.charge(np.array([[1e-3, 2e-3, 0.4]]))
-    mean, std = Posterior(charges, loud, charges.radius).mean_and_std(charge)
+    loud = NoiseModel("loud", 1.0, 0.05)
+    charge = charges.charges(np.array([[1.0, 2.0, 0.4]]))
+    mean, std = Posterior(charges, loud, charges.domain.radius).mean_and_std(charge)
     centre, reach = np.append(mean[0, :2], np.log(mean[0, 2])), 6.0 * np.append(std[0, :2], std[0, 2] / mean[0, 2])
     expected_mean, expected_std = brute_force(charges, loud, charge[0], centre, reach, (70, 70, 70))
     assert std[0] == pytest.approx(expected_std, rel=0.01)
@@ -136,41 +134,41 @@ def test_noise_that_grows_with_the_charge_speaks_for_small_ones(charges):
 def test_deviations_are_as_large_as_errors(charges):
     """Simulated presses and their noise: the squares of error over deviation are one on average."""
     contact, charge = spread(charges, 300, seed=3)
-    mean, std = Posterior(charges, REFERENCE, charges.radius).mean_and_std(charge)
+    mean, std = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)
     squares = np.mean(((mean - contact) / std) ** 2, axis=0)
     assert squares == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 300))
 
 
 def test_finer_cells_change_nothing(charges):
     contact, charge = spread(charges, 40, seed=4)
-    coarse, _ = Posterior(charges, REFERENCE, charges.radius).mean_and_std(charge)
-    fine, _ = Posterior(charges, REFERENCE, charges.radius, step=0.75).mean_and_std(charge)
+    coarse, _ = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)
+    fine, _ = Posterior(charges, REFERENCE, charges.domain.radius, step=0.75).mean_and_std(charge)
     rms = [np.sqrt(np.mean(np.sum((mean - contact)[:, :2] ** 2, axis=1))) for mean in (coarse, fine)]
     assert rms[0] == pytest.approx(rms[1], rel=1e-3)
 
 
 def test_a_smaller_prior_knows_more(charges):
-    charge = charges.charge(np.array([[3.9e-3, 0.0, 0.1]]))
-    wide = Posterior(charges, REFERENCE, charges.radius).mean_and_std(charge)[1]
-    narrow = Posterior(charges, REFERENCE, 4e-3).mean_and_std(charge)[1]
+    charge = charges.charges(np.array([[3.9, 0.0, 0.1]]))
+    wide = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)[1]
+    narrow = Posterior(charges, REFERENCE, 4.0).mean_and_std(charge)[1]
     assert narrow[0, 0] < 0.8 * wide[0, 0]
 
 
 def test_charges_of_nothing_still_give_an_answer(charges):
     """What no press gives: the nearest that the prior knows, finite."""
-    mean, std = Posterior(charges, REFERENCE, charges.radius).mean_and_std(1e-12 * np.array([[0.0, -5.0, 1e6]]))
+    mean, std = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(np.array([[0.0, -5.0, 1e6]]))
     assert np.isfinite(mean).all()
     assert np.isfinite(std).all()
-    assert np.hypot(*mean[0, :2]) <= charges.radius
+    assert np.hypot(*mean[0, :2]) <= charges.domain.radius
 
 
 def test_bad_input_is_refused(charges):
-    posterior = Posterior(charges, REFERENCE, charges.radius)
-    with pytest.raises(ChargeError, match=r"shape \(n, 3\), got shape \(2, 4\)"):
+    posterior = Posterior(charges, REFERENCE, charges.domain.radius)
+    with pytest.raises(ChargeError, match=r"shape \(n, 3\), n at least 1, got shape \(2, 4\)"):
         posterior.mean_and_std(np.ones((2, 4)))
     with pytest.raises(ChargeError, match="finite"):
         posterior.mean_and_std(np.array([[np.nan, 1.0, 1.0]]))
     with pytest.raises(InputError, match="white noise"):
         replace(posterior, noise=noise_model("clean"))
     with pytest.raises(InputError, match="up to 8 mm"):
-        replace(posterior, radius=9e-3)
+        replace(posterior, radius=9.0)
