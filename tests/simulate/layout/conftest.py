@@ -1,14 +1,11 @@
-"""Scenes that the tests of layouts share, small ones: presses within 4 mm."""
-
-from dataclasses import replace
+"""A table of charges that the tests of layouts share, a small one: presses within 4 mm."""
 
 import pytest
 
 from isocharge.simulate import Circle, load_sensor
-from isocharge.simulate.layout.scene import DesignScene
-from isocharge.simulate.layout.square_charges import solve_square_charges
+from isocharge.simulate.layout.charge_table import ChargeTable
 
-RADIUS = 4e-3
+RADIUS = 4.0
 
 
 @pytest.fixture(scope="session")
@@ -17,20 +14,5 @@ def sensor():
 
 
 @pytest.fixture(scope="session")
-def scene(sensor):
-    return DesignScene.of(sensor.film, Circle(1e-3), 1.0, RADIUS)
-
-
-@pytest.fixture(scope="session")
-def charges(sensor, scene):
-    return solve_square_charges(sensor, scene)
-
-
-@pytest.fixture(scope="session")
-def uniaxial(scene):
-    return solve_square_charges(load_sensor("four-25um-uniaxial"), scene)
-
-
-@pytest.fixture(scope="session")
-def edge(scene):
-    return solve_square_charges(replace(load_sensor("four-25um-uniaxial"), readout="edge"), scene)
+def tables(sensor):
+    return {s.name: ChargeTable.solve(s, Circle(1.0), 1.0, RADIUS) for s in (sensor, load_sensor("four-25um-uniaxial"))}

@@ -112,10 +112,9 @@ def design_command(
 def _table(found: Design) -> str:
     """Places, and errors before and after."""
     rows = ["{:<10} {:9.3f} {:9.3f} mm".format(e.name, *e.centre) for e in found.sensor.electrodes]
-    rows.append("least position error, mm    worst      rms")
+    rows.append("least position error, mm     worst      rms")
     for name, errors in (("before", found.before), ("after", found.after)):
         for level, values in errors.to_dict().items() if errors else ():
-            rows.append(
-                f"{name}, {level.replace('_', ' '):<15} {values['worst_mm']:8.3f} {values['rms_mm']:8.3f}".rstrip()
-            )
+            title = f"{name}, {level.replace('_', ' ')}"
+            rows.append(f"{title:<26} {values['worst_mm']:7.3f} {values['rms_mm']:8.3f}")
     return "\n".join(rows)

@@ -3,6 +3,7 @@
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from isocharge.common.extras import require
 from isocharge.simulate.artwork.leads import Leads
@@ -11,9 +12,10 @@ from isocharge.simulate.sensor.sensor import Sensor
 with require("design"):
     import ezdxf
     from ezdxf import units
-    from ezdxf.addons.drawing import Frontend, RenderContext
     from ezdxf.addons.drawing.config import BackgroundPolicy, Configuration
+    from ezdxf.addons.drawing.frontend import Frontend
     from ezdxf.addons.drawing.layout import Margins, Page, Settings, Units
+    from ezdxf.addons.drawing.properties import RenderContext
     from ezdxf.addons.drawing.svg import SVGBackend
     from ezdxf.document import Drawing
 
@@ -44,7 +46,7 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
     for electrode in sensor.electrodes:
         space.add_lwpolyline(electrode.corners, close=True, dxfattribs={"layer": "ELECTRODES"})
         name = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in electrode.name)
-        space.add_text(name, height=HEIGHT, dxfattribs={"layer": "NAMES"}).set_placement(electrode.centre)
+        space.add_text(name, height=HEIGHT, dxfattribs={"layer": "NAMES"}).set_placement(max(electrode.corners))
     y, left = -radius - BELOW, -0.5 * RULER
     ticks = [left + TICK * number for number in range(round(RULER / TICK) + 1)]
     for start, end in (((left, y), (-left, y)), *(((x, y), (x, y - SHORT)) for x in ticks)):
@@ -74,9 +76,10 @@ def to_svg(document: Drawing) -> str:
 @contextmanager
 def _without_dates() -> Iterator[None]:
     """Fixed dates and identifiers instead of today's."""
-    before = ezdxf.options.write_fixed_meta_data_for_testing
-    ezdxf.options.write_fixed_meta_data_for_testing = True
+    options: Any = ezdxf.options  # type: ignore[attr-defined]
+    before = options.write_fixed_meta_data_for_testing
+    options.write_fixed_meta_data_for_testing = True
     try:
         yield
     finally:
-        ezdxf.options.write_fixed_meta_data_for_testing = before
+        options.write_fixed_meta_data_for_testing = before

@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
@@ -85,7 +85,9 @@ class WeightMap:
         return np.asarray(weights)
 
 
-Goal = Literal["worst", "rms"] | WeightMap
+Plain = Literal["worst", "rms"]
+
+Goal = Plain | WeightMap
 """What is made small: the largest error, its root mean square, or that with weights."""
 
 
@@ -95,8 +97,8 @@ def read_goal(text: str) -> Goal:
     Raises:
         InputError: If it is no goal, or the map cannot be read.
     """
-    if text == "worst" or text == "rms":
-        return text
+    if text in get_args(Plain):
+        return cast(Plain, text)
     try:
         header, *lines = read_whole(Path(text)).decode("utf-8-sig").splitlines()
         if header.replace(" ", "") != HEADER:
@@ -224,7 +226,8 @@ class DesignCase:
         for electrode in self.stay:
             low, high = np.min(electrode.corners, axis=0), np.max(electrode.corners, axis=0)
             spare.append((np.maximum(low - places, places - high) - half).max(axis=1) - self.gap)
-        return np.min(spare, axis=0)
+        least: Array = np.min(spare, axis=0)
+        return least
 
     def apart(self, places: Array, others: Array) -> Array:
         """Distance to spare between squares at `places` (n, 2) and `others` (m, 2), shape (n, m), mm."""

@@ -171,7 +171,7 @@ class _Pressed:
         node = (which[:, None, None, None] * (INSIDE + OUTSIDE) + rows[..., None]) * AROUND + columns[..., None, :]
         weights = share[:, None, None] * by_row[..., None] * by_column[..., None, :]
         flat = weights.reshape(len(which), 1, -1).astype(np.float32)
-        mean = np.matmul(flat, self.density[node.reshape(len(which), -1)])[:, 0].astype(float)
+        mean: Array = np.matmul(flat, self.density[node.reshape(len(which), -1)])[:, 0].astype(float)
         place = (mean[:, 1] + 1j * mean[:, 2]) * turn
         mean[:, 1], mean[:, 2] = place.real, place.imag
         return mean

@@ -61,18 +61,18 @@ def position_variance(inverse: Array) -> Array:
     return variance
 
 
-def with_one_more(sensitivity: Array, candidates: np.ndarray) -> Array:
+def with_one_more(sensitivity: Array, candidates: Array) -> Array:
     """Squared errors with each of many candidates beside given electrodes.
 
     Args:
         sensitivity: Of the electrodes, shape (n_press, n_electrode, 5).
-        candidates: Of one more, shape (n_press, 5, n_candidate), single precision.
+        candidates: Of one more, shape (n_press, 5, n_candidate).
 
     Returns:
         Shape (n_press, n_candidate), mm^2.
     """
     inverse = inverse_information(sensitivity)
-    moved = inverse.astype(np.float32) @ candidates
+    moved = inverse @ candidates
     gain = (moved[:, :2] ** 2).sum(axis=1) / (1.0 + (moved * candidates).sum(axis=1))
     squared: Array = position_variance(inverse)[:, None] - PRIOR[0] ** 2 * gain
     return squared

@@ -113,9 +113,9 @@ class Search:
         """The best different layouts that exchange reaches, each of shape (n_new, 2), mm, the best first."""
         case, side = self.case, self.case.square_side
         stay = self.model.sensitivity(self.table.rows(case.presses, places[:0], side, case.stay))
-        candidates = self.model.sensitivity(self.table.rows(case.presses, places, side)).swapaxes(1, 2)
+        candidates = self.model.sensitivity(self.table.rows(case.presses, places, side))
         apart = case.apart(places, places) >= 0.0
-        grid = _Grid(candidates.astype(np.float32), stay, apart, case.weights(case.presses), self._power)
+        grid = _Grid(np.ascontiguousarray(candidates.swapaxes(1, 2)), stay, apart, case.weights(case.presses), self._power)
         found = sorted((grid.exchange(start) for start in track(layouts, "exchanging")), key=lambda one: one[0])
         different = [found[0]]
         for value, chosen in found:
@@ -173,7 +173,7 @@ class Search:
             method="SLSQP",
             bounds=[*((x - reach, x + reach) for x in places.ravel().tolist()), (None, None)],
             constraints={"type": "ineq", "fun": spare},
-            options={"maxiter": STEPS, "ftol": 1e-5, "eps": DIFFERENCE},
+            options={"maxiter": STEPS, "ftol": 1e-4, "eps": DIFFERENCE},
         )
         moved: Array = solved.x[:-1].reshape(-1, 2)
         return moved
@@ -184,14 +184,14 @@ class _Grid:
     """Places that are compared.
 
     Attributes:
-        candidates: Sensitivity of a square at each place, shape (n_press, 5, n_place), single precision.
+        candidates: Sensitivity of a square at each place, shape (n_press, 5, n_place).
         stay: That of the electrodes that stay, shape (n_press, n_stay, 5).
         apart: Whether squares at two places keep their distance, shape (n_place, n_place).
         weight: Of the presses, shape (n_press,).
         power: Of the errors whose mean is made small.
     """
 
-    candidates: np.ndarray
+    candidates: Array
     stay: Array
     apart: np.ndarray
     weight: Array

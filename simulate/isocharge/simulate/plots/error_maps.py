@@ -9,6 +9,7 @@ from matplotlib.patches import Circle as Disk
 from matplotlib.ticker import ScalarFormatter
 
 from isocharge.common.arrays import Array
+from isocharge.simulate.layout.case import KNOWN
 from isocharge.simulate.layout.design import Design, ErrorMap
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes
@@ -39,7 +40,8 @@ def error_maps_picture(design: Design) -> Figure:
     bar = figure.colorbar(shown, ax=list(every), label="least position error (rms), mm", shrink=0.85, extend="max")
     for axis in ("major", "minor"):
         getattr(bar.ax.yaxis, f"set_{axis}_formatter")(ScalarFormatter())
-    figure.suptitle(f"{case.force:g} N, {case.probe.notation}, noise {case.noise.name}, with what nobody knows exactly")
+    known = "everything else known" if case.nuisances == KNOWN else "with what nobody knows exactly"
+    figure.suptitle(f"{case.force:g} N, {case.probe.notation}, noise {case.noise.name}, {known}")
     return figure
 
 

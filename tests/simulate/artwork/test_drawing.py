@@ -1,0 +1,104 @@
+"""Drawings read back by other programs: svgelements and ezdxf."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import ezdxf
+import numpy as np
+import pytest
+from svgelements import SVG, Path
+
+from isocharge.simulate import Electrode, built_in_sensors, load_sensor
+from isocharge.simulate.artwork.drawing import RULER, draw_layout, to_dxf, to_svg
+from isocharge.simulate.artwork.leads import straight_leads
+
+MICROMETRE = 1e-3
+"""In mm."""
+
+
+@pytest.fixture(params=[*built_in_sensors(), "shapes"])
+def sensor(request):
+    if request.param != "shapes":
+        return load_sensor(request.param)
+    triangle = Electrode('<"A\x01&B">\n', ((0.0, 10.0123456), (3.0, 10.0), (1.2345678, 14.0)))
+    square = Electrode.of_square("C", (-12.3456789, 0.1), 2.7182818)
+    return replace(load_sensor("three-25um-biaxial"), electrodes=(triangle, square))
+
+
+@pytest.fixture
+def drawing(sensor):
+    return draw_layout(sensor, straight_leads(sensor))
+
+
+def box(points):
+    return [*np.min(points, axis=0), *np.max(points, axis=0)]
+
+
+def test_dxf_has_the_places_and_sizes_of_the_sensor(sensor, drawing, tmp_path):
+    path = tmp_path / "layout.dxf"
+    path.write_text(to_dxf(drawing), "utf-8")
+    document = ezdxf.readfile(path)
+    assert not document.audit().errors
+    assert document.units == ezdxf.units.MM
+    space = document.modelspace()
+    outlines = [np.array(line.get_points("xy")) for line in space.query('LWPOLYLINE[layer=="ELECTRODES"]')]
+    for outline, electrode in zip(outlines, sensor.electrodes, strict=True):
+        assert outline == pytest.approx(np.array(electrode.corners), abs=MICROMETRE)
+    (film,) = space.query("CIRCLE")
+    assert film.dxf.radius == pytest.approx(sensor.film.radius)
+    names = [text.dxf.text.replace("\ufffd", "") for text in space.query('TEXT[layer=="NAMES"]')]
+    assert names == ["".join(filter(str.isprintable, name)) for name in sensor.electrode_names]
+    assert {line.dxf.const_width for line in space.query('LWPOLYLINE[layer=="LEADS"]')} == {0.3}
+
+
+def test_svg_is_the_same_drawing_to_scale(sensor, drawing, tmp_path):
+    path = tmp_path / "layout.svg"
+    path.write_text(to_svg(drawing), "utf-8")
+    svg = SVG.parse(str(path), ppi=25.4)  # a pixel is a millimetre
+    boxes = np.array([shape.bbox() for shape in svg.elements(lambda element: isinstance(element, Path))])
+    film = boxes[np.argmax(boxes[:, 3] - boxes[:, 1])]
+    assert film[2:] - film[:2] == pytest.approx([2.0 * sensor.film.radius] * 2, abs=MICROMETRE)
+    middle = 0.5 * (film[2:] + film[:2])
+    for electrode in sensor.electrodes:
+        left, low, right, high = box(electrode.corners)
+        expected = [middle[0] + left, middle[1] - high, middle[0] + right, middle[1] - low]
+        assert np.abs(boxes - expected).max(axis=1).min() < MICROMETRE
+    assert np.abs(boxes[:, 2] - boxes[:, 0] - RULER).min() < MICROMETRE
+
+
+def test_the_same_layout_gives_the_same_bytes(sensor, drawing):
+    again = draw_layout(sensor, straight_leads(sensor))
+    assert to_dxf(again) == to_dxf(drawing)
+    assert to_svg(again) == to_svg(drawing)
+    assert not ezdxf.options.write_fixed_meta_data_for_testing
+
+
+def sampled(path):
+    return path[0] + np.linspace(0.0, 1.0, 2000)[:, None] * (path[1] - path[0])
+
+
+def test_leads_reach_the_rim_and_cross_nothing(sensor):
+    leads = straight_leads(sensor)
+    assert leads.without == ()
+    assert leads.summary == f"all {len(sensor.electrodes)} leads go straight to the rim"
+    for electrode in sensor.electrodes:
+        path = leads.paths[electrode.name]
+        assert np.hypot(*path[1]) == pytest.approx(sensor.film.radius)
+        assert path[0] == pytest.approx(np.array(electrode.centre))
+        for other in sensor.electrodes:
+            left, low, right, high = box(other.corners)
+            x, y = sampled(path).T
+            near = (x > left - 0.44) & (x < right + 0.44) & (y > low) & (y < high)
+            assert other is electrode or not near.any()
+    for first, second in combinations(leads.paths.values(), 2):
+        assert min(np.hypot(*(sampled(second) - point).T).min() for point in sampled(first)[::10]) > 0.59
+
+
+def test_an_electrode_without_a_straight_way_is_named():
+    """A ring of squares without gaps that are wide enough, and one in the middle."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+    ring = [Electrode.of_square(f"R{n}", (10.0 * np.cos(a), 10.0 * np.sin(a)), 2.7) for n, a in enumerate(angles)]
+    middle = Electrode.of_square("M", (0.0, 0.0), 3.0)
+    leads = straight_leads(replace(load_sensor("three-25um-biaxial"), electrodes=(middle, *ring)))
+    assert leads.without == ("M",)
+    assert leads.summary == "no straight way to the rim for M: lead them out on another layer"
