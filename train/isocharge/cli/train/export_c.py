@@ -3,6 +3,8 @@
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, NewFolderOption, board_of
 from isocharge.cli.shared.terminal import say, this_command
 from isocharge.common.files import refuse_existing
+from isocharge.serve import find_model
+from isocharge.train.export_c.folder import export_c
 
 
 def export_c_command(model: ModelArgument, output: NewFolderOption, device: DeviceOption = None) -> None:
@@ -15,8 +17,5 @@ def export_c_command(model: ModelArgument, output: NewFolderOption, device: Devi
     Example: isocharge train export-c four-25um-biaxial -o c
     """
     refuse_existing(output)
-    from isocharge.serve import find_model
-    from isocharge.train.export_c.folder import export_c
-
     folder = export_c(find_model(model), output, board_of(device), command=this_command())
     say(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")

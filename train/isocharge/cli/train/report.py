@@ -3,18 +3,19 @@
 import json as json_module
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from isocharge.cli.shared.measured_presses import read_presses_of
-from isocharge.cli.shared.options import NewFolderOption, ProbeOption
-from isocharge.cli.shared.terminal import progress, say, this_command
+from isocharge.cli.shared.options import FreshOption, JsonOption, NewFolderOption, ProbeOption
+from isocharge.cli.shared.terminal import say, shown_progress, this_command
 from isocharge.common.errors import InputError, ModelError
-from isocharge.common.files import refuse_existing
-
-if TYPE_CHECKING:
-    from isocharge.simulate import Dataset
+from isocharge.common.resumable_run import refuse_finished
+from isocharge.serve import find_model
+from isocharge.simulate import Dataset, load_sensor, parse_probe, read_dataset
+from isocharge.train.data.measured import dataset_of
+from isocharge.train.report import QUICK, Settings, write_report
 
 
 def report_command(
@@ -54,36 +55,29 @@ def report_command(
             "--quick", help="Try it on little data, in half a minute; the figures mean nothing. (default: all data)"
         ),
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the record, as in report.json. (default: no)")] = False,
+    fresh: FreshOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Compare a model with other methods: error (mm, % of force) against time (us), throughput and memory (bytes).
 
     All methods answer the same noisy presses. Measured presses are judged as they are, by a fifth that no method has
     seen: no simulator has a say, and what needs one is left out. --probe is what made the presses of PRESSES.csv.
 
-    It takes some minutes for a dataset of 24,000 presses. Let nothing else run meanwhile: times are measured.
+    It takes some minutes for a dataset of 24,000 presses. Let nothing else run meanwhile: times are measured. A report
+    that was stopped leaves DIR.part with its solves and limits; the same command goes on. --json prints report.json.
 
     Example: isocharge train report presses -o report
     """
-    refuse_existing(output)
+    refuse_finished(output)
     if model and len(model) != len(datasets):
         raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
-    from isocharge.serve import find_model
-    from isocharge.train.report import QUICK, Settings, write_report
-
     loaded = [_read(path, sensor, probe) for path in datasets]
     names = model or [dataset.sensor.name for dataset in loaded]
     subjects = [(dataset, find_model(name)) for dataset, name in zip(loaded, names, strict=True)]
     students = [find_model(name) for name in student] if student else _students_of(names)
-    with progress("report") as advance:
-        record = write_report(
-            output,
-            subjects,
-            QUICK if quick else Settings(),
-            students=students,
-            command=this_command(),
-            progress=advance,
-        )
+    settings, command = QUICK if quick else Settings(), this_command()
+    with shown_progress():
+        record = write_report(output, subjects, settings, students=students, command=command, fresh=fresh)
     for section in record["datasets"]:
         for sentence in section["verdict"]["sentences"]:
             say(f"{section['sensor']}: {sentence}")
@@ -94,8 +88,6 @@ def report_command(
 
 def _students_of(models: list[str]) -> list[Path]:
     """The students that are there, by name."""
-    from isocharge.serve import find_model
-
     students = []
     for model in models:
         with suppress(ModelError):
@@ -103,11 +95,8 @@ def _students_of(models: list[str]) -> list[Path]:
     return students
 
 
-def _read(path: Path, sensor: str | None, probe: str) -> "Dataset":
+def _read(path: Path, sensor: str | None, probe: str) -> Dataset:
     """A dataset folder, or a file of measured presses."""
-    from isocharge.simulate import load_sensor, parse_probe, read_dataset
-    from isocharge.train.data.measured import dataset_of
-
     if not path.is_file():
         return read_dataset(path)
     if sensor is None:
