@@ -23,29 +23,27 @@ from isocharge.serve import Predictor, find_model
 from isocharge.simulate import Sweep, read_dataset, run_sweep
 from isocharge.simulate.execution.workers import cores, local_workers
 from isocharge.simulate.numerics.statistics import rms
-from isocharge.train import FilmsConfig, FilmsModel, FitConfig, fit_network, read_films, train_films, write_film_model
-from isocharge.train.data.noise import with_noise
+from isocharge.train import FilmsConfig, FilmsModel, fit, fit_films, read_films, release, release_films
 from isocharge.train.data.presses import position_error
-from isocharge.train.release.release import predict_with
 
 SAMPLES = 24_000
 CALLS = 2000
 
 
 def one_film(films: FilmsModel, parameters: np.ndarray, seed: int) -> dict[str, Any]:
-    """Errors of both networks on the same presses of one film, each told or trained on that film."""
+    """Errors of both networks on the same presses of one film, each knowing or trained on that film."""
     sensor, probe = films.prior.film(parameters)
     with TemporaryDirectory() as folder:
-        sweep = Sweep(1e-3 * films.domain.radius_mm, films.domain.force_range_N, SAMPLES)
-        single = fit_network(read_dataset(run_sweep(Path(folder) / "presses", sensor, (probe,), sweep)), FitConfig())
-    presses, rng = single.held, np.random.default_rng(seed)
-    charge_pC = with_noise(presses.charge_pC, films.noise, rng)
-    answers = {"all films": films.fold(parameters).predict(charge_pC)[0], "alone": predict_with(single)(charge_pC)[0]}
+        sweep = Sweep(films.domain.radius, films.domain.force_range, SAMPLES)
+        single = fit(read_dataset(run_sweep(Path(folder) / "presses", sensor, (probe,), sweep)))
+    presses = single.test
+    charge = presses.noisy(films.noise, seed)
+    answers = {"all films": films.fold(parameters).predict(charge)[0], "alone": single.predict(charge)[0]}
     position = {name: rms(position_error(contact, presses.contact)) for name, contact in answers.items()}
     force = {name: 100.0 * rms(c[:, 2] / presses.contact[:, 2] - 1.0) for name, c in answers.items()}
     return {
-        "pretension_MPa": 1e-6 * float(parameters[0]),
-        "radius_mm": single.network.domain.radius_mm,
+        "pretension_MPa": float(parameters[0]),
+        "radius_mm": single.domain.radius,
         "presses": len(presses),
         "position_rms_mm": position,
         "force_rms_percent": force,
@@ -75,16 +73,16 @@ def folding_time(films: FilmsModel, parameters: np.ndarray) -> float:
     with TemporaryDirectory() as folder:
         for number in range(3):
             begin = time.perf_counter()
-            write_film_model(films, parameters, Path(folder) / "mine", card="", version=number + 1)
+            release(films.film(parameters), Path(folder) / "mine", version=number + 1)
             times.append(time.perf_counter() - begin)
     return min(times)
 
 
 def training_time(films: FilmsModel, folder: Path) -> float:
     """From nothing to a released folder, s, in a process for each core."""
-    config, begin = FilmsConfig(radius=1e-3 * films.domain.radius_mm), time.perf_counter()
-    with local_workers(cores()) as workers:
-        train_films(films.prior, folder, config, map_jobs=workers.in_order)
+    config, begin = FilmsConfig(radius=films.domain.radius), time.perf_counter()
+    with local_workers(cores()) as executor:
+        release_films(fit_films(films.prior, config, executor=executor), folder)
     return time.perf_counter() - begin
 
 
@@ -116,7 +114,7 @@ def main() -> None:
 def summary(record: dict[str, Any]) -> str:
     """The record as lines for people."""
     lines = [
-        f"{film['pretension_MPa']:.2f} MPa: {film['position_rms_mm']['all films']:.4f} mm told the film, "
+        f"{film['pretension_MPa']:.2f} MPa: {film['position_rms_mm']['all films']:.4f} mm knowing the film, "
         f"{film['position_rms_mm']['alone']:.4f} mm trained on it ({film['position_ratio']:.3f}); force "
         f"{film['force_rms_percent']['all films']:.3f} and {film['force_rms_percent']['alone']:.3f} % "
         f"({film['force_ratio']:.3f})"
