@@ -1,0 +1,97 @@
+"""What every map from contacts to charges keeps: derivatives, domain, names."""
+
+import numpy as np
+import pytest
+
+from isocharge.common.errors import ChargeError, SceneError
+from isocharge.simulate import ChargeMap, Domain, FunctionMap
+from isocharge.simulate.forward.charge_map import differences, within
+from isocharge.simulate.forward.checks import as_charges, check_forces, check_radius
+from isocharge.simulate.numerics.disk import sunflower
+
+DOMAIN = Domain(5.0, (0.1, 2.0))
+
+
+def linear(contact: np.ndarray) -> np.ndarray:
+    """Two charges with known derivatives: x + 2 y + 3 ln F and x y."""
+    x, y, force = contact.T
+    return np.stack([x + 2.0 * y + 3.0 * np.log(force), x * y], axis=1)
+
+
+CHECKED = ("forward map", "spline", "film family")
+"""Maps that refuse contacts outside their domain; others state it and leave the rest to the function."""
+
+
+@pytest.fixture
+def charge_map(request, three_map, three_spline, film_family) -> ChargeMap:
+    prior, family = film_family
+    return {
+        "forward map": three_map,
+        "spline": three_spline,
+        "film family": family.forward_map(*prior.film(prior.mean)),
+        "within": within(three_spline, 4.0),
+        "function": FunctionMap(linear, ("A", "B"), DOMAIN),
+    }[request.param]
+
+
+def contacts(domain: Domain, count: int = 60, share: float = 0.97) -> np.ndarray:
+    """Evenly over the disk, and over the forces in the logarithm."""
+    at, unit = share * sunflower(count), np.linspace(-share, share, count)
+    return domain.to_contact(np.stack([at.real, at.imag, unit], axis=1))
+
+
+@pytest.mark.parametrize("charge_map", [*CHECKED, "within", "function"], indirect=True)
+def test_a_map_keeps_the_protocol(charge_map):
+    contact = contacts(charge_map.domain)
+    charge, slope = charge_map.charges(contact), charge_map.derivatives(contact)
+    assert charge.shape == (60, len(charge_map.electrodes))
+    assert slope.shape == (*charge.shape, 3)
+    step = np.array([[1e-3, 0.0, 0.0], [0.0, 1e-3, 0.0]])
+    for axis in range(3):
+        if axis < 2:
+            ahead, behind, width = contact + step[axis], contact - step[axis], 2e-3
+        else:
+            ahead, behind, width = contact * [1.0, 1.0, np.exp(1e-4)], contact * [1.0, 1.0, np.exp(-1e-4)], 2e-4
+        expected = (charge_map.charges(ahead) - charge_map.charges(behind)) / width
+        np.testing.assert_allclose(slope[..., axis], expected, atol=2e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("charge_map", CHECKED, indirect=True)
+def test_outside_is_refused_with_the_limits(charge_map):
+    radius, (low, high) = charge_map.domain.radius, charge_map.domain.force_range
+    inside, limits = [0.0, 0.0, low], rf"at most {radius:g} mm from the centre and {low:g} to {high:g} N"
+    for outside in ([1.01 * radius, 0.0, low], [0.0, 0.0, 1.01 * high], [0.0, 0.0, 0.99 * low], [np.nan, 0.0, low]):
+        for ask in (charge_map.charges, charge_map.derivatives):
+            with pytest.raises(SceneError, match=rf"^press 1 at .* outside the .* {limits}"):
+                ask(np.array([inside, outside]))
+
+
+def test_differences_are_exact_for_second_order():
+    contact = contacts(DOMAIN)
+    slope = differences(linear, contact)
+    np.testing.assert_allclose(slope[:, 0], np.tile([1.0, 2.0, 3.0], (60, 1)), rtol=1e-9)
+    x, y, _ = contact.T
+    np.testing.assert_allclose(slope[:, 1], np.stack([y, x, 0.0 * x], axis=1), atol=1e-10)
+
+
+def test_a_domain_scales_to_the_unit_ball_and_back_and_takes_its_own_edge():
+    contact = contacts(DOMAIN, share=1.0)
+    unit = DOMAIN.to_unit(contact)
+    assert np.abs(unit[:, 2]).max() <= 1.0 + 1e-12
+    np.testing.assert_allclose(DOMAIN.to_contact(unit), contact, rtol=1e-12)
+    for rounding in (1.0 - 1e-12, 1.0 + 1e-12):
+        DOMAIN.check(np.array([[3.0, 4.0, 2.0], [0.0, 0.0, 0.1]]) * rounding, "map")
+        check_forces(np.array(DOMAIN.force_range) * rounding, DOMAIN.force_range, "map")
+        check_radius(5.0 * rounding, 5.0, "map")
+
+
+def test_what_a_user_gives_is_refused_by_name():
+    with pytest.raises(SceneError, match=r"^force: expected 0\.1 to 2 N, which the map covers, got 3 N$"):
+        check_forces(3.0, (0.1, 2.0), "map")
+    with pytest.raises(SceneError, match=r"^force of press 1: .* got 3 N$"):
+        check_forces(np.array([1.0, 3.0]), (0.1, 2.0), "map")
+    assert as_charges(np.ones((2, 3), dtype=np.float32), ("A", "B", "C")).dtype == np.float64
+    with pytest.raises(ChargeError, match=r"shape \(n, 3\) for \('A', 'B', 'C'\), got shape \(3,\)"):
+        as_charges(np.ones(3), ("A", "B", "C"))
+    with pytest.raises(ChargeError, match="charge of 'B' in press 0: expected a finite number, got nan"):
+        as_charges(np.array([[1.0, np.nan]]), ("A", "B"))
