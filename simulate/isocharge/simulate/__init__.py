@@ -27,6 +27,8 @@ with require("simulate"):
     from isocharge.simulate.identifiability.cramer_rao import limits_at
     from isocharge.simulate.identifiability.identification import identify
     from isocharge.simulate.identifiability.working_area import working_area
+    from isocharge.simulate.layout.case import DesignCase
+    from isocharge.simulate.layout.design import design
     from isocharge.simulate.measuring_chain.amplifier import Amplifier
     from isocharge.simulate.measuring_chain.noise import NoiseModel
     from isocharge.simulate.measuring_chain.noise_file import load_amplifier, noise_model
@@ -49,6 +51,7 @@ __all__ = [
     "ChargeSpline",
     "Circle",
     "Dataset",
+    "DesignCase",
     "Domain",
     "Electrode",
     "Equilibrium",
@@ -70,6 +73,7 @@ __all__ = [
     "built_in_sensors",
     "dask_workers",
     "deflection",
+    "design",
     "identify",
     "limits_at",
     "load_amplifier",
