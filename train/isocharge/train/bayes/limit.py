@@ -21,7 +21,6 @@ from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.train.bayes.posterior import Posterior
-from isocharge.train.data.presses import position_error
 
 PRESSES = 4000
 """Test presses of `bayes_limit`: the rms is then known to 3 %, its ratio to an estimator's on the same ones better."""
@@ -74,7 +73,7 @@ class BayesLimit:
     @classmethod
     def of(cls, contact: Array, std: Array, truth: Array) -> "BayesLimit":
         """From estimates, their standard deviations and the true contacts (x, y, F), each (n, 3), mm and N."""
-        position = position_error(contact, truth)
+        position = np.hypot(*(contact - truth)[:, :2].T)
         force = 100.0 * (contact[:, 2] / truth[:, 2] - 1.0)
         return cls(
             presses=len(truth),
