@@ -120,15 +120,6 @@ def test_messages_of_loggers_are_lines_too(lines):
     assert not any("sesame" in line for line in lines)
 
 
-def test_internal_errors_are_marked(app, lines, monkeypatch):
-    monkeypatch.setattr(app.handler, "_route", lambda _: 1 / 0)
-    monkeypatch.setattr(app.handler, "label", lambda _: "/")
-    monkeypatch.setattr(app.handler, "model_label", lambda _: None)
-    app.answer("GET", "/", bearer(), b"")
-    line = json.loads(lines[-1])
-    assert (line["level"], line["status"], line["error"]) == ("error", 500, "ZeroDivisionError")
-
-
 def test_calls_of_grpc_are_lines(app, lines):
     with (
         grpc_server(app.handler, "127.0.0.1", 0, Token(SECRET)) as url,

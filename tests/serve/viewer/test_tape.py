@@ -64,9 +64,3 @@ def test_overview_has_the_largest_force_of_each_piece(recorded):
     assert len(overview) <= PIECES
     assert overview.index(1.5) / len(overview) == pytest.approx(0.5, abs=0.01)
     assert sum(force > 0 for force in overview) == 1
-
-
-def test_a_leap_in_time_costs_no_memory(recorded):
-    tape = recorded
-    tape.append(samples([0.0, 1e11], [1.0, 2.0]))
-    assert len(tape.overview()) <= PIECES

@@ -126,13 +126,6 @@ def test_half_a_connection_is_enough_for_answers(server, requests):
         sender.join()
 
 
-def test_half_a_request_and_half_a_connection(server):
-    with connect(server) as connection:
-        connection.sendall(infer()[:-3])
-        connection.shutdown(socket.SHUT_WR)
-        assert everything(connection) == b""
-
-
 @pytest.fixture
 def certificate(tmp_path):
     authority = trustme.CA()
