@@ -11,48 +11,46 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from isocharge.simulate import noise_model
-from isocharge.train.baselines import FittingTask
-from isocharge.train.data.domain import ContactDomain
-from isocharge.train.data.presses import LabelledPresses
+from isocharge.simulate import Domain, noise_model
+from isocharge.train.baselines.rival import FittingTask
+from isocharge.train.data.presses import LabelledPresses, draw_contacts
 
-DOMAIN = ContactDomain(8.0, (0.05, 2.0))
+DOMAIN = Domain(8.0, (0.05, 2.0))
 
 
 @dataclass(frozen=True)
 class KnownMap:
     """Charges and their inverse."""
 
-    electrodes: int
+    count: int
     level: float = np.log(800.0)
     slope: float = 0.05
-    bend_mm: float = 8.0
+    bend: float = 8.0
     quadratic: float = 0.003
 
     @property
     def directions(self):
-        angle = 2.0 * np.pi * np.arange(self.electrodes) / self.electrodes
+        angle = 2.0 * np.pi * np.arange(self.count) / self.count
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
-    def charge_pC(self, contact):
-        bent = self.bend_mm * np.sinh(contact[:, :2] / self.bend_mm)
-        sign = np.array([1.0, -1.0, 1.0, -1.0]) if self.electrodes == 4 else np.zeros(self.electrodes)
+    def charges(self, contact):
+        bent = self.bend * np.sinh(contact[:, :2] / self.bend)
+        sign = np.array([1.0, -1.0, 1.0, -1.0]) if self.count == 4 else np.zeros(self.count)
         square = self.quadratic * (bent**2).sum(axis=1)[:, None] * sign
         return np.exp(self.level + 2.0 / 3.0 * np.log(contact[:, 2:]) + self.slope * bent @ self.directions.T + square)
 
-    def contact(self, charge_pC):
-        logs = np.log(charge_pC)
+    def contacts(self, charge):
+        logs = np.log(charge)
         mean = logs.mean(axis=1, keepdims=True)
-        bent = (logs - mean) @ self.directions / (0.5 * self.electrodes * self.slope)
-        position = self.bend_mm * np.arcsinh(bent / self.bend_mm)
-        return np.column_stack([position, np.exp(1.5 * (mean - self.level))])
+        bent = (logs - mean) @ self.directions / (0.5 * self.count * self.slope)
+        return np.column_stack([self.bend * np.arcsinh(bent / self.bend), np.exp(1.5 * (mean - self.level))])
 
     def presses(self, count, seed):
-        rng = np.random.default_rng(seed)
-        radius, angle = DOMAIN.radius_mm * np.sqrt(rng.random(count)), 2.0 * np.pi * rng.random(count)
-        force = np.exp(rng.uniform(*np.log(DOMAIN.force_range_N), count))
-        contact = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force])
-        return LabelledPresses(contact, self.charge_pC(contact))
+        contact = draw_contacts(np.random.default_rng(seed), DOMAIN, count)
+        return LabelledPresses(contact, self.charges(contact))
+
+    def task(self, quick=True):
+        return FittingTask(self.presses(3000, 1), self.presses(500, 2), DOMAIN, noise_model("reference"), quick=quick)
 
 
 @pytest.fixture(scope="session", params=[3, 4])
@@ -62,9 +60,7 @@ def known(request):
 
 @pytest.fixture(scope="session")
 def task(known):
-    return FittingTask(
-        known.presses(3000, 1), known.presses(500, 2), DOMAIN, noise_model("reference"), copies=2, quick=True
-    )
+    return known.task()
 
 
 @pytest.fixture(scope="session")

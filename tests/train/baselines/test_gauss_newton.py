@@ -1,72 +1,82 @@
-"""Gauss-Newton against SciPy, finite differences and a search on a dense grid."""
+"""Gauss-Newton against SciPy and a dense grid, on its series and on any charge map; triangulation on clean charges."""
 
 import numpy as np
 import pytest
-from scipy.optimize import approx_fprime
+from scipy.optimize import least_squares
+from tests.train.baselines.conftest import DOMAIN
 
-from isocharge.train.baselines import GaussNewton
-from isocharge.train.data.noise import noisy_charges
+from isocharge.simulate import ChargeSpline, FunctionMap, noise_model
+from isocharge.train.baselines.gauss_newton import GaussNewton
+from isocharge.train.baselines.triangulation import Triangulate
+from isocharge.train.data.presses import LabelledPresses, position_error
+
+NOISE = noise_model("reference")
 
 
 @pytest.fixture(scope="module")
-def fits(task):
-    return GaussNewton().fit(task)
+def search(known, task):
+    """On the map itself, with derivatives by finite differences."""
+    charge_map = FunctionMap(known.charges, tuple("ABCD"[: known.count]), DOMAIN)
+    return GaussNewton(DOMAIN, NOISE, charge_map).fit(task.train.charge, task.train.contact)
 
 
-def test_slopes_by_finite_differences(fits, known):
-    problem = fits[1].problem
-    charge = np.full(known.electrodes, 700.0)
-    sigma = problem.sigma(charge)
-    for unit in np.array([[0.1, -0.3, 0.2], [0.72, -0.71, 0.4], [0.3, 0.4, -0.9]]):
-        slopes = problem.residuals(unit, charge, sigma)[1]
-        expected = approx_fprime(unit, lambda at: problem.residuals(at, charge, sigma)[0], 1e-7)
-        np.testing.assert_allclose(slopes.T, expected, rtol=1e-3, atol=0.1)
+def cost(known, charge, contact):
+    return (((known.charges(contact) - charge) / NOISE.sigma(charge)) ** 2).sum(axis=1)
 
 
-def test_known_charges_of_the_fitted_map(fits, test_presses):
-    charge, _ = fits[1].problem.known(fits[1].domain.to_unit(test_presses.contact))
-    np.testing.assert_allclose(charge, test_presses.charge_pC, rtol=1e-3)
+def scipy_cost(known, charge, start):
+    """The least sum of squares by scipy, in polar coordinates, where the domain is a box."""
+
+    def residuals(polar):
+        contact = np.array([[polar[0] * np.cos(polar[1]), polar[0] * np.sin(polar[1]), np.exp(polar[2])]])
+        return ((known.charges(contact) - charge) / NOISE.sigma(charge))[0]
+
+    polar = [np.hypot(*start[:2]), np.arctan2(start[1], start[0]), np.log(start[2])]
+    bounds = ([0.0, -np.inf, np.log(0.05)], [8.0, np.inf, np.log(2.0)])
+    return 2.0 * least_squares(residuals, np.clip(polar, *bounds), bounds=bounds, x_scale="jac", xtol=1e-10).cost
 
 
-def costs_of(fits, task, charge):
-    problem, sigma = fits[1].problem, fits[1].problem.sigma(charge)
-    units = [task.domain.to_unit(form.predict(charge)) for form in fits]
-    return [(problem.residuals(unit, charge, sigma)[0] ** 2).sum(axis=1) for unit in units]
+def test_the_same_minimum_as_scipy_finds(search, known):
+    presses = known.presses(60, 7)
+    charge = presses.noisy(NOISE, 8)
+    expected = [scipy_cost(known, row[None], start) for row, start in zip(charge, presses.contact, strict=True)]
+    np.testing.assert_allclose(cost(known, charge, search.predict(charge)), expected, rtol=1e-3, atol=1e-3)
 
 
-def test_the_same_minimum_as_scipy_finds(fits, task, known):
-    charge = noisy_charges(known.presses(200, 7), task.noise, 8)
-    library, plain = costs_of(fits, task, charge)
-    np.testing.assert_allclose(plain, library, rtol=1e-3, atol=1e-3)
-
-
-def test_the_same_minimum_on_the_edge(fits, task, known):
-    contact = known.presses(100, 11).contact
+def test_the_same_minimum_on_the_edge(search, known):
+    contact = known.presses(40, 11).contact
     contact[:, :2] *= (8.0 * 1.02 / np.hypot(contact[:, 0], contact[:, 1]))[:, None]
     contact[::3, 2] = 2.05
-    library, plain = costs_of(fits, task, known.charge_pC(contact))
-    assert np.median(library) > 1.0
-    np.testing.assert_allclose(plain, library, rtol=0.01, atol=0.01)
+    charge = known.charges(contact)
+    expected = [scipy_cost(known, row[None], start) for row, start in zip(charge, contact, strict=True)]
+    assert np.median(expected) > 1.0
+    found = search.predict(charge)
+    np.testing.assert_allclose(cost(known, charge, found), expected, rtol=0.01, atol=0.01)
+    assert np.hypot(*found[:, :2].T).max() <= 8.0 + 1e-9
+    assert found[:, 2].max() <= 2.0 + 1e-9
 
 
-def test_no_contact_of_a_dense_grid_fits_better(fits, task, known):
-    presses = known.presses(5, 9)
-    charge = noisy_charges(presses, task.noise, 10)
-    plain = fits[1]
-    found = task.domain.to_unit(plain.predict(charge))
+def test_no_contact_of_a_dense_grid_fits_better(search, known):
+    charge = known.presses(5, 9).noisy(NOISE, 10)
     steps = np.stack(np.meshgrid(*[np.linspace(-0.05, 0.05, 21)] * 3), axis=-1).reshape(-1, 3)
-    for number, row in enumerate(charge):
-        sigma = plain.problem.sigma(row)
-        around = found[number] + steps
-        around = around[(np.hypot(around[:, 0], around[:, 1]) <= 1.0) & (np.abs(around[:, 2]) <= 1.0)]
-        costs = (plain.problem.residuals(around, row, sigma)[0] ** 2).sum(axis=1)
-        best = (plain.problem.residuals(found[number], row, sigma)[0] ** 2).sum()
-        assert best <= costs.min() + 1e-6
+    for row, found in zip(charge, search.predict(charge), strict=True):
+        around = DOMAIN.to_contact(DOMAIN.to_unit(found[None]) + steps)
+        around = around[(np.hypot(*around[:, :2].T) <= 8.0) & (np.abs(np.log(around[:, 2] / 0.3162)) <= np.log(40) / 2)]
+        assert cost(known, row, found[None])[0] <= cost(known, row, around).min() + 1e-6
 
 
-def test_answers_stay_in_the_domain(fits, known):
-    absurd = known.charge_pC(np.array([[7.9, 0.0, 1.9]])) * np.array([[0.5, *[3.0] * (known.electrodes - 1)]])
-    for form in fits:
-        x, y, force = form.predict(absurd)[0]
-        assert np.hypot(x, y) <= 8.0 + 1e-9
-        assert 0.05 - 1e-9 <= force <= 2.0 + 1e-9
+def test_its_own_series_answers_as_the_map_itself(search, known, task):
+    series = GaussNewton(DOMAIN, NOISE).fit(task.train.charge, task.train.contact)
+    charge = known.presses(200, 12).noisy(NOISE, 13)
+    assert np.median(position_error(series.predict(charge), search.predict(charge))) < 0.002
+
+
+def test_triangulation_finds_clean_presses(dataset, film):
+    spline, presses = ChargeSpline.of(film), LabelledPresses.of(dataset)[np.arange(60)]
+    for given in (False, True):
+        method = Triangulate(spline, given_force=given).fit(presses.charge, presses.contact)
+        inputs = np.column_stack([presses.charge, presses.contact[:, 2]]) if given else presses.charge
+        contact = method.predict(inputs)
+        found = np.isfinite(contact[:, 0])
+        assert found.mean() > 0.8
+        assert np.median(position_error(contact[found], presses.contact[found])) < 0.02

@@ -1,9 +1,11 @@
-"""Figures of merit against scikit-learn, SciPy and brute force."""
+"""Figures of merit against scikit-learn, SciPy and brute force; the computed sentences on made-up methods."""
 
 import numpy as np
+import pytest
 from sklearn.metrics import root_mean_squared_error
 
-from isocharge.train.report.measures import Errors, coverage, pareto, rounded
+from isocharge.train.report.measures import Errors, MethodRecord, coverage, pareto
+from isocharge.train.report.verdict import verdict
 
 
 def contacts(count, seed):
@@ -22,7 +24,6 @@ def test_errors_by_scikit_learn():
     distances = sorted(np.linalg.norm((found - truth)[:, :2], axis=1))
     assert distances[248] <= figures.position_median_mm <= distances[251]
     assert distances[473] <= figures.position_p95_mm <= distances[475] * 1.001
-    assert figures.answered == 1.0
 
 
 def test_presses_without_an_answer_do_not_count():
@@ -59,7 +60,24 @@ def test_true_deviations_cover_their_level():
     assert (too_small < levels[:, None] - 0.03).all()
 
 
-def test_numbers_for_the_record():
-    assert rounded(0.123456) == 0.1235
-    assert rounded(np.nan) is None
-    assert rounded(None) is None
+def method(name, kind, error, p50, *, per_second=1e5, given=False, answered=1.0):
+    errors = Errors(error, error, error, 1.0, 1.0, answered)
+    times = {"p50_us": p50, "p95_us": p50, "p50_of_rounds_us": (p50, p50), "per_second": per_second}
+    return MethodRecord(name, "NumPy", kind, "", given, errors, None, None, **times, memory_bytes=1, fit_seconds=0.0)
+
+
+@pytest.mark.parametrize(
+    ("others", "both", "sentence"),
+    [
+        ([("near", "learnt", 0.21, 5.0)], [], "near (NumPy) (2 times as fast, 5 % more error)"),
+        ([("slow", "learnt", 0.3, 20.0)], [], "none of 1 other methods is faster"),
+        ([("better", "paper", 0.19, 4.0)], ["better (NumPy)"], "better (NumPy) (2.5 times as fast, 5 % less error)"),
+        ([("small", "network", 0.19, 5.0)], ["small (NumPy)"], "networks that give the contact alone"),
+    ],
+)
+def test_what_is_faster_or_more_accurate_is_said(others, both, sentence):
+    released = method("released", "network", 0.2, 10.0)
+    silent = [method("given", "paper", 0.1, 1.0, given=True), method("rarely", "paper", 0.1, 1.0, answered=0.9)]
+    said = verdict([released, *silent, *(method(*other) for other in others)])
+    assert said["both"]["latency"] == both
+    assert sentence in said["sentences"][0]

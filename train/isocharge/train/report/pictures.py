@@ -56,7 +56,8 @@ def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: Mapping[str,
     markers = {kind: cycle(MARKERS) for kind in KINDS}
     for record in sorted(shown, key=lambda record: record.error_mm):
         colour, hollow = KINDS[record.kind], record.force_given or record.errors.answered < 1.0
-        style: dict[str, Any] = {"color": colour, "mfc": "white" if hollow else colour, "marker": next(markers[record.kind]), "ms": 7}
+        marker, fill = next(markers[record.kind]), "white" if hollow else colour
+        style: dict[str, Any] = {"color": colour, "mfc": fill, "marker": marker, "ms": 7}
         if record.name == RELEASED:
             style |= {"color": FELT, "mfc": FELT, "marker": "*", "ms": 14}
         axes.plot(record.cost(plot), record.error_mm, ls="", label=f"{record.name}, {record.error_mm:.3g} mm", **style)
