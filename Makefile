@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 
 # Tests that measure time, or wait for a port to come back: one at a time. All others share the cores, a file a worker;
 # some wait for processes that they started, so there is a worker more than the two cores that we count on.
-ALONE := tests/serve/live tests/serve/port tests/serve/virtual_sensor tests/serve/test_end_to_end.py tests/test_live.py tests/test_bench.py
+ALONE := tests/serve/live tests/serve/port tests/serve/virtual_sensor tests/serve/test_end_to_end.py tests/test_live.py tests/test_press_session.py
 # The file whose tests take longest goes first, so that no core waits for it at the end.
 FIRST := tests/test_pages.py
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, read_presses, write_presses
-from isocharge.serve.prediction import csv_numbers, measured_presses
-from isocharge.serve.prediction.measured_presses import KINDS, parse_presses
+from isocharge.serve.prediction import measured_presses
+from isocharge.serve.prediction.csv_numbers import LARGEST
+from isocharge.serve.prediction.measured_presses import KINDS, read_press_list
 
 NAMES = ("A", "B", "C")
 HEADER = "x_mm,y_mm,force_N,A,B,C"
@@ -53,8 +54,24 @@ def test_the_same_press_from_every_kind_of_file(read, text):
     assert read(text) == read(f"{HEADER}\n1,2,0.5,10,20,30\n")
 
 
-def test_columns_that_are_neither_are_named(read):
+def test_without_names_all_other_columns_are_electrodes(read, tmp_path):
+    text = "force_N,A,y_mm,x_mm,C\n0.5,10,2,1,30\n"
+    (tmp_path / "all.csv").write_text(text)
+    presses = read_presses(tmp_path / "all.csv")
+    assert (presses.electrodes, presses.charge_pC.tolist(), presses.ignored) == (("A", "C"), [[10.0, 30.0]], ())
+    assert presses.of_electrodes(("C", "A"), "mine").charge_pC.tolist() == [[30.0, 10.0]]
+    with pytest.raises(PressError, match=r"electrodes \('A', 'B'\) of mine, got \('A', 'C'\); missing: 'B'"):
+        presses.of_electrodes(("A", "B"), "mine")
     assert read("day,x_mm,y_mm,note,A,B,C\n1,2,3,a,4,5,6\n").ignored == ("day", "note")
+
+
+def test_a_list_of_presses_for_a_machine(tmp_path):
+    (tmp_path / "list.csv").write_text("n,x_mm,y_mm,force_N\n1,2,-3,0.5\n2,,,1\n")
+    nan = np.nan
+    np.testing.assert_array_equal(read_press_list(tmp_path / "list.csv"), [[2.0, -3.0, 0.5], [nan, nan, 1.0]])
+    (tmp_path / "list.csv").write_text("x_mm,y_mm,force_N\n1,1,1\n1,1,-1\n")
+    with pytest.raises(PressError, match=r"list\.csv, line 3, column 'force_N': expected a positive force"):
+        read_press_list(tmp_path / "list.csv")
 
 
 def test_unknown_values(read):
@@ -97,12 +114,9 @@ def test_rows(read):
         ("x_mm,y_mm,force_N,A,C\n1,2,3,4,5\n", "got the header .*; missing: 'B'$"),
         (f"{HEADER},B\n1,2,3,4,5,6,7\n", "got the header .*; repeated: 'B'$"),
         (f"{HEADER},force_N\n1,2,3,4,5,6,7\n", "repeated: 'force_N'$"),
-        ("x_mm,A,B,C\n1,2,3,4\n", r"expected the columns x_mm and y_mm, or neither, .* add 'y_mm'"),
-        ("y_mm,A,B,C\n1,2,3,4\n", "add 'x_mm'"),
+        ("x_mm,A,B,C\n1,2,3,4\n", "line 2: expected both x_mm and y_mm"),
         (f"{HEADER}\n1,,3,4,5,6\n", "line 2: expected both x_mm and y_mm, or two empty cells"),
         (f"{HEADER}\n1,2,3,4,5,6\n1,2,x,4,5,6\n", "line 3, column 'force_N': expected a positive force in N.*got 'x'"),
-        (f"{HEADER}\n1,2,1_0,4,5,6\n", "line 2, column 'force_N': .* got '1_0'"),
-        (f"{HEADER}\n1,2,\u0661,4,5,6\n", "column 'force_N': .* got '\u0661'"),
         (f"{HEADER}\n1,inf,3,4,5,6\n", "line 2, column 'y_mm': expected a position in mm.*got 'inf'"),
         (f"{HEADER}\n1,1e999,3,4,5,6\n", "line 2, column 'y_mm': .*got '1e999'"),
         (f"{HEADER}\n1,2,3,nan,5,6\n", "line 2, column 'A': expected a charge in pC, got 'nan'"),
@@ -141,16 +155,8 @@ def test_the_command_of_the_message_repairs_the_file(read, tmp_path, shell):
 
 @pytest.mark.parametrize(
     "text",
-    [
-        ",".join(["x" * 90] * 1000),
-        ",".join(["x"] * 1001),
-        "x" * 1_000_000,
-        HEADER + "\n" + "1," * 40_000,
-        HEADER + "\n" + "1" * 90_000 + ",2,3,4,5,6",
-        HEADER + '\n"' + "1\n" * 100_000,
-        ",".join(["A"] * 900),
-    ],
-    ids=["header", "columns", "line", "cells", "digits", "open quote", "repeated"],
+    [",".join(["x"] * 1001), "x" * 2_000_000, HEADER + '\n"' + "1\n" * 100_000, ",".join(["A"] * 900)],
+    ids=["columns", "line", "open quote", "repeated"],
 )
 def test_absurd_sizes_are_refused_in_short(read, text):
     with pytest.raises(PressError) as caught:
@@ -165,24 +171,17 @@ def test_too_many_presses(monkeypatch, read):
         read(HEADER + "\n1,2,3,4,5,6" * 4)
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"position_std_mm": 0.0}, "position_std_mm: expected a positive standard deviation in mm, got 0.0"),
-        ({"position_std_mm": float("nan")}, "position_std_mm: .* got nan"),
-        ({"force_std": -0.1}, "force_std: expected a positive share"),
-        ({"force_std": 1.5}, "force_std: .* got 1.5"),
-    ],
-)
-def test_defaults_that_are_refused(read, options, said):
-    with pytest.raises(PressError, match=said):
-        read(f"{HEADER}\n1,2,3,4,5,6\n", **options)
+def test_defaults_that_are_refused(read):
+    for options in ({"position_std_mm": 0.0}, {"force_std": float("nan")}, {"force_std": 1.5}):
+        with pytest.raises(PressError, match="expected a positive s"):
+            read(f"{HEADER}\n1,2,3,4,5,6\n", **options)
 
 
 @pytest.mark.parametrize("names", [(), ("A", "A"), ("",), ("force_N",), ("force_std", "A"), ("A\nB",)])
-def test_electrodes_that_cannot_be_columns(names):
+def test_electrodes_that_cannot_be_columns(names, tmp_path):
+    (tmp_path / "presses.csv").write_text("x_mm,y_mm,A\n1,2,3\n")
     with pytest.raises(PressError, match="electrode"):
-        parse_presses(["x_mm,y_mm,A\n", "1,2,3\n"], names, "presses.csv")
+        read_presses(tmp_path / "presses.csv", names)
 
 
 @pytest.mark.parametrize("name", ["nowhere.csv", "."])
@@ -199,8 +198,8 @@ def test_shapes_that_disagree():
 
 # Round trips
 
-FINITE = st.floats(-csv_numbers.LARGEST, csv_numbers.LARGEST)
-POSITIVE = st.floats(0.0, csv_numbers.LARGEST, exclude_min=True)
+FINITE = st.floats(-LARGEST, LARGEST)
+POSITIVE = st.floats(0.0, LARGEST, exclude_min=True)
 TEXT = st.text(st.characters(codec="utf-8"), min_size=1, max_size=8)
 
 
@@ -229,9 +228,6 @@ def test_what_is_written_is_read(presses, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "written.csv"
     write_presses(path, presses)
     assert read_presses(path, presses.electrodes) == presses
-    text = io.StringIO()
-    write_presses(text, presses)
-    assert text.getvalue().encode() == path.read_bytes()
 
 
 def test_a_written_file_is_plain_csv(read):

@@ -46,7 +46,9 @@ def test_five_presses_make_a_film_known_as_well_as_their_plan_says(problem, plan
     result, session = bench.session.result, bench.session
     assert result.left.position_mm < 2.0 * plan[4].position_mm
     unit = (result.posterior.parameters - bench.parameters) / problem.prior.std
-    assert unit @ np.linalg.solve(result.posterior.covariance, unit) < 40.0  # 13 parameters: one film in 4000 is farther
+    assert (
+        unit @ np.linalg.solve(result.posterior.covariance, unit) < 40.0
+    )  # 13 parameters: one film in 4000 is farther
     assert f"{result.left.position_mm:.2g} mm and {result.left.force_percent:.2g} % are left" in session.summary[0]
     alone = calibrate(bench.saved[-1], problem)
     np.testing.assert_array_equal(alone.posterior.parameters, result.posterior.parameters)

@@ -2,23 +2,15 @@
 
 import numpy as np
 import pytest
+from tests.train.rig.conftest import systematic
 
+from isocharge.simulate.forward.charge_map import Domain
+from isocharge.train.data.presses import draw_contacts
 from isocharge.train.rig.correction import Residuals, fit_correction
 
-RNG_SEEDS = range(4)
 
-
-def contacts(rng, count, radius_mm=8.0):
-    radius, angle = radius_mm * np.sqrt(rng.random(count)), 2.0 * np.pi * rng.random(count)
-    return np.column_stack(
-        [radius * np.cos(angle), radius * np.sin(angle), np.exp(rng.uniform(np.log(0.05), np.log(2.0), count))]
-    )
-
-
-def planted(contact):
-    """3 % times smooth functions of place, another for each electrode."""
-    x, y, _ = contact.T
-    return 0.03 * np.column_stack([np.sin(x / 4 + k) * np.cos(y / 5) for k in range(4)])
+def contacts(rng, count, radius=8.0):
+    return draw_contacts(rng, Domain(radius, (0.05, 2.0)), count)
 
 
 def residuals(seed, count, truth, std=0.004):
@@ -31,18 +23,18 @@ def residuals(seed, count, truth, std=0.004):
     return Residuals(contact, truth(contact) + noise, covariance)
 
 
-@pytest.mark.parametrize("seed", RNG_SEEDS)
+@pytest.mark.parametrize("seed", range(4))
 def test_a_planted_correction_comes_back(seed):
-    correction = fit_correction(residuals(seed, 200, planted))
+    correction = fit_correction(residuals(seed, 200, systematic))
     fresh = contacts(np.random.default_rng(100 + seed), 1000, 7.5)
-    left = correction.log_factor(fresh) - planted(fresh)
-    assert np.sqrt(np.mean(left**2)) < 0.25 * np.sqrt(np.mean(planted(fresh) ** 2))
+    left = correction.log_factor(fresh) - systematic(fresh)
+    assert np.sqrt(np.mean(left**2)) < 0.25 * np.sqrt(np.mean(systematic(fresh) ** 2))
     assert 4.0 < correction.freedom < 200.0
 
 
 def test_noise_alone_is_not_corrected():
     """At two standard errors, at most one of ten draws may look like a correction; then a tiny one."""
-    corrections = [fit_correction(residuals(seed, 60, lambda contact: 0.0 * planted(contact))) for seed in range(10)]
+    corrections = [fit_correction(residuals(seed, 60, lambda contact: 0.0 * systematic(contact))) for seed in range(10)]
     real = [correction for correction in corrections if not correction.nothing]
     assert len(real) <= 1
     fresh = contacts(np.random.default_rng(5), 500)
@@ -50,23 +42,23 @@ def test_noise_alone_is_not_corrected():
 
 
 def test_beyond_the_presses_it_stays():
-    correction = fit_correction(residuals(0, 200, planted))
+    correction = fit_correction(residuals(0, 200, systematic))
     far = np.array([[12.0, 5.0, 1.0], [3.0, 4.0, 50.0]])
     nearest = far.copy()
-    nearest[0, :2] *= correction.radius_mm / np.hypot(*far[0, :2])
-    nearest[1, 2] = correction.force_range_N[1]
+    nearest[0, :2] *= correction.domain.radius / np.hypot(*far[0, :2])
+    nearest[1, 2] = correction.domain.force_range[1]
     np.testing.assert_allclose(correction.log_factor(far), correction.log_factor(nearest), rtol=1e-12)
 
 
 def test_without_a_prior_it_is_weighted_least_squares():
     """Many presses and a wide prior: the same as NumPy's own least squares on whitened equations."""
-    data = residuals(3, 3000, planted)
+    data = residuals(3, 3000, systematic)
     correction = fit_correction(data)
     x, y, _ = data.contact.T
-    low, high = np.log(correction.force_range_N)
+    low, high = np.log(correction.domain.force_range)
     unit = (
-        x / correction.radius_mm,
-        y / correction.radius_mm,
+        x / correction.domain.radius,
+        y / correction.domain.radius,
         (2 * np.log(data.contact[:, 2]) - low - high) / (high - low),
     )
     chebyshev = np.polynomial.chebyshev.Chebyshev

@@ -1,4 +1,4 @@
-"""Calibrating at the bench, closed: a board on a pseudo-terminal is pressed where the dialogue asks, by nobody."""
+"""A press session, closed: a board on a pseudo-terminal is pressed where the dialogue asks, by nobody."""
 
 import os
 import queue
@@ -9,13 +9,11 @@ import time
 import numpy as np
 import pytest
 
-from isocharge.cli.train.bench.dialogue import QUESTION, Dialogue
-from isocharge.cli.train.bench.events import BenchEvents
-from isocharge.cli.train.bench.screen import Screen
+from isocharge.cli.train.press_dialogue import QUESTION, Dialogue, PressEvents, Screen
 from isocharge.serve import Frame, Port, PressWatch, ReadingStream, encode_frame
 from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 from isocharge.simulate import Circle, load_sensor
-from isocharge.train import BenchSession, films_for
+from isocharge.train import CalibrationProblem, PressSession
 
 RATE_HZ = 200.0
 NAMES = ("A", "B", "C", "D")
@@ -49,7 +47,7 @@ class Rig(threading.Thread):
             except queue.Empty:
                 continue
             self.pressed.append(contact)
-            yield from np.repeat(self._charges.charge_pC(self._parameters, contact[None]), 200, axis=0)
+            yield from np.repeat(self._charges.charges(self._parameters, contact[None]), 200, axis=0)
 
 
 class RiggedScreen(Screen):
@@ -73,17 +71,17 @@ class RiggedScreen(Screen):
 
 @pytest.mark.parametrize("count", [3, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_film_that_nobody_knows_is_known_after_some_presses(count, capsys):
-    chosen = films_for(load_sensor("four-25um-biaxial"), Circle(1e-3))
-    charges = chosen.scene.charges
+    problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
+    charges = problem.charges
     parameters = charges.prior.draw(np.random.default_rng(11), 1)[0]
-    session = BenchSession(chosen.scene, chosen.described, save=lambda _: None, until=0.0)
+    session = PressSession(problem, save=lambda _: None, until=0.0)
     rig = Rig(charges, parameters)
     answers, keyboard = os.pipe()
     rig.start()
     try:
         with (
             Port(rig.port.url, silence_s=2.0) as port,
-            BenchEvents(port, ReadingStream(NAMES), PressWatch(NAMES), answers) as events,
+            PressEvents(port, ReadingStream(NAMES), PressWatch(NAMES), answers) as events,
         ):
             Dialogue(session, events, RiggedScreen(rig, keyboard, count), lambda *_: None).with_person()
     finally:
@@ -94,9 +92,9 @@ def test_a_film_that_nobody_knows_is_known_after_some_presses(count, capsys):
         os.close(keyboard)
     said = capsys.readouterr().err
     np.testing.assert_allclose(session.presses.contact, rig.pressed, err_msg=said)
-    clean = charges.charge_pC(parameters, session.presses.contact)
+    clean = charges.charges(parameters, session.presses.contact)
     assert (np.abs(session.presses.charge_pC - clean) < 5 * np.hypot(1.0, 0.002 * clean) * 0.2).all()
-    deviation = (session.calibration.posterior.parameters - parameters) / charges.prior.std
-    assert deviation @ np.linalg.solve(session.calibration.posterior.covariance, deviation) < 40.0  # 13 parameters
-    assert session.calibration.left.position_mm < 0.3
+    deviation = (session.result.posterior.parameters - parameters) / charges.prior.std
+    assert deviation @ np.linalg.solve(session.result.posterior.covariance, deviation) < 40.0  # 13 parameters
+    assert session.result.left.position_mm < 0.3
     assert said.count("are left by not knowing the film") == count - 1

@@ -62,14 +62,10 @@ def test_a_film_that_fits(predictor, measure):
     assert (check.fits, check.verdict, check.notes) == (True, "fits: noise explains the errors", ())
     assert check.agreement.degrees == 1200
     assert check.agreement.chi_squared / 1200 == pytest.approx(1.0, abs=3 * (2 / 1200) ** 0.5)
-    for part in (check.position_mm, check.force_percent):
-        assert part.presses == 400
+    for part, rig in ((check.position_mm, RIG_MM * 2**0.5), (check.force_percent, 100 * RIG_SHARE)):
         assert part.rms == pytest.approx(part.explained, rel=0.1)
-        assert part.explained == pytest.approx(np.hypot(part.noise, part.rig))
+        assert part.rig == pytest.approx(rig)
         assert part.beyond < 0.45 * part.rms
-        assert part.median < part.rms < part.max
-    assert check.position_mm.rig == pytest.approx(RIG_MM * 2**0.5)
-    assert check.force_percent.rig == pytest.approx(100 * RIG_SHARE)
 
 
 def test_a_film_that_fits_is_hardly_ever_called_another(predictor, measure):
@@ -84,13 +80,10 @@ def test_a_scale_of_the_force_is_recognised(predictor, measure, seed):
     check = check_presses(predictor, measure(20, seed=seed, force_scale=1.05))
     assert check.fits is False
     assert check.verdict.startswith("does not fit: ")
-    assert check.verdict.endswith(" beyond noise: calibrate the film again")
     assert check.agreement.force.mean == pytest.approx(0.05, abs=4 * check.agreement.force.std)
     assert check.force_percent.beyond == pytest.approx(5.0, abs=0.5)
     assert check.position_mm.beyond < 0.05
-    (note,) = check.notes
-    assert "forces are 1.0" in note
-    assert "times the known ones" in note
+    assert "forces are 1.0" in check.notes[0]
 
 
 def test_a_common_shift_is_recognised_before_the_sum_of_squares_tells(predictor, measure):
@@ -134,8 +127,7 @@ def test_a_bad_press_is_named_and_does_not_condemn_the_film(predictor, measure):
     assert check.notes == ("line 9: nothing like the other presses, left out; look at it",)
     assert check.position_mm.max < 1.0
     presses.contact[3:5, :2] -= 2.0  # three of twelve are too many
-    worse = check_presses(predictor, presses)
-    assert (worse.fits, worse.counted) == (False, 12)
+    assert check_presses(predictor, presses).fits is False
 
 
 def test_presses_that_do_not_count(predictor, measure):
@@ -149,42 +141,33 @@ def test_presses_that_do_not_count(predictor, measure):
     assert check.errors.left_out[:5] == (
         *("not trained for", "not trained for", "neither place nor force is known", "a charge is unknown", ""),
     )
-    assert [note.partition(":")[0] for note in check.notes] == [
-        "1 of 10 presses do not count",
-        "1 of 10 presses do not count",
-        "2 of 10 presses do not count",
-    ]
     assert "0.05 to 2 N); if these are most, look at the units (lines 2, 3)" in check.notes[2]
     row = check.to_dict()["each"][3]
     assert (row["x_mm"], row["x_error_mm"], row["left_out"]) == (None, None, "a charge is unknown")
 
 
-def test_flags_of_the_answers(film, predictor, measure):
+def test_flags_of_the_answers(film, tmp_path, measure):
     """Misfit against the model's own 1 %; the linear model's misfit is the sum of negative charges."""
-    presses = measure(6)
-    presses.charge_pC[0] = film.charge_pC([20.0], [0.0], [1.0])[0]
-    presses.charge_pC[1] = [-3.0, 900.0, 900.0]
-    check = check_presses(predictor, presses)
-    assert check.errors.flags[0] == ("outside",)
-    assert "misfit" not in check.errors.flags[1]  # 3 is below the default, 5
-
-
-def test_the_misfit_s_limit_is_the_model_s(film, tmp_path, measure):
     film.write(tmp_path, errors={"misfit_p99": 2.5, "misfit_p999": 9.0})
     presses = measure(6)
+    presses.charge_pC[0] = film.charge_pC([20.0], [0.0], [1.0])[0]
     presses.charge_pC[1:4] = [-3.0, 900.0, 900.0]
     check = check_presses(Predictor("linear", models=tmp_path), presses)
+    assert check.errors.flags[0] == ("outside",)
     assert ["misfit" in flags for flags in check.errors.flags] == [False, True, True, True, False, False]
     assert any(
         note.startswith("3 of 6 presses have a misfit above 2.5, which 1 % of good ones") for note in check.notes
     )
 
 
-def test_another_layout_is_refused(predictor, measure):
+def test_electrodes_are_taken_by_their_names(predictor, measure):
     presses = measure(3)
-    for electrodes in (("C", "B", "A"), ("A", "B", "D")):
-        with pytest.raises(PressError, match=r"expected charges of the electrodes \('A', 'B', 'C'\) of linear/1, got"):
-            check_presses(predictor, replace(presses, electrodes=electrodes))
+    named = replace(presses, charge_pC=presses.charge_pC[:, ::-1], electrodes=("C", "B", "A"))
+    np.testing.assert_array_equal(
+        check_presses(predictor, named).errors.answer, check_presses(predictor, presses).errors.answer
+    )
+    with pytest.raises(PressError, match=r"expected charges of the electrodes \('A', 'B', 'C'\) of linear/1, got"):
+        check_presses(predictor, replace(presses, electrodes=("A", "B", "D")))
 
 
 def test_to_dict_is_json(predictor, measure):
@@ -204,13 +187,12 @@ def test_to_dict_is_json(predictor, measure):
 def test_common_part_is_the_weighted_mean():
     rng = np.random.default_rng(0)
     std = rng.uniform(0.5, 2.0, 500)
-    error = 0.3 + std * rng.normal(size=500)
-    common = Common.of(np.append(error, np.nan), np.append(std, 1.0) ** 2)
-    mean, weight = np.average(error, weights=std**-2, returned=True)
-    assert common.mean == pytest.approx(mean)
-    assert common.std == pytest.approx(weight**-0.5, rel=0.1)
-    wider = Common.of(0.3 + 3.0 * (error - 0.3), std**2)
-    assert wider.std == pytest.approx(3.0 * weight**-0.5, rel=0.1)
+    for scatter in (1.0, 3.0):
+        error = 0.3 + scatter * std * rng.normal(size=500)
+        common = Common.of(np.append(error, np.nan), np.append(std, 1.0) ** 2)
+        mean, weight = np.average(error, weights=std**-2, returned=True)
+        assert common.mean == pytest.approx(mean)
+        assert common.std == pytest.approx(scatter * weight**-0.5, rel=0.1)
 
 
 def test_summary_of_known_numbers():

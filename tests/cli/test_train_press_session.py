@@ -1,0 +1,263 @@
+"""Calibrating at a port: the dialogue against a list of events, and the command against a board that presses."""
+
+import json
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from isocharge.cli.train.press_dialogue import Dialogue, Ended, Screen, Typed
+from isocharge.common.errors import PortLost
+from isocharge.serve import Frame, Predictor, encode_frame, read_presses
+from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, Watched
+from isocharge.simulate import Circle, load_sensor
+from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.measuring_chain.levels import load_amplifier
+from isocharge.train import CalibrationProblem, next_presses
+from isocharge.train.calibration.folder import SESSION
+from isocharge.train.data.presses import draw_contacts
+
+NAMES = ("A", "B", "C", "D")
+RATE_HZ = 200.0
+
+
+class FakeSession:
+    """Proposes places one after the other, and knows enough after three presses."""
+
+    summary = ("so much is known",)
+
+    def __init__(self):
+        self.taken, self.skips = [], 0
+        self._place()
+
+    def _place(self):
+        self.proposed = SimpleNamespace(contact=np.array([len(self.taken) + self.skips / 10, 0.0, 1.0]))
+        self.presses = SimpleNamespace(contact=np.array(self.taken))
+
+    def __len__(self):
+        return len(self.taken)
+
+    @property
+    def enough(self):
+        return len(self.taken) >= 3
+
+    def take(self, _, contact):
+        self.taken.append(tuple(contact.tolist()))
+        self._place()
+
+    def undo(self, number):
+        self.taken.pop(-1 if number == "last" else number - 1)
+        self._place()
+        return len(self.taken) + 1 if number == "last" else number
+
+    def skip(self):
+        self.skips += 1
+        self._place()
+
+
+class Script:
+    """Events in their order; those that are not asked for are an error."""
+
+    def __init__(self, *events):
+        self.events, self.armed = list(events), 0
+
+    def arm(self):
+        self.armed += 1
+
+    def next(self):
+        return self.events.pop(0)
+
+
+STEADY = Watched(Phase.taken, press=SteadyPress(np.full(4, 500.0), np.ones(4), np.ones(4), 0.7, 0.5, 100, ()))
+TARED = Watched(Phase.waiting, np.zeros(4))
+HELD = Watched(Phase.settling, np.full(4, 400.0), 0.3)
+
+
+def refused(reason):
+    return Watched(Phase.refused, reason=reason)
+
+
+def dialogue(*events, asks=True, contacts=None):
+    """The session after a dialogue with a person, or with a machine that makes the presses of a list."""
+    session, script, taken = FakeSession(), Script(*events), []
+    talk = Dialogue(session, script, Screen(NAMES, live=False), lambda *_: taken.append(len(session)))
+    if contacts is None:
+        talk.with_person(asks=asks)
+    else:
+        talk.with_machine(contacts)
+    assert not script.events
+    return session, script, taken
+
+
+def test_enter_takes_a_press_as_proposed(capsys):
+    session, _, taken = dialogue(HELD, STEADY, Typed(""), STEADY, Typed("1.5 2 0.9"), STEADY, Typed("? ? 0.5"))
+    assert session.taken[:2] == [(0.0, 0.0, 1.0), (1.5, 2.0, 0.9)]
+    assert np.isnan(session.taken[2][:2]).all()
+    assert taken == [1, 2, 3]
+    said = capsys.readouterr().err
+    assert "1. Press 1.00 N at (0.0, 0.0) mm and hold." in said
+    assert "hold it, 0.3 s: A 400.0, B 400.0, C 400.0, D 400.0 pC" in said
+    assert "steady after 0.7 s: A 500.0" in said
+    assert said.count("so much is known") == 3
+    assert said.endswith("The film is known well enough; --until 0 goes on.\n")
+
+
+FIRST, SECOND, THIRD = ((float(x), 0.0, 1.0) for x in range(3))
+
+
+@pytest.mark.parametrize(
+    ("events", "taken", "said"),
+    [
+        ([STEADY, Typed(""), Typed("q")], [FIRST], "so much is known"),
+        ([STEADY, Typed("q")], [], ""),
+        ([STEADY, Typed(None)], [], ""),
+        ([Ended(None)], [], ""),
+        ([STEADY, Typed("u"), STEADY, Typed(""), Typed("u"), Typed("q")], [], "press 1 is taken back"),
+        ([STEADY, Typed(""), STEADY, Typed("u 1"), Typed(""), Typed("q")], [SECOND], "press 1 is taken back"),
+        ([Typed("s"), STEADY, Typed("s"), STEADY, Typed(""), Typed("q")], [(0.2, 0.0, 1.0)], "(0.2, 0.0) mm"),
+        ([Typed("what?"), STEADY, Typed("1 2"), Typed("1 2 3"), Typed("q")], [(1.0, 2.0, 3.0)], "got '1 2'"),
+        ([Typed(""), STEADY, Typed("q")], [], "press first"),
+    ],
+)
+def test_what_is_typed_is_done(events, taken, said, capsys):
+    assert dialogue(*events)[0].taken == taken
+    assert said in capsys.readouterr().err
+
+
+def test_a_press_that_is_refused_is_asked_for_again(capsys):
+    session, script, _ = dialogue(refused("it moves"), refused(AWAY), STEADY, Typed(""), Typed("q"))
+    assert session.taken == [FIRST]
+    assert script.armed == 4
+    assert "not taken: it moves; press again" in capsys.readouterr().err
+
+
+def test_nothing_is_asked_with_yes():
+    assert dialogue(STEADY, STEADY, STEADY, asks=False)[0].taken == [FIRST, SECOND, THIRD]
+
+
+LIST = np.array([[1.0, 1.0, 0.5], [2.0, 2.0, 0.5], [3.0, 3.0, np.nan]])
+
+
+def test_presses_of_a_machine_are_those_of_its_list(capsys):
+    session, script, _ = dialogue(TARED, STEADY, refused("it moves"), HELD, STEADY, contacts=LIST)
+    np.testing.assert_array_equal(session.taken, LIST[[0, 2]])
+    assert script.armed == 0
+    said = capsys.readouterr().err
+    assert said.index("let the machine begin") < said.index("1. 0.50 N")
+    assert "row 2 is left out: it moves" in said
+
+
+def test_a_port_that_goes_away_under_a_machine_ends_the_session():
+    with pytest.raises(PortLost, match="go on with row 2 of its list"):
+        dialogue(TARED, STEADY, refused(AWAY), contacts=LIST)
+
+
+@pytest.fixture(scope="module")
+def film():
+    """A film that a seed draws."""
+    problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
+    return problem.charges.forward_map(problem.prior.draw(np.random.default_rng(3), 1)[0])
+
+
+@pytest.fixture(scope="module")
+def places():
+    problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
+    return np.array([press.contact for press in next_presses(problem, 8)])
+
+
+def board(film, places, seed=0) -> Iterator[bytes]:
+    """Frames of a machine that presses at places for 1.2 s each, through an amplifier."""
+    t = np.arange(round(1.2 * RATE_HZ)) / RATE_HZ
+    rise = np.clip(np.minimum(t, 1.2 - t) / 0.1, 0.0, 1.0)[:, None] ** (2 / 3)
+    pause = np.zeros((round(0.8 * RATE_HZ), 4))
+    pieces = [np.zeros((400, 4))]
+    for charge in film.charges(places):
+        pieces += [rise * charge, pause]
+    measure = load_amplifier("reference").start(4, RATE_HZ, np.random.default_rng(seed))
+    for k, row in enumerate(measure(np.concatenate(pieces))):
+        yield encode_frame(Frame(k, round(1e6 * k / RATE_HZ), tuple(row + 12.0)))
+
+
+@pytest.fixture
+def desk(film, places, tmp_path, monkeypatch):
+    """A folder with the bytes of a board, and the list of the presses that it makes."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ISOCHARGE_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "frames.bin").write_bytes(b"".join(board(film, places)))
+    write_rows(tmp_path / "list.csv", places)
+    return tmp_path
+
+
+def write_rows(path, rows, names=()):
+    header = ["x_mm", "y_mm", "force_N", *names]
+    path.write_text("\n".join([",".join(header), *(",".join(map(str, row)) for row in rows.tolist())]))
+
+
+CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial", "-o", "film")
+
+
+def test_eight_presses_of_a_machine_make_a_film_as_good_as_clean_presses_do(command, desk, film, places):
+    """The model's error on fresh clean charges of that film; and the same presses, clean, through the file."""
+    code, out, err = command(*CALIBRATE, "--port", "frames.bin", "--press-list", "list.csv", "--json")
+    assert code == 0, err
+    *lines, end = map(json.loads, out.splitlines())
+    assert [line["press"] for line in lines] == list(range(1, 9))
+    clean = film.charges(places)
+    taken = np.array([[line["charge_pC"][name] for name in NAMES] for line in lines])
+    assert (np.abs(taken - clean) < 5 * np.hypot(1.0, 0.002 * clean) * np.sqrt(1 / 90 + 1 / 50)).all()
+    assert lines[-1]["error_left"] == end["error_left"]
+    assert not (desk / "film" / SESSION).exists()
+    np.testing.assert_array_equal(read_presses(desk / "film/1/presses.csv", NAMES).contact, places)
+    write_rows(desk / "clean.csv", np.column_stack([places, clean]), NAMES)
+    assert command("train", "calibrate", "clean.csv", "--sensor", "four-25um-biaxial", "-o", "clean")[0] == 0
+    errors = {name: error_of(desk / name, film) for name in ("film", "clean")}
+    assert errors["film"] < 1.5 * errors["clean"] + 0.01, errors
+
+
+def error_of(folder, film):
+    """Root-mean-square position error of a model on clean charges of a film, mm."""
+    contact = draw_contacts(np.random.default_rng(9), Domain(7.0, (0.3, 1.8)), 400)
+    answer = Predictor(str(folder)).predict_batch(film.charges(contact))
+    return float(np.sqrt(((answer.x_mm - contact[:, 0]) ** 2 + (answer.y_mm - contact[:, 1]) ** 2).mean()))
+
+
+def test_a_session_that_ends_early_goes_on_with_the_same_command(command, desk, film, places):
+    """The port ends after three presses: they are on disk; a machine then goes on with the fourth row."""
+    (desk / "some.bin").write_bytes(b"".join(board(film, places[:3])))
+    (desk / "rest.bin").write_bytes(b"".join(board(film, places[3:5], seed=1)))
+    write_rows(desk / "five.csv", places[:5])
+    code, _, err = command(*CALIBRATE, "--port", "some.bin", "--press-list", "five.csv")
+    assert code == 2
+    assert "3 presses are in film/presses.part.csv; the same command goes on with them" in err
+    assert len(read_presses(desk / "film" / SESSION)) == 3
+    code, _, err = command(*CALIBRATE, "--port", "rest.bin", "--press-list", "five.csv")
+    assert code == 0, err
+    assert "going on with 3 presses" in err
+    assert "4. 1.65 N" in err
+    np.testing.assert_array_equal(read_presses(desk / "film/1/presses.csv").contact, places[:5])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "expected PRESSES.csv, or --next K"),
+        (["--next", "2"], "nothing is calibrated without PRESSES.csv"),
+        (["list.csv", "--probe", "triangle:4.0"], "expected a round one"),
+        (["--port", "frames.bin", "list.csv"], "leave out PRESSES.csv, --next"),
+        (["--press-list", "list.csv"], "belong to --port"),
+        (["--port", "frames.bin", "--press-list", "far.csv"], "far.csv, press 2: expected a press within 9"),
+        (["--port", "frames.bin", "--press-list", "half.csv"], "half.csv, line 2: expected both x_mm and y_mm"),
+        (["--port", "frames.bin", "--press-list", "nothing.csv"], "cannot be read"),
+        (["--port", "noise.bin", "--press-list", "list.csv"], "no intact frame"),
+    ],
+)
+def test_what_cannot_be_is_said_before_the_first_press(command, desk, words, message):
+    (desk / "far.csv").write_text("x_mm,y_mm,force_N\n1,1,1\n30,1,1\n")
+    (desk / "half.csv").write_text("x_mm,y_mm,force_N\n1,,1\n")
+    (desk / "noise.bin").write_bytes(bytes(range(256)) * 100)
+    code, _, err = command(*CALIBRATE, *words)
+    assert code in (1, 2)
+    assert message in err
+    assert "Traceback" not in err
+    assert not (desk / "film").exists()

@@ -1,0 +1,78 @@
+"""From measured presses to a model: judged by presses of a film that is not the described one, and by nothing else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.train.rig.conftest import DOMAIN, measured, systematic
+
+from isocharge.common.errors import PressError
+from isocharge.serve import Predictor, check_presses, read_presses
+from isocharge.simulate import Circle, ForwardMap, load_sensor, virtual_film
+from isocharge.train import FitConfig, NetworkConfig, Rig, TrainingConfig, fit, release, rig_data
+from isocharge.train.data.measured import held_out
+from isocharge.train.data.presses import draw_contacts
+
+TINY = FitConfig(
+    NetworkConfig((32, 32), (8, 8)), TrainingConfig(steps=400, misfit_steps=5, misfit_charges=1_000, batch=256)
+)
+DESCRIBED, PROBE = load_sensor("three-25um-biaxial"), Circle(1.0)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """The forward map of a film that nobody described, solved for itself."""
+    return ForwardMap.build(*virtual_film(DESCRIBED, PROBE, 4), 8.1, (0.05, 2.0))
+
+
+@pytest.fixture(scope="module")
+def model(truth, tmp_path_factory):
+    """Trained without a network for all films: the presses correct the sensor as described."""
+    data = rig_data(Rig(measured(truth, 300), DESCRIBED, PROBE), None, drawn=4000)
+    return release(fit(data, TINY), tmp_path_factory.mktemp("models") / "rig")
+
+
+def test_the_errors_are_what_serve_check_says_of_presses_that_nobody_trained_on(model, truth):
+    presses = measured(truth, 300)
+    seen, held = (read_presses(model.folder / name) for name in ("presses.csv", "held_out.csv"))
+    assert held == presses[held_out(presses.contact)]
+    assert seen == presses[~held_out(presses.contact)]
+    check, errors = check_presses(Predictor(model.folder), held), model.metadata.errors
+    assert errors["measured_presses"] == len(held) == check.counted >= 10
+    assert errors["position_rms_mm"] == pytest.approx(check.position_mm.rms, rel=1e-3)
+    assert errors["position_median_mm"] == pytest.approx(check.position_mm.median, rel=1e-3)
+    assert errors["force_rms_percent"] == pytest.approx(check.force_percent.rms, rel=1e-3)
+
+
+def test_card_and_metadata_say_that_it_was_fitted_to_measurements(model):
+    card, errors = (model.folder / "card.md").read_text("utf-8"), model.metadata.errors
+    assert f"## Errors on {errors['measured_presses']:.0f} measured presses that training never saw" in card
+    assert "## Fitted to measured presses" in card
+    assert "The film was not calibrated" in card
+    assert "simulator, not a film" not in card
+    measurement = model.metadata.made_with["measured"]
+    assert measurement["trained_on"] + measurement["held_out"] == 300
+    assert not measurement["calibrated"]
+
+
+def test_the_model_is_right_about_the_film_and_not_about_the_described_one(model, truth):
+    """On clean charges of the true film, which neither training nor card has seen."""
+    contact = draw_contacts(np.random.default_rng(77), DOMAIN.within(7.0), 500)
+    error = {}
+    for name, forward_map in (("true", truth), ("described", replace(truth, sensor=DESCRIBED))):
+        charge = forward_map.charges(contact) * np.exp(systematic(contact, 3))
+        answer = Predictor(model.folder).predict_batch(charge)
+        error[name] = np.median(np.hypot(answer.x_mm - contact[:, 0], answer.y_mm - contact[:, 1]))
+    assert error["true"] < 0.3
+    assert error["described"] > 2.0 * error["true"]
+
+
+def test_what_does_not_count_is_said_and_too_few_presses_are_refused(truth, caplog):
+    presses = measured(truth, 60)
+    presses.contact[:3, 0] = 30.0
+    presses.charge_pC[3, 1] = np.nan
+    data = rig_data(Rig(presses, DESCRIBED, PROBE), None, drawn=1000)
+    assert len(data.test) >= 10
+    assert "4 of 60 presses are left out: 1 with an unknown place, force or charge; 3 beyond 8 mm" in caplog.text
+    with pytest.raises(PressError, match=r"at least 50 presses .* got 49 of 53.*isocharge train calibrate"):
+        rig_data(Rig(presses[:53], DESCRIBED, PROBE), None)
