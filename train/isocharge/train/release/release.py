@@ -76,7 +76,7 @@ def release(
         force_range_N=fitted.domain.force_range,
         noise=fitted.noise.to_dict(),
         dataset_sha256=fitted.sha256,
-        errors=evaluate(fitted) if errors is None else errors,
+        errors=evaluate(fitted) if errors is None else dict(errors),
         made_with={
             "command": command,
             **{package: metadata.version(package) for package in ("isocharge", "numpy", "onnx", "onnxruntime")},
