@@ -187,7 +187,7 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys)
     with shown_progress():
         for done in range(12):
             report("solving", done, 12)
-    assert capsys.readouterr().err == "solving: 4 of 12\nsolving: 8 of 12\n"
+    assert capsys.readouterr().err == "solving: 4 of 12\nsolving: 9 of 12\n"
 
 
 def test_a_point_says_theory_groups_and_estimated_error(command, tmp_path):
@@ -309,7 +309,7 @@ BAD = [
         2,
         "ConfigError: none.toml: cannot be",
     ),
-    (("simulate", "point", SENSOR, "--probe", "circle:1e-30"), 2, "SceneError: probe: expected a reach of at least"),
+    (("simulate", "point", SENSOR, "--probe", "circle:1e-30"), 2, "SceneError: probe radius: expected at least 0.02 mm"),
     (("simulate", "point", SENSOR, "--force", "1e6"), 2, "beyond small strains"),
     (
         ("simulate", "sweep", SENSOR, "--samples", "1000000000000", "-o", "OUT"),

@@ -4,7 +4,7 @@ import logging
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 
 import typer
@@ -14,9 +14,6 @@ from isocharge.common.progress import Listener, listening
 
 LINE_S = 5.0
 """Time between two lines of progress where there is no terminal, s."""
-
-Advance = Callable[..., None]
-"""`advance(done, total)` or `advance(done, total, note)`: moves a progress bar; the note stands behind it."""
 
 
 def say(message: str) -> None:
@@ -115,66 +112,3 @@ def _bars() -> Iterator[Listener]:
             bars.update(rows[title], completed=done, total=total, note=note)
 
         yield show
-
-
-@contextmanager
-def progress(title: str) -> Iterator[Advance]:
-    """A progress bar with the remaining time; yields the function that moves it."""
-    with progress_rows((title, "")) as (advance,):
-        yield advance
-
-
-@contextmanager
-def progress_rows(*rows: tuple[str, str]) -> Iterator[tuple[Advance, ...]]:
-    """A progress bar for each (title, unit), shown once it moves, with the remaining time and the units per second.
-
-    Yields the functions that move them. A bar that is moved back starts its clock again.
-    """
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.text import Text
-
-    class Rate(ProgressColumn):
-        def render(self, task: Task) -> Text:
-            return Text(rate(task.finished_speed or task.speed, task.fields["unit"]))
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        Rate(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
-
-        def mover(title: str, unit: str, visible: bool) -> Advance:
-            row = bar.add_task(title, total=None, start=visible, visible=visible, note="", unit=unit)
-
-            def advance(done: int, total: int, note: str = "") -> None:
-                task = bar.tasks[row]
-                if not task.started or done < task.completed:
-                    bar.reset(row, visible=True)
-                bar.update(row, completed=done, total=total, note=note)
-
-            return advance
-
-        yield tuple(mover(title, unit, number == 0) for number, (title, unit) in enumerate(rows))
-
-
-def rate(per_second: float | None, unit: str) -> str:
-    """A rate as "1,234 samples/s"; empty if it is unknown or has no unit."""
-    if not unit or per_second is None:
-        return ""
-    return f"{per_second:,.0f} {unit}/s" if per_second >= 10.0 else f"{per_second:.1f} {unit}/s"
