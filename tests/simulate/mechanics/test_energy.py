@@ -47,26 +47,21 @@ def condensed(mesh, matrix: np.ndarray) -> np.ndarray:
     return first - coupling.T @ np.linalg.solve(whole[:, 3, :, 3], coupling)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_residual_is_the_slope_of_the_energy(elastic, mesh, seed):
-    field, direction = mesh.random_field(seed), mesh.random_field(seed + 100)
+def test_residual_is_the_slope_of_the_energy(elastic, mesh):
+    field, direction = mesh.random_field(0), mesh.random_field(100)
     slope = sum(share * elastic.energy(field + step * direction) for step, share in STENCIL)
     scale = sum(abs(share * elastic.energy(field + step * direction)) for step, share in STENCIL)
     assert np.sum(elastic.residual(field) * direction) == pytest.approx(slope, abs=1e-12 * scale)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_tangent_is_the_slope_of_the_residual(elastic, mesh, seed):
+def test_tangent_is_the_slope_of_the_residual(elastic, mesh):
     """Of the condensed matrix where bending carries a fourth unknown."""
-    field, direction = mesh.random_field(seed), mesh.random_field(seed + 100)
+    field, direction = mesh.random_field(0), mesh.random_field(100)
     slope = sum(share * elastic.residual(field + step * direction) for step, share in STENCIL)
-    product = condensed(mesh, elastic.tangent(field)) @ direction.ravel()
-    np.testing.assert_allclose(product.reshape(-1, 3), slope, atol=1e-9 * np.abs(slope).max())
-
-
-def test_tangent_is_symmetric(elastic, mesh):
-    tangent = elastic.tangent(mesh.random_field(5))
+    tangent = elastic.tangent(field)
     np.testing.assert_allclose(tangent, tangent.transpose(0, 3, 4, 1, 2), atol=1e-12 * np.abs(tangent).max())
+    product = condensed(mesh, tangent) @ direction.ravel()
+    np.testing.assert_allclose(product.reshape(-1, 3), slope, atol=1e-9 * np.abs(slope).max())
 
 
 def test_guard_is_tension_in_the_tangent_only(elastic, mesh):

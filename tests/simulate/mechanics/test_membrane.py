@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from isocharge.simulate import Circle, Polygon, Resolution
 from isocharge.simulate.mechanics.membrane import Membrane
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.mechanics.stress import strain, stress, turn_stress
+from isocharge.simulate.mechanics.stress import rotate_stress, strain, stress
 
 
 def groups(amplitude2: float, tension: float, poisson: float = 0.34) -> DimensionlessGroups:
@@ -28,7 +28,7 @@ def green(slope: np.ndarray, amplitude2: float) -> np.ndarray:
     return 0.5 * (f.T @ f - np.eye(2)) / amplitude2
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_strain_is_green_lagranges(seed):
     slope = np.random.default_rng(seed).standard_normal((2, 3))
     e = green(slope, 0.3)
@@ -50,11 +50,11 @@ def test_stress_solves_the_plane_stress_compliance(poisson):
     s12=st.floats(-5.0, 5.0),
 )
 @settings(derandomize=True)
-def test_turned_stress_is_the_rotated_tensor(angle, s11, s22, s12):
+def test_rotated_stress_is_the_rotated_tensor(angle, s11, s22, s12):
     q = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     tensor = q @ np.array([[s11, s12], [s12, s22]]) @ q.T
-    turned = turn_stress(np.array([s11, s22, s12]), angle)
-    np.testing.assert_allclose(turned, [tensor[0, 0], tensor[1, 1], tensor[0, 1]], atol=1e-12)
+    rotated = rotate_stress(np.array([s11, s22, s12]), angle)
+    np.testing.assert_allclose(rotated, [tensor[0, 0], tensor[1, 1], tensor[0, 1]], atol=1e-12)
 
 
 @pytest.mark.parametrize("probe", [Circle(0.2), Polygon.rectangle(0.3, 0.2, 0.5)], ids=["circle", "rectangle"])
@@ -122,8 +122,8 @@ def test_elastic_energy_does_not_see_a_rigid_motion_on_top(mesh, motion):
     membrane, field = Membrane(mesh.geometry, groups(amplitude2, 0.0)), mesh.random_field(9)
     scale = np.array([amplitude2, amplitude2, np.sqrt(amplitude2)])
     rigid = moved(mesh.points, rotation.as_matrix(), shift, amplitude2)
-    turned = rigid + (field * scale) @ rotation.as_matrix().T / scale
-    assert membrane.energy(turned) == pytest.approx(membrane.energy(field), rel=1e-10)
+    rotated = rigid + (field * scale) @ rotation.as_matrix().T / scale
+    assert membrane.energy(rotated) == pytest.approx(membrane.energy(field), rel=1e-10)
 
 
 # The patch test, on elements with curved sides
@@ -147,7 +147,3 @@ def test_patch_of_uniform_strain_is_exact(mesh, tension):
 def test_gradient_of_a_linear_function_is_constant(mesh):
     slope = np.einsum("epan,en->epa", mesh.geometry.gradient, (mesh.points @ [2.0, -3.0])[mesh.template.nodes])
     np.testing.assert_allclose(slope - [2.0, -3.0], 0.0, atol=1e-11)
-
-
-def test_stiffened_adds_tension():
-    assert groups(0.1, 0.2).stiffened(0.5) == groups(0.1, 0.7)

@@ -8,32 +8,34 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate import Circle, Film, Polygon, Probe, Resolution, Theory
+from isocharge.simulate import Circle, Film, Polygon, Probe, Resolution, SolveSettings, Theory
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.sensor.probe import farthest
+from isocharge.simulate.solver.load_case import LoadCase
 from isocharge.simulate.solver.mesh_choice import choose_mesh
 
-FILM = Film(1.0, 1e-3, 1.0, 0.3)
+RADIUS = 45.0
+FILM = Film(RADIUS, 0.025, 3000.0, 0.34)
 FULL = Theory(stretching=True, bending=True, pretensioned=False)
 COMMON = settings(derandomize=True, deadline=None, max_examples=25)
 
 
 @st.composite
 def probes(draw) -> Probe:
-    """Circles, rectangles, triangles and other convex polygons, on a film of unit radius, turned by any angle."""
+    """Circles, rectangles, triangles and other convex polygons, rotated by any angle."""
     kind = draw(st.sampled_from(["circle", "rectangle", "triangle", "polygon"]))
-    size, turn = 10.0 ** draw(st.floats(-3.0, -0.7)), draw(st.floats(0.0, 2.0 * np.pi))
+    size, angle = RADIUS * 10.0 ** draw(st.floats(-3.0, -0.7)), draw(st.floats(0.0, 2.0 * np.pi))
     if kind == "circle":
         return Circle(size)
     if kind == "rectangle":
-        return Polygon.rectangle(2.0 * size, 2.0 * size * draw(st.floats(0.1, 1.0)), turn)
+        return Polygon.rectangle(2.0 * size, 2.0 * size * draw(st.floats(0.1, 1.0)), angle)
     if kind == "triangle":
-        return Polygon.triangle(1.7 * size, turn)
+        return Polygon.triangle(1.7 * size, angle)
     gaps = np.array(draw(st.lists(st.floats(0.4, 1.0), min_size=4, max_size=8)))
-    angle = 2.0 * np.pi * np.cumsum(gaps) / gaps.sum()
-    return Polygon.of(size * np.stack([np.cos(angle), np.sin(angle)], axis=1), turn)
+    direction = 2.0 * np.pi * np.cumsum(gaps) / gaps.sum()
+    return Polygon.of(size * np.stack([np.cos(direction), np.sin(direction)], axis=1), angle)
 
 
 @st.composite
@@ -41,10 +43,11 @@ def presses(draw) -> tuple[Probe, tuple[float, float], Resolution, float]:
     """Presses that are accepted, up to the rim: probe, place, mesh and layer."""
     probe, layer = draw(probes()), 10.0 ** draw(st.floats(-3.0, -1.0))
     share, angle = draw(st.one_of(st.floats(0.0, 0.97), st.floats(0.9, 0.999))), draw(st.floats(-np.pi, np.pi))
-    distance = share * (1.0 - probe.reach)
+    distance = share * (RADIUS - probe.reach)
     at = (distance * np.cos(angle), distance * np.sin(angle))
     try:
-        resolution = choose_mesh(FILM, probe, at, FULL, 1e-3, layer).resolution
+        case = LoadCase.of(FILM, probe, at, 1e-3, SolveSettings(theory=FULL, layer=layer), None)
+        resolution = choose_mesh(case).resolution
     except SceneError:
         assume(False)
     return probe, at, resolution, layer
@@ -92,7 +95,7 @@ def test_locate_finds_any_point_where_it_was(scene, seed):
     placement, mesh = place(FILM, probe, at, resolution, layer).placement, template_for(probe, resolution)
     rng = np.random.default_rng(seed)
     disk = np.sqrt(rng.random(120)) * np.exp(2j * np.pi * rng.random(120))
-    near = placement.corners.mean() + 3.0 * probe.reach * disk[:100]
+    near = placement.corners.mean() + 3.0 * probe.reach / RADIUS * disk[:100]
     rim = np.exp(2j * np.pi * rng.random(20))
     film = np.concatenate([disk, near[np.abs(near) < 1.0], rim, placement.element_points(mesh).ravel()])
     if mesh.half:
@@ -117,37 +120,38 @@ def test_accepted_presses_have_no_folded_elements(scene):
 def test_footprint_is_the_probes(scene):
     """Its area, centroid and share of the load: exact for polygons, to the mesh's accuracy for circles."""
     probe, at, resolution, layer = scene
-    mesh, distance = template_for(probe, resolution), float(np.hypot(*at))
+    mesh, distance = template_for(probe, resolution), float(np.hypot(*at)) / RADIUS
     placed = place(FILM, probe, at, resolution, layer)
     geometry = placed.geometry
     exact = 1e-9 if isinstance(probe, Polygon) else 1e-4
     inner = geometry.weights[mesh.footprint]
-    assert mesh.copies * inner.sum() == pytest.approx(probe.area, rel=exact)
+    assert mesh.copies * inner.sum() == pytest.approx(probe.area / RADIUS**2, rel=exact)
     assert mesh.copies * geometry.load.sum() == pytest.approx(1.0, rel=1e-12)
     mean = mesh.copies * geometry.load @ placed.node_points
-    assert mean.real == pytest.approx(distance, abs=exact * probe.reach)
+    assert mean.real == pytest.approx(distance, abs=exact * probe.reach / RADIUS)
     if not mesh.half:
-        assert mean.imag == pytest.approx(0.0, abs=exact * probe.reach)
+        assert mean.imag == pytest.approx(0.0, abs=exact * probe.reach / RADIUS)
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.4, 0.85])
 @pytest.mark.parametrize(
     "probe",
-    [Polygon.rectangle(0.2, 0.1, 0.7), Polygon.triangle(0.1, 0.3)],
+    [Polygon.rectangle(9.0, 4.5, 0.7), Polygon.triangle(4.5, 0.3)],
     ids=["rectangle", "triangle"],
 )
 def test_load_is_uniform_over_a_polygon(probe, distance):
     """Second moments about the centroid, from the corners' closed formula, to round-off: no staircase of elements."""
     resolution = Resolution(4, 8, 3)
     mesh = template_for(probe, resolution)
-    placed = place(FILM, probe, (distance, 0.0), resolution, 0.05)
+    placed = place(FILM, probe, (distance * RADIUS, 0.0), resolution, 0.05)
     load, about = placed.geometry.load, placed.node_points - distance
-    (x, y), (u, v) = (np.stack([z.real, z.imag]) for z in (probe.outline, np.roll(probe.outline, -1)))
-    cross = (x * v - u * y) / (12.0 * probe.area)
+    outline = probe.outline / RADIUS
+    (x, y), (u, v) = (np.stack([z.real, z.imag]) for z in (outline, np.roll(outline, -1)))
+    cross = (x * v - u * y) / (12.0 * probe.area / RADIUS**2)
     assert load @ about.real**2 == pytest.approx(np.sum(cross * (x * x + x * u + u * u)), rel=1e-11)
     assert load @ about.imag**2 == pytest.approx(np.sum(cross * (y * y + y * v + v * v)), rel=1e-11)
     mixed = 0.5 * np.sum(cross * (x * v + 2 * x * y + 2 * u * v + u * y))
-    assert load @ (about.real * about.imag) == pytest.approx(mixed, abs=1e-12 * probe.reach**2)
+    assert load @ (about.real * about.imag) == pytest.approx(mixed, abs=1e-12 * (probe.reach / RADIUS) ** 2)
     assert not load[~np.isin(np.arange(mesh.n_node), mesh.nodes[mesh.footprint])].any()
 
 
@@ -155,7 +159,7 @@ def test_load_is_uniform_over_a_polygon(probe, distance):
 def test_load_is_uniform_over_a_disk(distance, radius):
     """1, the centre, R^2/4 along each axis."""
     resolution = Resolution(8, 8, 4)
-    placed = place(FILM, Circle(radius), (distance, 0.0), resolution, 0.05)
+    placed = place(FILM, Circle(radius * RADIUS), (distance * RADIUS, 0.0), resolution, 0.05)
     load, about = 2.0 * placed.geometry.load, placed.node_points - distance
     assert load.sum() == pytest.approx(1.0, rel=1e-13)
     assert abs(load @ about.real) < 1e-8 * radius
@@ -166,10 +170,10 @@ def test_load_is_uniform_over_a_disk(distance, radius):
 @pytest.mark.parametrize(("distance", "radius"), [(0.0, 0.02), (0.5, 0.002), (0.3, 0.5), (0.9, 0.05), (0.96, 0.03)])
 def test_footprint_edge_is_the_right_circle(distance, radius):
     """The template's ring |z| = rho lands on the circle with the footprint's radius and centre, the rim on the rim."""
-    placement = place(FILM, Circle(radius), (distance, 0.0), Resolution(), 0.05).placement
-    turn = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 50))
-    np.testing.assert_allclose(np.abs(placement.to_film(placement.rho * turn) - distance), radius, atol=1e-13)
-    np.testing.assert_allclose(np.abs(placement.to_film(turn)), 1.0, atol=1e-13)
+    placement = place(FILM, Circle(radius * RADIUS), (distance * RADIUS, 0.0), Resolution(), 0.05).placement
+    ring = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 50))
+    np.testing.assert_allclose(np.abs(placement.to_film(placement.rho * ring) - distance), radius, atol=1e-13)
+    np.testing.assert_allclose(np.abs(placement.to_film(ring)), 1.0, atol=1e-13)
     film = np.sqrt(np.linspace(0.0, 1.0, 99)) * np.exp(1j * np.arange(99.0))
     np.testing.assert_allclose(placement.to_film(placement.to_template(film)), film, atol=1e-10)
 
@@ -181,14 +185,16 @@ def test_circle_round_a_polygon_is_on_the_film_and_holds_it(scene):
     placement = place(FILM, probe, at, resolution, layer).placement
     ring = placement.to_film(placement.rho * np.exp(2j * np.pi * np.arange(400) / 400))
     assert np.abs(ring).max() < 1.0
-    assert np.abs(placement.corners).max() == pytest.approx(farthest(probe, at), abs=0.8 * probe.reach)
+    assert np.abs(placement.corners).max() == pytest.approx(
+        farthest(probe, at) / RADIUS, abs=0.8 * probe.reach / RADIUS
+    )
     assert np.all(np.abs(placement.to_template(placement.corners)) < placement.rho)
 
 
 def test_area_converges_exponentially_with_the_order():
     error = []
     for order in (2, 4, 6):
-        mesh = place(FILM, Circle(0.11), (0.4, 0.0), Resolution(order, 8, 4), 0.05)
+        mesh = place(FILM, Circle(5.0), (18.0, 0.0), Resolution(order, 8, 4), 0.05)
         error.append(abs(2.0 * mesh.geometry.weights.sum() - np.pi))
     assert error[1] < error[0] / 50.0
     assert error[2] < error[1] / 50.0
@@ -196,10 +202,10 @@ def test_area_converges_exponentially_with_the_order():
 
 def test_placement_of_many_is_each_of_them():
     probe, resolution = Polygon.triangle(0.1), Resolution(3, 8, 3, 1)
-    mesh, distance, turn = template_for(probe, resolution), np.array([0.0, 0.2, 0.7]), np.array([0.0, 1.0, -2.0])
-    many = Placement.of(mesh, probe, distance, 1.0, 0.05, turn)
+    mesh, distance, rotation = template_for(probe, resolution), np.array([0.0, 0.2, 0.7]), np.array([0.0, 1.0, -2.0])
+    many = Placement.of(mesh, probe, distance, 1.0, 0.05, rotation)
     for i in range(3):
-        alone = Placement.of(mesh, probe.turned(turn[i]), distance[i], 1.0, 0.05)
+        alone = Placement.of(mesh, probe.rotated(rotation[i]), distance[i], 1.0, 0.05)
         for name in ("c", "rho", "corners", "start", "end", "depth"):
             np.testing.assert_allclose(getattr(many, name)[i], getattr(alone, name), atol=1e-12)
     film = np.array([[0.1 + 0.2j, 0.75 - 0.03j, -0.9j, 0.0]] * 3)

@@ -6,8 +6,8 @@ import pytest
 from isocharge.simulate import Resolution
 from isocharge.simulate.mesh.template import Template, template
 
-RESOLUTIONS = (Resolution(2, 8, 1), Resolution(3, 8, 4), Resolution(4, 16, 3, 2), Resolution(5, 24, 2, 1))
-CORNERS = (0, 3, 4, 5, 7)
+RESOLUTIONS = (Resolution(2, 8, 1), Resolution(4, 16, 3, 2))
+CORNERS = (0, 3, 5)
 
 
 @pytest.fixture(params=RESOLUTIONS, ids=str)
@@ -71,18 +71,18 @@ def test_template_is_half_a_disk_for_circles_only(built):
     assert built.on_axis.any() == built.half
 
 
-def test_elements_are_permuted_by_a_turn_of_the_probe(built):
+def test_elements_are_permuted_by_a_rotation_of_the_probe(built):
     """Going round by one corner as often as there are corners is the identity; neighbours stay neighbours."""
     if built.half:
         return
     every = np.arange(built.n_element)
-    once = built.turned(1, built.n_corner)
+    once = built.rotated(1, built.n_corner)
     assert sorted(once) == every.tolist()
     again = every
     for _ in range(built.n_corner):
         again = once[again]
     np.testing.assert_array_equal(again, every)
-    np.testing.assert_array_equal(built.turned(0, 1), every)
+    np.testing.assert_array_equal(built.rotated(0, 1), every)
     shared = {frozenset((a, b)) for a, b in _neighbours(built)}
     assert {frozenset((int(once[a]), int(once[b]))) for a, b in _neighbours(built)} == shared
 
@@ -95,15 +95,3 @@ def _neighbours(mesh: Template) -> list[tuple[int, int]]:
             pairs.append((seen[edge], number // 4))
         seen[edge] = number // 4
     return pairs
-
-
-def test_template_is_built_once(resolution):
-    assert template(resolution, 4) is template(resolution, 4)
-    assert template(resolution, 4) is not template(resolution, 0)
-
-
-def test_template_needs_no_set_up(resolution):
-    """What is built is what the cache gives, numbers of nodes included."""
-    alone, cached = Template(resolution, 4), template(resolution, 4)
-    np.testing.assert_array_equal(alone.nodes, cached.nodes)
-    np.testing.assert_array_equal(alone.on_rim, cached.on_rim)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from isocharge.simulate.numerics.disk_least_squares import bounded_step, into_domain, minimise, minimise_one
+from isocharge.simulate.numerics.disk_least_squares import into_domain, minimise, minimise_one
 
 RNG = np.random.default_rng(0)
 TARGETS = np.concatenate([RNG.uniform(-1.0, 1.0, (60, 3)), 30.0 * RNG.normal(size=(60, 3)), [[0.0, 0.0, 5.0]]])
@@ -66,12 +66,6 @@ def test_one_problem_ends_where_it_does_among_many():
         end, square = minimise_one(alone, starts[row])
         np.testing.assert_allclose(end, unit[row], atol=1e-9)
         assert square == pytest.approx((residual[row] ** 2).sum(), rel=1e-9)
-
-
-def test_a_step_without_damping_solves_the_linear_problem():
-    slopes, target = RNG.normal(size=(6, 3, 5)), RNG.uniform(-0.5, 0.5, size=(6, 3))
-    residual = -np.einsum("nke,nk->ne", slopes, target)
-    np.testing.assert_allclose(bounded_step(np.zeros((6, 3)), residual, slopes, np.zeros(6)), target, rtol=1e-9)
 
 
 def test_the_domain_is_reached_and_its_points_stay():

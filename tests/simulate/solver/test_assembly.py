@@ -7,7 +7,7 @@ from isocharge.simulate import Resolution
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.template import Template, template
-from isocharge.simulate.solver.assembly import Assembly, assembly
+from isocharge.simulate.solver.assembly import Assembly
 
 SMALL = ((Resolution(2, 8, 1), 0), (Resolution(3, 8, 2, 1), 0), (Resolution(3, 8, 1), 3), (Resolution(2, 8, 1, 2), 4))
 
@@ -64,19 +64,6 @@ def test_tangent_of_a_film_is_solved_like_the_dense_one(mesh, bending):
     np.testing.assert_allclose(solution, expected, atol=1e-8 * np.abs(expected).max())
 
 
-def test_factor_serves_many_right_hand_sides(mesh):
-    matrix, rights = random_matrices(mesh.template, 3, 5), [mesh.random_field(seed) for seed in range(3)]
-    factor = Assembly(mesh.template, 3).factor(matrix)
-    for right in rights:
-        np.testing.assert_allclose(factor.solve(right), dense_solution(mesh.template, matrix, right), atol=1e-12)
-
-
-def test_right_hand_side_is_left_alone(mesh):
-    right = np.ones((mesh.template.n_node, 3))
-    Assembly(mesh.template, 4).factor(random_matrices(mesh.template, 4, 0)).solve(right)
-    assert np.all(right == 1.0)
-
-
 def test_fixed_values_of_the_right_hand_side_are_ignored(mesh):
     matrix, right = random_matrices(mesh.template, 3, 0), mesh.random_field(0)
     factor = Assembly(mesh.template, 3).factor(matrix)
@@ -84,8 +71,3 @@ def test_fixed_values_of_the_right_hand_side_are_ignored(mesh):
     right[mesh.template.on_rim] = 1e6
     right[mesh.template.on_axis, 1] = 1e6
     np.testing.assert_array_equal(factor.solve(right), first)
-
-
-def test_assembly_is_built_once():
-    assert assembly(Resolution(3, 8, 2), 4, 3) is assembly(Resolution(3, 8, 2), 4, 3)
-    assert assembly(Resolution(3, 8, 2), 4, 3) is not assembly(Resolution(3, 8, 2), 4, 4)

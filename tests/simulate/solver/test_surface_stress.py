@@ -15,9 +15,10 @@ from isocharge.simulate import (
     Theory,
     load_sensor,
     press,
-    theory_for,
     touch_charge,
+    touch_stress,
 )
+from isocharge.simulate.mechanics.theory import theory_for
 
 PLATE = Theory(stretching=False, bending=True, pretensioned=False)
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
@@ -27,7 +28,7 @@ FORCE = 1e-3
 
 @pytest.fixture(scope="module")
 def thick(film):
-    return replace(film, thickness=1e-3)
+    return replace(film, thickness=1.0)
 
 
 def outer(film, force: float, c: float, r: float) -> tuple[float, float]:
@@ -46,7 +47,7 @@ def outer(film, force: float, c: float, r: float) -> tuple[float, float]:
 
 
 def surface_stress(solved, surface: str, points: np.ndarray) -> np.ndarray:
-    return solved.touch_stress(points, surface) - solved.touch_stress(points)
+    return touch_stress(solved, points, surface) - touch_stress(solved, points)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3])
@@ -71,15 +72,15 @@ def test_bending_stress_under_the_middle(thick, share):
     c = share * thick.radius
     solved = press(thick, Circle(c), (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
     moment = FORCE * (1.0 + thick.poisson) / (4.0 * np.pi) * (np.log(1.0 / share) + 0.25 * share**2)
-    found = surface_stress(solved, "top", np.array([(1e-9, 0.0)]))[0]
+    found = surface_stress(solved, "top", np.array([(1e-6, 0.0)]))[0]
     np.testing.assert_allclose(found[:2], -6.0 * moment / thick.thickness**2, rtol=1e-3)
 
 
-@pytest.mark.parametrize("probe", [Circle(2e-3), Polygon.rectangle(4e-3, 2e-3, 0.5)], ids=["circle", "rectangle"])
+@pytest.mark.parametrize("probe", [Circle(2.0), Polygon.rectangle(4.0, 2.0, 0.5)], ids=["circle", "rectangle"])
 def test_sides_are_opposite(thick, probe):
     """The touched side is compressed under the probe and stretched at the rim; the other the other way round."""
-    solved = press(thick, probe, (6e-3, 4e-3), FORCE)
-    points = np.array([(6e-3, 4e-3), (0.0, -44.9e-3), (10e-3, 10e-3)])
+    solved = press(thick, probe, (6.0, 4.0), FORCE)
+    points = np.array([(6.0, 4.0), (0.0, -44.9), (10.0, 10.0)])
     top, bottom = (surface_stress(solved, surface, points) for surface in ("top", "bottom"))
     np.testing.assert_allclose(top, -bottom, rtol=1e-9, atol=1e-12 * np.abs(top).max())
     assert np.all(top[0, :2] < 0.0)
@@ -88,14 +89,14 @@ def test_sides_are_opposite(thick, probe):
 
 def test_curvature_of_a_made_up_field_is_read_exactly(film, made_up):
     """W = (3 x^2 + 2 x y - y^2) / 2 in the frame of the press: bending strain h / 2 times the second derivatives."""
-    at, amplitude2 = (5e-3, -4e-3), 1e-4
+    at, amplitude2 = (5.0, -4.0), 1e-4
 
     def field(x: np.ndarray) -> np.ndarray:
         w = 1.5 * x[:, 0] ** 2 + x[:, 0] * x[:, 1] - 0.5 * x[:, 1] ** 2
         return np.stack([0.0 * w, 0.0 * w, w], axis=1)
 
     solved = made_up(field, at, amplitude2=amplitude2, order=9)
-    points = at + np.random.default_rng(0).uniform(-4e-3, 4e-3, (20, 2))
+    points = at + np.random.default_rng(0).uniform(-4.0, 4.0, (20, 2))
     half = 0.5 * film.thickness / film.radius * np.sqrt(amplitude2) * film.young / (1.0 - film.poisson**2)
     local = half * np.array([3.0 - film.poisson, -1.0 + 3.0 * film.poisson, (1.0 - film.poisson) / 2.0 * 2.0])
     angle = np.arctan2(at[1], at[0])
@@ -108,28 +109,26 @@ def test_curvature_of_a_made_up_field_is_read_exactly(film, made_up):
 
 def test_charge_of_a_surface_is_the_integral_of_its_stress(thick):
     """A small electrode reads A (d31 s11 + d32 s22) of its own side."""
-    probe, corner = Circle(2e-3), np.array([(12e-3, 0.0), (12.1e-3, 0.0), (12.1e-3, 0.1e-3), (12e-3, 0.1e-3)])
+    probe, corner = Circle(2.0), np.array([(12.0, 0.0), (12.1, 0.0), (12.1, 0.1), (12.0, 0.1)])
     sensor = replace(load_sensor("four-25um-uniaxial"), film=thick)
     sensor = replace(sensor, electrodes=(Electrode("A", tuple((float(x), float(y)) for x, y in corner)),))
     solved = press(thick, probe, (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
     for surface, sign in (("top", 1.0), ("bottom", -1.0)):
         charge = touch_charge(replace(sensor, surface=surface), solved) - touch_charge(sensor, solved)
-        radial, hoop = outer(thick, FORCE, 2e-3, 12.05e-3)
-        assert charge[0] == pytest.approx(sign * 1e-8 * (20e-12 * radial + 2e-12 * hoop), rel=5e-3)
+        radial, hoop = outer(thick, FORCE, 2.0, 12.05)
+        assert charge[0] == pytest.approx(sign * 0.01 * (20.0 * radial + 2.0 * hoop), rel=5e-3)
 
 
 @pytest.mark.parametrize("surface", ["top", "bottom"])
 def test_surface_needs_bending(film, surface):
     sensor = replace(load_sensor("three-25um-biaxial"), surface=surface)
-    solved = press(film, Circle(1e-3), (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE))
+    solved = press(film, Circle(1.0), (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE))
     message = (
         rf"surface '{surface}' needs bending, but the film was solved as a nonlinear membrane; solve it with "
         r"SolveSettings\(theory="
     )
     with pytest.raises(SensorError, match=message):
         touch_charge(sensor, solved)
-    bent = press(
-        film, Circle(1e-3), (0.0, 0.0), 1.0, SolveSettings(theory=theory_for(sensor, Circle(1e-3), (1.0, 1.0)))
-    )
+    bent = press(film, Circle(1.0), (0.0, 0.0), 1.0, SolveSettings(theory=theory_for(sensor, Circle(1.0), (1.0, 1.0))))
     middle = touch_charge(replace(sensor, surface="middle"), bent)
     assert np.abs(touch_charge(sensor, bent) / middle - 1.0).max() > 1e-5
