@@ -10,8 +10,6 @@ from isocharge.serve import (
     Chain,
     Chunk,
     Frame,
-    HumRule,
-    LeakRule,
     Predictor,
     PressWatch,
     ReadingStream,
@@ -20,6 +18,7 @@ from isocharge.serve import (
     encode_frame,
 )
 from isocharge.serve.signal_chain.chain import ChainState, advance
+from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.simulate import load_amplifier
 
 RATE_HZ = 200.0
@@ -35,10 +34,10 @@ def held(*presses, seconds):
 def undo(measurement, charge_pC, seed, *, hum=True):
     """Touch charges and contact, with tau known to 0.5 % and gains to 0.2 %."""
     rng = np.random.default_rng(seed + 1000)
-    output = measurement(charge_pC * 1e-12) * 1e12
+    output = measurement(charge_pC)
     gain = measurement.gain * (1 + 0.002 * rng.uniform(-1, 1, 3))
     tau = measurement.tau * (1 + 0.005 * rng.uniform(-1, 1, 3))
-    chain = Chain(gain_pC=1 / gain, limit_pC=1499.9, hum=HumRule() if hum else None, leak=LeakRule(tau))
+    chain = Chain(gain_pC=1 / gain, limit_pC=1499.9, hum=HumRule() if hum else None, tau_s=tau)
     state, charges, contact = ChainState.start(3), [], []
     for k, row in enumerate(output):
         state, reading = advance(chain, state, row, k / RATE_HZ, 1 / RATE_HZ)
@@ -66,8 +65,8 @@ def test_two_held_presses(tau):
 def test_ten_minutes_of_rest_give_no_touch():
     """The whole of `bench`, film temperature wandering included."""
     measurement = load_amplifier("bench").start(3, RATE_HZ, np.random.default_rng(0))
-    output = measurement(np.zeros((120_000, 3))) * 1e12
-    chain = Chain(gain_pC=1 / measurement.gain, leak=LeakRule(np.full(3, 10.0)), hum=HumRule())
+    output = measurement(np.zeros((120_000, 3)))
+    chain = Chain(gain_pC=1 / measurement.gain, tau_s=np.full(3, 10.0), hum=HumRule())
     state = ChainState.start(3)
     for k, row in enumerate(output):
         state, reading = advance(chain, state, row, k / RATE_HZ, 1 / RATE_HZ)
@@ -129,7 +128,7 @@ def steady_presses(level, seed, table, tau_error=0.0):
     clean = np.concatenate([np.zeros((600, 4)), *(part for press in pressed for part in (rise * press, pause))])
     stream, watch = ReadingStream(names, device_from_table(table, "test")), PressWatch(names)
     taken, reasons = [], []
-    for k, row in enumerate(measurement(clean * 1e-12) * 1e12):
+    for k, row in enumerate(measurement(clean)):
         for reading in stream.feed(Chunk(encode_frame(Frame(k, 5000 * k, tuple(row))), 1e9 + k / RATE_HZ, 0)):
             watched = watch.feed(reading)
             if watched.press is not None:

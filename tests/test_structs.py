@@ -25,20 +25,20 @@ from isocharge.common.structs import (
 )
 
 
-class Auto(Settings, tag_field="format", tag="auto"):
+class Auto(Settings, tag_field="format", tag="auto", frozen=True):
     columns: tuple[str, ...] = ()
 
 
-class Binary(Settings, tag_field="format", tag="binary"):
+class Binary(Settings, tag_field="format", tag="binary", frozen=True):
     length: Annotated[int, Meta(ge=1, le=100)]
 
 
-class Part(Settings):
+class Part(Settings, frozen=True):
     name: Text
     at: Annotated[tuple[float, float], Meta(description="[x, y] in mm")] = (0.0, 0.0)
 
 
-class Board(Settings):
+class Board(Settings, frozen=True):
     radius: Positive = 1.0
     share: NotNegative = 0.0
     offset: Finite = 0.0
@@ -56,7 +56,7 @@ class Board(Settings):
             raise WrongKey("low", f"at most high ({self.high})", self.low)
 
 
-class File(Settings):
+class File(Settings, frozen=True):
     board: Board
     names: tuple[str, ...] = ()
 
@@ -90,7 +90,7 @@ def test_a_value_that_fits_is_taken():
         ({"frames": {"format": "morse"}}, "board.frames.format: expected one of auto, binary, got 'morse'"),
         ({"parts": [{"name": "a"}, {"name": ""}]}, "board.parts[2].name: expected a text of 1 to 1000 characters"),
         ({"parts": [{"name": "a", "at": [1]}]}, "board.parts[1].at: expected [x, y] in mm, got [1]"),
-        ({"parts": 3}, "board.parts: expected a list, got 3"),
+        ({"parts": 3}, "board.parts: expected a list of tables, got 3"),
         ({"parts": [3]}, "board.parts[1]: expected a table, got 3"),
         ({"radus": 1}, "unknown key 'board.radus'; did you mean 'radius'? Known are radius, share"),
         ({"zzz": 1}, "unknown key 'board.zzz'; known are radius"),

@@ -12,7 +12,6 @@ from isocharge.serve import (
     Chunk,
     Frame,
     Predictor,
-    TextParser,
     TouchStream,
     device_from_table,
     encode_frame,
@@ -20,6 +19,7 @@ from isocharge.serve import (
 )
 from isocharge.serve.frames.cobs import cobs_encode
 from isocharge.serve.frames.layout_parser import DescribedParser, described_parser
+from isocharge.serve.frames.text import TextParser
 from isocharge.serve.recognition.recognise import recognise
 
 FRAMES = [Frame(seq, 5000 * seq, (800.0 + seq, 700.0 - seq, 900.5), 0, ("A", "B", "C")) for seq in range(6)]

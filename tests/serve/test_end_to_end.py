@@ -5,7 +5,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from isocharge.serve import BinaryParser, Port, SequenceGaps, VirtualSensor, stream, wander
+from isocharge.serve import BinaryParser, Port, VirtualSensor, stream, wander
+from isocharge.serve.frames.sequence import SequenceGaps
 
 
 def reference_noise(charge_pC, rng):

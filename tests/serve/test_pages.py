@@ -13,22 +13,16 @@ from pathlib import Path
 import pytest
 
 from isocharge.common.errors import DeviceError
-from isocharge.serve import (
-    Frame,
-    HumRule,
-    LeakRule,
-    TareRule,
-    TextParser,
-    TouchRule,
-    device_from_table,
-    encode_frame,
-    flags,
-    load_device,
-)
+from isocharge.serve import Frame, device_from_table, encode_frame, flags, load_device
 from isocharge.serve.frames.cobs import cobs_decode
+from isocharge.serve.frames.text import TextParser
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
+from isocharge.serve.signal_chain.contact import TouchRule
+from isocharge.serve.signal_chain.hum import HumRule
+from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
 
 SERVE = Path(__file__).parents[2] / "serve"

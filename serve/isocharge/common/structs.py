@@ -210,7 +210,7 @@ def _faults_of_keys(table: Mapping[str, Any], kind: type[Struct], path: str) -> 
     known = {item.encode_name: hints[item.name] for item in msgspec.structs.fields(kind)}
     for key in table if config.forbid_unknown_fields else ():
         if key not in known and key != config.tag_field:
-            yield unknown_key(_join(path, key), key, [config.tag_field] * (config.tag is not None) + list(known))
+            yield unknown_key(_join(path, key), key, [*filter(None, [config.tag_field]), *known])
     for item in msgspec.structs.fields(kind):
         if item.encode_name in table:
             yield from _faults(table[item.encode_name], known[item.encode_name], _join(path, item.encode_name))
@@ -265,13 +265,30 @@ def _described(kind: inspect.Type) -> str:
             options = [_described(item) for item in types if not isinstance(item, inspect.NoneType)]
             return " or ".join(dict.fromkeys(options))
         case inspect.TupleType(item_types=items):
-            return f"a list of {len(items)} values"
-        case inspect.CollectionType():
-            return "a list"
+            return f"a list of {len(items)} {_plural(items[0])}"
+        case inspect.CollectionType(item_type=item, min_length=least):
+            return f"a list of {_plural(item)}" + (f", {least} or more" if least else "")
         case inspect.StructType() | inspect.DictType():
             return "a table"
         case _:
             return type(kind).__name__.removesuffix("Type").lower()
+
+
+def _plural(kind: inspect.Type) -> str:
+    """What the items of a list are."""
+    match kind:
+        case inspect.Metadata(type=inner):
+            return _plural(inner)
+        case inspect.StrType():
+            return "texts"
+        case inspect.FloatType() | inspect.IntType():
+            return "numbers"
+        case inspect.StructType() | inspect.DictType():
+            return "tables"
+        case inspect.TupleType() | inspect.CollectionType():
+            return "lists"
+        case _:
+            return "values"
 
 
 def _one_of(words: Iterable[object]) -> str:

@@ -13,21 +13,15 @@ from isocharge.common.versions import version_attribute
 from isocharge.serve.examination.port_check import Examination, examine
 from isocharge.serve.frames.autodetect import AutoParser
 from isocharge.serve.frames.binary import BinaryParser, encode_frame
-from isocharge.serve.frames.frame import Frame, FrameCounts, Parser
-from isocharge.serve.frames.frame_layout import FrameLayout
-from isocharge.serve.frames.layout_parser import DescribedParser
-from isocharge.serve.frames.sequence import SequenceGaps
-from isocharge.serve.frames.text import TextParser
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.frames.text_encoder import encode_text
 from isocharge.serve.live.device import Device, device_from_table, load_device
-from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
 from isocharge.serve.live.reading_stream import ReadingStream
-from isocharge.serve.live.steady_press import PressWatch, SteadyPress, SteadyRule
+from isocharge.serve.live.steady_press import PressWatch
 from isocharge.serve.live.stream import Policy, TouchStream, stream
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import Model, check_golden, load_model, write_model
 from isocharge.serve.model.repository import find_model
-from isocharge.serve.port.device_clock import DeviceClock
 from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
 from isocharge.serve.port.serial_port import Chunk, Port
 from isocharge.serve.port.source import open_source
@@ -37,14 +31,10 @@ from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses
 from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
-from isocharge.serve.prediction.validity import Domain
+from isocharge.serve.prediction.validity import Validity
 from isocharge.serve.signal_chain.chain import Chain
-from isocharge.serve.signal_chain.contact import TouchRule
-from isocharge.serve.signal_chain.hum import HumRule
-from isocharge.serve.signal_chain.leak import LeakRule
-from isocharge.serve.signal_chain.tare import Tare, TareRule
 from isocharge.serve.virtual_sensor.script import Faults, Script, wander
-from isocharge.serve.virtual_sensor.sensor import Truth, VirtualSensor
+from isocharge.serve.virtual_sensor.sensor import VirtualSensor
 
 __all__ = [
     "AutoParser",
@@ -53,21 +43,13 @@ __all__ = [
     "Chunk",
     "Contact",
     "Contacts",
-    "DescribedParser",
     "Device",
-    "DeviceClock",
-    "Domain",
     "Examination",
     "Faults",
     "Frame",
-    "FrameCounts",
-    "FrameLayout",
-    "HumRule",
-    "LeakRule",
     "MeasuredPresses",
     "Model",
     "ModelMetadata",
-    "Parser",
     "Policy",
     "Port",
     "PredictionRecord",
@@ -79,21 +61,11 @@ __all__ = [
     "Recorder",
     "Recording",
     "Script",
-    "SequenceGaps",
-    "SteadyPress",
-    "SteadyRule",
-    "Tare",
-    "TareRule",
-    "TextParser",
-    "TouchRule",
     "TouchStream",
-    "Truth",
-    "UdpSink",
+    "Validity",
     "VirtualSensor",
     "check_golden",
     "check_presses",
-    "csv_header",
-    "csv_line",
     "device_from_table",
     "encode_frame",
     "encode_text",

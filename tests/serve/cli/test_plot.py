@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from isocharge.cli.serve import plot
 from isocharge.cli.serve.pictures import recording as pictures
 from isocharge.serve import Chunk, Frame, Recorder, encode_frame
 
@@ -25,7 +26,7 @@ def recorded(command, film, models, tmp_path):
 def figure_of(monkeypatch):
     """The figures that are drawn from now on."""
     figures, draw = [], pictures.recording_picture
-    monkeypatch.setattr(pictures, "recording_picture", lambda *words: figures.append(draw(*words)) or figures[-1])
+    monkeypatch.setattr(plot, "recording_picture", lambda *words: figures.append(draw(*words)) or figures[-1])
     return figures
 
 
@@ -51,7 +52,7 @@ def test_a_recording_is_drawn(command, recorded, models, tmp_path, monkeypatch):
 
 
 def test_a_long_recording_is_drawn_as_bands(command, recorded, models, tmp_path, monkeypatch):
-    monkeypatch.setattr("isocharge.serve.export.traces.MOST_GROUPS", 32)
+    monkeypatch.setattr(pictures, "MOST_GROUPS", 32)
     figures, records = figure_of(monkeypatch), []
     assert command("serve", "plot", recorded, "--models", models, "-o", tmp_path / "touch.png")[0] == 0
     records = [json.loads(line) for line in recorded.read_text().splitlines() if '"timestamp"' in line]

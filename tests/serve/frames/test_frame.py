@@ -1,6 +1,6 @@
 """The counters that all parsers share."""
 
-from isocharge.serve import FrameCounts
+from isocharge.serve.frames.frame import FrameCounts
 
 
 def test_a_resynchronisation_is_a_good_frame_after_damage():

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from isocharge.common.errors import DeviceError
-from isocharge.serve import DescribedParser, Frame
+from isocharge.serve import Frame
 from isocharge.serve.frames.formats import frame_layout
+from isocharge.serve.frames.layout_parser import DescribedParser
 
 ROBOTIQ = (Path(__file__).parents[2] / "data" / "frames" / "robotiq_ft300.toml").read_text("utf-8")
 
@@ -80,7 +81,7 @@ def test_wrong_descriptions(good, bad, said):
     [
         ("[]", r"fields: expected one or more that are channels, got \[\]"),
         ('[{name = "seq", type = "u8"}]', r"fields: expected one or more that are channels, got \['seq'\]"),
-        ("3", r"fields: expected a list, got 3"),
+        ("3", r"fields: expected a list of tables, got 3"),
         ("[3]", r"fields\[1\]: expected a table, got 3"),
     ],
 )

@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import DeviceError
-from isocharge.serve import DescribedParser, Frame
+from isocharge.serve import Frame
 from isocharge.serve.frames.formats import frame_layout
-from isocharge.serve.frames.layout_parser import described_parser
+from isocharge.serve.frames.layout_parser import DescribedParser, described_parser
 
 FOLDER = Path(__file__).parents[2] / "data" / "frames"
 LAYOUTS = {path.stem: frame_layout(tomllib.loads(path.read_text("utf-8")), path.name) for path in FOLDER.glob("*.toml")}

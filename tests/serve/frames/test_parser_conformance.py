@@ -19,21 +19,14 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve import (
-    AutoParser,
-    BinaryParser,
-    DescribedParser,
-    Frame,
-    FrameLayout,
-    Parser,
-    TextParser,
-    encode_frame,
-    encode_text,
-)
+from isocharge.serve import AutoParser, BinaryParser, Frame, encode_frame, encode_text
 from isocharge.serve.frames.formats import frame_layout
-from isocharge.serve.frames.layout_parser import described_parser
+from isocharge.serve.frames.frame import Parser
+from isocharge.serve.frames.frame_layout import FrameLayout
+from isocharge.serve.frames.layout_parser import DescribedParser, described_parser
+from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_encoder import TEXT_FORMATS
-from isocharge.serve.virtual_sensor.faults import corrupt
+from isocharge.serve.virtual_sensor.script import corrupt
 
 CHECKSUMMED = frame_layout(
     {

@@ -1,6 +1,6 @@
 """Frame numbers: gaps, repeats and restarts."""
 
-from isocharge.serve import SequenceGaps
+from isocharge.serve.frames.sequence import SequenceGaps
 
 
 def follow(*numbers):

@@ -7,10 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve import DeviceClock, Frame, SequenceGaps, TextParser, encode_text
-from isocharge.serve.frames.text import LONGEST_LINE
+from isocharge.serve import Frame, encode_text
+from isocharge.serve.frames.sequence import SequenceGaps
+from isocharge.serve.frames.text import LONGEST_LINE, TextParser
 from isocharge.serve.frames.text_encoder import TEXT_FORMATS
 from isocharge.serve.frames.text_lines import Notation, parse_line
+from isocharge.serve.port.device_clock import DeviceClock
 
 README_OF_TELEPLOT = [
     ("myValue:1234", ("myValue",), (1234.0,)),

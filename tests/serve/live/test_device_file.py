@@ -8,17 +8,16 @@ from isocharge.serve import (
     AutoParser,
     BinaryParser,
     Chunk,
-    DescribedParser,
     Frame,
     ReadingStream,
-    TextParser,
     device_from_table,
     encode_frame,
     load_device,
 )
+from isocharge.serve.frames.layout_parser import DescribedParser
+from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.channels import ChannelPicker
-from isocharge.serve.live.device import ANY_BOARD
-from isocharge.serve.live.device import with_offset_limit
+from isocharge.serve.live.device import ANY_BOARD, with_offset_limit
 from isocharge.serve.signal_chain.chain import ChainState, advance
 
 ELECTRODES = ("A", "B", "C")

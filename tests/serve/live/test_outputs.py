@@ -8,7 +8,7 @@ import socket
 import pytest
 
 from isocharge.common.errors import InputError
-from isocharge.serve import UdpSink, csv_header, csv_line
+from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
 
 ELECTRODES = ("A", "B")
 

@@ -14,13 +14,13 @@ from isocharge.serve import (
     Frame,
     Policy,
     Predictor,
-    SequenceGaps,
-    TareRule,
     TouchStream,
     device_from_table,
     encode_frame,
     stream,
 )
+from isocharge.serve.frames.sequence import SequenceGaps
+from isocharge.serve.signal_chain.tare import TareRule
 
 OFFSET = np.array([12.0, -7.0, 3.0])
 CHAIN = Chain(tare=TareRule(frames=10))

@@ -134,7 +134,7 @@ def spoilt(film):
         ("other output", ModelError, "expected the outputs"),
         ("golden too narrow", ChargeError, "'A', 'B', 'C'"),
         ("no answer", ModelError, "answers contact = .*nan"),
-        ("no golden", ModelError, "n > 0"),
+        ("no golden", ModelError, "expected a list of lists, 1 or more"),
     ],
 )
 def test_unusable_model_leaves_nothing_behind(film, tmp_path, wrong, error, said, another_version):
@@ -204,7 +204,7 @@ def test_not_a_model_is_chained_from_its_cause(own_model, data):
     [
         (None, "missing; a model comes with"),
         ("{", "expected JSON, got"),
-        ("{}", "key 'inputs' is missing; the file is damaged"),
+        ("{}", "key 'sha256' is missing; the file is damaged"),
         ("[]", "expected a table"),
     ],
 )

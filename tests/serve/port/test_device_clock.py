@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.serve import DeviceClock
+from isocharge.serve.port.device_clock import DeviceClock
 
 MODULUS, START_S = 2**32, 1_700_000_000.0
 

@@ -104,7 +104,7 @@ def test_contacts_as_csv(film, predictor):
 def test_contacts_as_csv_with_flags(film, predictor):
     out = io.StringIO()
     contacts = predictor.predict_batch(film.charge_pC([1.0, 9.0, 9.0], [0.5, 0.0, 0.0], [1.0, 0.25, 99.0]))
-    write_contacts(contacts, out, predictor.domain)
+    write_contacts(contacts, out, predictor.validity)
     header, *rows = (line.split(",") for line in out.getvalue().splitlines())
     assert header == [*Contacts._fields, "flags"]
     assert [row[-1] for row in rows] == ["", "outside", "outside beyond"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.serve import Contact, Contacts, Domain, Predictor
+from isocharge.serve import Contact, Contacts, Predictor, Validity
 from isocharge.serve.prediction.validity import MISFIT_LIMIT, inside_polygon
 
 GOOD = Contact(1.0, -2.0, 0.5, 0.1, 0.1, 0.01, 0.3)
@@ -43,11 +43,11 @@ def test_inside_polygon_of_a_notched_square(closed):
     ],
 )
 def test_flags_of_a_contact(film, changes, flags):
-    assert Domain.of(film.metadata()).flags(GOOD._replace(**changes)) == flags
+    assert Validity.of(film.metadata()).flags(GOOD._replace(**changes)) == flags
 
 
 def test_batch_flags_equal_one_by_one(film):
-    domain, rng = Domain.of(film.metadata()), np.random.default_rng(2)
+    domain, rng = Validity.of(film.metadata()), np.random.default_rng(2)
     columns = rng.uniform(-3, 10, (7, 50)).astype(np.float32)
     one_by_one = [domain.flags(Contact(*row)) for row in columns.T.tolist()]
     assert domain.batch_flags(Contacts(*columns)) == one_by_one
@@ -60,7 +60,7 @@ def test_no_absurd_charge_goes_without_a_flag(name):
     size = (20_000, len(predictor.metadata.electrodes))
     charge_pC = 10 ** rng.uniform(-1, 10, size) * rng.choice([1, 1, -1], size)
     charge_pC[:100] = 10 ** rng.uniform(5, 10, (100, 1))  # the same on all electrodes
-    flags = predictor.domain.batch_flags(predictor.predict_batch(charge_pC))
+    flags = predictor.validity.batch_flags(predictor.predict_batch(charge_pC))
     impossible = (charge_pC < 1.0).any(axis=1) | (charge_pC > 1e4).any(axis=1)  # 3,900 pC: 1 N on an electrode
     assert all(words for words, wrong in zip(flags, impossible, strict=True) if wrong)
     assert all("beyond" in words for words in flags[:100])
@@ -69,8 +69,8 @@ def test_no_absurd_charge_goes_without_a_flag(name):
 def test_flags_of_one_contact_equal_those_in_a_batch():
     """One contact takes a short cut where it is well inside; it must not show."""
     rng = np.random.default_rng(0)
-    square = Domain(np.array([[-4.0, -3.0], [6.0, -3.0], [6.0, 5.0], [-4.0, 5.0]]), (0.05, 2.0))
-    away = Domain(square.corners_mm + 20.0, (0.05, 2.0))
+    square = Validity(np.array([[-4.0, -3.0], [6.0, -3.0], [6.0, 5.0], [-4.0, 5.0]]), (0.05, 2.0))
+    away = Validity(square.corners_mm + 20.0, (0.05, 2.0))
     for x, y, force, misfit in zip(*rng.uniform(-8, 8, (2, 500)), *rng.uniform(0, [[2.5], [6]], (2, 500)), strict=True):
         contact = Contact(x, y, force, 0.1, 0.1, 0.01, misfit)
         for domain in (square, away):

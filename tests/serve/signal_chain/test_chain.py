@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import TareError
-from isocharge.serve import Chain, LeakRule, TareRule, TouchRule
+from isocharge.serve import Chain
 from isocharge.serve.signal_chain.chain import ChainState, advance
-from isocharge.serve.signal_chain.contact import Touch, update_contact
-from isocharge.serve.signal_chain.tare import measure_tare
+from isocharge.serve.signal_chain.contact import Touch, TouchRule, update_contact
+from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve.signal_chain.tare import TareRule, measure_tare
 
 RULE, OFFSET = TareRule(), np.array([12.0, -7.0, 3.0])
 RATE_HZ = 200.0

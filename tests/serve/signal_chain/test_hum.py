@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.serve import HumRule
-from isocharge.serve.signal_chain.hum import Hum, remove_hum
+from isocharge.serve.signal_chain.hum import Hum, HumRule, remove_hum
 
 
 def clean(raw_pC, rate_Hz, rule=None):

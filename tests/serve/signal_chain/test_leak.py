@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from isocharge.serve import Chain, LeakRule, TareRule
+from isocharge.serve import Chain
 from isocharge.serve.signal_chain.chain import ChainState, advance
-from isocharge.serve.signal_chain.leak import Leak, undo_leak
+from isocharge.serve.signal_chain.leak import Leak, LeakRule, undo_leak
+from isocharge.serve.signal_chain.tare import TareRule
 
 RATE_HZ, TAU_S = 200.0, 2.0
 

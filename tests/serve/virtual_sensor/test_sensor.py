@@ -8,17 +8,8 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import PortError, SceneError
-from isocharge.serve import (
-    AutoParser,
-    BinaryParser,
-    Faults,
-    Port,
-    Script,
-    SequenceGaps,
-    VirtualSensor,
-    encode_text,
-    wander,
-)
+from isocharge.serve import AutoParser, BinaryParser, Faults, Port, Script, VirtualSensor, encode_text, wander
+from isocharge.serve.frames.sequence import SequenceGaps
 from isocharge.serve.virtual_sensor.script import corrupt
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import onnx
 import pytest
+from msgspec import structs
 from onnx import helper, numpy_helper
 
 from isocharge.common.errors import ModelError
@@ -82,7 +83,7 @@ def random_network(electrodes, contact, misfit, *, int8=False):
 def written(folder, network):
     """A model folder of a network."""
     names = tuple(f"E{number} */" for number in range(network.typical.size))
-    about = replace(load_model(find_model(MODELS[0])).metadata, name=folder.name, version=1, electrodes=names)
+    about = structs.replace(load_model(find_model(MODELS[0])).metadata, name=folder.name, version=1, electrodes=names)
     charges = np.random.default_rng(1).uniform(100.0, 3000.0, (64, len(names))).astype(np.float32)
     return write_model(folder, export_onnx(network, about.to_props()), about, charges, "card")
 

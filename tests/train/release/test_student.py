@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import onnx
 import pytest
+from msgspec import structs
 from onnx import numpy_helper
 
 from isocharge.common.errors import DatasetError, ModelError
@@ -64,6 +65,6 @@ def test_its_case_is_what_the_teacher_knows(teacher, dataset):
     assert case.probes == (Circle(1.0),)
     assert case.domain.radius == pytest.approx(8.0, abs=1e-3)
     assert case.domain.force_range == (0.05, 2.0)
-    measured = replace(teacher.metadata, errors={**teacher.metadata.errors, "measured_presses": 40.0})
+    measured = structs.replace(teacher.metadata, errors={**teacher.metadata.errors, "measured_presses": 40.0})
     with pytest.raises(ModelError, match="teacher/1 was trained on measured presses"):
         StudentCase.of(measured)

@@ -20,7 +20,8 @@ from isocharge.cli.shared.virtual_sensor import check_pseudo_terminals, virtual_
 from isocharge.common.arrays import Array
 from isocharge.common.files import new_folder
 from isocharge.common.progress import report
-from isocharge.serve import BinaryParser, Port, PredictionRecord, Predictor, SequenceGaps, stream
+from isocharge.serve import BinaryParser, Port, PredictionRecord, Predictor, stream
+from isocharge.serve.frames.sequence import SequenceGaps
 from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, noise_model, press, read_dataset
 from isocharge.simulate.dataset.sweep import solve_maps, write_sweep
 from isocharge.train import Release, fit, load_config, release

@@ -47,7 +47,7 @@ def predict_command(
         if json:
             _print_lines(record.to_json() for record in table_records(charge_pC, predictor))
         else:
-            write_contacts(predictor.predict_batch(charge_pC), sys.stdout, predictor.domain)
+            write_contacts(predictor.predict_batch(charge_pC), sys.stdout, predictor.validity)
             sys.stdout.flush()
 
 

@@ -37,7 +37,7 @@ def record_writer(
     stack: ExitStack, output: Output, udp: str | None, electrodes: tuple[str, ...], put: Callable[[str], object]
 ) -> Lines:
     """The function that gives each record to `put` as a line, and sends it to the network."""
-    from isocharge.serve import UdpSink, csv_header, csv_line
+    from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
 
     sink = stack.enter_context(UdpSink(udp)) if udp else None
     if output is Output.csv:

@@ -19,7 +19,8 @@ from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.cli.shared.virtual_sensor import check_pseudo_terminals, virtual_sensor
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, OutputExists
-from isocharge.serve import FrameLayout, Script, encode_frame, encode_text, load_device
+from isocharge.serve import Script, encode_frame, encode_text, load_device
+from isocharge.serve.frames.frame_layout import FrameLayout
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
 from isocharge.serve.virtual_sensor.sensor import Encode
 from isocharge.simulate import (

@@ -208,11 +208,10 @@ def _missing(
             if channel.span_pC == 0.0
         )
     else:
-        yield from _missing_in_channels(channels, device.tare)
-    leaks = device.leak is not None and device.leak.on
-    if capture.frames[0].t_us is None and leaks:
+        yield from _missing_in_channels(channels, device.tare or TareRule())
+    if capture.frames[0].t_us is None and device.leak is not None:
         yield "a device clock (t_us, t_ms or t_s): without it the leak is undone by arrival times, which jitter"
-    if not leaks:
+    if device.leak is None:
         yield "the amplifier's time constants ([leak] tau_s in a device file): without them held presses fade"
 
 

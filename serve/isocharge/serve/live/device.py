@@ -29,7 +29,7 @@ section. An unknown key is an error.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -51,8 +51,6 @@ from isocharge.serve.signal_chain.thermal import ThermalRule
 
 LEAST_ELECTRODES_FOR_WARMING = 4
 """Number of electrodes from which warming can be separated from force: a contact alone has three unknowns."""
-
-AnyRule = TypeVar("AnyRule", bound=Rule)
 
 
 class Gain(Rule, frozen=True, kw_only=True):
@@ -120,14 +118,14 @@ class DeviceSections(Settings, frozen=True):
     gain: Gain | None = None
     saturation: Saturation | None = None
     hum: HumRule | None = None
-    tare: TareRule = TareRule()
+    tare: TareRule | None = TareRule()
     leak: LeakSection | None = None
-    touch: TouchRule = TouchRule()
+    touch: TouchRule | None = TouchRule()
     common_mode: ThermalRule | None = None
 
 
 class Device(DeviceSections, frozen=True):
-    """What is known about a board; the other attributes are the sections of its file.
+    """What is known about a board; the other attributes are the sections of its file, None for what is switched off.
 
     Attributes:
         table: The content of the device file as it came; recordings keep it.
@@ -155,22 +153,22 @@ class Device(DeviceSections, frozen=True):
         Raises:
             DeviceError: If a setting is for other electrodes, or they are too few to follow warming.
         """
-        gain, leak, saturation, warming = _on(self.gain), _on(self.leak), _on(self.saturation), _on(self.common_mode)
-        if warming is not None and len(electrodes) < LEAST_ELECTRODES_FOR_WARMING:
+        if self.common_mode is not None and len(electrodes) < LEAST_ELECTRODES_FOR_WARMING:
             raise DeviceError(
                 f"{self.where}: common_mode: expected four electrodes or more, the model has {electrodes}; with three "
                 "every set of charges fits some contact, and warming cannot be separated from force: remove the section"
             )
+        gain, leak = self.gain, self.leak
         return Chain(
             gain_pC=None if gain is None else self._gain_pC(gain, electrodes),
             zero=None if gain is None else self._of_each("gain.offset", gain.offset, electrodes),
-            limit_pC=None if saturation is None else saturation.limit_pC,
-            hum=_on(self.hum),
-            tare=_on(self.tare),
+            limit_pC=None if self.saturation is None else self.saturation.limit_pC,
+            hum=self.hum,
+            tare=self.tare,
             tau_s=None if leak is None else self._of_each("leak.tau_s", leak.tau_s, electrodes),
             leak=leak or LeakRule(),
-            touch=_on(self.touch),
-            thermal=warming,
+            touch=self.touch,
+            thermal=self.common_mode,
         )
 
     def check_gain(self, electrodes: tuple[str, ...]) -> None:
@@ -200,10 +198,6 @@ class Device(DeviceSections, frozen=True):
         return np.array([numbers[name] for name in electrodes], dtype=float)
 
 
-def _on(rule: AnyRule | None) -> AnyRule | None:
-    return rule if rule is not None and rule.on else None
-
-
 ANY_BOARD = Device(name="any board")
 """The board of which nothing is known."""
 
@@ -229,8 +223,9 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     """
     frames = table.get("frames")
     tagged = {**table, "frames": {"format": "auto", **frames}} if isinstance(frames, Mapping) else table
-    sections = convert(tagged, DeviceSections, where, DeviceError)
-    return Device(**msgspec.structs.asdict(sections), table=table, where=where)
+    sections = msgspec.structs.asdict(convert(tagged, DeviceSections, where, DeviceError))
+    on: dict[str, Any] = {name: None if isinstance(one, Rule) and not one.on else one for name, one in sections.items()}
+    return Device(**on, table=table, where=where)
 
 
 def with_offset_limit(device: Device, offset_limit_pC: float) -> Device:

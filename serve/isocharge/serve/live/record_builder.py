@@ -12,7 +12,7 @@ from isocharge.serve.port.device_clock import ReadingTime
 from isocharge.serve.port.serial_port import Chunk
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import OUT_OF_CONTACT, UNKNOWN, Charges, PredictionRecord
-from isocharge.serve.prediction.validity import Domain
+from isocharge.serve.prediction.validity import Validity
 from isocharge.serve.signal_chain.chain import Reading
 
 
@@ -21,7 +21,7 @@ class RecordBuilder:
     """Builds prediction records; holds what all of them share."""
 
     predictor: Predictor
-    domain: Domain
+    validity: Validity
     electrodes: tuple[str, ...]
     model: str
     frame_id: str
@@ -30,7 +30,7 @@ class RecordBuilder:
     def of(cls, predictor: Predictor, frame_id: str | None = None) -> "RecordBuilder":
         """The builder for a model; `frame_id` names the film, by default as the model's sensor."""
         metadata = predictor.metadata
-        return cls(predictor, predictor.domain, metadata.electrodes, metadata.label, frame_id or metadata.frame_id)
+        return cls(predictor, predictor.validity, metadata.electrodes, metadata.label, frame_id or metadata.frame_id)
 
     def record(
         self, chunk: Chunk, frame: Frame, reading: Reading, when: ReadingTime, now_ns: Callable[[], int]
@@ -68,7 +68,7 @@ class RecordBuilder:
         if not reading.contact or reading.charge_pC is None:
             return OUT_OF_CONTACT, flags
         contact = self.predictor.predict(reading.charge_pC)
-        return contact._asdict(), flags + self.domain.flags(contact)
+        return contact._asdict(), flags + self.validity.flags(contact)
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
         """Charges by electrode name; None for one that is not a number."""

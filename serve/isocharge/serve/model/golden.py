@@ -5,16 +5,19 @@ the same answers: |a - b| <= 1e-5 max(|b|, floor).
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import onnxruntime as ort
+from msgspec import Meta, Struct
 
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
-from isocharge.common.tables import Table, read_json
+from isocharge.common.structs import Finite, NotNegative, Text, WrongKey, read_json
 from isocharge.serve.model.session import INPUT, OUTPUTS, run
 
 RELATIVE = 1e-5
@@ -85,35 +88,59 @@ def read_golden(path: Path) -> Golden:
     if not path.exists():
         raise ModelError(f"{path}: missing; a model comes with its golden.json: copy the whole folder")
     try:
-        return _of_table(Table(read_json(path, "golden vectors", ModelError), str(path), ModelError))
+        file = read_json(path, "golden vectors", ModelError, _File)
     except ModelError as error:
         raise ModelError(f"{error}; the file is damaged: copy or export the model again") from error
-
-
-def _of_table(file: Table) -> Golden:
-    """Golden vectors of any number of electrodes; that there is an answer to each press is checked with the model."""
-    inputs, outputs, tolerance = file.table("inputs"), file.table("outputs"), file.table("tolerance")
-    charges = inputs.sequence(INPUT, of="rows of charges")
-    if not charges or not isinstance(charges[0], list):
-        inputs.refuse(INPUT, "n rows of charges with n > 0")
     return Golden(
-        sha256=file.text("sha256"),
-        charge_pC=_rows(inputs, INPUT, len(charges[0])),
-        outputs={name: _rows(outputs, name, columns) for name, columns in OUTPUTS.items()},
-        relative=tolerance.number("relative", least=0.0),
-        floors={
-            name: tolerance.table("floor").numbers(name, count=columns, of=f"a list of {columns} numbers")
-            for name, columns in OUTPUTS.items()
-        },
+        sha256=file.sha256,
+        charge_pC=_singles(file.inputs.charge_pC),
+        outputs={name: _singles(getattr(file.outputs, name)) for name in OUTPUTS},
+        relative=file.tolerance.relative,
+        floors={name: getattr(file.tolerance.floor, name) for name in OUTPUTS},
     )
 
 
-def _rows(table: Table, name: str, width: int) -> Singles:
+Three = tuple[Finite, Finite, Finite]
+
+
+class _Inputs(Struct):
+    charge_pC: Annotated[list[list[Finite]], Meta(min_length=1)]
+
+    def __post_init__(self) -> None:
+        if len(set(map(len, self.charge_pC))) > 1:
+            raise WrongKey(INPUT, "rows of one length", self.charge_pC)
+
+
+class _Outputs(Struct):
+    contact: list[Three]
+    contact_std: list[Three]
+    misfit: list[tuple[Finite]]
+
+
+class _Floors(Struct):
+    contact: Three
+    contact_std: Three
+    misfit: tuple[Finite]
+
+
+class _Tolerance(Struct):
+    relative: NotNegative
+    floor: _Floors
+
+
+class _File(Struct):
+    """The content of `golden.json`; that there is an answer to each press is checked with the model."""
+
+    sha256: Text
+    inputs: _Inputs
+    outputs: _Outputs
+    tolerance: _Tolerance
+
+
+def _singles(rows: Sequence[Sequence[float]]) -> Singles:
     """An array of shape (n, width); what float32 cannot hold is infinite, and equals no answer."""
-    rows = table.sequence(name, of="rows")
-    numbers = [table.as_numbers(name, row, count=width, of=f"rows of {width} numbers") for row in rows]
     with np.errstate(over="ignore"):
-        return np.array(numbers, dtype=np.float64).reshape(-1, width).astype(np.float32)
+        return np.array(rows, dtype=np.float64).reshape(len(rows), -1 if rows else 0).astype(np.float32)
 
 
 def check_answers(golden: Golden, answers: dict[str, Singles], where: str) -> None:

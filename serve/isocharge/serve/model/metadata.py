@@ -8,11 +8,12 @@ that x and y refer to.
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from typing import Annotated, Any
 
-from isocharge.common.errors import ModelError
-from isocharge.common.tables import Table, parse_json, shown
+from msgspec import Meta, Struct
+
+from isocharge.common.errors import ModelError, shown
+from isocharge.common.structs import Finite, Settings, Text, WrongKey, convert, parse_json
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 """Pattern of model names: safe in paths, URLs, pages and config.pbtxt."""
@@ -21,8 +22,10 @@ FORMAT_VERSION = 1
 """Version of the metadata."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ModelMetadata:
+Names = Annotated[tuple[Text, ...], Meta(min_length=1)]
+
+
+class ModelMetadata(Settings, frozen=True, kw_only=True):
     """Everything a user of a model file needs to know.
 
     Attributes:
@@ -40,18 +43,28 @@ class ModelMetadata:
         format_version: Version of the metadata.
     """
 
-    name: str
-    version: int
-    sensor: Mapping[str, Any]
-    electrodes: tuple[str, ...]
-    working_area_mm: tuple[tuple[float, float], ...]
-    probes: tuple[str, ...]
-    force_range_N: tuple[float, float]
-    noise: Mapping[str, Any]
-    dataset_sha256: str
-    errors: Mapping[str, float]
-    made_with: Mapping[str, Any]
+    name: Annotated[str, Meta(pattern=f"^{NAME.pattern}$", description="letters, digits, '-', '_' and '.'")]
+    version: Annotated[int, Meta(ge=1)]
+    sensor: dict[str, Any]
+    electrodes: Names
+    working_area_mm: Annotated[tuple[tuple[Finite, Finite], ...], Meta(min_length=3)]
+    probes: Names
+    force_range_N: tuple[Finite, Finite]
+    noise: dict[str, Any]
+    dataset_sha256: Text
+    errors: dict[str, Finite]
+    made_with: dict[str, Any]
     format_version: int = FORMAT_VERSION
+
+    def __post_init__(self) -> None:
+        if "name" not in self.sensor:
+            raise WrongKey("sensor.name")
+        if not isinstance(name := self.sensor["name"], str) or not name:
+            raise WrongKey("sensor.name", "a text", name)
+        if len(set(self.electrodes)) < len(self.electrodes):
+            raise WrongKey("electrodes", "names that differ", self.electrodes)
+        if self.force_range_N[0] > self.force_range_N[1]:
+            raise WrongKey("force_range_N", "a smaller and a larger number", list(self.force_range_N))
 
     @property
     def label(self) -> str:
@@ -69,7 +82,7 @@ class ModelMetadata:
         Raises:
             ModelError: If a value is not JSON, NaN included.
         """
-        return {field.name: _to_json(field.name, getattr(self, field.name)) for field in fields(self)}
+        return {name: _to_json(name, getattr(self, name)) for name in self.__struct_fields__}
 
     @classmethod
     def from_props(cls, props: Mapping[str, str], where: str) -> "ModelMetadata":
@@ -82,16 +95,25 @@ class ModelMetadata:
         Raises:
             ModelError: If the format version is another, or a key is missing or wrong.
         """
+        where = f"{where}: metadata"
         try:
-            version = _table(props, ("format_version",), where).whole("format_version", least=1)
+            known = [name for name in cls.__struct_fields__ if name in props]
+            values = {name: parse_json(props[name], f"{where}: {name}", ModelError) for name in known}
+            version = convert(values, _Version, where, ModelError).format_version
             if version == FORMAT_VERSION:
-                return cls(**_fields(_table(props, tuple(field.name for field in fields(cls)), where)))
+                return convert(values, cls, where, ModelError)
         except ModelError as error:
             raise ModelError(f"{error}; export the model again") from error
         raise ModelError(
-            f"{where}: metadata format {version} is not supported (this version reads {FORMAT_VERSION}); "
-            "export it again or upgrade isocharge"
+            f"{where} format {version} is not supported (this version reads {FORMAT_VERSION}); export it again or "
+            "upgrade isocharge"
         )
+
+
+class _Version(Struct):
+    """What is read first of any version."""
+
+    format_version: Annotated[int, Meta(ge=1)]
 
 
 def _to_json(key: str, value: Any) -> str:
@@ -99,67 +121,3 @@ def _to_json(key: str, value: Any) -> str:
         return json.dumps(value, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ModelError(f"model metadata {key!r}: expected a JSON value, got {shown(value)} ({error})") from error
-
-
-def _table(props: Mapping[str, str], names: tuple[str, ...], where: str) -> Table:
-    """The values of those of these fields that `props` has."""
-    values: dict[str, Any] = {}
-    for name in names:
-        if name in props:
-            values[name] = parse_json(props[name], f"{where}: metadata: {name}", ModelError)
-    return Table(values, f"{where}: metadata", ModelError)
-
-
-def _fields(table: Table) -> dict[str, Any]:
-    """The arguments of `ModelMetadata`."""
-    sensor, errors = table.table("sensor"), table.table("errors")
-    sensor.text("name")
-    return {
-        "name": _name(table),
-        "version": table.whole("version", least=1),
-        "sensor": dict(sensor.values),
-        "electrodes": _electrodes(table),
-        "working_area_mm": _polygon(table, "working_area_mm"),
-        "probes": _texts(table, "probes"),
-        "force_range_N": _range(table, "force_range_N"),
-        "noise": dict(table.table("noise").values),
-        "dataset_sha256": table.text("dataset_sha256"),
-        "errors": {name: errors.number(name) for name in errors},
-        "made_with": dict(table.table("made_with").values),
-    }
-
-
-def _name(table: Table) -> str:
-    name = table.text("name")
-    if not NAME.fullmatch(name):
-        table.refuse("name", "letters, digits, '-', '_' and '.'")
-    return name
-
-
-def _texts(table: Table, key: str) -> tuple[str, ...]:
-    texts = table.texts(key)
-    if not texts:
-        table.refuse(key, "one text or more")
-    return texts
-
-
-def _electrodes(table: Table) -> tuple[str, ...]:
-    names = _texts(table, "electrodes")
-    if len(set(names)) < len(names):
-        table.refuse("electrodes", "names that differ")
-    return names
-
-
-def _range(table: Table, key: str) -> tuple[float, float]:
-    low, high = table.numbers(key, count=2, of="a smaller and a larger number")
-    if low > high:
-        table.refuse(key, "a smaller and a larger number")
-    return low, high
-
-
-def _polygon(table: Table, key: str) -> tuple[tuple[float, float], ...]:
-    points = table.sequence(key, of="points")
-    if len(points) < 3:
-        table.refuse(key, "three points or more")
-    corners = [table.as_numbers(key, point, count=2, of="points of two numbers") for point in points]
-    return tuple((x, y) for x, y in corners)

@@ -20,7 +20,7 @@ from isocharge.serve.model.model_folder import Model, check_golden, load_model
 from isocharge.serve.model.repository import model_names, repositories, version_folders
 from isocharge.serve.network.statistics import Statistics
 from isocharge.serve.prediction.bound_press import BoundPress
-from isocharge.serve.prediction.validity import Domain
+from isocharge.serve.prediction.validity import Validity
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ class LoadedVersion:
     @cached_property
     def misfit_limit(self) -> float:
         """Misfit above which a press has the flag `misfit`, in standard deviations."""
-        return Domain.of(self.metadata).misfit_limit
+        return Validity.of(self.metadata).misfit_limit
 
     def press(self) -> BoundPress:
         """Bound memory for one press; each thread has its own."""

@@ -17,15 +17,18 @@ import json
 import logging
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
-from isocharge.common.errors import OutputError, RecordingError
+import msgspec
+from msgspec import Meta, Struct
+
+from isocharge.common.errors import OutputError, RecordingError, cut
 from isocharge.common.files import bounded_lines, refuse_existing
-from isocharge.common.progress import Progress
-from isocharge.common.tables import Table, cut, is_whole, parse_json
+from isocharge.common.progress import report
+from isocharge.common.structs import Text, WrongKey, parse_json
 from isocharge.serve.port.serial_port import Chunk
 
 VERSION = 1
@@ -34,24 +37,19 @@ VERSION = 1
 KIND = "isocharge_recording"
 """Key of the version in the first line: what makes a file a recording."""
 
-POLICIES = ("every", "latest")
-"""Which frames get a record."""
-
 LONGEST_ENTRY = 1 << 20
 """Longest line, characters: a chunk of 64 KiB in base64 is a tenth of it."""
 
-LONGEST_US, LATEST_S = 1e12, 1e11
-"""Largest latency that counts as one, us: eleven days; and latest time, unix seconds: the year 5138."""
+Latency = Annotated[float, Meta(ge=-1e12, le=1e12, description="a latency of some days at most, us")]
+Moment = Annotated[float, Meta(ge=-1e11, le=1e11, description="a time before the year 5138, unix seconds")]
+Nanoseconds = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 
 WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 """To open a new file, without changing line ends on Windows."""
 
-LONGEST_MARKER = 1000
-"""Characters of a marker's text."""
-
 log = logging.getLogger(__name__)
 
-Entry = TypeVar("Entry")
+Line = TypeVar("Line")
 """What a line is read as."""
 
 
@@ -185,17 +183,21 @@ class Recording:
         """
         self._path = path
         try:
-            header = _header(path)
-            version = header.whole(KIND)
-            self.model, self.policy = header.text("model"), header.choice("policy", POLICIES)
-            self.device = dict(header.table("device").values)
-            self.name = header.text("name", "", or_empty=True)
+            if not path.is_file():
+                raise RecordingError("there is no file of that name")
+            with path.open(encoding="utf-8") as file:
+                first = next(bounded_lines(file, LONGEST_ENTRY), "")
+            header = parse_json(first, "first line", RecordingError, _Header)
         except (OSError, ValueError) as error:
             raise RecordingError(
                 f"{path}: expected a recording of `serve stream --record` ({cut(str(error))})"
             ) from error
-        if version != VERSION:
-            raise RecordingError(f"{path}: recording version {version} is not supported (this version reads {VERSION})")
+        if header.isocharge_recording != VERSION:
+            raise RecordingError(
+                f"{path}: recording version {header.isocharge_recording} is not supported (this version reads "
+                f"{VERSION})"
+            )
+        self.model, self.policy, self.device, self.name = header.model, header.policy, header.device, header.name
 
     def events(self) -> Iterator[Event | NewModel]:
         """Chunks, requests for a new tare and changes of the model, in their order.
@@ -209,90 +211,86 @@ class Recording:
         """As `events`, with the markers between them."""
         chunk: Chunk | None = None
         latencies_us: list[float] = []
-        for entry in self._entries():
-            if isinstance(entry, float):
-                latencies_us.append(entry)
+        for entry in self._lines(_Entry):
+            if entry.latency_us is not None and entry.timestamp is not None:
+                latencies_us.append(entry.latency_us)
                 continue
             if chunk is not None:
                 yield Event(chunk, tuple(latencies_us))
-            chunk, latencies_us = entry if isinstance(entry, Chunk) else None, []
-            if chunk is None:
-                yield entry if isinstance(entry, Marker | NewModel) else Event(None)
+            chunk, latencies_us = None, []
+            moment = entry.moment
+            if isinstance(moment, Chunk):
+                chunk = moment
+            else:
+                yield moment
         if chunk is not None:
             yield Event(chunk, tuple(latencies_us))
 
-    def for_each_record(self, take: Callable[[Table], None], progress: Progress | None = None) -> None:
-        """Call `take` with each record as it was written, in their order.
-
-        Args:
-            take: An InputError that it raises is raised again with file and line.
-            progress: Called now and then with the characters read until then, and the size of the file.
+    def records(self, kind: type[Line]) -> Iterator[Line]:
+        """The records as they were written, in their order, each as a struct of the fields that are wanted.
 
         Raises:
-            RecordingError: If a line other than the last one is damaged, or `take` refuses its record.
+            RecordingError: If a line other than the last one is damaged, or a record is another one.
         """
-        for _ in self._parsed(lambda entry: take(entry) if "timestamp" in entry else None, progress):
-            pass
+        return self._lines(kind, only='{"timestamp"')
 
-    def _entries(self) -> Iterator[Chunk | Marker | float | NewModel | None]:
-        """The content of each line, as `_entry` gives it."""
-        return self._parsed(_entry)
-
-    def _parsed(self, parse: Callable[[Table], Entry], progress: Progress | None = None) -> Iterator[Entry]:
-        """What `parse` makes of each line after the first."""
+    def _lines(self, kind: type[Line], only: str = "") -> Iterator[Line]:
+        """Each line after the first, those alone that begin so."""
         number, characters, size = 1, 0, self._path.stat().st_size
+        decode = msgspec.json.Decoder(kind).decode
         try:
             with self._path.open(encoding="utf-8", errors="replace") as file:
                 for line in bounded_lines(file, LONGEST_ENTRY):
                     if not line.endswith("\n"):
                         return  # the power failed while it was written
-                    if number > 1:
-                        yield parse(Table(parse_json(line, "entry", RecordingError), "", RecordingError))
+                    if number > 1 and (line.startswith(only) or not line.startswith("{")):
+                        try:
+                            content = decode(line)
+                        except (ValueError, RecursionError):  # again, for what was expected and given
+                            content = parse_json(line, "", RecordingError, kind)
+                        yield content
                     number, characters = number + 1, characters + len(line)
-                    if progress is not None and number % 1000 == 0:
-                        progress(min(characters, size), size)
+                    if number % 1000 == 0:
+                        report("reading", min(characters, size), size)
         except (OSError, ValueError) as error:
             raise RecordingError(f"{self._path}, line {number}: damaged ({cut(str(error))})") from error
 
 
-def _header(path: Path) -> Table:
-    """The first line of a recording."""
-    if not path.is_file():
-        raise RecordingError("there is no file of that name")
-    with path.open(encoding="utf-8") as file:
-        line = next(bounded_lines(file, LONGEST_ENTRY), "")
-    return Table(parse_json(line, "first line", RecordingError), "first line", RecordingError)
+class _Header(Struct):
+    """The first line."""
+
+    isocharge_recording: int
+    model: Text
+    policy: Literal["every", "latest"]
+    device: dict[str, Any]
+    name: str = ""
 
 
-def _entry(content: Table) -> Chunk | Marker | float | NewModel | None:
-    """A chunk, a marker, the latency of a record (us), a new model, or None for a request for a new tare.
+class _Entry(Struct):
+    """A later line: one of these keys, or a record."""
 
-    Raises:
-        RecordingError, ValueError: If it is none of these.
-    """
-    if "timestamp" in content:
-        return content.number("latency_us", least=-LONGEST_US, most=LONGEST_US)
-    if "tare" in content:
-        return None
-    if "use" in content:
-        return NewModel(content.text("use"))
-    if "marker" in content:
-        return _marker(content)
-    *times, data = content.sequence("chunk", of="timestamp, clock, outage and bytes")
-    timestamp, _, outage_s = content.as_numbers("chunk", times, count=3, of="three numbers and bytes")
-    if not isinstance(data, str):
-        content.refuse("chunk", "three numbers and bytes in base64")
-    if not (abs(timestamp) <= LATEST_S and outage_s >= 0.0 and is_whole(times[1])):
-        content.refuse("chunk", "a time of this age, nanoseconds and an outage")
-    return Chunk(base64.b64decode(data, validate=True), timestamp, times[1], outage_s)
+    timestamp: float | None = None
+    latency_us: Latency | None = None
+    tare: bool | None = None
+    use: Text | None = None
+    marker: tuple[Moment, Annotated[str, Meta(max_length=1000)]] | None = None
+    chunk: tuple[Moment, Nanoseconds, Annotated[float, Meta(ge=0.0)], bytes] | None = None
 
+    def __post_init__(self) -> None:
+        if self.timestamp is not None and self.latency_us is None:
+            raise WrongKey("latency_us")
+        if all(key is None for key in (self.timestamp, self.tare, self.use, self.marker, self.chunk)):
+            raise WrongKey("chunk")
 
-def _marker(content: Table) -> Marker:
-    timestamp, *texts = content.sequence("marker", of="timestamp and text")
-    (moment,) = content.as_numbers("marker", [timestamp], count=1, of="a time and a text")
-    if len(texts) != 1 or not isinstance(texts[0], str) or len(texts[0]) > LONGEST_MARKER or abs(moment) > LATEST_S:
-        content.refuse("marker", f"a time of this age and a text of at most {LONGEST_MARKER} characters")
-    return Marker(moment, texts[0])
+    @property
+    def moment(self) -> "Chunk | Event | Marker | NewModel":
+        """What happened, if it is no record."""
+        if self.chunk is not None:
+            timestamp, clock_ns, outage_s, data = self.chunk
+            return Chunk(data, timestamp, clock_ns, outage_s)
+        if self.marker is not None:
+            return Marker(*self.marker)
+        return Event(None) if self.use is None else NewModel(self.use)
 
 
 class RecordedClock:

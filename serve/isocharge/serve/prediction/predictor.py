@@ -24,7 +24,7 @@ from isocharge.serve.model.repository import find_model
 from isocharge.serve.model.session import OUTPUTS, run
 from isocharge.serve.prediction.bound_press import BoundPress
 from isocharge.serve.prediction.contact import Contact, Contacts
-from isocharge.serve.prediction.validity import Domain
+from isocharge.serve.prediction.validity import Validity
 
 log = logging.getLogger(__name__)
 
@@ -57,9 +57,9 @@ class Predictor:
         loaded = load_model(find_model(model, models))
         self._metadata = loaded.metadata
         self._session = loaded.session
-        self._domain = Domain.of(loaded.metadata)
+        self._validity = Validity.of(loaded.metadata)
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
-        self._far_mm2, self._far_N = self._domain.far
+        self._far_mm2, self._far_N = self._validity.far
         self._warned = False
         _check_shared(self._press, loaded)
 
@@ -69,9 +69,9 @@ class Predictor:
         return self._metadata
 
     @property
-    def domain(self) -> Domain:
+    def validity(self) -> Validity:
         """Where the model may be trusted; its `batch_flags` are those of `predict_batch`."""
-        return self._domain
+        return self._validity
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
         """The contact of one press; `flags` says whether to trust it.
@@ -100,7 +100,7 @@ class Predictor:
         Three charges and three unknowns: with three electrodes, a wrong charge mostly looks like another press, and
         only one that leads out of the working area or the forces is seen.
         """
-        return self._domain.flags(contact)
+        return self._validity.flags(contact)
 
     def predict_into(self, charge_pC: Singles, out: Singles) -> None:
         """The contact of one press, for the hot loop: from an array into an array, and nothing else.
@@ -150,10 +150,10 @@ class Predictor:
 
     def _summary(self) -> Iterator[tuple[str, str]]:
         """What the model takes and where it may be trusted."""
-        low, high = self._domain.force_range_N
+        low, high = self._validity.force_range_N
         yield "sensor", self._metadata.frame_id
         yield "charges", f"{' '.join(self._metadata.electrodes)} (pC)"
-        yield "positions", f"up to {self._domain.reach_mm:.3g} mm"
+        yield "positions", f"up to {self._validity.reach_mm:.3g} mm"
         yield "forces", f"{low:.3g} to {high:.3g} N"
 
     def _warn(self, charge_pC: object, contact: Contact) -> None:

@@ -11,7 +11,7 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.contact import Contacts
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.serve.prediction.predictor import Predictor
-from isocharge.serve.prediction.validity import MISFIT_LIMIT, Domain, inside_polygon
+from isocharge.serve.prediction.validity import MISFIT_LIMIT, Validity, inside_polygon
 
 NO_CHARGE, NOTHING_KNOWN, NOT_TRAINED = "a charge is unknown", "neither place nor force is known", "not trained for"
 """Reasons why a press does not count."""
@@ -27,7 +27,7 @@ class PressErrors:
         error: Predicted less known x and y, mm, and force, a share of the known one, shape (n, 3); NaN where unknown.
         noise_std: The model's own standard deviations, in the units of `error`, shape (n, 3): noise of the charges.
         rig_std: Those of what is known, in the units of `error`, shape (n, 3).
-        flags: `outside` (the answer, as `Domain` has it) and `misfit` (beyond 1 % of good presses) of each press.
+        flags: `outside` (the answer, as `Validity` has it) and `misfit` (beyond 1 % of good presses) of each press.
         left_out: Why a press does not count, empty if it does.
     """
 
@@ -110,7 +110,7 @@ def _answers(predictor: Predictor, charge_pC: Array) -> Array:
 
 
 def _flags(metadata: ModelMetadata, answer: Array) -> tuple[tuple[str, ...], ...]:
-    outside = [OUTSIDE in flags for flags in Domain.of(metadata).batch_flags(Contacts(*answer.astype(np.float32).T))]
+    outside = [OUTSIDE in flags for flags in Validity.of(metadata).batch_flags(Contacts(*answer.astype(np.float32).T))]
     misfit, whole = answer[:, -1] > misfit_limit(metadata), ~np.isnan(answer[:, 0])
     return tuple(
         (OUTSIDE,) * (is_outside and is_whole) + (MISFIT,) * is_misfit

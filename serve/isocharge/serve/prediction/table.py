@@ -18,7 +18,7 @@ from isocharge.serve.prediction.contact import Contacts
 from isocharge.serve.prediction.csv_numbers import CsvNumbers, ignored_words
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
-from isocharge.serve.prediction.validity import Domain
+from isocharge.serve.prediction.validity import Validity
 
 BLOCK = 4096
 """Rows that are worked on at a time."""
@@ -61,20 +61,19 @@ def read_charges(
     return np.frombuffer(charges, dtype=np.float64).reshape(-1, len(electrodes))
 
 
-def write_contacts(contacts: Contacts, out: TextIO, domain: Domain | None = None) -> None:
+def write_contacts(contacts: Contacts, out: TextIO, validity: Validity | None = None) -> None:
     """Write contacts as CSV, a row for each press, columns as in `Contact`, numbers to six decimals.
 
     Args:
         contacts: The contacts.
         out: Receives the text.
-        domain: Where their model may be trusted: adds a column `flags`, words with blanks between.
+        validity: Where their model may be trusted: adds a column `flags`, words with blanks between.
     """
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(Contacts._fields + ("flags",) * (domain is not None))
+    writer.writerow(Contacts._fields + ("flags",) * (validity is not None))
     for block in blocks(np.column_stack(contacts)):
-        words = (
-            [()] * len(block) if domain is None else [(" ".join(f),) for f in domain.batch_flags(Contacts(*block.T))]
-        )
+        flags = [] if validity is None else validity.batch_flags(Contacts(*block.T))
+        words: list[tuple[str, ...]] = [(" ".join(one),) for one in flags] or [()] * len(block)
         writer.writerows((*map("{:.6f}".format, row), *flags) for row, flags in zip(block.tolist(), words, strict=True))
 
 
@@ -96,7 +95,7 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
 
 def _block_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
     metadata, contacts = predictor.metadata, predictor.predict_batch(charge_pC)
-    flags = predictor.domain.batch_flags(contacts)
+    flags = predictor.validity.batch_flags(contacts)
     for charges, contact, its_flags in zip(charge_pC.tolist(), np.column_stack(contacts).tolist(), flags, strict=True):
         yield PredictionRecord(
             timestamp=None,

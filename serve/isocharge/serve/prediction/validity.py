@@ -18,8 +18,8 @@ FAR = 3.0
 
 
 @dataclass(frozen=True)
-class Domain:
-    """The domain in which a model may be trusted.
+class Validity:
+    """Where a model may be trusted: the area, the forces and the misfit that it was trained for.
 
     Attributes:
         corners_mm: Corners of the working area, a polygon, shape (n, 2), mm.
@@ -32,8 +32,8 @@ class Domain:
     misfit_limit: float = MISFIT_LIMIT
 
     @classmethod
-    def of(cls, metadata: ModelMetadata) -> "Domain":
-        """The domain that a model's metadata state."""
+    def of(cls, metadata: ModelMetadata) -> "Validity":
+        """What a model's metadata state."""
         limit = max(MISFIT_LIMIT, metadata.errors.get("misfit_p999", MISFIT_LIMIT))
         return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit)
 
