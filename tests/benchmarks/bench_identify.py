@@ -9,12 +9,10 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
 from isocharge.common.files import write_whole
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
-from isocharge.simulate.identifiability.identification import identify, search_radius
+from isocharge.simulate.identifiability.identification import Identification, search_radius
+from isocharge.simulate.plots.figure import new_figure
 from isocharge.simulate.plots.limit_map import TICKS, draw_limit_map
 
 SENSORS = ("three-25um-biaxial", "three-25um-uniaxial", "four-25um-biaxial", "four-25um-uniaxial")
@@ -24,18 +22,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("-o", "--output", type=Path, help="PNG to write")
     output = parser.parse_args().output
-    probe = Circle(1e-3)
+    probe = Circle(1.0)
     widest = max((load_sensor(name) for name in SENSORS), key=lambda sensor: search_radius(sensor, probe))
     film = ForwardMap.build(widest, probe, search_radius(widest, probe))
-    figure = Figure(figsize=(11.5, 10.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(11.5, 10.4)
     all_axes = figure.subplots(2, 2)
     print("| sensor | working area | first fold | position, 0.05 N, 1 N | force, 0.05 N, 1 N |\n|---|---|---|---|---|")
     for name, axes in zip(SENSORS, all_axes.ravel(), strict=True):
-        identified = identify(replace(film, sensor=load_sensor(name)), noise_model("reference"))
-        weak, one, _ = (limits.summary() for limits in identified.inside)
+        identified = Identification.of(replace(film, sensor=load_sensor(name)), noise_model("reference"))
+        weak, one, _ = (limits.statistics() for limits in identified.inside)
         print(
-            f"| {name} | {1e3 * identified.area.radius:.1f} mm | {1e3 * identified.area.fold_radius:.1f} mm | "
+            f"| {name} | {identified.area.radius:.1f} mm | {identified.area.fold_radius:.1f} mm | "
             f"{weak['position_median_mm']:.3f}, {one['position_median_mm']:.3f} mm | "
             f"{weak['force_median_percent']:.2f}, {one['force_median_percent']:.2f} % |"
         )

@@ -23,12 +23,12 @@ from pathlib import Path
 import numpy as np
 import scipy
 
+from isocharge.common.progress import listening
 from isocharge.simulate import (
     Dataset,
     Resolution,
     SolveSettings,
     Sweep,
-    SweepCallbacks,
     load_sensor,
     parse_probe,
     press,
@@ -76,18 +76,15 @@ class Run:
 
 def measure(sensor_name: str, samples: int, workers: int, checks: int, seed: int) -> Run:
     sensor = load_sensor(sensor_name)
-    sweep = Sweep(10e-3, (0.05, 2.0), samples, seed, "random")
+    sweep = Sweep(10.0, (0.05, 2.0), samples, seed, "random")
     began, solved_at = time.perf_counter(), []
     with tempfile.TemporaryDirectory() as folder:
-        with local_workers(workers) as crew:
-            run_sweep(
-                Path(folder) / "presses",
-                sensor,
-                [parse_probe(text) for text in PROBES],
-                sweep,
-                workers=crew,
-                callbacks=SweepCallbacks(sampled=lambda *_: solved_at.append(time.perf_counter())),
-            )
+        with (
+            local_workers(workers) as executor,
+            listening(lambda title, *_: solved_at.append(time.perf_counter()) if title == "pressing" else None),
+        ):
+            probes = [parse_probe(text) for text in PROBES]
+            run_sweep(Path(folder) / "presses", sensor, probes, sweep, executor=executor)
         seconds = time.perf_counter() - began
         usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
         parent, worker = (used.ru_maxrss / 1024 for used in usage)
@@ -137,8 +134,8 @@ def press_of(dataset: Dataset, row: int) -> tuple[str, float, float, float]:
 def solve(sensor, one: tuple[str, float, float, float]) -> np.ndarray:
     """Touch charges, pC."""
     probe, x, y, force = one
-    solved = press(sensor.film, parse_probe(probe), (1e-3 * x, 1e-3 * y), force, SolveSettings(resolution=FINER))
-    return 1e12 * touch_charge(sensor, solved)
+    solved = press(sensor.film, parse_probe(probe), (x, y), force, SolveSettings(resolution=FINER))
+    return touch_charge(sensor, solved)
 
 
 def main() -> None:

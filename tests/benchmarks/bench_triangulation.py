@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from isocharge.simulate import ForwardMap, Polygon, Triangulation, load_sensor, noise_model
+from isocharge.simulate import ChargeSpline, ForwardMap, Polygon, Sweep, Triangulation, load_sensor, noise_model
 
-RADIUS, FORCES = 8e-3, (0.05, 2.0)
+RADIUS, FORCES = 8.0, (0.05, 2.0)
 
 
 def main() -> None:
@@ -20,24 +20,22 @@ def main() -> None:
     options.add_argument("--presses", type=int, default=2000)
     options.add_argument("--seed", type=int, default=0)
     chosen = options.parse_args()
-    rng = np.random.default_rng(chosen.seed)
-    distance, angle = RADIUS * np.sqrt(rng.random(chosen.presses)), 2.0 * np.pi * rng.random(chosen.presses)
-    x, y = distance * np.cos(angle), distance * np.sin(angle)
-    force = np.exp(rng.uniform(*np.log(FORCES), chosen.presses))
-    solved = ForwardMap.build(load_sensor("three-25um-biaxial"), Polygon.triangle(4e-3), 10e-3, FORCES)
+    contact = Sweep(RADIUS, FORCES, chosen.presses, chosen.seed, sampling="random").contacts()
+    solved = ForwardMap.build(load_sensor("three-25um-biaxial"), Polygon.triangle(4.0), 10.0, FORCES)
     for layout in ("three", "four"):
         film = replace(solved, sensor=load_sensor(f"{layout}-25um-biaxial"))
         began = time.process_time()
-        contours = Triangulation.from_map(film)
-        print(f"{layout}: tabled in {time.process_time() - began:.1f} s, to {contours.table.error:.1e}")
-        clean = film.forward(x, y, force)
+        splines = ChargeSpline.of(film)
+        print(f"{layout}: tabulated in {time.process_time() - began:.1f} s, to {splines.error:.1e}")
+        contours, clean = Triangulation(splines), film.charges(contact)
+        contours.locate(clean[:1], contact[:1, 2])  # the grid of starting points is made once
         for noise in ("clean", "reference"):
             charge = noise_model(noise).add(clean, np.random.default_rng(chosen.seed))
             for known in (True, False):
                 began = time.process_time()
-                fix = contours.locate(charge, force) if known else contours.locate_with_force(charge)
+                fix = contours.locate(charge, contact[:, 2]) if known else contours.locate_with_force(charge)
                 each = (time.process_time() - began) / chosen.presses
-                error = 1e3 * np.hypot(fix.x - x, fix.y - y)[fix.found]
+                error = np.hypot(*(fix.contact - contact)[fix.found, :2].T)
                 median, most = np.percentile(error, (50, 95))
                 print(
                     f"{layout}, force {'known' if known else 'unknown'}, {noise}: {fix.found.sum()} found, "

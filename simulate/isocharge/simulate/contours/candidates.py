@@ -133,7 +133,8 @@ class SeedGrid:
         totals, total = self.nodal.sum(axis=2), charge.sum(axis=1)
         sign = np.sign(totals.sum())  # with negative coefficients the charges fall with the force
         columns = [np.interp(sign * total, sign * column, self.logs) for column in totals.T]
-        return np.exp(np.stack(columns, axis=1))
+        force: Array = np.exp(np.stack(columns, axis=1))
+        return force
 
     def distance(self, charge: Array, force: Array) -> Array:
         """Root mean square distance from each node to the contours of charges (n, n_electrode); (n, n_node), mm."""

@@ -18,7 +18,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.simulate.contours.candidates import FLAT, INSIDE, Candidates, SeedGrid
 from isocharge.simulate.contours.fix import AMBIGUOUS, APART, RESOLVED, TOLERANCE, Fix, Meeting, check_triangulation
-from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.checks import as_charges, check_forces
 from isocharge.simulate.numerics.disk import onto_disk
@@ -200,7 +200,7 @@ class Triangulation:
             Distances, shape (n, n_electrode); their derivatives by x, y and, unless the force is fixed, ln F times the
             radius, shape (n, n_electrode, 2 or 3).
         """
-        known, slopes = self._charges.charges(contact), self._charges.derivatives(contact)
+        known, slopes = linearised(self._charges, contact)
         usual = np.median(self._grid.slope, axis=0) * self._grid.growth(contact[:, 2])[:, None]
         slope = np.maximum(np.linalg.norm(slopes[..., :2], axis=2), FLAT * usual)
         lengths = slopes / (slope[..., None] * np.array([1.0, 1.0, self.charge_map.domain.radius]))

@@ -145,5 +145,5 @@ class Sweep:
         n_force = most // (place.size * n_rotation) if forces else 1
         force = self._force(np.linspace(0.0, 1.0, n_force) if n_force > 1 else np.array([0.5]))
         rotation = period * np.arange(n_rotation) / n_rotation
-        at, pushed, turned = (axis.ravel() for axis in np.meshgrid(place, force, rotation, indexing="ij"))
-        return at, pushed.real, turned.real
+        at, pushed, rotated = np.indices((place.size, n_force, n_rotation)).reshape(3, -1)
+        return place[at], force[pushed], rotation[rotated]

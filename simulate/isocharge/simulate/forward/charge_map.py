@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -96,6 +96,21 @@ class ChargeMap(Protocol):
         """d(Q)/d(x, y, ln F) at contacts, shape (n, 3): (n, n_electrode, 3), pC/mm, pC/mm and pC."""
 
 
+@runtime_checkable
+class LinearisedMap(ChargeMap, Protocol):
+    """A charge map that gives charges and derivatives at once, in less time."""
+
+    def linearised(self, contact: Array) -> tuple[Array, Array]:
+        """What `charges` and `derivatives` give."""
+
+
+def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
+    """Charges and derivatives of contacts, at once where the map can; see `ChargeMap`."""
+    if isinstance(charge_map, LinearisedMap):
+        return charge_map.linearised(contact)
+    return charge_map.charges(contact), charge_map.derivatives(contact)
+
+
 @dataclass(frozen=True)
 class FunctionMap:
     """Any function of contacts as a map, with derivatives by central differences.
@@ -136,6 +151,9 @@ class _Within:
 
     def derivatives(self, contact: Array) -> Array:
         return self.whole.derivatives(contact)
+
+    def linearised(self, contact: Array) -> tuple[Array, Array]:
+        return linearised(self.whole, contact)
 
 
 def within(charge_map: ChargeMap, radius: float) -> ChargeMap:

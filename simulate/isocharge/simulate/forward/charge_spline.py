@@ -111,9 +111,13 @@ class ChargeSpline:
         Raises:
             SceneError: If a contact lies outside the domain.
         """
+        return self.linearised(contact)[1]
+
+    def linearised(self, contact: Array) -> tuple[Array, Array]:
+        """See `charges` and `derivatives`."""
         self.domain.check(contact, "table")
-        _, slope, by_force = self.first_order(contact[:, :2], contact[:, 2])
-        return np.concatenate([slope, by_force[..., None]], axis=2)
+        charge, slope, by_force = self.first_order(contact[:, :2], contact[:, 2])
+        return charge, np.concatenate([slope, by_force[..., None]], axis=2)
 
     def first_order(self, position: Array, force: Array | float) -> tuple[Array, Array, Array]:
         """Charges and their derivatives, wherever Newton's method steps.

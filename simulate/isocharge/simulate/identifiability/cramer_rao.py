@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 SMALLEST = 1e-14
@@ -76,7 +76,7 @@ def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Arra
 def limits_at(charge_map: ChargeMap, contact: Array, noise: NoiseModel, nuisance: Nuisance | None = None) -> CramerRao:
     """Limits at contacts (x, y, F), shape (n, 3), mm and N; `nuisance` says what else is unknown."""
     unknown = None if nuisance is None else nuisance(contact)
-    return cramer_rao(charge_map.charges(contact), charge_map.derivatives(contact), noise, unknown)
+    return cramer_rao(*linearised(charge_map, contact), noise, unknown)
 
 
 def _invert(information: Array) -> Array:

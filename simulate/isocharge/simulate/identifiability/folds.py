@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.identifiability.nearest_contact import INSIDE
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings, onto_disk
@@ -53,7 +53,8 @@ def _unit_columns(jacobian: Array) -> Array:
 
 def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> Array:
     """J / sigma of contacts (x, y, F): shape (n, 3) to (n, n_electrode, 3), 1/mm, 1/mm and without unit."""
-    scaled: Array = charge_map.derivatives(contact) / noise.sigma(charge_map.charges(contact))[..., None]
+    charge, slopes = linearised(charge_map, contact)
+    scaled: Array = slopes / noise.sigma(charge)[..., None]
     return scaled
 
 

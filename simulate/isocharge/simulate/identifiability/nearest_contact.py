@@ -4,13 +4,12 @@ min over contacts c of the domain of |(Q - Q(c)) / sigma|
 """
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.stats import qmc
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk_least_squares import MOST_STEPS, minimise
 
@@ -25,14 +24,6 @@ CANDIDATES = 4096
 
 CHUNK = 2048
 """Charges compared with all candidates at once."""
-
-
-@runtime_checkable
-class LinearisedMap(ChargeMap, Protocol):
-    """A charge map that gives charges and derivatives at once, in less time."""
-
-    def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """What `charges` and `derivatives` give."""
 
 
 def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, start: Array) -> tuple[Array, Array]:
@@ -83,19 +74,13 @@ def _descent(
         return np.column_stack([logs[:, :2], np.clip(np.exp(logs[:, 2]), *force_range)])
 
     def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
-        known, slopes = _linearised(charge_map, to_contact(unit))
+        known, slopes = linearised(charge_map, to_contact(unit))
         sigma = sigma_of(rows, known)
         return (charge[rows] - known) / sigma, -(slopes * scale / sigma[..., None]).swapaxes(1, 2)
 
     logs = np.column_stack([start[:, :2], np.log(start[:, 2])])
     unit, residual = minimise(residuals, (logs - centre) / np.where(scale > 0.0, scale, 1.0), steps)
     return to_contact(unit), residual
-
-
-def _linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
-    if isinstance(charge_map, LinearisedMap):
-        return charge_map.linearised(contact)
-    return charge_map.charges(contact), charge_map.derivatives(contact)
 
 
 def search(
