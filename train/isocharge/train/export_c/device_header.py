@@ -1,5 +1,7 @@
 """`isocharge_device.h`: the numbers of a device file, for the signal chain in C."""
 
+from typing import Any
+
 import numpy as np
 from msgspec.structs import asdict
 
@@ -42,12 +44,17 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     leak = None if chain.tau_s is None else chain.leak
     rules = {"HUM": chain.hum, "TARE": chain.tare, "LEAK": leak, "TOUCH": chain.touch, "THERMAL": chain.thermal}
     for prefix, rule in rules.items():
-        settings = {} if rule is None else asdict(rule)
+        settings: dict[str, Any] = {} if rule is None else asdict(rule)
         numbers[SWITCHES[prefix]] = str(int(settings.pop("on", False)))
-        if prefix == "LEAK" and chain.tau_s is not None:
-            numbers["LEAK_TAU_S"] = c_doubles(chain.tau_s)
+        if rule is leak and leak is not None:
+            settings = {"tau_s": None} | settings | {"tau_s": chain.tau_s}  # first, and one for each electrode
         for name, value in settings.items():
-            word = str(int(value)) if isinstance(value, int) else c_double(value)
-            numbers[f"{prefix}_{NAMES.get(name, name.upper())}"] = word
+            numbers[f"{prefix}_{NAMES.get(name, name.upper())}"] = _number(value)
     lines = "\n".join(f"#define ISOCHARGE_{name} {text}" for name, text in numbers.items())
     return source_text("isocharge_device.h", board=c_comment(device.name), lines=lines)
+
+
+def _number(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return c_doubles(value)
+    return str(int(value)) if isinstance(value, int) else c_double(value)
