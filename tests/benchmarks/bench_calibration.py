@@ -25,15 +25,13 @@ from matplotlib.ticker import FormatStrFormatter, NullFormatter, ScalarFormatter
 
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle, ForwardMap, load_sensor
-from isocharge.simulate.numerics.disk_least_squares import minimise
 from isocharge.simulate.plots.figure import new_figure
-from isocharge.train import SensorFilms, calibrate, films_for
-from isocharge.train.calibration.contact_error import ContactSensitivity
-from isocharge.train.calibration.film_charges import charges_of
-from isocharge.train.calibration.next_press import information_of
-from isocharge.train.data.noise import sigma_pC, with_noise
-from isocharge.train.training.checkpoint import Checkpoint
+from isocharge.train import CalibrationProblem, calibrate
+from isocharge.train.baselines.gauss_newton import GaussNewton
+from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
+from isocharge.train.data.presses import draw_contacts
 from isocharge.train.training.descent import Descent, TrainingStage
+from isocharge.train.training.fit import likelihood_loss, start_loss, with_fresh_noise
 from isocharge.train.training.network import Features, InverseNetwork
 
 SENSORS = ("four-25um-biaxial", "three-25um-biaxial", "four-25um-uniaxial")
@@ -50,15 +48,8 @@ TUNING_STEPS = 300
 
 
 @lru_cache(maxsize=4)
-def films_of(sensor: str) -> SensorFilms:
-    return films_for(load_sensor(sensor), Circle(1e-3))
-
-
-def contacts(rng: np.random.Generator, films: Any, count: int) -> np.ndarray:
-    """(x_mm, y_mm, force_N) even over the working area and the logarithm of the force."""
-    radius, angle = films.domain.radius_mm * np.sqrt(rng.random(count)), 2.0 * np.pi * rng.random(count)
-    low, high = np.log(films.domain.force_range_N)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.exp(rng.uniform(low, high, count))])
+def problem_of(sensor: str) -> CalibrationProblem:
+    return CalibrationProblem.of(load_sensor(sensor), Circle(1.0))
 
 
 def errors(answer: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
@@ -67,93 +58,89 @@ def errors(answer: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     return float(np.sqrt(squares.mean())), float(100.0 * np.sqrt(np.mean((answer[:, 2] / truth[:, 2] - 1.0) ** 2)))
 
 
-def limit(chosen: SensorFilms, truth: np.ndarray, contact: np.ndarray) -> tuple[float, float]:
+def as_read(problem: CalibrationProblem, contact: np.ndarray, charge: np.ndarray, rng: Any) -> MeasuredPresses:
+    """Presses as a rig reads them."""
+    read, count = contact.copy(), len(contact)
+    read[:, :2] += POSITION_MM * rng.standard_normal((count, 2))
+    read[:, 2] *= np.exp(FORCE * rng.standard_normal(count))
+    std = np.full(count, POSITION_MM), np.full(count, FORCE)
+    return MeasuredPresses(read, charge, *std, problem.electrodes, tuple(range(count)))
+
+
+def limit(problem: CalibrationProblem, truth: np.ndarray, contact: np.ndarray) -> tuple[float, float]:
     """The linearised limit of what not knowing the film leaves after presses at `contact`, at the true film."""
-    scene = chosen.scene
-    information = np.eye(truth.size)
-    if len(contact):
-        told = information_of(scene.charges, truth, contact, scene.noise, POSITION_MM, FORCE)
-        information = information + told.sum(axis=0)
-    left = ContactSensitivity.at(scene.charges, truth, scene.domain, scene.noise).left(np.linalg.inv(information))
+    information = np.eye(truth.size) + information_of(problem, truth, contact, POSITION_MM, FORCE).sum(axis=0)
+    left = ContactSensitivity.at(problem, truth).left(np.linalg.inv(information))
     return left.position_mm, left.force_percent
 
 
-def gains_only(chosen: SensorFilms, presses: MeasuredPresses) -> np.ndarray:
+def gains_only(problem: CalibrationProblem, presses: MeasuredPresses) -> np.ndarray:
     """The described film with the gains that fit the presses best."""
-    parameters = chosen.described.parameters.copy()
-    expected = chosen.scene.charges.charge_pC(parameters, presses.contact)
+    parameters = problem.before.parameters.copy()
+    expected = problem.charges.charges(parameters, presses.contact)
     ratio = np.maximum(presses.charge_pC, 1.0) / np.maximum(expected, 1.0)
     parameters[-expected.shape[1] :] += np.median(np.log(ratio), axis=0)
     return parameters
 
 
-def fine_tuned(chosen: SensorFilms, presses: MeasuredPresses, charge_pC: np.ndarray, seed: int) -> np.ndarray:
+def fine_tuned(problem: CalibrationProblem, presses: MeasuredPresses, charge: np.ndarray, seed: int) -> np.ndarray:
     """Contacts by the network of the described film, all of its weights tuned on the presses alone."""
-    films = chosen.films
-    network = films.fold(chosen.described.parameters)
+    network = problem.films.fold(problem.before.parameters)
     layers = network.layers
     weights = [torch.tensor(part) for layer in (*layers.hidden, layers.last) for part in layer]
     weights.append(torch.tensor(layers.skip))
     for weight in weights:
         weight.requires_grad_(True)
-    scale = torch.tensor(films.domain.scale)
 
-    def answers(charge: torch.Tensor) -> torch.Tensor:
-        logs = torch.log(charge.clamp(1.0, 1e6) / torch.tensor(network.typical))
+    def answers(charges: torch.Tensor) -> torch.Tensor:
+        logs = torch.log(charges.clamp(1.0, 1e6) / torch.tensor(network.typical))
         value = logs
         for number in range(len(layers.hidden)):
             value = torch.tanh(value @ weights[2 * number] + weights[2 * number + 1])
         return (value @ weights[-3] + weights[-2] + logs @ weights[-1])[:, :3]
 
     random = torch.Generator().manual_seed(seed)
-    charge, contact = torch.tensor(presses.charge_pC), torch.tensor(presses.contact)
+    measured, contact = torch.tensor(presses.charge_pC), torch.tensor(presses.contact)
     target = torch.stack([contact[:, 0], contact[:, 1], torch.log(contact[:, 2])], dim=1)
-    optimiser = torch.optim.Adam(weights, lr=1e-3)
+    optimiser, scale = torch.optim.Adam(weights, lr=1e-3), torch.tensor(problem.domain.scale)
     for _ in range(TUNING_STEPS):
-        noise = torch.hypot(torch.tensor(1.0).double(), 0.002 * charge)
-        noisy = charge + noise * torch.randn(charge.shape, generator=random, dtype=torch.float64)
+        noise = torch.hypot(torch.tensor(1.0).double(), 0.002 * measured)
+        noisy = measured + noise * torch.randn(measured.shape, generator=random, dtype=torch.float64)
         loss = (((answers(noisy) - target) / scale) ** 2).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     with torch.no_grad():
-        tuned = answers(torch.tensor(charge_pC)).numpy()
+        tuned = answers(torch.tensor(charge)).numpy()
     return np.column_stack([tuned[:, :2], np.exp(tuned[:, 2])])
 
 
 def without_context(sensor: str) -> InverseNetwork:
     """One network for all films that is not told the film: the mean over the films, by maximum likelihood."""
-    films, rng = films_of(sensor).films, np.random.default_rng(3)
+    problem, rng = problem_of(sensor), np.random.default_rng(3)
     parts = []
-    for parameters in films.prior.draw(rng, POOLED_FILMS):
-        at = contacts(rng, films, POOLED_PRESSES)
-        parts.append((at, charges_of(films.family.forward_map(*films.prior.film(parameters)), at)))
-    contact, charge_pC = (np.concatenate(part) for part in zip(*parts, strict=True))
+    for parameters in problem.prior.draw(rng, POOLED_FILMS):
+        at = draw_contacts(rng, problem.domain, POOLED_PRESSES)
+        parts.append((at, problem.films.forward_map(parameters).charges(at)))
+    contact, charge = (np.concatenate(part) for part in zip(*parts, strict=True))
     torch.manual_seed(0)
-    network = InverseNetwork(films.domain, Features.fit(charge_pC), (96, 96, 96), (8,))
-    charge, unit = torch.tensor(charge_pC).float(), torch.tensor(films.domain.to_unit(contact)).float()
-    held = len(charge) // 10
+    network = InverseNetwork(problem.domain, Features.fit(charge), (96, 96, 96), (8,))
+    charges, unit = torch.tensor(charge).float(), torch.tensor(problem.domain.to_unit(contact)).float()
+    held, warm_up = len(charges) // 10, POOLED_STEPS // 7
 
     def loss_of(rows: torch.Tensor, step: int, random: torch.Generator) -> torch.Tensor:
-        sigma = torch.hypot(torch.tensor(1.0), 0.002 * charge[rows])
-        noisy = charge[rows] + sigma * torch.randn(sigma.shape, generator=random)
-        mean, log_std = network.posterior(noisy)
-        miss = mean - unit[rows]
-        if step < POOLED_STEPS // 7:
-            return (
-                (30.0 * miss**2 + 0.1 * (log_std + 0.5 * miss.detach() ** 2 * torch.exp(-2.0 * log_std))).sum(1).mean()
-            )
-        return (log_std + 0.5 * (miss * torch.exp(-log_std)) ** 2).sum(dim=1).mean()
+        answer = network.posterior(with_fresh_noise(charges[rows], problem.noise, random))
+        return (start_loss if step < warm_up else likelihood_loss)(*answer, unit[rows])
 
     def loss(step: int, random: torch.Generator) -> torch.Tensor:
-        return loss_of(held + torch.randint(len(charge) - held, (1024,), generator=random), step, random)
+        return loss_of(held + torch.randint(len(charges) - held, (1024,), generator=random), step, random)
 
     def score() -> tuple[float, str]:
         with torch.no_grad():
             return loss_of(torch.arange(held), POOLED_STEPS, torch.Generator().manual_seed(5)).item(), ""
 
-    stage = TrainingStage("contact", network.contact, loss, score, POOLED_STEPS, POOLED_STEPS // 7)
-    Descent(stage, 0.005, POOLED_STEPS, 0).run(Checkpoint(), lambda _step, _text: None)
+    stage = TrainingStage("contact", network.contact, loss, score, POOLED_STEPS, warm_up)
+    Descent(stage, 0.005, POOLED_STEPS, 0).run()
     return network.eval()
 
 
@@ -161,80 +148,61 @@ def pooled_errors(job: tuple[str, int, int]) -> list[tuple[float, float]]:
     """Errors of that network on the fresh contacts of every film."""
     torch.set_num_threads(1)
     sensor, first, count = job
-    films, network = films_of(sensor).films, without_context(sensor)
+    problem, network = problem_of(sensor), without_context(sensor)
     rows = []
     for seed in range(first, first + count):
         rng = np.random.default_rng([seed, 13])
-        at = contacts(rng, films, CONTACTS)
-        film = films.family.forward_map(*films.prior.film(films.prior.draw(np.random.default_rng([seed, 7]), 1)[0]))
-        charge_pC = with_noise(charges_of(film, at), films.noise, rng)
+        at = draw_contacts(rng, problem.domain, CONTACTS)
+        film = problem.films.forward_map(problem.prior.draw(np.random.default_rng([seed, 7]), 1)[0])
         with torch.no_grad():
-            answer = network(torch.tensor(charge_pC).float())[0].double().numpy()
+            answer = network(torch.tensor(problem.noise.add(film.charges(at), rng)).float())[0].double().numpy()
         rows.append(errors(answer, at))
     return rows
 
 
-def gauss_newton(chosen: SensorFilms, parameters: np.ndarray, charge_pC: np.ndarray) -> np.ndarray:
-    """Contacts by least squares on the calibrated film's forward map, started from its network's."""
-    films, charges = chosen.films, chosen.scene.charges
-    domain, forward_map = films.domain, charges.forward_map(parameters)
-    sigma = sigma_pC(films.noise, charge_pC)
-
-    def residuals(rows: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        at = charges.into_domain(domain.to_contact(unit))
-        slopes = charges.by_contact(forward_map, at) * domain.scale
-        miss = (charge_pC[rows] - charges_of(forward_map, at)) / sigma[rows]
-        return miss, -(slopes / sigma[rows][:, :, None]).transpose(0, 2, 1)
-
-    start = domain.to_unit(films.fold(parameters).predict(charge_pC)[0])
-    unit, _ = minimise(residuals, start, steps=8)
-    return domain.to_contact(unit)
+def gauss_newton(problem: CalibrationProblem, parameters: np.ndarray, charge: np.ndarray) -> np.ndarray:
+    """Contacts by least squares on the calibrated film's forward map."""
+    forward_map = problem.charges.forward_map(parameters)
+    at = draw_contacts(np.random.default_rng(0), problem.domain, 600)
+    search = GaussNewton(problem.domain, problem.noise, forward_map)
+    return search.fit(forward_map.charges(at), at).predict(charge)
 
 
 def study(job: tuple[str, int, bool]) -> dict[str, Any]:
     """One film: errors of every method by number of presses."""
     torch.set_num_threads(1)
     sensor, seed, fine = job
-    chosen = films_of(sensor)
-    films, charges = chosen.films, chosen.scene.charges
-    rng = np.random.default_rng([seed, 7])
-    truth = films.prior.draw(rng, 1)[0]
-    film = charges.forward_map(truth)
+    problem, rng = problem_of(sensor), np.random.default_rng([seed, 7])
+    films, truth = problem.films, problem.prior.draw(rng, 1)[0]
+    film = problem.charges.forward_map(truth)
     if fine:  # solved for this film, independently of the family
-        film = ForwardMap.build(*films.prior.film(truth), 1.02e-3 * films.domain.radius_mm)
-    real, fresh = contacts(rng, films, max(COUNTS)), contacts(rng, films, CONTACTS)
-    charge = with_noise(charges_of(film, real), films.noise, rng)
-    test = with_noise(charges_of(film, fresh), films.noise, rng)
-    read = real.copy()
-    read[:, :2] += POSITION_MM * rng.standard_normal((len(real), 2))
-    read[:, 2] *= np.exp(FORCE * rng.standard_normal(len(real)))
-    at_truth = films.fold(truth).predict(test)[0]
+        film = ForwardMap.build(*problem.prior.film(truth), 1.02 * problem.domain.radius)
+    real, fresh = (draw_contacts(rng, problem.domain, count) for count in (max(COUNTS), CONTACTS))
+    charge, test = (problem.noise.add(film.charges(at), rng) for at in (real, fresh))
+    presses, at_truth = as_read(problem, real, charge, rng), films.fold(truth).predict(test)[0]
     record: dict[str, Any] = {
         "sensor": sensor,
         "seed": seed,
         "noise": errors(at_truth, fresh),
-        "uncalibrated": errors(films.fold(chosen.described.parameters).predict(test)[0], fresh),
+        "uncalibrated": errors(films.fold(problem.before.parameters).predict(test)[0], fresh),
         "by_count": {},
     }
     for count in COUNTS:
-        std = np.full(count, POSITION_MM), np.full(count, FORCE)
-        names = films.prior.sensor.electrode_names
-        presses = MeasuredPresses(read[:count], charge[:count], *std, names, tuple(range(count)))
         began = time.perf_counter()
-        calibration = calibrate(presses, chosen.scene, chosen.described, warn=lambda _: None)
+        result = calibrate(presses[:count], problem)
         seconds = time.perf_counter() - began
-        answer = films.fold(calibration.posterior.parameters).predict(test)[0]
+        answer = films.fold(result.posterior.parameters).predict(test)[0]
         row = {
             "left": errors(answer, at_truth),
-            "limit": limit(chosen, truth, real[:count]),
+            "limit": limit(problem, truth, real[:count]),
             "error": errors(answer, fresh),
-            "gains_only": errors(films.fold(gains_only(chosen, presses)).predict(test)[0], fresh),
-            "bad": int(calibration.posterior.bad.sum()),
+            "gains_only": errors(films.fold(gains_only(problem, presses[:count])).predict(test)[0], fresh),
+            "bad": int(result.posterior.bad.sum()),
             "seconds": seconds,
         }
         if fine:
-            row["fine_tuned"] = errors(fine_tuned(chosen, presses, test, seed), fresh)
-            row["gauss_newton"] = errors(gauss_newton(chosen, calibration.posterior.parameters, test), fresh)
+            row["fine_tuned"] = errors(fine_tuned(problem, presses[:count], test, seed), fresh)
+            row["gauss_newton"] = errors(gauss_newton(problem, result.posterior.parameters, test), fresh)
         record["by_count"][count] = row
     return record
 
@@ -242,24 +210,14 @@ def study(job: tuple[str, int, bool]) -> dict[str, Any]:
 def covered(job: tuple[str, int]) -> tuple[int, int]:
     """How many of the identified quantities of a film lie in their 95 % intervals, and how many there are."""
     sensor, seed = job
-    chosen = films_of(sensor)
-    charges, prior = chosen.scene.charges, chosen.films.prior
-    rng = np.random.default_rng([seed, 11])
-    truth, count = prior.draw(rng, 1)[0], 10
-    real = contacts(rng, chosen.films, count)
-    charge = with_noise(charges.charge_pC(truth, real), chosen.films.noise, rng)
-    read = real.copy()
-    read[:, :2] += POSITION_MM * rng.standard_normal((count, 2))
-    read[:, 2] *= np.exp(FORCE * rng.standard_normal(count))
-    std = np.full(count, POSITION_MM), np.full(count, FORCE)
-    presses = MeasuredPresses(read, charge, *std, prior.sensor.electrode_names, tuple(range(count)))
-    calibration = calibrate(presses, chosen.scene, chosen.described, warn=lambda _: None)
-    inside = total = 0
-    for quantity in calibration.quantities.values():
-        if quantity.identified:
-            off = float(quantity.weights @ ((calibration.posterior.parameters - truth) / prior.std))
-            inside, total = inside + (abs(off) <= 1.96 * quantity.std), total + 1
-    return inside, total
+    problem, rng = problem_of(sensor), np.random.default_rng([seed, 11])
+    truth, real = problem.prior.draw(rng, 1)[0], draw_contacts(rng, problem.domain, 10)
+    charge = problem.noise.add(problem.charges.charges(truth, real), rng)
+    result = calibrate(as_read(problem, real, charge, rng), problem)
+    deviation = (result.posterior.parameters - truth) / problem.prior.std
+    identified = [quantity for quantity in result.quantities.values() if quantity.identified]
+    inside = sum(abs(float(quantity.weights @ deviation)) <= 1.96 * quantity.std for quantity in identified)
+    return inside, len(identified)
 
 
 def summary(records: list[dict[str, Any]]) -> dict[str, Any]:

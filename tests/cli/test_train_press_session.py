@@ -13,7 +13,7 @@ from isocharge.serve import Frame, Predictor, encode_frame, read_presses
 from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, Watched
 from isocharge.simulate import Circle, load_sensor
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.measuring_chain.levels import load_amplifier
+from isocharge.simulate.measuring_chain.noise_file import load_amplifier
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration.folder import SESSION
 from isocharge.train.data.presses import draw_contacts
