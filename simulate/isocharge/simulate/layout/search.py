@@ -115,17 +115,14 @@ class Search:
         stay = self.model.sensitivity(self.table.rows(case.presses, places[:0], side, case.stay))
         candidates = self.model.sensitivity(self.table.rows(case.presses, places, side))
         apart = case.apart(places, places) >= 0.0
-        grid = _Grid(np.ascontiguousarray(candidates.swapaxes(1, 2)), stay, apart, case.weights(case.presses), self._power)
+        power = POWERS["worst" if case.goal == "worst" else "rms"]
+        grid = _Grid(np.ascontiguousarray(candidates.swapaxes(1, 2)), stay, apart, case.weights(case.presses), power)
         found = sorted((grid.exchange(start) for start in track(layouts, "exchanging")), key=lambda one: one[0])
         different = [found[0]]
         for value, chosen in found:
             if len(different) < FINALISTS and value > different[-1][0] * (1.0 + ALIKE):
                 different.append((value, chosen))
         return [places[chosen] for _, chosen in different]
-
-    @property
-    def _power(self) -> float:
-        return POWERS["worst" if self.case.goal == "worst" else "rms"]
 
     def value(self, places: Array) -> float:
         """What is made small, mm: the worst error on the fine grid, or the weighted root mean square."""
