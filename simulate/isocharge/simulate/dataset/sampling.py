@@ -141,9 +141,9 @@ class Sweep:
         forces, rotations = self.force_range[0] < self.force_range[1], self.orientation == "random" and period > 0.0
         side = max(1, round(most ** (1.0 / (2 + forces + rotations))))
         n_rotation = side if rotations else 1
-        place = self.radius * lattice(most // (n_rotation * (side if forces else 1)))
+        place: Complexes = self.radius * lattice(most // (n_rotation * (side if forces else 1)))
         n_force = most // (place.size * n_rotation) if forces else 1
         force = self._force(np.linspace(0.0, 1.0, n_force) if n_force > 1 else np.array([0.5]))
-        rotation = period * np.arange(n_rotation) / n_rotation
+        rotation: Array = period * np.arange(n_rotation) / n_rotation
         at, pushed, rotated = np.indices((place.size, n_force, n_rotation)).reshape(3, -1)
         return place[at], force[pushed], rotation[rotated]
