@@ -1,27 +1,16 @@
 """Files that are read whole, lines that are read one by one, parts of runs: bounded, whatever they hold."""
 
 import io
-import json
 import os
 import signal
-import time
 
 import numpy as np
 import pytest
 
-from isocharge.common.errors import InputError, OutputError, OutputExists
+from isocharge.common.errors import OutputError, OutputExists
 from isocharge.common.files import bounded_lines, new_file, read_whole, sha256_of
 from isocharge.common.number_text import number_of
 from isocharge.common.resumable_run import resume_folder
-from isocharge.common.tables import (
-    DEEPEST,
-    MOST_JSON_BYTES,
-    MOST_TOML_BYTES,
-    parse_json,
-    parse_toml,
-    read_json,
-    read_toml,
-)
 from isocharge.simulate.execution.workers import in_order
 from isocharge.train.training.descent import tensors
 
@@ -85,48 +74,6 @@ def test_what_is_no_number(text):
 @pytest.mark.parametrize("text", ["10", " 1e3 ", "-.5", "+7."])
 def test_what_is_a_number(text):
     assert number_of(text) == float(text)
-
-
-DEEP = {
-    "arrays": "a = " + "[" * 5000 + "]" * 5000,
-    "tables": "a = " + "{a = " * 5000 + "1" + "}" * 5000,
-    "a key": "a." * 50_000 + "a = 1",
-    "a quoted key": '"\\"".' * 20_000 + "a = 1",
-    "a key in a table": "[" + "'a'." * 50_000 + "a]",
-    "a key with blanks": "a . " * 50_000 + "a = 1",
-    "just too deep": "a = " + "[" * (DEEPEST + 1) + "]" * (DEEPEST + 1),
-}
-
-
-@pytest.mark.parametrize("how", DEEP)
-def test_deep_toml_is_refused_at_once(how):
-    began = time.perf_counter()
-    with pytest.raises(InputError, match=r"^f: not a TOML file") as caught:
-        parse_toml(DEEP[how], "f", InputError)
-    assert time.perf_counter() - began < 1.0
-    assert len(str(caught.value)) < 500
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "[" * 900 + "]" * 900, "9" * 5000, "[1", b"\xff"])
-def test_json_that_is_none_or_deep(text):
-    with pytest.raises(InputError, match=r"^f: expected JSON") as caught:
-        parse_json(text, "f", InputError)
-    assert len(str(caught.value)) < 600
-
-
-def test_what_is_not_too_deep():
-    text = "[" * DEEPEST + "]" * DEEPEST
-    assert parse_json(text, "f", InputError) == json.loads(text)
-    dots = "a = [" + "0.5, " * 1000 + "0.5]\n# 1.2.3.4\nb = '" + ". " * 100 + "'\n"
-    assert parse_toml(dots, "f", InputError)["b"] == ". " * 100
-
-
-@pytest.mark.parametrize(("read", "most"), [(read_toml, MOST_TOML_BYTES), (read_json, MOST_JSON_BYTES)])
-def test_settings_are_bounded(tmp_path, read, most):
-    path = tmp_path / "file"
-    path.write_bytes(b" " * (most + 1))
-    with pytest.raises(InputError, match="larger than"):
-        read(path, "a file", InputError)
 
 
 GARBAGE = [b"", b"garbage", b"\x93NUMPY\x01\x00", b"PK\x03\x04", b"\x80\x02."]

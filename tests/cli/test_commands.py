@@ -309,7 +309,11 @@ BAD = [
         2,
         "ConfigError: none.toml: cannot be",
     ),
-    (("simulate", "point", SENSOR, "--probe", "circle:1e-30"), 2, "SceneError: probe radius: expected at least 0.02 mm"),
+    (
+        ("simulate", "point", SENSOR, "--probe", "circle:1e-30"),
+        2,
+        "SceneError: probe radius: expected at least 0.02 mm",
+    ),
     (("simulate", "point", SENSOR, "--force", "1e6"), 2, "beyond small strains"),
     (
         ("simulate", "sweep", SENSOR, "--samples", "1000000000000", "-o", "OUT"),

@@ -4,8 +4,8 @@ These numbers have no imports, so that `--help` can show them at once.
 """
 
 DEFAULT_RADIUS = 8.0
-"""Largest distance of a press from the film's centre, mm: the electrodes of the built-in sensors, 10 mm from the centre,
-begin about there."""
+"""Largest distance of a press from the film's centre, mm: the electrodes of the built-in sensors begin about
+there, 10 mm from the centre."""
 
 DEFAULT_FORCE_RANGE = (0.05, 2.0)
 """Smallest and largest force, N. The released models cover it."""

@@ -11,19 +11,19 @@ of the force: that of a membrane is constant. simulate writes the file, serve sh
 """
 
 import base64
-import binascii
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import InputError
-from isocharge.common.tables import Table, read_json
+from isocharge.common.structs import Finite, Positive, WrongKey, read_json
 
 VERSION = 1
 """Version of the file's format."""
@@ -103,37 +103,52 @@ def read_deflection_field(path: Path) -> DeflectionField:
     Raises:
         InputError: If it cannot be read, or is no field of this version.
     """
-    table = Table(read_json(path, "a deflection field", InputError), str(path), InputError)
-    version = table.whole("isocharge_deflection")
-    if version != VERSION:
-        raise InputError(f"{path}: deflection field {version} is not supported (this version reads {VERSION})")
-    film = table.table("film")
-    forces, distances, rings = (
-        table.as_numbers(key, table.sequence(key), count=len(table.sequence(key)), of="numbers")
-        for key in ("force_N", "distance_mm", "rings")
-    )
-    shape = (len(forces), len(distances), len(rings), table.whole("angles", least=2))
-    for key, numbers in (("force_N", forces), ("distance_mm", distances), ("rings", rings)):
-        if not numbers or any(a >= b for a, b in pairwise(numbers)):
-            table.refuse(key, "increasing numbers")
+    file = read_json(path, "a deflection field", InputError, _File)
+    shares = np.frombuffer(file.deflection, "<u2").reshape(file.shape) / STEPS
     return DeflectionField(
-        {key: film.number(key) for key in FILM_KEYS},
-        table.number("probe_radius_mm", above=0.0),
-        forces,
-        distances,
-        rings,
-        _decoded(table, shape) * table.number("scale_mm", above=0.0),
+        {key: getattr(file.film, key) for key in FILM_KEYS},
+        file.probe_radius_mm,
+        file.force_N,
+        file.distance_mm,
+        file.rings,
+        shares * file.scale_mm,
     )
 
 
-def _decoded(table: Table, shape: tuple[int, int, int, int]) -> Array:
-    """The numbers as shares of the largest."""
-    try:
-        data = base64.b64decode(table.get("deflection"), validate=True)
-    except (TypeError, ValueError, binascii.Error):
-        table.refuse("deflection", "numbers of 16 bits in base64")
-    count = math.prod(shape)
-    if count > MOST_NUMBERS or len(data) != 2 * count:
-        table.refuse("deflection", f"{count} numbers of 16 bits in base64, {MOST_NUMBERS} at most", len(data))
-    shares: Array = np.frombuffer(data, "<u2").reshape(shape) / STEPS
-    return shares
+Increasing = Annotated[tuple[Finite, ...], Meta(min_length=1)]
+
+
+class _Film(Struct):
+    radius_mm: Finite
+    thickness_um: Finite
+    young_GPa: Finite
+    poisson: Finite
+    pretension_MPa: Finite
+
+
+class _File(Struct):
+    """The content of the file; `deflection` are shares of the largest, in base64."""
+
+    isocharge_deflection: Annotated[int, Meta(ge=VERSION, le=VERSION, description=f"the version {VERSION}")]
+    film: _Film
+    probe_radius_mm: Positive
+    force_N: Increasing
+    distance_mm: Increasing
+    rings: Increasing
+    angles: Annotated[int, Meta(ge=2)]
+    scale_mm: Positive
+    deflection: bytes
+
+    def __post_init__(self) -> None:
+        for key in ("force_N", "distance_mm", "rings"):
+            if any(a >= b for a, b in pairwise(getattr(self, key))):
+                raise WrongKey(key, "increasing numbers", list(getattr(self, key)))
+        count = math.prod(self.shape)
+        if count > MOST_NUMBERS or len(self.deflection) != 2 * count:
+            expected = f"{count} numbers of 16 bits in base64, {MOST_NUMBERS} at most"
+            raise WrongKey("deflection", expected, len(self.deflection))
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Of the numbers: forces, distances, rings, angles."""
+        return len(self.force_N), len(self.distance_mm), len(self.rings), self.angles

@@ -23,9 +23,9 @@ from typing import IO, Any, TypeVar
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import InputError, OutputError, OutputExists, SolveError, TrainingError
+from isocharge.common.errors import InputError, OutputError, OutputExists, SolveError, TrainingError, cut
 from isocharge.common.files import new_folder, read_whole, refuse_existing, sha256_of, sync_folder, write_whole
-from isocharge.common.tables import cut, read_json
+from isocharge.common.structs import read_json
 
 Content = TypeVar("Content")
 

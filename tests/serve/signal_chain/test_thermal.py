@@ -12,7 +12,7 @@ import pytest
 
 from isocharge.serve.signal_chain.chain import Chain, ChainState, advance
 from isocharge.serve.signal_chain.contact import Touch
-from isocharge.serve.signal_chain.leak import Leak, LeakRule
+from isocharge.serve.signal_chain.leak import Leak
 from isocharge.serve.signal_chain.tare import Tare
 from isocharge.serve.signal_chain.thermal import NO_DRIFT, ThermalDrift, ThermalRule, track_thermal_drift
 

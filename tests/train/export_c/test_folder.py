@@ -86,14 +86,6 @@ def test_the_readme_says_what_works(exports, shell, tmp_path, compile_c):
         assert path.stem in text or path.name == "README.md"
 
 
-def test_headers_are_for_cpp_too(exports, tmp_path):
-    if shutil.which("g++") is None:
-        pytest.skip("g++ is not installed")
-    (tmp_path / "all.cpp").write_text('#include "isocharge_chain.h"\n#include "isocharge_frames.h"\nint main() {}\n')
-    words = ["g++", "-Wall", "-Wextra", "-Werror", "-c", "-I", exports[1], "all.cpp"]
-    subprocess.run(words, cwd=tmp_path, check=True)
-
-
 @pytest.fixture(scope="module")
 def host(tmp_path_factory, compile_c):
     """The host example for a board with a leak, compiled with sanitizers, and its board."""
@@ -176,57 +168,32 @@ def test_host_example_says_what_is_wrong(host, tmp_path):
     assert played(program, tmp_path / "noisy", 1, 2)[0] == 2
 
 
-@pytest.fixture(scope="module")
-def sketch(exports, tmp_path_factory):
-    """Compiles the sketch with a host's Arduino: the program that reads pins and sends."""
-    if shutil.which("g++") is None:
-        pytest.skip("g++ is not installed")
-
-    def compile_sketch(*options):
-        folder = tmp_path_factory.mktemp("sketch")
-        export = exports[0] / "arduino" / "isocharge_sketch"
-        objects = []
-        for source in sorted(export.glob("*.c")):
-            objects.append(folder / f"{source.stem}.o")
-            subprocess.run(["gcc", "-std=c11", "-O2", "-c", source, "-o", objects[-1]], check=True)
-        ino = f'-DSKETCH="{export / "isocharge_sketch.ino"}"'
-        words = ["g++", "-Wall", "-Wextra", "-Werror", *options, ino, "-I", export, "-I", HERE / "board"]
-        subprocess.run([*words, HERE / "board" / "run_sketch.cpp", *objects, "-o", folder / "sketch"], check=True)
-        return folder / "sketch"
-
-    return compile_sketch
-
-
-@pytest.fixture(scope="module")
-def pins():
-    """What the pins read: rest, a press of some hundred counts, rest; shape (900, 3)."""
-    counts = np.random.default_rng(1).normal(20.0, 1.0, (900, 3))
-    counts[400:600] += [700.0, 750.0, 800.0]
-    return counts.astype(int)
-
-
-def run_sketch(program, pins):
+def run_sketch(export, folder, pins, *options):
+    """What the sketch sends, compiled with a host's Arduino, while its pins read these counts."""
+    objects = []
+    for source in sorted(export.glob("*.c")):
+        objects.append(folder / f"{source.stem}.o")
+        subprocess.run(["gcc", "-std=c11", "-O2", "-c", source, "-o", objects[-1]], check=True)
+    ino = f'-DSKETCH="{export / "isocharge_sketch.ino"}"'
+    words = ["g++", "-Wall", "-Wextra", "-Werror", *options, ino, "-I", export, "-I", HERE / "board"]
+    subprocess.run([*words, HERE / "board" / "run_sketch.cpp", *objects, "-o", folder / "sketch"], check=True)
     lines = "".join(f"{5000 * (k + 1)} {' '.join(map(str, row))}\n" for k, row in enumerate(pins.tolist()))
-    return subprocess.run([program], input=lines.encode(), capture_output=True, check=True).stdout
+    return subprocess.run([folder / "sketch"], input=lines.encode(), capture_output=True, check=True).stdout
 
 
-def expected_of(pins):
-    """Our records of the same readings."""
-    data = [encode_frame(Frame(k, 5000 * (k + 1), tuple(map(float, row)))) for k, row in enumerate(pins.tolist())]
-    return list(
-        TouchStream(Predictor("three-25um-biaxial"), device_from_table({}, "x")).feed(Chunk(b"".join(data), 0.0, 0))
-    )
-
-
-def test_sketch_prints_the_contacts(sketch, pins):
-    printed = run_sketch(sketch(), pins).decode()
-    forces = [float(value) for value in re.findall(r">force_N:(\S+)", printed)]
-    expected = [record.force_N for record in expected_of(pins) if record.contact]
+@pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed")
+def test_sketch_prints_our_contacts_and_sends_frames_that_we_read(exports, tmp_path):
+    """Rest, a press of some hundred counts, rest."""
+    export = exports[0] / "arduino" / "isocharge_sketch"
+    pins = np.random.default_rng(1).normal(20.0, 1.0, (900, 3))
+    pins[400:600] += [700.0, 750.0, 800.0]
+    pins = pins.astype(int)
+    printed = run_sketch(export, tmp_path, pins).decode()
+    data = b"".join(encode_frame(Frame(k, 5000 * (k + 1), tuple(map(float, row)))) for k, row in enumerate(pins))
+    records = TouchStream(Predictor("three-25um-biaxial"), device_from_table({}, "x")).feed(Chunk(data, 0.0, 0))
+    expected = [record.force_N for record in records if record.contact]
     assert len(expected) > 150
-    np.testing.assert_allclose(forces, expected, atol=1e-3)
-
-
-def test_sketch_sends_frames_that_we_read(sketch, pins):
-    frames = BinaryParser().feed(run_sketch(sketch("-DSEND_FRAMES=1"), pins))
+    np.testing.assert_allclose([float(force) for force in re.findall(r">force_N:(\S+)", printed)], expected, atol=1e-3)
+    frames = BinaryParser().feed(run_sketch(export, tmp_path, pins, "-DSEND_FRAMES=1"))
     assert [frame.values for frame in frames] == [tuple(map(float, row)) for row in pins.tolist()]
     assert [frame.t_us for frame in frames[:2]] == [5000, 10000]

@@ -1,11 +1,11 @@
 """Training: a dataset in, a small network that gives contacts from charges out, as an ONNX model with its card.
 
-    from isocharge.simulate import read_dataset
-    from isocharge.train import evaluate, fit, release
+from isocharge.simulate import read_dataset
+from isocharge.train import evaluate, fit, release
 
-    fitted = fit(read_dataset(Path("presses")))
-    print(evaluate(fitted))
-    release(fitted, Path("models/mine"))
+fitted = fit(read_dataset(Path("presses")))
+print(evaluate(fitted))
+release(fitted, Path("models/mine"))
 """
 
 from typing import TYPE_CHECKING

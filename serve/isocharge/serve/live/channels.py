@@ -7,8 +7,7 @@ from operator import itemgetter
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import ChargeError
-from isocharge.common.tables import cut
+from isocharge.common.errors import ChargeError, cut
 from isocharge.serve.frames.frame import Frame
 
 

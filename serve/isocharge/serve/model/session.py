@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 import onnxruntime as ort
 
 from isocharge.common.arrays import Singles
-from isocharge.common.errors import ModelError
-from isocharge.common.tables import cut
+from isocharge.common.errors import ModelError, cut
 
 INPUT = "charge_pC"
 """Name of the input."""

@@ -10,9 +10,8 @@ from typing import NoReturn
 
 import numpy as np
 
-from isocharge.common.errors import InputError
+from isocharge.common.errors import InputError, shown
 from isocharge.common.number_text import number_of
-from isocharge.common.tables import shown
 
 MOST_COLUMNS = 1_000
 """Columns of a table."""

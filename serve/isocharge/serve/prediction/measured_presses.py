@@ -17,9 +17,8 @@ from typing import TextIO
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.common.errors import PressError
+from isocharge.common.errors import PressError, shown
 from isocharge.common.files import bounded_lines, write_whole
-from isocharge.common.tables import shown
 from isocharge.serve.prediction.csv_numbers import CsvNumbers
 from isocharge.serve.prediction.table import CHARGE
 

@@ -15,8 +15,7 @@ import onnxruntime as ort
 from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Singles
-from isocharge.common.errors import ChargeError, ModelError
-from isocharge.common.tables import shown
+from isocharge.common.errors import ChargeError, ModelError, shown
 from isocharge.serve.model.charges import as_batch, as_press, write_finite
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import Model, load_model

@@ -4,15 +4,17 @@ A model carries its sensor whole, as the simulator wrote it. What is missing the
 lies beside the model, or is shipped for the films of the released ones.
 """
 
-import json
 import math
+from collections.abc import Mapping
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
+from msgspec import Struct
+
 from isocharge.common.deflection_field import DeflectionField, read_deflection_field
 from isocharge.common.errors import InputError
-from isocharge.common.tables import Table
+from isocharge.common.structs import Finite, Positive, convert
 from isocharge.serve.model.metadata import ModelMetadata
 
 FILE = "deflection.json"
@@ -64,21 +66,23 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
 def _outlines_mm(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[float]]]:
     """Corners of each electrode where it lies on the real film; none for a sensor of another form."""
     try:
-        table = Table(json.loads(json.dumps(sensor)), "sensor", InputError)
-        parts = table.table("electrodes")
+        parts = convert(sensor["electrodes"], dict[str, Point | Positive | _Polygon], "sensor", InputError)
         return {name: _placed(_corners(parts, name), sensor.get("calibration") or {}) for name in electrodes}
     except (InputError, TypeError, ValueError, KeyError):
         return {}
 
 
-def _corners(parts: Table, name: str) -> list[tuple[float, float]]:
-    if isinstance(parts.values[name], dict):
-        polygon = parts.table(name)
-        points = polygon.sequence("polygon_mm", of="points")
-        corners = [polygon.as_numbers("polygon_mm", point, count=2, of="points") for point in points]
-        return [(x, y) for x, y in corners]
-    x, y = parts.numbers(name, count=2, of="x and y")
-    half = 0.5 * parts.number("side_mm", above=0.0)
+Point = tuple[Finite, Finite]
+
+
+class _Polygon(Struct):
+    polygon_mm: list[Point]
+
+
+def _corners(parts: Mapping[str, Any], name: str) -> list[Point]:
+    if isinstance(part := parts[name], _Polygon):
+        return part.polygon_mm
+    (x, y), half = part, 0.5 * parts["side_mm"]
     return [(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]
 
 

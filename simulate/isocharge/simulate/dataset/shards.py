@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import DatasetError, SensorError
+from isocharge.common.errors import DatasetError, SensorError, cut, shown
 from isocharge.common.files import new_folder, read_whole, sha256_of, write_whole
-from isocharge.common.tables import MOST_JSON_BYTES, Table, cut, parse_json, shown
+from isocharge.common.structs import MOST_JSON_BYTES, Text, convert, parse_json
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
@@ -229,21 +230,25 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
     expected = sensor
     manifest, checksum = _read_manifest(folder)
     try:
-        sensor = sensor_from_dict(manifest.table("sensor").values, f"{folder}/manifest.json")
+        listed = convert(manifest, _Manifest, f"{folder}/manifest.json", DatasetError)
+        sensor = sensor_from_dict(listed.sensor, f"{folder}/manifest.json")
         if expected is not None and expected != sensor:
             raise DatasetError(
                 f"{folder}/manifest.json: expected the sensor {expected.name!r}, got {_differs(sensor, expected)}; use "
                 "its own dataset, or make one"
             )
-        if manifest.get("electrodes") != list(sensor.electrode_names):
-            manifest.refuse("electrodes", f"the sensor's electrodes in its order, {list(sensor.electrode_names)}")
-        shards = [_read_shard(folder, entry, sensor) for entry in manifest.tables("shards")]
+        if listed.electrodes != list(sensor.electrode_names):
+            raise DatasetError(
+                f"{folder}/manifest.json: electrodes: expected the sensor's electrodes in its order, "
+                f"{list(sensor.electrode_names)}, got {shown(listed.electrodes)}"
+            )
+        shards = [_read_shard(folder, entry, sensor) for entry in listed.shards]
     except SensorError as error:
         raise DatasetError(str(error)) from error
     if not shards:
         raise DatasetError(f"{folder}/manifest.json: lists no shards")
     joined = {name: np.concatenate([getattr(shard, name) for shard in shards]) for name in COLUMNS}
-    return Dataset(sensor, Samples(**joined), dict(manifest.values), checksum)
+    return Dataset(sensor, Samples(**joined), manifest, checksum)
 
 
 def _differs(sensor: Sensor, expected: Sensor) -> str:
@@ -255,7 +260,20 @@ def _differs(sensor: Sensor, expected: Sensor) -> str:
     return f"one of that name with another {', '.join(keys)}"
 
 
-def _read_manifest(folder: Path) -> tuple[Table, str]:
+class _Shard(Struct):
+    file: Text
+    sha256: Text
+
+
+class _Manifest(Struct):
+    """What a reader needs of a manifest."""
+
+    sensor: dict[str, Any]
+    electrodes: list[str]
+    shards: list[_Shard]
+
+
+def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
     path = folder / "manifest.json"
     if not path.is_file():
         raise DatasetError(
@@ -263,12 +281,12 @@ def _read_manifest(folder: Path) -> tuple[Table, str]:
         )
     data = _bytes_of(path, MOST_JSON_BYTES)
     try:
-        manifest = Table(parse_json(data, "", DatasetError), "", DatasetError)
-        version = manifest.get("format_version")
+        manifest = parse_json(data, "", DatasetError, dict[str, Any])
+        if "format_version" not in manifest:
+            raise DatasetError("key 'format_version' is missing")
     except DatasetError as error:
         raise DatasetError(f"{path}: not a manifest of a dataset: {error}") from error
-    manifest.where = str(path)
-    if version != FORMAT_VERSION:
+    if (version := manifest["format_version"]) != FORMAT_VERSION:
         raise DatasetError(
             f"{path}: format version {shown(version)} is not supported (this version reads {FORMAT_VERSION}); "
             f"make the dataset again or upgrade isocharge"
@@ -283,12 +301,12 @@ def _bytes_of(path: Path, most: int) -> bytes:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); make the dataset again") from error
 
 
-def _read_shard(folder: Path, entry: Table, sensor: Sensor) -> Samples:
-    path = folder / Path(entry.text("file")).name
+def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
+    path = folder / Path(entry.file).name
     if not path.is_file():
         raise DatasetError(f"{path}: the manifest lists this shard, but the file is missing; make the dataset again")
     data = _bytes_of(path, MOST_SHARD_BYTES)
-    checksum, expected = sha256_of(data), entry.text("sha256")
+    checksum, expected = sha256_of(data), entry.sha256
     if checksum != expected:
         raise DatasetError(
             f"{path} is damaged: expected sha256 {expected[:12]}..., got {checksum[:12]}...; make the dataset again"

@@ -27,4 +27,3 @@ def cubic_weights(at: Array, count: int, periodic: bool = False) -> tuple[Intege
     weights = np.concatenate([-b * c * d / 6.0, a * c * d / 2.0, -a * b * d / 2.0, a * b * c / 6.0], axis=-1)
     number = first[..., None] + TAPS
     return number % count if periodic else number, weights
-

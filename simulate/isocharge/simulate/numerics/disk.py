@@ -42,7 +42,7 @@ class Rings:
         return values.reshape(*self.position.shape[:2], *values.shape[1:])
 
 
-def lattice(most: int) -> np.ndarray:
+def lattice(most: int) -> Complexes:
     """Points x + iy of the largest square lattice with at most `most` points in the unit disk.
 
     The centre is one of them and the outermost lie on the circle; from the inside out, shape (n,).
@@ -54,7 +54,7 @@ def lattice(most: int) -> np.ndarray:
     ring = rings[np.searchsorted(np.cumsum(counts), max(most, 1), side="right") - 1]
     inside = np.flatnonzero(squared <= ring)
     inside = inside[np.lexsort((j[inside], i[inside], squared[inside]))]
-    points: np.ndarray = (i[inside] + 1j * j[inside]) / max(np.sqrt(ring), 1.0) * (1.0 - 1e-15)
+    points: Complexes = (i[inside] + 1j * j[inside]) / max(np.sqrt(ring), 1.0) * (1.0 - 1e-15)
     return points
 
 

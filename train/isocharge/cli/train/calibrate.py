@@ -16,7 +16,7 @@ from isocharge.common.json_values import plain_values
 from isocharge.simulate.sensor.probe import parse_probe
 from isocharge.simulate.sensor.sensor_file import load_sensor
 from isocharge.train.calibration.calibrate import calibrate
-from isocharge.train.calibration.contact_error import next_presses
+from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.folder import SESSION, read_earlier, result_table, write_calibration
 from isocharge.train.calibration.problem import CalibrationProblem
 
@@ -126,8 +126,9 @@ def calibrate_command(
         (output / SESSION).unlink(missing_ok=True)
         say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
     known = result.posterior if result else problem.before
-    std = {"position_std_mm": position_std_mm, "force_std": force_std}
-    proposed = next_presses(problem, next_count, known, **std) if next_count else []
+    proposed: list[ProposedPress] = []
+    if next_count:
+        proposed = next_presses(problem, next_count, known, position_std_mm=position_std_mm, force_std=force_std)
     if json:
         table = result_table(result) if result else {}
         values = plain_values(table | {"next": [vars(press) for press in proposed]})

@@ -70,7 +70,9 @@ def simulated_errors(predict: Predict, presses: LabelledPresses, noise: NoiseMod
 def measured_errors(predict: Predict, presses: LabelledPresses) -> dict[str, float]:
     """Errors on measured presses as they are; see `evaluate`."""
     errors = contact_errors(*predict(presses.charge)[:2], presses.contact)
-    return {name: error for name, error in errors.items() if name not in ONLY_SIMULATED} | {HELD_PRESSES: float(len(presses))}
+    return {name: error for name, error in errors.items() if name not in ONLY_SIMULATED} | {
+        HELD_PRESSES: float(len(presses))
+    }
 
 
 def measured_alarm(predict: Predict, presses: LabelledPresses) -> dict[str, float]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon as Patch
 from msgspec import Struct
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import RecordingError
 from isocharge.simulate import Sensor
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
@@ -108,10 +108,10 @@ def _number(value: float | None) -> float:
 class _Axis:
     """Time in groups of records: `start` of each group, their `first` and `last` times, and where lines break."""
 
-    start: Array
+    start: Integers
     first: Array
     last: Array
-    breaks: Array
+    breaks: Integers
 
     @classmethod
     def of(cls, time: Array, seconds: float) -> "_Axis":
@@ -201,7 +201,7 @@ def _draw_film(
         widths = [4.0 * traces.values[name][few] for name in ("x_std_mm", "y_std_mm")]
         axes.add_collection(
             EllipseCollection(
-                *widths, np.zeros(len(few)), units="xy", offsets=place[few], transOffset=axes.transData,
+                *widths, np.zeros(len(few)), units="xy", offsets=place[few], offset_transform=axes.transData,
                 facecolors="none", edgecolors=INK, lw=0.6, alpha=0.6, zorder=6,
             )
         )  # fmt: skip

@@ -85,7 +85,6 @@ class Connection(asyncio.Protocol):
         self._parser = self._new_parser()
         self._url, self._headers, self._body = b"", list[tuple[bytes, bytes]](), bytearray()
         self._piece = self._fed = 0  # bytes of this piece; bytes since the request began, or since the last of its body
-        self._trailer_bytes = 0
         self._starts_in_piece = True  # whether this piece begins with a request
         self._has_answered = False  # whether a request of this piece was answered
         self._expects_continue = False
@@ -247,18 +246,15 @@ class Connection(asyncio.Protocol):
         """A request begins, somewhere in this piece of data; of what is before it in the piece, it knows nothing."""
         self._phase, self._fed = Phase.HEADERS, self._piece if self._starts_in_piece else 0
         self._starts_in_piece = self._expects_continue = False
-        self._url, self._headers, self._body, self._trailer_bytes = b"", [], bytearray(), 0
+        self._url, self._headers, self._body = b"", [], bytearray()
 
     def on_url(self, url: bytes) -> None:
         """A piece of the request line's target."""
         self._url += url
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """A header; or a trailer, which is measured as one and then ignored."""
+        """A header; a trailer is ignored."""
         if self._phase is Phase.BODY:
-            self._trailer_bytes += len(name) + len(value) + 4
-            if self._trailer_bytes > self._limits.header_bytes:
-                self._refuse_headers()
             return
         name = name.lower()
         if name == b"expect":
