@@ -198,10 +198,10 @@ def _draw_film(
         size = 3.0 + 30.0 * force / max(float(force.max()), 1e-9)
         marks = axes.scatter(*place[at].T, c=time[at], s=size, lw=0.0, alpha=0.8, zorder=4)
         few = at[np.unique(np.linspace(0, len(at) - 1, MOST_ELLIPSES).astype(int))]
-        widths = [4.0 * traces.values[name][few] for name in ("x_std_mm", "y_std_mm")]
+        width, height = (4.0 * traces.values[name][few] for name in ("x_std_mm", "y_std_mm"))
         axes.add_collection(
             EllipseCollection(
-                *widths, np.zeros(len(few)), units="xy", offsets=place[few], offset_transform=axes.transData,
+                width, height, np.zeros(len(few)), units="xy", offsets=place[few], offset_transform=axes.transData,
                 facecolors="none", edgecolors=INK, lw=0.6, alpha=0.6, zorder=6,
             )
         )  # fmt: skip
