@@ -32,6 +32,7 @@ from isocharge.simulate.mesh.elements import Geometry
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template
+from kept import kept
 
 DATA = Path(__file__).parents[1] / "data"
 TURNED = Polygon.rectangle(4.0, 2.0, 0.3)
@@ -237,7 +238,7 @@ def skfem() -> ModuleType:
 @pytest.fixture(scope="session")
 def three_map() -> ForwardMap:
     """The forward map of the released model's sensor."""
-    return ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0))
+    return kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0))
 
 
 @pytest.fixture(scope="session")

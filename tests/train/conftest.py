@@ -2,9 +2,11 @@
 
 import pytest
 
-from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, read_dataset, run_sweep
+from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, read_dataset
+from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, TrainingData, fit
 from isocharge.train.training.fit import train_network
+from kept import kept
 
 QUICK = FitConfig(
     network=NetworkConfig(hidden=(32, 32), misfit_hidden=(24, 24)),
@@ -20,21 +22,21 @@ def sensor():
 @pytest.fixture(scope="session")
 def film(sensor):
     """The forward map: the simulator's own word on every charge."""
-    return ForwardMap.build(sensor, Circle(1.0))
+    return kept(ForwardMap.build, sensor, Circle(1.0))
 
 
 @pytest.fixture(scope="session")
-def dataset(sensor, tmp_path_factory):
+def dataset(film, tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "presses"
-    return read_dataset(run_sweep(folder, sensor, (Circle(1.0),), Sweep(samples=6_000)))
+    return read_dataset(write_sweep(folder, (film,), Sweep(samples=6_000)))
 
 
 @pytest.fixture(scope="session")
 def trained(dataset):
     """The network in torch, with the presses that it learned from and those that it did not."""
-    return train_network(TrainingData.of(dataset), QUICK)
+    return kept(train_network, TrainingData.of(dataset), QUICK)
 
 
 @pytest.fixture(scope="session")
 def fitted(dataset):
-    return fit(dataset, QUICK)
+    return kept(fit, dataset, QUICK)
