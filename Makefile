@@ -5,23 +5,18 @@ BIN := $(VENV)/bin
 
 .PHONY: demo test test-all attack docs bench soak release report paper proto clean
 
-# Tests that measure time, or wait for a port to come back: one at a time. All others share the cores, a file a worker;
-# some wait for processes that they started, so there is a worker more than the two cores that we count on.
-ALONE := tests/serve/live tests/serve/port tests/serve/virtual_sensor tests/serve/test_end_to_end.py tests/test_live.py tests/test_press_session.py
-# The file whose tests take longest goes first, so that no core waits for it at the end.
-FIRST := tests/test_pages.py
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
 demo: $(VENV)/installed
 	$(BIN)/isocharge demo
 
+# Some tests wait for a clock or a process, so there is a worker more than the two cores that we count on.
 test: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(ONE_THREAD) $(BIN)/python -m pytest $(FIRST) tests $(addprefix --ignore=,$(ALONE)) -n 3 --dist loadfile --no-loadscope-reorder
-	$(BIN)/python -m pytest $(ALONE)
+	$(ONE_THREAD) $(BIN)/python -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
 
 test-all: docs
 	$(BIN)/python -m pytest -m "slow or not slow"

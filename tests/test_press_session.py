@@ -15,6 +15,8 @@ from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, PressSession
 
+pytestmark = pytest.mark.xdist_group("clock")
+
 RATE_HZ = 200.0
 NAMES = ("A", "B", "C", "D")
 TARE_S = 1.5

@@ -8,6 +8,8 @@ import pytest
 from isocharge.serve import BinaryParser, Port, VirtualSensor, stream, wander
 from isocharge.serve.frames.sequence import SequenceGaps
 
+pytestmark = pytest.mark.xdist_group("clock")
+
 
 def reference_noise(charge_pC, rng):
     return charge_pC + np.hypot(1.0, 0.002 * charge_pC) * rng.standard_normal(charge_pC.shape)

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from isocharge.serve import Port
 from isocharge.serve.port.request import QUIET_S, UNANSWERED_S, Asker, Request
 
+pytestmark = pytest.mark.xdist_group("clock")
+
 
 class Clock:
     """A clock that is set by hand."""

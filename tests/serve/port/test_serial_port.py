@@ -13,6 +13,8 @@ from isocharge.common.errors import PortError, PortLost
 from isocharge.serve import Port
 from isocharge.serve.virtual_sensor.pseudo_port import PORT_BUFFER, PseudoPort
 
+pytestmark = pytest.mark.xdist_group("clock")
+
 
 @pytest.fixture
 def board():

@@ -8,6 +8,8 @@ import pytest
 from isocharge.common.errors import InputError
 from isocharge.serve import Port, open_source
 
+pytestmark = pytest.mark.xdist_group("clock")
+
 
 def test_file_is_read_to_its_end(tmp_path):
     path = tmp_path / "frames.bin"

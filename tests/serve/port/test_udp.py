@@ -8,6 +8,8 @@ from isocharge.common.errors import PortError
 from isocharge.serve import Port
 from isocharge.serve.port.udp import is_text
 
+pytestmark = pytest.mark.xdist_group("clock")
+
 
 @pytest.fixture
 def address():

@@ -7,6 +7,8 @@ from isocharge.common.errors import SceneError
 from isocharge.serve import Faults, Script, wander
 from isocharge.serve.virtual_sensor.script import load_script
 
+pytestmark = pytest.mark.xdist_group("clock")
+
 
 @pytest.fixture(scope="module")
 def script():

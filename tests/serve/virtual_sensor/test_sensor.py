@@ -12,6 +12,8 @@ from isocharge.serve import AutoParser, BinaryParser, Faults, Port, Script, Virt
 from isocharge.serve.frames.sequence import SequenceGaps
 from isocharge.serve.virtual_sensor.script import corrupt
 
+pytestmark = pytest.mark.xdist_group("clock")
+
 
 def steady(n=10, rate_Hz=200.0, force_N=1.0):
     return Script(np.zeros(n), np.zeros(n), np.full(n, force_N), rate_Hz)
