@@ -2,8 +2,7 @@
 
 python -W error .ci/docs.py OUTPUT_FOLDER
 
-Every module gets a page. A reference that leads nowhere is an
-error, as every warning is.
+Every module gets a page. A reference that leads nowhere is an error, as every warning is.
 """
 
 import re
@@ -20,10 +19,10 @@ DOTTED = re.compile(r"`(isocharge(?:\.\w+)+)`")
 
 
 def modules() -> list[str]:
-    """Every module of the namespace package, private ones left out."""
-    isocharge = import_module("isocharge")
-    names = sorted(entry.name for entry in walk_packages(isocharge.__path__, "isocharge."))
-    return [name for name in names if "._" not in name]
+    """Every module of the namespace packages, private ones left out."""
+    packages = [import_module(name) for name in ("isocharge", "isocharge.cli")]
+    names = {entry.name for package in packages for entry in walk_packages(package.__path__, f"{package.__name__}.")}
+    return sorted(name for name in names if "._" not in name)
 
 
 def check_docstrings(names: list[str]) -> None:

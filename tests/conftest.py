@@ -108,7 +108,8 @@ def installed(tmp_path_factory):
         absent = {package for packages in PACKAGES.values() for package in packages} - present
         absent -= {"google"}  # protobuf comes with onnxruntime
         path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"  # this environment's `isocharge` first
-        return os.environ | {"PATH": path, "PYTHONPATH": str(folder), "ABSENT_PACKAGES": " ".join(sorted(absent))}
+        search = f"{folder}:{os.environ.get('PYTHONPATH', '')}"
+        return os.environ | {"PATH": path, "PYTHONPATH": search, "ABSENT_PACKAGES": " ".join(sorted(absent))}
 
     return environment
 

@@ -8,6 +8,7 @@ import pytest
 
 from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
+from kept import kept
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")
@@ -27,22 +28,22 @@ def column(sensor):
 def shares(name):
     """Shares of presses with a flag, in %, by fault."""
     predictor, rng = Predictor(name), np.random.default_rng(7)
-    reach, names = 0.999 * predictor.domain.reach_mm, predictor.metadata.electrodes
-    forward_map = ForwardMap.build(load_sensor(name), Circle(1e-3), radius=1e-3 * reach, force_range=(0.4, 2.0))
-    radius, angle = 1e-3 * reach * np.sqrt(rng.random(PRESSES)), 2.0 * np.pi * rng.random(PRESSES)
+    reach, names = 0.999 * predictor.validity.reach_mm, predictor.metadata.electrodes
+    forward_map = kept(ForwardMap.build, load_sensor(name), Circle(1.0), radius=reach, force_range=(0.4, 2.0))
+    radius, angle = reach * np.sqrt(rng.random(PRESSES)), 2.0 * np.pi * rng.random(PRESSES)
     force = np.exp(rng.uniform(np.log(0.5), np.log(2.0), PRESSES))
-    clean = forward_map.forward(radius * np.cos(angle), radius * np.sin(angle), force)
-    charge_pC = 1e12 * noise_model("reference").add(clean, rng)
+    clean = forward_map.charges(np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force]))
+    charge_pC = noise_model("reference").add(clean, rng)
 
     def share(*gains):
         flags = []
         for gain in gains:
             for electrode in range(len(names)):
                 faulty = charge_pC * np.where(np.arange(len(names)) == electrode, gain, 1.0)
-                flags += predictor.domain.batch_flags(predictor.predict_batch(faulty))
+                flags += predictor.validity.batch_flags(predictor.predict_batch(faulty))
         return 100.0 * sum(map(bool, flags)) / len(flags)
 
-    swapped = predictor.domain.batch_flags(predictor.predict_batch(charge_pC[:, [1, 0, *range(2, len(names))]]))
+    swapped = predictor.validity.batch_flags(predictor.predict_batch(charge_pC[:, [1, 0, *range(2, len(names))]]))
     return {
         "none": share(1.0),
         "one gain 5 % off": share(0.95, 1.05),

@@ -34,7 +34,7 @@ def test_each_parameter_says_what_it_is_with_unit_and_default(path):
     for parameter in COMMANDS[path].params:
         text = parameter.help
         assert re.match(r"[A-Z'].*(\.|\))$", text, re.DOTALL), (parameter.name, text)
-        hidden = parameter.default is None or parameter.default is False
+        hidden = parameter.default is None or parameter.default is False or parameter.default == ""
         if hidden and not parameter.required and not parameter.secondary_opts:
             assert "(default: " in text, parameter.name
         elif not parameter.required:

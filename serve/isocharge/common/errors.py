@@ -1,7 +1,7 @@
 """The one tree of exceptions; each is also the built-in that fits it, so plain Python code can catch it.
 
 A message says what was expected, what was got, where, and what to do. The command line maps the tree to exit codes in
-`isocharge.cli` (wrong input is 2, everything else is 1), the servers to HTTP and gRPC statuses in
+`isocharge.cli.main` (wrong input is 2, everything else is 1), the servers to HTTP and gRPC statuses in
 `isocharge.serve.network.protocol.response`.
 """
 

@@ -1,4 +1,4 @@
-"""Tables of settings to TOML: the writer beside `isocharge.common.tables`, which reads them.
+"""Tables of settings to TOML: the writer beside `isocharge.common.structs`, which reads them.
 
 Not a library's: tomli-w gives each number of a list a line, so that the position of an electrode takes four, and writes
 no comments; tomlkit is made to change files and keep their style.

@@ -46,7 +46,7 @@ def test_an_electrode_that_looks_like_a_comment_or_begins_with_a_blank():
     ("text", "said"),
     [
         (",".join(f"column {i}" for i in range(2000)), "expected at most 1,000 columns, got 2,000"),
-        ("A" * 200_000, "line 1: expected at most 100,000 characters, got more"),
+        ("A" * 200_000, "line 1: not CSV text in UTF-8 .field larger"),
         ("A,B," + "x" * 90_000, "missing: 'C'"),
         ("A,B,C\n" + ",".join("1" * 20_000), "line 2: expected 3 cells"),
     ],

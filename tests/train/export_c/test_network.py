@@ -14,7 +14,7 @@ from isocharge.serve import find_model, write_model
 from isocharge.serve.model.model_folder import load_model
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 from isocharge.train.export_c.network import read_network
-from isocharge.train.release.export import export_onnx
+from isocharge.train.model_release.export import export_onnx
 from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, PlainPerceptron
 
 FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0])

@@ -1,11 +1,11 @@
 """Training: a dataset in, a small network that gives contacts from charges out, as an ONNX model with its card.
 
-from isocharge.simulate import read_dataset
-from isocharge.train import evaluate, fit, release
+    from isocharge.simulate import read_dataset
+    from isocharge.train import evaluate, fit, release
 
-fitted = fit(read_dataset(Path("presses")))
-print(evaluate(fitted))
-release(fitted, Path("models/mine"))
+    fitted = fit(read_dataset(Path("presses")))
+    print(evaluate(fitted))
+    release(fitted, Path("models/mine"))
 """
 
 from typing import TYPE_CHECKING
@@ -25,9 +25,9 @@ with require("train"):
     from isocharge.train.films.films_model import FilmsModel
     from isocharge.train.films.fit import FilmsConfig, fit_films
     from isocharge.train.films.release import release_films
-    from isocharge.train.release.evaluate import evaluate
-    from isocharge.train.release.release import Release, release
-    from isocharge.train.release.student import StudentCase, student_config, student_data
+    from isocharge.train.model_release.evaluate import evaluate
+    from isocharge.train.model_release.release import Release, release
+    from isocharge.train.model_release.student import StudentCase, student_config, student_data
     from isocharge.train.rig.rig_data import Rig, rig_data
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
     from isocharge.train.training.fit import Fitted, fit

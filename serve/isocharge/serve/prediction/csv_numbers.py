@@ -118,8 +118,8 @@ class CsvNumbers:
         except InputError:  # of whoever gives the lines
             raise
         except (csv.Error, ValueError) as cause:  # ValueError: no UTF-8, or a line that is too long to be held
-            where = f"{self.where}, line {reader.line_num + 1}"
-            raise self.error(f"{where}: not CSV text in UTF-8 ({cause})") from cause
+            line = reader.line_num + (not isinstance(cause, csv.Error))  # a csv.Error is of a line that was counted
+            raise self.error(f"{self.where}, line {line}: not CSV text in UTF-8 ({cause})") from cause
 
 
 def _is_comment(line: str, names: frozenset[str]) -> bool:

@@ -42,7 +42,7 @@ class Windows:
     """Frames of one length in a stream.
 
     Attributes:
-        framing: One of `isocharge.serve.frames.frame_layout.FRAMINGS`.
+        framing: One of `isocharge.serve.frames.frame_layout.Framing`.
         stream: All bytes, shape (n,).
         starts: Where windows begin, shape (frames,).
         length: Bytes in each.

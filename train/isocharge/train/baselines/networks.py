@@ -20,7 +20,7 @@ from isocharge.serve import Predictor
 from isocharge.serve.model.session import INPUT, open_session
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
-from isocharge.train.release.export import GraphBuilder, add_layers, make_model
+from isocharge.train.model_release.export import GraphBuilder, add_layers, make_model
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.training.fit import train_network
 from isocharge.train.training.folding import FoldedLayers, contact_alone

@@ -1,7 +1,7 @@
 """The Bayes limit: the errors of the posterior mean, which no estimator of x, y, F can beat on average.
 
-problem = BayesProblem(load_sensor("three-25um-biaxial"), Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
-print(bayes_limit(problem).position_rms_mm)
+    problem = BayesProblem(load_sensor("three-25um-biaxial"), Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
+    print(bayes_limit(problem).position_rms_mm)
 """
 
 from concurrent.futures import Executor

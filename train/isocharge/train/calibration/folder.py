@@ -36,7 +36,7 @@ from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.picture import calibration_picture
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity
-from isocharge.train.release.release import release
+from isocharge.train.model_release.release import release
 from isocharge.train.training.source import Provenance
 
 RESULT, SENSOR, PRESSES, PICTURE, CARD = "calibration.json", "sensor.toml", "presses.csv", "calibration.png", "card.md"

@@ -12,8 +12,8 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.train.data.presses import draw_contacts, position_error
 from isocharge.train.films.films_file import FILE, films_bytes, films_from_bytes
 from isocharge.train.films.films_model import FilmsModel
-from isocharge.train.release.evaluate import ONLY_SIMULATED, contact_errors, rounded
-from isocharge.train.release.release import Release, release
+from isocharge.train.model_release.evaluate import ONLY_SIMULATED, contact_errors, rounded
+from isocharge.train.model_release.release import Release, release
 from isocharge.train.training.fit import Fitted
 from isocharge.train.training.source import Provenance
 

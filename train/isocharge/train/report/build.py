@@ -25,7 +25,7 @@ from isocharge.train.baselines.rival import FittingTask, Rival
 from isocharge.train.baselines.rivals import BOOSTING, GAUSS_NEWTON, LINEAR_BAND, POLYNOMIAL, TABLE, rivals
 from isocharge.train.data.measured import check_enough, held_out
 from isocharge.train.data.presses import LabelledPresses, domain_of, is_measured, presses_of, split_by_position
-from isocharge.train.release.release import model_domain
+from isocharge.train.model_release.release import model_domain
 from isocharge.train.report import effects, maps, pictures
 from isocharge.train.report.case import EvaluationCase, press_on
 from isocharge.train.report.limits import BAYES, ErrorBounds

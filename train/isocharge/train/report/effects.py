@@ -14,7 +14,7 @@ from isocharge.train.baselines.networks import ReleasedModel
 from isocharge.train.baselines.rival import FittingTask, Rival
 from isocharge.train.baselines.rivals import gauss_newton, polynomial_ridge
 from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.release.evaluate import about_1_N, alarm_threshold
+from isocharge.train.model_release.evaluate import about_1_N, alarm_threshold
 from isocharge.train.report.case import EvaluationCase, press_on
 from isocharge.train.report.measures import Errors, rounded
 from isocharge.train.report.settings import Settings

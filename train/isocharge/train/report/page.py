@@ -9,7 +9,7 @@ from typing import Any
 from isocharge.train.baselines.linear_band import BAND
 from isocharge.train.baselines.networks import RELEASED
 from isocharge.train.baselines.rivals import LINEAR_BAND
-from isocharge.train.release.evaluate import FALSE_ALARMS
+from isocharge.train.model_release.evaluate import FALSE_ALARMS
 from isocharge.train.report.effects import FARTHEST, GAIN_OFF, PRETENSION_OFF
 from isocharge.train.report.measures import MethodRecord
 

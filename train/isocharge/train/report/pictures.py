@@ -14,7 +14,7 @@ from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
 from isocharge.train.baselines.networks import RELEASED
-from isocharge.train.release.evaluate import FALSE_ALARMS
+from isocharge.train.model_release.evaluate import FALSE_ALARMS
 from isocharge.train.report.limits import BAYES, CRAMER_RAO
 from isocharge.train.report.maps import COORDINATES, Draws
 from isocharge.train.report.measures import MethodRecord, Plot

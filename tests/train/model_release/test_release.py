@@ -17,7 +17,7 @@ from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit, release
 from isocharge.train.data.measured import held_out
 from isocharge.train.data.presses import draw_contacts
-from isocharge.train.release.evaluate import simulated_errors
+from isocharge.train.model_release.evaluate import simulated_errors
 
 QUICK = FitConfig(
     network=NetworkConfig(hidden=(24, 24), misfit_hidden=(24, 24)),

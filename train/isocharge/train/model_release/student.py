@@ -20,8 +20,8 @@ from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.sensor.probe import Probe, parse_probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
-from isocharge.train.release.evaluate import HELD_PRESSES
-from isocharge.train.release.release import model_domain
+from isocharge.train.model_release.evaluate import HELD_PRESSES
+from isocharge.train.model_release.release import model_domain
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.training.source import Teacher, TrainingData
 

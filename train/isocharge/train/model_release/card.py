@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.train.data.misfit_charges import misfit_noise
-from isocharge.train.release.evaluate import HELD_PRESSES
+from isocharge.train.model_release.evaluate import HELD_PRESSES
 from isocharge.train.training.fit import Fitted
 
 

@@ -7,7 +7,7 @@ from isocharge.common.errors import TrainingError
 from isocharge.serve.model.session import open_session, run
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
-from isocharge.train.release.evaluate import Predict
+from isocharge.train.model_release.evaluate import Predict
 
 GOLDEN = 64
 """Golden vectors per model: half clean, a quarter noisy, a quarter absurd."""

@@ -12,7 +12,7 @@ from isocharge.common.errors import DatasetError, ModelError
 from isocharge.serve import Predictor, load_model
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import FitConfig, NetworkConfig, StudentCase, TrainingConfig, fit, release, student_data
-from isocharge.train.release.student import MOST_PARAMETERS, parameters, student_config
+from isocharge.train.model_release.student import MOST_PARAMETERS, parameters, student_config
 
 STUDENT = FitConfig(
     network=NetworkConfig(hidden=(24, 24), misfit_hidden=(16, 16), weights="int8"),

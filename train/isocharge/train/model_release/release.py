@@ -14,10 +14,10 @@ from isocharge.serve.model.model_folder import check_target, write_model
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.misfit_charges import misfit_noise
-from isocharge.train.release.card import model_card
-from isocharge.train.release.evaluate import evaluate
-from isocharge.train.release.export import export_onnx
-from isocharge.train.release.graph_check import check_graph
+from isocharge.train.model_release.card import model_card
+from isocharge.train.model_release.evaluate import evaluate
+from isocharge.train.model_release.export import export_onnx
+from isocharge.train.model_release.graph_check import check_graph
 from isocharge.train.training.fit import Fitted
 
 CORNERS = 64
