@@ -6,6 +6,8 @@
     fitted = fit(read_dataset(Path("presses")))
     print(evaluate(fitted))
     release(fitted, Path("models/mine"))
+
+Each of the three works alone.
 """
 
 from typing import TYPE_CHECKING
