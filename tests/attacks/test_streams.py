@@ -17,8 +17,8 @@ from isocharge.serve import (
     encode_frame,
     encode_text,
 )
-from isocharge.serve.frames.cobs import cobs_encode
 from isocharge.serve.frames.layout_parser import DescribedParser, described_parser
+from isocharge.serve.frames.stuffing import cobs_encode
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.recognition.recognise import recognise
 
@@ -45,7 +45,7 @@ def text(notation):
 
 
 def described_layout():
-    return device_from_table({"frames": DESCRIBED}, "attack").layout
+    return device_from_table({"frames": DESCRIBED}, "attack").frames
 
 
 def stuffed(framing):
@@ -53,7 +53,7 @@ def stuffed(framing):
     fields = [{"name": "seq", "type": "u8"}, {"type": "pad", "value": "0C"}]
     fields += [{"name": name, "type": "i24"} for name in "ABC"]
     table = {"format": "described", "framing": framing, "length": 12, "checksum": "crc-8", "fields": fields}
-    layout = device_from_table({"frames": table}, "attack").layout
+    layout = device_from_table({"frames": table}, "attack").frames
     escapes = {
         "cobs": lambda data: cobs_encode(data) + b"\0",
         "slip": lambda data: data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0",

@@ -14,7 +14,7 @@ from msgspec.structs import fields
 
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame, device_from_table, encode_frame, flags, load_device
-from isocharge.serve.frames.cobs import cobs_decode
+from isocharge.serve.frames.stuffing import cobs_decode
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.model_store import open_model_store

@@ -88,3 +88,20 @@ def test_wrong_descriptions(good, bad, said):
 def test_fields_that_make_no_frame(fields, said):
     with pytest.raises(DeviceError, match=said):
         layout(f'sync = "55"\nlength = 2\nfields = {fields}')
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"width": 12}, "width: expected one of 8, 16, 24, 32"),
+        ({"polynomial": "11021"}, "polynomial: expected a number of 16 bits in hexadecimal"),
+        ({"polynomial": "x"}, "polynomial: expected a number in hexadecimal"),
+        ({"poly": "1021"}, "unknown key 'checksum.poly'"),
+        ({"reflected": 1}, "reflected: expected true or false"),
+    ],
+)
+def test_wrong_parameters_of_a_check(change, said):
+    check = {"width": 16, "polynomial": "1021"} | change
+    fields = [{"name": "A", "type": "u8"}]
+    with pytest.raises(DeviceError, match=said):
+        frame_layout({"sync": "55", "length": 4, "checksum": check, "fields": fields}, "device.toml")

@@ -15,7 +15,6 @@ from crcmod.predefined import mkPredefinedCrcFun
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame
 from isocharge.serve.frames.formats import frame_layout
 from isocharge.serve.frames.layout_parser import DescribedParser, described_parser
@@ -81,16 +80,21 @@ def test_every_flipped_bit_is_noticed(name, counts, data):
     assert parser.feed(bad + good + bytes(len(good))) == DescribedParser(LAYOUTS[name]).feed(good)
 
 
-def test_memory_is_bounded():
-    parser = DescribedParser(LAYOUTS["optoforce_omd"])
-    for _ in range(100):
-        parser.feed(b"\xaa\x07\x08" * 400)
-        assert len(parser._tail) < 16
-    assert parser.counts.bytes_dropped + len(parser._tail) == 120_000
+@settings(derandomize=True)
+@given(st.lists(st.one_of(COUNTS, st.binary(max_size=20), st.just(b"\xaa\x07\x08")), max_size=12), st.integers(1, 50))
+def test_every_byte_is_a_part_of_a_frame_or_counted_as_dropped(parts, step):
+    """Nothing is held after the connection, and nothing is counted twice."""
+    layout = LAYOUTS["optoforce_omd"]
+    stream = b"".join(part if isinstance(part, bytes) else encoded("optoforce_omd", part) for part in parts)
+    parser = DescribedParser(layout)
+    frames = [frame for at in range(0, len(stream), step) for frame in parser.feed(stream[at : at + step])]
+    parser.forget()
+    assert parser.counts.bytes_dropped == len(stream) - layout.length * len(frames)
+    assert parser.counts.frames == len(frames)
 
 
-@pytest.mark.parametrize("name", ["seq", "t_us", "t_s"])
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", ["seq", "t_s"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_number_or_clock_that_is_no_number_costs_its_frame_only(name, value):
     """Without a checksum nothing else tells that the line was damaged."""
     fields = f'fields = [{{name = "{name}", type = "f32"}}, {{name = "A", type = "f32"}}]'
@@ -152,7 +156,8 @@ def test_stuffed_frames(framing, stuff):
     frames = [frame for at in range(0, len(stream), 7) for frame in parser.feed(stream[at : at + 7])]
     assert [frame.seq for frame in frames] == list(range(256))
     assert frames[3].values == struct.unpack("<f", struct.pack("<f", 0.1 * 3))
-    assert (parser.counts.crc_errors, parser.counts.malformed) == (1, 1)
+    dropped = len(bad) + len(stuff(b"123")) - 2 * (framing == "hdlc")  # which begins with an idle delimiter
+    assert (parser.counts.crc_errors, parser.counts.malformed, parser.counts.bytes_dropped) == (1, 1, dropped)
 
 
 def test_datagrams_hold_whole_frames():
@@ -185,20 +190,3 @@ def test_check_of_given_parameters():
     layout = frame_layout({"sync": "55", "length": 4, "byte_order": "big", "checksum": check, "fields": fields}, "test")
     data = b"\x55\x07"
     assert layout.checked(data) == mkPredefinedCrcFun("crc-16-genibus")(data).to_bytes(2, "big")
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"width": 12}, "width: expected one of 8, 16, 24, 32"),
-        ({"polynomial": "11021"}, "polynomial: expected a number of 16 bits in hexadecimal"),
-        ({"polynomial": "x"}, "polynomial: expected a number of 16 bits"),
-        ({"poly": "1021"}, "unknown key 'checksum.poly'"),
-        ({"reflected": 1}, "reflected: expected true or false"),
-    ],
-)
-def test_wrong_parameters_of_a_check(change, said):
-    check = {"width": 16, "polynomial": "1021"} | change
-    fields = [{"name": "A", "type": "u8"}]
-    with pytest.raises(DeviceError, match=said):
-        frame_layout({"sync": "55", "length": 4, "checksum": check, "fields": fields}, "device.toml")

@@ -6,12 +6,10 @@ that does is caught; damage gives no wrong frame where there is a checksum; nois
 The short runs are part of every test run; 10 million bytes for each format are in `make test-all`.
 """
 
-import tomllib
-import tracemalloc
+import pickle
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -22,45 +20,17 @@ from hypothesis import strategies as st
 from isocharge.serve import AutoParser, BinaryParser, Frame, encode_frame, encode_text
 from isocharge.serve.frames.formats import frame_layout
 from isocharge.serve.frames.frame import Parser
-from isocharge.serve.frames.frame_layout import FrameLayout
-from isocharge.serve.frames.layout_parser import DescribedParser, described_parser
+from isocharge.serve.frames.layout_parser import described_parser
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_encoder import TEXT_FORMATS
 from isocharge.serve.virtual_sensor.script import corrupt
 
-CHECKSUMMED = frame_layout(
-    {
-        "sync": "AA 55",
-        "length": 22,
-        "checksum": "crc-16/x-25",
-        "fields": [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
-        + [{"name": name, "type": "f32"} for name in "ABC"],
-    },
-    "test",
-)
-TRIPLES = frame_layout(
-    {
-        "sync": "A5 5A",
-        "length": 16,
-        "byte_order": "big",
-        "checksum": "crc-16/ccitt-false",
-        "checksum_from": 2,
-        "fields": [{"name": "seq", "type": "u16"}, {"type": "pad", "value": "0C"}]
-        + [{"name": name, "type": "i24"} for name in "ABC"],
-    },
-    "test",
-)
-STUFFED = frame_layout(
-    {
-        "framing": "slip",
-        "length": 20,
-        "checksum": "crc-16/modbus",
-        "fields": [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
-        + [{"name": name, "type": "f32"} for name in "ABC"],
-    },
-    "test",
-)
-SOLD = sorted((Path(__file__).parents[2] / "data" / "frames").glob("*.toml"))
+HEAD = [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
+FLOATS = [{"name": name, "type": "f32"} for name in "ABC"]
+TRIPLES = [{"type": "pad", "value": "0C"}, *({"name": name, "type": "i24"} for name in "ABC")]
+SYNCED = {"sync": "AA 55", "length": 22, "checksum": "crc-16/x-25", "fields": HEAD + FLOATS}
+BITS_24 = {"sync": "A5 5A", "length": 16, "byte_order": "big", "checksum": "crc-16/ccitt-false", "checksum_from": 2}
+STUFFED = {"framing": "slip", "length": 20, "checksum": "crc-16/modbus", "fields": HEAD + FLOATS}
 
 
 class Format(NamedTuple):
@@ -73,7 +43,6 @@ class Format(NamedTuple):
         junk: Strategy of bytes that may stand before a frame without damage to it.
         lead: Bytes after which the format is recognised.
         tail: Bytes after which the last frame is complete whatever stood before it.
-        faulty: The same parser with a planted fault: it skips something intact to resynchronise.
     """
 
     parser: Callable[[], Parser]
@@ -82,11 +51,10 @@ class Format(NamedTuple):
     junk: st.SearchStrategy
     lead: bytes = b""
     tail: bytes = b""
-    faulty: Callable[[], Parser] | None = None
 
 
 class SkipsAFrame:
-    """The planted fault, for any parser: after dropped bytes it skips a whole frame."""
+    """The planted fault, for any parser: after dropped bytes it skips a whole frame to resynchronise."""
 
     def __init__(self, make):
         self._parser, self._skips = make(), False
@@ -103,99 +71,52 @@ class SkipsAFrame:
         return frames
 
 
-class SkipsAPiece(BinaryParser):
-    """The planted fault: after a bad piece it skips the next one unread."""
-
-    def _take(self, piece):
-        if getattr(self, "skips", False):
-            self.skips = False
-            return None
-        dropped = self.counts.bytes_dropped
-        frame = super()._take(piece)
-        self.skips = self.counts.bytes_dropped > dropped
-        return frame
-
-
-class SkipsALine(TextParser):
-    """The planted fault: after a bad line it skips the next one unread."""
-
-    def _take(self, data):
-        if getattr(self, "skips", False):
-            self.skips = False
-            return []
-        dropped = self.counts.bytes_dropped
-        frames = super()._take(data)
-        self.skips = self.counts.bytes_dropped > dropped
-        return frames
-
-
-class SkipsALength(DescribedParser):
-    """The planted fault: where the checksum does not fit it goes on after the frame's length instead of by one byte."""
-
-    def feed(self, data):
-        data, at, frames = self._tail + data, 0, []
-        while (start := data.find(self.layout.sync, at)) >= 0 and start + self.layout.length <= len(data):
-            at = start + self.layout.length
-            frame = self._decode(data[start:at])
-            frames += [] if frame is None else [frame]
-        self._tail = data[start if start >= 0 else len(data) - len(self.layout.sync) + 1 :]
-        return frames
-
-
 SEQ, T_US = st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
-THREE = st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 3)
+THREE = st.builds(Frame, seq=SEQ, t_us=T_US, values=st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 3))
 PIECES = st.binary(min_size=1, max_size=40).map(lambda data: data.replace(b"\0", b"\x01") + b"\0")
 LINES = st.binary(max_size=20).map(lambda data: b"\x80" + data.replace(b"\n", b"\r") + b"\n")
+SLIP_JUNK = st.binary(min_size=1, max_size=12).map(lambda data: data.replace(b"\xc0", b"\x01") + b"\xc0")
 
 
-def binary(make=BinaryParser, lead=b"", faulty=SkipsAPiece):
+def binary(make=BinaryParser, lead=b""):
     floats = st.lists(st.floats(width=32, allow_nan=False), max_size=8).map(tuple)
     frames = st.builds(Frame, seq=SEQ, t_us=T_US, values=floats, flags=st.integers(0, 255))
-    return Format(make, encode_frame, frames, PIECES, lead, faulty=faulty)
+    return Format(make, encode_frame, frames, PIECES, lead)
 
 
-def text(notation, make=TextParser, faulty=SkipsALine):
+def text(notation, make=TextParser):
     encode = partial(encode_text, notation=notation)
-    lead = b"\n" + encode(Frame(0, 0, (1.0, 2.0, 3.0))) * 3
-    return Format(make, encode, st.builds(Frame, seq=SEQ, t_us=T_US, values=THREE), LINES, lead, faulty=faulty)
+    return Format(make, encode, THREE, LINES, b"\n" + encode(Frame(0, 0, (1.0, 2.0, 3.0))) * 3)
 
 
-def described(layout: FrameLayout):
+def described(table):
     """Noise before its frames often has the sync pattern in it."""
-    counts = st.lists(st.integers(-32768, 32767), min_size=len(layout.channels), max_size=len(layout.channels))
-    values = counts.map(
-        lambda numbers: tuple(n * field.scale for n, field in zip(numbers, layout.channels, strict=True))
-    )
+    layout = frame_layout(table, "test")
+    values = st.tuples(*[st.integers(-32768, 32767).map(float)] * 3)
     noise = st.one_of(st.just(layout.sync), st.just(layout.sync[:1]), st.binary(max_size=6))
     return Format(
-        partial(DescribedParser, layout),
+        partial(described_parser, layout),
         layout.encode,
-        st.builds(Frame, seq=st.integers(0, 32767), t_us=st.integers(0, 32767), values=values),
+        st.builds(Frame, seq=SEQ, t_us=T_US, values=values),
         st.lists(noise, min_size=1, max_size=5).map(b"".join),
         tail=bytes(layout.length),
-        faulty=partial(SkipsALength, layout),
     )
 
 
 def slip(frame):
     """As RFC 1055 stuffs it."""
-    return STUFFED.encode(frame).replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
+    data = frame_layout(STUFFED, "test").encode(frame)
+    return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
 
 
-SLIP = partial(described_parser, STUFFED)
-SLIP_JUNK = st.binary(min_size=1, max_size=12).map(lambda data: data.replace(b"\xc0", b"\x01") + b"\xc0")
-FAULTY_AUTO = partial(SkipsAFrame, AutoParser)
 FORMATS = {
     "binary": binary(),
-    "described": described(CHECKSUMMED),
-    "described with 24 bits": described(TRIPLES),
-    "slip": Format(
-        SLIP, slip, st.builds(Frame, seq=SEQ, t_us=T_US, values=THREE), SLIP_JUNK, faulty=partial(SkipsAFrame, SLIP)
-    ),
-    **{path.stem: described(frame_layout(tomllib.loads(path.read_text("utf-8")), path.name)) for path in SOLD},
+    "described": described(SYNCED),
+    "described with 24 bits": described(BITS_24 | {"fields": HEAD[:1] + TRIPLES}),
+    "slip": described(STUFFED)._replace(encode=slip, frames=THREE, junk=SLIP_JUNK, tail=b""),
     **{name: text(name) for name in TEXT_FORMATS},
-    "auto binary": binary(AutoParser, encode_frame(Frame(0, 0, (1.0, 2.0, 3.0))), FAULTY_AUTO),
-    **{f"auto {name}": text(name, AutoParser, FAULTY_AUTO) for name in TEXT_FORMATS},
+    "auto binary": binary(AutoParser, encode_frame(Frame(0, 0, (1.0, 2.0, 3.0)))),
+    "auto pairs": text("pairs", AutoParser),
 }
 every_format = pytest.mark.parametrize("name", FORMATS)
 ANY_BYTES = st.one_of(
@@ -204,7 +125,7 @@ ANY_BYTES = st.one_of(
 
 
 @every_format
-@settings(derandomize=True)
+@settings(derandomize=True, max_examples=60)
 @given(data=st.data())
 def test_chunks_never_change_frames_or_counters(name, data):
     form = FORMATS[name]
@@ -228,7 +149,7 @@ def alone(form, frame):
 def loses_no_intact_frame(form, make):
     """The property: whatever stands between two frames damages nothing but itself."""
 
-    @settings(derandomize=True, database=None, phases=[Phase.generate])
+    @settings(derandomize=True, database=None, phases=[Phase.generate], max_examples=60)
     @given(st.lists(st.tuples(st.none() | form.junk, form.frames), min_size=1, max_size=8))
     def check(pairs):
         parser = make()
@@ -249,13 +170,13 @@ def test_intact_frames_are_never_lost(name):
 @every_format
 def test_planted_fault_is_caught(name):
     with pytest.raises(AssertionError):
-        loses_no_intact_frame(FORMATS[name], FORMATS[name].faulty)
+        loses_no_intact_frame(FORMATS[name], partial(SkipsAFrame, FORMATS[name].parser))
 
 
 @every_format
 def test_unfinished_frame_is_forgotten_with_its_connection(name):
     """The first half of one frame and the second half of another make no frame."""
-    form, frame = FORMATS[name], Frame(1, 2, (100.0,) * channels(name))
+    form, frame = FORMATS[name], Frame(1, 2, (100.0,) * 3)
     parser = form.parser()
     parser.feed(form.lead + form.encode(frame)[:-3])
     before = parser.counts.frames
@@ -265,74 +186,53 @@ def test_unfinished_frame_is_forgotten_with_its_connection(name):
     assert parser.feed(form.encode(frame) * 4 + form.tail)[-1].values == alone(form, frame)[0].values
 
 
-def channels(name):
-    """Values in a frame of this format."""
-    path = next((path for path in SOLD if path.stem == name), None)
-    return 3 if path is None else len(frame_layout(tomllib.loads(path.read_text("utf-8")), name).channels)
-
-
 def frames_of_three(n, seed):
     values = np.random.default_rng(seed).normal(0, 800, (n, 3)).astype(np.float32)
     return [Frame(k % 65536, 1000 * k, tuple(row)) for k, row in enumerate(values.tolist())]
 
 
 @pytest.mark.parametrize("name", ["binary", "described", "auto binary"])
-@pytest.mark.parametrize("seed", range(4))
-def test_damage_of_one_percent_of_bytes(name, seed):
+def test_damage_of_one_percent_of_bytes(name):
     """No wrong frame is taken, and none is lost that is intact between intact neighbours."""
     form = FORMATS[name]
-    rng, sent = np.random.default_rng(seed), frames_of_three(2000, seed)
+    rng, sent = np.random.default_rng(0), frames_of_three(2000, 0)
     damaged = [corrupt(form.encode(frame), 0.01, rng) for frame in sent]
-    got = form.parser().feed(b"".join(damaged) + form.encode(sent[0]))
-    key = lambda frame: (frame.seq, frame.t_us, frame.values)  # noqa: E731
-    assert set(map(key, got)) <= set(map(key, sent))
+    got = {(f.seq, f.t_us, f.values) for f in form.parser().feed(b"".join(damaged) + form.encode(sent[0]))}
     after_intact_end = [True, *(data.endswith(b"\0") or name == "described" for data in damaged)]
-    intact = [f for f, data, ok in zip(sent, damaged, after_intact_end, strict=False) if ok and data == form.encode(f)]
+    intact = {
+        (f.seq, f.t_us, f.values)
+        for f, data, ok in zip(sent, damaged, after_intact_end, strict=False)
+        if ok and data == form.encode(f)
+    }
     assert 1000 < len(intact) < 1900
-    assert {key(frame) for frame in intact} <= set(map(key, got))
-
-
-FUZZED = [name for name in FORMATS if channels(name) == 3]
-
-
-def fuzz(name, size, seed=0):
-    """Feed damaged frames, noise, and both cut anyhow; the parser, the memory that it holds, and the bytes fed."""
-    form, fed = FORMATS[name], 0
-    rng, parser = np.random.default_rng(seed), FORMATS[name].parser()
-    clean = b"".join(map(form.encode, frames_of_three(2000, seed)))
-    tracemalloc.start()
-    try:
-        while fed < size:
-            share = rng.choice([0.0, 0.001, 0.01, 0.1])
-            data = corrupt(clean, share, rng) if rng.random() < 0.7 else rng.bytes(len(clean))
-            for chunk in np.split(np.frombuffer(data, np.uint8), np.sort(rng.integers(0, len(data), 40))):
-                parser.feed(chunk.tobytes())
-            fed += len(data)
-            held = tracemalloc.get_traced_memory()[0]
-    finally:
-        tracemalloc.stop()
-    return parser, held, fed, clean
+    assert intact <= got <= {(f.seq, f.t_us, f.values) for f in sent}
 
 
 def check_fuzzed(name, size, seed=0):
-    """The parser holds little, has dropped no more than it got, and reads good frames again at once."""
-    parser, held, fed, clean = fuzz(name, size, seed)
-    counts, form = parser.counts, FORMATS[name]
-    assert held < 2_000_000
-    assert counts.bytes_dropped <= fed
-    before = counts.frames
-    assert before > 0
+    """Fed with damaged frames and noise, it holds little, drops no more than it got, and reads on at once."""
+    form, fed = FORMATS[name], 0
+    rng, parser = np.random.default_rng(seed), form.parser()
+    clean = b"".join(map(form.encode, frames_of_three(400, seed)))
+    while fed < size:
+        share = rng.choice([0.0, 0.001, 0.01, 0.1])
+        data = corrupt(clean, share, rng) if rng.random() < 0.7 else rng.bytes(len(clean))
+        for a, b in pairwise([0, *np.sort(rng.integers(0, len(data), 10)).tolist(), len(data)]):
+            parser.feed(data[a:b])
+        fed += len(data)
+        assert len(pickle.dumps(parser)) < 100_000
+    before = parser.counts.frames
+    assert parser.counts.bytes_dropped <= fed
     parser.feed(b"\n" + clean + form.tail)
-    assert parser.counts.frames - before >= 1999
+    assert parser.counts.frames - before >= 399
 
 
-@pytest.mark.parametrize("name", FUZZED)
+@every_format
 def test_fuzz_of_some_bytes(name):
-    check_fuzzed(name, 200_000)
+    check_fuzzed(name, 60_000)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", FUZZED)
+@every_format
 def test_fuzz_of_ten_million_bytes(name):
     check_fuzzed(name, 10_000_000, seed=1)

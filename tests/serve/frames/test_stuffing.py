@@ -5,7 +5,7 @@ from cobs import cobs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve.frames.stuffing import STUFFINGS
+from isocharge.serve.frames.stuffing import STUFFINGS, cobs_decode, cobs_encode
 
 EXAMPLES = [
     ("slip", "C0", "DB DC"),
@@ -47,3 +47,30 @@ def test_what_was_stuffed_comes_back(data):
 def test_damaged_pieces(name, stuffed):
     with pytest.raises(ValueError, match=r"."):
         STUFFINGS[name].decode(bytes.fromhex(stuffed))
+
+
+@settings(derandomize=True)
+@given(st.one_of(st.binary(max_size=600), st.binary(min_size=240, max_size=270).map(lambda data: data * 2)))
+def test_cobs_equals_the_cobs_package(data):
+    assert cobs_encode(data) == cobs.encode(data)
+    assert cobs_decode(cobs.encode(data)) == data
+
+
+@pytest.mark.parametrize("n", [253, 254, 255, 507, 508, 509])
+@pytest.mark.parametrize("tail", [b"", b"\0", b"\0x", b"x\0"])
+def test_cobs_about_the_block_length(n, tail):
+    data = b"x" * n + tail
+    assert cobs_encode(data) == cobs.encode(data)
+    assert cobs_decode(cobs_encode(data)) == data
+
+
+@settings(derandomize=True)
+@given(st.binary(min_size=1, max_size=300))
+def test_cobs_refuses_what_the_cobs_package_refuses(data):
+    try:
+        expected = cobs.decode(data)
+    except cobs.DecodeError:
+        with pytest.raises(ValueError, match="follow"):
+            cobs_decode(data)
+    else:
+        assert cobs_decode(data) == expected

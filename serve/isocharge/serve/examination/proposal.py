@@ -12,7 +12,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.examination.capture import Capture, read_frames
 from isocharge.serve.examination.listening import Heard
-from isocharge.serve.frames.binary import BinaryParser
+from isocharge.serve.frames.binary import FORMAT as BINARY
 from isocharge.serve.live.channels import electrode_of
 from isocharge.serve.live.device import device_from_table
 from isocharge.serve.recognition.recognise import recognise
@@ -128,7 +128,7 @@ def unit_of(format_name: str, names: Sequence[str], values: Array) -> str:
     Returns:
         "pC", "counts" or "V".
     """
-    if format_name == BinaryParser.format or all(channel.endswith("_pC") for channel in names):
+    if format_name == BINARY or all(channel.endswith("_pC") for channel in names):
         return "pC"
     finite = values[np.isfinite(values).all(axis=1)]
     varies = bool(len(finite)) and bool(np.ptp(finite, axis=0).any())

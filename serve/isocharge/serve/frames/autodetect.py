@@ -8,14 +8,14 @@ import re
 from collections.abc import Mapping
 
 from isocharge.serve.frames.binary import BinaryParser
-from isocharge.serve.frames.frame import Frame, FrameCounts, Parser
+from isocharge.serve.frames.frame import Frame, Parser
 from isocharge.serve.frames.text import TextParser
 
 _STEP = re.compile(rb"[^\0\n]*[\0\n]|[^\0\n]+")
 
 
-class AutoParser:
-    """Bytes in, frames out, from the frames on by which the format was recognised."""
+class AutoParser(Parser):
+    """Bytes in, frames out, from the frames on by which the format was recognised; until then all bytes are dropped."""
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
         """Set up both parsers.
@@ -23,54 +23,28 @@ class AutoParser:
         Args:
             columns, meanings: As `TextParser` takes them.
         """
+        super().__init__("nothing recognised yet")
         self._candidates: tuple[Parser, ...] = (BinaryParser(), TextParser(columns, meanings))
-        self._chosen: Parser | None = None
-        self._seen = 0
-
-    @property
-    def chosen(self) -> Parser | None:
-        """The parser of the recognised format; None before."""
-        return self._chosen
-
-    @property
-    def counts(self) -> FrameCounts:
-        """The counters of the chosen parser; before, all bytes count as dropped."""
-        return self._chosen.counts if self._chosen else FrameCounts(bytes_dropped=self._seen)
-
-    @property
-    def seq_modulus(self) -> int:
-        """The number at which a frame's `seq` wraps to 0, of the chosen parser."""
-        return (self._chosen or self._candidates[0]).seq_modulus
-
-    @property
-    def t_us_modulus(self) -> int:
-        """The time at which a frame's `t_us` wraps to 0, of the chosen parser, us."""
-        return (self._chosen or self._candidates[0]).t_us_modulus
-
-    @property
-    def format(self) -> str:
-        """The recognised format, for people."""
-        return self._chosen.format if self._chosen else "nothing recognised yet"
 
     def feed(self, data: bytes) -> list[Frame]:
         """The frames that end within `data`."""
-        if self._chosen is not None:
-            return self._chosen.feed(data)
+        if len(self._candidates) == 1:
+            return self._feed(self._candidates[0], data)
         for step in _STEP.finditer(data):
-            frames = self._try(step.group())
-            if self._chosen is not None:
-                return frames + self._chosen.feed(data[step.end() :])
+            self.counts.drop(len(step.group()))
+            for candidate in self._candidates:
+                if frames := candidate.feed(step.group()):
+                    self._candidates, self.counts = (candidate,), candidate.counts
+                    return frames + self._feed(candidate, data[step.end() :])
         return []
 
     def forget(self) -> None:
         """Drop what is unfinished: what comes next is from another connection."""
-        for candidate in self._candidates if self._chosen is None else (self._chosen,):
+        for candidate in self._candidates:
             candidate.forget()
 
-    def _try(self, step: bytes) -> list[Frame]:
-        self._seen += len(step)
-        for candidate in self._candidates:
-            if frames := candidate.feed(step):
-                self._chosen = candidate
-                return frames
-        return []
+    def _feed(self, chosen: Parser, data: bytes) -> list[Frame]:
+        """What the chosen parser reads; it also knows format and moduli, and text learns them as it comes."""
+        frames = chosen.feed(data)
+        self.format, self.seq_modulus, self.t_us_modulus = chosen.format, chosen.seq_modulus, chosen.t_us_modulus
+        return frames

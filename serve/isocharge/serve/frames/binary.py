@@ -7,9 +7,11 @@ a parser that is out of step is back in step at the next zero: a damaged frame c
 import binascii
 import struct
 
-from isocharge.serve.frames.cobs import cobs_decode, cobs_encode
-from isocharge.serve.frames.frame import T_US_MODULUS, Frame, FrameCounts, Splitter
-from isocharge.serve.frames.sequence import SEQ_MODULUS
+from isocharge.serve.frames.frame import ChecksumError, DelimitedParser, Frame
+from isocharge.serve.frames.stuffing import cobs_decode, cobs_encode
+
+FORMAT = "binary frames of isocharge"
+"""The format, for people."""
 
 FRAME_VERSION = 1
 """Version of the frame's layout, its first byte."""
@@ -46,56 +48,25 @@ def crc16(data: bytes) -> int:
     return binascii.crc_hqx(data, 0xFFFF)
 
 
-class CrcError(ValueError):
-    """The checksum does not fit; only the parser sees it, and counts it."""
+class BinaryParser(DelimitedParser):
+    """Bytes in, frames out. Memory is bounded by the longest possible frame."""
 
+    def __init__(self, delimiter: bytes = DELIMITER, longest: int = LONGEST_PIECE) -> None:
+        """Begin without bytes; the arguments are those of `DelimitedParser`."""
+        super().__init__(delimiter, longest, FORMAT)
 
-def decode_piece(piece: bytes) -> Frame:
-    """The frame between two delimiters.
+    def _take(self, piece: bytes) -> list[Frame]:
+        """The frame of a piece; an empty one is an idle line."""
+        return self._attempt(self._decode, piece, len(piece) + 1) if piece else []
 
-    Raises:
-        CrcError: If its checksum does not fit.
-        ValueError: If it is not a frame for another reason.
-    """
-    payload = cobs_decode(piece)
-    if len(payload) < HEAD.size + CRC.size:
-        raise ValueError(f"expected at least {HEAD.size + CRC.size} bytes, got {len(payload)}")
-    body = payload[: -CRC.size]
-    if CRC.pack(crc16(body)) != payload[-CRC.size :]:
-        raise CrcError(f"expected CRC {CRC.pack(crc16(body)).hex()}, got {payload[-CRC.size :].hex()}")
-    version, seq, t_us, n, flags = HEAD.unpack_from(body)
-    if version != FRAME_VERSION or len(body) != HEAD.size + 4 * n:
-        raise ValueError(f"expected version {FRAME_VERSION} and {4 * n} bytes of charges, got {body.hex()}")
-    return Frame(seq, t_us, struct.unpack_from(f"<{n}f", body, HEAD.size), flags)
-
-
-class BinaryParser:
-    """Bytes in, frames out; `counts` says what was lost. Memory is bounded by the longest possible frame."""
-
-    seq_modulus = SEQ_MODULUS
-    t_us_modulus = T_US_MODULUS
-    format = "binary frames of isocharge"
-
-    def __init__(self) -> None:
-        self.counts = FrameCounts()
-        self._pieces = Splitter(DELIMITER, LONGEST_PIECE, self.counts)
-
-    def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end within `data`; the bytes after the last delimiter wait for the next call."""
-        return [frame for piece in self._pieces.feed(data) if (frame := self._take(piece)) is not None]
-
-    def forget(self) -> None:
-        """Drop what is unfinished: what comes next is from another connection."""
-        self._pieces.forget()
-
-    def _take(self, piece: bytes) -> Frame | None:
-        """The frame in a piece, or None if it is damaged, which is counted, or empty, which is an idle line."""
-        if not piece:
-            return None
-        try:
-            frame = decode_piece(piece)
-        except ValueError as error:
-            self.counts.refuse(len(piece) + len(DELIMITER), damaged=isinstance(error, CrcError))
-            return None
-        self.counts.accept()
-        return frame
+    def _decode(self, piece: bytes) -> Frame:
+        payload = cobs_decode(piece)
+        if len(payload) < HEAD.size + CRC.size:
+            raise ValueError("shorter than a frame without charges")
+        body = payload[: -CRC.size]
+        if CRC.pack(crc16(body)) != payload[-CRC.size :]:
+            raise ChecksumError("another CRC")
+        version, seq, t_us, n, flags = HEAD.unpack_from(body)
+        if version != FRAME_VERSION or len(body) != HEAD.size + 4 * n:
+            raise ValueError("another version, or another number of charges than announced")
+        return Frame(seq, t_us, struct.unpack_from(f"<{n}f", body, HEAD.size), flags)

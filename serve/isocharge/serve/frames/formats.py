@@ -30,8 +30,8 @@ class TextFrames(FrameSection, tag="text", frozen=True):
     @property
     def meanings(self) -> Mapping[str, str]:
         """`seq`, `t_us`, `t_ms` or `t_s` by the name that the board has for it."""
-        names = {"seq": self.seq, "t_us": self.t_us, "t_ms": self.t_ms, "t_s": self.t_s}
-        return {name: meaning for meaning, name in names.items() if name}
+        names = {self.seq: "seq", self.t_us: "t_us", self.t_ms: "t_ms", self.t_s: "t_s"}
+        return {name: meaning for name, meaning in names.items() if name}
 
     def parser(self) -> Parser:
         """A new parser."""

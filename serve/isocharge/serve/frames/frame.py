@@ -1,18 +1,30 @@
-"""What all frame formats share: the frame, the parser and its counters, and the cutting of bytes at a delimiter.
+"""What all frame formats share: the frame, the parser with its counters, and the meaning of a row of numbers.
 
 Parsers know no port: bytes in, frames and counters out. However the bytes are cut into chunks, the frames and counters
 are the same, and memory is bounded whatever comes.
 """
 
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, TypeVar
+
+from isocharge.serve.frames.sequence import SEQ_MODULUS
 
 SATURATED_BIT = 0x01
 """In a frame's flags: an amplifier is at its limit. The other bits are reserved and sent as zero."""
 
 T_US_MODULUS = 1 << 32
 """Time at which a clock of 32 bits wraps to 0, us."""
+
+SEQ, FLAGS = "seq", "flags"
+"""Names under which a device sends the number of a frame, and its flags."""
+
+TIMES_US = {"t_us": 1.0, "t_ms": 1e3, "t_s": 1e6}
+"""Names under which a device sends its clock, with their units, us."""
+
+Raw = TypeVar("Raw")
+"""What a frame is decoded from: its bytes, or the numbers of a row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +66,9 @@ class FrameCounts:
     resyncs: int = 0
     astray: bool = False
 
-    def accept(self, frames: int = 1) -> None:
-        """Count intact frames."""
-        self.frames += frames
+    def accept(self) -> None:
+        """Count an intact frame."""
+        self.frames += 1
         self.resyncs += self.astray
         self.astray = False
 
@@ -69,63 +81,126 @@ class FrameCounts:
     def drop(self, size: int) -> None:
         """Count dropped bytes."""
         self.bytes_dropped += size
-        self.astray = True
+        self.astray |= size > 0
 
 
-class Parser(Protocol):
-    """Bytes in, frames out."""
+class ChecksumError(ValueError):
+    """The checksum of a piece does not fit; the parser counts it."""
 
-    @property
-    def counts(self) -> FrameCounts:
-        """The counters so far."""
 
-    @property
-    def seq_modulus(self) -> int:
-        """The number at which a frame's `seq` wraps to 0."""
+class Columns:
+    """What the numbers of a row are: frame number, clock and flags by their names, channels all others.
 
-    @property
-    def t_us_modulus(self) -> int:
-        """The time at which a frame's `t_us` wraps to 0, us."""
+    Attributes:
+        seq, time: Positions of number and clock; None without them.
+        us: Unit of the clock, us.
+        channels: Positions of the channels, with the value of one count.
+        names: Names of the channels; empty if they have none.
+    """
 
-    @property
-    def format(self) -> str:
-        """The format, for people."""
+    def __init__(self, names: Sequence[str], scales: Sequence[float], flags: int | None = None) -> None:
+        """Look up the names.
 
+        Args:
+            names: Of all numbers; empty texts for numbers without names.
+            scales: Value of one count of each.
+            flags: Position of the flags; None without them.
+        """
+        times = [names.index(name) for name in TIMES_US if name in names]
+        self.seq = names.index(SEQ) if SEQ in names else None
+        self.time = times[0] if times else None
+        self.us = TIMES_US[names[times[0]]] * scales[times[0]] if times else 1.0
+        self.channels = [(at, scale) for at, scale in enumerate(scales) if at not in (self.seq, flags, *times)]
+        self.names = tuple(names[at] for at, _ in self.channels) if any(names) else ()
+        self._flags = flags
+
+    def frame(self, numbers: Sequence[Any]) -> Frame:
+        """The frame of a row.
+
+        Raises:
+            ValueError, OverflowError: If number or clock is not finite.
+        """
+        return Frame(
+            None if self.seq is None else round(numbers[self.seq]),
+            None if self.time is None else round(numbers[self.time] * self.us),
+            tuple([numbers[at] * scale for at, scale in self.channels]),
+            0 if self._flags is None else int(numbers[self._flags]),
+            self.names,
+        )
+
+
+class Parser(ABC):
+    """Bytes in, frames out.
+
+    Attributes:
+        format: The format, for people.
+        seq_modulus: The number at which a frame's `seq` wraps to 0.
+        t_us_modulus: The time at which a frame's `t_us` wraps to 0, us.
+        counts: The counters so far.
+    """
+
+    def __init__(self, format: str, seq_modulus: int = SEQ_MODULUS, t_us_modulus: int = T_US_MODULUS) -> None:
+        """Begin without bytes."""
+        self.format, self.seq_modulus, self.t_us_modulus = format, seq_modulus, t_us_modulus
+        self.counts = FrameCounts()
+        self._tail = b""
+
+    @abstractmethod
     def feed(self, data: bytes) -> list[Frame]:
         """The frames that end within `data`; the bytes after them wait for the next call."""
 
     def forget(self) -> None:
         """Drop what is unfinished: what comes next is from another connection."""
-
-
-class Splitter:
-    """Cuts bytes at a delimiter; pieces longer than any frame are dropped and counted, so memory is bounded."""
-
-    def __init__(self, delimiter: bytes, longest: int, counts: FrameCounts) -> None:
-        self._delimiter, self._longest, self._counts = delimiter, longest, counts
+        self.counts.drop(len(self._tail))
         self._tail = b""
-        self._overlong = False
 
-    def feed(self, data: bytes) -> Iterator[bytes]:
-        """The pieces that end within `data`, without delimiter; a dropped one is counted when its turn comes."""
-        *pieces, self._tail = (self._tail + data).split(self._delimiter)
+    def _attempt(self, decode: Callable[[Raw], Frame], raw: Raw, size: int) -> list[Frame]:
+        """The frame that is decoded; one that is wrong is counted, with the bytes that it costs."""
+        try:
+            frame = decode(raw)
+        except (ValueError, OverflowError) as error:
+            self.counts.refuse(size, damaged=isinstance(error, ChecksumError))
+            return []
+        self.counts.accept()
+        return [frame]
+
+
+class DelimitedParser(Parser):
+    """A parser of pieces between delimiters of one byte; a piece longer than any frame is dropped and counted."""
+
+    def __init__(self, delimiter: bytes, longest: int, *about: Any) -> None:
+        """Begin without bytes.
+
+        Args:
+            delimiter: The byte after a piece.
+            longest: Length of the longest piece that is read, bytes.
+            about: As `Parser` takes it.
+        """
+        super().__init__(*about)
+        self._delimiter, self._longest = delimiter, longest
+        self._is_overlong = False
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that end within `data`; the bytes after the last delimiter wait for the next call."""
+        *pieces, tail = (self._tail + data).split(self._delimiter)
+        frames = []
         for piece in pieces:
-            if self._fits(piece):
-                yield piece
-        if self._overlong or len(self._tail) > self._longest:
-            self._overlong = True
-            self._counts.drop(len(self._tail))
-            self._tail = b""
+            if self._is_overlong or len(piece) > self._longest:
+                self._is_overlong = False
+                self.counts.refuse(len(piece) + 1)
+            else:
+                frames += self._take(piece)
+        self._tail = tail
+        if self._is_overlong or len(tail) > self._longest:
+            self._is_overlong = True
+            super().forget()
+        return frames
 
     def forget(self) -> None:
-        """Drop what is unfinished."""
-        if self._tail:
-            self._counts.drop(len(self._tail))
-        self._tail = b""
+        """Drop what is unfinished: what comes next is from another connection."""
+        super().forget()
+        self._is_overlong = False
 
-    def _fits(self, piece: bytes) -> bool:
-        if not self._overlong and len(piece) <= self._longest:
-            return True
-        self._overlong = False
-        self._counts.refuse(len(piece) + len(self._delimiter))
-        return False
+    @abstractmethod
+    def _take(self, piece: bytes) -> list[Frame]:
+        """The frames that a piece completes; what is none is counted."""

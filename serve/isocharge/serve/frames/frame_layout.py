@@ -21,7 +21,6 @@ hexadecimal that a frame must have, such as its length. A field named `seq` is t
 """
 
 import struct
-from collections.abc import Sequence
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -29,11 +28,8 @@ from msgspec import Meta, field
 
 from isocharge.common.structs import Finite, Settings, WrongKey
 from isocharge.serve.frames.checksums import CHECKSUMS, Checksum, Crc
-from isocharge.serve.frames.frame import Frame
-from isocharge.serve.frames.text_lines import SEQ, TIMES_US
-
-FLAGS = "flags"
-"""Name of the field that holds a frame's flags."""
+from isocharge.serve.frames.frame import FLAGS, SEQ, T_US_MODULUS, TIMES_US, ChecksumError, Columns, Frame
+from isocharge.serve.frames.sequence import SEQ_MODULUS
 
 TYPES = {
     **{"u8": "B", "u16": "H", "u24": "3s", "u32": "I"},
@@ -58,6 +54,9 @@ Framing = Literal["sync", "cobs", "slip", "hdlc", "datagram"]
 ByteOrder = Literal["little", "big"]
 Hexadecimal = Annotated[
     str, Meta(pattern=r"^\s*([0-9A-Fa-f]{2}\s*)+$", description="bytes in hexadecimal, as in '20 4E'")
+]
+HexadecimalNumber = Annotated[
+    str, Meta(pattern="^[0-9A-Fa-f]{1,8}$", description="a number in hexadecimal, as in '1021'")
 ]
 
 
@@ -102,56 +101,41 @@ class Field(Settings, frozen=True):
         return struct.calcsize(f"<{self.letter}")
 
     @property
-    def is_float(self) -> bool:
-        """Whether it holds a number with a fraction."""
-        return self.kind[0] == "f"
-
-    @property
-    def is_triple(self) -> bool:
-        """Whether it has three bytes, which `struct` does not read."""
-        return self.kind in ("u24", "i24")
-
-    @property
     def modulus(self) -> int:
         """The number at which an unsigned counter of this size begins again."""
         return 1 << 8 * self.size
 
-    def fitting(self, value: float) -> int:
-        """A whole number that fits: counters and clocks wrap; a channel at its limit stays there, as a converter."""
+    def packed(self, value: float, order: ByteOrder) -> float | bytes:
+        """A value as `struct` takes it: counters and clocks wrap, a channel at its limit stays there."""
+        count = value / self.scale
+        if self.kind[0] == "f":
+            return count
         if self.name in (SEQ, *TIMES_US):
-            return round(value) % self.modulus
+            count = round(count) % self.modulus
         low = 0 if self.kind[0] == "u" else -self.modulus // 2
-        return min(max(round(value), low), low + self.modulus - 1)
+        count = min(max(round(count), low), low + self.modulus - 1)
+        return count.to_bytes(3, order, signed=low < 0) if self.size == 3 else count
 
 
 class CrcParameters(Settings, frozen=True):
     """A cyclic redundancy check without a name; see `isocharge.serve.frames.checksums.Crc`."""
 
     width: Literal[8, 16, 24, 32]
-    polynomial: str
-    start: str = "0"
+    polynomial: HexadecimalNumber
+    start: HexadecimalNumber = "0"
     reflected: bool = False
-    final: str = "0"
+    final: HexadecimalNumber = "0"
 
     def __post_init__(self) -> None:
         for key in ("polynomial", "start", "final"):
-            text = getattr(self, key)
-            if not 0 <= _hexadecimal(text) < 1 << self.width:
-                raise WrongKey(key, f"a number of {self.width} bits in hexadecimal, as in '1021'", text)
+            if int(getattr(self, key), 16) >> self.width:
+                raise WrongKey(key, f"a number of {self.width} bits in hexadecimal, as in '1021'", getattr(self, key))
 
     @property
     def checksum(self) -> Checksum:
         """How to compute it."""
-        polynomial, start, final = (_hexadecimal(text) for text in (self.polynomial, self.start, self.final))
+        polynomial, start, final = (int(text, 16) for text in (self.polynomial, self.start, self.final))
         return Checksum(Crc(self.width, polynomial, start, self.reflected, final), self.width // 8)
-
-
-def _hexadecimal(text: str) -> int:
-    """A number; -1 for a text that is none."""
-    try:
-        return int(text, 16) if text.isascii() and text.isalnum() else -1
-    except ValueError:
-        return -1
 
 
 class FrameSection(Settings, frozen=True, tag_field="format"):
@@ -202,13 +186,11 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             raise WrongKey("fields", "names that differ", names)
         if not self.channels:
             raise WrongKey("fields", "one or more that are channels", names)
-        length = len(self.sync) + self.body.size + self.check.size
-        if self.length != length:
-            raise WrongKey("length", f"{length} for these fields", self.length)
-        if self.checksum_from >= length - self.check.size:
-            raise WrongKey(
-                "checksum_from", f"less than {length - self.check.size}, inside the frame", self.checksum_from
-            )
+        end = len(self.sync) + self.body.size
+        if self.length != end + self.check.size:
+            raise WrongKey("length", f"{end + self.check.size} for these fields", self.length)
+        if self.checksum_from >= end:
+            raise WrongKey("checksum_from", f"less than {end}, inside the frame", self.checksum_from)
 
     @cached_property
     def sync(self) -> bytes:
@@ -237,6 +219,29 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         return CHECKSUMS[self.checksum] if isinstance(self.checksum, str) else self.checksum.checksum
 
     @cached_property
+    def columns(self) -> Columns:
+        """What the numbers of the fields are."""
+        names, scales = [entry.name for entry in self.fields], [entry.scale for entry in self.fields]
+        return Columns(names, scales, names.index(FLAGS) if FLAGS in names else None)
+
+    @property
+    def seq_modulus(self) -> int:
+        """The number at which the field `seq` wraps to 0."""
+        at = self.columns.seq
+        return SEQ_MODULUS if at is None else self.fields[at].modulus
+
+    @property
+    def t_us_modulus(self) -> int:
+        """The time at which the clock's field wraps to 0, us."""
+        at = self.columns.time
+        return T_US_MODULUS if at is None else round(self.fields[at].modulus * self.columns.us)
+
+    @cached_property
+    def triples(self) -> tuple[tuple[int, bool], ...]:
+        """Positions of the fields of three bytes, which `struct` does not read, and whether each has a sign."""
+        return tuple((at, entry.kind == "i24") for at, entry in enumerate(self.fields) if entry.size == 3)
+
+    @cached_property
     def constants(self) -> tuple[tuple[int, bytes], ...]:
         """Positions and bytes that every frame has besides the sync."""
         at, constants = len(self.sync), []
@@ -250,17 +255,27 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         value = self.check.compute(data[self.checksum_from :])
         return value.to_bytes(self.check.size, self.checksum_order or self.byte_order)
 
-    def counts(self, data: bytes) -> Sequence[Any]:
-        """The numbers in the fields of a frame, without their scales."""
-        numbers = self.body.unpack_from(data, len(self.sync))
-        if not any(field.is_triple for field in self.fields):
-            return numbers
-        return [self._of_three(field, number) for field, number in zip(self.fields, numbers, strict=True)]
+    def decode(self, data: bytes) -> Frame:
+        """The frame in exactly these bytes, without stuffing.
 
-    def _of_three(self, field: Field, number: Any) -> Any:
-        if not field.is_triple:
-            return number
-        return int.from_bytes(number, self.byte_order, signed=field.kind == "i24")
+        Raises:
+            ChecksumError: If its checksum does not fit.
+            ValueError: If a constant byte is another one, or number or clock is none.
+            OverflowError: If number or clock is infinite.
+        """
+        end = self.length - self.check.size
+        if self.check.size and self.checked(data[:end]) != data[end:]:
+            raise ChecksumError("another checksum")
+        if self.constants and any(not data.startswith(constant, at) for at, constant in self.constants):
+            raise ValueError("other constant bytes than the layout's")
+        counts = self.body.unpack_from(data, len(self.sync))
+        return self.columns.frame(self._with_triples(counts) if self.triples else counts)
+
+    def _with_triples(self, counts: tuple[Any, ...]) -> list[Any]:
+        numbers = list(counts)
+        for at, is_signed in self.triples:
+            numbers[at] = int.from_bytes(numbers[at], self.byte_order, signed=is_signed)
+        return numbers
 
     def encode(self, frame: Frame) -> bytes:
         """The bytes of a frame without stuffing; its values go into the channels in their order.
@@ -268,18 +283,10 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         Raises:
             struct.error: If a number does not fit its field.
         """
-        counts = iter([value / field.scale for field, value in zip(self.channels, frame.values, strict=True)])
-        known: dict[str, float] = {SEQ: frame.seq or 0, FLAGS: frame.flags}
-        known |= {name: (frame.t_us or 0) / us for name, us in TIMES_US.items()}
-        values = [known[field.name] / field.scale if field.name in known else next(counts) for field in self.fields]
-        packed = [self._packed(field, value) for field, value in zip(self.fields, values, strict=True)]
-        data = bytearray(self.sync + self.body.pack(*packed))
+        values: dict[str, float] = {SEQ: frame.seq or 0, FLAGS: frame.flags}
+        values |= {name: (frame.t_us or 0) / us for name, us in TIMES_US.items()}
+        values |= {entry.name: value for entry, value in zip(self.channels, frame.values, strict=True)}
+        data = self.sync + self.body.pack(*(entry.packed(values[entry.name], self.byte_order) for entry in self.fields))
         for at, constant in self.constants:
-            data[at : at + len(constant)] = constant
-        return bytes(data) + self.checked(bytes(data))
-
-    def _packed(self, field: Field, value: float) -> float | bytes:
-        if field.is_float:
-            return value
-        count = field.fitting(value)
-        return count.to_bytes(3, self.byte_order, signed=field.kind == "i24") if field.is_triple else count
+            data = data[:at] + constant + data[at + len(constant) :]
+        return data + self.checked(data)

@@ -55,9 +55,6 @@ class CounterWrap:
 
     A counter that falls has wrapped if all it ever showed is below a usual modulus, and the step modulo that is no
     larger than its steps before. Otherwise it has begun anew.
-
-    Attributes:
-        modulus: Where it wraps, or may wrap if it has not yet.
     """
 
     def __init__(self, usual: Iterable[int], modulus: int, most_steps: int) -> None:
@@ -68,27 +65,20 @@ class CounterWrap:
             modulus: That of a counter which has not wrapped yet.
             most_steps: Largest step over a wrap, in steps before.
         """
-        self.modulus = modulus
-        self._usual, self._most_steps = tuple(usual), most_steps
+        self._usual, self._modulus, self._most_steps = tuple(usual), modulus, most_steps
         self._last: int | None = None
         self._step, self._largest = 1, 0
 
-    def forget(self) -> None:
-        """The next value is the first one of a new connection."""
-        self._last = None
-
-    def update(self, value: int) -> None:
-        """Take the next value."""
+    def update(self, value: int | None) -> int:
+        """Take the next value, None where a connection ends, and give the modulus as far as it is known."""
         last, self._last = self._last, value
-        if last is not None and value < last:
-            self._fell(value - last)
-        elif last is not None and value > last:
+        if value is None or last is None:
+            return self._modulus
+        if value < last:
+            most = self._most_steps * self._step
+            fits = (m for m in self._usual if self._largest < m and (value - last) % m <= min(most, m // 2))
+            self._modulus = next(fits, self._modulus)
+        elif value > last:
             self._step = value - last
-        if value > self._largest:
-            self._largest = value
-
-    def _fell(self, step: int) -> None:
-        for modulus in self._usual:
-            if self._largest < modulus and step % modulus <= min(self._most_steps * self._step, modulus // 2):
-                self.modulus = modulus
-                return
+        self._largest = max(self._largest, value)
+        return self._modulus

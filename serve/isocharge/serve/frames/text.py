@@ -11,13 +11,11 @@ Some names mean something: `seq` counts frames; `t_us`, `t_ms` or `t_s` is the d
 Where number or clock wrap is learned when they do.
 """
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
-from isocharge.serve.frames.frame import T_US_MODULUS, Frame, FrameCounts, Splitter
+from isocharge.serve.frames.frame import SEQ, T_US_MODULUS, TIMES_US, Columns, DelimitedParser, Frame
 from isocharge.serve.frames.sequence import SEQ_MODULUS, CounterWrap
-from isocharge.serve.frames.text_lines import SEQ, TIMES_US, Line, Notation, parse_line
+from isocharge.serve.frames.text_lines import Line, Notation, parse_line
 
 LONGEST_LINE = 4096
 """Longest line of a frame, bytes."""
@@ -38,7 +36,6 @@ MOST_SEQ_STEPS, MOST_TIME_STEPS = 2, 16
 """Largest step of number and clock over a wrap, in steps before it."""
 
 
-@dataclass(frozen=True, slots=True)
 class Layout:
     """The layout of a row, or of a cycle of lines.
 
@@ -47,52 +44,20 @@ class Layout:
         names: Names of all values; empty for CSV without header.
         width: Number of values.
         lines: Number of lines in a cycle; 1 for rows.
-        channels: Positions of the channels among the values.
-        seq, time: Positions of number and clock; None without them.
-        us: Unit of the clock, us.
+        columns: What the values are.
     """
 
-    notation: Notation
-    names: tuple[str, ...]
-    width: int
-    lines: int
-    channels: tuple[int, ...]
-    seq: int | None
-    time: int | None
-    us: float
-
-    @classmethod
-    def of(cls, notation: Notation, names: tuple[str, ...], width: int, lines: int) -> "Layout":
-        """The layout of values with these names."""
-        seq = names.index(SEQ) if SEQ in names else None
-        time = next((names.index(name) for name in TIMES_US if name in names), None)
-        channels = tuple(at for at in range(width) if at not in (seq, time))
-        return cls(notation, names, width, lines, channels, seq, time, 1.0 if time is None else TIMES_US[names[time]])
-
-    @property
-    def channel_names(self) -> tuple[str, ...]:
-        """Names of the channels; empty if they have none."""
-        return tuple(self.names[at] for at in self.channels) if self.names else ()
-
-    def frame(self, values: Sequence[float]) -> Frame:
-        """The frame of a row.
-
-        Raises:
-            ValueError: If number or clock is not finite.
-        """
-        seq = None if self.seq is None else _whole(values[self.seq])
-        t_us = None if self.time is None else _whole(values[self.time] * self.us)
-        return Frame(seq, t_us, tuple(values[at] for at in self.channels), names=self.channel_names)
+    def __init__(self, notation: Notation, names: tuple[str, ...], width: int, lines: int = 1) -> None:
+        self.notation, self.names, self.width, self.lines = notation, names, width, lines
+        self.columns = Columns(names or ("",) * width, (1.0,) * width)
 
 
-def _whole(value: float) -> int:
-    if not math.isfinite(value):
-        raise ValueError(f"expected a number or time, got {value}")
-    return round(value)
+class TextParser(DelimitedParser):
+    """Bytes in, frames out; the layout is recognised, and where number and clock wrap is learned.
 
-
-class TextParser:
-    """Bytes in, frames out; the layout is recognised."""
+    Attributes:
+        layout: The layout; None before it is recognised.
+    """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
         """Set up the parser.
@@ -101,136 +66,111 @@ class TextParser:
             columns: Names for the columns of a CSV.
             meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the device has for it.
         """
-        self.counts = FrameCounts()
+        super().__init__(b"\n", LONGEST_LINE, "text of a layout that is not clear yet")
         self.layout: Layout | None = None
         self._columns, self._meanings = columns, dict(meanings or {})
         self._seq_wrap = CounterWrap(SEQ_MODULI, SEQ_MODULUS, MOST_SEQ_STEPS)
-        self._clock_wrap: CounterWrap | None = None
+        self._clock_wrap = clock_wrap(1.0)
         self._noise = b""
-        self._lines = Splitter(b"\n", LONGEST_LINE, self.counts)
-        self._history: list[tuple[Line, int]] = []
+        self._gathered: list[tuple[Line, int]] = []
         self._cycle: dict[str, float] = {}
         self._cycle_bytes = 0
-        self._first = True
-
-    @property
-    def seq_modulus(self) -> int:
-        """The number at which a frame's `seq` wraps to 0; 16 bits until it has wrapped."""
-        return self._seq_wrap.modulus
-
-    @property
-    def t_us_modulus(self) -> int:
-        """The time at which the clock wraps to 0, us; that of 32 bits in its unit until it has wrapped."""
-        return self._clock_wrap.modulus if self._clock_wrap else T_US_MODULUS
-
-    @property
-    def format(self) -> str:
-        """The layout, for people."""
-        if self.layout is None:
-            return "text of a layout that is not clear yet"
-        names = ", ".join(self.layout.names) or f"{self.layout.width} columns without names"
-        return f"text, {self.layout.notation}: {names}"
-
-    def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end within `data`; an unfinished line waits for the next call."""
-        return [frame for line in self._lines.feed(data) for frame in self._take(line)]
+        self._is_first = True
 
     def forget(self) -> None:
         """Drop what is unfinished: what comes next is from another connection."""
-        self._lines.forget()
+        super().forget()
         self._drop_cycle()
-        self._first = True
-        self._seq_wrap.forget()
-        if self._clock_wrap:
-            self._clock_wrap.forget()
+        self._is_first = True
+        self._seq_wrap.update(None)
+        self._clock_wrap.update(None)
 
-    def _take(self, data: bytes) -> list[Frame]:
-        """The frames that this line completes, usually one."""
-        size, first, self._first = len(data) + 1, self._first, False
+    def _take(self, piece: bytes) -> list[Frame]:
+        size, is_first, self._is_first = len(piece) + 1, self._is_first, False
         try:
-            line = parse_line(data)
+            line = parse_line(piece)
         except ValueError:
-            self._refuse_noise(data, size)
-            return []
+            if piece != self._noise:  # one that comes again is an echo: the lines around it stay gathered
+                self._refuse_gathered()
+            self._noise = piece
+            return self._refuse(size)
         if self._meanings and line.names:
             line = line._replace(names=tuple(self._meanings.get(name, name) for name in line.names))
-        if first and line.notation is Notation.csv:  # "801.2" may have been cut to "1.2": nothing would show it
-            self._refuse(size)
-            return []
+        if is_first and line.notation is Notation.csv:  # "801.2" may have been cut to "1.2": nothing would show it
+            self._refuse_gathered()
+            return self._refuse(size)
         if line.notation is Notation.nothing:
             return []
         if line.notation is Notation.header:
             return self._name_columns(line, size)
-        return self._recognise(line, size) if self.layout is None else self._read(line, size)
+        return self._recognise(line, size) if self.layout is None else self._read(self.layout, line, size)
 
-    def _refuse_noise(self, data: bytes, size: int) -> None:
-        """Count a line that is no reading; one that comes again is an echo, and the lines round it stay gathered."""
-        if data == self._noise:
-            self.counts.refuse(size)
-            return
-        self._noise = data
-        self._refuse(size)
-
-    def _refuse(self, size: int) -> None:
-        """Count a bad line, and drop the lines that were gathered to recognise a layout."""
+    def _refuse(self, size: int) -> list[Frame]:
+        """Count a bad line."""
         self.counts.refuse(size)
-        for _, length in self._history:
-            self.counts.refuse(length)
-        self._history.clear()
+        return []
+
+    def _refuse_gathered(self) -> None:
+        """Count the lines that were gathered to recognise a layout."""
+        for _, size in self._gathered:
+            self.counts.refuse(size)
+        self._gathered = []
 
     def _name_columns(self, header: Line, size: int) -> list[Frame]:
         """Name the columns by a header; it comes again after a reset of the board."""
-        if self.layout is not None and (self.layout.notation is not Notation.csv or self._columns):
-            self.counts.refuse(size)
-        elif self.layout is not None and self.layout.width == len(header.names):
-            self.layout = Layout.of(Notation.csv, header.names, self.layout.width, 1)
-        elif self.layout is None and not self._columns:
-            self._columns = header.names
+        layout = self.layout
+        if layout is None:
+            self._columns = self._columns or header.names
+        elif layout.notation is Notation.csv and not self._columns and layout.width == len(header.names):
+            self._adopt(Layout(Notation.csv, header.names, layout.width))
+        else:
+            return self._refuse(size)
         return []
+
+    def _adopt(self, layout: Layout) -> None:
+        self.layout, self._clock_wrap = layout, clock_wrap(layout.columns.us)
+        names = ", ".join(layout.names) or f"{layout.width} columns without names"
+        self.format = f"text, {layout.notation}: {names}"
 
     def _recognise(self, line: Line, size: int) -> list[Frame]:
         """Gather lines until they repeat; then read the gathered ones."""
-        self._history.append((line, size))
-        period = _period([gathered for gathered, _ in self._history])
+        self._gathered.append((line, size))
+        period = _period([gathered for gathered, _ in self._gathered])
         if not period or len(line.values) > MOST_VALUES:
-            while len(self._history) > TIMES_TO_RECOGNISE * LONGEST_CYCLE:
-                self.counts.refuse(self._history.pop(0)[1])
+            while len(self._gathered) > TIMES_TO_RECOGNISE * LONGEST_CYCLE:
+                self._refuse(self._gathered.pop(0)[1])
             return []
-        self.layout = self._layout([gathered for gathered, _ in self._history[-period:]])
-        history, self._history = self._history, []
-        before, repeating = history[: -TIMES_TO_RECOGNISE * period], history[-TIMES_TO_RECOGNISE * period :]
-        for _, length in before:
-            self.counts.refuse(length)
-        return [frame for gathered, length in repeating for frame in self._read(gathered, length)]
+        layout = self._layout([gathered for gathered, _ in self._gathered[-period:]])
+        repeating = self._gathered[-TIMES_TO_RECOGNISE * period :]
+        del self._gathered[-TIMES_TO_RECOGNISE * period :]
+        self._refuse_gathered()
+        self._adopt(layout)
+        return [frame for gathered, length in repeating for frame in self._read(layout, gathered, length)]
 
     def _layout(self, lines: list[Line]) -> Layout:
         first, width = lines[0], len(lines[0].values)
         if len(lines) > 1:
             names = sorted({name for line in lines for name in line.names}, key=_before)
-            return Layout.of(first.notation, tuple(names), len(names), len(lines))
+            return Layout(first.notation, tuple(names), len(names), len(lines))
         names_of_csv = self._columns if len(self._columns) == width else ()
-        return Layout.of(first.notation, first.names or names_of_csv, width, 1)
+        return Layout(first.notation, first.names or names_of_csv, width)
 
-    def _read(self, line: Line, size: int) -> list[Frame]:
-        layout = self.layout
-        assert layout is not None
+    def _read(self, layout: Layout, line: Line, size: int) -> list[Frame]:
         if line.notation is not layout.notation:
-            self.counts.refuse(size)
-            return []
+            return self._refuse(size)
         if layout.lines > 1:
             return self._gather(layout, line, size)
         if len(line.values) != layout.width or (line.names and line.names != layout.names):
-            self.counts.refuse(size)
-            return []
+            return self._refuse(size)
         return self._frame(layout, line.values, size)
 
     def _gather(self, layout: Layout, line: Line, size: int) -> list[Frame]:
-        """Take a line of a cycle; the last one completes a frame."""
+        """Take a line of a cycle; the last one completes a frame. A clock may come with every value of a cycle."""
         new = [name for name in line.names if name not in TIMES_US]
-        if not set(line.names) <= set(layout.names) or not new:
-            self.counts.refuse(size)
-            return []
-        if new[0] == _start(layout) or new[0] in self._cycle:
+        if not new or not set(line.names) <= set(layout.names):
+            return self._refuse(size)
+        begin = next(name for name in layout.names if name not in TIMES_US)
+        if new[0] == begin or new[0] in self._cycle:
             self._drop_cycle()
         self._cycle |= dict(zip(line.names, line.values, strict=True))
         self._cycle_bytes += size
@@ -247,36 +187,22 @@ class TextParser:
         self._cycle, self._cycle_bytes = {}, 0
 
     def _frame(self, layout: Layout, values: Sequence[float], size: int) -> list[Frame]:
-        try:
-            frame = layout.frame(values)
-        except ValueError:
-            self.counts.refuse(size)
-            return []
-        self.counts.accept()
-        if frame.seq is not None:
-            self._seq_wrap.update(frame.seq)
-        if frame.t_us is not None:
-            if self._clock_wrap is None:
-                self._clock_wrap = clock_wrap(layout.us)
-            self._clock_wrap.update(frame.t_us)
-        return [frame]
+        frames = self._attempt(layout.columns.frame, values, size)
+        for frame in frames:
+            self.seq_modulus = self._seq_wrap.update(frame.seq)
+            self.t_us_modulus = self._clock_wrap.update(frame.t_us)
+        return frames
 
 
 def clock_wrap(us: float) -> CounterWrap:
     """The watch over a clock in a unit, us: of 16, 24 or 32 bits, or computed from one of 32 bits in us or ms."""
-    moduli = {1 << bits for bits in (16, 24, 32)}
-    usual = {modulus * round(us) for modulus in moduli} | {T_US_MODULUS, 1000 * T_US_MODULUS}
+    usual = {(1 << bits) * round(us) for bits in (16, 24, 32)} | {T_US_MODULUS, 1000 * T_US_MODULUS}
     return CounterWrap(sorted(usual), T_US_MODULUS * round(us), MOST_TIME_STEPS)
 
 
 def _before(name: str) -> tuple[bool, str]:
     """Sort key: number and clock before the channels."""
     return name != SEQ and name not in TIMES_US, name
-
-
-def _start(layout: Layout) -> str:
-    """The name that begins a cycle; a clock may come with every value, so it is no beginning."""
-    return next(name for name in layout.names if name not in TIMES_US)
 
 
 def _period(lines: list[Line]) -> int:

@@ -3,8 +3,7 @@
 import json
 from collections.abc import Callable
 
-from isocharge.serve.frames.frame import Frame
-from isocharge.serve.frames.text_lines import SEQ, TIMES_US
+from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame
 
 
 def _csv_line(frame: Frame) -> str:

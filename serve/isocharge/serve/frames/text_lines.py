@@ -20,12 +20,6 @@ from typing import Any, NamedTuple
 
 from isocharge.common.number_text import number_of
 
-SEQ = "seq"
-"""Name under which a device sends the number of a frame."""
-
-TIMES_US = {"t_us": 1.0, "t_ms": 1e3, "t_s": 1e6}
-"""Names under which a device sends its clock, with their units, us."""
-
 TELEPLOT_TIME = "t_ms"
 """Name of the clock in Teleplot's lines."""
 

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from isocharge.serve.frames.binary import BinaryParser
-from isocharge.serve.frames.frame import Frame
+from isocharge.serve.frames.frame import SEQ, Frame
 from isocharge.serve.frames.text import Layout, TextParser
-from isocharge.serve.frames.text_lines import SEQ, Notation
+from isocharge.serve.frames.text_lines import Notation
 from isocharge.serve.recognition.described import described_frames
 from isocharge.serve.recognition.framing import FEWEST
 from isocharge.serve.recognition.series import clock_of, is_counter
@@ -74,7 +74,7 @@ def _text_keys(layout: Layout, frame: Frame, names: dict[int, str]) -> dict[str,
     if layout.notation is Notation.csv and layout.names:
         columns = list(layout.names)
         for position, name in names.items():
-            columns[layout.channels[position]] = name
+            columns[layout.columns.channels[position][0]] = name
         return {"columns": columns}
     if frame.names:
         return {name: frame.names[position] for position, name in names.items()}
