@@ -129,6 +129,8 @@ def test_files_that_are_none(tmp_path):
         (b"\xff", "not a TOML file: not text in UTF-8"),
         (b"#" * (MOST_TOML_BYTES + 1), r"cannot be read \(larger than 262144 bytes\); expected a device file in TOML"),
         (b"a = " + b"[" * 100_000, "not a TOML file"),
+        (b"a." * 100_000 + b"a = 1", "not a TOML file: a key of more than 32 parts"),
+        (b"'a b' . " * 30_000 + b"a = 1", "not a TOML file: a key of more than 32 parts"),
     ):
         path.write_bytes(content)
         with pytest.raises(DeviceError, match=rf"^{path}: {message}"):

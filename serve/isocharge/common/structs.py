@@ -20,6 +20,7 @@ Whatever does not fit is an error of one form:
 """
 
 import difflib
+import re
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
@@ -39,6 +40,10 @@ LARGEST_FLOAT = sys.float_info.max
 
 MOST_TOML_BYTES, MOST_JSON_BYTES = 1 << 18, 1 << 22
 """Largest file of settings, bytes; Python reads TOML a hundred times slower than JSON."""
+
+_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
+_DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_PART}\.[ \t]*+){{32}}")
+"""A key with more dots than a table has levels: Python needs memory as the square of their number to read it."""
 
 Finite = Annotated[float, Meta(ge=-LARGEST_FLOAT, le=LARGEST_FLOAT)]
 NotNegative = Annotated[float, Meta(ge=0.0, le=LARGEST_FLOAT)]
@@ -102,6 +107,8 @@ def parse_toml(text: str, where: str, error: type[InputError]) -> dict[str, Any]
 def parse_toml(text: str, where: str, error: type[InputError], kind: type[T]) -> T: ...
 def parse_toml(text: str, where: str, error: type[InputError], kind: Any = dict[str, Any]) -> Any:
     """The content of a text in TOML; `where` opens the message of the error."""
+    if _DEEP_KEY.search(text):
+        raise error(f"{where}: not a TOML file: a key of more than 32 parts")
     try:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as cause:
