@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from attacks.faults import mutated, with_junk
 from isocharge.common.files import sha256_of
 from isocharge.common.resumable_run import resume_folder
 from isocharge.serve import (
@@ -75,7 +76,7 @@ def _write(folder):
     (folder / "device.toml").write_text(DEVICE)
     (folder / "noise.toml").write_text(NOISE)
     shutil.copy(next((ROOT / "train/configs").glob("*.toml")), folder / "config.toml")
-    (folder / "script.csv").write_text("seconds,x_mm,y_mm,force_N\n0,0,0,0\n1,1,1,1.5\n2,2,1e0,0\n")
+    (folder / "script.toml").write_text("presses = [[0, 0, 0, 0], [1, 1, 1, 1.5]]\n[faults]\nlose_share = 0.1\n")
     (folder / "charges.csv").write_text("A,B,C\n800.5,700.25,900\n1,2,3\n")
     with Recorder(folder / "touch.rec", "linear/1", "every", {"tare": {"frames": 10}}) as recorder:
         for k in range(3):
@@ -106,152 +107,94 @@ def _read_charges(path):
 KINDS = ("sensor", "device", "noise", "configuration", "script", "charges", "recording")
 
 
+def number_bomb(rng, text):
+    """A number of the text in another notation, or one that nobody expects."""
+    place = rng.choice(list(re.finditer(r"-?\d+(\.\d+)?", text)))
+    return text[: place.start()] + rng.choice(NUMBERS) + text[place.end() :]
+
+
+NUMBERS = ("1" * 23, "1" * 400, "1" * 5000, "1_0", "nan", "inf", "-inf", "1e999", "0x10", "true", "[]", "{}", "-0")
+
+BOMBS = (
+    lambda n: b"a = " + b"[" * n,
+    lambda n: b"a = " + b"{a = " * n,
+    lambda n: b"a." * n + b"a = 1",
+    lambda n: b"'a' . " * n + b"a = 1",
+    lambda n: b"".join(b"[s%d]\n" % k for k in range(n)),
+    lambda n: b"[electrodes]\nside_mm = 3\n" + b"".join(b"e%d = [0, 0]\n" % k for k in range(n)),
+    lambda n: b'{"a":' * n,
+    lambda n: b"[" * n + b"]" * n,
+    lambda n: b"c," * n + b"\n",
+    lambda n: b"A,B,C\n" + b"1,2,3\n" * (n // 10) + b"x\n",
+    lambda n: b'"' * n,
+    lambda n: b"\n" * n,
+    bytes,
+)
+
+FAULTS = {
+    "cut": (2_000, lambda rng, good: good[: rng.randrange(len(good))]),
+    "bytes": (5_000, mutated),
+    "numbers": (2_000, lambda rng, good: number_bomb(rng, good.decode()).encode()),
+    "bombs": (300, lambda rng, _: rng.choice(BOMBS)(rng.choice((30, 900, 20_000, 200_000)))),
+}
+"""Number of inputs, and what makes one of them from a good file."""
+
+
 @pytest.mark.parametrize("kind", KINDS)
-def test_truncated_at_each_byte(kind, files, attack):
+@pytest.mark.parametrize("faults", FAULTS)
+def test_settings_and_recordings(kind, faults, files, attack):
     path, read = files[kind]
-    good, ends = path.read_bytes(), iter(range(10**9))
+    good, (count, make) = path.read_bytes(), FAULTS[faults]
     read(path)
 
-    def cut(_):
-        return good[: next(ends) % len(good)]
-
-    attack(f"files {kind}", _from_bytes(path, read, good), cut, len(good))
-    path.write_bytes(good)
-
-
-def _from_bytes(path, read, good):
-    """Reads bytes as the file's; the good ones are put back, in case a test fails."""
-
-    def from_bytes(data):
+    def read_bytes(data):
         path.write_bytes(data)
         try:
             read(path)
         finally:
             path.write_bytes(good)
 
-    return from_bytes
+    attack(f"{kind} {faults}", read_bytes, lambda rng: make(rng, good), count)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_with_faults(kind, files, attack, faults):
-    path, read = files[kind]
-    good, mutated = path.read_bytes(), faults[0]
-    attack(f"files {kind}", _from_bytes(path, read, good), lambda rng: mutated(rng, good), 5_000)
-
-
-def _number_bombs(rng, text):
-    """A number of the text in another notation, or one that nobody expects."""
-    numbers = list(re.finditer(r"-?\d+(\.\d+)?", text))
-    place = rng.choice(numbers)
-    new = rng.choice(
-        (
-            "1" * 23,
-            "1" * 400,
-            "1" * 5000,
-            "1_0",
-            "nan",
-            "inf",
-            "-inf",
-            "1e999",
-            "0x10",
-            "true",
-            "[]",
-            "{}",
-            "-0",
-            "1e-320",
-        )
-    )
-    return text[: place.start()] + new + text[place.end() :]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_with_numbers_that_nobody_expects(kind, files, attack):
-    path, read = files[kind]
-    good = path.read_bytes()
-    attack(
-        f"files {kind}",
-        _from_bytes(path, read, good),
-        lambda rng: _number_bombs(rng, good.decode()).encode(),
-        2_000,
-    )
-
-
-BOMBS = {
-    "arrays": lambda n: b"a = " + b"[" * n,
-    "tables": lambda n: b"a = " + b"{a = " * n,
-    "keys": lambda n: b"a." * n + b"a = 1",
-    "quoted keys": lambda n: b"'a' . " * n + b"a = 1",
-    "sections": lambda n: b"".join(b"[s%d]\n" % k for k in range(n)),
-    "electrodes": lambda n: b"[electrodes]\nside_mm = 3\n" + b"".join(b"e%d = [0, 0]\n" % k for k in range(n)),
-    "json": lambda n: b'{"a":' * n,
-    "lists": lambda n: b"[" * n + b"]" * n,
-    "columns": lambda n: b"c," * n + b"\n",
-    "rows": lambda n: b"A,B,C\n" + b"1,2,3\n" * (n // 10) + b"x\n",
-    "quotes": lambda n: b'"' * n,
-    "blank lines": lambda n: b"\n" * n,
-    "zeros": bytes,
-}
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_bombs(kind, files, attack):
-    path, read = files[kind]
-    good = path.read_bytes()
-    attack(
-        f"files {kind}",
-        _from_bytes(path, read, good),
-        lambda rng: rng.choice(list(BOMBS.values()))(rng.choice((30, 900, 20_000, 200_000))),
-        300,
-    )
-
-
-@pytest.mark.parametrize("how", ["sensor", "device", "metadata", "golden"])
-def test_tables_with_junk(how, attack, faults, model):
+def test_tables_with_junk(attack, model):
     """Junk of the right syntax, where the readers of text do not stop it."""
-    _, with_junk = faults
     sensor = sensor_to_dict(load_sensor("three-25um-biaxial"))
     device = {"frames": {"format": "text", "columns": ["A"]}, "leak": {"tau_s": 1.0}, "tare": {"frames": 9}, "hum": {}}
-    folder, props = model, load_model(model).metadata.to_props()
-    golden = json.loads((folder / "golden.json").read_text())
-    golden = golden | {"inputs": {"charge_pC": golden["inputs"]["charge_pC"][:2]}}
-    cases = {
-        "sensor": (sensor, lambda value: sensor_from_dict(value, "junk")),
-        "device": (device, lambda value: device_from_table(value, "junk").chain(("A", "B", "C"))),
-        "metadata": (
-            {name: json.loads(value) for name, value in props.items()},
-            lambda value: ModelMetadata.from_props(_props(value), "junk"),
-        ),
-        "golden": (golden, lambda value: _load_golden(folder, value)),
-    }
-    good, read = cases[how]
-    attack(f"tables {how}", read, lambda rng: with_junk(rng, good), 12_000 if how != "golden" else 2_000)
+    props = {name: json.loads(value) for name, value in load_model(model).metadata.to_props().items()}
+    golden = json.loads((model / "golden.json").read_text())
+    golden["inputs"]["charge_pC"] = golden["inputs"]["charge_pC"][:2]
+
+    def read_golden(value):
+        (model / "golden.json").write_text(json.dumps(value))
+        check_golden(load_model(model))
+
+    def read_props(value):
+        ModelMetadata.from_props({str(name): json.dumps(item) for name, item in value.items()}, "junk")
+
+    def table(rng, good):
+        return {name: with_junk(rng, item) if rng.random() < 0.3 else item for name, item in good.items()}
+
+    attack("sensor tables", lambda value: sensor_from_dict(value, "junk"), lambda rng: table(rng, sensor), 12_000)
+    attack("device tables", lambda value: read_device(value, "junk"), lambda rng: table(rng, device), 12_000)
+    attack("metadata", read_props, lambda rng: table(rng, props), 12_000)
+    attack("golden vectors", read_golden, lambda rng: with_junk(rng, golden), 2_000)
 
 
-def _props(value):
-    return {str(name): json.dumps(item) for name, item in value.items()} if isinstance(value, dict) else {}
+def read_device(value, where):
+    device_from_table(value, where).chain(("A", "B", "C"))
 
 
-def _load_golden(folder, value):
-    path = folder / "golden.json"
-    good = path.read_bytes()
-    path.write_text(json.dumps(value))
-    try:
-        check_golden(load_model(folder))
-    finally:
-        path.write_bytes(good)
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
+@pytest.fixture
+def model(tmp_path):
     """A copy of a released model."""
-    folder = tmp_path_factory.mktemp("models") / "three-25um-biaxial"
+    folder = tmp_path / "three-25um-biaxial"
     shutil.copytree(find_model("three-25um-biaxial").parent, folder)
     return folder / "1"
 
 
-def test_a_model_with_faults(model, attack, faults):
+def test_a_model_with_faults(model, attack):
     """The checksum fits: what is refused is refused by the graph, its interface or its answers."""
-    mutated, _ = faults
     graph, golden = model / "model.onnx", json.loads((model / "golden.json").read_text())
     good = graph.read_bytes()
 
@@ -263,22 +206,18 @@ def test_a_model_with_faults(model, attack, faults):
     head = 4000  # nodes and metadata; most of the rest is numbers
     attack("files model", read, lambda rng: mutated(rng, good[:head]) + good[head:], 1_500)
     attack("files model", read, lambda rng: mutated(rng, good), 1_500)
-    graph.write_bytes(good)
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
+@pytest.fixture
+def dataset(tmp_path):
     rng = np.random.default_rng(0)
     columns = {name: rng.uniform(0.1, 2.0, 5) for name in ("x_mm", "y_mm", "force_N", "orientation_deg")}
     samples = Samples(**columns, probe=np.array(["circle:1.0"] * 5), charge_pC=rng.uniform(100, 2000, (5, 3)))
     about = {"probes": ["circle:1.0"], "ranges": {"radius_mm": 8.0}, "seed": 3, "solver": {"order": 4}}
-    return write_dataset(
-        tmp_path_factory.mktemp("data") / "presses", load_sensor("three-25um-biaxial"), [samples], about
-    )
+    return write_dataset(tmp_path / "presses", load_sensor("three-25um-biaxial"), [samples], about)
 
 
-def test_a_dataset_with_faults(dataset, attack, faults):
-    mutated, with_junk = faults
+def test_a_dataset_with_faults(dataset, attack):
     path, shard = dataset / "manifest.json", dataset / "shard-00000.npz"
     good, good_shard = path.read_bytes(), shard.read_bytes()
 
@@ -293,16 +232,14 @@ def test_a_dataset_with_faults(dataset, attack, faults):
         path.write_text(json.dumps(manifest))
         read_dataset(dataset)
 
-    attack("files manifest", read_manifest, lambda rng: mutated(rng, good), 5_000)
-    attack("files manifest", read_manifest, lambda rng: json.dumps(with_junk(rng, json.loads(good))).encode(), 5_000)
-    attack("files shard", read_shard, lambda rng: mutated(rng, good_shard), 5_000)
+    attack("manifest bytes", read_manifest, lambda rng: mutated(rng, good), 5_000)
+    attack("manifest", read_manifest, lambda rng: json.dumps(with_junk(rng, json.loads(good))).encode(), 5_000)
     path.write_bytes(good)
-    shard.write_bytes(good_shard)
+    attack("shard", read_shard, lambda rng: mutated(rng, good_shard), 5_000)
 
 
-def test_parts_of_runs_with_faults(tmp_path, attack, faults):
+def test_parts_of_runs_with_faults(tmp_path, attack):
     """Their checksums fit; a part that is garbage is computed again, and the run goes on."""
-    mutated, _ = faults
     array, state = io.BytesIO(), io.BytesIO()
     np.save(array, np.arange(12.0).reshape(3, 4))
     torch.save({"step": 3, "weights": torch.zeros(3)}, state)
@@ -323,8 +260,7 @@ def test_parts_of_runs_with_faults(tmp_path, attack, faults):
 NOTATIONS = ("circle:1.0", "rectangle:4.0x2.0@30", "triangle:4.0@-3", "polygon:0,0;1,0;1,1;0,1")
 
 
-def test_probes_with_faults(attack, faults):
-    mutated, _ = faults
+def test_probes_with_faults(attack):
     attack(
         "probes",
         parse_probe,
@@ -333,8 +269,7 @@ def test_probes_with_faults(attack, faults):
     )
 
 
-def test_chunks_of_recordings_with_junk(tmp_path, attack, faults):
-    _, with_junk = faults
+def test_chunks_of_recordings_with_junk(tmp_path, attack):
     path = tmp_path / "junk.rec"
     header = {"isocharge_recording": 1, "model": "linear/1", "policy": "every", "device": {}}
     chunk = {"chunk": [1e9, 5, 0.0, base64.b64encode(b"abc").decode()]}

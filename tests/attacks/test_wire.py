@@ -22,6 +22,7 @@ import grpc
 import pytest
 import trustme
 
+from attacks.faults import mutated, with_junk
 from isocharge.serve.network.grpc.messages import METHODS, SERVICE
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
@@ -145,8 +146,7 @@ REQUESTS = (
 )
 
 
-def test_requests_with_faults(server, attack, faults):
-    mutated, _ = faults
+def test_requests_with_faults(server, attack):
 
     def requests(rng):
         data = mutated(rng, rng.choice(REQUESTS))
@@ -156,9 +156,8 @@ def test_requests_with_faults(server, attack, faults):
     assert b"200 OK" in send(server.http, REQUEST)
 
 
-def test_bodies_with_faults(attack, faults):
+def test_bodies_with_faults(attack):
     """Past the transport: what the handler makes of any body, with any header that says how to read it."""
-    mutated, with_junk = faults
     handler = Handler(open_model_store(MODELS))
     good = json.loads(BODY)
     headers = ([], [(b"content-encoding", b"gzip")], [(b"content-encoding", b"deflate")])
@@ -177,9 +176,8 @@ def test_bodies_with_faults(attack, faults):
     attack("wire bodies", read, bodies, 200_000)
 
 
-def test_grpc_bytes_with_faults(server, attack, faults):
+def test_grpc_bytes_with_faults(server, attack):
     """On the port, instead of HTTP/2; the preface is right in half of them."""
-    mutated, _ = faults
     preface = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
     frames = b"\0\0\0\4\0\0\0\0\0" + b"\0\0\5\1\4\0\0\0\1\x82\x86\x84\x41\0" + b"\0\0\4\3\0\0\0\0\1\0\0\0\2"
 
@@ -197,9 +195,8 @@ def is_live(server):
         return METHODS["ServerLive"][1].FromString(channel.unary_unary(f"/{SERVICE}/ServerLive")(b"", timeout=5)).live
 
 
-def test_grpc_messages_with_faults(server, attack, faults):
+def test_grpc_messages_with_faults(server, attack):
     """No status blames the server: neither INTERNAL nor UNKNOWN."""
-    mutated, _ = faults
     contents = {
         "name": "charge_pC",
         "datatype": "FP32",
@@ -317,7 +314,7 @@ def test_a_good_client_beside(server, kind):
     assert beside < 10.0 * quiet
 
 
-def test_half_handshakes(tmp_path, share, counted):
+def test_half_handshakes(tmp_path, share):
     """However many begin and fall silent, a client that finishes its own is served."""
     authority = trustme.CA()
     authority.issue_cert("127.0.0.1").private_key_and_cert_chain_pem.write_to_path(tmp_path / "both.pem")
@@ -326,15 +323,14 @@ def test_half_handshakes(tmp_path, share, counted):
     server, number = Server(tmp_path, "--tls-cert", str(tmp_path / "both.pem")), max(60, round(3_000 * share))
     rng = random.Random(0)
     hello = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + rng.randbytes(400)
-    with counted("wire handshakes", number):
-        for _ in range(number // 60):
-            with ExitStack() as stack:
-                for _ in range(60):
-                    half = stack.enter_context(socket.create_connection(server.http))
-                    with suppress(ConnectionError):
-                        half.sendall(hello[: rng.randrange(len(hello))])
-                plain = stack.enter_context(socket.create_connection(server.http, timeout=5))
-                with trusted.wrap_socket(plain, server_hostname="127.0.0.1") as secure:
-                    secure.sendall(REQUEST)
-                    assert secure.recv(1 << 16).startswith(b"HTTP/1.1 200")
+    for _ in range(number // 60):
+        with ExitStack() as stack:
+            for _ in range(60):
+                half = stack.enter_context(socket.create_connection(server.http))
+                with suppress(ConnectionError):
+                    half.sendall(hello[: rng.randrange(len(hello))])
+            plain = stack.enter_context(socket.create_connection(server.http, timeout=5))
+            with trusted.wrap_socket(plain, server_hostname="127.0.0.1") as secure:
+                secure.sendall(REQUEST)
+                assert secure.recv(1 << 16).startswith(b"HTTP/1.1 200")
     server.end()
