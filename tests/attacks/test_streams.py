@@ -18,8 +18,8 @@ from isocharge.serve import (
     encode_frame,
     encode_text,
 )
-from isocharge.serve.frames.cobs import cobs_encode
 from isocharge.serve.frames.formats import frame_layout
+from isocharge.serve.frames.stuffing import cobs_encode
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.recognition.recognise import recognise
 
