@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -14,6 +15,10 @@ from isocharge.cli.main import main
 from isocharge.common.extras import PACKAGES
 
 ROOT = Path(__file__).parents[1]
+
+signal.signal(
+    signal.SIGINT, signal.default_int_handler
+)  # a run in the background ignores it, and so would its commands
 
 
 @pytest.hookimpl(tryfirst=True)

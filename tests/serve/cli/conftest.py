@@ -1,12 +1,15 @@
 """What the tests of the commands share."""
 
 from functools import partial
+from itertools import chain, islice
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from boards import TcpBoard, interrupt, taps
 from isocharge.cli.main import app
-from isocharge.serve import VirtualSensor, wander
+from isocharge.serve import Frame, encode_frame
 
 
 @pytest.fixture
@@ -15,6 +18,16 @@ def presses(tmp_path, film):
     path = tmp_path / "presses.csv"
     a, b, c = film.charge_pC([1.0, -2.0], [0.5, 3.0], [1.0, 0.25]).T
     path.write_text("C,A,B\n" + "".join(f"{k:.9g},{i:.9g},{j:.9g}\n" for i, j, k in zip(a, b, c, strict=True)))
+    return path
+
+
+@pytest.fixture(scope="session")
+def frames(tmp_path_factory, film):
+    """A file of bytes: rest, a press, rest, 300 frames in all."""
+    rng, path = np.random.default_rng(5), tmp_path_factory.mktemp("frames") / "frames.bin"
+    press = film.charge_pC([2.0], [1.0], [0.5])[0]
+    rows = [rng.normal(0, 1, 3) + (press if 150 <= k < 250 else 0.0) for k in range(300)]
+    path.write_bytes(b"".join(encode_frame(Frame(k, 5000 * k, tuple(row))) for k, row in enumerate(rows)))
     return path
 
 
@@ -32,11 +45,36 @@ def run():
 
 
 @pytest.fixture
+def recorded(frames, models, run, tmp_path):
+    """A recording of these frames, and the lines that were printed."""
+    path = tmp_path / "touch.rec"
+    return path, run("stream", "linear", "--port", frames, "--models", models, "--record", path).stdout
+
+
+@pytest.fixture
 def start(start_command):
     return partial(start_command, "serve")
 
 
 @pytest.fixture
-def sensor(film):
-    with VirtualSensor(film.charges, wander(seed=2, seconds=20.0)) as sensor:
-        yield sensor
+def board(film):
+    """A board that is tapped again and again."""
+    with TcpBoard(taps(film)) as board:
+        yield board
+
+
+@pytest.fixture
+def board_until(film):
+    """A board that is tapped, and does something after so many frames; by default it ends the command with Ctrl-C."""
+
+    def make(count, act=interrupt):
+        rows = taps(film)
+        return TcpBoard(chain(islice(rows, count), _after(act), rows))
+
+    return make
+
+
+def _after(act):
+    """No rows; but whoever asks for them has the act done."""
+    act()
+    yield from ()

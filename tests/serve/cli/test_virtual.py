@@ -1,195 +1,161 @@
-"""`serve virtual` as a user meets it: what it plays is felt, a film of a seed is one draw, and it cleans up."""
+"""`serve virtual` as a user meets it: what it plays is what was pressed, a film of a seed is one draw, it cleans up."""
 
-import json
 import re
-import signal
+import threading
+import time
+from contextlib import suppress
 
 import numpy as np
 import pytest
 
-from isocharge.common.errors import InputError, OutputExists, SensorError
-from isocharge.serve import BinaryParser, Port
+from boards import interrupt
+from isocharge.common.errors import InputError, OutputExists, SceneError, SensorError
+from isocharge.serve import Port, device_from_table, load_device
 from isocharge.simulate import Circle, ForwardMap, load_sensor, virtual_film
+from kept import kept
+
+pytestmark = pytest.mark.xdist_group("clock")
+
+SENSOR = "three-25um-biaxial"
+DESCRIBED = load_sensor(SENSOR), Circle(1.0)
+FILM_9 = virtual_film(*DESCRIBED, 9)
+BUILD = ForwardMap.build
 
 
-def test_virtual_sensor_plays_and_cleans_up(start, tmp_path):
-    link = tmp_path / "film"
-    process = start("virtual", "three-25um-biaxial", "--link", link, "--noise", "clean", "--force-max", "0.5")
-    url = process.stdout.readline().strip()
-    assert str(link.readlink()) == url
-    parser, frames = BinaryParser(), []
-    with Port(str(link)) as port:
-        for chunk in port:
-            frames += parser.feed(chunk.data)
-            if len(frames) > 300:
-                break
-    assert {len(frame.values) for frame in frames} == {3}
-    assert max(sum(frame.values) for frame in frames) > 300.0
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=20)
-    assert (process.returncode, link.is_symlink()) == (0, False)
-    assert "frames sent, " in err.splitlines()[-1]
+def small_map(sensor, probe):
+    """A map of the middle of the film."""
+    return kept(BUILD, sensor, probe, 3.0, (0.2, 0.5))
 
 
-def test_virtual_sensor_for_a_time(start):
-    process = start("virtual", "three-25um-biaxial", "--seconds", "0.3", "--rate", "100")
-    out, err = process.communicate(timeout=60)
-    assert (process.returncode, out.startswith("/dev/")) == (0, True)
-    assert 25 < int(err.splitlines()[-1].split()[0]) < 100
+@pytest.fixture(autouse=True)
+def asked(monkeypatch):
+    """What the commands ask for; they get a small map, of film 9 or of the described one."""
+    asked = []
 
-
-def test_virtual_sensor_does_not_overwrite(tmp_path, run):
-    taken = tmp_path / "film"
-    taken.write_text("mine")
-    with pytest.raises(OutputExists, match="film: the path exists already"):
-        run("virtual", "three-25um-biaxial", "--link", taken, "--seconds", "0")
-    assert taken.read_text() == "mine"
-
-
-def test_virtual_sensor_that_is_unknown(run):
-    with pytest.raises(SensorError):
-        run("virtual", "five-25um-biaxial")
-
-
-def test_scripted_presses_as_text_are_felt(start, tmp_path, run):
-    link = tmp_path / "film"
-    script = tmp_path / "play.toml"
-    script.write_text("presses = [[0, 0, 0, 0], [1.2, 0, 0, 0], [1.3, 1, 2, 0.5], [9, 1, 2, 0.5]]\n")
-    words = ["--link", link, "--frames", "teleplot", "--script", script, "--force-max", "0.5", "--noise", "clean"]
-    process = start("virtual", "three-25um-biaxial", *words)
-    process.stdout.readline()
-    result = run("stream", "three-25um-biaxial", "--port", link, "--count", 400)
-    last = json.loads(result.stdout.splitlines()[-1])
-    assert (last["x_mm"], last["y_mm"], last["force_N"]) == pytest.approx((1.0, 2.0, 0.5), abs=0.05)
-
-
-def test_presses_beyond_the_usual_radius(start, tmp_path, run):
-    """A script may go as far as it says."""
-    link, script = tmp_path / "film", tmp_path / "play.toml"
-    script.write_text("presses = [[0, 14, 0, 0], [1.2, 14, 0, 0], [1.3, 14, 0, 0.5], [9, 14, 0, 0.5]]\n")
-    model, words = "four-25um-biaxial-15mm", ["--link", link, "--force-max", "0.5", "--noise", "clean"]
-    process = start("virtual", model, "--script", script, *words)
-    process.stdout.readline()
-    last = json.loads(run("stream", model, "--port", link, "--count", 300).stdout.splitlines()[-1])
-    assert (last["x_mm"], last["y_mm"], last["force_N"]) == pytest.approx((14.0, 0.0, 0.5), abs=0.1)
-
-
-@pytest.mark.parametrize(
-    ("words", "radius_mm"),
-    [((), 8.0), (("--radius", 15), 15.0), (("--script", "far.toml"), 13.0), (("--film", 1), 8.0)],
-)
-def test_a_virtual_film_is_solved_as_far_as_it_is_pressed(tmp_path, monkeypatch, words, radius_mm, run):
-    def build(*_, radius, **__):
-        raise InputError(f"asked for {radius:.3f} mm")
-
-    (tmp_path / "far.toml").write_text("presses = [[0, 5, 12, 0], [1, 5, 12, 0], [2, 5, 12, 1], [4, 5, 12, 0]]\n")
-    monkeypatch.setattr(ForwardMap, "build", build)
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=f"asked for {radius_mm:.3f} mm"):
-        run("virtual", "four-25um-biaxial-15mm", *words)
-
-
-HELD = "presses = [[0, 0, 0, 0], [0.5, 0, 0, 0], [0.501, 1, 2, 0.5], [60, 1, 2, 0.5]]\n"
-"""A script: half a second without touch, then one press that is held."""
-
-
-def held_charge_pC(start, folder, sensor, film):
-    """The touch charges of HELD that the command plays, pC, and what it says on stderr."""
-    link, script = folder / f"film{film}", folder / "held.toml"
-    script.write_text(HELD)
-    words = ["--link", link, "--script", script, "--force-max", "0.5", "--noise", "clean", "--film", film]
-    process = start("virtual", sensor, *words)
-    process.stdout.readline()
-    parser, frames = BinaryParser(), []
-    with Port(str(link)) as port:
-        for chunk in port:
-            frames += parser.feed(chunk.data)
-            if len(frames) > 250:
-                break
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=20)
-    values = np.array([frame.values for frame in frames])
-    rest = values[values.sum(axis=1) < values.sum(axis=1).mean()]
-    return values[-1] - rest[0], err
-
-
-def charge_of_film_pC(sensor, seed):
-    """The same from a forward map of the film that the seed draws."""
-    film, probe = virtual_film(load_sensor(sensor), Circle(1.0), seed)
-    forward_map = ForwardMap.build(film, probe, 3.0, (0.2, 0.5))
-    return forward_map.charges(np.array([[1.0, 2.0, 0.5]]))[0]
-
-
-def test_virtual_film_plays_the_charges_of_its_film_and_does_not_tell_it(start, tmp_path):
-    """Seed 9 draws a rather slack film, which is solved in the shortest time."""
-    sensor = "three-25um-biaxial"
-    charge_pC, err = held_charge_pC(start, tmp_path, sensor, 9)
-    np.testing.assert_allclose(charge_pC, charge_of_film_pC(sensor, 9), rtol=2e-3)
-    described = ForwardMap.build(load_sensor(sensor), Circle(1.0), 3.0, (0.2, 0.5))
-    described_pC = described.charges(np.array([[1.0, 2.0, 0.5]]))[0]
-    assert np.abs(charge_pC / described_pC - 1.0).max() > 0.02
-    first, last = err.splitlines()
-    assert first == "playing film 9 of three-25um-biaxial at 200 Hz; Ctrl-C stops"
-    assert re.fullmatch(r"\d+ frames sent, \d+ withheld because no program read them, 0 lost and 0 .*", last)
-
-
-@pytest.mark.slow
-def test_a_seed_is_a_film(start, tmp_path):
-    sensor = "four-25um-biaxial"
-    charges = []
-    for run_number, film in enumerate((3, 3, 4)):
-        folder = tmp_path / str(run_number)
-        folder.mkdir()
-        charges.append(held_charge_pC(start, folder, sensor, film)[0])
-        np.testing.assert_allclose(charges[-1], charge_of_film_pC(sensor, film), rtol=2e-3)
-    np.testing.assert_array_equal(charges[0], charges[1])
-    assert np.abs(charges[2] / charges[0] - 1.0).max() > 0.05
-
-
-def test_virtual_film_of_a_seed_is_one_draw(monkeypatch, run):
-    """What the command solves: the same for the same seed, another for another, the described without one."""
-    solved = []
-
-    def build(sensor, probe, **_):
-        solved.append((sensor, probe))
-        raise InputError("not solved in this test")
+    def build(sensor, probe, *, radius, force_range):
+        asked.append((sensor, probe, radius, force_range))
+        return small_map(*(FILM_9 if (sensor, probe) == FILM_9 else DESCRIBED))
 
     monkeypatch.setattr(ForwardMap, "build", build)
-    for words in ((), ("--film", 3), ("--film", 3, "--seed", 8), ("--film", 4)):
-        with pytest.raises(InputError, match="not solved"):
-            run("virtual", "four-25um-biaxial", "--probe", "circle:1.5", *words)
-    described = load_sensor("four-25um-biaxial"), Circle(1.5)
-    assert solved[0] == described
-    assert solved[1] == solved[2] == virtual_film(*described, 3)
-    assert solved[3] == virtual_film(*described, 4) != solved[1]
+    monkeypatch.setattr("isocharge.cli.shared.virtual_sensor.SCRIPT_S", 3.0)
+    return asked
 
 
-@pytest.mark.parametrize("probe", ["rectangle:4x2", "triangle:4"])
-def test_virtual_film_needs_a_round_probe(probe, run):
-    with pytest.raises(InputError, match=f"--film: expected a round --probe like circle:1.0.*got '{probe}'"):
-        run("virtual", "three-25um-biaxial", "--film", 1, "--probe", probe)
+@pytest.fixture
+def played(run, tmp_path):
+    """Play until so many frames have come: their values, shape (n, electrodes), pC, and the result of the command."""
+
+    def play(count, *words, board=None):
+        link, parser, frames = tmp_path / "film", (board or device_from_table({}, "any")).parser(), []
+
+        def read():
+            while not link.exists():
+                time.sleep(0.01)
+            with Port(str(link), reconnect=True) as port:
+                for chunk in port:
+                    frames.extend(parser.feed(chunk.data))
+                    if len(frames) >= count:
+                        break
+            interrupt()
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        result = run("virtual", SENSOR, "--link", link, "--rate", 1000, *words)
+        reader.join(30)
+        assert not link.is_symlink()
+        return np.array([frame.values for frame in frames]), result
+
+    return play
 
 
-def test_virtual_sensor_of_described_frames_with_faults(start, tmp_path, run):
-    link, device = tmp_path / "film", tmp_path / "board.toml"
+def test_random_presses_come_after_a_second_of_rest(played, asked):
+    values, result = played(1300, "--noise", "clean", "--force-max", 0.5)
+    total = values.sum(axis=1)
+    assert values.shape[1] == 3
+    assert np.ptp(total[:800]) < 1e-3
+    assert total.max() - total[0] > 300.0
+    assert result.stdout.startswith("/dev/")
+    assert re.match(
+        r"\d+ frames sent, \d+ withheld because no program read them, 0 lost", result.stderr.splitlines()[-1]
+    )
+    assert asked == [(*DESCRIBED, 8.0, (0.05, 0.5))]
+
+
+@pytest.mark.parametrize("frames", ["binary", "teleplot"])
+def test_a_film_of_a_seed_plays_its_charges_and_does_not_tell_it(played, tmp_path, frames):
+    """A script: half a second without touch, then one press that is held."""
+    script = tmp_path / "held.toml"
+    script.write_text("presses = [[0, 0, 0, 0], [0.5, 0, 0, 0], [0.501, 1, 2, 0.5], [2, 1, 2, 0.5]]\n")
+    values, result = played(600, "--script", script, "--noise", "clean", "--film", 9, "--frames", frames)
+    expected_pC = small_map(*FILM_9).charges(np.array([[1.0, 2.0, 0.5]]))[0]
+    np.testing.assert_allclose(values[-1, -3:] - values[0, -3:], expected_pC, rtol=1e-3)
+    assert f"playing film 9 of {SENSOR} at 1000 Hz" in result.stderr
+
+
+def test_described_frames_with_the_faults_of_a_script(played, tmp_path):
+    device, script = tmp_path / "board.toml", tmp_path / "play.toml"
     device.write_text(
         '[frames]\nformat = "described"\nsync = "AA 55"\nlength = 14\nchecksum = "crc-16/x-25"\nfields = [\n'
         '{name = "seq", type = "u16"}, {name = "t_ms", type = "u16"},\n'
         '{name = "A", type = "i16", scale = 0.1}, {name = "B", type = "i16", scale = 0.1},'
         '{name = "C", type = "i16", scale = 0.1}]\n'
     )
+    script.write_text("[faults]\nlose_share = 0.05\ncorrupt_share = 0.001\nunplug_every_s = 0.5\nunplug_s = 0.2\n")
+    values, result = played(700, "--device", device, "--script", script, board=load_device(device))
+    assert values.shape == (len(values), 3)
+    lost, damaged, unplugged = map(
+        int, re.search(r"(\d+) lost and (\d+) damaged on purpose, (\d+) times", result.stderr).groups()
+    )
+    assert lost > 100
+    assert damaged > 0
+    assert unplugged >= 1
+
+
+def test_the_amplifier_of_a_script(played, tmp_path):
+    """Its converter reads no more than it says, and the bias current fills it while nothing touches."""
     script = tmp_path / "play.toml"
-    script.write_text("[faults]\nlose_share = 0.05\ncorrupt_share = 0.001\nunplug_every_s = 1.4\n")
-    words = ["--link", link, "--device", device, "--script", script, "--force-max", "0.5"]
-    process = start("virtual", "three-25um-biaxial", *words)
-    process.stdout.readline()
-    result = run("stream", "three-25um-biaxial", "--port", link, "--device", device, "--seconds", 3)
-    lines = [json.loads(line) for line in result.stdout.splitlines()]
-    came_back = sum("reconnected" in line["flags"] for line in lines)
-    assert 1 <= came_back <= 2
-    assert f"{came_back} reconnects" in result.stderr.splitlines()[-1]
-    assert any("gap" in line["flags"] for line in lines)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=20)
-    assert "damaged on purpose" in err.splitlines()[-1]
-    assert not link.is_symlink()
+    script.write_text(
+        "limit_pC = 50\ndrift_pC_per_s = 100.0\n"
+        "presses = [[0, 0, 0, 0], [0.2, 0, 0, 0], [0.3, 0, 0, 0.5], [2, 0, 0, 0.5]]\n"
+    )
+    values, _ = played(500, "--script", script, "--noise", "clean")
+    change = values - values[0]
+    assert (np.abs(change[150]) > 5.0).all()
+    assert 40.0 < np.abs(change).max() <= 100.0
+
+
+def test_a_film_is_solved_as_far_as_it_is_pressed(tmp_path, run, asked):
+    (tmp_path / "far.toml").write_text("presses = [[0, 0, 0, 0], [1, 0, 0, 0], [2, 5, 12, 1], [4, 5, 12, 0]]\n")
+    for words in ((), ("--radius", 15), ("--script", tmp_path / "far.toml")):
+        with suppress(SceneError):  # the small map does not reach so far
+            run("virtual", "four-25um-biaxial-15mm", "--seconds", 0, *words)
+    assert [round(radius, 3) for _, _, radius, _ in asked] == [8.0, 15.0, 13.0]
+
+
+def test_a_seed_is_one_draw(run, asked):
+    """The same film for the same seed, another for another, the described without one."""
+    for words in ((), ("--film", 3), ("--film", 3, "--seed", 8), ("--film", 4)):
+        run("virtual", "four-25um-biaxial", "--probe", "circle:1.5", "--seconds", 0, *words)
+    described = load_sensor("four-25um-biaxial"), Circle(1.5)
+    films = [one[:2] for one in asked]
+    assert films[0] == described
+    assert films[1] == films[2] == virtual_film(*described, 3)
+    assert films[3] == virtual_film(*described, 4) != films[1]
+
+
+def test_what_is_refused(run, asked, tmp_path):
+    taken = tmp_path / "film"
+    taken.write_text("mine")
+    with pytest.raises(OutputExists, match="film: the path exists already"):
+        run("virtual", SENSOR, "--link", taken, "--seconds", 0)
+    assert taken.read_text() == "mine"
+    with pytest.raises(InputError, match="the link cannot be made"):
+        run("virtual", SENSOR, "--link", tmp_path / "no" / "film", "--seconds", 0)
+    with pytest.raises(SensorError):
+        run("virtual", "five-25um-biaxial")
+    with pytest.raises(InputError, match=r"--film: expected a round --probe like circle:1\.0.*got 'triangle:4'"):
+        run("virtual", SENSOR, "--film", 1, "--probe", "triangle:4")
+    (tmp_path / "plain.toml").write_text("")
+    with pytest.raises(InputError, match="expected a file with described frames"):
+        run("virtual", SENSOR, "--device", tmp_path / "plain.toml")
+    assert len(asked) <= 1

@@ -106,6 +106,7 @@ def virtual_command(
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
     check_pseudo_terminals()
+    _refuse_taken(link)
     play = load_script(script) if script else VirtualScript()
     described, pressing = _played(sensor, probe, film)
     changes: dict[str, Any] = {"step": play.temperature_step_K, "bias": play.drift_pC_per_s, "limit": play.limit_pC}
@@ -114,7 +115,6 @@ def virtual_command(
     forces = (DEFAULT_FORCE_RANGE[0], force_max)
     with shown_progress():
         forward_map = ForwardMap.build(described, pressing, radius=_farthest(radius, presses), force_range=forces)
-    _refuse_taken(link)
     player = virtual_sensor(
         forward_map, amplifier, seed, rate, script=presses, encode=encode, faults=play.faults, link=link
     )
