@@ -129,7 +129,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
     """
     presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
     check_before(presses, problem.charges)
-    far, cautions = outside(presses, problem.charges), []
+    far, cautions = outside(presses.contact, problem.charges.domain), []
     if far.any():
         low, high = problem.charges.domain.force_range
         too_far = (

@@ -103,10 +103,8 @@ class ContactSensitivity:
         Position and force count in units of the error that noise alone leaves.
         """
         unit = self.of_noise
-        scale = np.array([1.0 / unit.position_mm, 1.0 / unit.position_mm, 100.0 / unit.force_percent])
-        scaled = self.by_parameter * scale[:, None]
-        cost: Array = np.einsum("nip,niq->pq", scaled, scaled) / len(scaled)
-        return cost
+        scaled = self.by_parameter / np.array([[unit.position_mm], [unit.position_mm], [0.01 * unit.force_percent]])
+        return np.asarray(np.einsum("nip,niq->pq", scaled, scaled) / len(scaled))
 
 
 def _whitened_slopes(problem: CalibrationProblem, parameters: Array, contact: Array) -> tuple[Array, Array]:
@@ -140,9 +138,8 @@ def information_of(
     rig = np.diag([position_std_mm**-2.0, position_std_mm**-2.0, force_std**-2.0])
     normal = np.einsum("nki,nkj->nij", slopes, slopes) + rig
     across = np.einsum("nki,nkp->nip", slopes, by_film)
-    at_known_contact: Array = np.einsum("nkp,nkq->npq", by_film, by_film)
-    information: Array = at_known_contact - np.einsum("nip,nij,njq->npq", across, np.linalg.inv(normal), across)
-    return information
+    unknown = np.einsum("nip,nij,njq->npq", across, np.linalg.inv(normal), across)
+    return np.asarray(np.einsum("nkp,nkq->npq", by_film, by_film) - unknown)
 
 
 @dataclass(frozen=True)
@@ -210,9 +207,8 @@ def _candidates(domain: Domain, avoid_mm: Array) -> Array:
     """Presses to compare, on a grid that a person can set, shape (n, 3)."""
     at, (low, high) = domain.radius * sunflower(PLACES), domain.force_range
     places = np.unique(np.round(np.column_stack([at.real, at.imag]) / ROUND_MM) * ROUND_MM, axis=0)
-    places = places[np.hypot(*places.T) <= domain.radius]
     distance = np.hypot(*np.moveaxis(places[:, None] - avoid_mm, 2, 0))
-    places = places[(distance > AVOIDED_MM).all(axis=1)]
+    places = places[(distance > AVOIDED_MM).all(axis=1) & (np.hypot(*places.T) <= domain.radius)]
     if not len(places):
         raise PressError(f"no place within {domain.radius:.3g} mm of the centre is left to press; skip fewer")
     forces = np.maximum(np.round(low * (high / low) ** np.array(FORCES) / ROUND_N) * ROUND_N, ROUND_N)

@@ -4,7 +4,8 @@ A rig knows place and force of a press to its own uncertainty, or one of them no
 is the one that fits charges and rig best; the residuals of both speak about the film.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,16 +14,8 @@ from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.simulate.forward.charge_map import ChargeMap, differences
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
+from isocharge.simulate.numerics.disk_least_squares import minimise
 from isocharge.train.calibration.film_charges import CONTACT_STEPS, FilmCharges
-
-ROUNDS, STEPS = 8, 8
-"""How often the slopes are computed at most, and how many Gauss-Newton steps they serve for at most."""
-
-SETTLED = 1e-4
-"""Largest change of a contact, in its own standard deviations, at which the steps end."""
-
-LONGEST_MM, LONGEST_LOG = 1.0, 0.5
-"""Largest step of a position, mm, and of the logarithm of a force."""
 
 PLACES = 300
 """Places among which the start of a press is chosen whose place is not known."""
@@ -82,19 +75,16 @@ class PressData:
         return np.concatenate([self.weight[:, :, None] * by_contact, of_rig], axis=1)
 
 
-@dataclass(frozen=True)
-class AdjustedContacts:
+class AdjustedContacts(NamedTuple):
     """Contacts adjusted to one film.
 
     Attributes:
         contact: (x, y, ln F), shape (n, 3).
         residual: As `PressData.residual`, shape (n, n_electrode + 3).
-        slopes: Derivatives of the residual by the contact, shape (n, n_electrode + 3, 3).
     """
 
     contact: Array
     residual: Array
-    slopes: Array
 
     @property
     def chi2(self) -> Array:
@@ -102,16 +92,18 @@ class AdjustedContacts:
         chi2: Array = (self.residual**2).sum(axis=1)
         return chi2
 
-    def projected(self, by_parameter: Array) -> Array:
-        """Derivatives of the residual by the parameters once the contacts follow them (Golub and Pereyra 1973).
 
-        Args:
-            by_parameter: Derivatives at fixed contacts, shape (n, n_electrode + 3, n_parameter).
-        """
-        normal = np.einsum("nki,nkj->nij", self.slopes, self.slopes)
-        moved = np.linalg.solve(normal, np.einsum("nki,nkp->nip", self.slopes, by_parameter))
-        projected: Array = by_parameter - np.einsum("nki,nip->nkp", self.slopes, moved)
-        return projected
+def projected(by_parameter: Array, slopes: Array) -> Array:
+    """Derivatives of the residual by the parameters once the contacts follow them (Golub and Pereyra 1973).
+
+    Args:
+        by_parameter: Derivatives at fixed contacts, shape (n, n_electrode + 3, n_parameter).
+        slopes: Derivatives by the contacts, shape (n, n_electrode + 3, 3).
+    """
+    normal = np.einsum("nki,nkj->nij", slopes, slopes)
+    moved = np.linalg.solve(normal, np.einsum("nki,nkp->nip", slopes, by_parameter))
+    across: Array = by_parameter - np.einsum("nki,nip->nkp", slopes, moved)
+    return across
 
 
 def with_force(contact: Array) -> Array:
@@ -119,72 +111,24 @@ def with_force(contact: Array) -> Array:
     return np.column_stack([contact[:, :2], np.exp(contact[:, 2])])
 
 
-def adjust_contacts(
-    charges: FilmCharges, parameters: Array, data: PressData, start: AdjustedContacts | Array
-) -> AdjustedContacts:
+def adjust_contacts(charges: FilmCharges, parameters: Array, data: PressData, start: Array) -> AdjustedContacts:
     """The contacts that fit charges and rig best on one film.
 
     Args:
         charges: The films.
         parameters: The film, shape (n_parameter,).
         data: The presses.
-        start: Contacts (x, y, ln F), shape (n, 3), or those adjusted to a neighbouring film, whose slopes serve for the
-            first steps: charges alone are a seventh of the work.
+        start: Contacts (x, y, ln F), shape (n, 3).
     """
-    film = charges.forward_map(parameters)
+    film, domain = charges.forward_map(parameters), charges.domain
 
-    def linearised(contact: Array) -> AdjustedContacts:
-        by_contact = differences(film.charges, with_force(contact), CONTACT_STEPS)
-        return AdjustedContacts(contact, data.residual(film, contact), data.slopes(by_contact))
+    def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
+        contact, presses = unit * domain.scale + domain.centre, data[rows]
+        slopes = presses.slopes(differences(film.charges, with_force(contact), CONTACT_STEPS))
+        return presses.residual(film, contact), (slopes * domain.scale).swapaxes(1, 2)
 
-    if isinstance(start, AdjustedContacts):
-        adjusted = replace(start, residual=data.residual(film, start.contact))
-    else:
-        adjusted = linearised(_inside(charges, start))
-    for _ in range(ROUNDS):
-        adjusted, settled = _steps_with_these_slopes(charges, film, data, adjusted)
-        if settled:
-            break
-        adjusted = linearised(adjusted.contact)
-    return adjusted
-
-
-def _steps_with_these_slopes(
-    charges: FilmCharges, film: ChargeMap, data: PressData, adjusted: AdjustedContacts
-) -> tuple[AdjustedContacts, bool]:
-    """Gauss-Newton steps that keep the slopes, as long as they help; whether the contacts have settled."""
-    normal = np.einsum("nki,nkj->nij", adjusted.slopes, adjusted.slopes)
-    unit = np.sqrt(np.einsum("nii->ni", normal))
-    share = np.ones(len(data))
-    for _ in range(STEPS):
-        gradient = np.einsum("nki,nk->ni", adjusted.slopes, adjusted.residual)
-        step = -np.linalg.solve(normal, gradient[..., None])[..., 0]
-        size = np.maximum(np.hypot(step[:, 0], step[:, 1]) / LONGEST_MM, np.abs(step[:, 2]) / LONGEST_LOG)
-        step *= (share / np.maximum(size, 1.0))[:, None]
-        trial = _inside(charges, adjusted.contact + step)
-        residual = data.residual(film, trial)
-        change = (residual**2).sum(axis=1) - adjusted.chi2
-        better = change <= 1e-9 * (1.0 + adjusted.chi2)
-        moved = np.where(better, np.abs((trial - adjusted.contact) * unit).max(axis=1), 0.0)
-        adjusted = replace(
-            adjusted,
-            contact=np.where(better[:, None], trial, adjusted.contact),
-            residual=np.where(better[:, None], residual, adjusted.residual),
-        )
-        worse = ~better & (np.abs(step * unit).max(axis=1) > SETTLED)
-        if worse.any():
-            if share.min() < 0.1:
-                break
-            share = np.where(worse, 0.3 * share, share)
-        elif moved.max() < SETTLED:
-            return adjusted, True
-    return adjusted, False
-
-
-def _inside(charges: FilmCharges, contact: Array) -> Array:
-    """(x, y, ln F) moved into the domain of all films."""
-    inside = charges.into_domain(with_force(np.clip(contact, -1e3, 1e2)))
-    return np.column_stack([inside[:, :2], np.log(inside[:, 2])])
+    unit, residual = minimise(residuals, (start - domain.centre) / domain.scale)
+    return AdjustedContacts(unit * domain.scale + domain.centre, residual)
 
 
 def search_places(charges: FilmCharges, parameters: Array, data: PressData) -> Array:
@@ -193,15 +137,11 @@ def search_places(charges: FilmCharges, parameters: Array, data: PressData) -> A
     Ratios hardly depend on the film's stiffness and coefficients, which are not known yet.
     """
     start, unknown = data.contact.copy(), ~data.known[:, -3:-1].all(axis=1)
-    if not unknown.any():
-        return start
-    lattice = charges.domain.radius * sunflower(PLACES)
-    force = np.exp(np.median(data.contact[unknown, 2]))
-    at = np.column_stack([lattice.real, lattice.imag, np.full(PLACES, force)])
-    candidates = np.log(charges.charges(parameters, at))
-    for row in np.flatnonzero(unknown):
-        seen = data.known[row, :-3]
-        measured = np.log(np.maximum(data.charge[row, seen], 1.0))
-        ratios = (measured - measured.mean()) - (candidates[:, seen] - candidates[:, seen].mean(axis=1)[:, None])
-        start[row, :2] = at[int(np.argmin((ratios**2).sum(axis=1))), :2]
+    if unknown.any():
+        lattice = charges.domain.radius * sunflower(PLACES)
+        force = np.exp(np.median(data.contact[unknown, 2]))
+        at = np.column_stack([lattice.real, lattice.imag, np.full(PLACES, force)])
+        measured = np.where(data.known[unknown, :-3], np.log(np.maximum(data.charge[unknown], 1.0)), np.nan)
+        logs = measured[:, None] - np.log(charges.charges(parameters, at))
+        start[unknown, :2] = at[np.nanvar(logs, axis=2).argmin(axis=1), :2]
     return start

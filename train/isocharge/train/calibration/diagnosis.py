@@ -5,14 +5,14 @@ other units. What then explains them is named; the data are never mended silentl
 """
 
 from collections.abc import Iterator
-from itertools import combinations, permutations
-from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import PressError
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.calibration.film_charges import FilmCharges
 
 DEAD_SHARE = 0.02
@@ -24,23 +24,23 @@ REVERSED_SHARE = 0.3
 REVERSED = 0.8
 """Share of negative charges above which a channel counts as reversed."""
 
-FEWEST_TO_TELL = 3
-"""Charges of a channel below which nothing is said of its sign."""
-
-MOST_PERMUTED = 5
-"""Electrodes up to which all orders of the columns are tried; beyond, only two are exchanged."""
-
 METRES_MM = 0.05
 """Positions that differ, but by less than this in all, were hardly meant as mm."""
 
-FORCE_UNITS = {"g": 9.80665e-3, "mN": 1e-3, "kg": 9.80665, "lbf": 4.4482216}
-"""Unit to newtons."""
-
-PLACE_UNITS = {"m": 1e3, "cm": 10.0, "inch": 25.4, "um": 1e-3}
-"""Unit to millimetres."""
-
-CHARGE_UNITS = {"nC": 1e3, "C": 1e12, "fC": 1e-3}
-"""Unit to picocoulombs."""
+OTHER_UNITS = (
+    ("forces", "N", "g", (1.0, 1.0, 9.80665e-3), 1.0),
+    ("forces", "N", "mN", (1.0, 1.0, 1e-3), 1.0),
+    ("forces", "N", "kg", (1.0, 1.0, 9.80665), 1.0),
+    ("forces", "N", "lbf", (1.0, 1.0, 4.4482216), 1.0),
+    ("positions", "mm", "m", (1e3, 1e3, 1.0), 1.0),
+    ("positions", "mm", "cm", (10.0, 10.0, 1.0), 1.0),
+    ("positions", "mm", "inch", (25.4, 25.4, 1.0), 1.0),
+    ("positions", "mm", "um", (1e-3, 1e-3, 1.0), 1.0),
+    ("charges", "pC", "nC", (1.0, 1.0, 1.0), 1e3),
+    ("charges", "pC", "C", (1.0, 1.0, 1.0), 1e12),
+    ("charges", "pC", "fC", (1.0, 1.0, 1.0), 1e-3),
+)
+"""What is written, in which unit, in which one by mistake, and the factors on (x, y, F) and Q that put it right."""
 
 PRETENSIONS = (0.03, 0.25, 0.5, 1.0)
 """Pretensions that are tried, over the largest of the prior."""
@@ -68,14 +68,6 @@ AXES = (
 """In words, and the matrix from positions as written to positions on the film."""
 
 
-class Mistake(NamedTuple):
-    """One way in which presses may have been written wrongly, and the presses put right."""
-
-    sentence: str
-    contact: Array
-    charge: Array
-
-
 def check_before(presses: MeasuredPresses, charges: FilmCharges) -> None:
     """Refuse presses that cannot be what they say, before anything is fitted.
 
@@ -87,18 +79,14 @@ def check_before(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
 
 def _check_places(presses: MeasuredPresses, radius: float) -> None:
-    distance = np.hypot(presses.contact[:, 0], presses.contact[:, 1])
-    known = np.isfinite(distance)
-    if not known.any():
-        return
-    worst = int(np.nanargmax(distance))
-    if distance[worst] >= radius:
-        x, y, _ = presses.contact[worst]
+    places = presses.contact[:, :2]
+    for row in np.flatnonzero(np.hypot(*places.T) >= radius)[:1]:
         raise PressError(
-            f"line {presses.lines[worst]}: a press at ({x:g}, {y:g}) mm "
+            f"line {presses.lines[row]}: a press at ({places[row, 0]:g}, {places[row, 1]:g}) mm "
             f"is off the film, whose radius is {radius:g} mm; positions are in mm from the film's centre"
         )
-    spread = np.ptp(presses.contact[known, :2], axis=0).max()
+    places = places[np.isfinite(places[:, 0])]
+    spread = np.ptp(places, axis=0).max() if len(places) else 0.0
     if 0.0 < spread < METRES_MM:
         raise PressError(
             f"all places lie within {spread:.3g} mm of each other; positions are in mm: were they written in metres?"
@@ -106,69 +94,58 @@ def _check_places(presses: MeasuredPresses, radius: float) -> None:
 
 
 def _check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
-    typical = np.array([_median(np.abs(column)) for column in presses.charge_pC.T])
-    expected = _smallest_shares(presses, charges)
-    for number, name in enumerate(presses.electrodes):
-        others = _median(np.delete(typical, number))
-        if np.isnan(typical[number]):
+    charge, placed = presses.charge_pC, presses.contact[presses.placed]
+    for name, column in zip(presses.electrodes, charge.T, strict=True):
+        if np.isnan(column).all():
             raise PressError(f"electrode {name!r}: no press has a charge of it; a calibration needs all electrodes")
-        if typical[number] < DEAD_SHARE * min(expected[number], 1.0) * others:
+    shares = _shares(charge)
+    least = np.min([1.0 + 0.0 * shares, *map(_shares, _expected(charges, placed) if len(placed) else ())], axis=0)
+    for name, column, share, smallest in zip(presses.electrodes, charge.T, shares, least, strict=True):
+        if share < DEAD_SHARE * smallest:
             raise PressError(
-                f"electrode {name!r} is dead: half of its charges are below {typical[number]:.3g} pC where those of "
-                f"the others are {others:.3g} pC; check the channel, its cable and its amplifier"
+                f"electrode {name!r} is dead: half of its charges are below {np.nanmedian(np.abs(column)):.3g} pC, "
+                f"{100.0 * share:.2g} % of those of the others; check the channel, its cable and its amplifier"
             )
-        known = presses.charge_pC[~np.isnan(presses.charge_pC[:, number]), number]
-        large = typical[number] > REVERSED_SHARE * others  # weak ones may be negative, on taut uniaxial films
-        if known.size >= FEWEST_TO_TELL and np.mean(known < 0.0) > REVERSED and large:
+        negative, known = np.sum(column < 0.0), np.sum(np.isfinite(column))
+        if negative > REVERSED * known and share > REVERSED_SHARE:  # weak ones may be negative, on taut uniaxial films
             raise PressError(
-                f"electrode {name!r}: {np.sum(known < 0.0)} of its {known.size} charges are negative; a press gives a "
-                "positive charge: exchange its wires or its sign"
+                f"electrode {name!r}: {negative} of its {known} charges are negative; a press gives a positive charge: "
+                "exchange its wires or its sign"
             )
 
 
-def _smallest_shares(presses: MeasuredPresses, charges: FilmCharges) -> Array:
-    """Typical charge of each channel over that of the others, the smallest that films of some pretension give."""
-    placed = presses.contact[presses.placed]
-    if not len(placed):
-        return np.ones(len(presses.electrodes))
-    typical = np.median(np.abs(_expected(charges, placed)), axis=1)
-    others = [np.median(np.delete(typical, number, axis=1), axis=1) for number in range(typical.shape[1])]
-    smallest: Array = np.min(typical / np.transpose(others), axis=0)
-    return smallest
+def _shares(charge: Array) -> Array:
+    """Typical charge of each channel over that of the others, from charges of shape (n, n_electrode)."""
+    typical = np.nanmedian(np.abs(charge), axis=0)
+    others = [np.median(np.delete(typical, number)) for number in range(typical.size)]
+    shares: Array = typical / np.maximum(others, 1e-9)
+    return shares
 
 
 def _expected(charges: FilmCharges, contact: Array) -> Array:
     """Charges of contacts on the prior's mean film with `PRETENSIONS`, shape (n_pretension, n, n_electrode), pC."""
-    contact, films = charges.into_domain(contact), []
-    for share in PRETENSIONS:
-        parameters = charges.prior.mean.copy()
-        parameters[0] = share * charges.prior.spread.pretension
-        films.append(charges.charges(parameters, contact))
-    return np.array(films)
+    prior, contact = charges.prior, charges.into_domain(contact)
+    shares = np.array(PRETENSIONS)[:, None] * prior.spread.pretension
+    films = np.column_stack([shares, np.tile(prior.mean[1:], (len(shares), 1))])
+    return np.array([charges.charges(parameters, contact) for parameters in films])
 
 
-def _median(values: Array) -> float:
-    """The median of what is known; NaN if nothing is."""
-    known = values[~np.isnan(values)]
-    return float(np.median(known)) if known.size else np.nan
+def outside(contact: Array, domain: Domain) -> Booleans:
+    """Which contacts, shape (n, 3), lie beyond a radius or a range of forces; what is not known does not."""
+    x, y, force = contact.T
+    low, high = domain.force_range
+    return np.asarray((np.hypot(x, y) > domain.radius) | (force < low) | (force > high))
 
 
-def outside(presses: MeasuredPresses, charges: FilmCharges) -> Booleans:
-    """Which presses lie beyond the radius or the forces that films are solved for, shape (n,)."""
-    x, y, force = presses.contact.T
-    low, high = charges.domain.force_range
-    return np.asarray((np.hypot(x, y) > charges.domain.radius) | (force < low) | (force > high))
-
-
-def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[Mistake]:
+def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     """The mistakes that would explain presses far better than as they are written, best first; none if nothing does."""
     placed = presses[presses.placed]
     if not len(placed):
         return []
-    as_written = _misfit(charges, placed.contact, placed.charge_pC)
-    tried = [(_misfit(charges, mistake.contact, mistake.charge), mistake) for mistake in _mistakes(placed)]
-    tried = sorted((pair for pair in tried if pair[0] < CLEARER * as_written), key=lambda pair: pair[0])
-    return [mistake for misfit, mistake in tried if misfit <= AS_GOOD * tried[0][0]]
+    mistakes = [(_misfit(charges, contact, charge), sentence) for sentence, contact, charge in _tried(placed, charges)]
+    clearer = CLEARER * _misfit(charges, placed.contact, placed.charge_pC)
+    least = min(misfit for misfit, _ in mistakes)
+    return [sentence for misfit, sentence in sorted(mistakes) if misfit < clearer and misfit <= AS_GOOD * least]
 
 
 def _misfit(charges: FilmCharges, contact: Array, charge: Array) -> float:
@@ -181,32 +158,31 @@ def _misfit(charges: FilmCharges, contact: Array, charge: Array) -> float:
     return float(np.min(own / SCATTER**2 + (common / OFFSET) ** 2))
 
 
-def _mistakes(presses: MeasuredPresses) -> Iterator[Mistake]:
-    """Every mistake that is tried, one at a time."""
+def _tried(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str, Array, Array]]:
+    """Every mistake that is tried, one at a time, in words, with contacts and charges put right."""
     contact, charge, electrodes = presses.contact, presses.charge_pC, presses.electrodes
-    for order in _orders(len(electrodes)):
-        swapped = f"those named {', '.join(electrodes)} hold {', '.join(electrodes[number] for number in order)}"
-        yield Mistake(f"the charge columns are swapped: {swapped}", contact, charge[:, np.argsort(order)])
-    for sentence, matrix in AXES:
+    for order in _orders(presses, charges):
+        swapped = ", ".join(electrodes[number] for number in order)
+        sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {swapped}"
+        yield sentence, contact, charge[:, np.argsort(order)]
+    for turned, matrix in AXES:
         rotated = np.column_stack([contact[:, :2] @ matrix.T, contact[:, 2]])
-        yield Mistake(f"the rig's axes are not the film's: {sentence}", rotated, charge)
-    for unit, factor in FORCE_UNITS.items():
-        yield Mistake(f"the forces are in {unit}, not N", contact * [1.0, 1.0, factor], charge)
-    for unit, factor in PLACE_UNITS.items():
-        yield Mistake(f"the positions are in {unit}, not mm", contact * [factor, factor, 1.0], charge)
-    for unit, factor in CHARGE_UNITS.items():
-        yield Mistake(f"the charges are in {unit}, not pC", contact, charge * factor)
+        yield f"the rig's axes are not the film's: {turned}", rotated, charge
+    for what, unit, other, of_contact, of_charge in OTHER_UNITS:
+        yield f"the {what} are in {other}, not {unit}", contact * of_contact, charge * of_charge
 
 
-def _orders(count: int) -> Iterator[tuple[int, ...]]:
-    """Orders of the columns other than the right one: all of them for a few electrodes, exchanges of two for more."""
-    identity = tuple(range(count))
-    if count <= MOST_PERMUTED:
-        yield from (order for order in permutations(identity) if order != identity)
-        return
-    for pair in combinations(identity, 2):
-        exchanged = dict(zip(pair, pair[::-1], strict=True))
-        yield tuple(exchanged.get(number, number) for number in identity)
+def _orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
+    """The electrodes that columns fit best, in the order of the columns, by films of some pretension, if it is another.
+
+    The logarithms of every column are compared with those of every electrode; the best assignment is taken.
+    """
+    orders, measured = set(), np.log(np.maximum(presses.charge_pC, 1e-3))
+    for expected in _expected(charges, presses.contact):
+        logs = measured[:, :, None] - np.log(np.maximum(expected, 1e-3))[:, None]
+        apart = np.nansum(np.minimum((logs - np.nanmedian(logs)) ** 2, 4.0), axis=0)
+        orders.add(tuple(linear_sum_assignment(apart)[1].tolist()))
+    return orders - {tuple(range(len(presses.electrodes)))}
 
 
 def explain(presses: MeasuredPresses, charges: FilmCharges, times_noise: float) -> PressError:
@@ -222,7 +198,7 @@ def explain(presses: MeasuredPresses, charges: FilmCharges, times_noise: float) 
         best = "most of them lie outside the places and forces of a calibration"
     begin = f"no film of {charges.prior.sensor.name!r} explains these {len(presses)} presses: {best}"
     if mistakes := find_mistakes(presses, charges):
-        sentences = "; or ".join(mistake.sentence for mistake in mistakes[:3])
+        sentences = "; or ".join(mistakes[:3])
         return PressError(f"{begin}, but it would explain them if {sentences}. Nothing was changed: put the file right")
     return PressError(
         f"{begin}; is it this layout and this probe ({charges.prior.probe.notation}), are places and forces those "

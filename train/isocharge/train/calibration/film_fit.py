@@ -17,7 +17,14 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_distribution
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.train.calibration.contacts import AdjustedContacts, PressData, adjust_contacts, search_places, with_force
+from isocharge.train.calibration.contacts import (
+    AdjustedContacts,
+    PressData,
+    adjust_contacts,
+    projected,
+    search_places,
+    with_force,
+)
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.problem import FilmEstimate
 
@@ -73,17 +80,14 @@ class FilmPosterior(FilmEstimate):
 
 def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate) -> FilmPosterior:
     """The film that explains presses; `before` is what is known of it without them."""
-    fit = _FilmFit(charges, before)
-    freedom = np.maximum(data.known.sum(axis=1) - 3.0, 0.0)
-    best, adjusted = fit.solve(data, np.ones(len(data)), before.parameters)
-    keep = np.ones(len(data), dtype=bool)
+    keep, freedom = np.ones(len(data), dtype=bool), np.maximum(data.known.sum(axis=1) - 3.0, 0.0)
+    film, adjusted = _solve(charges, before, data, keep, before.parameters)
     if len(data) >= FEWEST_TO_JUDGE and _suspicious(adjusted.chi2, freedom):
-        keep, start = _good_presses(fit, data, best, adjusted.chi2, freedom)
-        best, _ = fit.solve(data[keep], np.ones(int(keep.sum())), start)
-        adjusted = fit.adjusted(best, data)
-    jacobian = fit.jacobian(best, data[keep], np.ones(int(keep.sum())), fit.adjusted(best, data[keep]))
-    covariance = np.linalg.inv(jacobian.T @ jacobian).astype(float)
-    return FilmPosterior(best, covariance, with_force(adjusted.contact), adjusted.chi2, freedom, ~keep)
+        keep, start = _good_presses(charges, before, data, film.parameters, adjusted.chi2, freedom)
+        film, _ = _solve(charges, before, data[keep], keep[keep], start)
+        adjusted = adjust_contacts(charges, film.parameters, data, search_places(charges, film.parameters, data))
+    contact = with_force(adjusted.contact)
+    return FilmPosterior(film.parameters, film.covariance, contact, adjusted.chi2, freedom, ~keep)
 
 
 def _suspicious(chi2: Array, freedom: Array) -> bool:
@@ -94,72 +98,51 @@ def _suspicious(chi2: Array, freedom: Array) -> bool:
 
 
 def _good_presses(
-    fit: "_FilmFit", data: PressData, start: Array, chi2: Array, freedom: Array
+    charges: FilmCharges, before: FilmEstimate, data: PressData, start: Array, chi2: Array, freedom: Array
 ) -> tuple[Booleans, Array]:
     """Which presses agree with the film that most of them agree on, and that film."""
     weight = np.ones(len(data))
     for _ in range(WEIGHTINGS):
-        before, weight = weight, (HEAVY_TAILS + freedom) / (HEAVY_TAILS + chi2)
-        if np.abs(weight / before - 1.0).max() < 0.1:
+        last, weight = weight, (HEAVY_TAILS + freedom) / (HEAVY_TAILS + chi2)
+        if np.abs(weight / last - 1.0).max() < 0.1:
             break
-        start, adjusted = fit.solve(data, weight, start)
-        chi2 = adjusted.chi2
+        film, adjusted = _solve(charges, before, data, weight, start)
+        start, chi2 = film.parameters, adjusted.chi2
     freedom = np.maximum(freedom, 1.0)
     scatter = np.median(chi2 / np.maximum(chi2_distribution.median(freedom), 0.1))
     keep = chi2 <= chi2_distribution.isf(BAD / len(data), freedom) * max(1.0, scatter)
-    if np.mean(~keep) > LARGEST_BAD_SHARE:
-        keep[:] = True
-    return keep, start
+    return (keep if np.mean(~keep) <= LARGEST_BAD_SHARE else np.ones_like(keep)), start
 
 
-@dataclass(frozen=True)
-class _FilmFit:
-    """Least squares over the parameters of a film."""
+def _solve(
+    charges: FilmCharges, before: FilmEstimate, data: PressData, weight: Array | Booleans, start: Array
+) -> tuple[FilmEstimate, AdjustedContacts]:
+    """The film that explains weighted presses best, from a start, and the contacts adjusted to it."""
+    std, root = charges.prior.std, np.sqrt(weight)
+    low, high = (bound / std for bound in charges.prior.bounds)
+    of_prior, place = np.linalg.inv(np.linalg.cholesky(before.covariance)), search_places(charges, start, data)
+    last: list[tuple[Array, AdjustedContacts]] = []
 
-    charges: FilmCharges
-    before: FilmEstimate
+    def adjusted_at(unit: Array) -> AdjustedContacts:
+        if not last or not np.array_equal(last[-1][0], unit):
+            begin = last[-1][1].contact if last else place
+            last[:] = [(unit.copy(), adjust_contacts(charges, unit * std, data, begin))]
+        return last[-1][1]
 
-    def adjusted(self, parameters: Array, data: PressData) -> AdjustedContacts:
-        """The contacts that fit a film best."""
-        return adjust_contacts(self.charges, parameters, data, search_places(self.charges, parameters, data))
+    def residual(unit: Array) -> Array:
+        of_presses = adjusted_at(unit).residual * root[:, None]
+        return np.concatenate([of_presses.ravel(), of_prior @ (unit - before.parameters / std)])
 
-    def solve(self, data: PressData, weight: Array, start: Array) -> tuple[Array, AdjustedContacts]:
-        """The best parameters from a start, and the contacts adjusted to them."""
-        prior = self.charges.prior
-        low, high = (bound / prior.std for bound in prior.bounds)
-        place = search_places(self.charges, start, data)
-        root, mean = np.linalg.inv(np.linalg.cholesky(self.before.covariance)), self.before.parameters / prior.std
-        last: list[tuple[Array, AdjustedContacts]] = []
+    def jacobian(unit: Array) -> Array:
+        at = with_force(adjusted_at(unit).contact)
+        by_contact = charges.by_contact(unit * std, at)
+        of_charge = data.weight[:, :, None] * charges.by_parameter(unit * std, at, by_contact)
+        by_parameter = np.concatenate([of_charge, np.zeros((len(data), 3, unit.size))], axis=1)
+        rows = projected(by_parameter, data.slopes(by_contact)) * root[:, None, None]
+        return np.concatenate([rows.reshape(-1, unit.size), of_prior])
 
-        def adjusted_at(unit: Array) -> AdjustedContacts:
-            if not last or not np.array_equal(last[-1][0], unit):
-                begin = last[-1][1] if last else place
-                last[:] = [(unit.copy(), adjust_contacts(self.charges, unit * prior.std, data, begin))]
-            return last[-1][1]
-
-        def residual(unit: Array) -> Array:
-            of_presses = adjusted_at(unit).residual * np.sqrt(weight)[:, None]
-            return np.concatenate([of_presses.ravel(), root @ (unit - mean)])
-
-        result = least_squares(
-            residual,
-            np.clip(start / prior.std, low + MARGIN, high - MARGIN),
-            jac=lambda unit: self.jacobian(unit * prior.std, data, weight, adjusted_at(unit)),
-            bounds=(low, high),
-            x_scale=1.0,
-            ftol=TOLERANCE,
-            xtol=TOLERANCE,
-            max_nfev=MOST_STEPS,
-        )
-        return result.x * prior.std, adjusted_at(result.x)
-
-    def jacobian(self, parameters: Array, data: PressData, weight: Array, adjusted: AdjustedContacts) -> Array:
-        """Derivatives of the residual by the parameters over their prior standard deviations."""
-        at = with_force(adjusted.contact)
-        by_contact = self.charges.by_contact(parameters, at)
-        by_charge = data.weight[:, :, None] * self.charges.by_parameter(parameters, at, by_contact)
-        by_parameter = np.concatenate([by_charge, np.zeros((len(data), 3, parameters.size))], axis=1)
-        here = AdjustedContacts(adjusted.contact, adjusted.residual, data.slopes(by_contact))
-        rows = here.projected(by_parameter) * np.sqrt(weight)[:, None, None]
-        root = np.linalg.inv(np.linalg.cholesky(self.before.covariance))
-        return np.concatenate([rows.reshape(-1, parameters.size), root])
+    start = np.clip(start / std, low + MARGIN, high - MARGIN)
+    bounds, tolerance = (low, high), {"ftol": TOLERANCE, "xtol": TOLERANCE}
+    result = least_squares(residual, start, jacobian, bounds, x_scale=1.0, max_nfev=MOST_STEPS, **tolerance)
+    covariance = np.linalg.inv(result.jac.T @ result.jac).astype(float)
+    return FilmEstimate(result.x * std, covariance), adjusted_at(result.x)

@@ -13,7 +13,6 @@ A further calibration in the same folder is its next version: a server that watc
 nothing is lost.
 """
 
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import replace
@@ -21,14 +20,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, PressError
-from isocharge.common.files import read_whole, write_whole
+from isocharge.common.files import write_whole
 from isocharge.common.json_values import plain_values
+from isocharge.common.structs import read_json
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.repository import version_folders
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text, write_presses
+from isocharge.simulate.plots.figure import picture_bytes
 from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.calibrate import CalibrationResult
@@ -44,9 +46,6 @@ RESULT, SENSOR, PRESSES, PICTURE, CARD = "calibration.json", "sensor.toml", "pre
 
 SESSION = "presses.part.csv"
 """Name of the file with the presses of a session that is not over."""
-
-DOTS_PER_INCH = 90
-"""Of the picture: readable, and some 150 kB."""
 
 FILE_UNITS = {"pretension": 1e6, "shift_x": 1e-3, "shift_y": 1e-3, "probe_radius": 1e-3}
 """Factors to the parameters in calibration.json, which are in Pa and m."""
@@ -85,13 +84,11 @@ def write_calibration(result: CalibrationResult, folder: Path, command: str = ""
         OutputError: If the file system refuses.
     """
     check_calibration_folder(folder)
-    picture = io.BytesIO()
-    calibration_picture(result).savefig(picture, dpi=DOTS_PER_INCH, format="png")
     files = {
         RESULT: json.dumps(plain_values(result_table(result)), indent=1, allow_nan=False).encode(),
         SENSOR: sensor_to_toml(result.film[0]).encode(),
         PRESSES: presses_text(result.presses).encode(),
-        PICTURE: picture.getvalue(),
+        PICTURE: picture_bytes(calibration_picture(result)),
     }
     version = release(
         replace(result.fitted, provenance=Provenance(files=files)),
@@ -133,6 +130,19 @@ def error_table(error: ContactError) -> dict[str, float]:
     return {"position_mm": error.position_mm, "force_percent": error.force_percent}
 
 
+class _Parameter(Struct, frozen=True):
+    value: float
+    std: float
+
+
+class _Earlier(Struct, frozen=True):
+    """What `read_earlier` takes from calibration.json."""
+
+    sensor: str
+    parameters: dict[str, _Parameter]
+    correlations: list[list[float]]
+
+
 def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
     """The film of an earlier calibration, with what may have drifted since.
 
@@ -144,37 +154,22 @@ def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
         PressError: If the folder has no calibration, or one of other parameters.
     """
     path, prior = folder / RESULT, problem.prior
-    try:
-        table: dict[str, Any] = json.loads(read_whole(path))
-        names = tuple(table["parameters"])
-        parameters, std = np.array([[entry["value"], entry["std"]] for entry in table["parameters"].values()]).T
-        correlations = np.array(table["correlations"], dtype=float)
-        if not np.isfinite(correlations).all() or correlations.shape != (len(names), len(names)):
-            raise ValueError(f"correlations of shape {correlations.shape}")
-        sensor = table["sensor"]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    table = read_json(path, "the calibration.json of `train calibrate`", PressError, _Earlier)
+    names = tuple(table.parameters)
+    if names != prior.names or table.sensor != prior.sensor.name:
         raise PressError(
-            f"{path}: no calibration ({type(error).__name__}: {error}); expected the folder of `train calibrate`"
-        ) from error
-    if names != prior.names or sensor != prior.sensor.name:
-        raise PressError(
-            f"{path}: a calibration of {sensor!r} with the parameters {', '.join(names)}; expected "
+            f"{path}: a calibration of {table.sensor!r} with the parameters {', '.join(names)}; expected "
             f"{prior.sensor.name!r} with {', '.join(prior.names)}"
         )
-    units = _units(prior)
-    covariance = _positive(correlations * np.outer(std, std) / np.outer(units * prior.std, units * prior.std))
-    return FilmEstimate(parameters / units, covariance).drifted(prior)
+    if [len(row) for row in table.correlations] != [len(names)] * len(names):
+        raise PressError(f"{path}: correlations: expected {len(names)} rows of as many numbers")
+    value, std = np.array([[entry.value, entry.std] for entry in table.parameters.values()]).T / _units(prior)
+    unit = std / prior.std
+    return FilmEstimate(value, np.array(table.correlations) * np.outer(unit, unit)).drifted(prior)
 
 
 def _units(prior: FilmPrior) -> Array:
     return np.array([FILE_UNITS.get(name, 1.0) for name in prior.names])
-
-
-def _positive(covariance: Array) -> Array:
-    """A covariance made positive definite against rounding."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    repaired: Array = (vectors * np.maximum(values, 1e-10)) @ vectors.T
-    return repaired
 
 
 def _card(result: CalibrationResult, about: ModelMetadata) -> str:

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from matplotlib.tri import Triangulation
 
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
@@ -15,9 +16,6 @@ from isocharge.train.calibration.quantities import NORMAL_95
 
 LEVELS_MM = (0.02, 5.0)
 """Errors at the ends of the colours, mm."""
-
-TICKS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
-"""Errors that the colour bar names, mm."""
 
 ASSUMED, FITTED = "#b9c4cf", "#3a7ca5"
 """Colours of what was assumed before the presses and of what they say."""
@@ -37,9 +35,8 @@ def calibration_picture(result: CalibrationResult) -> Figure:
     if bad.any():
         after.plot(*contact[bad, :2].T, "X", color=FELT, mec=INK, ms=9, label="left out")
     after.legend(loc="upper right", fontsize=8)
-    figure.colorbar(
-        shades, ax=[before, after], label="position error by not knowing the film (rms), mm", ticks=TICKS, format="%g"
-    )
+    label = "position error by not knowing the film (rms), mm"
+    figure.colorbar(shades, ax=[before, after], label=label, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g")
     _draw_quantities(identified, result)
     _draw_residuals(residuals, result)
     figure.suptitle(f"calibration of {result.film[0].name}", fontsize=13)
@@ -63,19 +60,19 @@ def _draw_error(axes: Any, result: CalibrationResult, error: ContactError, title
 def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
     """95 % intervals after the presses within those before, each in units of the standard deviation before."""
     quantities = list(result.quantities.values())[::-1]
-    row = np.arange(len(quantities))
-    axes.barh(row, 4.0, left=-2.0, color=ASSUMED, height=0.72, label="assumed before, 95 %")
     change = (result.posterior.parameters - result.problem.before.parameters) / result.problem.prior.std
+    centre = np.array([quantity.weights @ change / quantity.before_std for quantity in quantities])
+    half = np.array([NORMAL_95 * quantity.std / quantity.before_std for quantity in quantities])
+    row, identified = np.arange(len(quantities)), np.array([quantity.identified for quantity in quantities])
+    axes.barh(row, 4.0, left=-2.0, color=ASSUMED, height=0.72, label="assumed before, 95 %")
+    for some, colour, label in (
+        (identified, FITTED, "identified by the presses, 95 %"),
+        (~identified, INK, "not identified"),
+    ):
+        axes.errorbar(centre[some], row[some], xerr=half[some], fmt="w|", ecolor=colour, elinewidth=5, label=label)
     for number, quantity in enumerate(quantities):
-        centre = float(quantity.weights @ change) / quantity.before_std
-        half = NORMAL_95 * quantity.std / quantity.before_std
-        axes.plot([centre - half, centre + half], [number, number], color=FITTED if quantity.identified else INK, lw=5)
-        axes.plot(centre, number, "|", color="white", ms=9)
-        axes.annotate(
-            f"{quantity.value:.3g} ± {quantity.std:.2g}", (4.2, number), va="center", fontsize=8, annotation_clip=False
-        )
-    axes.plot([], [], color=FITTED, lw=5, label="identified by the presses, 95 %")
-    axes.plot([], [], color=INK, lw=5, label="not identified")
+        text = f"{quantity.value:.3g} ± {quantity.std:.2g}"
+        axes.annotate(text, (4.2, number), va="center", fontsize=8, annotation_clip=False)
     axes.set(yticks=row, yticklabels=[quantity.name for quantity in quantities], xlim=(-4.0, 4.0))
     axes.set(xlabel="from what was assumed, in its standard deviations", title="what the presses tell")
     axes.tick_params(axis="y", labelsize=8)

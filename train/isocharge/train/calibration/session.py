@@ -17,17 +17,15 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.prediction.measured_presses import FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.train.calibration.calibrate import FEW, CalibrationResult, calibrate
-from isocharge.train.calibration.contact_error import ProposedPress, information_of, next_presses
-from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
+from isocharge.train.calibration.contact_error import ProposedPress, next_presses
+from isocharge.train.calibration.diagnosis import outside
+from isocharge.train.calibration.problem import CalibrationProblem
 
 FEWEST_TO_SAY = 2
 """Presses from which the error left is said: one press alone says little."""
 
 ENOUGH = 0.5
 """Error left by the film, as a share of the position error that noise alone leaves, at which a session is over."""
-
-Save = Callable[[MeasuredPresses], None]
-"""Puts the presses of a session on disk."""
 
 EXPECTED_ANSWER = (
     'Enter for "as proposed", the real "x y force" in mm and N (? for a value that is unknown), s to skip the place, '
@@ -68,33 +66,20 @@ def read_answer(text: str) -> Answer:
     Raises:
         PressError: If it is something else; says what is expected.
     """
-    text = text.strip()
-    word = text.lower()
-    if not word:
-        return Answer(Reply.take)
-    for reply in (Reply.skip, Reply.quit):
-        if word in (reply[0], reply):
-            return Answer(reply)
+    word = text.strip().lower()
+    if word in ("", *Reply, "s", "q"):
+        return Answer(Reply({"s": "skip", "q": "quit"}.get(word, word or "take")))
     if undo := re.fullmatch(r"(?:u|undo)\s*(\d*)", word):
         return Answer(Reply.undo, number=int(undo[1]) if undo[1] else "last")
-    if word == "?":
-        return Answer(Reply.take, np.full(3, np.nan))
-    cells = text.split(",") if "," in text else text.split()
-    if len(cells) != 3:
-        raise PressError(f"expected {EXPECTED_ANSWER}; got {text!r:.60}")
-    return Answer(Reply.take, np.array([_value(cell.strip(), text) for cell in cells]))
-
-
-def _value(cell: str, text: str) -> float:
-    if cell in ("", "?"):
-        return np.nan
+    cells = [cell.strip() for cell in (word.split(",") if "," in word else word.split())] * (3 if word == "?" else 1)
+    known = [cell not in ("", "?") for cell in cells]
     try:
-        value = float(cell)
+        contact = np.array([float(cell) if given else np.nan for cell, given in zip(cells, known, strict=True)])
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise PressError(f"expected a number with a decimal point, or ?, got {cell!r:.30} in {text!r:.60}")
-    return value
+        contact = np.empty(0)
+    if contact.shape != (3,) or not np.array_equal(np.isfinite(contact), known):
+        raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")
+    return Answer(Reply.take, contact)
 
 
 class PressSession:
@@ -107,11 +92,14 @@ class PressSession:
         refusal: Why no film explains the presses; empty where one does.
     """
 
+    result: CalibrationResult | None
+    _proposed: ProposedPress | None
+
     def __init__(
         self,
         problem: CalibrationProblem,
         *,
-        save: Save,
+        save: Callable[[MeasuredPresses], None],
         presses: MeasuredPresses | None = None,
         position_std_mm: float = POSITION_STD_MM,
         force_std: float = FORCE_STD,
@@ -127,16 +115,13 @@ class PressSession:
             force_std: How well it knows a force, share.
             until: Error left by the film as a share of that of noise, at which it is enough; 0 for never.
         """
-        none = MeasuredPresses(
-            np.empty((0, 3)), np.empty((0, len(problem.electrodes))), np.empty(0), np.empty(0), problem.electrodes, ()
-        )
+        if presses is None:
+            n, names = len(problem.electrodes), problem.electrodes
+            presses = MeasuredPresses(np.empty((0, 3)), np.empty((0, n)), np.empty(0), np.empty(0), names, ())
         self.problem, self._save, self._until = problem, save, until
         self._std = {"position_std_mm": position_std_mm, "force_std": force_std}
         self._skipped: list[tuple[float, float]] = []
-        self._proposed: ProposedPress | None = None
-        self.result: CalibrationResult | None = None
-        self.presses, self.refusal = none, ""
-        self._fit(presses or none)
+        self._fit(presses)
 
     def __len__(self) -> int:
         return len(self.presses)
@@ -149,17 +134,12 @@ class PressSession:
             PressError: If every place was skipped.
         """
         if self._proposed is None:
-            film, avoid = self.result.posterior if self.result else self._planned(), np.array(self._skipped)
-            (self._proposed,) = next_presses(self.problem, 1, film, avoid_mm=avoid.reshape(-1, 2), **self._std)
+            film, avoid = self.problem.before, np.reshape(self._skipped, (-1, 2))
+            count = len(self) + 1  # of a plan for presses that no film explains
+            if self.result:
+                film, count = self.result.posterior, 1
+            self._proposed = next_presses(self.problem, count, film, avoid_mm=avoid, **self._std)[-1]
         return self._proposed
-
-    def _planned(self) -> FilmEstimate:
-        """What would be known if presses that no film explains said what presses at their places say."""
-        placed, before = self.presses.contact[self.presses.placed], self.problem.before
-        if not len(placed):
-            return before
-        information = information_of(self.problem, before.parameters, placed, **self._std).sum(axis=0)
-        return FilmEstimate(before.parameters, np.linalg.inv(np.linalg.inv(before.covariance) + information))
 
     @property
     def enough(self) -> bool:
@@ -194,10 +174,10 @@ class PressSession:
     def check(self, contact: Array) -> None:
         """Raise PressError if no calibration takes a press (x, y, F), NaN where unknown, shape (3,), mm and N."""
         domain = self.problem.charges.domain
-        (x, y, force), (low, high) = contact.tolist(), domain.force_range
-        if math.isnan(x) != math.isnan(y):
+        if math.isnan(contact[0]) != math.isnan(contact[1]):
             raise PressError("expected both x and y, or ? for both, got one of them")
-        if math.hypot(x, y) > domain.radius or not (math.isnan(force) or low <= force <= high):
+        if outside(contact[None], domain).any():
+            low, high = domain.force_range
             raise PressError(
                 f"expected a press within {domain.radius:.3g} mm of the centre and of {low:.2g} to {high:.2g} N, "
                 f"got {describe_press(contact)}; press there, or give the real values in mm and N"
