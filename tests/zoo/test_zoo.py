@@ -1,22 +1,35 @@
 """From "plug in" to a right touch with what `serve doctor` says and writes, and nothing else.
 
-Each board goes through the two commands as a user does: doctor listens and writes a device file, stream reads the board
-with it. What no doctor can see, the charge of one count, is given as an option, as doctor asks for it. The touch is
-compared with the model's own answer on the true charges: 0.03 mm and 0.5 % of the force.
+Boards that are not ours: a film, an amplifier, a converter, and bytes packed by struct, json, cobs and crcmod, never by
+the encoders of isocharge. Their frames go through the two steps of a user: the findings of doctor become a device file,
+and a stream reads the board with it. What no doctor can see, the charge of one count, is given as doctor asks for it.
+The touch is compared with the model's own answer on the true charges: 0.03 mm and 0.5 % of the force.
 """
 
 import binascii
 import json
 import struct
+import threading
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 
 import crcmod.predefined
 import numpy as np
 import pytest
 from cobs import cobs
 
-from isocharge.serve import Predictor
+from isocharge.common.errors import DeviceError
+from isocharge.serve import Chunk, Predictor, TouchStream, load_device
+from isocharge.serve.examination.device_text import device_text
+from isocharge.serve.examination.listening import Heard
+from isocharge.serve.examination.port_check import findings
+from isocharge.serve.port.request import Request
+from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
+
+RATE_HZ = 400.0
+predictor = cache(Predictor)
 
 ccitt, modbus, x25, maxim = map(
     crcmod.predefined.mkPredefinedCrcFun, ("crc-ccitt-false", "modbus", "x-25", "crc-8-maxim")
@@ -134,102 +147,139 @@ def ticks(k, q):
 
 @dataclass(frozen=True)
 class Kind:
-    """A board, the options that doctor asks for, and where it is plugged in."""
+    """A board, what its user knows of the gain, and what doctor asks for without it."""
 
-    encode: object
-    words: tuple[str, ...] = ()
-    line: str = "pty"
+    encode: Callable[[int, np.ndarray], bytes]
+    gain: dict = field(default_factory=dict)
     model: str = FOUR
-    asks: str = ""
-    options: dict = field(default_factory=dict)
+    url: str = "/dev/ttyACM0"
+    request: Request | None = None
 
 
 ZOO = {
-    "24 bits, big-endian": Kind(big_24_bit, ("--pC-per-unit", "2e-4"), asks="--pC-per-unit"),
-    "offset binary": Kind(offset_binary, ("--pC-per-unit", "0.0625"), asks="--pC-per-unit"),
-    "CSV counts, dead inputs": Kind(csv_counts, ("--pC-per-unit", "0.05"), asks="--pC-per-unit"),
+    "24 bits, big-endian": Kind(big_24_bit, {"pC_per_unit": 2e-4}),
+    "offset binary": Kind(offset_binary, {"pC_per_unit": 0.0625}),
+    "CSV counts, dead inputs": Kind(csv_counts, {"pC_per_unit": 0.05}),
     "JSON of other names": Kind(other_names),
-    "length-prefixed": Kind(length_prefixed, ("--pC-per-unit", "1e-3"), asks="--pC-per-unit"),
+    "length-prefixed": Kind(length_prefixed, {"pC_per_unit": 1e-3}),
     "Teleplot": Kind(teleplot),
     "Arduino plotter": Kind(arduino_plotter),
-    "half-duplex with echo": Kind(
-        answer, ("--request", r"?\n", "--request-Hz", "300"), "asked", THREE, options={"request": b"?\n"}
-    ),
-    "Modbus over TCP": Kind(modbus_reply, ("--pC-per-unit", "0.0625"), "tcp", asks="--pC-per-unit"),
-    "volts": Kind(volts, ("--V-per-unit", "-1", "--feedback-pF", "1000"), asks="--feedback-pF"),
-    "structs over UDP": Kind(bare_struct, line="udp"),
-    "JSON over UDP": Kind(other_names, line="udp"),
-    "COBS": Kind(stuffed_by_cobs, ("--pC-per-unit", "1e-3"), asks="--pC-per-unit"),
+    "a board that is asked": Kind(answer, model=THREE, request=Request(b"?\n", 300.0, echo=True)),
+    "Modbus": Kind(modbus_reply, {"pC_per_unit": 0.0625}),
+    "volts": Kind(volts, {"V_per_unit": -1.0, "feedback_pF": 1000.0}),
+    "structs over UDP": Kind(bare_struct, url="udp://127.0.0.1:9"),
+    "JSON over UDP": Kind(other_names, url="udp://127.0.0.1:9"),
+    "COBS": Kind(stuffed_by_cobs, {"pC_per_unit": 1e-3}),
     "SLIP": Kind(stuffed_by_slip, model=THREE),
-    "sentences": Kind(sentence, ("--pC-per-unit", "0.02"), asks="--pC-per-unit"),
-    "eight inputs": Kind(converter_of_eight, ("--pC-per-unit", "1e-3"), asks="--pC-per-unit"),
+    "sentences": Kind(sentence, {"pC_per_unit": 0.02}),
+    "eight inputs": Kind(converter_of_eight, {"pC_per_unit": 1e-3}),
     "odd ticks": Kind(ticks),
 }
 
 
+class Board:
+    """A board on a clock of its own: 400 frames a second, three in a chunk; at rest, with offset and noise."""
+
+    def __init__(self, kind):
+        self.encode, self.press_pC = kind.encode, np.array(PRESSES[kind.model])
+        self.rng = np.random.default_rng(len(self.press_pC))
+        self.rest_pC = self.rng.uniform(-8.0, 8.0, len(self.press_pC))
+        self.frames = 0
+
+    def frame(self, *, pressed=False):
+        charge_pC = self.rest_pC + self.rng.normal(0.0, 0.3, len(self.rest_pC)) + self.press_pC * pressed
+        self.frames += 1
+        return self.encode(self.frames - 1, charge_pC)
+
+    def chunks(self, count, *, pressed=False):
+        for _ in range(count // 3):
+            yield Chunk(b"".join(self.frame(pressed=pressed) for _ in range(3)), 1.7e9 + self.frames / RATE_HZ, 0)
+
+
+def examined(board, kind, gain):
+    """What doctor finds in a second of a board."""
+    heard = Heard(kind.url, 115200, kind.request, list(board.chunks(330)), 0.825)
+    return findings(heard, electrodes=predictor(kind.model).metadata.electrodes, gain=gain)
+
+
 @pytest.fixture
-def diagnosed(command, tmp_path, plug_in, board):
-    """Plug a board in, and let doctor write its file: (board, file, what doctor says)."""
+def written(tmp_path):
+    """Write the device file that doctor proposes: its path."""
 
-    def diagnose(kind, *words, name="board.toml"):
-        plugged = plug_in(board(kind.encode, np.array(PRESSES[kind.model]), kind.line, **kind.options))
-        path = tmp_path / name
-        code, out, err = command(
-            "serve", "doctor", "--port", plugged.url, "--seconds", "0.8", "--model", kind.model, "--write", path, *words
-        )
-        assert code == 0, out + err
-        return plugged, path, out
+    def write(examination):
+        path = tmp_path / "board.toml"
+        path.write_text(device_text(examination), "utf-8")
+        return path
 
-    return diagnose
+    return write
 
 
-def touch(command, plugged, path, model):
-    """The mean of position (mm) and force (N) over the end of a press, and all records."""
-    plugged.press_in(1.2)
-    code, out, err = command("serve", "stream", model, "--port", plugged.url, "--device", path, "--count", "650")
-    assert code == 0, err
-    records = [json.loads(line) for line in out.splitlines()]
+def check_touch(records, model):
+    """The end of a press is where the model sees it in the true charges."""
     pressed = [record for record in records if record["contact"]][20:]
-    assert len(pressed) > 50, err
-    assert all("restart" not in record["flags"] and "gap" not in record["flags"] for record in records), err
-    return np.mean([[record[key] for key in ("x_mm", "y_mm", "force_N")] for record in pressed], axis=0), records
-
-
-@pytest.mark.parametrize("name", ZOO)
-def test_a_board_gets_to_a_right_touch(name, diagnosed, command):
-    kind = ZOO[name]
-    plugged, path, words = diagnosed(kind, *kind.words)
-    assert "not one byte" not in words
-    (x_mm, y_mm, force_N), records = touch(command, plugged, path, kind.model)
-    expected = Predictor(kind.model).predict(PRESSES[kind.model])
+    assert len(pressed) > 50
+    expected = predictor(model).predict(PRESSES[model])
+    x_mm, y_mm, force_N = np.mean([[record[key] for key in ("x_mm", "y_mm", "force_N")] for record in pressed], axis=0)
     assert np.hypot(x_mm - expected.x_mm, y_mm - expected.y_mm) < 0.03
     assert abs(force_N / expected.force_N - 1.0) < 0.005
+    assert all("restart" not in record["flags"] and "gap" not in record["flags"] for record in records)
     clock = [record["t_device_us"] for record in records if record["t_device_us"] is not None]
     assert (np.diff(clock) > 0).all()
 
 
-@pytest.mark.parametrize("name", ["offset binary", "CSV counts, dead inputs", "volts"])
-def test_what_cannot_be_seen_is_asked_for(name, diagnosed, command):
-    """Raw counts are never called pC, and a file without their charge is refused, not guessed."""
+@pytest.mark.parametrize("name", ZOO)
+def test_a_board_gets_to_a_right_touch(name, written):
     kind = ZOO[name]
-    plugged, path, words = diagnosed(kind)
-    assert kind.asks in words
-    table = words[words.index("channel ") :].splitlines()[0]
-    assert "pC" not in table
-    code, _, err = command("serve", "stream", kind.model, "--port", plugged.url, "--device", path, "--seconds", "1")
-    assert (code, "gain.pC_per_unit" in err) == (2, True)
+    board = Board(kind)
+    examination = examined(board, kind, kind.gain)
+    stream = TouchStream(predictor(kind.model), load_device(written(examination)))
+    chunks = [*board.chunks(480), *board.chunks(171, pressed=True)]
+    check_touch([json.loads(record.to_json()) for chunk in chunks for record in stream.feed(chunk)], kind.model)
 
 
-def test_three_channels_for_a_model_of_four(diagnosed, command, board, plug_in):
-    """The models that this board can serve are named, and one of them works with the file."""
-    plugged = plug_in(board(answer, np.array(PRESSES[THREE])))
-    code, out, err = command("serve", "doctor", "--port", plugged.url, "--seconds", "1", "--model", FOUR)
-    assert "3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')" in out
-    assert f"models of 3 electrodes: {THREE}" in err
-    assert code == 0
-    kind = Kind(answer, model=THREE)
-    plugged, path, _ = diagnosed(kind)
-    (x_mm, y_mm, force_N), _ = touch(command, plugged, path, THREE)
-    expected = Predictor(THREE).predict(PRESSES[THREE])
-    assert np.hypot(x_mm - expected.x_mm, y_mm - expected.y_mm) < 0.03
-    assert abs(force_N / expected.force_N - 1.0) < 0.005
+@pytest.mark.parametrize(
+    ("name", "asked"),
+    [
+        ("offset binary", "--pC-per-unit NUMBER, negative"),
+        ("CSV counts, dead inputs", "--pC-per-unit NUMBER, negative"),
+        ("volts", "--feedback-pF"),
+    ],
+)
+def test_what_cannot_be_seen_is_asked_for(name, asked, written):
+    """Raw counts are never called pC, and a file without their charge is refused, not guessed."""
+    examination = examined(Board(ZOO[name]), ZOO[name], {})
+    assert asked in " ".join(examination.missing)
+    assert examination.unit != "pC"
+    with pytest.raises(DeviceError, match=r"gain\.pC_per_unit"):
+        load_device(written(examination))
+
+
+@pytest.mark.xdist_group("clock")
+def test_a_board_that_is_plugged_in(command, tmp_path):
+    """By the commands, over a pseudo-terminal; at first for a model of four electrodes, which does not fit."""
+    kind, port, stop = Kind(answer, model=THREE), PseudoPort(), threading.Event()
+    board, sent, rest = Board(kind), 0, float("inf")
+
+    def send():
+        nonlocal sent
+        while not stop.wait(0.0025):
+            sent += port.write_whole(board.frame(pressed=sent > rest))
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        path = tmp_path / "board.toml"
+        doctor = ("serve", "doctor", "--port", port.url, "--seconds", "0.8")
+        code, out, err = command(*doctor, "--model", FOUR)
+        assert code == 0
+        assert "3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')" in out
+        assert f"models of 3 electrodes: {THREE}" in err
+        assert command(*doctor, "--model", THREE, "--write", path)[0] == 0
+        rest = sent + 600  # of which the port may hold two hundred that nobody reads
+        code, out, err = command("serve", "stream", THREE, "--port", port.url, "--device", path, "--count", "750")
+        assert code == 0, err
+    finally:
+        stop.set()
+        sender.join()
+        port.close()
+    check_touch([json.loads(line) for line in out.splitlines()], THREE)

@@ -1,22 +1,62 @@
-"""Listening at one speed after the other, on a port whose speed is not known."""
+"""Listening at one speed after the other, on ports whose speed, echo or silence is not known."""
 
-import random
+import os
+import socket
+import threading
 import time
+import tty
+from contextlib import suppress
 
 import pytest
 
 from isocharge.serve import examine
 from isocharge.serve.examination import listening
+from isocharge.serve.examination.listening import Heard, listen
+from isocharge.serve.port.request import Request
 from isocharge.serve.port.serial_port import Chunk
+
+pytestmark = pytest.mark.xdist_group("clock")
+
+
+@pytest.fixture
+def pty():
+    """A pseudo-terminal: the descriptor of the board's end, and the path of the reader's."""
+    board, reader = os.openpty()
+    tty.setraw(reader)
+    os.set_blocking(board, False)
+    yield board, os.ttyname(reader)
+    os.close(board)
+    os.close(reader)
+
+
+@pytest.fixture
+def run(pty):  # noqa: ARG001 - the threads end before the pseudo-terminal does
+    """Call a function in a thread again and again, until the test ends."""
+    stop, threads = threading.Event(), []
+
+    def start(function, pause_s=0.0):
+        def loop():
+            while not stop.wait(pause_s):
+                function()
+
+        threads.append(threading.Thread(target=loop))
+        threads[-1].start()
+
+    yield start
+    stop.set()
+    for thread in threads:
+        thread.join()
 
 
 class PortOfOneSpeed:
-    """A serial port that gives lines at 57600 bit/s, and something else at other speeds; times are by the clock."""
+    """A serial port that gives lines at 57600 bit/s, other bytes at other speeds; a read moves a clock of its own."""
+
+    echo_share, opened = 0.0, []
+    now_s = 0.0
 
     def __init__(self, url, *, baud, request):
-        self.baud, self.opened, self.sent, self.random = baud, time.monotonic(), 0, random.Random(baud)
-        assert url == "/dev/ttyUSB9"
-        assert request is None
+        self.baud, self.lines = baud, 0
+        self.opened.append((url, baud, request))
 
     def __enter__(self):
         return self
@@ -25,28 +65,37 @@ class PortOfOneSpeed:
         pass
 
     def read(self, timeout_s):
-        time.sleep(min(timeout_s, 0.01))
-        due = int((time.monotonic() - self.opened) * 200)
-        lines = b"".join(b"A:%d.5,B:%d.25,C:7.5\n" % (k % 7, k % 5) for k in range(self.sent, due))
-        self.sent = due
-        data = lines if self.baud == 57600 else self.random.randbytes(len(lines) // 3)
-        return Chunk(data, time.time(), 0) if data else None
+        type(self).now_s += min(timeout_s, 0.01)
+        self.lines += 2
+        data = b"".join(b"A:%d.5,B:%d.25,C:7.5\n" % (k % 7, k % 5) for k in (self.lines, self.lines + 1))
+        return Chunk(data if self.baud == 57600 else b"\xf8\x80\xfe\xff", 1e9 + self.now_s, 0)
 
 
-@pytest.mark.parametrize("seconds", [0.6, 1.3])
-def test_the_speed_is_found(monkeypatch, seconds):
-    """What was heard in deciding is a part of the listening: the right speed takes no longer than asked for."""
+@pytest.fixture
+def opened(monkeypatch):
+    """(url, speed, request) of the ports that were opened."""
     monkeypatch.setattr(listening, "Port", PortOfOneSpeed)
-    report = examine("/dev/ttyUSB9", bauds=(115200, 57600, 9600), seconds=seconds)
-    assert (report.baud, report.good > 100) == (57600, True)
-    assert report.seconds == pytest.approx(seconds, abs=0.1)
+    monkeypatch.setattr(listening.time, "monotonic", lambda: PortOfOneSpeed.now_s)
+    monkeypatch.setattr(PortOfOneSpeed, "opened", [])
+    return PortOfOneSpeed.opened
 
 
-def test_no_speed_is_right(monkeypatch):
-    monkeypatch.setattr(listening, "Port", PortOfOneSpeed)
-    report = examine("/dev/ttyUSB9", bauds=(115200, 9600), seconds=0.6)
+def test_the_speed_is_found(opened):
+    report = examine("/dev/ttyUSB9", bauds=(115200, 57600, 9600), seconds=2.0)
+    assert (report.baud, report.good, report.seconds) == (57600, pytest.approx(400, abs=3), pytest.approx(2.0))
+    assert [baud for _, baud, _ in opened] == [115200, 57600, 57600]
+
+
+def test_no_speed_is_right(opened):
+    report = examine("/dev/ttyUSB9", bauds=(115200, 9600), seconds=1.0)
     assert (report.good, report.baud) == (0, 115200)
+    assert [baud for _, baud, _ in opened] == [115200, 9600, 115200]
     assert "another baud rate" in report.missing[0]
+
+
+def test_one_speed_is_not_tried(opened):
+    assert examine("/dev/ttyUSB9", bauds=(57600,), seconds=1.0).good > 190
+    assert len(opened) == 1
 
 
 @pytest.mark.parametrize(
@@ -55,3 +104,44 @@ def test_no_speed_is_right(monkeypatch):
 )
 def test_what_has_a_speed(url, has):
     assert listening.has_speed(url) == has
+
+
+def test_what_is_sent_is_heard_as_long_as_asked(run, pty):
+    board, url = pty
+    run(lambda: os.write(board, b"1,2\n"), 0.005)
+    began = time.monotonic()
+    heard = listen(url, (115200, 9600), 0.4, None, lambda _: False)
+    assert 0.4 <= heard.seconds <= time.monotonic() - began
+    assert heard.bytes_seen > 8
+    assert 0.0 < heard.span_s < heard.seconds + 0.2
+
+
+@pytest.mark.parametrize("echo", [True, False])
+def test_an_echo_is_found_out(run, pty, echo):
+    board, url = pty
+
+    def answer():
+        with suppress(BlockingIOError):
+            asked = os.read(board, 100)
+            os.write(board, (asked if echo else b"") + b"1,2\n")
+
+    run(answer, 0.001)
+    heard = listen(url, (115200,), 0.3, Request(b"?\n", 100.0), lambda _: True)
+    assert heard.request == Request(b"?\n", 100.0, echo=echo)
+    assert set(b"".join(heard.data).split(b"\n")) == {b"1,2", b""}
+
+
+def test_datagrams_are_chunks(run):
+    with socket.socket(type=socket.SOCK_DGRAM) as sender:
+        sender.bind(("127.0.0.1", 0))
+        url = f"udp://127.0.0.1:{sender.getsockname()[1] + 1}"
+        run(lambda: sender.sendto(b"\x01\x02\x03", ("127.0.0.1", int(url.rpartition(":")[2]))), 0.01)
+        heard = listen(url, (115200,), 0.3, None, lambda _: True)
+        assert heard.are_datagrams
+        assert set(heard.data) == {b"\x01\x02\x03"}
+
+
+def test_span_of_a_burst():
+    chunks = [Chunk(b"x", 100.0 + 0.1 * k, 0) for k in range(5)]
+    assert Heard("x", 1, chunks=chunks, seconds=3.0).span_s == pytest.approx(0.5)
+    assert Heard("x", 1, chunks=chunks[:1], seconds=3.0).span_s == 3.0

@@ -3,7 +3,6 @@
 import os
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 from isocharge.common.errors import PortLost
@@ -23,9 +22,6 @@ ECHO_S = 0.3
 ECHO_SHARE = 0.7
 """Share of requests that come back from which a line has an echo, dimensionless."""
 
-STEP_S = 0.1
-"""Longest wait for a byte before the clock is looked at, s."""
-
 
 @dataclass
 class Heard:
@@ -36,6 +32,7 @@ class Heard:
         request: What the board was asked.
         chunks: The bytes as they came.
         seconds: Time of listening, s.
+        echo_share: Share of the requests that the line brought back, dimensionless.
     """
 
     url: str
@@ -43,6 +40,7 @@ class Heard:
     request: Request | None = None
     chunks: list[Chunk] = field(default_factory=list)
     seconds: float = 0.0
+    echo_share: float = 0.0
 
     @property
     def data(self) -> list[bytes]:
@@ -80,65 +78,35 @@ def listen(
     request: Request | None,
     is_clear: Callable[[Heard], bool],
 ) -> Heard:
-    """Listen to a port, at the first of some speeds at which the bytes make sense.
+    """Listen to a port, at the first of some speeds at which the bytes make sense; silence is silence at any speed.
 
     Args:
         url: The port.
-        bauds: Speeds to try, bit/s.
-        seconds: Time of listening, s; what is heard in deciding for a speed is a part of it.
+        bauds: Speeds to try, each for a second, bit/s.
+        seconds: Time of listening at the right one, s.
         request: What the board has to be asked; whether the line brings it back is found out.
-        is_clear: Whether bytes make sense; asked once, while more come.
+        is_clear: Whether bytes make sense.
 
     Raises:
         PortError: If the port cannot be opened.
     """
-    if not has_speed(url):
-        bauds = bauds[:1]
-    best: Heard | None = None
-    for baud in bauds:
-        heard, clear = _listen(Heard(url, baud, request), seconds, is_clear if len(bauds) > 1 else None)
-        if clear or not heard.chunks:  # silence is silence at any speed
-            return heard
-        best = best or heard
-    assert best is not None
-    return best
+    if request is not None and not request.echo:
+        request = replace(request, echo=_listen(url, bauds[0], ECHO_S, request).echo_share >= ECHO_SHARE)
+    if has_speed(url) and len(bauds) > 1:
+        tries = (_listen(url, baud, TRY_S, request) for baud in bauds)
+        bauds = [next((heard.baud for heard in tries if not heard.chunks or is_clear(heard)), bauds[0])]
+    return _listen(url, bauds[0], seconds, request)
 
 
-def _listen(heard: Heard, seconds: float, is_clear: Callable[[Heard], bool] | None) -> tuple[Heard, bool]:
-    if heard.request is not None and not heard.request.echo:
-        heard.request = _with_echo(heard)
-        seconds = max(STEP_S, seconds - ECHO_S)
-    answer: Future[bool] | None = None
-    began = time.monotonic()
-    with (
-        Port(heard.url, baud=heard.baud, request=heard.request) as port,
-        ThreadPoolExecutor(1) as pool,
-    ):
-        while (left_s := began + seconds - time.monotonic()) > 0.0:
-            try:
-                chunk = port.read(min(STEP_S, left_s))
-            except PortLost:
-                break  # the check uses what came before
-            heard.chunks += [chunk] if chunk else []
-            heard.seconds = time.monotonic() - began
-            if is_clear and answer is None and heard.seconds >= TRY_S and heard.chunks:
-                answer = pool.submit(is_clear, replace(heard, chunks=list(heard.chunks)))
-            if answer is not None and answer.done() and not answer.result():
-                return heard, False
-        heard.seconds = time.monotonic() - began
-    if is_clear is None:
-        return heard, True
-    return heard, answer.result() if answer else is_clear(heard)
-
-
-def _with_echo(heard: Heard) -> Request:
-    """The request, with the knowledge whether the line brings it back."""
-    assert heard.request is not None
-    end_s = time.monotonic() + ECHO_S
-    with Port(heard.url, baud=heard.baud, request=heard.request) as port:
-        while (left_s := end_s - time.monotonic()) > 0.0:
-            try:
-                port.read(left_s)
-            except PortLost:
-                break
-        return replace(heard.request, echo=port.echo_share >= ECHO_SHARE)
+def _listen(url: str, baud: int, seconds: float, request: Request | None) -> Heard:
+    """Listen for a while; after the loss of a port, what came before counts."""
+    heard, began = Heard(url, baud, request), time.monotonic()
+    with Port(url, baud=baud, request=request) as port:
+        try:
+            while (left_s := began + seconds - time.monotonic()) > 0.0:
+                chunk = port.read(left_s)
+                heard.chunks += [chunk] if chunk else []
+        except PortLost:
+            pass
+    heard.seconds, heard.echo_share = time.monotonic() - began, port.echo_share
+    return heard

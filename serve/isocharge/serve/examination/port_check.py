@@ -11,7 +11,8 @@ import numpy as np
 from isocharge.serve.examination.capture import Capture, read_frames
 from isocharge.serve.examination.channel_health import MAINS_HZ, ChannelHealth, channel_health
 from isocharge.serve.examination.listening import BAUDS, Heard, listen
-from isocharge.serve.examination.proposal import Gain, Proposal, propose, unit_of
+from isocharge.serve.examination.proposal import Proposal, propose, unit_of
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.channels import position_of
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
 from isocharge.serve.port.request import Request
@@ -29,6 +30,14 @@ HUM_LIMIT_PC = 0.5
 
 DRIFT_LIMIT_PC_PER_S = 2.0
 """Largest harmless drift, pC/s."""
+
+TO_ASK_FOR = {
+    "counts": "the charge of one count, pC: --pC-per-unit NUMBER, negative where the amplifier inverts (1 if these are "
+    "pC)",
+    "V": "the amplifier's feedback capacitance, if these are volts: --V-per-unit 1 --feedback-pF NUMBER; or the charge "
+    "of one unit, pC: --pC-per-unit NUMBER (1 if these are pC)",
+}
+"""What is missing of the gain, by the unit of the channels."""
 
 
 @dataclass(frozen=True)
@@ -96,44 +105,42 @@ def examine(
         DeviceError: If the gain is wrong, or for other electrodes.
     """
     heard = listen(url, bauds, seconds, request or device.request, lambda part: _is_clear(part, device))
-    if device is not ANY_BOARD:
-        return _examination(heard, device, Proposal(dict(device.table), _unit(heard, device), electrodes))
-    proposal = propose(heard, "board", electrodes, Gain(gain or {}))
-    if proposal is None:
-        return _examination(heard, device, Proposal({}, "pC", electrodes))
-    table = {key: value for key, value in proposal.table.items() if not (key == "gain" and proposal.needs_gain)}
-    proposed = device_from_table(table, "board")
-    proposed.check_gain(proposal.electrodes)
-    return _examination(heard, proposed, proposal)
-
-
-def _unit(heard: Heard, device: Device) -> str:
-    """The unit of the channels behind the gain of a device."""
-    capture = read_frames(heard, device)
-    if device.gain is not None or not capture.frames:
-        return "pC"
-    return unit_of(capture.parser.format, capture.names, capture.values()[0])
+    return findings(heard, device=device, electrodes=electrodes, gain=gain)
 
 
 def _is_clear(heard: Heard, device: Device) -> bool:
     """Whether what was heard are frames, so that the speed is right."""
-    if device is not ANY_BOARD:
-        return read_frames(heard, device).share > RIGHT_BAUD_SHARE
-    frames = recognise(heard.data, heard.span_s, are_datagrams=heard.are_datagrams)
-    return (
-        frames is not None
-        and read_frames(heard, device_from_table({"frames": frames}, "board")).share > RIGHT_BAUD_SHARE
-    )
+    if device is ANY_BOARD:
+        frames = recognise(heard.data, heard.span_s, are_datagrams=heard.are_datagrams)
+        device = device_from_table({"frames": frames or {}}, "board")
+    return read_frames(heard, device).share > RIGHT_BAUD_SHARE
 
 
-def _examination(heard: Heard, device: Device, proposal: Proposal) -> Examination:
+def findings(
+    heard: Heard,
+    *,
+    device: Device = ANY_BOARD,
+    electrodes: tuple[str, ...] = (),
+    gain: Mapping[str, Any] | None = None,
+) -> Examination:
+    """What the bytes of a port say; the other arguments are those of `examine`.
+
+    Raises:
+        DeviceError: If the gain is wrong, or for other electrodes.
+    """
+    proposal = Proposal(dict(device.table), electrodes)
+    if device is ANY_BOARD:
+        proposal = propose(heard, electrodes, gain or {})
+        known = {key: value for key, value in proposal.table.items() if gain or key != "gain"}
+        device = device_from_table(known, "board")
+        device.check_gain(proposal.electrodes)
     capture = read_frames(heard, device)
+    unit = "pC" if device.gain is not None else unit_of(capture)
     used = _used(capture, device)
     channels = tuple(_channels(capture, device, used))
-    numbered = bool(capture.frames) and capture.frames[0].seq is not None
-    counts = capture.parser.counts
-    unused = tuple(name for position, name in enumerate(capture.names) if position not in used.values())
-    missing = _missing(heard, capture, channels, device, proposal)
+    first = capture.frames[0] if capture.frames else Frame(None, None, ())
+    counts, is_numbered = capture.parser.counts, first.seq is not None
+    unused = tuple(name for position, name in enumerate(capture.names) if position not in used)
     return Examination(
         url=heard.url,
         baud=heard.baud,
@@ -143,46 +150,48 @@ def _examination(heard: Heard, device: Device, proposal: Proposal) -> Examinatio
         rate_Hz=capture.rate_Hz,
         good=len(capture.frames),
         bad=counts.crc_errors + counts.malformed,
-        lost=capture.gaps.lost if numbered else None,
-        repeated=capture.gaps.repeated if numbered else None,
-        device_clock=bool(capture.frames) and capture.frames[0].t_us is not None,
-        unit=proposal.unit,
+        lost=capture.gaps.lost if is_numbered else None,
+        repeated=capture.gaps.repeated if is_numbered else None,
+        device_clock=first.t_us is not None,
+        unit=unit,
         channels=channels,
         unused=unused,
-        missing=tuple(missing),
+        missing=tuple(_missing(capture, channels, unused, device, proposal.electrodes, unit)),
         device=proposal.table,
     )
 
 
-def _used(capture: Capture, device: Device) -> dict[str, int]:
-    """Positions of the channels that electrodes use, under the channels' names; all where the file names none."""
-    names = capture.names
+def _used(capture: Capture, device: Device) -> dict[int, str]:
+    """Electrodes by the positions of their channels; all channels under their own names where the device names none."""
     if not device.channels or not capture.frames:
-        return {name: position for position, name in enumerate(names)}
-    positions = [position_of(channel, capture.frames[-1]) for channel in device.channels.values()]
-    return {names[position]: position for position in positions if position is not None}
+        return dict(enumerate(capture.names))
+    positions = {position_of(name, capture.frames[-1]): electrode for electrode, name in device.channels.items()}
+    return {position: electrode for position, electrode in positions.items() if position is not None}
 
 
-def _channels(capture: Capture, device: Device, used: Mapping[str, int]) -> Iterator[ChannelHealth]:
+def _channels(capture: Capture, device: Device, used: Mapping[int, str]) -> Iterator[ChannelHealth]:
     """The health of each channel that is used, from the frames that have as many values as the last one."""
     if not capture.frames:
         return
     values, times_s = capture.values()
-    last = capture.frames[-1]
-    electrodes = {position_of(channel, last): electrode for electrode, channel in device.channels.items()}
-    for name, position in used.items():
-        column = values[:, position]
-        with np.errstate(over="ignore"):
-            charge_pC = device.gain.charge_pC(electrodes.get(position, name), column) if device.gain else column
-        yield channel_health(name, charge_pC, times_s, capture.rate_Hz)
+    for position, electrode in used.items():
+        charge_pC = values[:, position]
+        if device.gain is not None:
+            with np.errstate(over="ignore"):
+                charge_pC = device.gain.charge_pC(electrode, charge_pC)
+        yield channel_health(capture.names[position], charge_pC, times_s, capture.rate_Hz)
 
 
 def _missing(
-    heard: Heard, capture: Capture, channels: tuple[ChannelHealth, ...], device: Device, proposal: Proposal
+    capture: Capture,
+    channels: tuple[ChannelHealth, ...],
+    unused: tuple[str, ...],
+    device: Device,
+    electrodes: tuple[str, ...],
+    unit: str,
 ) -> Iterator[str]:
     """One sentence for each thing that is missing to get a touch."""
-    electrodes = proposal.electrodes
-    if not heard.bytes_seen:
+    if not capture.bytes_seen:
         yield "not one byte came: check power and cable, and whether the board sends unasked (if not: --request)"
         return
     if not capture.frames:
@@ -196,60 +205,38 @@ def _missing(
     if capture.gaps.lost:
         yield f"{capture.gaps.lost} frames lost: a slower rate, or a faster link"
     if electrodes and len(channels) != len(electrodes) and not set(device.channels) >= set(electrodes):
+        alive = f"{len(channels)} channels" + (f" that live, of {len(capture.names)}" if unused else "")
         yield (
-            f"{_alive_words(capture, proposal)}, but the model has the electrodes {electrodes}: another model "
-            "(--model), or [channels] in a device file"
+            f"{alive}, but the model has the electrodes {electrodes}: another model (--model), or [channels] in a "
+            "device file"
         )
-    if proposal.needs_gain:
-        yield _gain_words(proposal)
-        yield from (
-            f"life on channel {channel.name}: every value is {channel.offset_pC:g}"
-            for channel in channels
-            if channel.span_pC == 0.0
-        )
-    else:
-        yield from _missing_in_channels(channels, device.tare or TareRule())
+    if unit != "pC":
+        yield TO_ASK_FOR[unit]
+    for channel in channels:
+        if channel.span_pC == 0.0:
+            yield f"life on channel {channel.name}: every value is {channel.offset_pC:g}"
+        if unit == "pC":
+            yield from _missing_in(channel, device.tare or TareRule())
     if capture.frames[0].t_us is None and device.leak is not None:
         yield "a device clock (t_us, t_ms or t_s): without it the leak is undone by arrival times, which jitter"
     if device.leak is None:
         yield "the amplifier's time constants ([leak] tau_s in a device file): without them held presses fade"
 
 
-def _gain_words(proposal: Proposal) -> str:
-    """What the user has to say about the amplifier."""
-    if proposal.unit == "V":
-        return (
-            "the amplifier's feedback capacitance, if these are volts: --V-per-unit 1 --feedback-pF NUMBER; or the "
-            "charge of one unit, pC: --pC-per-unit NUMBER (1 if these are pC)"
+def _missing_in(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
+    """What is wrong with the charges of a channel."""
+    if channel.unusable:
+        yield f"charges on channel {channel.name}: {channel.unusable} values are no numbers, or absurd"
+    if (noise_pC := channel.noise_pC or 0.0) > rule.noise_limit_pC:
+        yield f"quiet on channel {channel.name}: {noise_pC:.3g} pC rms, for a tare {rule.noise_limit_pC:g}"
+    if abs(channel.offset_pC or 0.0) > rule.offset_limit_pC:
+        yield (
+            f"rest near zero on channel {channel.name}: {channel.offset_pC:.4g} pC, a tare takes "
+            f"{rule.offset_limit_pC:g} (is something lying on the film? does the amplifier rest there? then [gain] "
+            "offset)"
         )
-    return "the charge of one count, pC: --pC-per-unit NUMBER, negative where the amplifier inverts (1 if these are pC)"
-
-
-def _dead_words(channel: ChannelHealth) -> str:
-    return f"life on channel {channel.name}: every value is {channel.offset_pC:g}"
-
-
-def _alive_words(capture: Capture, proposal: Proposal) -> str:
-    total, alive = len(capture.names), len(capture.names) - len(proposal.unused)
-    return f"{total} channels" if alive in (0, total) else f"{alive} channels that live, of {total}"
-
-
-def _missing_in_channels(channels: tuple[ChannelHealth, ...], rule: TareRule) -> Iterator[str]:
-    for channel in channels:
-        if channel.unusable:
-            yield f"charges on channel {channel.name}: {channel.unusable} values are no numbers, or absurd"
-        if (noise_pC := channel.noise_pC or 0.0) > rule.noise_limit_pC:
-            yield f"quiet on channel {channel.name}: {noise_pC:.3g} pC rms, for a tare {rule.noise_limit_pC:g}"
-        if abs(channel.offset_pC or 0.0) > rule.offset_limit_pC:
-            yield (
-                f"rest near zero on channel {channel.name}: {channel.offset_pC:.4g} pC, a tare takes "
-                f"{rule.offset_limit_pC:g} (is something lying on the film? does the amplifier rest there? then [gain] "
-                "offset)"
-            )
-        if channel.span_pC == 0.0:
-            yield _dead_words(channel)
-        if abs(drift := channel.drift_pC_per_s or 0.0) > DRIFT_LIMIT_PC_PER_S:
-            yield f"a steady channel {channel.name}: it drifts by {drift:.2g} pC/s"
-        for frequency, hum in zip(MAINS_HZ, channel.hum_pC, strict=True):
-            if hum is not None and hum > HUM_LIMIT_PC:
-                yield f"[hum] frequency_Hz = {frequency:g} (device file): channel {channel.name} hums by {hum:.2g} pC"
+    if abs(drift := channel.drift_pC_per_s or 0.0) > DRIFT_LIMIT_PC_PER_S:
+        yield f"a steady channel {channel.name}: it drifts by {drift:.2g} pC/s"
+    for frequency, hum in zip(MAINS_HZ, channel.hum_pC, strict=True):
+        if hum is not None and hum > HUM_LIMIT_PC:
+            yield f"[hum] frequency_Hz = {frequency:g} (device file): channel {channel.name} hums by {hum:.2g} pC"

@@ -3,9 +3,8 @@
 What cannot be seen from outside, the charge of one count, is asked for and never made up.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,95 +40,54 @@ ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Names of electrodes where no model says them."""
 
 
-@dataclass(frozen=True)
-class Gain:
-    """What the user knows of the amplifier.
-
-    Attributes:
-        settings: Keys of the section `[gain]`: pC_per_unit, or V_per_unit and feedback_pF; empty for nothing.
-    """
-
-    settings: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def largest_pC(self) -> float | None:
-        """Largest magnitude of the charge of one unit, pC; None where it is not known."""
-        factors = [_largest(self.settings[key]) for key in self.settings]
-        return float(np.prod(factors)) if factors else None
-
-
-def _largest(setting: Any) -> float:
-    return max(abs(float(value)) for value in (setting.values() if isinstance(setting, Mapping) else [setting]))
-
-
-@dataclass(frozen=True)
-class Proposal:
+class Proposal(NamedTuple):
     """A device file.
 
     Attributes:
-        table: Its content.
-        unit: Of the board's values: "pC", "counts" or "V".
+        table: Its content; empty if the frames are not recognised.
         electrodes: Those of the model, or as many names as channels are alive.
-        unused: Channels that are no electrodes.
-        is_complete: Whether every electrode has a channel.
     """
 
     table: dict[str, Any]
-    unit: str
-    electrodes: tuple[str, ...] = ()
-    unused: tuple[str, ...] = ()
-    is_complete: bool = True
-
-    @property
-    def needs_gain(self) -> bool:
-        """Whether the charge of one unit has to be filled in."""
-        return self.unit != "pC"
+    electrodes: tuple[str, ...]
 
 
-def propose(heard: Heard, name: str, electrodes: tuple[str, ...], gain: Gain) -> Proposal | None:
-    """The device file for a board; None if its frames are not recognised.
+def propose(heard: Heard, electrodes: tuple[str, ...], gain: Mapping[str, Any]) -> Proposal:
+    """The device file for a board.
 
     Args:
         heard: What it sent.
-        name: For the file.
         electrodes: Those of the model; empty if any will do.
-        gain: What the user knows of the amplifier.
+        gain: What the user knows of the amplifier: pC_per_unit, or V_per_unit and feedback_pF; empty for nothing.
     """
     frames = recognise(heard.data, heard.span_s, are_datagrams=heard.are_datagrams)
     if frames is None:
-        return None
+        return Proposal({}, electrodes)
     if heard.request is not None:
         frames |= {"request": heard.request.data.hex(" ").upper(), "request_Hz": heard.request.rate_Hz}
         frames |= {"echo": True} if heard.request.echo else {}
-    capture = read_frames(heard, device_from_table({"frames": frames}, name))
+    table: dict[str, Any] = {"name": "board", "frames": frames}
+    capture = read_frames(heard, device_from_table(table, "board"))
     if not capture.frames:
-        return None
+        return Proposal({}, electrodes)
     values, _ = capture.values()
-    unit = "pC" if gain.settings else unit_of(capture.parser.format, capture.names, values)
     chosen = _chosen(capture, values, electrodes)
-    table: dict[str, Any] = {"name": name, "frames": frames}
     if chosen:
         table["channels"] = {electrode: capture.names[position] for electrode, position in chosen.items()}
-    positions = chosen or {channel: position for position, channel in enumerate(capture.names)}
-    if section := _gain_section(gain, unit, values, positions if chosen else {}):
-        table["gain"] = section
-    unused = tuple(channel for position, channel in enumerate(capture.names) if position not in positions.values())
-    return Proposal(table, unit, electrodes or tuple(chosen), unused, bool(chosen))
+    if gain or unit_of(capture) != "pC":
+        columns = {electrode: values[:, position] for electrode, position in chosen.items()}
+        table["gain"] = _offsets(columns, gain) | dict(gain)
+    return Proposal(table, electrodes or tuple(chosen))
 
 
-def unit_of(format_name: str, names: Sequence[str], values: Array) -> str:
-    """The unit of the values where nothing is known of the gain: numbers with a fraction are taken as pC.
+def unit_of(capture: Capture) -> str:
+    """The unit of the values where nothing is known of the gain: "pC", "counts" or "V".
 
-    Args:
-        format_name: The format of the frames, for people; our binary frames hold pC.
-        names: Of the channels.
-        values: Shape (n, channels).
-
-    Returns:
-        "pC", "counts" or "V".
+    Our binary frames hold pC, and numbers with a fraction are taken for it.
     """
-    if format_name == BINARY or all(channel.endswith("_pC") for channel in names):
+    if not capture.frames or capture.parser.format == BINARY or all(name.endswith("_pC") for name in capture.names):
         return "pC"
+    values, _ = capture.values()
     finite = values[np.isfinite(values).all(axis=1)]
     varies = bool(len(finite)) and bool(np.ptp(finite, axis=0).any())
     if not varies and not np.abs(finite).max(initial=0.0) > LARGEST_STILL_PC:
@@ -138,7 +96,7 @@ def unit_of(format_name: str, names: Sequence[str], values: Array) -> str:
         return "counts"
     noise = [noise_of(column) for column in finite.T]
     is_small = float(np.abs(finite).max()) <= LARGEST_V and 0.0 < max(noise) <= LARGEST_NOISE_V
-    return "V" if is_small or all(channel.endswith("V") for channel in names) else "pC"
+    return "V" if is_small or all(name.endswith("V") for name in capture.names) else "pC"
 
 
 def _chosen(capture: Capture, values: Array, electrodes: tuple[str, ...]) -> dict[str, int]:
@@ -178,26 +136,31 @@ def _most_alike(values: Array, alive: list[int], count: int) -> list[int]:
     return alive[begin : begin + count]
 
 
-def _gain_section(gain: Gain, unit: str, values: Array, positions: Mapping[str, int]) -> dict[str, Any]:
-    """The section `[gain]`: what the user knows, and the rest of each channel where it is an offset."""
-    if unit == "pC" and not gain.settings:
-        return {}
-    offsets = {electrode: _offset(values[:, position]) for electrode, position in positions.items()}
-    rests = {electrode: rest_of(values[:, position]) for electrode, position in positions.items()}
-    largest_pC = gain.largest_pC
-    limit_pC = 0.5 * TareRule().offset_limit_pC
-    if largest_pC is not None:
-        is_offset = any(abs(rest) * largest_pC > limit_pC for rest in rests.values())
-        close = all(abs(rests[electrode] - offsets[electrode]) * largest_pC <= limit_pC for electrode in rests)
-        offsets = offsets if close else {electrode: _rounded(rest) for electrode, rest in rests.items()}
+def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, Any]:
+    """The key `offset` of the section `[gain]`, one for all electrodes if they are alike; nothing if they rest at 0."""
+    rests = {electrode: rest_of(column) for electrode, column in columns.items()}
+    offsets = {electrode: _offset(column) for electrode, column in columns.items()}
+    if gain:
+        limit = 0.5 * TareRule().offset_limit_pC / _largest_pC(gain)
+        is_offset = any(abs(rest) > limit for rest in rests.values())
+        if any(abs(rest - offsets[electrode]) > limit for electrode, rest in rests.items()):
+            offsets = {electrode: _rounded(rest) for electrode, rest in rests.items()}
     else:
-        noise = {electrode: noise_of(values[:, position]) for electrode, position in positions.items()}
-        is_offset = any(abs(rests[electrode]) > max(REST_SIGMAS * noise[electrode], 1e-9) for electrode in rests)
-    section: dict[str, Any] = {}
-    if is_offset and offsets:
-        alike = len(set(offsets.values())) == 1
-        section["offset"] = next(iter(offsets.values())) if alike else offsets
-    return section | dict(gain.settings)
+        noise = {electrode: noise_of(column) for electrode, column in columns.items()}
+        is_offset = any(abs(rest) > max(REST_SIGMAS * noise[electrode], 1e-9) for electrode, rest in rests.items())
+    if not is_offset:
+        return {}
+    alike = set(offsets.values())
+    return {"offset": alike.pop() if len(alike) == 1 else offsets}
+
+
+def _largest_pC(gain: Mapping[str, Any]) -> float:
+    """Largest magnitude of the charge of one unit, pC."""
+    largest = 1.0
+    for setting in gain.values():
+        numbers = setting.values() if isinstance(setting, Mapping) else [setting]
+        largest *= max(abs(float(number)) for number in numbers)
+    return largest
 
 
 def _offset(column: Array) -> float | int:
