@@ -70,7 +70,7 @@ def test_wander_depends_on_the_seed_alone():
     [
         {"force_range_N": (0.0, 2.0)},
         {"force_range_N": (2.0, 1.0)},
-        {"radius_mm": -1.0},
+        {"radius_mm": 0.0},
         {"rate_Hz": 0.0},
         {"seconds": 0.0},
     ],
@@ -78,6 +78,16 @@ def test_wander_depends_on_the_seed_alone():
 def test_wander_refuses_impossible_scripts(wrong):
     with pytest.raises(SceneError, match="wander: expected 0 < smallest"):
         wander(seed=0, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("t_s", "is_silent"), [(0.0, False), (0.5, False), (2.0, True), (2.4, True), (2.5, False), (4.1, True)]
+)
+def test_faults_recur_and_the_first_comes_after_one_period(t_s, is_silent):
+    gap, unplugged = Faults(gap_every_s=2.0, gap_s=0.5), Faults(unplug_every_s=2.0, unplug_s=0.5)
+    assert gap.is_silent(t_s) == unplugged.is_silent(t_s) == unplugged.is_unplugged(t_s) == is_silent
+    assert not gap.is_unplugged(t_s)
+    assert not Faults().is_silent(t_s)
 
 
 def test_script_arrays_agree():

@@ -30,17 +30,13 @@ class PseudoPort:
 
     def write_whole(self, data: bytes) -> bool:
         """Write all of `data`, or nothing if the reader is too far behind, without waiting; whether it was written."""
-        if self._waiting() + len(data) > PORT_BUFFER:
+        waiting = array.array("i", [0])
+        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, waiting)
+        if waiting[0] + len(data) > PORT_BUFFER:
             return False
         with contextlib.suppress(BlockingIOError):
             return os.write(self._writer, data) == len(data)
         return False
-
-    def _waiting(self) -> int:
-        """Number of bytes that the reader has not read yet."""
-        count = array.array("i", [0])
-        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, count)
-        return count[0]
 
     def close(self) -> None:
         """Make the port vanish, as when a cable is pulled."""

@@ -85,13 +85,18 @@ class Faults(Settings, frozen=True, kw_only=True):
     unplug_s: NotNegative = 0.5
     clock_ppm: Annotated[float, Meta(gt=-1e6, lt=1e6)] = 0.0
 
-    def in_gap(self, t_s: float) -> bool:
-        """Whether nothing is sent at this time, s from the start; the first gap comes after one interval."""
-        return self.gap_every_s > 0.0 and t_s >= self.gap_every_s and t_s % self.gap_every_s < self.gap_s
+    def is_silent(self, t_s: float) -> bool:
+        """Whether nothing is sent at this time, s from the start: a gap, or the port is away."""
+        return _is_in(t_s, self.gap_every_s, self.gap_s) or self.is_unplugged(t_s)
 
-    def unplugged(self, t_s: float) -> bool:
+    def is_unplugged(self, t_s: float) -> bool:
         """Whether the port is away at this time, s from the start."""
-        return self.unplug_every_s > 0.0 and t_s >= self.unplug_every_s and t_s % self.unplug_every_s < self.unplug_s
+        return _is_in(t_s, self.unplug_every_s, self.unplug_s)
+
+
+def _is_in(t_s: float, every_s: float, length_s: float) -> bool:
+    """Whether a time lies in one of the intervals that recur, the first after one period; a period of 0 has none."""
+    return every_s > 0.0 and t_s >= every_s and t_s % every_s < length_s
 
 
 class VirtualScript(Settings, frozen=True):
@@ -198,21 +203,14 @@ def _random_path(rng: np.random.Generator, t: Array) -> NDArray[np.complex128]:
 def _force_level(rng: np.random.Generator, t: Array, duration: float) -> Array:
     """Level of the force, from 0 (smallest) to 1 (largest), at times t from 0 to the duration, s, shape (n,)."""
     level = rng.uniform() + 0.15 * np.sin(2.0 * np.pi * (rng.uniform(0.3, 1.0) * t + rng.uniform()))
-    return np.clip(level, 0.0, 1.0) * _smooth_step(t / RAMP_S) * _smooth_step((duration - t) / RAMP_S)
-
-
-def _smooth_step(s: Array) -> Array:
-    s = np.clip(s, 0.0, 1.0)
-    return s * s * (3.0 - 2.0 * s)
+    ramp = np.clip(np.minimum(t, duration - t) / RAMP_S, 0.0, 1.0)
+    return np.clip(level, 0.0, 1.0) * ramp * ramp * (3.0 - 2.0 * ramp)
 
 
 def corrupt(data: bytes, share: float, rng: np.random.Generator) -> bytes:
     """Damage a share of bytes: a third each is flipped in one bit, dropped, or followed by a random byte."""
-    positions = np.flatnonzero(rng.random(len(data)) < share)
-    if not positions.size:
-        return data
     damaged = [bytes([byte]) for byte in data]
-    for position in positions.tolist():
+    for position in np.flatnonzero(rng.random(len(data)) < share).tolist():
         kind, extra = int(rng.integers(3)), int(rng.integers(256))
         flipped = bytes([data[position] ^ 1 << extra % 8])
         damaged[position] = (flipped, b"", bytes([data[position], extra]))[kind]

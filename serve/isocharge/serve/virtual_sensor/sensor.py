@@ -10,7 +10,7 @@ import itertools
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
@@ -64,6 +64,7 @@ class VirtualSensor:
     Readers may come and go. Entering the context sets the counters to 0.
 
     Attributes:
+        port_path: Device path of the pseudo-terminal that was opened first.
         withheld: Frames that did not fit into the port, because nobody read.
         lost: Frames that a fault lost.
         corrupted: Frames that a fault damaged.
@@ -108,21 +109,15 @@ class VirtualSensor:
         self._script, self._noise, self._encode = script, noise, encode
         self._faults, self._link = faults or Faults(), link
         self._clean_pC = _clean_charges(charges, script)
-        electrodes = self._clean_pC.shape[1]
-        random_pC = self._rng.uniform(-20.0, 20.0, electrodes)
+        random_pC = self._rng.uniform(-20.0, 20.0, self._clean_pC.shape[1])
         self._offset_pC = random_pC if offset_pC is None else np.asarray(offset_pC)
-        self._block = max(1, round(BLOCK_S * script.rate_Hz))
         self._sent_s = np.full(SEQ_MODULUS, np.nan)
+        self._frames = self.withheld = self.lost = self.corrupted = self.unplugged = 0
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
         self._port: PseudoPort | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
-        self._reset()
-
-    def _reset(self) -> None:
-        self._first_url = ""
-        self._frames = self.withheld = self.lost = self.corrupted = self.unplugged = 0
-        self._played_pC: list[tuple[float, ...]] = []
+        self.port_path = ""
 
     @property
     def url(self) -> str:
@@ -133,27 +128,55 @@ class VirtualSensor:
         """
         if self._writer is None:
             raise PortError("the virtual sensor does not play; use `with VirtualSensor(...) as sensor`")
-        return str(self._link) if self._link else self._first_url
-
-    @property
-    def port_path(self) -> str:
-        """The device path of the pseudo-terminal that was opened first."""
-        return self._first_url
+        return str(self._link or self.port_path)
 
     @property
     def sent(self) -> int:
         """Frames that were written."""
         return self._frames - self.withheld - self.lost
 
+    def frames(self) -> Iterator[bytes]:
+        """The bytes of each frame from the first on, by no clock; nothing for a frame that a fault loses."""
+        self.lost = self.corrupted = 0
+        block = max(1, round(BLOCK_S * self._script.rate_Hz))
+        for first in itertools.count(step=block):
+            clean_pC = self._clean_pC.take(range(first, first + block), axis=0, mode="wrap")
+            played_pC = clean_pC if self._noise is None else self._noise(clean_pC, self._rng)
+            for number, row in enumerate((played_pC + self._offset_pC).tolist(), first):
+                yield self._frame(number, tuple(row))
+
+    def _frame(self, number: int, charge_pC: tuple[float, ...]) -> bytes:
+        faults, t_s = self._faults, number / self._script.rate_Hz
+        if faults.is_silent(t_s) or (faults.lose_share and self._rng.random() < faults.lose_share):
+            self.lost += 1
+            return b""
+        t_us = round(t_s * (1e6 + faults.clock_ppm)) % T_US_MODULUS
+        whole = self._encode(Frame(number % SEQ_MODULUS, t_us, charge_pC))
+        data = corrupt(whole, faults.corrupt_share, self._rng) if faults.corrupt_share else whole
+        self.corrupted += data != whole
+        return data
+
+    def truth(self, seq: int) -> Truth:
+        """The press in the latest frame with this number.
+
+        Raises:
+            SceneError: If no frame had it yet.
+        """
+        latest = self._frames - 1
+        frame = latest - (latest - seq) % SEQ_MODULUS
+        if frame < 0 or not 0 <= seq < SEQ_MODULUS:
+            raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest, SEQ_MODULUS - 1)}")
+        at, script = frame % len(self._script), self._script
+        x_mm, y_mm, force_N = (float(values[at]) for values in (script.x_mm, script.y_mm, script.force_N))
+        return Truth(x_mm, y_mm, force_N, self._clean_pC[at], float(self._sent_s[seq]))
+
     def __enter__(self) -> Self:
         """Open the port and start to play."""
-        self._reset()
+        self._frames = self.withheld = self.unplugged = 0
         if self._link is None and self._faults.unplug_every_s > 0.0:
             self._folder = tempfile.TemporaryDirectory(prefix="isocharge-")
             self._link = Path(self._folder.name) / "film"
-        self._plug()
-        assert self._port is not None
-        self._first_url = self._port.url
+        self.port_path = self._plug().url
         self._stop.clear()
         self._writer = threading.Thread(target=self._play, name="virtual sensor", daemon=True)
         self._writer.start()
@@ -172,7 +195,23 @@ class VirtualSensor:
             self._folder.cleanup()
             self._folder = self._link = None
 
-    def _plug(self) -> None:
+    def _play(self) -> None:
+        start = time.perf_counter()
+        for number, data in enumerate(self.frames()):
+            t_s = number / self._script.rate_Hz
+            if self._stop.wait(max(0.0, start + t_s - time.perf_counter())):
+                return
+            self._sent_s[number % SEQ_MODULUS] = time.perf_counter()
+            self._frames = number + 1  # before writing: a quick reader may ask for the truth at once
+            if self._faults.is_unplugged(t_s):
+                self._unplug()
+            elif self._port is None:
+                self._plug()
+                self.unplugged += 1
+            if data and self._port is not None:
+                self.withheld += not self._port.write_whole(data)
+
+    def _plug(self) -> PseudoPort:
         port = PseudoPort()
         try:
             if self._link:
@@ -181,6 +220,7 @@ class VirtualSensor:
             port.close()
             raise
         self._port = port
+        return port
 
     def _unplug(self) -> None:
         if self._port is None:
@@ -189,63 +229,6 @@ class VirtualSensor:
             self._link.unlink(missing_ok=True)
         self._port.close()
         self._port = None
-
-    def truth(self, seq: int) -> Truth:
-        """The press in the latest frame with this number.
-
-        Raises:
-            SceneError: If no frame had it yet.
-        """
-        latest = self._frames - 1
-        frame = latest - (latest - seq) % SEQ_MODULUS
-        if frame < 0 or not 0 <= seq < SEQ_MODULUS:
-            raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest, SEQ_MODULUS - 1)}")
-        at, script = frame % len(self._script), self._script
-        x_mm, y_mm, force_N = (float(values[at]) for values in (script.x_mm, script.y_mm, script.force_N))
-        return Truth(x_mm, y_mm, force_N, self._clean_pC[at], float(self._sent_s[seq]))
-
-    def _play(self) -> None:
-        start = time.perf_counter()
-        for frame in itertools.count():
-            if frame % self._block == 0:
-                self._played_pC = self._measure(frame)
-            due = start + frame / self._script.rate_Hz
-            if self._stop.wait(max(0.0, due - time.perf_counter())):
-                return
-            self._send(frame)
-
-    def _measure(self, first: int) -> list[tuple[float, ...]]:
-        """The amplifier's output for the next block, one tuple for each frame."""
-        clean_pC = self._clean_pC.take(range(first, first + self._block), axis=0, mode="wrap")
-        played_pC = clean_pC if self._noise is None else self._noise(clean_pC, self._rng)
-        return [tuple(row) for row in (played_pC + self._offset_pC).tolist()]
-
-    def _send(self, frame: int) -> None:
-        t_s = frame / self._script.rate_Hz
-        seq, t_us = frame % SEQ_MODULUS, round(t_s * (1e6 + self._faults.clock_ppm)) % T_US_MODULUS
-        self._sent_s[seq] = time.perf_counter()
-        self._frames = frame + 1  # before writing: a quick reader may ask for the truth at once
-        port = self._plugged(t_s)
-        if port is None or self._faults.in_gap(t_s) or self._chance(self._faults.lose_share):
-            self.lost += 1
-            return
-        whole = self._encode(Frame(seq, t_us, self._played_pC[frame % self._block]))
-        data = corrupt(whole, self._faults.corrupt_share, self._rng) if self._faults.corrupt_share else whole
-        self.corrupted += data != whole
-        if not port.write_whole(data):
-            self.withheld += 1
-
-    def _chance(self, share: float) -> bool:
-        return share > 0.0 and self._rng.random() < share
-
-    def _plugged(self, t_s: float) -> PseudoPort | None:
-        """The port, or None while it is away; opens and closes it as the faults say."""
-        if self._faults.unplugged(t_s):
-            self._unplug()
-        elif self._port is None:
-            self._plug()
-            self.unplugged += 1
-        return self._port
 
 
 def _clean_charges(forward: Charges, script: Script) -> Array:
