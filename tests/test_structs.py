@@ -134,10 +134,10 @@ def test_files_that_are_none(tmp_path):
     ):
         path.write_bytes(content)
         with pytest.raises(DeviceError, match=rf"^{path}: {message}"):
-            read_toml(path, "a device file", DeviceError)
+            read_toml(path, "a device file", DeviceError, dict)
     with pytest.raises(DeviceError, match=r"cannot be read \(.*\); expected a device file in TOML"):
-        read_toml(tmp_path, "a device file", DeviceError)
+        read_toml(tmp_path, "a device file", DeviceError, dict)
     for content in (b"{", b"[" * 100_000, b"NaN", b"\xef", b"1" * 5000):
         path.write_bytes(content)
         with pytest.raises(DeviceError, match=rf"^{path}: (expected JSON, got|not a JSON file)"):
-            read_json(path, "a list", DeviceError)
+            read_json(path, "a list", DeviceError, list)

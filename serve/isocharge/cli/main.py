@@ -13,7 +13,7 @@ import typer
 from isocharge.cli.serve.app import serve_app
 from isocharge.cli.shared.lazy import lazy_group
 from isocharge.cli.shared.standard_streams import open_closed_streams
-from isocharge.cli.shared.terminal import cautions_to_stderr, say
+from isocharge.cli.shared.terminal import say, warnings_to_stderr
 from isocharge.cli.simulate.app import simulate_app
 from isocharge.cli.train.app import train_app
 from isocharge.common.errors import InputError, IsochargeError
@@ -48,7 +48,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     open_closed_streams()
     try:
-        with cautions_to_stderr():
+        with warnings_to_stderr():
             app()
     except (IsochargeError, OSError, MemoryError) as error:
         say(f"{type(error).__name__}: {error}")

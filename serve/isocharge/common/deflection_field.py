@@ -61,10 +61,8 @@ class DeflectionField:
 
     def fits(self, film: Any) -> bool:
         """Whether a film, as a sensor file describes it, is the one of this field."""
-        if not isinstance(film, Mapping):
-            return False
-        given = {key: film.get(key, 0.0 if key == "pretension_MPa" else None) for key in FILM_KEYS}
-        return all(is_close(given[key], self.film[key]) for key in FILM_KEYS)
+        given = {"pretension_MPa": 0.0, **film} if isinstance(film, Mapping) else {}
+        return all(_is_close(given.get(key), self.film[key]) for key in FILM_KEYS)
 
     def to_json(self) -> dict[str, Any]:
         """The content of the file."""
@@ -83,7 +81,7 @@ class DeflectionField:
         }
 
 
-def is_close(given: object, value: float) -> bool:
+def _is_close(given: object, value: float) -> bool:
     """Whether a value is a number, and this one."""
     return isinstance(given, int | float) and math.isclose(given, value, rel_tol=1e-6, abs_tol=1e-12)
 
@@ -106,7 +104,7 @@ def read_deflection_field(path: Path) -> DeflectionField:
     file = read_json(path, "a deflection field", InputError, _File)
     shares = np.frombuffer(file.deflection, "<u2").reshape(file.shape) / STEPS
     return DeflectionField(
-        {key: getattr(file.film, key) for key in FILM_KEYS},
+        file.film,
         file.probe_radius_mm,
         file.force_N,
         file.distance_mm,
@@ -118,19 +116,11 @@ def read_deflection_field(path: Path) -> DeflectionField:
 Increasing = Annotated[tuple[Finite, ...], Meta(min_length=1)]
 
 
-class _Film(Struct):
-    radius_mm: Finite
-    thickness_um: Finite
-    young_GPa: Finite
-    poisson: Finite
-    pretension_MPa: Finite
-
-
 class _File(Struct):
     """The content of the file; `deflection` are shares of the largest, in base64."""
 
     isocharge_deflection: Annotated[int, Meta(ge=VERSION, le=VERSION, description=f"the version {VERSION}")]
-    film: _Film
+    film: dict[str, Finite]
     probe_radius_mm: Positive
     force_N: Increasing
     distance_mm: Increasing
@@ -140,6 +130,8 @@ class _File(Struct):
     deflection: bytes
 
     def __post_init__(self) -> None:
+        if set(self.film) != set(FILM_KEYS):
+            raise WrongKey("film", f"the keys {', '.join(FILM_KEYS)}", list(self.film))
         for key in ("force_N", "distance_mm", "rings"):
             if any(a >= b for a, b in pairwise(getattr(self, key))):
                 raise WrongKey(key, "increasing numbers", list(getattr(self, key)))

@@ -6,7 +6,7 @@ import os
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
@@ -96,15 +96,12 @@ def new_file(path: Path) -> Iterator[Path]:
     refuse_existing(path)
     draft = _draft_of(path)
     try:
-        yield draft
-        sync_folder(draft)
-        refuse_existing(path)
-        draft.replace(path)
-        sync_folder(path.parent)
-    except OSError as error:
-        if isinstance(error, IsochargeError | BrokenPipeError):  # a pipe is no matter of this file
-            raise
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another output") from error
+        with _refusals_explained(path):
+            yield draft
+            sync_folder(draft)
+            refuse_existing(path)
+            draft.replace(path)
+            sync_folder(path.parent)
     finally:
         draft.unlink(missing_ok=True)
 
@@ -127,35 +124,38 @@ def new_folder(path: Path) -> Iterator[Path]:
     missing = [parent for parent in path.parents if not parent.exists()]
     draft = _draft_of(path)
     try:
-        draft.mkdir(parents=True)
-        yield draft
-        sync_folder(draft)
-        _rename(draft, path)
-        sync_folder(path.parent)
-    except BaseException as error:
+        with _refusals_explained(path):
+            draft.mkdir(parents=True)
+            yield draft
+            sync_folder(draft)
+            refuse_existing(path)  # another process may have been faster
+            draft.rename(path)
+            sync_folder(path.parent)
+    finally:
         shutil.rmtree(draft, ignore_errors=True)
-        for parent in missing:
-            _remove_empty(parent)
-        if isinstance(error, OSError) and not isinstance(error, IsochargeError):
-            raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another output") from error
-        raise
+        remove_empty(missing)
 
 
 def _draft_of(path: Path) -> Path:
     return path.with_name(f".{secrets.token_hex(4)}.draft")
 
 
-def _rename(draft: Path, path: Path) -> None:
+@contextmanager
+def _refusals_explained(path: Path) -> Iterator[None]:
+    """Turn the file system's errors into OutputError."""
     try:
-        draft.rename(path)
-    except OSError:
-        refuse_existing(path)  # another process was faster
-        raise
+        yield
+    except OSError as error:
+        if isinstance(error, IsochargeError | BrokenPipeError):  # a pipe is no matter of this file
+            raise
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another output") from error
 
 
-def _remove_empty(folder: Path) -> None:
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove the folders that are empty, the innermost first."""
+    for folder in folders:
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
 
 
 def sync_folder(folder: Path) -> None:

@@ -12,18 +12,6 @@ Listener = Callable[[str, int, int, str], None]
 
 _listener: ContextVar[Listener | None] = ContextVar("progress", default=None)
 
-Progress = Callable[[int, int], None]
-"""Called with (done, total)."""
-
-StageProgress = Callable[[int, int, str], None]
-"""Called with (done, total, stage): the name of the stage and its latest figure, for people."""
-
-Announce = Callable[[str], None]
-"""Called with the name of the step that begins."""
-
-Warn = Callable[[str], object]
-"""Called with a sentence that the user should read; the work goes on."""
-
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:

@@ -9,7 +9,7 @@
 A part counts only if its checksum exists and matches; all other parts are computed again.
 """
 
-import importlib
+import fcntl
 import io
 import json
 import logging
@@ -18,13 +18,21 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, OutputError, OutputExists, SolveError, TrainingError, cut
-from isocharge.common.files import new_folder, read_whole, refuse_existing, sha256_of, sync_folder, write_whole
+from isocharge.common.files import (
+    new_folder,
+    read_whole,
+    refuse_existing,
+    remove_empty,
+    sha256_of,
+    sync_folder,
+    write_whole,
+)
 from isocharge.common.structs import read_json
 
 Content = TypeVar("Content")
@@ -58,12 +66,10 @@ class ResumableRun:
             write_whole(self._place(name, final), data)
             write_whole(self._parts / f"{name}.sha256", sha256_of(data).encode())
 
-    def load(self, name: str, *, final: bool = False) -> bytes | None:
-        """A finished part, or None if it must be computed; a damaged part gives a warning and None."""
-        return self.load_as(name, bytes, final=final)
+    def load(self, name: str, decode: Callable[[bytes], Content], *, final: bool = False) -> Content | None:
+        """A finished part, or None if it must be computed; a damaged part gives a warning and None.
 
-    def load_as(self, name: str, decode: Callable[[bytes], Content], *, final: bool = False) -> Content | None:
-        """As `load`, and decoded; a part that cannot be decoded is damaged, too, whatever its checksum says.
+        A part that cannot be decoded is damaged, too, whatever its checksum says.
 
         Args:
             name: Of the part.
@@ -147,7 +153,7 @@ class _Keeping(Executor):
         part = f"{self._name}-{self._submitted:04d}.npy"
         self._submitted += 1
         kept: Future[Any] = Future()
-        if (saved := self._run.load_as(part, _array)) is not None:
+        if (saved := self._run.load(part, _array)) is not None:
             kept.set_result(saved)
             return kept
         computed = self._executor.submit(function, *args, **kwargs)
@@ -233,9 +239,7 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
                     draft.remove()
                 raise
     finally:
-        for parent in parents:
-            if parent.is_dir() and not any(parent.iterdir()):
-                parent.rmdir()
+        remove_empty(parents)
 
 
 @contextmanager
@@ -279,28 +283,17 @@ def _lock(folder: Path) -> Iterator[None]:
     """Keep other processes out; the system lets go if this one is killed."""
     with (folder / "lock").open("w") as file:
         try:
-            _lock_file(file)
-        except (BlockingIOError, PermissionError) as error:  # the latter on Windows
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
             raise OutputExists(
                 f"another process is at work in {folder}; wait for it, or choose another output"
             ) from error
         yield
 
 
-def _lock_file(file: IO[str]) -> None:
-    """Lock an open file until it is closed, by what the system has for it."""
-    try:
-        posix: Any = importlib.import_module("fcntl")
-    except ImportError:
-        windows: Any = importlib.import_module("msvcrt")
-        windows.locking(file.fileno(), windows.LK_NBLCK, 1)
-        return
-    posix.flock(file, posix.LOCK_EX | posix.LOCK_NB)
-
-
 def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
     try:
-        saved = read_json(folder / "run.json", "the settings of a run", InputError)
+        saved = read_json(folder / "run.json", "the settings of a run", InputError, dict[str, Any])
     except InputError as error:
         raise OutputExists(
             f"{folder} is in the way: it holds no run.json that can be read; choose another output or remove it"

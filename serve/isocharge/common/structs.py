@@ -26,7 +26,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, overload
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta, Struct, inspect
@@ -67,27 +67,19 @@ class WrongKey(ValueError):
         self.key = key
 
 
-@overload
-def read_toml(path: Path, what: str, error: type[InputError]) -> dict[str, Any]: ...
-@overload
-def read_toml(path: Path, what: str, error: type[InputError], kind: type[T]) -> T: ...
-def read_toml(path: Path, what: str, error: type[InputError], kind: Any = dict[str, Any]) -> Any:
+def read_toml(path: Path, what: str, error: type[InputError], kind: type[T]) -> T:
     """The content of a TOML file.
 
     Args:
         path: The file.
         what: What the file should be, for messages: "a device file".
         error: Raised if it cannot be read, or does not fit.
-        kind: The type of its content; by default it is given as it stands.
+        kind: The type of its content; `dict[str, Any]` for a table as it stands.
     """
     return parse_toml(_text(path, MOST_TOML_BYTES, what, "TOML", error), str(path), error, kind)
 
 
-@overload
-def read_json(path: Path, what: str, error: type[InputError]) -> Any: ...
-@overload
-def read_json(path: Path, what: str, error: type[InputError], kind: type[T]) -> T: ...
-def read_json(path: Path, what: str, error: type[InputError], kind: Any = Any) -> Any:
+def read_json(path: Path, what: str, error: type[InputError], kind: type[T]) -> T:
     """The content of a JSON file; the arguments are those of `read_toml`."""
     return parse_json(_text(path, MOST_JSON_BYTES, what, "JSON", error), str(path), error, kind)
 
@@ -101,11 +93,7 @@ def _text(path: Path, most: int, what: str, language: str, error: type[InputErro
         raise error(f"{path}: not a {language} file: not text in UTF-8: {cause}") from cause
 
 
-@overload
-def parse_toml(text: str, where: str, error: type[InputError]) -> dict[str, Any]: ...
-@overload
-def parse_toml(text: str, where: str, error: type[InputError], kind: type[T]) -> T: ...
-def parse_toml(text: str, where: str, error: type[InputError], kind: Any = dict[str, Any]) -> Any:
+def parse_toml(text: str, where: str, error: type[InputError], kind: type[T]) -> T:
     """The content of a text in TOML; `where` opens the message of the error."""
     if _DEEP_KEY.search(text):
         raise error(f"{where}: not a TOML file: a key of more than 32 parts")
@@ -116,11 +104,7 @@ def parse_toml(text: str, where: str, error: type[InputError], kind: Any = dict[
     return convert(content, kind, where, error)
 
 
-@overload
-def parse_json(text: str | bytes, where: str, error: type[InputError]) -> Any: ...
-@overload
-def parse_json(text: str | bytes, where: str, error: type[InputError], kind: type[T]) -> T: ...
-def parse_json(text: str | bytes, where: str, error: type[InputError], kind: Any = Any) -> Any:
+def parse_json(text: str | bytes, where: str, error: type[InputError], kind: type[T]) -> T:
     """The content of a text in JSON; `where`, if not empty, opens the message of the error."""
     try:
         return msgspec.json.decode(text, type=kind)
@@ -262,8 +246,8 @@ def _described(kind: inspect.Type) -> str:
             return _number("whole number", above, least, most)
         case inspect.BoolType():
             return "true or false"
-        case inspect.StrType(max_length=longest):
-            return "a text" if longest is None else f"a text of 1 to {longest} characters"
+        case inspect.StrType(max_length=int(longest)):
+            return f"a text of 1 to {longest} characters"
         case inspect.LiteralType(values=values):
             return _one_of(values)
         case inspect.EnumType(cls=cls):
@@ -272,30 +256,25 @@ def _described(kind: inspect.Type) -> str:
             options = [_described(item) for item in types if not isinstance(item, inspect.NoneType)]
             return " or ".join(dict.fromkeys(options))
         case inspect.TupleType(item_types=items):
-            return f"a list of {len(items)} {_plural(items[0])}"
+            return f"a list of {len(items)} {_noun(items[0])}s"
         case inspect.CollectionType(item_type=item, min_length=least):
-            return f"a list of {_plural(item)}" + (f", {least} or more" if least else "")
-        case inspect.StructType() | inspect.DictType():
-            return "a table"
-        case _:
-            return type(kind).__name__.removesuffix("Type").lower()
+            return f"a list of {_noun(item)}s" + (f", {least} or more" if least else "")
+    return f"a {_noun(kind)}"
 
 
-def _plural(kind: inspect.Type) -> str:
-    """What the items of a list are."""
-    match kind:
-        case inspect.Metadata(type=inner):
-            return _plural(inner)
-        case inspect.StrType():
-            return "texts"
-        case inspect.FloatType() | inspect.IntType():
-            return "numbers"
-        case inspect.StructType() | inspect.DictType():
-            return "tables"
-        case inspect.TupleType() | inspect.CollectionType():
-            return "lists"
-        case _:
-            return "values"
+_NOUNS: tuple[tuple[Any, str], ...] = (
+    (inspect.StrType, "text"),
+    ((inspect.FloatType, inspect.IntType), "number"),
+    ((inspect.StructType, inspect.DictType), "table"),
+    ((inspect.TupleType, inspect.CollectionType), "list"),
+    (inspect.BytesType, "text in base64"),
+)
+
+
+def _noun(kind: inspect.Type) -> str:
+    """What a value of a type is, in a word."""
+    plain = kind.type if isinstance(kind, inspect.Metadata) else kind
+    return next((noun for kinds, noun in _NOUNS if isinstance(plain, kinds)), "value")
 
 
 def _one_of(words: Iterable[object]) -> str:

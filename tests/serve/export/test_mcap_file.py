@@ -162,7 +162,7 @@ def vector(value):
 
 @pytest.mark.parametrize("encoding", RecordEncoding)
 @pytest.mark.usefixtures("rosbags_knows_json")
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(data=st.data())
 def test_rosbags_reads_every_message(tmp_path_factory, encoding, data):
     lines = [record.to_json() for record in data.draw(st.lists(records(), max_size=20))]
@@ -221,7 +221,7 @@ def test_readers_of_mcap_find_schemas_index_and_checksums(tmp_path):
         assert sum(1 for _ in NonSeekingReader(file, validate_crcs=True).iter_messages()) == 15000
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(record=records())
 def test_every_record_is_valid_under_its_schema(record):
     schema = record_schema(ELECTRODES)
@@ -236,22 +236,6 @@ def test_the_schema_refuses_what_is_no_record():
         assert not valid(record | {name: [1.0] if name != "contact" else None}), name
 
 
-def test_viewers_list_every_field_of_the_schema():
-    """Foxglove and Lichtblick take a topic's fields from `properties`, one plain type each."""
-
-    def check(schema):
-        assert schema["type"] == "object"
-        for field in schema["properties"].values():
-            assert field["type"] in ("boolean", "string", "number", "integer", "object", "array")
-            if field["type"] == "object":
-                check(field)
-
-    schema = record_schema(ELECTRODES)
-    check(schema)
-    assert set(schema["properties"]) == set(FIELDS)
-    assert set(schema["properties"]["tare_pC"]["properties"]) == set(ELECTRODES)
-
-
 def whole_messages(data):
     """The records in a file that may have no end."""
     messages = []
@@ -263,26 +247,22 @@ def whole_messages(data):
 def test_a_process_that_is_killed_leaves_all_but_the_last_second(tmp_path):
     path = tmp_path / "touch.mcap"
     code = f"""
-import sys, time
+import os, signal, sys
 from pathlib import Path
 from isocharge.serve.export.mcap_file import McapFile
-with McapFile(Path({str(path)!r}), ("A", "B", "C")) as file:
-    for number, line in enumerate(sys.stdin):
+clock = [0.0]
+with McapFile(Path({str(path)!r}), ("A", "B", "C"), now=lambda: clock[0]) as file:
+    for line in sys.stdin:
         file.write(line.rstrip())
-        print(number, flush=True)
-        time.sleep(0.02)
+        clock[0] += 0.02
+    os.kill(os.getpid(), signal.SIGKILL)
 """
-    lines = [press(number).to_json() for number in range(140)]  # no more than a pipe holds
-    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        process.stdin.write("\n".join(lines).encode())
-        process.stdin.flush()
-        for reply in process.stdout:
-            if int(reply) == 120:
-                break
-        process.send_signal(signal.SIGKILL)
+    lines = [press(number).to_json() for number in range(120)]
+    done = subprocess.run([sys.executable, "-c", code], input="\n".join(lines).encode(), timeout=60, check=False)
+    assert done.returncode == -signal.SIGKILL
     recovered = whole_messages(path.read_bytes())
     assert recovered == lines[: len(recovered)]
-    assert len(recovered) > 40  # of 120 in 2.4 s
+    assert len(recovered) >= 69  # of 120 in 2.4 s, written every second
 
 
 def test_a_full_disk_ends_the_file_and_not_the_stream(tmp_path, monkeypatch, caplog):
@@ -331,11 +311,6 @@ def test_nothing_is_overwritten(tmp_path):
     assert path.read_text() == "mine"
     with pytest.raises(OutputError, match="cannot be written: No such file"), McapFile(Path("/no/such/x"), ELECTRODES):
         pass
-
-
-def test_an_empty_file_is_one(tmp_path):
-    path = write(tmp_path / "touch.mcap", [], RecordEncoding.ros2)
-    assert read_with_rosbags(path) == {"/isocharge/record": [], "/isocharge/wrench": [], "/isocharge/pose": []}
 
 
 def test_records_wait_no_longer_than_a_second(tmp_path):

@@ -40,11 +40,6 @@ def test_highest_version_is_by_number(roots):
     for version in ("1", "10", "9", "011", "draft", ".11.abcd"):
         put(roots["given"], version=version)
     assert find_model("m", roots["given"]).name == "10"
-
-
-def test_version_by_name(roots):
-    put(roots["given"], version="1")
-    put(roots["given"], version="2")
     assert find_model("m/1", roots["given"]).name == "1"
 
 
@@ -89,9 +84,3 @@ def test_repository_that_was_named_must_be_there(roots):
     put(roots["current"])
     with pytest.raises(ModelError, match="nope: expected a folder of models"):
         find_model("m", roots["given"] / "nope")
-
-
-def test_folder_without_a_version_is_no_model(roots):
-    (roots["given"] / "m").mkdir()
-    with pytest.raises(ModelError, match="no model 'm'"):
-        find_model("m", roots["given"])

@@ -81,12 +81,6 @@ def test_unknown_values(read):
     np.testing.assert_array_equal(presses.charge_pC[1], [10, nan, 30])
 
 
-@pytest.mark.parametrize(("columns", "row"), [("force_N", "0.5"), ("x_mm,y_mm", "1,2")])
-def test_columns_that_are_absent_are_unknown(read, columns, row):
-    presses = read(f"{columns},A,B,C\n{row},10,20,30\n")
-    assert np.isnan(presses.contact).sum() == (2 if columns == "force_N" else 1)
-
-
 def test_uncertainty_is_the_caller_s_where_the_file_has_none(read):
     presses = read(f"{HEADER},force_std\n1,2,3,4,5,6,0.003\n1,2,3,4,5,6,\n", position_std_mm=0.3, force_std=0.02)
     assert presses.position_std_mm.tolist() == [0.3, 0.3]
@@ -153,28 +147,11 @@ def test_the_command_of_the_message_repairs_the_file(read, tmp_path, shell):
     assert read_presses(tmp_path / "new.csv", NAMES) == read(f"{HEADER}\n1.5,2,0.5,4,5,6\n")
 
 
-@pytest.mark.parametrize(
-    "text",
-    [",".join(["x"] * 1001), "x" * 2_000_000, HEADER + '\n"' + "1\n" * 100_000, ",".join(["A"] * 900)],
-    ids=["columns", "line", "open quote", "repeated"],
-)
-def test_absurd_sizes_are_refused_in_short(read, text):
-    with pytest.raises(PressError) as caught:
-        read(text)
-    assert len(str(caught.value)) < 700
-
-
 def test_too_many_presses(monkeypatch, read):
     monkeypatch.setattr(measured_presses, "MOST_ROWS", 3)
     assert len(read(HEADER + "\n1,2,3,4,5,6" * 3)) == 3
     with pytest.raises(PressError, match="expected at most 3 presses, got more; split the file"):
         read(HEADER + "\n1,2,3,4,5,6" * 4)
-
-
-def test_defaults_that_are_refused(read):
-    for options in ({"position_std_mm": 0.0}, {"force_std": float("nan")}, {"force_std": 1.5}):
-        with pytest.raises(PressError, match="expected a positive s"):
-            read(f"{HEADER}\n1,2,3,4,5,6\n", **options)
 
 
 @pytest.mark.parametrize("names", [(), ("A", "A"), ("",), ("force_N",), ("force_std", "A"), ("A\nB",)])
@@ -223,7 +200,7 @@ def some_presses(draw):
 
 
 @given(presses=some_presses())
-@settings(derandomize=True, max_examples=300)
+@settings(derandomize=True, max_examples=60)
 def test_what_is_written_is_read(presses, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "written.csv"
     write_presses(path, presses)
@@ -240,7 +217,7 @@ def test_a_written_file_is_plain_csv(read):
 
 
 @given(data=st.binary(max_size=200) | st.text(max_size=200).map(lambda text: (HEADER + "\n" + text).encode()))
-@settings(derandomize=True, max_examples=300)
+@settings(derandomize=True, max_examples=100)
 def test_any_bytes_are_presses_or_a_press_error(data, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "any.csv"
     path.write_bytes(data)

@@ -70,14 +70,13 @@ def test_a_film_that_fits(predictor, measure):
 
 def test_a_film_that_fits_is_hardly_ever_called_another(predictor, measure):
     """p values of films that fit are uniform, and the verdict errs as rarely as it says."""
-    checks = [check_presses(predictor, measure(12, seed=seed)) for seed in range(300)]
+    checks = [check_presses(predictor, measure(12, seed=seed)) for seed in range(150)]
     assert stats.kstest([check.agreement.p_value for check in checks], "uniform").pvalue > 0.01
-    assert sum(not check.fits for check in checks) <= 8  # 1 % of 300, and three deviations
+    assert sum(not check.fits for check in checks) <= 5  # 1 % of 150, and three deviations
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_a_scale_of_the_force_is_recognised(predictor, measure, seed):
-    check = check_presses(predictor, measure(20, seed=seed, force_scale=1.05))
+def test_a_scale_of_the_force_is_recognised(predictor, measure):
+    check = check_presses(predictor, measure(20, force_scale=1.05))
     assert check.fits is False
     assert check.verdict.startswith("does not fit: ")
     assert check.agreement.force.mean == pytest.approx(0.05, abs=4 * check.agreement.force.std)
@@ -92,14 +91,6 @@ def test_a_common_shift_is_recognised_before_the_sum_of_squares_tells(predictor,
     assert check.agreement.p_value > check.agreement.common_p_value
     assert check.agreement.shift_x.mean == pytest.approx(0.06, abs=4 * check.agreement.shift_x.std)
     assert any(note.startswith("positions are off by (0.0") for note in check.notes)
-
-
-def test_scatter_without_a_common_part_is_recognised(predictor, measure):
-    check = check_presses(predictor, measure(30, seed=2, noise=5.0))
-    assert check.fits is False
-    assert check.agreement.common_p_value > 1e-3
-    squares = np.sum(check.errors.error[:, :2] ** 2, axis=1).mean() - check.position_mm.explained**2
-    assert check.position_mm.beyond == pytest.approx(squares**0.5)
 
 
 @pytest.mark.parametrize(("known", "degrees"), [((True, False), 40), ((False, True), 20)])

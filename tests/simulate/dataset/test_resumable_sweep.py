@@ -210,8 +210,8 @@ def test_a_part_is_what_was_saved(tmp_path):
     with pytest.raises(Stopped):
         save_and_raise(tmp_path / "out", Stopped())
     with resume_folder(tmp_path / "out", {"a": [1, 2]}) as draft:
-        assert draft.load("part") == b"1"
-        assert draft.load("other") is None
+        assert draft.load("part", bytes) == b"1"
+        assert draft.load("other", bytes) is None
         (draft.data / "file").write_bytes(b"2")
     assert files(tmp_path / "out") == {"file": b"2"}
 

@@ -16,12 +16,13 @@ from isocharge.cli.demo.page import Live, draw_page
 from isocharge.cli.shared.live_page import LiveOption, page_address
 from isocharge.cli.shared.options import ConfigOption
 from isocharge.cli.shared.terminal import say, shown_progress, this_command
-from isocharge.cli.shared.virtual_sensor import check_pseudo_terminals, virtual_sensor
+from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.arrays import Array
 from isocharge.common.files import new_folder
 from isocharge.common.progress import report
 from isocharge.serve import BinaryParser, Port, PredictionRecord, Predictor, stream
 from isocharge.serve.frames.sequence import SequenceGaps
+from isocharge.serve.virtual_sensor.pseudo_port import posix_modules
 from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, noise_model, press, read_dataset
 from isocharge.simulate.dataset.sweep import solve_maps, write_sweep
 from isocharge.train import Release, fit, load_config, release
@@ -84,7 +85,7 @@ def demo_command(
 
     Example: isocharge demo -o first-light
     """
-    check_pseudo_terminals()
+    posix_modules()  # no pseudo-terminal: an error before anything is computed
     if live is not None:
         show_live_film(SENSOR, RATE_HZ, SEED, page_address(live, None), seconds)
         return

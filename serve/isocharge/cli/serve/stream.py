@@ -1,5 +1,6 @@
 """`isocharge serve stream`: prediction records from a port as they come."""
 
+import signal
 from collections import deque
 from contextlib import ExitStack, closing
 from functools import partial
@@ -33,7 +34,7 @@ from isocharge.cli.shared.live_page import LiveOption, PageFeed, TokenOption, an
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
 from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
 from isocharge.cli.shared.stopping import on_signal, stop_after, unless_hung_up, until_stopped
-from isocharge.cli.shared.terminal import log_to_stderr, say
+from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError, ModelError
 
 if TYPE_CHECKING:
@@ -125,16 +126,15 @@ def stream_command(
     recorded = RecordedStream(path, recorder)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
-        stack.enter_context(log_to_stderr())
         page = None
         if address is not None:
             shown = live_page(address, token, path.frame_id, predictor.metadata, find_model(model, models))
             page, _ = stack.enter_context(shown)
         request = board.request
         source = stack.enter_context(open_source(awaited(port, wait), baud=baud, reconnect=reconnect, request=request))
-        stack.enter_context(on_signal("SIGUSR1", recorded.request_tare))
+        stack.enter_context(on_signal(signal.SIGUSR1, recorded.request_tare))
         renew = partial(recorded.request_model, partial(_load, model, models))
-        stack.enter_context(on_signal("SIGHUP", unless_hung_up(renew)))
+        stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(renew)))
         stack.enter_context(stop_after(seconds))
         lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
         put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not

@@ -16,11 +16,12 @@ from isocharge.cli.shared.forward_maps import SLACK
 from isocharge.cli.shared.options import ProbeOption, SensorArgument
 from isocharge.cli.shared.stopping import until_stopped
 from isocharge.cli.shared.terminal import say, shown_progress
-from isocharge.cli.shared.virtual_sensor import check_pseudo_terminals, virtual_sensor
+from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, OutputExists
 from isocharge.serve import Script, encode_frame, encode_text, load_device
 from isocharge.serve.frames.frame_layout import FrameLayout
+from isocharge.serve.virtual_sensor.pseudo_port import posix_modules
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
 from isocharge.serve.virtual_sensor.sensor import Encode
 from isocharge.simulate import (
@@ -105,7 +106,7 @@ def virtual_command(
 
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
-    check_pseudo_terminals()
+    posix_modules()  # no pseudo-terminal: an error before anything is computed
     _refuse_taken(link)
     play = load_script(script) if script else VirtualScript()
     described, pressing = _played(sensor, probe, film)

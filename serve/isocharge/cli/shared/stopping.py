@@ -1,9 +1,7 @@
 """How a command that runs until it is stopped ends well, and what else signals ask of it."""
 
-import _thread
 import os
 import signal
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -30,14 +28,8 @@ def stop_after(seconds: float | None) -> Iterator[None]:
     if seconds is None:
         yield
         return
-    with _alarm(max(seconds, 1e-3)) if hasattr(signal, "SIGALRM") else _timer(seconds):
-        yield
-
-
-@contextmanager
-def _alarm(seconds: float) -> Iterator[None]:
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
     try:
         yield
     finally:
@@ -46,23 +38,8 @@ def _alarm(seconds: float) -> Iterator[None]:
 
 
 @contextmanager
-def _timer(seconds: float) -> Iterator[None]:
-    """Windows has no alarm; there, a read that is under way ends first."""
-    timer = threading.Timer(seconds, _thread.interrupt_main)
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-
-
-@contextmanager
-def on_signal(name: str, act: Callable[[], object]) -> Iterator[None]:
-    """Act when a signal comes; a system that does not have it, as Windows, sends none."""
-    number = getattr(signal, name, None)
-    if number is None:
-        yield
-        return
+def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[None]:
+    """Act when a signal comes."""
     before = signal.signal(number, lambda *_: act())
     try:
         yield

@@ -5,7 +5,7 @@ import shlex
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import contextmanager
 
 import typer
 
@@ -29,30 +29,22 @@ def this_command() -> str:
     return shlex.join(["isocharge", *sys.argv[1:]])
 
 
-def log_to_stderr() -> AbstractContextManager[None]:
-    """Print warnings of the live path for people."""
-    return _printed("isocharge.serve", "%(message)s")
-
-
 @contextmanager
-def cautions_to_stderr() -> Iterator[None]:
-    """Print warnings of simulation and training for people."""
-    with ExitStack() as stack:
-        for name in ("common", "simulate", "train"):
-            stack.enter_context(_printed(f"isocharge.{name}", "caution: %(message)s"))
-        yield
-
-
-@contextmanager
-def _printed(name: str, style: str) -> Iterator[None]:
-    """Print what a logger warns of."""
-    handler, logger = logging.StreamHandler(), logging.getLogger(name)
-    handler.setFormatter(logging.Formatter(style))
+def warnings_to_stderr() -> Iterator[None]:
+    """Print warnings of all packages for people; those of simulation and training begin with `caution:`."""
+    handler, logger = logging.StreamHandler(), logging.getLogger("isocharge")
+    handler.setFormatter(_Sentence())
     logger.addHandler(handler)
     try:
         yield
     finally:
         logger.removeHandler(handler)
+
+
+class _Sentence(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        caution = "" if record.name.startswith("isocharge.serve") else "caution: "
+        return caution + record.getMessage()
 
 
 @contextmanager

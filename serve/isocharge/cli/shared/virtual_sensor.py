@@ -2,33 +2,25 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from isocharge.common.arrays import Array
-    from isocharge.serve import Script, VirtualSensor
-    from isocharge.simulate import Amplifier, ForwardMap
+from isocharge.common.arrays import Array
+from isocharge.serve import Script, VirtualSensor, wander
+from isocharge.simulate import Amplifier, ForwardMap, load_amplifier
 
 SCRIPT_S = 60.0
 """Length of the random script that a virtual sensor repeats, s."""
 
 
-def check_pseudo_terminals() -> None:
-    """Raise PortError on a system without pseudo-terminals, before a command computes for what it cannot play."""
-    from isocharge.serve.virtual_sensor.pseudo_port import posix_modules
-
-    posix_modules()
-
-
 def virtual_sensor(
-    forward_map: "ForwardMap",
-    noise: "str | Amplifier",
+    forward_map: ForwardMap,
+    noise: str | Amplifier,
     seed: int,
     rate_Hz: float = 200.0,
     *,
-    script: "Script | None" = None,
+    script: Script | None = None,
     **options: Any,
-) -> "VirtualSensor":
+) -> VirtualSensor:
     """A sensor that plays wandering presses over the whole domain of a forward map.
 
     Args:
@@ -39,9 +31,6 @@ def virtual_sensor(
         script: Presses to play instead of random ones.
         options: Options of `VirtualSensor`: encode, faults, link.
     """
-    from isocharge.serve import VirtualSensor, wander
-    from isocharge.simulate import load_amplifier
-
     amplifier = load_amplifier(noise) if isinstance(noise, str) else noise
     presses = script or wander(
         seed=seed,
@@ -59,7 +48,7 @@ def virtual_sensor(
     )
 
 
-def _charges(forward_map: "ForwardMap", contact: "Array") -> "Array":
+def _charges(forward_map: ForwardMap, contact: Array) -> Array:
     """Charges of contacts; below the map's smallest force they fall with force to the 2/3, as those of a membrane."""
     low, force = forward_map.domain.force_range[0], contact[:, 2]
     share = (force.clip(max=low) / low) ** (2.0 / 3.0)

@@ -208,7 +208,7 @@ def load_device(path: Path) -> Device:
     Raises:
         DeviceError: If it cannot be read, or a key is unknown, missing or wrong.
     """
-    return device_from_table(read_toml(path, "a device file", DeviceError), str(path))
+    return device_from_table(read_toml(path, "a device file", DeviceError, dict[str, Any]), str(path))
 
 
 def device_from_table(table: Mapping[str, Any], where: str) -> Device:

@@ -98,7 +98,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         where = f"{where}: metadata"
         try:
             known = [name for name in cls.__struct_fields__ if name in props]
-            values = {name: parse_json(props[name], f"{where}: {name}", ModelError) for name in known}
+            values = {name: parse_json(props[name], f"{where}: {name}", ModelError, object) for name in known}
             version = convert(values, _Version, where, ModelError).format_version
             if version == FORMAT_VERSION:
                 return convert(values, cls, where, ModelError)

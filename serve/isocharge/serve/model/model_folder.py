@@ -17,13 +17,13 @@ from types import MappingProxyType
 import onnxruntime as ort
 from numpy.typing import ArrayLike
 
+from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ModelError, OutputExists
 from isocharge.common.files import new_folder, read_whole, refuse_existing, sha256_of, write_whole
 from isocharge.serve.model.charges import as_batch
 from isocharge.serve.model.golden import Golden, check_answers, make_golden, read_golden
 from isocharge.serve.model.metadata import NAME, ModelMetadata
-from isocharge.serve.model.session import check_interface, check_rows, open_session, run
-from isocharge.serve.model.triton_config import triton_config
+from isocharge.serve.model.session import INPUT, OUTPUTS, check_interface, check_rows, open_session, run
 
 
 @dataclass(frozen=True)
@@ -175,3 +175,14 @@ def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
         key = differing[0]
         raise ModelError(f"the graph's metadata disagree on {key!r}: expected {given[key]}, got {inside[key]}")
     check_golden(model)
+
+
+def triton_config(name: str, electrodes: int) -> str:
+    """The text of `config.pbtxt` for a model with this number of electrodes; Triton adds the batch dimension."""
+    head = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
+    return head + _tensors("input", {INPUT: electrodes}) + _tensors("output", OUTPUTS)
+
+
+def _tensors(kind: str, widths: dict[str, int]) -> str:
+    lines = [f'  {{ name: "{name}" data_type: TYPE_FP32 dims: [ {width} ] }}' for name, width in widths.items()]
+    return f"{kind} [\n" + ",\n".join(lines) + "\n]\n"

@@ -33,13 +33,6 @@ class Contact(NamedTuple):
         numbers = ", ".join(f"{name}={value} +- {std}" for name, value, std in self._rounded())
         return f"Contact({numbers}, misfit={self.misfit:.2g})"
 
-    def _repr_html_(self) -> str:
-        """A table, for notebooks."""
-        numbers = [(name, f"{value} &plusmn; {std}") for name, value, std in self._rounded()]
-        numbers.append(("misfit", f"{self.misfit:.2g}"))
-        rows = (f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in numbers)
-        return f"<table><caption>Contact</caption>{''.join(rows)}</table>"
-
     def _rounded(self) -> Iterator[tuple[str, str, str]]:
         """Name, value and standard deviation of position and force."""
         for name, value, std in zip(self._fields[:3], self[:3], self[3:6], strict=True):

@@ -7,7 +7,7 @@ The loop of a host program uses `predict_into` with its two arrays; people use `
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -138,22 +138,11 @@ class Predictor:
 
     def __repr__(self) -> str:
         """Model, electrodes and domain."""
-        return f"Predictor({self._metadata.label}: {', '.join(f'{name} {text}' for name, text in self._summary())})"
-
-    def _repr_html_(self) -> str:
-        """A table, for notebooks."""
-        from html import escape  # late: its list of entities would take longer to import than serial ports
-
-        rows = [f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self._summary()]
-        return f"<table><caption>Predictor {self._metadata.label}</caption>{''.join(rows)}</table>"
-
-    def _summary(self) -> Iterator[tuple[str, str]]:
-        """What the model takes and where it may be trusted."""
-        low, high = self._validity.force_range_N
-        yield "sensor", self._metadata.frame_id
-        yield "charges", f"{' '.join(self._metadata.electrodes)} (pC)"
-        yield "positions", f"up to {self._validity.reach_mm:.3g} mm"
-        yield "forces", f"{low:.3g} to {high:.3g} N"
+        metadata, (low, high) = self._metadata, self._validity.force_range_N
+        return (
+            f"Predictor({metadata.label}: sensor {metadata.frame_id}, charges {' '.join(metadata.electrodes)} (pC), "
+            f"positions up to {self._validity.reach_mm:.3g} mm, forces {low:.3g} to {high:.3g} N)"
+        )
 
     def _warn(self, charge_pC: object, contact: Contact) -> None:
         """Log, once, that an answer is no measurement."""

@@ -89,25 +89,22 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
     Raises:
         ChargeError: If the charges do not fit the model.
     """
+    metadata = predictor.metadata
     for block in blocks(charge_pC):
-        yield from _block_records(block, predictor)
-
-
-def _block_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
-    metadata, contacts = predictor.metadata, predictor.predict_batch(charge_pC)
-    flags = predictor.validity.batch_flags(contacts)
-    for charges, contact, its_flags in zip(charge_pC.tolist(), np.column_stack(contacts).tolist(), flags, strict=True):
-        yield PredictionRecord(
-            timestamp=None,
-            t_device_us=None,
-            seq=None,
-            **dict(zip(Contacts._fields, contact, strict=True)),
-            contact=True,
-            charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
-            charge_raw_pC=None,
-            tare_pC=None,
-            flags=its_flags,
-            latency_us=None,
-            model=metadata.label,
-            frame_id=metadata.frame_id,
-        )
+        contacts = predictor.predict_batch(block)
+        flags = predictor.validity.batch_flags(contacts)
+        for charges, contact, its_flags in zip(block.tolist(), np.column_stack(contacts).tolist(), flags, strict=True):
+            yield PredictionRecord(
+                timestamp=None,
+                t_device_us=None,
+                seq=None,
+                **dict(zip(Contacts._fields, contact, strict=True)),
+                contact=True,
+                charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
+                charge_raw_pC=None,
+                tare_pC=None,
+                flags=its_flags,
+                latency_us=None,
+                model=metadata.label,
+                frame_id=metadata.frame_id,
+            )

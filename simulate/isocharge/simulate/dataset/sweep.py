@@ -153,7 +153,7 @@ def _finish_shards(
     parts = list(_cut(presses, shard))
     entries: dict[int, dict[str, Any]] = {}
     for number, part in enumerate(parts):
-        if (data := run.load(shard_name(number), final=True)) is not None:
+        if (data := run.load(shard_name(number), bytes, final=True)) is not None:
             entries[number] = shard_entry(shard_name(number), len(part), data)
     done = sum(entry["samples"] for entry in entries.values())
     missing = [number for number in range(len(parts)) if number not in entries]

@@ -114,12 +114,12 @@ def load_sensor(sensor: str | Path) -> Sensor:
     """
     if str(sensor) in built_in_sensors():
         text = (resources.files("isocharge.simulate") / "sensors" / f"{sensor}.toml").read_text("utf-8")
-        return sensor_from_dict(parse_toml(text, str(sensor), SensorError), str(sensor))
+        return sensor_from_dict(parse_toml(text, str(sensor), SensorError, dict[str, Any]), str(sensor))
     path = Path(sensor)
     if not path.is_file():
         names = ", ".join(built_in_sensors())
         raise SensorError(f"no sensor {str(sensor)!r}: it is neither a built-in name ({names}) nor a file")
-    described = sensor_from_dict(read_toml(path, "a sensor file", SensorError), str(path))
+    described = sensor_from_dict(read_toml(path, "a sensor file", SensorError, dict[str, Any]), str(path))
     for caution in _cautions(described):
         log.warning("%s: %s", path, caution)
     return described
@@ -199,7 +199,8 @@ def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
         text.encode()
     except UnicodeEncodeError as error:
         raise SensorError(f"sensor {sensor.name!r}: a name is no text that UTF-8 can hold ({error})") from error
-    sensor_from_dict(parse_toml(text, f"sensor {sensor.name!r}", SensorError), f"sensor {sensor.name!r}")
+    where = f"sensor {sensor.name!r}"
+    sensor_from_dict(parse_toml(text, where, SensorError, dict[str, Any]), where)
     return text
 
 

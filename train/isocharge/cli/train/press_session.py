@@ -12,7 +12,7 @@ import typer
 from msgspec.structs import replace
 
 from isocharge.cli.shared.options import board_of
-from isocharge.cli.shared.terminal import log_to_stderr, say
+from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, Screen
 from isocharge.common.errors import InputError, PressError
 from isocharge.common.json_values import plain_values
@@ -115,7 +115,6 @@ def _events(port: PressPort, problem: CalibrationProblem) -> Iterator[PressEvent
     stream = ReadingStream(problem.electrodes, board, reader=f"sensor {problem.sensor.name}")
     keyboard = None if machine or port.yes else _keyboard()
     with (
-        log_to_stderr(),
         open_source(port.url, baud=port.baud, reconnect=not machine, request=board.request) as source,
         PressEvents(source, stream, PressWatch(problem.electrodes), keyboard) as events,
     ):

@@ -77,7 +77,7 @@ class Descent:
             TrainingError: If the loss is not finite.
         """
         saved_at = time.monotonic()
-        if run and (state := run.load_as(self.stage.name, tensors)) is not None:
+        if run and (state := run.load(self.stage.name, tensors)) is not None:
             self._restore(state)
         while self.step < self.stage.steps and not self._stalled():
             loss = self._advance()

@@ -307,7 +307,7 @@ class _Training:
 
     def _misfit_examples(self) -> MisfitExamples:
         """Examples that the run kept, or drawn: the search for their nearest contacts takes long enough to keep."""
-        if self.resumable and (kept := self.resumable.load_as("misfit-charges", tensors)) is not None:
+        if self.resumable and (kept := self.resumable.load("misfit-charges", tensors)) is not None:
             return MisfitExamples(*(values.numpy() for values in kept))
         config, noise = self.config, misfit_noise(self.noise)
         examples = draw_misfit_examples(self.split.train, self.split.field, noise, config.misfit_charges, config.seed)
