@@ -59,8 +59,8 @@ def test_the_file_says_the_same(field, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"isocharge_deflection": 2}, "not supported"),
-        ({"film": {"radius_mm": 45.0}}, "is missing"),
+        ({"isocharge_deflection": 2}, "the version 1"),
+        ({"film": {"radius_mm": 45.0}}, "expected the keys"),
         ({"force_N": [1.0, 0.2]}, "increasing"),
         ({"angles": 10**9}, "at most"),
         ({"deflection": "no base64"}, "base64"),
