@@ -6,7 +6,9 @@ import pytest
 
 from isocharge.common.errors import PortError
 from isocharge.serve import Port
-from isocharge.serve.port.udp import is_text
+
+pytestmark = pytest.mark.xdist_group("clock")
+
 
 pytestmark = pytest.mark.xdist_group("clock")
 
@@ -22,7 +24,7 @@ def address():
 def received(address, *datagrams):
     """What a port reads of datagrams that a board sends."""
     with (
-        Port(f"udp://127.0.0.1:{address[1]}", silence_s=2.0) as port,
+        Port(f"udp://127.0.0.1:{address[1]}", silence_s=10.0) as port,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board,
     ):
         for datagram in datagrams:
@@ -37,7 +39,8 @@ def test_each_datagram_is_a_chunk(address):
 
 
 def test_lines_without_an_end_get_one(address):
-    assert received(address, b'{"A": 1}', b"A:1\nB:2", b"\xaa\x00") == [b'{"A": 1}\n', b"A:1\nB:2\n", b"\xaa\x00"]
+    text, bytes_ = [b'{"A": 1}', b"A:1\tB:2", "1 µC".encode()], [b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f"]
+    assert received(address, *text, *bytes_) == [*(line + b"\n" for line in text), *bytes_]
 
 
 def test_a_board_that_ends_its_lines_gets_no_more_ends(address):
@@ -69,10 +72,3 @@ def test_addresses_that_are_none(url):
 def test_an_address_that_is_taken(address):
     with Port(f"udp://127.0.0.1:{address[1]}"), pytest.raises(PortError, match="in use"):
         Port(f"udp://127.0.0.1:{address[1]}").__enter__()
-
-
-@pytest.mark.parametrize(
-    ("data", "said"), [(b"A:1\t2\r\n", True), ("1 µC".encode(), True), (b"\xaa\x55", False), (b"1\x002", False)]
-)
-def test_what_is_text(data, said):
-    assert is_text(data) == said

@@ -114,7 +114,7 @@ def test_a_recording_begun_on_the_page_is_repeated_bit_for_bit(
     assert code == 0
     assert replayed.splitlines() == written
     assert any(json.loads(line)["contact"] for line in written)
-    (marked,) = [moment for moment in Recording(path).events_and_markers() if hasattr(moment, "text")]
+    (marked,) = [moment for moment in Recording(path).events() if hasattr(moment, "text")]
     assert marked.text == "here"
 
 

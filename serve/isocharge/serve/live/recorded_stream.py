@@ -176,7 +176,7 @@ def replay(
         ModelError: If a model of the recording cannot be loaded.
     """
     delay_s: float | None = None
-    for event in recording.events_and_markers():
+    for event in recording.events():
         if isinstance(event, Marker):
             on_marker(event)
             continue

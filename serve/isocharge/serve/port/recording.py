@@ -22,7 +22,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
-import msgspec
 from msgspec import Meta, Struct
 
 from isocharge.common.errors import OutputError, RecordingError, cut
@@ -199,16 +198,12 @@ class Recording:
             )
         self.model, self.policy, self.device, self.name = header.model, header.policy, header.device, header.name
 
-    def events(self) -> Iterator[Event | NewModel]:
-        """Chunks, requests for a new tare and changes of the model, in their order.
+    def events(self) -> Iterator[Event | Marker | NewModel]:
+        """Chunks, requests for a new tare, markers and changes of the model, in their order.
 
         Raises:
             RecordingError: If a line other than the last one is damaged.
         """
-        return (event for event in self.events_and_markers() if not isinstance(event, Marker))
-
-    def events_and_markers(self) -> Iterator[Event | Marker | NewModel]:
-        """As `events`, with the markers between them."""
         chunk: Chunk | None = None
         latencies_us: list[float] = []
         for entry in self._lines(_Entry):
@@ -217,12 +212,9 @@ class Recording:
                 continue
             if chunk is not None:
                 yield Event(chunk, tuple(latencies_us))
-            chunk, latencies_us = None, []
-            moment = entry.moment
-            if isinstance(moment, Chunk):
-                chunk = moment
-            else:
-                yield moment
+            chunk, latencies_us = entry.bytes_that_came, []
+            if chunk is None:
+                yield entry.moment
         if chunk is not None:
             yield Event(chunk, tuple(latencies_us))
 
@@ -237,18 +229,13 @@ class Recording:
     def _lines(self, kind: type[Line], only: str = "") -> Iterator[Line]:
         """Each line after the first, those alone that begin so."""
         number, characters, size = 1, 0, self._path.stat().st_size
-        decode = msgspec.json.Decoder(kind).decode
         try:
             with self._path.open(encoding="utf-8", errors="replace") as file:
                 for line in bounded_lines(file, LONGEST_ENTRY):
                     if not line.endswith("\n"):
                         return  # the power failed while it was written
                     if number > 1 and (line.startswith(only) or not line.startswith("{")):
-                        try:
-                            content = decode(line)
-                        except (ValueError, RecursionError):  # again, for what was expected and given
-                            content = parse_json(line, "", RecordingError, kind)
-                        yield content
+                        yield parse_json(line, "", RecordingError, kind)
                     number, characters = number + 1, characters + len(line)
                     if number % 1000 == 0:
                         report("reading", min(characters, size), size)
@@ -283,11 +270,16 @@ class _Entry(Struct):
             raise WrongKey("chunk")
 
     @property
-    def moment(self) -> "Chunk | Event | Marker | NewModel":
-        """What happened, if it is no record."""
-        if self.chunk is not None:
-            timestamp, clock_ns, outage_s, data = self.chunk
-            return Chunk(data, timestamp, clock_ns, outage_s)
+    def bytes_that_came(self) -> Chunk | None:
+        """The chunk, if it is one."""
+        if self.chunk is None:
+            return None
+        timestamp, clock_ns, outage_s, data = self.chunk
+        return Chunk(data, timestamp, clock_ns, outage_s)
+
+    @property
+    def moment(self) -> Event | Marker | NewModel:
+        """What happened, if it is neither record nor chunk."""
         if self.marker is not None:
             return Marker(*self.marker)
         return Event(None) if self.use is None else NewModel(self.use)

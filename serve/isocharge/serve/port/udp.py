@@ -22,12 +22,11 @@ _CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 class UdpSocket:
     """An open socket on which datagrams come."""
 
-    def __init__(self, url: str, timeout_s: float) -> None:
+    def __init__(self, url: str) -> None:
         """Bind a socket.
 
         Args:
             url: udp://HOST:PORT; without a host, datagrams may come from anywhere.
-            timeout_s: Longest time to wait for a datagram, s.
 
         Raises:
             OSError: If the address cannot be bound.
@@ -45,7 +44,7 @@ class UdpSocket:
         except OSError:
             self._socket.close()
             raise
-        self._timeout_s, self._ends_lines = timeout_s, False
+        self._ends_lines = False
         self._peer: tuple[str, int] | None = None
 
     def reset_input_buffer(self) -> None:
@@ -53,9 +52,9 @@ class UdpSocket:
         while self._is_ready(0.0):
             self._socket.recv(MOST_BYTES)
 
-    def receive(self, timeout_s: float | None = None) -> bytes:
+    def receive(self, timeout_s: float) -> bytes:
         """The next datagram that is not empty; nothing if none comes in time."""
-        end_s = time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s)
+        end_s = time.monotonic() + timeout_s
         while self._is_ready(max(0.0, end_s - time.monotonic())):
             data, self._peer = self._socket.recvfrom(MOST_BYTES)
             if data:
@@ -76,15 +75,5 @@ class UdpSocket:
 
     def _with_line_end(self, data: bytes) -> bytes:
         self._ends_lines |= data.endswith(b"\n")
-        return data if self._ends_lines or not is_text(data) else data + b"\n"
-
-
-def is_text(data: bytes) -> bool:
-    """Whether bytes are text in UTF-8 without control characters."""
-    if _CONTROL.search(data):
-        return False
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError:
-        return False
-    return True
+        is_text = not _CONTROL.search(data) and data.decode("utf-8", "replace").encode() == data
+        return data + b"\n" if is_text and not self._ends_lines else data
