@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import ChargeError, InputError
 from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
@@ -29,13 +29,15 @@ from isocharge.simulate.identifiability.folds import singular_values
 from isocharge.simulate.identifiability.force_profile import ForceProfile
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import onto_disk
-from isocharge.train.bayes.cells import Cells
 
 CHUNK = 64
 """Presses integrated at once: keeps the working arrays within some 100 MB."""
 
 ACROSS = 32
 """Cells across the disk to begin with."""
+
+EDGE = 8
+"""Points across a cell on the edge of the disk; each counts as inside or outside."""
 
 MOST_CUTS = 10
 """Cuts of a cell in four at most: down to a thirty-thousandth of the disk."""
@@ -51,6 +53,83 @@ NEAR = 9.0
 
 WIDTH, NODES = 5.0, 12
 """Half width of the force's integral in standard deviations, and its points: to 1e-4 together."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Squares in the plane of positions, each for one press.
+
+    Attributes:
+        press: Number of the press, ascending, shape (n,).
+        root: Number of the first cell that it was cut from, shape (n,).
+        centre: Shape (n, 2), mm.
+        side: Of every cell, mm.
+    """
+
+    press: Integers
+    root: Integers
+    centre: Array
+    side: float
+
+    @classmethod
+    def roots(cls, radius: float) -> "Cells":
+        """The first cells of one press, all over the disk."""
+        side = 2.0 * radius / ACROSS
+        centre = _grid(ACROSS, side)
+        centre = centre[_is_within(centre, side, radius)]
+        return cls(np.zeros(len(centre), dtype=np.intp), np.arange(len(centre)), centre, side)
+
+    def __len__(self) -> int:
+        return self.press.size
+
+    def __getitem__(self, rows: np.ndarray) -> "Cells":
+        return Cells(self.press[rows], self.root[rows], self.centre[rows], self.side)
+
+    def cut(self, radius: float) -> "Cells":
+        """Each in four; those without a share in the disk are dropped."""
+        parts = self._four(0.25)
+        return parts[_is_within(parts.centre, parts.side, radius)]
+
+    def finer(self, radius: float) -> Iterator["Cells"]:
+        """Whole ones as Gauss and Legendre's four points, others in sixteen."""
+        edge = self.on_edge(radius)
+        yield self[~edge]._four(1.0 / np.sqrt(12.0))
+        yield self[edge].cut(radius).cut(radius)
+
+    def _four(self, offset: float) -> "Cells":
+        """Four half as wide in place of each, their centres `offset` sides off its middle in both directions."""
+        centre = (self.centre[:, None] + _grid(2, 2.0 * offset * self.side)).reshape(-1, 2)
+        return Cells(np.repeat(self.press, 4), np.repeat(self.root, 4), centre, 0.5 * self.side)
+
+    def on_edge(self, radius: float) -> Booleans:
+        """Which may stick out of the disk, shape (n,)."""
+        return np.asarray(np.hypot(*self.centre.T) + np.sqrt(0.5) * self.side > radius)
+
+    def inside(self, radius: float) -> tuple[Array, Array]:
+        """Share of each cell that lies in the disk, shape (n,), and that share's centre, shape (n, 2).
+
+        A corner without any of the counted points has half of one point's share.
+        """
+        share, centre = np.ones(len(self)), self.centre.copy()
+        edge = np.flatnonzero(self.on_edge(radius))
+        points = centre[edge, None] + _grid(EDGE, self.side / EDGE)
+        counts = np.hypot(points[..., 0], points[..., 1]) <= radius
+        total = counts.sum(axis=1, keepdims=True)
+        share[edge] = np.maximum(total[:, 0], 0.5) / EDGE**2
+        middle = np.einsum("np,npi->ni", counts, points) / np.maximum(total, 1)
+        centre[edge] = np.where(total > 0, middle, onto_disk(centre[edge], radius))
+        return share, centre
+
+
+def _grid(count: int, step: float) -> Array:
+    """`count` x `count` points about the origin, shape (count^2, 2)."""
+    line = step * (np.arange(count) - 0.5 * (count - 1))
+    return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+
+
+def _is_within(centre: Array, side: float, radius: float) -> Booleans:
+    """Which squares have a share in the disk."""
+    return np.asarray(np.hypot(*np.maximum(np.abs(centre) - 0.5 * side, 0.0).T) < radius)
 
 
 @dataclass(frozen=True)
@@ -104,15 +183,11 @@ class Posterior:
     @cached_property
     def _roots(self) -> tuple[Cells, Array, Array]:
         """The first cells, their terms, and the steepest slope of each scaled charge in them, (n, n_electrode)."""
-        side = 2.0 * self.radius / ACROSS
-        line = side * (np.arange(ACROSS) + 0.5) - self.radius
-        centre = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        centre = centre[np.hypot(*np.maximum(np.abs(centre) - 0.5 * side, 0.0).T) < self.radius]
-        cells = Cells(np.zeros(len(centre), dtype=np.intp), np.arange(len(centre)), centre, side)
-        corner = 0.5 * side * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
-        slopes = self.charges.slopes(onto_disk((centre[:, None] + corner).reshape(-1, 2), self.radius))
-        steepest = np.linalg.norm(slopes, axis=-1).max(axis=1).reshape(len(centre), len(corner), -1).max(axis=1)
-        return cells, self.charges.terms(onto_disk(centre, self.radius)), steepest
+        cells = Cells.roots(self.radius)
+        about = onto_disk((cells.centre[:, None] + _grid(3, 0.5 * cells.side)).reshape(-1, 2), self.radius)
+        steepest = np.linalg.norm(self.charges.slopes(about), axis=-1).max(axis=1)
+        terms = self.charges.terms(onto_disk(cells.centre, self.radius))
+        return cells, terms, steepest.reshape(len(cells), 9, -1).max(axis=1)
 
     def _integrate(self, charge: Array) -> Array:
         """Means and standard deviations, shape (2, n, 3)."""
@@ -138,12 +213,8 @@ class Posterior:
             np.minimum.at(best, cells.press, chi2)
             excess = np.maximum(np.sqrt(chi2) - np.sqrt(0.5) * cells.side * reach, 0.0) ** 2 - best[cells.press]
             alive = np.flatnonzero(excess <= MARGIN)
-            stiffest = np.zeros(len(charge))
-            np.maximum.at(
-                stiffest,
-                cells.press[alive],
-                self._stiffness(cells.centre[alive], terms[alive], logs[alive]),
-            )
+            stiffest, stiffness = np.zeros(len(charge)), self._stiffness(cells[alive], terms[alive], logs[alive])
+            np.maximum.at(stiffest, cells.press[alive], stiffness)
             cut_off = np.zeros(len(charge), dtype=bool)
             cut_off[cells.press[cells.on_edge(self.radius) & (chi2 <= best[cells.press] + NEAR)]] = True
             done = (stiffest * cells.side <= self.step)[cells.press] | (cut == MOST_CUTS)
@@ -163,9 +234,9 @@ class Posterior:
         steep = steepest * by_force.sum(axis=1)[:, None] / self.noise.sigma(known)
         return np.einsum("ne,ne->n", deviation, deviation), np.sqrt(np.einsum("ne,ne->n", steep, steep))
 
-    def _stiffness(self, position: Array, terms: Array, logs: Array) -> Array:
+    def _stiffness(self, cells: Cells, terms: Array, logs: Array) -> Array:
         """One over the smallest standard deviation of the position if it lay here, the force unknown; shape (n,)."""
-        by_force, slopes = self.charges.by_force(logs), self.charges.slopes(onto_disk(position, self.radius))
+        by_force, slopes = self.charges.by_force(logs), self.charges.slopes(onto_disk(cells.centre, self.radius))
         known = np.einsum("nk,nke->ne", by_force, terms)
         moved = np.einsum("nk,nkei->nei", by_force, slopes)
         jacobian = np.concatenate([moved, self._curve.slope(logs, known)[..., None]], axis=2)

@@ -109,30 +109,19 @@ class ChargeField:
     def log_charge(self, unit: Array) -> Array:
         """ln Q and its derivatives by the unit coordinates: contacts (n, 3) in them to (n, 4, n_electrode)."""
         degree, _, orders, n_electrode = (size - 1 for size in self.series.shape)
-        parts = [self._some_logs(some, degree, orders) for some in np.array_split(unit, len(unit) // CHUNK + 1)]
+        parts = []
+        for some in np.array_split(unit, len(unit) // CHUNK + 1):
+            plane, in_force = _terms(some, degree, orders)
+            by_force = (plane @ self._rows).reshape(len(some), in_force.shape[1], -1)
+            parts.append((in_force[:, None, :] @ by_force)[:, 0])
         return np.concatenate(parts).reshape(len(unit), 4, n_electrode + 1)
-
-    def with_slopes(self) -> Array:
-        """Series of ln Q and of its derivatives by the unit coordinates, side by side.
-
-        Returns:
-            Shape (degree + 1, degree + 1, force_degree + 1, 4, n_electrode).
-        """
-        return np.stack([self.series, *(_derivative(self.series, axis) for axis in range(3))], axis=3)
-
-    def _some_logs(self, unit: Array, degree: int, force_degree: int) -> Array:
-        plane, in_force = _terms(unit, degree, force_degree)
-        by_force = (plane @ self._rows).reshape(len(unit), in_force.shape[1], -1)
-        logs: Array = (in_force[:, None, :] @ by_force)[:, 0]
-        return logs
 
     @cached_property
     def _rows(self) -> Array:
         """The series and its derivatives by term of the plane, shape (n_term, (force_degree + 1) 4 n_electrode)."""
         all_four = np.stack([self.series, *(_derivative(self.series, axis) for axis in range(3))])
         of_terms = all_four[:, *_plane_terms(self.series.shape[0] - 1)]  # (4, n_term, force_degree + 1, n_electrode)
-        rows: Array = of_terms.transpose(1, 2, 0, 3).reshape(of_terms.shape[1], -1)
-        return rows
+        return np.asarray(of_terms.transpose(1, 2, 0, 3).reshape(of_terms.shape[1], -1))
 
 
 def _plane_terms(degree: int) -> tuple[Integers, Integers]:

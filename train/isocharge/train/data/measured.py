@@ -38,8 +38,7 @@ def held_out(contact: Array) -> Booleans:
     order = np.argsort([sha256_of(position.tobytes()) for position in positions])
     enough = max(HELD_SHARE * len(contact), min(FEWEST_HELD, 0.5 * len(contact)))
     before = np.cumsum(counts[order]) - counts[order]
-    held: Booleans = np.isin(number.ravel(), order[before < enough])
-    return held
+    return np.asarray(np.isin(number.ravel(), order[before < enough]))
 
 
 def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Dataset:

@@ -6,8 +6,6 @@ off the image of the forward map by any distance, wrong gains, dying electrodes,
 everything. Few electrodes make a space small enough to be covered.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
@@ -29,19 +27,6 @@ def misfit_noise(noise: NoiseModel) -> NoiseModel:
     return noise if noise.white > 0.0 else noise_model("reference")
 
 
-@dataclass(frozen=True)
-class MisfitExamples:
-    """Charges and how far from any known contact they are.
-
-    Attributes:
-        charge: Shape (n, n_electrode), pC.
-        residual: (Q - Q(c)) / sigma at the nearest known contact c, shape (n, n_electrode).
-    """
-
-    charge: Array
-    residual: Array
-
-
 def draw_misfit_examples(
     presses: LabelledPresses,
     charge_map: ChargeMap,
@@ -50,8 +35,8 @@ def draw_misfit_examples(
     seed: int,
     *,
     candidates: int = CANDIDATES,
-) -> MisfitExamples:
-    """Draw charges of every kind and find their nearest contacts.
+) -> Array:
+    """Draw charges of every kind, and find how far from any known contact they are.
 
     Args:
         presses: To start from.
@@ -60,16 +45,20 @@ def draw_misfit_examples(
         count: How many.
         seed: Of all that is drawn.
         candidates: Contacts among which searches start.
+
+    Returns:
+        The charges Q, pC, and their residuals (Q - Q(c)) / sigma at the nearest known contact c, shape (2, count,
+        n_electrode).
     """
     rng = np.random.default_rng(seed)
     chosen = presses[rng.integers(len(presses), size=count)]
     kinds = np.array(list(KINDS))[rng.choice(len(KINDS), size=count, p=list(KINDS.values()))]
     charge = np.empty_like(chosen.charge)
     for kind in KINDS:
-        charge[kinds == kind] = _DRAW[kind](rng, chosen.charge[kinds == kind], presses.charge, noise)
+        charge[kinds == kind] = _draw(kind, rng, chosen.charge[kinds == kind], presses.charge, noise)
     charge = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
     near = np.isin(kinds, ("noisy", "moved"))
-    return MisfitExamples(charge, _residuals(charge_map, charge, noise.sigma(charge), chosen, near, candidates))
+    return np.stack([charge, _residuals(charge_map, charge, noise.sigma(charge), chosen, near, candidates)])
 
 
 def _residuals(
@@ -87,56 +76,25 @@ def _residuals(
     return residual
 
 
-def _noisy_press(rng: np.random.Generator, charge: Array, _: Array, noise: NoiseModel) -> Array:
-    return noise.add(charge, rng)
-
-
-def _moved(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
-    """In any direction, by a thousandth up to a factor of seven."""
-    size = 10.0 ** rng.uniform(-3.0, 0.3, (len(charge), 1))
-    moved: Array = charge * np.exp(size * rng.standard_normal(charge.shape))
-    return moved
-
-
-def _gains(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
-    """Half of the electrodes off by 15 %."""
-    off = rng.random(charge.shape) < 0.5
-    wrong: Array = charge * np.exp(0.15 * off * rng.standard_normal(charge.shape))
-    return wrong
-
-
-def _failing_electrode(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
-    """One electrode keeps a share of its charge, down to a thousandth."""
-    dead = rng.integers(charge.shape[1], size=(len(charge), 1)) == np.arange(charge.shape[1])
-    left: Array = np.where(dead, charge * 10.0 ** rng.uniform(-3.0, 0.0, (len(charge), 1)), charge)
-    return left
-
-
-def _scaled(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
-    """All by a common factor from a hundredth to a hundred, and a little each."""
-    common = 10.0 ** rng.uniform(-2.0, 2.0, (len(charge), 1))
-    scaled: Array = charge * common * np.exp(0.05 * rng.standard_normal(charge.shape))
-    return scaled
-
-
-def _two_presses(rng: np.random.Generator, charge: Array, others: Array, _: NoiseModel) -> Array:
-    both: Array = charge + others[rng.integers(len(others), size=len(charge))]
-    return both
-
-
-def _uniform_in_logs(rng: np.random.Generator, charge: Array, _: Array, __: NoiseModel) -> Array:
-    """Between what counts as nothing and 10 nC, or what counts as most."""
-    decades = np.where(rng.random((len(charge), 1)) < 0.3, np.log10(HIGHEST_CHARGE), 4.0)
-    drawn: Array = 10.0 ** (decades * rng.random(charge.shape))
-    return drawn
-
-
-_DRAW = {
-    "noisy": _noisy_press,
-    "moved": _moved,
-    "gains": _gains,
-    "dying": _failing_electrode,
-    "scaled": _scaled,
-    "two": _two_presses,
-    "any": _uniform_in_logs,
-}
+def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: NoiseModel) -> Array:
+    """Charges of one kind made from those of presses, shape (n, n_electrode), pC."""
+    each = len(charge), 1
+    match kind:
+        case "noisy":
+            return noise.add(charge, rng)
+        case "moved":  # in any direction, by a thousandth up to a factor of seven
+            factor = np.exp(10.0 ** rng.uniform(-3.0, 0.3, each) * rng.standard_normal(charge.shape))
+        case "gains":  # half of the electrodes off by 15 %
+            factor = np.exp(0.15 * (rng.random(charge.shape) < 0.5) * rng.standard_normal(charge.shape))
+        case "dying":  # one electrode keeps a share of its charge, down to a thousandth
+            dead = rng.integers(charge.shape[1], size=each) == np.arange(charge.shape[1])
+            factor = np.where(dead, 10.0 ** rng.uniform(-3.0, 0.0, each), 1.0)
+        case "scaled":  # all by a common factor from a hundredth to a hundred, and a little each
+            charge = charge * 10.0 ** rng.uniform(-2.0, 2.0, each)
+            factor = np.exp(0.05 * rng.standard_normal(charge.shape))
+        case "two":
+            return charge + others[rng.integers(len(others), size=len(charge))]
+        case _:  # uniform in logarithms, from what counts as nothing to 10 nC or to what counts as most
+            decades = np.where(rng.random(each) < 0.3, np.log10(HIGHEST_CHARGE), 4.0)
+            return 10.0 ** (decades * rng.random(charge.shape))
+    return charge * factor

@@ -141,5 +141,4 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
 
 def position_error(contact: Array, truth: Array) -> Array:
     """Distance between estimated and true position, mm, shape (n,), from contacts of shape (n, 3)."""
-    distance: Array = np.hypot(contact[:, 0] - truth[:, 0], contact[:, 1] - truth[:, 1])
-    return distance
+    return np.asarray(np.hypot(contact[:, 0] - truth[:, 0], contact[:, 1] - truth[:, 1]))

@@ -1,5 +1,7 @@
 """A perceptron whose weights depend on a context: computed once per film, after which it is a plain perceptron.
 
+Its inputs are the charges with the exact scales of the film divided out, its context what else is known of the film.
+
 A small network turns the context into psi. Layer l then has the weights W_l0 + sum_k phi_lk W_lk, with phi linear in
 psi, and a bias that is linear in psi; so has the layer that skips the others.
 """
@@ -13,8 +15,11 @@ import torch
 from torch import Tensor, nn
 
 from isocharge.common.arrays import Array
+from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
+from isocharge.train.films.film_scaling import FilmScaling
+from isocharge.train.films.films_data import FilmPresses
 from isocharge.train.training.folding import PlainPerceptron
-from isocharge.train.training.network import Trainable
+from isocharge.train.training.network import Trainable, as_tensor, whitening
 
 BASES = 6
 """Matrices that a layer's weights are made of, besides the constant one."""
@@ -22,8 +27,44 @@ BASES = 6
 PSI = 64
 """Width of the context's network."""
 
+FITTED = 512
+"""Films that the whitening is taken from."""
+
 FIRST_BASIS, FIRST_SHARE = 0.3, 0.3
 """Sizes at the start: of the bases, over the constant matrix; of phi."""
+
+
+@dataclass(frozen=True)
+class FilmInputs:
+    """x = (ln clip(Q) - ln scale(film) - mean) @ whitening.
+
+    Attributes:
+        scaling: Exact scales and context of films.
+        mean: Of the logarithms (Q in pC), shape (n_electrode,).
+        whitening: Shape (n_electrode, n_electrode).
+    """
+
+    scaling: FilmScaling
+    mean: Array
+    whitening: Array
+
+    @classmethod
+    def fit(cls, scaling: FilmScaling, presses: FilmPresses) -> "FilmInputs":
+        """Zero mean and unit covariance along the principal axes, over clean charges of many films."""
+        some = presses[:FITTED]
+        logs = np.log(np.clip(some.charge(), LOWEST_CHARGE, HIGHEST_CHARGE))
+        logs = (logs - scaling.log_charge_scale(some.parameters)[:, None]).reshape(-1, logs.shape[-1])
+        return cls(scaling, *whitening(logs))
+
+    def values(self, charge: Tensor, parameters: Array) -> Tensor:
+        """Charges (n_film, n, n_electrode) of films (n_film, n_parameter) to inputs of the same shape."""
+        shift = as_tensor(self.scaling.log_charge_scale(parameters) + self.mean)
+        logs = torch.log(charge.clamp(LOWEST_CHARGE, HIGHEST_CHARGE)) - shift[:, None]
+        return logs @ as_tensor(self.whitening)
+
+    def context(self, parameters: Array) -> Tensor:
+        """Contexts of films, (n_film, n_parameter) to (n_film, n_context)."""
+        return as_tensor(self.scaling.context(parameters))
 
 
 class ConditionalPerceptron(Trainable):
@@ -110,9 +151,7 @@ class ConditionalWeights:
         )
 
     def _linear(self, name: str, value: Array) -> Array:
-        moved: Array = self.arrays[f"{name}.weight"] @ value + self.arrays[f"{name}.bias"]
-        return moved
+        return np.asarray(self.arrays[f"{name}.weight"] @ value + self.arrays[f"{name}.bias"])
 
     def _mixed(self, constant: str, bases: str, shares: Array) -> Array:
-        mixed: Array = self.arrays[constant] + np.tensordot(shares, self.arrays[bases], axes=1)
-        return mixed
+        return np.asarray(self.arrays[constant] + np.tensordot(shares, self.arrays[bases], axes=1))

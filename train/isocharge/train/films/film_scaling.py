@@ -38,8 +38,7 @@ class FilmScaling:
     def log_charge_scale(self, parameters: Array) -> Array:
         """ln of the charges' exact factors, 1 for the described film: (..., n_parameter) to (..., n_electrode)."""
         common = _of(parameters, "young") + 0.5 * (_of(parameters, "d31") + _of(parameters, "d32"))
-        scale: Array = parameters[..., len(SHARED) :] + common[..., None]
-        return scale
+        return np.asarray(parameters[..., len(SHARED) :] + common[..., None])
 
     def rotation(self, parameters: Array) -> Array:
         """Matrix T of `to_film`, (..., n_parameter) to (..., 3, 3): the rotation of the electrodes."""
@@ -53,22 +52,19 @@ class FilmScaling:
         described = np.array(self.prior.sensor.calibration.shift)
         moved = described + _shift(parameters) - _rotation(_of(parameters, "rotation")) @ described
         stiffness = _of(parameters, "young") + _of(parameters, "thickness")
-        offset: Array = np.concatenate([moved, stiffness[..., None]], axis=-1) / self.domain.scale
-        return offset
+        return np.asarray(np.concatenate([moved, stiffness[..., None]], axis=-1) / self.domain.scale)
 
     def to_film(self, parameters: Array, unit: Array) -> Array:
         """Unit coordinates on the described film with the scales divided out, (..., 3), to those on the film: T u + o.
 
         The place is carried along by the electrodes; the force grows with the stiffness.
         """
-        on_film: Array = (self.rotation(parameters) @ unit[..., None])[..., 0] + self.offset(parameters)
-        return on_film
+        return np.asarray((self.rotation(parameters) @ unit[..., None])[..., 0] + self.offset(parameters))
 
     def context(self, parameters: Array) -> Array:
         """What a network knows of a film, standardised over the films: (..., n_parameter) to (..., 9 + n_electrode)."""
         centre, spread = self.standard
-        context: Array = (self._raw_context(parameters) - centre) / spread
-        return context
+        return np.asarray((self._raw_context(parameters) - centre) / spread)
 
     @cached_property
     def standard(self) -> tuple[Array, Array]:
@@ -98,8 +94,7 @@ class FilmScaling:
 
 def _of(parameters: Array, name: str) -> Array:
     """One of the parameters that all films share, shape (...)."""
-    values: Array = parameters[..., SHARED.index(name)]
-    return values
+    return np.asarray(parameters[..., SHARED.index(name)])
 
 
 def _shift(parameters: Array) -> Array:

@@ -91,13 +91,11 @@ def read_films(version_folder: Path) -> FilmsModel:
     path = version_folder / FILE
     try:
         data = read_whole(path)
-    except FileNotFoundError as error:
-        raise ModelError(
-            f"{path}: missing; expected the version folder of a model for all films, as `isocharge train fit --films` "
-            "writes it"
-        ) from error
     except OSError as error:
-        raise ModelError(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
+        raise ModelError(
+            f"{path}: cannot be read ({error.strerror}); expected the version folder of a model for all films, as "
+            "`isocharge train fit --films` writes it"
+        ) from error
     return films_from_bytes(data, str(path))
 
 

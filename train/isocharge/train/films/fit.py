@@ -1,34 +1,50 @@
 """Fit one network to all the films that a sensor may be."""
 
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib import metadata
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
+from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.film_family import FilmFamily
+from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.measuring_chain.noise_file import noise_model
-from isocharge.simulate.sensor.film_prior import FilmPrior
+from isocharge.simulate.sensor.film_prior import REACH, SHARED, FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.misfit_charges import misfit_noise
-from isocharge.train.films.conditional_network import ConditionalPerceptron, ConditionalWeights
-from isocharge.train.films.contact_stage import ContactStage, FilmInputs
-from isocharge.train.films.film_presses import draw_film_presses
+from isocharge.train.films.conditional_network import ConditionalPerceptron, ConditionalWeights, FilmInputs
 from isocharge.train.films.film_scaling import FilmScaling
-from isocharge.train.films.films_model import FilmsModel
-from isocharge.train.films.misfit_films import (
+from isocharge.train.films.films_data import (
+    D31,
+    D32,
     DrawnFilms,
-    MisfitStage,
-    NearPresses,
+    FilmPresses,
+    FilmsSource,
+    draw_film_presses,
     draw_misfit_films,
     draw_near_films,
+    gains_of,
+    part_factors,
 )
+from isocharge.train.films.films_model import FilmsModel
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.fit import WARM_UP, threads_and_seed
+from isocharge.train.training.fit import (
+    WARM_UP,
+    contact_score,
+    likelihood_loss,
+    mean_square,
+    start_loss,
+    threads_and_seed,
+    with_fresh_noise,
+)
+from isocharge.train.training.network import as_tensor, compress_length
 
 BEYOND = 1.5
 """How far the family reaches beyond the domain, mm: a calibration moves presses whose place is not exactly known."""
@@ -38,6 +54,15 @@ FORCES_BEYOND = (0.8, 1.2)
 
 LARGEST_GRADIENT = 5.0
 """Norm to which gradients are cut: films whose map nearly folds pull hard."""
+
+WIDEST = 8.0
+"""Largest deviation of a good press, over that of the noise."""
+
+NEAR_WEIGHT = 10.0
+"""Weight of good presses in the loss of the misfit: they decide when an alarm is false, and their misfits are small."""
+
+WATCHED = 0.06
+"""Share of the films that are watched while the misfit network trains."""
 
 
 @dataclass(frozen=True)
@@ -117,23 +142,19 @@ def fit_films(
     with threads_and_seed(1, config.seed):
         domain = Domain(config.radius, config.force_range)
         family = _family(prior, config, kept("family"))
-        source = DrawnFilms(prior, family, domain, misfit_noise(noise))
+        source = FilmsSource(prior, family, domain, misfit_noise(noise))
         sizes = config.films, config.presses, config.seed
         presses = draw_film_presses(prior, family, domain, *sizes, kept("presses"))
         inputs = FilmInputs.fit(FilmScaling(prior, domain), presses)
-        batch, warm_up = (config.batch_films, config.batch_presses), round(WARM_UP * config.steps)
 
         part = _network(inputs, config.hidden, 6)
-        contact = ContactStage(part, inputs, presses, noise, config.watched, batch, warm_up, config.seed)
-        _descend(TrainingStage("contact", part, contact.loss, contact.score, config.steps, warm_up), config, run)
+        _descend(contact_stage(part, inputs, presses, noise, config), config, run)
 
-        examples = draw_misfit_films(
-            source, config.misfit_films, config.misfit_charges, config.seed, kept("nearest-contacts")
-        )
+        sizes = config.misfit_films, config.misfit_charges, config.seed
+        examples = draw_misfit_films(source, *sizes, kept("nearest-contacts"))
         near = draw_near_films(source, config.near_films, config.presses, config.seed, kept("good-presses"))
         vector = _network(inputs, config.misfit_hidden, inputs.mean.size)
-        misfit = MisfitStage.of(vector, NearPresses.of(inputs, near, source.noise), examples, batch)
-        _descend(TrainingStage("misfit", vector, misfit.loss, misfit.score, config.misfit_steps), config, run)
+        _descend(misfit_stage(vector, inputs, examples, near, source.noise, config), config, run)
     return FilmsModel(
         family=family,
         scaling=inputs.scaling,
@@ -173,5 +194,97 @@ def _network(inputs: FilmInputs, hidden: tuple[int, ...], outputs: int) -> Condi
 
 def _descend(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | None) -> None:
     """Train to the end: the schedule's last steps are the best."""
-    cut = replace(stage, largest_gradient=LARGEST_GRADIENT)
-    Descent(cut, config.learning_rate, stage.steps, config.seed).run(run)
+    Descent(stage, config.learning_rate, stage.steps, config.seed).run(run)
+
+
+def contact_stage(
+    part: ConditionalPerceptron, inputs: FilmInputs, presses: FilmPresses, noise: NoiseModel, config: FilmsConfig
+) -> TrainingStage:
+    """The contact network's losses; the last films of the presses are only watched."""
+    scaling, warm_up, trained = inputs.scaling, round(WARM_UP * config.steps), len(presses) - config.watched
+
+    def posterior(
+        of: np.ndarray, rows: np.ndarray, parameters: Array, random: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, log standard deviation and truth in unit coordinates, each (n, 3), of noisy charges."""
+        parts = torch.from_numpy(presses.response[of[:, None], rows])
+        factors = as_tensor(part_factors(parameters))[:, None, :, None]
+        clean = (parts @ factors)[..., 0] * as_tensor(gains_of(parameters))[:, None]
+        out = part(inputs.values(with_fresh_noise(clean, noise, random), parameters), inputs.context(parameters))
+        rotation, offset = as_tensor(scaling.rotation(parameters)), as_tensor(scaling.offset(parameters))
+        mean = torch.baddbmm(offset[:, None], out[..., :3], rotation.transpose(1, 2))
+        unit = as_tensor(scaling.domain.to_unit(presses.contact[of[:, None], rows].reshape(-1, 3)))
+        return mean.reshape(-1, 3), out[..., 3:].reshape(-1, 3), unit
+
+    def loss(step: int, random: torch.Generator) -> Tensor:
+        of = torch.randint(trained, (config.batch_films,), generator=random)
+        rows = torch.randint(presses.contact.shape[1], (config.batch_films, config.batch_presses), generator=random)
+        parameters = _with_fresh_factors(scaling.prior, presses.parameters[of.numpy()], random)
+        answers = posterior(of.numpy(), rows.numpy(), parameters, random)
+        return (start_loss if step < warm_up else likelihood_loss)(*answers)
+
+    def score() -> tuple[float, str]:
+        of = np.arange(trained, len(presses))
+        rows = np.tile(np.arange(presses.contact.shape[1]), (config.watched, 1))
+        random = torch.Generator().manual_seed(config.seed)
+        return contact_score(*posterior(of, rows, presses.parameters[of], random), scaling.domain, "films")
+
+    return TrainingStage("contact", part, loss, score, config.steps, warm_up, LARGEST_GRADIENT)
+
+
+def _with_fresh_factors(prior: FilmPrior, parameters: Array, random: torch.Generator) -> Array:
+    """The films with d31, d32 and gains drawn anew."""
+    fresh, columns = parameters.copy(), [D31, D32, *range(len(SHARED), parameters.shape[1])]
+    drawn = torch.randn((len(parameters), len(columns)), generator=random).clamp(-REACH, REACH).double().numpy()
+    fresh[:, columns] = prior.mean[columns] + prior.std[columns] * drawn
+    return fresh
+
+
+def misfit_stage(
+    part: ConditionalPerceptron,
+    inputs: FilmInputs,
+    examples: DrawnFilms,
+    near: DrawnFilms,
+    noise: NoiseModel,
+    config: FilmsConfig,
+) -> TrainingStage:
+    """The misfit network's losses, half of every batch from good presses; the last films of the examples are watched.
+
+    Args:
+        part: The network.
+        inputs: What it sees.
+        examples: What `draw_misfit_films` gives.
+        near: What `draw_near_films` gives; their deviations, up to `WIDEST` times the noise, are new in every step.
+        noise: Of good presses.
+        config: Batches and steps.
+    """
+    values = inputs.values(as_tensor(examples.charge), examples.parameters)
+    context, targets = inputs.context(examples.parameters), compress_length(torch.tensor(examples.aim)).float()
+    trained = len(values) - max(1, round(WATCHED * len(values)))
+    near_charge, across = as_tensor(near.charge), as_tensor(near.aim)
+
+    def near_squares(films: int, presses: int, random: torch.Generator) -> Tensor:
+        of = torch.randint(len(near_charge), (films,), generator=random)
+        rows = torch.randint(near_charge.shape[1], (films, presses), generator=random)
+        clean = near_charge[of[:, None], rows]
+        widest = 1.0 + (WIDEST - 1.0) * torch.rand((films, presses, 1), generator=random) ** 3
+        deviation = widest * torch.randn(clean.shape, generator=random)
+        noisy = clean + torch.hypot(torch.tensor(noise.white), noise.gain * clean) * deviation
+        residual = (across[of[:, None], rows] @ deviation[..., None])[..., 0]
+        parameters = near.parameters[of.numpy()]
+        vector = part(inputs.values(noisy, parameters), inputs.context(parameters))
+        return mean_square(vector, compress_length(residual))
+
+    def loss(_: int, random: torch.Generator) -> Tensor:
+        films = config.batch_films // 2
+        of = torch.randint(trained, (films,), generator=random)
+        rows = torch.randint(values.shape[1], (films, config.batch_presses), generator=random)
+        all_kinds = mean_square(part(values[of[:, None], rows], context[of]), targets[of[:, None], rows])
+        return NEAR_WEIGHT * near_squares(films, config.batch_presses, random) + all_kinds
+
+    def score() -> tuple[float, str]:
+        all_kinds = mean_square(part(values[trained:], context[trained:]), targets[trained:]).item()
+        good = near_squares(len(near_charge), 8, torch.Generator().manual_seed(0)).item()
+        return NEAR_WEIGHT * good + all_kinds, f"{all_kinds:.4f} on watched films, {good:.5f} on good presses"
+
+    return TrainingStage("misfit", part, loss, score, config.misfit_steps, largest_gradient=LARGEST_GRADIENT)

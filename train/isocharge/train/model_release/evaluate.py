@@ -50,9 +50,13 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     test = fitted.test if presses is None else presses
     if not test.measured:
         return simulated_errors(fitted.predict, test, fitted.noise, seed)
+    errors = contact_errors(*fitted.predict(test.charge)[:2], test.contact)
+    kept = {name: error for name, error in errors.items() if name not in ONLY_SIMULATED}
     if fitted.good.measured:
-        return {**measured_errors(fitted.predict, test), **measured_alarm(fitted.predict, fitted.good)}
-    return {**measured_errors(fitted.predict, test), **misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)}
+        alarm = {"misfit_p99": rounded(alarm_threshold(fitted.predict(fitted.good.charge)[2]))}
+    else:
+        alarm = misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)
+    return {**kept, HELD_PRESSES: float(len(test)), **alarm}
 
 
 def simulated_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int = 1) -> dict[str, float]:
@@ -65,19 +69,6 @@ def simulated_errors(predict: Predict, presses: LabelledPresses, noise: NoiseMod
         "clean_position_p95_mm": rounded(np.percentile(clean, 95)),
         **misfit_errors(predict, presses, noise, seed),
     }
-
-
-def measured_errors(predict: Predict, presses: LabelledPresses) -> dict[str, float]:
-    """Errors on measured presses as they are; see `evaluate`."""
-    errors = contact_errors(*predict(presses.charge)[:2], presses.contact)
-    return {name: error for name, error in errors.items() if name not in ONLY_SIMULATED} | {
-        HELD_PRESSES: float(len(presses))
-    }
-
-
-def measured_alarm(predict: Predict, presses: LabelledPresses) -> dict[str, float]:
-    """The misfit that 1 % of measured presses exceed, as a model's errors have it."""
-    return {"misfit_p99": rounded(alarm_threshold(predict(presses.charge)[2]))}
 
 
 def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]:
@@ -115,8 +106,7 @@ def alarm_threshold(good_misfits: Array) -> float:
 def about_1_N(force: Array) -> Booleans:
     """Which forces, N, count as 1 N; the same shape."""
     low, high = ABOUT_1_N
-    about: Booleans = (force >= low) & (force <= high)
-    return about
+    return np.asarray((force >= low) & (force <= high))
 
 
 def rounded(value: float | np.floating) -> float:

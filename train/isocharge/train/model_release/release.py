@@ -16,8 +16,7 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.model_release.card import model_card
 from isocharge.train.model_release.evaluate import evaluate
-from isocharge.train.model_release.export import export_onnx
-from isocharge.train.model_release.graph_check import check_graph
+from isocharge.train.model_release.export import check_graph, export_onnx
 from isocharge.train.training.fit import Fitted
 
 CORNERS = 64

@@ -5,7 +5,6 @@ the model's; its misfit is learned from exact searches, as the model's was.
 """
 
 from dataclasses import dataclass, replace
-from hashlib import sha256
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, ModelError
+from isocharge.common.files import sha256_of
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.simulate.dataset.shards import Dataset
@@ -97,7 +97,7 @@ def student_data(model: Path, dataset: Dataset, network: NetworkConfig) -> Train
         columns = np.stack(predictor.predict_batch(charge), axis=1).astype(float)
         return columns[:, :3], columns[:, 3:6]
 
-    checksum = sha256((model / "model.onnx").read_bytes()).hexdigest()
+    checksum = sha256_of((model / "model.onnx").read_bytes())
     return replace(TrainingData.of(dataset), teacher=Teacher(about.label, checksum, answer))
 
 

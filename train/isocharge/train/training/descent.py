@@ -92,21 +92,21 @@ class Descent:
 
     def _advance(self) -> Tensor:
         share = _rate_share(self.step / self.stage.steps)
-        for optimiser in self.optimisers:
-            for group in optimiser.param_groups:
-                group["lr"] = share * group["initial_lr"]
+        for optimiser, rate in self.optimisers:
+            optimiser.param_groups[0]["lr"] = share * rate
         loss = self.stage.loss(self.step, self.random)
         self.stage.part.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         if self.step >= self.stage.warm_up_steps and math.isfinite(self.stage.largest_gradient):
             torch.nn.utils.clip_grad_norm_(self.stage.part.parameters(), self.stage.largest_gradient)
-        for optimiser in self.optimisers:
+        for optimiser, _ in self.optimisers:
             optimiser.step()
         self.step += 1
         return loss
 
     def _evaluate(self, loss: float) -> None:
-        score, text = self.stage.score()
+        with torch.no_grad():
+            score, text = self.stage.score()
         if not (math.isfinite(loss) and math.isfinite(score)):
             raise TrainingError(
                 f"the {self.stage.name} loss is {loss} at step {self.step} of {self.stage.steps}; lower "
@@ -123,7 +123,7 @@ class Descent:
     def _state(self) -> dict[str, Any]:
         return {
             "part": self.stage.part.state_dict(),
-            "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
+            "optimisers": [optimiser.state_dict() for optimiser, _ in self.optimisers],
             "random": self.random.get_state(),
             "step": self.step,
             "best": (self.best, self.best_step),
@@ -132,7 +132,7 @@ class Descent:
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.stage.part.load_state_dict(state["part"])
-        for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
+        for (optimiser, _), saved in zip(self.optimisers, state["optimisers"], strict=True):
             optimiser.load_state_dict(saved)
         self.random.set_state(state["random"])
         self.step, (self.best, self.best_step) = state["step"], state["best"]
@@ -158,14 +158,10 @@ def _rate_share(done: float) -> float:
     return 0.5 * (1.0 + math.cos(math.pi * (done - RISE) / (1.0 - RISE)))
 
 
-def _optimisers(part: Trainable, rate: float) -> list[torch.optim.Optimizer]:
-    matrices = [matrix for matrix in part.hidden_matrices() if matrix.requires_grad]
+def _optimisers(part: Trainable, rate: float) -> list[tuple[torch.optim.Optimizer, float]]:
+    """Optimisers of a network, each with its largest rate; rounded matrices have none."""
     hidden = {id(matrix) for matrix in part.hidden_matrices()}
-    others = [parameter for parameter in part.parameters() if id(parameter) not in hidden]
-    adam = torch.optim.Adam(others, lr=rate, betas=(0.9, 0.98))
-    muon = [torch.optim.Muon(matrices, lr=MUON_RATE * rate, weight_decay=0.0)] if matrices else []
-    optimisers: list[torch.optim.Optimizer] = [*muon, adam]
-    for optimiser in optimisers:
-        for group in optimiser.param_groups:
-            group["initial_lr"] = group["lr"]
-    return optimisers
+    adam = torch.optim.Adam([each for each in part.parameters() if id(each) not in hidden], betas=(0.9, 0.98))
+    trained = [matrix for matrix in part.hidden_matrices() if matrix.requires_grad]
+    muon = [(torch.optim.Muon(trained, weight_decay=0.0), MUON_RATE * rate)] if trained else []
+    return [*muon, (adam, rate)]

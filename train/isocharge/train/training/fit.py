@@ -10,6 +10,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import metadata
 
 import numpy as np
@@ -18,21 +19,22 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import ConfigError, DatasetError
+from isocharge.common.errors import ConfigError
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.simulate.dataset.shards import Dataset
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.train.data.charge_field import ChargeField
-from isocharge.train.data.fold_free import SMALLEST_SHARE, ambiguous_pairs, fold_free_domain, probable_fold
+from isocharge.train.data.fold_free import invertible_domain
 from isocharge.train.data.measured import held_out
-from isocharge.train.data.misfit_charges import MisfitExamples, draw_misfit_examples, misfit_noise
+from isocharge.train.data.misfit_charges import draw_misfit_examples, misfit_noise
 from isocharge.train.data.presses import LabelledPresses, split_by_position
 from isocharge.train.training.config import FitConfig, TrainingConfig
-from isocharge.train.training.descent import Descent, TrainingStage, tensor_bytes, tensors
+from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.folding import FoldedNetwork, fold_network
-from isocharge.train.training.network import Features, InverseNetwork, Perceptron, compress_length
+from isocharge.train.training.network import Features, InverseNetwork, Perceptron, as_tensor, compress_length
 from isocharge.train.training.source import Provenance, Teacher, TrainingData
 
 _log = logging.getLogger(__name__)
@@ -160,7 +162,7 @@ class Split:
         """Split presses by position, within the largest disk in which the map certainly does not fold."""
         presses, names = data.presses, data.sensor.electrode_names
         first = ChargeField.fit(data.domain, names, *split_by_position(presses, training.hold_out, training.seed))
-        domain, cautions = _without_folds(first, presses, misfit_noise(training.noise_model))
+        domain, cautions = invertible_domain(first, presses, misfit_noise(training.noise_model))
         inside = presses if domain == data.domain else presses.within(domain.radius)
         if presses.measured:
             out = held_out(inside.contact)
@@ -168,35 +170,7 @@ class Split:
         else:
             trainable, held = split_by_position(inside, training.hold_out, training.seed)
         train, watched = split_by_position(trainable, WATCHED * training.hold_out, training.seed + 1)
-        return cls(domain, train, watched, held, ChargeField.fit(domain, names, train, watched), tuple(cautions))
-
-
-def _without_folds(field: ChargeField, presses: LabelledPresses, noise: NoiseModel) -> tuple[Domain, list[str]]:
-    """The largest disk in which the map certainly does not fold, and sentences on what is known about it."""
-    asked, domain = field.domain, fold_free_domain(field, noise)
-    if domain.radius < SMALLEST_SHARE * asked.radius:
-        raise DatasetError(
-            f"the map from contacts to charges folds {domain.radius:g} mm from the centre, of {asked.radius:g} "
-            "mm asked for: beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
-        )
-    cautions = []
-    if domain != asked:
-        cautions.append(
-            f"the map from contacts to charges folds beyond {domain.radius:g} mm: two contacts give the same charges "
-            f"there; the model is trained for {domain.radius:g} mm, not {asked.radius:g} mm, on "
-            f"{len(presses.within(domain.radius))} of {len(presses)} presses"
-        )
-    elif np.isfinite(fold := probable_fold(field, noise)):
-        return domain, [
-            f"the map from contacts to charges seems to fold about {fold:.2g} mm from the centre, where two "
-            "contacts give the same charges; the presses cannot tell it for certain, and the model is trained "
-            f"across it, up to {asked.radius:g} mm; see 'isocharge simulate identify', then ask for a smaller "
-            "radius or add an electrode"
-        ]
-    if pairs := ambiguous_pairs(field, noise, domain.radius).summary:
-        which = "no model tells which of them it is; see 'isocharge simulate identify'"
-        cautions.append(f"{pairs[0].lower()}{pairs[1:-1]}; {which}")
-    return domain, cautions
+        return cls(domain, train, watched, held, ChargeField.fit(domain, names, train, watched), cautions)
 
 
 @dataclass(frozen=True)
@@ -221,7 +195,10 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
             _log.warning("%s", caution)
         features, sizes = Features.fit(split.train.charge), config.network
         network = InverseNetwork(split.domain, features, sizes.hidden, sizes.misfit_hidden)
-        _Training(network, split, config, data.teacher, run).run()
+        _train(contact_stage(network, split, training, data.teacher), network.contact, config, run)
+        _train(
+            misfit_stage(network, _misfit_examples(split, training, run), training), network.misfit_vector, config, run
+        )
     return TrainedNetwork(network.eval(), split)
 
 
@@ -241,110 +218,80 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-class _Training:
-    """One training: data as tensors, and the stages one after the other."""
-
-    def __init__(
-        self,
-        network: InverseNetwork,
-        split: Split,
-        settings: FitConfig,
-        teacher: Teacher | None,
-        run: ResumableRun | None,
-    ) -> None:
-        self.network, self.split, self.teacher, self.resumable = network, split, teacher, run
-        self.config, self.rounded = settings.training, settings.network.weights == "int8"
-        self.noise, self.warm_up = self.config.noise_model, round(WARM_UP * self.config.steps)
-        to_unit = split.domain.to_unit
-        self.charge = torch.tensor(split.train.charge).float()
-        self.unit = torch.tensor(to_unit(split.train.contact)).float()
-        self.watched_charge = torch.tensor(split.watched.noisy(self.noise, self.config.seed)).float()
-        self.watched_unit = torch.tensor(to_unit(split.watched.contact)).float()
-
-    def run(self) -> None:
-        contact, config = self.network.contact, self.config
-        stage = TrainingStage(
-            "contact", contact, self._contact_loss, self._contact_score, config.steps, warm_up_steps=self.warm_up
+def _train(stage: TrainingStage, part: Perceptron, config: FitConfig, run: ResumableRun | None) -> None:
+    """Train a perceptron; where weights are to be rounded, round its hidden ones and train the others on."""
+    settings = config.training
+    Descent(stage, settings.learning_rate, settings.patience, settings.seed).run(run)
+    if config.network.weights == "int8":
+        part.round_hidden()
+        settling = replace(
+            stage,
+            name=f"{stage.name}-rounded",
+            loss=lambda step, random: stage.loss(stage.steps + step, random),
+            steps=round(SETTLING * stage.steps),
+            warm_up_steps=0,
         )
-        self._train_part(stage, contact)
-        examples, vector = self._misfit_examples(), self.network.misfit_vector
-        data = _MisfitData.of(self.network, examples, config)
-        self._train_part(TrainingStage("misfit", vector, data.loss, data.score, config.misfit_steps), vector)
-
-    def _train_part(self, stage: TrainingStage, part: Perceptron) -> None:
-        """Train a perceptron; where weights are rounded, round its hidden ones and train the others on."""
-        self._descend(stage)
-        if self.rounded:
-            part.round_hidden()
-            settling = replace(
-                stage,
-                name=f"{stage.name}-rounded",
-                loss=lambda step, random: stage.loss(stage.steps + step, random),
-                steps=round(SETTLING * stage.steps),
-                warm_up_steps=0,
-            )
-            self._descend(settling)
-
-    def _descend(self, stage: TrainingStage) -> None:
-        Descent(stage, self.config.learning_rate, self.config.patience, self.config.seed).run(self.resumable)
-
-    def _contact_loss(self, step: int, random: torch.Generator) -> Tensor:
-        rows = torch.randint(len(self.charge), (min(self.config.batch, len(self.charge)),), generator=random)
-        charge = with_fresh_noise(self.charge[rows], self.noise, random)
-        mean, log_std = self.network.posterior(charge)
-        if self.teacher is None:
-            return (start_loss if step < self.warm_up else likelihood_loss)(mean, log_std, self.unit[rows])
-        taught = self.teacher.posterior(charge, self.network.domain)
-        return start_loss(mean, log_std, taught[0]) if step < self.warm_up else teaching_loss(mean, log_std, *taught)
-
-    def _contact_score(self) -> tuple[float, str]:
-        with torch.no_grad():
-            mean, log_std = self.network.posterior(self.watched_charge)
-            loss = likelihood_loss(mean, log_std, self.watched_unit).item()
-            off = ((mean - self.watched_unit) * self.network.scale) ** 2
-        position, force = off[:, :2].sum(dim=1).mean().sqrt().item(), off[:, 2].mean().sqrt().item()
-        return loss, f"{loss:.3f} on watched presses: {position:.4f} mm and {100.0 * force:.3f} % of force rms"
-
-    def _misfit_examples(self) -> MisfitExamples:
-        """Examples that the run kept, or drawn: the search for their nearest contacts takes long enough to keep."""
-        if self.resumable and (kept := self.resumable.load("misfit-charges", tensors)) is not None:
-            return MisfitExamples(*(values.numpy() for values in kept))
-        config, noise = self.config, misfit_noise(self.noise)
-        examples = draw_misfit_examples(self.split.train, self.split.field, noise, config.misfit_charges, config.seed)
-        if self.resumable:
-            kept = [torch.tensor(examples.charge), torch.tensor(examples.residual)]
-            self.resumable.save("misfit-charges", tensor_bytes(kept))
-        return examples
+        Descent(settling, settings.learning_rate, settings.patience, settings.seed).run(run)
 
 
-@dataclass(frozen=True)
-class _MisfitData:
-    """The misfit network's data: inputs and compressed vectors, the last `watched` of them not trained on."""
+def contact_stage(
+    network: InverseNetwork, split: Split, config: TrainingConfig, teacher: Teacher | None
+) -> TrainingStage:
+    """Contacts and their deviations, of the presses or of a teacher, from charges with fresh noise."""
+    noise, domain, warm_up = config.noise_model, split.domain, round(WARM_UP * config.steps)
+    charge, unit = as_tensor(split.train.charge), as_tensor(domain.to_unit(split.train.contact))
+    watched_charge = as_tensor(split.watched.noisy(noise, config.seed))
+    watched_unit = as_tensor(domain.to_unit(split.watched.contact))
 
-    network: InverseNetwork
-    inputs: Tensor
-    targets: Tensor
-    watched: int
-    batch: int
+    def loss(step: int, random: torch.Generator) -> Tensor:
+        rows = torch.randint(len(charge), (min(config.batch, len(charge)),), generator=random)
+        noisy = with_fresh_noise(charge[rows], noise, random)
+        mean, log_std = network.posterior(noisy)
+        if teacher is None:
+            return (start_loss if step < warm_up else likelihood_loss)(mean, log_std, unit[rows])
+        taught = teacher.posterior(noisy, domain)
+        return start_loss(mean, log_std, taught[0]) if step < warm_up else teaching_loss(mean, log_std, *taught)
 
-    @classmethod
-    def of(cls, network: InverseNetwork, examples: MisfitExamples, config: TrainingConfig) -> "_MisfitData":
-        inputs = network.inputs(torch.tensor(examples.charge).float())
-        watched = round(WATCHED * config.hold_out * len(inputs))
-        return cls(network, inputs, compress_length(torch.tensor(examples.residual)).float(), watched, config.batch)
+    def score() -> tuple[float, str]:
+        return contact_score(*network.posterior(watched_charge), watched_unit, domain, "presses")
 
-    def loss(self, _: int, random: torch.Generator) -> Tensor:
-        rows = torch.randint(len(self.inputs) - self.watched, (self.batch,), generator=random)
-        return self._squares(self.inputs[rows], self.targets[rows]).mean()
+    return TrainingStage("contact", network.contact, loss, score, config.steps, warm_up)
 
-    def score(self) -> tuple[float, str]:
-        with torch.no_grad():
-            mean = self._squares(self.inputs[-self.watched :], self.targets[-self.watched :]).mean().item()
+
+def _misfit_examples(split: Split, config: TrainingConfig, run: ResumableRun | None) -> Array:
+    """What `draw_misfit_examples` gives; the search takes long enough to keep it in the run."""
+    presses, noise = split.train, misfit_noise(config.noise_model)
+    draw = partial(draw_misfit_examples, presses, split.field, noise, config.misfit_charges, config.seed)
+    return run.keeping("misfit-charges").submit(draw).result() if run else draw()
+
+
+def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:
+    """The compressed vectors of examples; the last of them are only watched."""
+    inputs = network.inputs(as_tensor(examples[0]))
+    targets = compress_length(torch.tensor(examples[1])).float()
+    trained = len(inputs) - max(1, round(WATCHED * config.hold_out * len(inputs)))
+
+    def squares(rows: Tensor | slice) -> Tensor:
+        return mean_square(network.misfit_vector(inputs[rows]), targets[rows])
+
+    def loss(_: int, random: torch.Generator) -> Tensor:
+        return squares(torch.randint(trained, (config.batch,), generator=random))
+
+    def score() -> tuple[float, str]:
+        mean = squares(slice(trained, None)).item()
         return mean, f"{mean:.4f} on watched charges"
 
-    def _squares(self, inputs: Tensor, targets: Tensor) -> Tensor:
-        squares: Tensor = ((self.network.misfit_vector(inputs) - targets) ** 2).sum(dim=1)
-        return squares
+    return TrainingStage("misfit", network.misfit_vector, loss, score, config.misfit_steps)
+
+
+def contact_score(mean: Tensor, log_std: Tensor, unit: Tensor, domain: Domain, what: str) -> tuple[float, str]:
+    """The loss on what is only watched, and a text with the errors there."""
+    loss = likelihood_loss(mean, log_std, unit).item()
+    x, y, force = ((mean - unit).double().numpy() * domain.scale).T
+    return (
+        loss,
+        f"{loss:.3f} on watched {what}: {rms(np.hypot(x, y)):.4f} mm and {100.0 * rms(force):.3f} % of force rms",
+    )
 
 
 def with_fresh_noise(charge: Tensor, noise: NoiseModel, random: torch.Generator) -> Tensor:
@@ -363,6 +310,11 @@ def start_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:
 def likelihood_loss(mean: Tensor, log_std: Tensor, unit: Tensor) -> Tensor:
     """Negative logarithm of a Gaussian likelihood, but for a constant."""
     return (log_std + 0.5 * ((mean - unit) * torch.exp(-log_std)) ** 2).sum(dim=1).mean()
+
+
+def mean_square(vector: Tensor, target: Tensor) -> Tensor:
+    """Mean square of the distance between vectors (..., n_electrode)."""
+    return torch.sum((vector - target) ** 2, dim=-1).mean()
 
 
 def teaching_loss(mean: Tensor, log_std: Tensor, taught_mean: Tensor, taught_log_std: Tensor) -> Tensor:

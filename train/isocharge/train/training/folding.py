@@ -78,8 +78,7 @@ class FoldedLayers:
         value = logs
         for weight, bias in self.hidden:
             value = np.tanh(value @ weight + bias)
-        answers: Array = value @ self.last[0] + self.last[1] + logs @ self.skip
-        return answers
+        return np.asarray(value @ self.last[0] + self.last[1] + logs @ self.skip)
 
 
 @dataclass(frozen=True)
@@ -162,5 +161,4 @@ def _side_by_side(perceptrons: Sequence[PlainPerceptron]) -> tuple[list[Layer], 
 
 def _matrix(layer: nn.Linear) -> Array:
     """Weights of a layer, shape (inputs, outputs)."""
-    weights: Array = layer.weight.detach().double().numpy().T
-    return weights
+    return np.asarray(layer.weight.detach().double().numpy().T)

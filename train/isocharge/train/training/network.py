@@ -49,10 +49,14 @@ class Features:
         """From clean charges, shape (n, n_electrode): zero mean, unit covariance along the principal axes."""
         within = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
         typical = 2.0 ** np.round(np.log2(within).mean(axis=0))
-        logs = np.log(within / typical)
-        mean = logs.mean(axis=0)
-        _, singular, axes = np.linalg.svd(logs - mean, full_matrices=False)
-        return cls(typical, mean, axes.T * (np.sqrt(len(logs)) / np.maximum(singular, 1e-12)))
+        return cls(typical, *whitening(np.log(within / typical)))
+
+
+def whitening(values: Array) -> tuple[Array, Array]:
+    """Mean and matrix M of values (n, k): (values - mean) @ M has unit covariance along its principal axes."""
+    mean = values.mean(axis=0)
+    _, singular, axes = np.linalg.svd(values - mean, full_matrices=False)
+    return mean, axes.T * (np.sqrt(len(values)) / np.maximum(singular, 1e-12))
 
 
 class Trainable(nn.Module, ABC):
@@ -111,12 +115,6 @@ class InverseNetwork(nn.Module):
         misfit_hidden: Widths of the misfit network.
     """
 
-    centre: Tensor
-    scale: Tensor
-    typical: Tensor
-    logs_mean: Tensor
-    whitening: Tensor
-
     def __init__(
         self, domain: Domain, features: Features, hidden: tuple[int, ...], misfit_hidden: tuple[int, ...]
     ) -> None:
@@ -125,14 +123,10 @@ class InverseNetwork(nn.Module):
         self.domain, self.features = domain, features
         self.contact = Perceptron(n_electrode, hidden, 6)
         self.misfit_vector = Perceptron(n_electrode, misfit_hidden, n_electrode)
-        for name, values in (
-            ("centre", domain.centre),
-            ("scale", domain.scale),
-            ("typical", features.typical),
-            ("logs_mean", features.mean),
-            ("whitening", features.matrix),
-        ):
-            self.register_buffer(name, torch.tensor(values).float())
+        self.centre, self.scale, self.typical, self.logs_mean, self.whitening = (
+            nn.Buffer(as_tensor(values))
+            for values in (domain.centre, domain.scale, features.typical, features.mean, features.matrix)
+        )
 
     def inputs(self, charge: Tensor) -> Tensor:
         """What both perceptrons see, finite for any charges (n, n_electrode), pC."""
@@ -159,3 +153,8 @@ def compress_length(residual: Tensor) -> Tensor:
     """What the misfit network learns: residuals (..., n_electrode), their lengths brought to asinh(length / unit)."""
     length: Tensor = torch.linalg.vector_norm(residual, dim=-1, keepdim=True)
     return residual * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=1e-9))
+
+
+def as_tensor(values: Array) -> Tensor:
+    """In single precision."""
+    return torch.tensor(values).float()

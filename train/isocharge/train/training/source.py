@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from isocharge.common.arrays import Array
@@ -12,6 +11,7 @@ from isocharge.simulate.dataset.shards import Dataset
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.train.data.presses import LabelledPresses, domain_of, presses_of
+from isocharge.train.training.network import as_tensor
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Teacher:
         """Mean and log standard deviation of the domain's unit coordinates, each (n, 3)."""
         contact, std = self.answer(charge.double().numpy())
         relative = np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]]) / domain.scale
-        return torch.tensor(domain.to_unit(contact)).float(), torch.tensor(np.log(relative)).float()
+        return as_tensor(domain.to_unit(contact)), as_tensor(np.log(relative))
 
 
 @dataclass(frozen=True)

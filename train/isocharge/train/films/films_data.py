@@ -1,7 +1,10 @@
-"""Presses on many films, with the charges that d31 and d32 give kept apart.
+"""What the networks for all films learn from.
 
-Gains and piezoelectric coefficients act on the charges exactly, so that training draws them anew in every step: the
-presses are stored for the described coefficients, one part of the charge for each.
+The contact network: presses on many films, with the charges that d31 and d32 give kept apart. Gains and piezoelectric
+coefficients act on the charges exactly, so that training draws them anew in every step: the presses are stored for the
+described coefficients, one part of the charge for each.
+
+The misfit network: charges of all kinds with their nearest contacts, and good presses.
 """
 
 from concurrent.futures import Executor
@@ -14,11 +17,13 @@ from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import DatasetError
 from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
-from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.forward.charge_map import Domain, FunctionMap, linearised
 from isocharge.simulate.forward.film_family import FilmFamily
+from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.sensor.film import Piezo
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
-from isocharge.train.data.presses import draw_contacts
+from isocharge.train.data.misfit_charges import draw_misfit_examples
+from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses, draw_contacts
 
 CHUNK = 16
 """Films that one job computes."""
@@ -26,6 +31,10 @@ CHUNK = 16
 MOST_NEGATIVE = 0.2
 """Share of the presses that may give some electrode no positive charge: light ones on taut uniaxial films do. What is
 below 1 pC counts as 1 pC, and the other electrodes have to say it."""
+
+CANDIDATES = 512
+"""Contacts among which the search for the nearest starts; fewer than for one film alone, where a candidate costs less.
+"""
 
 D31, D32 = SHARED.index("d31"), SHARED.index("d32")
 """Places of the coefficients among the parameters."""
@@ -55,8 +64,7 @@ class FilmPresses:
     def charge(self) -> Array:
         """Clean charges of the films as they are, shape (n_film, n_press, n_electrode), pC."""
         factors = part_factors(self.parameters), gains_of(self.parameters)
-        charge: Array = np.einsum("fpec,fc,fe->fpe", self.response.astype(float), *factors)
-        return charge
+        return np.asarray(np.einsum("fpec,fc,fe->fpe", self.response.astype(float), *factors))
 
 
 def part_factors(parameters: Array) -> Array:
@@ -66,8 +74,7 @@ def part_factors(parameters: Array) -> Array:
 
 def gains_of(parameters: Array) -> Array:
     """Factors of the electrodes: (n_film, n_parameter) to (n_film, n_electrode)."""
-    gains: Array = np.exp(parameters[:, len(SHARED) :])
-    return gains
+    return np.asarray(np.exp(parameters[:, len(SHARED) :]))
 
 
 def draw_film_presses(
@@ -135,3 +142,86 @@ def _check_positive(drawn: FilmPresses) -> None:
             f"{drawn.contact[film, row].tolist()} (mm, mm, N), {charge[film, row].tolist()} pC; check d31 "
             "and d32, or ask for a smaller radius"
         )
+
+
+@dataclass(frozen=True)
+class FilmsSource:
+    """Where examples come from.
+
+    Attributes:
+        prior: The films.
+        family: Their forward maps.
+        domain: The contacts.
+        noise: Noise of good presses.
+    """
+
+    prior: FilmPrior
+    family: FilmFamily
+    domain: Domain
+    noise: NoiseModel
+
+    def charge_map(self, parameters: Array) -> FunctionMap:
+        """The charges of one film as the model sees them, clipped."""
+        forward_map = self.family.forward_map(*self.prior.film(parameters))
+
+        def charges(contact: Array) -> Array:
+            return np.clip(forward_map.charges(contact), LOWEST_CHARGE, HIGHEST_CHARGE)
+
+        return FunctionMap(charges, forward_map.electrodes, self.domain)
+
+
+@dataclass(frozen=True)
+class DrawnFilms:
+    """Charges on films.
+
+    Attributes:
+        parameters: Of the films, shape (n_film, n_parameter).
+        charge: Shape (n_film, n, n_electrode), pC.
+        aim: What the misfit network learns about them; shape (n_film, n, n_electrode, ...).
+    """
+
+    parameters: Array
+    charge: Array
+    aim: Array
+
+
+def draw_misfit_films(
+    source: FilmsSource, films: int, charges: int, seed: int, executor: Executor | None = None
+) -> DrawnFilms:
+    """Draw films, and charges of every kind on each; `aim` is (Q - Q(c)) / sigma at the nearest contact c."""
+    parameters = source.prior.draw(np.random.default_rng([seed, 2]), films)
+    jobs = in_order(executor, partial(_of_every_kind, source, charges, seed), enumerate(parameters))
+    return DrawnFilms(parameters, *np.stack(list(track(jobs, "searching nearest contacts", films)), axis=1))
+
+
+def _of_every_kind(source: FilmsSource, charges: int, seed: int, job: tuple[int, Array]) -> Array:
+    """Charges and residuals, shape (2, charges, n_electrode)."""
+    number, parameters = job
+    charge_map = source.charge_map(parameters)
+    contact = draw_contacts(np.random.default_rng([seed, 3, number]), source.domain, charges)
+    presses = LabelledPresses(contact, charge_map.charges(contact))
+    return draw_misfit_examples(presses, charge_map, source.noise, charges, seed + number, candidates=CANDIDATES)
+
+
+def draw_near_films(
+    source: FilmsSource, films: int, presses: int, seed: int, executor: Executor | None = None
+) -> DrawnFilms:
+    """Draw films, and clean presses on each, about which the nearest contact follows without a search.
+
+    `aim` is a matrix, shape (n_film, n, n_electrode, n_electrode): of a deviation in units of the noise it leaves the
+    part that no contact explains, to first order. Noise of many seeds is free then.
+    """
+    parameters = source.prior.draw(np.random.default_rng([seed, 4]), films)
+    jobs = in_order(executor, partial(_good_presses, source, presses, seed), enumerate(parameters))
+    drawn = np.stack(list(track(jobs, "drawing good presses", films)))
+    return DrawnFilms(parameters, drawn[..., 0], drawn[..., 1:])
+
+
+def _good_presses(source: FilmsSource, presses: int, seed: int, job: tuple[int, Array]) -> Array:
+    """Charges and matrices side by side, shape (presses, n_electrode, 1 + n_electrode)."""
+    number, parameters = job
+    contact = draw_contacts(np.random.default_rng([seed, 5, number]), source.domain, presses)
+    charge, slopes = linearised(source.charge_map(parameters), contact)
+    basis = np.linalg.qr(slopes * source.domain.scale / source.noise.sigma(charge)[:, :, None])[0]
+    across = np.eye(charge.shape[1]) - basis @ basis.transpose(0, 2, 1)
+    return np.concatenate([charge[:, :, None], across], axis=2)
