@@ -2,9 +2,10 @@
 
 import pytest
 
-from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, read_dataset
+from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Sweep, load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, TrainingData, fit
+from isocharge.train.training import fit as fit_module
 from isocharge.train.training.fit import train_network
 from kept import kept
 
@@ -26,6 +27,11 @@ def film(sensor):
 
 
 @pytest.fixture(scope="session")
+def spline(film):
+    return kept(ChargeSpline.of, film)
+
+
+@pytest.fixture(scope="session")
 def dataset(film, tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "presses"
     return read_dataset(write_sweep(folder, (film,), Sweep(samples=6_000)))
@@ -38,5 +44,8 @@ def trained(dataset):
 
 
 @pytest.fixture(scope="session")
-def fitted(dataset):
-    return kept(fit, dataset, QUICK)
+def fitted(dataset, trained):
+    """The same network, folded."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "train_network", lambda *_, **__: trained)
+        return fit(dataset, QUICK)

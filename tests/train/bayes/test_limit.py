@@ -7,15 +7,9 @@ import pytest
 
 from isocharge.common.errors import ChargeError, InputError
 from isocharge.common.resumable_run import resume_parts
-from isocharge.simulate import ChargeSpline, Circle, noise_model
+from isocharge.simulate import Circle, noise_model
 from isocharge.train import BayesLimit, BayesProblem, bayes_estimate, bayes_limit
 from isocharge.train.bayes import posterior
-
-
-@pytest.fixture(scope="module")
-def charges(film):
-    """The map as splines, made once."""
-    return ChargeSpline.of(film)
 
 
 @pytest.fixture
@@ -23,12 +17,12 @@ def problem(sensor):
     return BayesProblem(sensor, Circle(1.0))
 
 
-def test_the_limit_is_what_the_estimates_give(problem, film):
-    limit = bayes_limit(problem, 60, seed=5, forward_map=film)
+def test_the_limit_is_what_the_estimates_give(problem, spline):
+    limit = bayes_limit(problem, 40, seed=5, charge_map=spline)
     assert 0.05 < limit.position_median_mm < limit.position_rms_mm < 0.4
-    assert limit.presses == 60
+    assert limit.presses == 40
     assert limit.expected_position_rms_mm == pytest.approx(limit.position_rms_mm, rel=0.5)
-    assert limit.force_rms_percent < 2.0
+    assert limit.expected_force_rms_percent == pytest.approx(limit.force_rms_percent, rel=0.5)
 
 
 def test_errors_by_hand():
@@ -37,17 +31,20 @@ def test_errors_by_hand():
     assert limit.position_rms_mm == pytest.approx(0.5 / np.sqrt(2.0))
     assert limit.position_median_mm == pytest.approx(0.25)
     assert limit.force_rms_percent == pytest.approx(1.0 / np.sqrt(2.0))
+    assert limit.position_p95_mm == pytest.approx(0.475)
+    assert limit.force_median_percent == pytest.approx(0.5)
     assert limit.expected_position_rms_mm == pytest.approx(np.sqrt(2.0))
+    assert limit.expected_force_rms_percent == pytest.approx(100.0 * np.sqrt(0.5 * (1.01**-2 + 0.25)))
 
 
-def test_who_computes_does_not_matter_and_a_run_keeps_it(problem, film, charges, tmp_path, monkeypatch):
+def test_who_computes_does_not_matter_and_a_run_keeps_it(problem, film, spline, tmp_path, monkeypatch):
     monkeypatch.setattr(posterior, "CHUNK", 2)
     charge = film.charges(np.array([[3.0, -2.0, 1.5], [0.0, 1.0, 0.2], [-5.0, 5.0, 0.7]]))
-    here = bayes_estimate(problem, charge, charge_map=charges)
+    here = bayes_estimate(problem, charge, charge_map=spline)
     assert here[0] == pytest.approx(np.array([[3.0, -2.0, 1.5], [0.0, 1.0, 0.2], [-5.0, 5.0, 0.7]]), abs=0.05)
     with ThreadPoolExecutor(2) as pool, resume_parts(tmp_path / "it", {}) as run:
-        there = bayes_estimate(problem, charge, charge_map=charges, executor=run.keeping("bayes", pool))
-        kept = bayes_estimate(problem, 0.0 * charge, charge_map=charges, executor=run.keeping("bayes", pool))
+        there = bayes_estimate(problem, charge, charge_map=spline, executor=run.keeping("bayes", pool))
+        kept = bayes_estimate(problem, 0.0 * charge, charge_map=spline, executor=run.keeping("bayes", pool))
     np.testing.assert_array_equal(here, there)
     np.testing.assert_array_equal(here, kept)  # loaded, whatever the charges are now
 
@@ -60,6 +57,6 @@ def test_who_computes_does_not_matter_and_a_run_keeps_it(problem, film, charges,
         (np.ones((1, 3)), {"noise": noise_model("clean")}, InputError, "noise"),
     ],
 )
-def test_what_does_not_fit_is_refused(sensor, charges, charge, options, error, message):
+def test_what_does_not_fit_is_refused(sensor, spline, charge, options, error, message):
     with pytest.raises(error, match=message):
-        bayes_estimate(BayesProblem(sensor, Circle(1.0), **options), charge, charge_map=charges)
+        bayes_estimate(BayesProblem(sensor, Circle(1.0), **options), charge, charge_map=spline)

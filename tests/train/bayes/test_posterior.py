@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from isocharge.common.errors import ChargeError, InputError
-from isocharge.simulate import ChargeSpline, Domain, NoiseModel, noise_model
+from isocharge.simulate import Domain, NoiseModel, noise_model
 from isocharge.train.bayes.posterior import Posterior
 from isocharge.train.data.presses import draw_contacts
 
@@ -50,12 +50,12 @@ def spread(charges, count, seed):
     return contact, REFERENCE.add(charges.charges(contact), rng)
 
 
-@pytest.fixture(scope="module")
-def charges(film):
-    return ChargeSpline.of(film)
+@pytest.fixture
+def charges(spline):
+    return spline
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_linear_charges_in_white_noise_give_the_textbook_gaussian(seed):
     made, white = straight(seed), 0.01
     noisy = made.terms(np.array([[0.2, -0.3]]))[:, 0] + white * np.random.default_rng(seed).normal(size=(1, 4))
@@ -105,17 +105,13 @@ def brute_force(charges, noise, charge, centre, reach, count):
     return mean, std
 
 
-@pytest.mark.parametrize(
-    "contact",
-    [(2.0, -3.0, 1.0), (-7.9, 0.4, 0.3), (1.0, 6.0, 0.0503), (7.2, 3.4, 0.06), (0.1, 0.0, 1.995)],
-    ids=["within", "at the rim", "least force", "rim, small force", "centre, most force"],
-)
+@pytest.mark.parametrize("contact", [(2.0, -3.0, 1.0), (7.2, 3.4, 0.0503), (0.1, 0.0, 1.995)])
 def test_as_brute_force(charges, contact):
     charge = REFERENCE.add(charges.charges(np.array([contact])), np.random.default_rng(1))
     mean, std = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)
     centre, reach = mean[0].copy(), 7.0 * std[0]
     centre[2], reach[2] = np.log(mean[0, 2]), 7.0 * std[0, 2] / mean[0, 2]
-    expected_mean, expected_std = brute_force(charges, REFERENCE, charge[0], centre, reach, (240, 240, 24))
+    expected_mean, expected_std = brute_force(charges, REFERENCE, charge[0], centre, reach, (200, 200, 24))
     assert std[0] == pytest.approx(expected_std, rel=0.01)
     assert (np.abs(mean[0] - expected_mean) < 0.01 * expected_std).all()
 
@@ -126,21 +122,21 @@ def test_noise_that_grows_with_the_charge_speaks_for_small_ones(charges):
     charge = charges.charges(np.array([[1.0, 2.0, 0.4]]))
     mean, std = Posterior(charges, loud, charges.domain.radius).mean_and_std(charge)
     centre, reach = np.append(mean[0, :2], np.log(mean[0, 2])), 6.0 * np.append(std[0, :2], std[0, 2] / mean[0, 2])
-    expected_mean, expected_std = brute_force(charges, loud, charge[0], centre, reach, (70, 70, 70))
+    expected_mean, expected_std = brute_force(charges, loud, charge[0], centre, reach, (60, 60, 60))
     assert std[0] == pytest.approx(expected_std, rel=0.01)
     assert (np.abs(mean[0] - expected_mean) < 0.01 * expected_std).all()
 
 
 def test_deviations_are_as_large_as_errors(charges):
     """Simulated presses and their noise: the squares of error over deviation are one on average."""
-    contact, charge = spread(charges, 300, seed=3)
+    contact, charge = spread(charges, 120, seed=3)
     mean, std = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)
     squares = np.mean(((mean - contact) / std) ** 2, axis=0)
-    assert squares == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 300))
+    assert squares == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 120))
 
 
 def test_finer_cells_change_nothing(charges):
-    contact, charge = spread(charges, 40, seed=4)
+    contact, charge = spread(charges, 12, seed=4)
     coarse, _ = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)
     fine, _ = Posterior(charges, REFERENCE, charges.domain.radius, step=0.75).mean_and_std(charge)
     rms = [np.sqrt(np.mean(np.sum((mean - contact)[:, :2] ** 2, axis=1))) for mean in (coarse, fine)]

@@ -9,8 +9,8 @@ from isocharge.common.progress import listening
 from isocharge.common.resumable_run import resume_parts
 from isocharge.serve import Predictor, check_golden, load_model
 from isocharge.train import FilmsConfig, fit_films, read_films, release_films
+from isocharge.train.films import films_data
 from isocharge.train.films import fit as films_fit
-from isocharge.train.films import misfit_films
 from isocharge.train.films import release as films_release
 from isocharge.train.films.fit import films_identity
 from isocharge.train.films.release import evaluate_films
@@ -20,6 +20,7 @@ TINY = FilmsConfig(
     hidden=(24, 24), misfit_hidden=(16, 16), films=48, presses=32, watched=8, steps=300, misfit_films=3,
     misfit_charges=24, near_films=4, misfit_steps=40, batch_films=16, batch_presses=32,
 )  # fmt: skip
+SHORT = replace(TINY, films=16, presses=16, watched=4, steps=30, misfit_films=2, misfit_charges=8, near_films=2)
 
 
 @pytest.fixture
@@ -34,7 +35,7 @@ def solved(films, monkeypatch):
 
     monkeypatch.setattr(films_fit, "FilmFamily", Solved)
     monkeypatch.setattr(films_release, "FILMS", 4)
-    monkeypatch.setattr(misfit_films, "CANDIDATES", 64)
+    monkeypatch.setattr(films_data, "CANDIDATES", 64)
 
 
 @pytest.mark.usefixtures("solved")
@@ -55,21 +56,22 @@ def test_a_tiny_fit_end_to_end(films, tmp_path):
 
 @pytest.mark.usefixtures("solved")
 def test_a_stopped_fit_goes_on_with_the_same_weights(films, tmp_path, monkeypatch):
-    monkeypatch.setattr(descent, "SAVE_EVERY_S", 0.1)
-    identity = films_identity(films.prior, TINY)
+    monkeypatch.setattr(descent, "SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr(descent, "REPORT_EVERY", 10)
+    identity = films_identity(films.prior, SHORT)
 
     class Stop(Exception):
         pass
 
     def stop(title, done, *_):
-        if title == "training the contact network" and done >= 200:
+        if title == "training the contact network" and done == 20:
             raise Stop
 
     with pytest.raises(Stop), listening(stop), resume_parts(tmp_path / "it", identity) as run:
-        fit_films(films.prior, TINY, run=run)
+        fit_films(films.prior, SHORT, run=run)
     with resume_parts(tmp_path / "it", identity) as run:
-        again = fit_films(films.prior, TINY, run=run)
-    straight = fit_films(films.prior, TINY)
+        again = fit_films(films.prior, SHORT, run=run)
+    straight = fit_films(films.prior, SHORT)
     for part in ("contact", "misfit"):
         for name, values in getattr(straight, part).arrays.items():
             np.testing.assert_array_equal(getattr(again, part).arrays[name], values)

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import TrainingError
 from isocharge.simulate import noise_model
-from isocharge.train.model_release.export import export_onnx
-from isocharge.train.model_release.graph_check import check_graph
+from isocharge.train.model_release.export import check_graph, export_onnx
 from isocharge.train.training.folding import fold_network
 
 REFERENCE = noise_model("reference")

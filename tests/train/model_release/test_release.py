@@ -18,14 +18,15 @@ from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingC
 from isocharge.train.data.measured import held_out
 from isocharge.train.data.presses import draw_contacts
 from isocharge.train.model_release.evaluate import simulated_errors
+from kept import kept
 
 QUICK = FitConfig(
     network=NetworkConfig(hidden=(24, 24), misfit_hidden=(24, 24)),
-    training=TrainingConfig(steps=200, misfit_steps=50, misfit_charges=2_000, batch=256),
+    training=TrainingConfig(steps=200, misfit_steps=50, misfit_charges=1_000, batch=256),
 )
 REFERENCE = noise_model("reference")
 MODELS = Path(__file__).parents[3] / "models"
-LOW, HIGH, RADIUS = 0.05, 2.0, 8.0
+LOW, HIGH, RADIUS, WIDEST = 0.05, 2.0, 8.0, 15.001
 LARGEST = {
     "three-25um-biaxial-films": (0.10, 0.4, 0.36, 1.0),  # three charges tell less of a film of 1.5 MPa
     "three-25um-biaxial-12mm": (0.14, 0.25, 0.18, 0.8),  # and less of a wide area
@@ -55,9 +56,16 @@ def known(touch, film):
     area = np.array(touch.metadata.working_area_mm)
     radius = np.cos(np.pi / len(area)) * np.hypot(*area[0])
     sensor = sensor_from_dict(dict(touch.metadata.sensor))
-    ready = radius <= RADIUS and sensor.film == film.sensor.film
-    wide = film if ready else ForwardMap.build(sensor, Circle(1.0), max(radius, RADIUS))
+    if sensor.film != film.sensor.film:
+        return ForwardMap.build(sensor, Circle(1.0), radius), radius
+    wide = film if radius <= RADIUS else kept(ForwardMap.build, film.sensor, Circle(1.0), radius=WIDEST)
     return replace(wide, sensor=sensor), radius
+
+
+@pytest.fixture(scope="module")
+def truth(known):
+    """Contacts that no training saw, and the simulator's charges."""
+    return presses(known[0], 10_000, 78, known[1])
 
 
 def presses(film, count, seed, within=RADIUS):
@@ -115,19 +123,10 @@ def test_versions_go_side_by_side_and_none_is_replaced(released, fitted):
     assert Predictor(released.folder.parent).metadata.version == 2
 
 
-def test_the_card_holds_on_other_presses(known, touch):
-    errors = simulated_errors(predict(touch), presses(*known_presses(known, 6000, 78)), REFERENCE, seed=6)
+def test_the_card_holds_on_other_presses_and_is_good_enough(truth, touch):
+    errors = simulated_errors(predict(touch), truth[:6000], REFERENCE, seed=6)
     for name in ("position_median_mm", "position_rms_mm", "force_rms_percent", "misfit_p99"):
         assert errors[name] == pytest.approx(touch.metadata.errors[name], rel=0.15, abs=0.02 * (name == "misfit_p99"))
-
-
-def known_presses(known, count, seed):
-    film, radius = known
-    return film, count, seed, radius
-
-
-def test_the_released_models_reach_what_they_should(known, touch):
-    errors = simulated_errors(predict(touch), presses(*known_presses(known, 6000, 77)), REFERENCE, seed=5)
     largest_median, largest_rms, largest_clean, percent = LARGEST.get(touch.metadata.name, (0.10, 0.20, 0.18, 0.8))
     assert errors["position_median_mm"] <= largest_median
     assert errors["position_rms_mm"] <= largest_rms
@@ -138,9 +137,8 @@ def test_the_released_models_reach_what_they_should(known, touch):
         assert errors["found_dead_electrode"] >= 0.99
 
 
-def test_the_deviations_are_honest(known, touch):
+def test_the_deviations_are_honest(truth, touch):
     """68 % and 95 % intervals cover what they say, per coordinate and in every third of force and radius."""
-    truth = presses(*known_presses(known, 12_000, 79))
     charge = truth.noisy(REFERENCE, seed=7)
     contact, std, _ = predict(touch)(charge)
     deviation = np.abs(contact - truth.contact) / std
@@ -189,13 +187,11 @@ def test_the_misfit_is_the_distance_to_the_nearest_known_contact(known, touch, g
     assert np.all(np.abs(misfit - searched) <= 2.0 + 0.6 * searched)
 
 
-def test_four_electrodes_have_one_check_to_spare(known, touch):
+def test_four_electrodes_have_one_check_to_spare(known, truth, touch):
     """Inside the domain the misfit of good presses is the length of one normal deviate."""
     if len(touch.metadata.electrodes) != 4:
         pytest.skip("three charges always fit some contact")
-    truth = presses(*known_presses(known, 6000, 4))
-    truth = truth.within(0.9 * known[1])
-    charge = truth.noisy(REFERENCE, seed=3)
+    charge = truth.within(0.9 * known[1]).noisy(REFERENCE, seed=3)
     good, off = touch.predict_batch(charge).misfit, 0.4 if touch.metadata.name.endswith("-student") else 0.15
     for share in (0.5, 0.9, 0.95, 0.99):
         assert np.quantile(good, share) == pytest.approx(halfnorm.ppf(share), rel=off)

@@ -9,14 +9,14 @@ from msgspec import structs
 from onnx import numpy_helper
 
 from isocharge.common.errors import DatasetError, ModelError
-from isocharge.serve import Predictor, load_model
+from isocharge.serve import Predictor
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import FitConfig, NetworkConfig, StudentCase, TrainingConfig, fit, release, student_data
 from isocharge.train.model_release.student import MOST_PARAMETERS, parameters, student_config
 
 STUDENT = FitConfig(
     network=NetworkConfig(hidden=(24, 24), misfit_hidden=(16, 16), weights="int8"),
-    training=TrainingConfig(steps=800, misfit_steps=100, misfit_charges=2_000, batch=256),
+    training=TrainingConfig(steps=400, misfit_steps=50, misfit_charges=1_000, batch=256),
 )
 
 
@@ -39,7 +39,7 @@ def test_it_answers_as_its_teacher_does_and_names_it(teacher, student, dataset):
     assert np.median(np.abs(mine.force_N / theirs.force_N - 1.0)) < 0.01
     wider = np.log(mine.x_std_mm / theirs.x_std_mm)  # by what it knows less well
     assert -0.05 < np.median(wider) < 0.4
-    assert load_model(student.folder).metadata.made_with["teacher"] == "teacher/1"
+    assert student.metadata.made_with["teacher"] == "teacher/1"
     assert "answers of `teacher/1`" in (student.folder / "card.md").read_text()
 
 

@@ -7,7 +7,7 @@ It depends on the film, the probe, the noise and the range of presses.
 """
 
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -88,10 +88,6 @@ class BayesLimit:
             expected_force_rms_percent=100.0 * rms(std[:, 2] / contact[:, 2]),
         )
 
-    def to_dict(self) -> dict[str, float | int]:
-        """For JSON."""
-        return asdict(self)
-
 
 def bayes_estimate(
     problem: BayesProblem,
@@ -130,7 +126,7 @@ def bayes_limit(
     presses: int = PRESSES,
     seed: int = 0,
     *,
-    forward_map: ForwardMap | None = None,
+    charge_map: ForwardMap | ChargeSpline | None = None,
     executor: Executor | None = None,
 ) -> BayesLimit:
     """The limit of a problem on presses drawn from its prior: a minute.
@@ -139,10 +135,10 @@ def bayes_limit(
         problem: Sensor, probe, prior and noise.
         presses: Number of presses.
         seed: Of presses and noise.
-        forward_map: The problem's, if it exists.
+        charge_map: As for `bayes_estimate`.
         executor: As for `bayes_estimate`.
     """
-    charges = forward_map or problem.forward_map(executor)
+    charges = charge_map or problem.forward_map(executor)
     contact = Sweep(problem.radius, problem.force_range, presses, seed, sampling="random").contacts()
     charge = problem.noise.add(charges.charges(contact), np.random.default_rng([seed, 1]))
     return BayesLimit.of(*bayes_estimate(problem, charge, charge_map=charges, executor=executor), contact)

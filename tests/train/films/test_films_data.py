@@ -1,4 +1,4 @@
-"""Presses on many films: the parts of the charges add up to what the film itself gives."""
+"""What networks for all films learn from: each film's own charges, nearest contacts, and what no contact explains."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -8,8 +8,9 @@ import pytest
 
 from isocharge.common.errors import DatasetError
 from isocharge.simulate import FilmPrior, Piezo, load_sensor
-from isocharge.train.films import film_presses
-from isocharge.train.films.film_presses import draw_film_presses
+from isocharge.simulate.identifiability.nearest_contact import search
+from isocharge.train.films import films_data
+from isocharge.train.films.films_data import FilmsSource, draw_film_presses, draw_misfit_films, draw_near_films
 
 
 def charges(prior, family, parameters, contact):
@@ -40,12 +41,44 @@ def test_films_drawn_anew_are_films(films):
 
 
 def test_the_draw_does_not_depend_on_who_draws(films, monkeypatch):
-    monkeypatch.setattr(film_presses, "CHUNK", 2)
+    monkeypatch.setattr(films_data, "CHUNK", 2)
     with ThreadPoolExecutor(2) as pool:
         here, there = (
             draw_film_presses(films.prior, films.family, films.domain, 5, 8, 2, executor) for executor in (None, pool)
         )
     np.testing.assert_array_equal(here.response, there.response)
+
+
+@pytest.fixture
+def source(films):
+    return FilmsSource(films.prior, films.family, films.domain, films.noise)
+
+
+def test_misfit_examples_are_those_of_their_film(source, monkeypatch):
+    """The residual is at a contact of the film: charge less noise times residual lies on its map, hence has none."""
+    monkeypatch.setattr(films_data, "CANDIDATES", 64)
+    drawn = draw_misfit_films(source, 2, 12, seed=1)
+    for parameters, charge, residual in zip(drawn.parameters, drawn.charge, drawn.aim, strict=True):
+        charge_map = source.charge_map(parameters)
+        near = np.linalg.norm(residual, axis=1) < 5.0
+        nearest = charge[near] - source.noise.sigma(charge[near]) * residual[near]
+        found, left = search(charge_map, nearest, source.noise.sigma(nearest), candidates=64)
+        assert near.any()
+        assert np.linalg.norm(left, axis=1).max() < 0.05
+        assert (np.hypot(found[:, 0], found[:, 1]) <= source.domain.radius * (1 + 1e-9)).all()
+
+
+def test_what_no_contact_explains_is_perpendicular_to_the_derivatives(source):
+    drawn = draw_near_films(source, 2, 5, seed=1)
+    for parameters, charge, across in zip(drawn.parameters, drawn.charge, drawn.aim, strict=True):
+        charge_map = source.charge_map(parameters)
+        contact, left = search(charge_map, charge, source.noise.sigma(charge), candidates=256)
+        assert np.linalg.norm(left, axis=1).max() < 0.05
+        slopes = charge_map.derivatives(contact) / source.noise.sigma(charge)[:, :, None]
+        slopes /= np.linalg.norm(slopes, axis=1, keepdims=True)
+        np.testing.assert_allclose(across @ slopes, 0.0, atol=0.02)
+        np.testing.assert_allclose(across @ across, across, atol=1e-9)
+        np.testing.assert_allclose(np.trace(across, axis1=1, axis2=2), 1.0)  # four charges, three unknowns
 
 
 def test_charges_that_are_not_positive_are_refused(films):
