@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC
+from isocharge.serve.frames.frame_layout import DATAGRAM, PADDING, SYNC
 from isocharge.serve.recognition.check_search import FoundCheck, find_checks
-from isocharge.serve.recognition.fields import CONSTANT_SHARE, Part, Role, Split, Weights, number_values, split_frame
+from isocharge.serve.recognition.fields import CONSTANT_SHARE, Part, Split, Weights, number_values, split_frame
 from isocharge.serve.recognition.framing import MOST_BYTES, Bytes, Windows, framings
-from isocharge.serve.recognition.series import Series, clock_of, steps
+from isocharge.serve.recognition.series import Series
 
 MOST_FRAMES = 300
 """Frames that are examined."""
@@ -59,7 +59,7 @@ def described_frames(
             candidate
             for windows in group
             for candidate in _candidates(windows, _rate_Hz(windows, chunks, seconds), weights)
-            if any(part.role is Role.channel for part in candidate.split.parts)
+            if any(part.role == "channel" for part in candidate.split.parts)
         ]
         if candidates:
             return _table(min(candidates, key=lambda candidate: candidate.score))
@@ -109,7 +109,7 @@ def _table(best: Candidate) -> dict[str, Any]:
     table: dict[str, Any] = {"format": "described"}
     if windows.framing != SYNC:
         table["framing"] = windows.framing
-    if sync := sum(part.size for part in split.parts if part.role is Role.sync):
+    if sync := sum(part.size for part in split.parts if part.role == "sync"):
         usual = [int(np.bincount(column).argmax()) for column in best.rows[:, :sync].T]
         table["sync"] = bytes(usual).hex(" ").upper()
     table |= {"length": windows.length, "byte_order": split.order}
@@ -125,30 +125,24 @@ def _table(best: Candidate) -> dict[str, Any]:
 def _fields(best: Candidate) -> list[dict[str, Any]]:
     """The fields of a device file; neighbouring bytes without meaning are one padding."""
     fields: list[dict[str, Any]] = []
-    taken: set[Role] = set()
+    roles = [part.role for part in best.split.parts]
     channels = 0
-    for part in best.split.parts:
-        kind = f"{'f' if part.is_float else 'u'}{8 * part.size}"
-        if part.role is Role.channel:
+    for position, part in enumerate(best.split.parts):
+        kind, is_first = f"{'f' if part.is_float else 'u'}{8 * part.size}", part.role not in roles[:position]
+        if part.role == "channel":
             channels += 1
             fields.append({"name": f"ch{channels}", "type": _type(best, part)})
-        elif part.role is Role.seq and Role.seq not in taken:
+        elif part.role == "seq" and is_first:
             fields.append({"name": "seq", "type": kind})
-        elif part.role is Role.clock and Role.clock not in taken:
-            name, scale = clock_of(_steps(best, part), best.rate_Hz) or ("t_us", 1.0)
+        elif part.role == "clock" and is_first:
+            name, scale = part.clock
             fields.append({"name": name, "type": kind} | ({"scale": scale} if scale != 1.0 else {}))
-        elif part.role is not Role.sync:
-            if fields and fields[-1]["type"] == "pad":
-                fields[-1]["count"] = fields[-1].get("count", 1) + part.size
-            else:
-                fields.append({"type": "pad"} | ({"count": part.size} if part.size > 1 else {}))
-        taken.add(part.role)
+        elif part.role != "sync":
+            size = part.size
+            if fields and fields[-1]["type"] == PADDING:
+                size += fields.pop().get("count", 1)
+            fields.append({"type": PADDING} | ({"count": size} if size > 1 else {}))
     return fields
-
-
-def _steps(best: Candidate, part: Part) -> Series:
-    values = number_values(best.rows, part, best.split.order)
-    return np.diff(values.astype(float)) if part.is_float else steps(values, 8 * part.size)
 
 
 def _type(best: Candidate, part: Part) -> str:
@@ -156,8 +150,8 @@ def _type(best: Candidate, part: Part) -> str:
     if part.is_float:
         return f"f{8 * part.size}"
     alike = [other for other in best.split.parts if other.row == part.row]
-    votes = [_sign_vote(number_values(best.rows, other, best.split.order), 8 * part.size) for other in alike]
-    return f"{'i' if sum(votes) > 0 else 'u'}{8 * part.size}"
+    counts = [number_values(best.rows, other.at, other.size, best.split.order) for other in alike]
+    return f"{'i' if sum(_sign_vote(values, 8 * part.size) for values in counts) > 0 else 'u'}{8 * part.size}"
 
 
 def _sign_vote(counts: Series, bits: int) -> int:

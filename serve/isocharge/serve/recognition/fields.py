@@ -7,8 +7,8 @@ type side by side. `tests/benchmarks/fit_recognition.py` fits the weights on ran
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import cache
+from typing import Literal
 
 import numpy as np
 
@@ -69,16 +69,6 @@ class Weights:
     no_check: float = 4.0
 
 
-class Role(StrEnum):
-    """What a part of a frame is."""
-
-    sync = "sync"
-    pad = "pad"
-    seq = "seq"
-    clock = "clock"
-    channel = "channel"
-
-
 @dataclass(frozen=True)
 class Part:
     """A part of a frame.
@@ -89,19 +79,21 @@ class Part:
         score: What it adds, bits, without the row that a channel may begin.
         is_float: Whether it is a floating-point number.
         is_dead: Whether it is a channel that never varies.
+        clock: Name of its field in a device file and value of one tick, of a clock.
     """
 
-    role: Role
+    role: Literal["sync", "pad", "seq", "clock", "channel"]
     at: int
     size: int
     score: float = 0.0
     is_float: bool = False
     is_dead: bool = False
+    clock: tuple[str, float] = ("", 1.0)
 
     @property
     def row(self) -> tuple[int, bool] | None:
         """What channels of one row have in common; None for other parts."""
-        return (self.size, self.is_float) if self.role is Role.channel else None
+        return (self.size, self.is_float) if self.role == "channel" else None
 
 
 @dataclass(frozen=True)
@@ -113,12 +105,12 @@ class Split:
     order: ByteOrder
 
 
-def number_values(rows: Bytes, part: Part, order: ByteOrder) -> Series:
-    """The numbers of a part in all frames, unsigned unless floating-point, shape (n,)."""
-    cut = np.ascontiguousarray(rows[:, part.at : part.at + part.size])
-    if part.is_float:
-        return cut.view(("<" if order == "little" else ">") + FLOATS[part.size][0])[:, 0]
-    powers = 256 ** np.arange(part.size, dtype=np.int64)
+def number_values(rows: Bytes, at: int, size: int, order: ByteOrder, *, is_float: bool = False) -> Series:
+    """The numbers at a byte in all frames, unsigned unless floating-point, shape (n,)."""
+    cut = np.ascontiguousarray(rows[:, at : at + size])
+    if is_float:
+        return cut.view(("<" if order == "little" else ">") + FLOATS[size][0])[:, 0]
+    powers = 256 ** np.arange(size, dtype=np.int64)
     values: Series = cut @ (powers if order == "little" else powers[::-1])
     return values
 
@@ -146,7 +138,7 @@ def split_frame(
             tail, parts = _cheapest(fields, begin, weights)
             score += tail + weights.unusual * (order not in (None, way))
             if best is None or score < best.score:
-                best = Split(score, (Part(Role.sync, 0, begin), *parts)[not begin :], way)
+                best = Split(score, (Part("sync", 0, begin), *parts)[not begin :], way)
     return best
 
 
@@ -187,20 +179,20 @@ def _fields_at(
     rows: Bytes, at: int, end: int, order: ByteOrder, rate_Hz: float, constant: Series, weights: Weights
 ) -> Iterator[Part]:
     """The numbers, clocks and channels that may begin at a byte; the byte alone, without a meaning, first."""
-    yield Part(Role.pad, at, 1, weights.constant if constant[at] else weights.noise)
+    yield Part("pad", at, 1, weights.constant if constant[at] else weights.noise)
     for size in range(1, min(4, end - at) + 1):
-        values = number_values(rows, Part(Role.channel, at, size), order)
+        values = number_values(rows, at, size, order)
         step, half = steps(values, 8 * size), 4 * size
         stands = int(values.min()) >> half == int(values.max()) >> half != 0
         unusual = weights.counter + weights.unusual * ((size == 4 and stands) + 3 * (size == 3))
         if is_counter(step):
-            yield Part(Role.seq, at, size, unusual)
-        elif size > 1 and clock_of(step, rate_Hz) is not None:
-            yield Part(Role.clock, at, size, unusual + bits_of_steps(step - float(np.median(step))))
+            yield Part("seq", at, size, unusual)
+        elif size > 1 and (clock := clock_of(step, rate_Hz)) is not None:
+            yield Part("clock", at, size, unusual + bits_of_steps(step - float(np.median(step))), clock=clock)
         if constant[at : at + size].all():
-            yield Part(Role.channel, at, size, weights.dead + weights.channel, is_dead=True)
+            yield Part("channel", at, size, weights.dead + weights.channel, is_dead=True)
         elif (bits := bits_of_steps(step) + weights.level * _level(values, size)) <= 8 * size - FULL_RANGE_BITS:
-            yield Part(Role.channel, at, size, bits + weights.channel)
+            yield Part("channel", at, size, bits + weights.channel)
     for size in FLOATS:
         if at + size <= end:
             yield from _float_at(rows, at, size, order, rate_Hz, weights)
@@ -213,18 +205,18 @@ def _level(values: Series, size: int) -> float:
 
 
 def _float_at(rows: Bytes, at: int, size: int, order: ByteOrder, rate_Hz: float, weights: Weights) -> Iterator[Part]:
-    values = number_values(rows, Part(Role.channel, at, size, is_float=True), order)
+    values = number_values(rows, at, size, order, is_float=True)
     _, letter, mantissa = FLOATS[size]
     bits = bits_of_floats(values, np.ascontiguousarray(values).view(values.dtype.byteorder + letter), mantissa)
     if bits is None:
         return
     step = np.diff(values.astype(float))
     if not step.any():
-        yield Part(Role.channel, at, size, weights.dead + weights.channel, is_float=True, is_dead=True)
+        yield Part("channel", at, size, weights.dead + weights.channel, is_float=True, is_dead=True)
         return
     if (clock := clock_of(step, rate_Hz)) is not None and clock[1] == 1.0:
         typical = float(np.median(step))
         jitter = bits_of_steps((step - typical) / (CLOCK_RESOLUTION * typical))
-        yield Part(Role.clock, at, size, weights.counter + jitter, is_float=True)
+        yield Part("clock", at, size, weights.counter + jitter, is_float=True, clock=clock)
     score = max(1.0, bits - weights.float_byte * size) + weights.channel
-    yield Part(Role.channel, at, size, score, is_float=True)
+    yield Part("channel", at, size, score, is_float=True)
