@@ -41,9 +41,7 @@ class Weights:
 
     Attributes:
         row: A row of channels of one type.
-        channel: A channel, besides the bits of its steps.
-        dead: A channel that never varies, in a row with others.
-        level: A bit of a channel's distance from zero.
+        channel: A channel, besides the bits of its steps; one that never varies needs none.
         counter: A number or a clock.
         sync: A byte of the sync.
         unusual: Something that boards seldom have: a sync of one byte, or with a byte that is dull; a clock of three
@@ -57,8 +55,6 @@ class Weights:
 
     row: float = 1.5
     channel: float = 0.15
-    dead: float = 1.0
-    level: float = 0.03
     counter: float = 0.2
     sync: float = 0.05
     unusual: float = 0.8
@@ -190,18 +186,12 @@ def _fields_at(
         elif size > 1 and (clock := clock_of(step, rate_Hz)) is not None:
             yield Part("clock", at, size, unusual + bits_of_steps(step - float(np.median(step))), clock=clock)
         if constant[at : at + size].all():
-            yield Part("channel", at, size, weights.dead + weights.channel, is_dead=True)
-        elif (bits := bits_of_steps(step) + weights.level * _level(values, size)) <= 8 * size - FULL_RANGE_BITS:
+            yield Part("channel", at, size, weights.channel, is_dead=True)
+        elif (bits := bits_of_steps(step)) <= 8 * size - FULL_RANGE_BITS:
             yield Part("channel", at, size, bits + weights.channel)
     for size in FLOATS:
         if at + size <= end:
             yield from _float_at(rows, at, size, order, rate_Hz, weights)
-
-
-def _level(values: Series, size: int) -> float:
-    """Bits of a channel's distance from zero, of integers with a sign, without, or offset by half."""
-    level, half = float(np.median(values)), float(1 << (8 * size - 1))
-    return float(np.log2(1.0 + min(level, abs(level - half), 2.0 * half - level)))
 
 
 def _float_at(rows: Bytes, at: int, size: int, order: ByteOrder, rate_Hz: float, weights: Weights) -> Iterator[Part]:
@@ -212,7 +202,7 @@ def _float_at(rows: Bytes, at: int, size: int, order: ByteOrder, rate_Hz: float,
         return
     step = np.diff(values.astype(float))
     if not step.any():
-        yield Part("channel", at, size, weights.dead + weights.channel, is_float=True, is_dead=True)
+        yield Part("channel", at, size, weights.channel, is_float=True, is_dead=True)
         return
     if (clock := clock_of(step, rate_Hz)) is not None and clock[1] == 1.0:
         typical = float(np.median(step))
