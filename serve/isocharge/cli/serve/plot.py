@@ -13,7 +13,7 @@ from isocharge.common.extras import require
 from isocharge.serve import Recording, find_model, load_model
 
 with require("simulate"):
-    from isocharge.cli.serve.pictures.recording import RecordFields, Traces, recording_picture
+    from isocharge.cli.serve.recording_picture import RecordFields, recording_picture, traces_of
     from isocharge.simulate.plots.figure import check_picture, save_picture
     from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
@@ -42,7 +42,7 @@ def plot_command(
     check_picture(output)
     recording = Recording(file)
     with shown_progress():
-        traces = Traces.of(recording.records(RecordFields), str(file))
+        traces = traces_of(recording.records(RecordFields), str(file))
     sensor = working_area = None
     try:
         metadata = load_model(find_model(model or recording.model, models)).metadata
@@ -52,4 +52,4 @@ def plot_command(
         missing = "the film, whose model is not to be had" if working_area is None else "electrodes"
         say(f"drawn without {missing}: {error}")
     save_picture(recording_picture(traces, sensor, working_area, f"{file.name}, {recording.model}"), output)
-    say(f"drawn in {output}: {len(traces)} records")
+    say(f"drawn in {output}: {len(traces['timestamp'])} records")

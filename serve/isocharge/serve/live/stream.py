@@ -1,22 +1,22 @@
 """Chunks of bytes in, prediction records out: the stream of readings, each with the answer of a model."""
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from isocharge.common.arrays import Array, Reals
 from isocharge.common.errors import ModelError
-from isocharge.serve.flags import GAP, RECONNECTED, REPEAT, RESTART
-from isocharge.serve.frames.frame import Parser
+from isocharge.serve.flags import GAP, INVALID, RECONNECTED, REPEAT, RESTART
+from isocharge.serve.frames.frame import Frame, Parser
 from isocharge.serve.frames.sequence import SequenceGaps
 from isocharge.serve.live.device import ANY_BOARD, Device
-from isocharge.serve.live.reading_stream import ReadingStream
-from isocharge.serve.live.record_builder import RecordBuilder
+from isocharge.serve.live.reading_stream import ReadingStream, TimedReading
 from isocharge.serve.port.serial_port import Chunk
 from isocharge.serve.prediction.predictor import Predictor
-from isocharge.serve.prediction.record import PredictionRecord
+from isocharge.serve.prediction.record import OUT_OF_CONTACT, UNKNOWN, Charges, PredictionRecord
 from isocharge.serve.signal_chain.chain import Chain, Reading
 
 LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
@@ -135,7 +135,12 @@ class TouchStream:
         self.counts = StreamCounts()
         self._before_restart = StreamTotals()
         self._policy, self._now_ns, self._frame_id = policy, now_ns, frame_id
-        self._predictor, self._records = predictor, RecordBuilder.of(predictor, frame_id)
+        self._use(predictor)
+
+    def _use(self, predictor: Predictor) -> None:
+        self._predictor, self._validity = predictor, predictor.validity
+        self._electrodes, self._label = predictor.metadata.electrodes, predictor.metadata.label
+        self._name = self.frame_id
 
     @property
     def predictor(self) -> Predictor:
@@ -159,7 +164,7 @@ class TouchStream:
                 f"model {after.label}: expected the electrodes {before.electrodes} of {before.label}, got "
                 f"{after.electrodes}; start another stream for it"
             )
-        self._predictor, self._records = predictor, RecordBuilder.of(predictor, self._frame_id)
+        self._use(predictor)
 
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
@@ -196,15 +201,15 @@ class TouchStream:
         frames = self._readings.frames(chunk)
         last, skipped = len(frames) - 1, set[str]()
         for number, frame in enumerate(frames):
-            reading, time_of_reading = self._readings.advance(frame, chunk)
+            timed = self._readings.advance(frame, chunk)
             if self._policy is Policy.latest and number < last:
                 self.counts.skipped += 1
-                skipped.update(reading.flags)
+                skipped.update(timed.reading.flags)
                 continue
             if skipped:
-                reading = _after(skipped, reading)
+                timed = timed._replace(reading=_after(skipped, timed.reading))
             self.counts.records += 1
-            yield self._records.record(chunk, frame, reading, time_of_reading, self._now_ns)
+            yield self._record(chunk, frame, timed)
         self._readings.arrived(frames, chunk)
 
     def finish(self) -> None:
@@ -214,6 +219,42 @@ class TouchStream:
             PortError: If there was not one intact frame.
         """
         self._readings.finish()
+
+    def _record(self, chunk: Chunk, frame: Frame, timed: TimedReading) -> PredictionRecord:
+        """The record of a frame; the clock is asked once everything is computed."""
+        reading, when = timed
+        contact, flags = self._contact(reading)
+        return PredictionRecord(
+            timestamp=when.host_s,
+            t_device_us=when.device_us,
+            seq=frame.seq,
+            **contact,
+            contact=reading.contact,
+            charge_pC=self._by_electrode(reading.charge_pC),
+            charge_raw_pC=self._by_electrode(reading.raw_pC),
+            tare_pC=self._by_electrode(reading.tare.charge_pC if reading.tare else None),
+            flags=flags,
+            latency_us=(self._now_ns() - chunk.clock_ns) / 1e3,
+            model=self._label,
+            frame_id=self._name,
+        )
+
+    def _contact(self, reading: Reading) -> tuple[dict[str, Any], tuple[str, ...]]:
+        """The fields of the contact, and the reading's flags with those of the contact."""
+        flags = reading.flags
+        if INVALID in flags:
+            return UNKNOWN, flags
+        if not reading.contact or reading.charge_pC is None:
+            return OUT_OF_CONTACT, flags
+        contact = self._predictor.predict(reading.charge_pC)
+        return contact._asdict(), flags + self._validity.flags(contact)
+
+    def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
+        """Charges by electrode name; None for one that is not a number."""
+        if charge_pC is None:
+            return None
+        values = charge_pC.tolist()
+        return {name: q if math.isfinite(q) else None for name, q in zip(self._electrodes, values, strict=True)}
 
     def _misfit(self, charge_pC: Array) -> Reals:
         """The model's misfit, shape (n,), for charges of shape (n, electrodes), pC."""

@@ -1,4 +1,0 @@
-"""Pictures of what was served: a recording.
-
-May import: nothing else of isocharge.cli.
-"""
