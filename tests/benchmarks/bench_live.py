@@ -3,8 +3,8 @@
 A board of 1 kHz plays on a pseudo-terminal; `isocharge serve stream --live --record` follows it. Rounds without viewers
 and rounds with three (one of which stalls) take turns in one run; each stream is a process of its own, as is the board
 and the viewers. Reported: the reader's latency (last byte to record), the frames that the recording misses, the age of
-the newest sample when a viewer has it, and the memory of the processes. With --browser, headless Chromium is one of the
-viewers and says how old its pictures are and how many a second it draws.
+the newest sample when a viewer has it. With --browser, headless Chromium is one of the viewers and says how old its
+pictures are and how many a second it draws.
 
     python tests/benchmarks/bench_live.py --rounds 4 --seconds 10 [--browser] [--rate-Hz 1000]
 """
@@ -86,60 +86,37 @@ async def _watch(url, form, stalls, seconds):
     return ages
 
 
-def children(pid):
-    """Numbers of the processes that a process has started."""
-    found = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True, check=False)
-    return [int(word) for word in found.stdout.split()]
-
-
-def memory_MB(*pids):
-    """Resident memory of processes together, MB."""
-    total = 0.0
-    for pid in pids:
-        text = Path(f"/proc/{pid}/status").read_text()
-        resident = re.search(r"VmRSS:\s+(\d+)", text)  # a process that has just ended has none
-        total += int(resident[1]) / 1e3 if resident else 0.0
-    return total
-
-
 def browse(url, seconds):
-    """Chromium's view: ages of its pictures (ms), pictures a second, and memory of the page every two seconds (MB)."""
+    """Chromium's view: ages of its pictures (ms), and pictures a second."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=[*ARGUMENTS, "--enable-precise-memory-info"])
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         page = browser.new_page(viewport={"width": 1280, "height": 820})
         page.goto(url)
         page.wait_for_timeout(3000)
-        memory = [page.evaluate("performance.memory.usedJSHeapSize")]
         page.evaluate("isocharge.page.ages.length = 0")
-        ages, ends = [], time.monotonic() + seconds
-        rates = []
-        while time.monotonic() < ends:
-            page.wait_for_timeout(2000)
-            ages += page.evaluate("isocharge.page.ages.splice(0)")
-            rates.append(page.evaluate("(({starts: s}) => 1000 * (s.length - 1) / (s.at(-1) - s[0]))(isocharge.page)"))
-            memory.append(page.evaluate("performance.memory.usedJSHeapSize"))
+        page.wait_for_timeout(1e3 * seconds)
+        ages = page.evaluate("isocharge.page.ages")
+        rate = page.evaluate("(({starts: s}) => 1000 * (s.length - 1) / (s.at(-1) - s[0]))(isocharge.page)")
         browser.close()
-    return ages, rates, [size / 1e6 for size in memory]
+    return ages, rate
 
 
 @contextmanager
 def following(port, folder, name, *words):
-    """A stream that follows the port and has its tare, with the URL of its page; it says why if it ends."""
+    """A stream that follows the port and has its tare; the URL of its page."""
     said = folder / f"{name}.txt"
     command = [sys.executable, "-m", "isocharge.cli", "serve", "stream", MODEL, "--port", port, "--output", "none"]
     with said.open("w") as output:
         process = subprocess.Popen([*command, *words], stderr=output)
     try:
         while "tared" not in said.read_text():
-            assert process.poll() is None
+            assert process.poll() is None, said.read_text()
             time.sleep(0.05)
         match = re.search(r"page: (\S+)", said.read_text())
-        yield process, match[1] if match else ""
-        assert process.poll() is None
-    except Exception as error:
-        raise RuntimeError(f"{name}: the stream said {said.read_text()!r}") from error
+        yield match[1] if match else ""
+        assert process.poll() is None, said.read_text()
     finally:
         process.terminate()
         process.wait(30)
@@ -161,19 +138,18 @@ def watched(url, viewers, seconds):
 
 
 def one_round(port, viewers, seconds, folder, name, in_browser):
-    """Follow the port for a while: latencies (us), lost frames, ages (s), memory (MB, start and end), browser."""
+    """Follow the port for a while: latencies (us), lost frames, ages (s), and what the browser says."""
     path = folder / f"{name}.rec"
     words = ["--live", "127.0.0.1:0"] if viewers else []
-    with following(port, folder, name, "--record", path, *words) as (process, url):
-        pids = [process.pid, *children(process.pid)]
-        memory = [memory_MB(*pids)]
-        with watched(url, viewers - in_browser, seconds) as ages:
-            browsed = browse(url, seconds) if in_browser else time.sleep(seconds)
-            memory.append(memory_MB(*pids))
+    with (
+        following(port, folder, name, "--record", path, *words) as url,
+        watched(url, viewers - in_browser, seconds) as ages,
+    ):
+        browsed = browse(url, seconds) if in_browser else time.sleep(seconds)
     latencies = np.array([us for event in Recording(path).events() for us in event.latencies_us])
     lines = (json.loads(line) for line in path.open() if line.startswith('{"timestamp"'))
     seq = np.array([line["seq"] for line in lines])
-    return latencies, int(((np.diff(seq) - 1) % 65536).sum()), ages, memory, browsed
+    return latencies, int(((np.diff(seq) - 1) % 65536).sum()), ages, browsed
 
 
 def percentiles(values, scale=1.0):
@@ -204,26 +180,16 @@ def main():
         for number in range(options.rounds):
             for viewers in (0, 3) if number % 2 == 0 else (3, 0):
                 in_browser = options.browser and viewers > 0
-                latencies, lost, ages, memory, browsed = one_round(
-                    port,
-                    viewers,
-                    options.seconds,
-                    Path(name),
-                    f"{number}-{viewers}",
-                    in_browser,
+                latencies, lost, ages, browsed = one_round(
+                    port, viewers, options.seconds, Path(name), f"{number}-{viewers}", in_browser
                 )
                 p99[viewers].append(float(np.percentile(latencies, 99)))
                 print(
                     f"round {number}, {viewers} viewers: latency us {percentiles(latencies)}; "
-                    f"{len(latencies)} records, {lost} lost; age ms {percentiles(ages, 1e3)}; memory MB "
-                    f"{' -> '.join(f'{size:.1f}' for size in memory)}"
+                    f"{len(latencies)} records, {lost} lost; age ms {percentiles(ages, 1e3)}"
                 )
                 if browsed is not None:
-                    pictures, rates, heap = browsed
-                    print(
-                        f"  Chromium: age of a picture ms {percentiles(pictures)}; pictures/s "
-                        f"{np.median(rates):.1f}; heap MB {heap[0]:.1f} -> {heap[-1]:.1f}, most {max(heap):.1f}"
-                    )
+                    print(f"  Chromium: age of a picture ms {percentiles(browsed[0])}; pictures/s {browsed[1]:.1f}")
     ratios = np.array(p99[3]) / np.array(p99[0])
     spread = f"median {np.median(ratios):.2f}, {ratios.min():.2f} to {ratios.max():.2f}"
     print(f"p99 with three viewers over without: {spread}")

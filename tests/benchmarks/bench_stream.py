@@ -1,6 +1,6 @@
 """The live path over a pseudo-terminal: frames lost and repeated, how long a record takes, and how much of a core.
 
-    python tests/benchmarks/bench_stream.py [--model NAME|PATH] [--seconds 60] [--rate-Hz 1000] [--corrupt 0] [--json]
+    python tests/benchmarks/bench_stream.py [--model NAME|PATH] [--seconds 60] [--rate-Hz 1000] [--json]
 
 The virtual sensor plays in a process of its own; the reader's processor time is its own alone, all stages of the signal
 chain on, each record turned into a line of JSON. The latency is that of the record itself: from the arrival of the last
@@ -15,9 +15,9 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
-from bench_predictor import machine
 
-from isocharge.serve import Faults, Port, Predictor, TouchStream, VirtualSensor, device_from_table, wander
+from isocharge.serve import Port, Predictor, TouchStream, VirtualSensor, device_from_table, wander
+from isocharge.serve.benchmark import machine
 
 BOARD = {
     "gain": {"pC_per_unit": 1.0},
@@ -43,21 +43,20 @@ def linear_film(electrodes: int) -> Any:
     return charges
 
 
-def board(pipe: Connection, electrodes: int, rate_Hz: float, faults: Faults, seed: int) -> None:
+def board(pipe: Connection, electrodes: int, rate_Hz: float, seed: int) -> None:
     """Play until the other end says so; then tell what was played."""
     script = wander(seed=seed, seconds=60.0, rate_Hz=rate_Hz)
-    options = {"noise": reference_noise, "faults": faults, "seed": seed}
-    with VirtualSensor(linear_film(electrodes), script, **options) as sensor:
+    with VirtualSensor(linear_film(electrodes), script, noise=reference_noise, seed=seed) as sensor:
         pipe.send(sensor.url)
         pipe.recv()
-    pipe.send({name: getattr(sensor, name) for name in ("sent", "withheld", "lost", "corrupted", "unplugged")})
+    pipe.send({name: getattr(sensor, name) for name in ("sent", "withheld")})
 
 
-def play(predictor: Predictor, seconds: float, rate_Hz: float, faults: Faults, seed: int) -> dict[str, Any]:
+def play(predictor: Predictor, seconds: float, rate_Hz: float, seed: int) -> dict[str, Any]:
     """Follow a virtual sensor for a while."""
     pipe, far = multiprocessing.Pipe()
     process = multiprocessing.get_context("spawn").Process(
-        target=board, args=(far, len(predictor.metadata.electrodes), rate_Hz, faults, seed)
+        target=board, args=(far, len(predictor.metadata.electrodes), rate_Hz, seed)
     )
     process.start()
     path, latencies = TouchStream(predictor, device_from_table(BOARD, "bench")), []
@@ -78,15 +77,8 @@ def play(predictor: Predictor, seconds: float, rate_Hz: float, faults: Faults, s
 
 def summary(latencies: np.ndarray, path: TouchStream, played: dict[str, int]) -> dict[str, Any]:
     """Counters and percentiles; latencies has the columns last byte to record (us), contact."""
-    counts, touched = path.parser.counts, latencies[latencies[:, 1] == 1.0]
-    return {
-        "frames": counts.frames,
-        "missing_by_number": path.gaps.lost,
-        "repeated": path.gaps.repeated,
-        "crc_errors": counts.crc_errors,
-        "malformed": counts.malformed,
-        "resynchronisations": counts.resyncs,
-        "outages": path.counts.outages,
+    touched = latencies[latencies[:, 1] == 1.0]
+    return path.totals()._asdict() | {
         "board": played,
         "in_contact": len(touched),
         "last_byte_to_record_us": percentiles(latencies[:, 0]),
@@ -103,13 +95,10 @@ def main() -> None:
     parser.add_argument("--model", default="three-25um-biaxial", help="model name or path")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate-Hz", type=float, default=1000.0)
-    parser.add_argument("--corrupt", type=float, default=0.0, help="share of bytes")
-    parser.add_argument("--lose", type=float, default=0.0, help="share of frames")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true", help="one JSON object")
     asked = parser.parse_args()
-    faults = Faults(corrupt_share=asked.corrupt, lose_share=asked.lose)
-    result = play(Predictor(asked.model), asked.seconds, asked.rate_Hz, faults, asked.seed)
+    result = play(Predictor(asked.model), asked.seconds, asked.rate_Hz, asked.seed)
     if asked.json:
         print(json.dumps({"benchmark": "stream", **vars(asked), "machine": machine(), "results": result}))
         return

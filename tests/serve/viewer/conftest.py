@@ -125,7 +125,7 @@ def viewer():
 
     def run(page, talk, **options):
         async def follow():
-            async with connect(page.live, subprotocols=["isocharge.live.1"], **options) as socket:
+            async with connect(page.live, **({"subprotocols": ["isocharge.live.1"]} | options)) as socket:
                 return await talk(Client(socket, page.form))
 
         return asyncio.run(follow())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.serve.viewer.samples import SampleFormat
-from isocharge.serve.viewer.tape import PIECES, LiveTape, RecordedTape
+from isocharge.serve.viewer.tape import PIECES, RecordedTape, Tape
 
 FORM = SampleFormat(("A",))
 
@@ -25,7 +25,7 @@ def samples(times, force_N=0.0):
 
 
 def test_a_live_tape_keeps_the_latest():
-    tape = LiveTape(FORM.dtype, most=10)
+    tape = Tape(FORM.dtype, most=10)
     for first in range(0, 35, 7):
         tape.append(samples(np.arange(first, first + 7.0)))
     assert (tape.oldest, tape.total) == (25, 35)

@@ -15,7 +15,7 @@ import numpy as np
 from isocharge.serve.viewer.link import PageEnd
 from isocharge.serve.viewer.messages import LiveRequest, ReplayRequest, samples_message
 from isocharge.serve.viewer.samples import SampleFormat, coalesce
-from isocharge.serve.viewer.tape import LiveTape, Playhead, RecordedTape
+from isocharge.serve.viewer.tape import Playhead, RecordedTape, Tape
 
 TICK_S, IDLE_S = 1 / 120, 0.05
 """Time between two looks at the reader, s: with viewers, and without."""
@@ -43,6 +43,8 @@ class Hub:
     """The stream and its viewers; belongs to one event loop.
 
     Attributes:
+        is_replay: Whether the stream is a recording.
+        requests: The type of the requests that this page takes.
         tape: The samples.
         description: Of the film, for the page, see `describe_film`.
         state: What changes seldom: counters, recording, notes; for the page.
@@ -63,17 +65,9 @@ class Hub:
         self.has_ended = False
         self._link = link
         self._dtype = SampleFormat(tuple(description["electrodes"])).dtype
-        self.tape: LiveTape | RecordedTape = RecordedTape(self._dtype) if is_recording else LiveTape(self._dtype)
-
-    @property
-    def is_replay(self) -> bool:
-        """Whether the stream is a recording."""
-        return isinstance(self.tape, RecordedTape)
-
-    @property
-    def requests(self) -> Any:
-        """The type of the requests that this page takes."""
-        return ReplayRequest if self.is_replay else LiveRequest
+        self.is_replay = is_recording
+        self.requests: Any = ReplayRequest if is_recording else LiveRequest
+        self.tape: Tape = RecordedTape(self._dtype) if is_recording else Tape(self._dtype)
 
     def close(self) -> None:
         """Close the link and the file of a recording."""
@@ -192,7 +186,7 @@ class Viewer:
     def _stop(self) -> int:
         """Number of the first sample that is not to be shown yet."""
         tape, playhead = self._hub.tape, self._playhead
-        if playhead is None or not isinstance(tape, RecordedTape) or not tape.total:
+        if playhead is None or not tape.total:
             return tape.total
         at_s = tape.span()[0] + playhead.at_s
         if playhead.has_jumped:
@@ -206,6 +200,5 @@ class Viewer:
         self._shows_playhead |= playhead.advance(max(step_s, 0.0), self._length_s(), is_complete=is_complete)
 
     def _length_s(self) -> float:
-        tape = self._hub.tape
-        start, end = tape.span() if isinstance(tape, RecordedTape) else (0.0, 0.0)
+        start, end = self._hub.tape.span()
         return end - start

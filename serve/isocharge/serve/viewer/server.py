@@ -14,8 +14,7 @@ import socket
 import time
 from collections.abc import AsyncIterator, Sequence
 from http import HTTPStatus
-from importlib.resources import files
-from importlib.resources.abc import Traversable
+from pathlib import Path
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -136,7 +135,8 @@ class PageServer:
                 return _to_send(self._files[path])
             if path not in (SESSION, LIVE):
                 raise UnknownPath(f"nothing is served under {path[:200]!r}; the page is /")
-            headers = {name.lower().encode(): _bytes(value) for name, value in request.headers.raw_items()}
+            items = request.headers.raw_items()
+            headers = {name.lower().encode(): value.encode("ascii", "surrogateescape") for name, value in items}
             offered = ",".join(request.headers.get_all("Sec-WebSocket-Protocol")).split(",")
             self._access.check(headers, map(str.strip, offered))
             if path == SESSION:
@@ -205,10 +205,6 @@ def _our_protocol(_connection: ServerConnection, offered: Sequence[Subprotocol])
     return Subprotocol(PROTOCOL) if PROTOCOL in offered else None
 
 
-def _bytes(header: str) -> bytes:
-    return header.encode("ascii", "surrogateescape")
-
-
 def _to_send(response: Response) -> WebResponse:
     """A response as `websockets` sends it, the last one of its connection."""
     headers = Headers([(name.decode(), value.decode()) for name, value in response.headers])
@@ -218,21 +214,14 @@ def _to_send(response: Response) -> WebResponse:
 
 def page_files() -> dict[str, Response]:
     """The answer to each path; `/` is the page."""
-    folder = files("isocharge.serve.viewer") / "page"
-    answers = {f"/{name}": _answer(file) for name, file in _walk(folder, "")}
+    folder = Path(__file__).with_name("page")
+    paths = [path for path in folder.rglob("*") if path.is_file()]
+    answers = {f"/{path.relative_to(folder).as_posix()}": _file_response(path) for path in paths}
     return answers | {"/": answers["/index.html"]}
 
 
-def _walk(folder: Traversable, prefix: str) -> list[tuple[str, Traversable]]:
-    entries: list[tuple[str, Traversable]] = []
-    for entry in folder.iterdir():
-        name = prefix + entry.name
-        entries += _walk(entry, f"{name}/") if entry.is_dir() else [(name, entry)]
-    return entries
-
-
-def _answer(file: Traversable) -> Response:
-    response = response_of(200, TYPES["." + file.name.rpartition(".")[2]], file.read_bytes())
+def _file_response(path: Path) -> Response:
+    response = response_of(200, TYPES[path.suffix], path.read_bytes())
     others = [header for header in PAGE_HEADERS if header[0] != b"content-security-policy"]
     response.headers.extend([(b"content-security-policy", POLICY), (b"cache-control", b"no-cache"), *others])
     return response

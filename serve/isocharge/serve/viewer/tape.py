@@ -17,7 +17,7 @@ PIECES = 600
 """Largest number of pieces in the overview of a recording."""
 
 
-class LiveTape:
+class Tape:
     """The latest samples of a stream without end, in bounded memory.
 
     Attributes:
@@ -33,9 +33,6 @@ class LiveTape:
         """Number of the oldest sample that is still there."""
         return max(0, self.total - len(self._ring))
 
-    def close(self) -> None:
-        """There is nothing to close."""
-
     def append(self, samples: Samples) -> None:
         """Add samples, and forget as many old ones as need be."""
         latest = samples[-len(self._ring) :]
@@ -47,37 +44,31 @@ class LiveTape:
         """Samples by number, those from `start` to before `stop` that are still there."""
         return self._ring[np.arange(max(start, self.oldest), stop) % len(self._ring)]
 
-    def index(self, timestamp: float) -> int:
-        """Number of the first sample after a time, unix seconds."""
-        return _first_after(self, timestamp)
-
     def timestamp(self, number: int) -> float:
         """Time of a sample, unix seconds."""
         return float(self._ring[number % len(self._ring)]["timestamp"])
 
+    def index(self, timestamp: float) -> int:
+        """Number of the first sample after a time, unix seconds."""
+        return bisect_right(range(self.total), timestamp, lo=self.oldest, key=self.timestamp)
 
-class RecordedTape:
-    """All samples of a recording, in a nameless file: a day of them needs no memory. Times never go back.
-
-    Attributes:
-        total: Samples so far.
-        oldest: Number of the first one, 0.
-    """
-
-    oldest = 0
-
-    def __init__(self, dtype: "np.dtype[Any]") -> None:
-        self.total = 0
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115
-        self._dtype = dtype
-        self._map: Samples = np.zeros(0, dtype)
-        self._latest = 0.0
-        self._piece_s = 0.01
-        self._force_N: list[float] = []
+    def span(self) -> tuple[float, float]:
+        """Times of the oldest and the latest sample, unix seconds; zeros if there is none."""
+        return (self.timestamp(self.oldest), self.timestamp(self.total - 1)) if self.total else (0.0, 0.0)
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Close the file, if there is one."""
+
+
+class RecordedTape(Tape):
+    """All samples of a recording, in a nameless file: a day of them needs no memory. Times never go back."""
+
+    def __init__(self, dtype: "np.dtype[Any]") -> None:
+        super().__init__(dtype)
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115
+        self._piece_s = 0.01
+        self._force_N: list[float] = []
+        self._map(LIVE_SAMPLES)
 
     def append(self, samples: Samples) -> None:
         """Add samples."""
@@ -85,37 +76,23 @@ class RecordedTape:
             return
         samples = samples.copy()
         times = np.maximum.accumulate(np.nan_to_num(samples["timestamp"], nan=0.0))
-        samples["timestamp"] = np.maximum(times, self._latest)
-        self._latest = float(samples["timestamp"][-1])
-        self._file.write(samples.tobytes())
-        self._file.flush()
-        self.total += len(samples)
+        samples["timestamp"] = np.maximum(times, self.span()[1])
+        while self.total + len(samples) > len(self._ring):
+            self._map(2 * len(self._ring))
+        super().append(samples)
         self._note_forces(samples)
 
-    def samples(self, start: int, stop: int) -> Samples:
-        """Samples by number."""
-        return np.array(self._mapped()[max(start, 0) : stop])
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
-    def index(self, timestamp: float) -> int:
-        """Number of the first sample after a time, unix seconds."""
-        return _first_after(self, timestamp)
-
-    def timestamp(self, number: int) -> float:
-        """Time of a sample, unix seconds."""
-        return float(self._mapped()[number]["timestamp"])
-
-    def span(self) -> tuple[float, float]:
-        """Times of the first and the last sample, unix seconds; zeros if there is none."""
-        return (self.timestamp(0), self._latest) if self.total else (0.0, 0.0)
+    def _map(self, most: int) -> None:
+        """Make room for so many samples."""
+        self._ring = np.memmap(self._file, self._ring.dtype, "r+", shape=(most,))
 
     def overview(self) -> list[float]:
         """Largest force in each of the equal pieces of the recording, N."""
         return [round(force, 3) for force in self._force_N]
-
-    def _mapped(self) -> Samples:
-        if len(self._map) < self.total:
-            self._map = np.memmap(self._file, self._dtype, mode="r", shape=(self.total,))
-        return self._map
 
     def _note_forces(self, samples: Samples) -> None:
         """Keep the largest force of each piece; two pieces become one where there would be too many."""
@@ -129,13 +106,6 @@ class RecordedTape:
         starts = np.flatnonzero(np.diff(piece, prepend=-1))
         for number, force in zip(piece[starts].tolist(), np.maximum.reduceat(force_N, starts).tolist(), strict=True):
             self._force_N[number] = max(self._force_N[number], force)
-
-
-Tape = LiveTape | RecordedTape
-
-
-def _first_after(tape: Tape, timestamp: float) -> int:
-    return bisect_right(range(tape.total), timestamp, lo=tape.oldest, key=tape.timestamp)
 
 
 @dataclass
