@@ -8,14 +8,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from choices import Choices
+from choices import QUICK, Choices
 from claims import claims, what_choices_change
-from entry import Entry
 from equation_4 import eq_4
 from figure_contours import fig_9, fig_10, fig_11
 from figure_curves import fig_6, fig_8, fig_12
 from figure_layouts import fig_1, fig_2, fig_3, fig_4, fig_5, fig_7
-from page import as_json, page
+from page import Entry, as_json, page
 from solves import Solves, solve_all
 from triangulation_errors import Accuracy
 
@@ -26,27 +25,24 @@ from isocharge.simulate import local_workers
 from isocharge.simulate.execution.workers import cores
 from isocharge.simulate.plots.figure import save_picture
 
-FIGURES = 15
+ENTRIES = 15
 """Number of entries of the page."""
 
 
-def write_paper(output: Path, choices: Choices, workers: int) -> tuple[Entry, ...]:
+def write_paper(output: Path, choices: Choices, workers: int) -> None:
     """Reproduce the paper in a new folder; the result does not depend on the number of worker processes."""
     began = time.perf_counter()
     with new_folder(output) as draft, local_workers(workers) as executor:
         solves = solve_all(choices, executor)
-        accuracy = Accuracy.of(solves, executor)
         entries = []
-        for entry in track(make_entries(solves, accuracy), "drawing", FIGURES):
+        for entry in track(make_entries(solves, Accuracy.of(solves, executor)), "drawing", ENTRIES):
+            entries.append(entry)
             if entry.figure is not None:
                 save_picture(entry.figure, draft / f"{entry.slug}.png")
                 entry.figure.set_layout_engine("none")  # as it was laid out, which takes as long as drawing it
                 save_picture(entry.figure, draft / f"{entry.slug}.svg")
-            entries.append(entry)
-        seconds = time.perf_counter() - began
         (draft / "paper.json").write_text(as_json(entries), "utf-8")
-        (draft / "paper.md").write_text(page(entries, choices, seconds), "utf-8")
-    return tuple(entries)
+        (draft / "paper.md").write_text(page(entries, choices, time.perf_counter() - began), "utf-8")
 
 
 def make_entries(solves: Solves, accuracy: Accuracy) -> Iterator[Entry]:
@@ -55,9 +51,8 @@ def make_entries(solves: Solves, accuracy: Accuracy) -> Iterator[Entry]:
         yield make(solves)
     yield fig_9(solves, accuracy)
     yield fig_10(solves, accuracy)
-    yield fig_11(solves)
-    yield fig_12(solves)
-    yield eq_4(solves)
+    for make in (fig_11, fig_12, eq_4):
+        yield make(solves)
     yield claims(solves, accuracy)
     yield what_choices_change(solves, accuracy)
 
@@ -69,4 +64,4 @@ if __name__ == "__main__":
     parser.add_argument("--workers", type=int, default=cores(), help="processes (default: one per core)")
     given = parser.parse_args()
     with shown_progress():
-        write_paper(given.output, Choices.quick() if given.quick else Choices(), given.workers)
+        write_paper(given.output, QUICK if given.quick else Choices(), given.workers)

@@ -4,45 +4,33 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from isocharge.simulate import Circle, Electrode, Polygon, Probe, Sensor, load_sensor
 from isocharge.simulate.forward.charge_spline import SPACING
-from isocharge.simulate.sensor.electrode import Electrode
-from isocharge.simulate.sensor.probe import Circle, Polygon, Probe
-from isocharge.simulate.sensor.sensor import Readout, Sensor
-from isocharge.simulate.sensor.sensor_file import load_sensor
+from isocharge.simulate.sensor.sensor import Readout
 
+# What the paper says
 
-@dataclass(frozen=True)
-class Paper:
-    """Numbers of Mirbagheri et al. (2007), in the paper's units.
+CUBICS = ((126.3, -592.4, 1743.9, 183.0), (52.679, -247.820, 731.498, 90.838), (47.189, -222.109, 656.633, 84.974))
+"""Eq. 4: charge (pC) of A, B, C against force (N), falling powers."""
 
-    Attributes:
-        cubics: Eq. 4: charge (pC) of A, B, C against force (N), falling powers.
-        error_mm: Distance between press and triangulated position ("only 0.122 mm").
-        contour_pC: The example of a contour, Fig. 6.
-        elements: Triangles of a mesh, least and most.
-        linear_N: Force up to which charge is called linear.
-        linear_MPa: Stress up to which PVDF is called linear.
-        fig_8_deg: Angles of the uppermost and the lowermost curve of Fig. 8.
-    """
+ERROR_MM = 0.122
+"""Distance between press and triangulated position ("only 0.122 mm")."""
 
-    cubics: tuple[tuple[float, float, float, float], ...] = (
-        (126.3, -592.4, 1743.9, 183.0),
-        (52.679, -247.820, 731.498, 90.838),
-        (47.189, -222.109, 656.633, 84.974),
-    )
-    error_mm: float = 0.122
-    contour_pC: float = 650.0
-    elements: tuple[int, int] = (13_000, 14_000)
-    linear_N: float = 0.5
-    linear_MPa: float = 40.0
-    fig_8_deg: tuple[float, float] = (140.0, 240.0)
+CONTOUR_PC = 650.0
+"""The example of a contour, Fig. 6, pC."""
 
+ELEMENTS = (13_000, 14_000)
+"""Triangles of a mesh, least and most."""
 
-PAPER = Paper()
+LINEAR_N, LINEAR_MPA = 0.5, 40.0
+"""Force up to which charge is called linear, and stress up to which PVDF is."""
 
+FIG_8_DEG = (140.0, 240.0)
+"""Angles of the uppermost and the lowermost curve of Fig. 8."""
+
+# What it leaves open
 
 TRIANGLE, RECTANGLE, CIRCLE = Polygon.triangle(4.0), Polygon.rectangle(4.0, 2.0), Circle(1.0)
-"""Probes: of the first two the paper gives the shape, of the third the size too."""
 
 OTHERS = (Polygon.triangle(2.0), Polygon.triangle(6.0), CIRCLE, RECTANGLE)
 """Probes to show what the size and the shape change."""
@@ -53,9 +41,9 @@ class Choices:
     """What the paper does not give.
 
     Attributes:
-        triangle: Fig. 5, 6, 9, 10, 12 and eq. 4: "the triangular probe".
-        rectangle: Fig. 8.
-        circle: Fig. 11; the paper gives its radius.
+        triangle: Fig. 5, 6, 9, 10, 12 and eq. 4: "the triangular probe"; its shape is given.
+        rectangle: Fig. 8; its shape is given.
+        circle: Fig. 11; the paper gives its radius, too.
         readout: The paper's eq. 3.
         degree: Of the polynomial along a line.
         length: Of the lines of a mapping scheme, mm.
@@ -90,39 +78,28 @@ class Choices:
     young: tuple[float, ...] = (2000.0, 4000.0)
     poisson: tuple[float, ...] = (0.25, 0.45)
 
-    @classmethod
-    def quick(cls) -> "Choices":
-        """Fewer presses and films, shorter lines: every figure and number, most of them coarser."""
-        return cls(
-            degree=2,
-            length=12.0,
-            printed_length=8.0,
-            spacing=0.6,
-            presses=30,
-            thickness=(0.025, 1.0),
-            pretension=(0.0, 1.5),
-            force=(0.05, 0.25, 0.5, 1.0, 2.0),
-            probes=OTHERS[:1],
-            young=(2000.0,),
-            poisson=(0.25,),
-        )
-
     def sensor(self, layout: str, film: str = "biaxial", readout: Readout | None = None) -> Sensor:
         """A built-in sensor, "three" or "four", with the paper's readout or another."""
         return replace(load_sensor(f"{layout}-25um-{film}"), readout=readout or self.readout)
 
     def as_printed(self) -> Sensor:
         """Three electrodes with B and C at 60 and 120 degrees from x, as the paper's sentence has it, A at -y."""
-        angles = dict(zip("ABC", np.deg2rad([-90.0, 60.0, 120.0]), strict=True))
-        electrodes = tuple(
-            Electrode.of_square(name, (10.0 * float(np.cos(a)), 10.0 * float(np.sin(a))), 3.0)
-            for name, a in angles.items()
-        )
-        return replace(self.sensor("three"), name="B and C at 60 and 120 degrees", electrodes=electrodes)
+        places = [10.0 * np.exp(1j * np.deg2rad(angle)) for angle in (-90.0, 60.0, 120.0)]
+        squares = [Electrode.of_square(name, (z.real, z.imag), 3.0) for name, z in zip("ABC", places, strict=True)]
+        return replace(self.sensor("three"), name="B and C at 60 and 120 degrees", electrodes=tuple(squares))
 
 
-def normalised_cubic(force: np.ndarray) -> np.ndarray:
-    """Eq. 4 for electrode A over its value at 1 N."""
-    cubic = np.array(PAPER.cubics[0])
-    normalised: np.ndarray = np.polyval(cubic / cubic.sum(), force)
-    return normalised
+QUICK = Choices(
+    degree=2,
+    length=12.0,
+    printed_length=8.0,
+    spacing=0.6,
+    presses=30,
+    thickness=(0.025, 1.0),
+    pretension=(0.0, 1.5),
+    force=(0.05, 0.25, 0.5, 1.0, 2.0),
+    probes=OTHERS[:1],
+    young=(2000.0,),
+    poisson=(0.25,),
+)
+"""Fewer presses and films, shorter lines: every figure and number, most of them coarser."""

@@ -3,15 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
-from choices import PAPER
-from entry import Entry, Row
-from figure_layouts import TOUCHED
-from solves import FORCE, Solves, sample
-from triangulation_errors import Accuracy, Errors, largest_change
+from choices import LINEAR_MPA
+from figure_layouts import TOUCHED, contact_charges
+from page import Entry, Row
+from solves import FORCE, Solves
+from triangulation_errors import Accuracy
 
-from isocharge.common.arrays import Array
 from isocharge.simulate.contours.charge_curves import Mapping
-from isocharge.simulate.forward.readout import contact_charge, thermal_charge
+from isocharge.simulate.forward.readout import thermal_charge
 from isocharge.simulate.solver.equilibrium import principal_stress
 
 D33, PYRO, KELVIN = -30.0, 30.0, 0.1
@@ -20,22 +19,38 @@ D33, PYRO, KELVIN = -30.0, 30.0, 0.1
 
 def claims(solves: Solves, accuracy: Accuracy) -> Entry:
     """What the text says without a figure."""
-    rows, numbers = [], {}
-    for make in (_edges, _d33, _pyro, _stress):
-        row, values = make(solves)
-        rows.append(row)
-        numbers.update(values)
-    rows += [_fourth(accuracy, solves.choices.degree), _known(accuracy)]
-    numbers["from_the_field_with_reference_noise"] = {name: e.numbers() for name, e in accuracy.noisy.items()}
-    numbers["drawn_with_reference_noise"] = {name: e.numbers() for name, e in accuracy.drawn_noisy.items()}
+    edges, of_edges = _edges(solves)
+    pressure, of_pressure = _d33(solves)
+    sensor, largest = solves.choices.sensor("three"), principal_stress(solves.shown)[1]
+    warm = thermal_charge(replace(sensor, piezo=replace(sensor.piezo, pyro=PYRO)), KELVIN)[0]
+    pyro = Row(
+        "pyroelectric charge",
+        "can dominate; left out",
+        f"{warm:.0f} pC on each electrode for {KELVIN:g} K",
+        f"{PYRO:g} uC/(m^2 K) on {sensor.electrodes[0].area:g} mm^2; the same on all, a press is not",
+    )
+    linear = Row(
+        "the material stays linear",
+        f"up to {LINEAR_MPA:g} MPa",
+        f"{largest:.0f} MPa beside the triangle at 1 N",
+        "beyond its range beside the probe" if largest > LINEAR_MPA else "within its range",
+    )
+    numbers = {
+        "edge_against_area_percent": of_edges,
+        "d33_pC": of_pressure,
+        "pyro_pC_per_0.1_K": warm,
+        "largest_stress_MPa": largest,
+        "from_the_field_with_reference_noise": {name: e.numbers() for name, e in accuracy.noisy.items()},
+        "drawn_with_reference_noise": {name: e.numbers() for name, e in accuracy.drawn_noisy.items()},
+    }
+    rows = [edges, pressure, pyro, linear, _fourth(accuracy, solves.choices.degree), _known(accuracy)]
     return Entry("Claims", "What the text says, in numbers.", None, rows, numbers)
 
 
 def _edges(solves: Solves) -> tuple[Row, dict[str, object]]:
     """Edge averages against the whole electrode."""
-    places = solves.places
     edge, area = (
-        solves.charges("triangle", solves.choices.sensor("three", readout=readout), places)
+        solves.charges("triangle", solves.choices.sensor("three", readout=readout), solves.places)
         for readout in ("edge", "area")
     )
     change = 100.0 * np.abs(edge / area - 1.0)
@@ -47,77 +62,48 @@ def _edges(solves: Solves) -> tuple[Row, dict[str, object]]:
         f"within {solves.choices.radius:g} mm",
         "an electrode collects from all of its area; edges are a quadrature that misses the stress beside the probe",
     )  # fmt: skip
-    return row, {"edge_against_area_percent": {"median": middle, "p95": most, "worst": worst}}
+    return row, {"median": middle, "p95": most, "worst": worst}
 
 
 def _d33(solves: Solves) -> tuple[Row, dict[str, object]]:
     """The contact pressure where the probe covers part of B."""
-    sensor = solves.choices.sensor("three")
-    taking = replace(sensor, piezo=replace(sensor.piezo, d33=D33))
+    sensor, whole = solves.choices.sensor("three"), -D33 * FORCE
     points = Mapping.lines(sensor, "A", length=solves.choices.length).points.reshape(-1, 2)
-    extra = np.array([contact_charge(taking, solves.choices.triangle, (x, y), FORCE) for x, y in points])
-    charge = solves.charges("triangle", sensor, points)
-    share = extra / charge
-    over = extra > TOUCHED * -D33 * FORCE
-    whole = -D33 * FORCE
+    extra = contact_charges(solves, sensor, points, D33)
+    share = extra / solves.charges("triangle", sensor, points)
     row = Row(
         "d33 where the probe overlaps an electrode",
         "no charge",
         f"up to {extra.max():.1f} pC, {100 * share.max():.1f} % of the charge there "
-        f"({over.any(axis=1).sum()} of {len(points)} presses of the scheme); "
+        f"({(extra > TOUCHED * whole).any(axis=1).sum()} of {len(points)} presses of the scheme); "
         f"{whole:.0f} pC if the electrode carried all of the force",
         f"a thin film does carry the probe's pressure; d33 = {D33:g} pC/N. Small beside the stretching: leaving "
         "it out is right, the reason given is not",
     )
-    return row, {"d33_pC": {"largest": extra.max(), "largest_share": share.max()}}
-
-
-def _pyro(solves: Solves) -> tuple[Row, dict[str, object]]:
-    sensor = solves.choices.sensor("three")
-    warm = thermal_charge(replace(sensor, piezo=replace(sensor.piezo, pyro=PYRO)), KELVIN)[0]
-    row = Row(
-        "pyroelectric charge",
-        "can dominate; left out",
-        f"{warm:.0f} pC on each electrode for {KELVIN:g} K",
-        f"{PYRO:g} uC/(m^2 K) on {sensor.electrodes[0].area:g} mm^2; the same on all, a press is not",
-    )
-    return row, {"pyro_pC_per_0.1_K": warm}
-
-
-def _stress(solves: Solves) -> tuple[Row, dict[str, object]]:
-    largest = principal_stress(solves.shown)[1]
-    row = Row(
-        "the material stays linear",
-        f"up to {PAPER.linear_MPa:g} MPa",
-        f"{largest:.0f} MPa beside the triangle at 1 N",
-        "beyond its range beside the probe" if largest > PAPER.linear_MPa else "within its range",
-    )
-    return row, {"largest_stress_MPa": largest}
-
-
-def _both(name: str, three: Errors, four: Errors) -> str:
-    """What a fourth electrode changes."""
-    medians, most = ([e.percentile(share) for e in (three, four)] for share in (50, 95))
-    return (
-        f"{name}: {medians[0]:.2g} to {medians[1]:.2g} mm at the median, {most[0]:.2g} to {most[1]:.2g} mm at 95 %, "
-        f"{100 * three.share_found:.0f} to {100 * four.share_found:.0f} % found"
-    )
+    return row, {"largest": extra.max(), "largest_share": share.max()}
 
 
 def _fourth(accuracy: Accuracy, degree: int) -> Row:
-    ours = "; ".join(
-        [
-            _both("as the paper, no noise", accuracy.drawn["three", degree], accuracy.drawn["four", degree]),
-            _both("from the field, no noise", accuracy.field["three"], accuracy.field["four"]),
-            _both("as the paper, noise", accuracy.drawn_noisy["three"], accuracy.drawn_noisy["four"]),
-            _both("from the field, noise", accuracy.noisy["three"], accuracy.noisy["four"]),
-        ]
-    )
-    why = (
+    """What a fourth electrode changes."""
+    changes = []
+    for name, three, four in (
+        ("as the paper, no noise", accuracy.drawn["three", degree], accuracy.drawn["four", degree]),
+        ("from the field, no noise", accuracy.field["three"], accuracy.field["four"]),
+        ("as the paper, noise", accuracy.drawn_noisy["three"], accuracy.drawn_noisy["four"]),
+        ("from the field, noise", accuracy.noisy["three"], accuracy.noisy["four"]),
+    ):
+        medians, most = ([e.percentile(share) for e in (three, four)] for share in (50, 95))
+        changes.append(
+            f"{name}: {medians[0]:.2g} to {medians[1]:.2g} mm at the median, {most[0]:.2g} to {most[1]:.2g} mm at "
+            f"95 %, {100 * three.share_found:.0f} to {100 * four.share_found:.0f} % found"
+        )
+    return Row(
+        "a fourth electrode, three to four",
+        "a more accurate position",
+        "; ".join(changes),
         "noise is 1 pC and 0.2 % of each charge. Averaging triples helps less than it could: contours of opposite "
-        "electrodes touch near the centre, and their crossing is poor there; a fourth charge finds more presses"
+        "electrodes touch near the centre, and their crossing is poor there; a fourth charge finds more presses",
     )
-    return Row("a fourth electrode, three to four", "a more accurate position", ours, why)
 
 
 def _known(accuracy: Accuracy) -> Row:
@@ -137,7 +123,7 @@ def _known(accuracy: Accuracy) -> Row:
 
 def what_choices_change(solves: Solves, accuracy: Accuracy) -> Entry:
     """Sizes that the paper does not give."""
-    rows = []
+    rows, numbers = [], {}
     film, piezo = solves.choices.sensor("three").film, solves.choices.sensor("three").piezo
     ours = {
         "E": f"{film.young * 1e-3:g} GPa",
@@ -145,33 +131,16 @@ def what_choices_change(solves: Solves, accuracy: Accuracy) -> Entry:
         "probe": f"{solves.choices.triangle.notation} (side, mm)",
         "pretension": "0 MPa",
     }
-    for name in solves.variants:
-        kind, _, value = name.partition(" ")
-        errors = accuracy.mistaken[name]
+    for name, errors in accuracy.mistaken.items():
+        (kind, _, value), changes = name.partition(" "), solves.changes(name)
         position = f"{errors.percentile(50):.3f} mm" if errors.found_mm.size else "no contours met"
-        change = f"charges by {_signed(solves, name)}, at most {100 * largest_change(solves, name):.1f} %"
-        rows.append(
-            Row(
-                f"{kind}: {value}",
-                "not given",
-                f"{change}; position if not known: {position}",
-                f"our choice {ours[kind]}",
-            )
+        change = (
+            f"charges by {100 * np.median(changes):+.1f} % at the median, at most {100 * np.abs(changes).max():.1f} %; "
+            f"position if not known: {position}"
         )
-    rows.append(
-        Row(
-            "d31, d32",
-            "not given",
-            f"charges are linear in them; biaxial {piezo.d31:g} and {piezo.d32:g} pC/N",
-            f"eq. 4 agrees with d31 = {piezo.d31 / solves.eq_4[1]:.1f} pC/N, all else as ours",
-        )
-    )
-    numbers = {name: {"largest_change": largest_change(solves, name)} for name in solves.variants}
+        rows.append(Row(f"{kind}: {value}", "not given", change, f"our choice {ours[kind]}"))
+        numbers[name] = {"largest_change": np.abs(changes).max()}
+    linear = f"charges are linear in them; biaxial {piezo.d31:g} and {piezo.d32:g} pC/N"
+    agreement = f"eq. 4 agrees with d31 = {piezo.d31 / solves.eq_4[1]:.1f} pC/N, all else as ours"
+    rows.append(Row("d31, d32", "not given", linear, agreement))
     return Entry("What the paper does not give", "Our choices, and what others would change.", None, rows, numbers)
-
-
-def _signed(solves: Solves, name: str) -> str:
-    """Median relative change of a charge, with its sign."""
-    at: Array = np.array(sample(solves.choices))
-    charge = solves.charges("triangle", solves.choices.sensor("three"), at)
-    return f"{100 * float(np.median(solves.variants[name][0] / charge - 1.0)):+.1f} % at the median"

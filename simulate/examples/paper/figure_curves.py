@@ -5,20 +5,21 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from choices import PAPER
-from entry import Entry, Row
+from choices import CONTOUR_PC, FIG_8_DEG
 from matplotlib.figure import Figure
+from page import Entry, Row
 from solves import FORCE, Solves
 
 from isocharge.common.arrays import Array
+from isocharge.simulate import Piezo, Sensor
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from isocharge.simulate.contours.graphical_method import draw_contour
 from isocharge.simulate.plots.contours import draw_curves
 from isocharge.simulate.plots.figure import COLOURS, PRESSED, new_figure
-from isocharge.simulate.sensor.film import Piezo
-from isocharge.simulate.sensor.sensor import Sensor
 
-FIG_6_DEG, FOUR_DEG = (35.0, 90.0), (110.0, 250.0)
+FROM_A_DEG = {"three": (35.0, 90.0), "four": (110.0, 250.0)}
+"""First and last line from A, by layout."""
+
 FINE = 97
 """Number of presses on a line that is drawn as a smooth curve."""
 
@@ -33,8 +34,8 @@ def curves_of(
     solves: Solves, probe: str, sensor: Sensor, name: str, degrees: tuple[float, float], length: float | None = None
 ) -> tuple[Curves, Curves]:
     """Curves at the scheme's presses, and finely along the same lines."""
-    ends = (np.deg2rad(degrees[0]), np.deg2rad(degrees[1]))
-    mapping = Mapping.lines(sensor, name, ends, length=length or solves.choices.length)
+    first, last = np.deg2rad(degrees)
+    mapping = Mapping.lines(sensor, name, (first, last), length=length or solves.choices.length)
     forward_map = solves.forward_map(probe, sensor)
     return Curves.of(forward_map, mapping, FORCE), Curves.of(forward_map, mapping.finer(FINE), FORCE)
 
@@ -43,27 +44,27 @@ def curve_numbers(curves: Curves) -> dict[str, object]:
     """A set of curves for JSON."""
     return {
         "angle_deg": np.rad2deg(curves.mapping.angle).tolist(),
-        "distance_mm": (curves.mapping.distance).tolist(),
-        "charge_pC": (curves.own).tolist(),
+        "distance_mm": curves.mapping.distance.tolist(),
+        "charge_pC": curves.own.tolist(),
     }
 
 
 def fig_6(solves: Solves) -> Entry:
     """Triangle, biaxial, from A; three electrodes as in the paper, and four."""
-    figure = new_figure(12.6, 5.2)
-    left, right = figure.subplots(1, 2)
-    at, smooth = curves_of(solves, "triangle", solves.choices.sensor("three"), "A", FIG_6_DEG)
-    four, four_smooth = curves_of(solves, "triangle", solves.choices.sensor("four"), "A", FOUR_DEG)
-    for axes, curves, line, layout in ((left, at, smooth, "three"), (right, four, four_smooth, "four")):
+    figure, sensors = new_figure(12.6, 5.2), {layout: solves.choices.sensor(layout) for layout in FROM_A_DEG}
+    both = {name: curves_of(solves, "triangle", sensors[name], "A", degrees) for name, degrees in FROM_A_DEG.items()}
+    for axes, (layout, (curves, line)) in zip(figure.subplots(1, 2), both.items(), strict=True):
         draw_curves(axes, curves, line)
-        axes.axhline(PAPER.contour_pC, color="k", lw=0.8, ls=":")
-        axes.annotate(f"{PAPER.contour_pC:g} pC", (4, PAPER.contour_pC), fontsize=8, va="bottom")
+        axes.axhline(CONTOUR_PC, color="k", lw=0.8, ls=":")
+        axes.annotate(f"{CONTOUR_PC:g} pC", (4, CONTOUR_PC), fontsize=8, va="bottom")
         axes.set_title(f"Fig. 6: triangular probe, biaxial film, {layout} electrodes, 1 N")
-    area = curves_of(solves, "triangle", solves.choices.sensor("three", readout="area"), "A", FIG_6_DEG)[0]
-    contour_row, distance = _example(solves, at, smooth)
+    at, smooth = both["three"]
+    whole = solves.choices.sensor("three", readout="area")
+    area, _ = curves_of(solves, "triangle", whole, "A", FROM_A_DEG["three"])
+    example, distance = _example(solves, at, smooth)
     apart, change = 100.0 * _spread(at), 100.0 * np.abs(at.own / area.own - 1.0).max(axis=0)
     rows = [
-        contour_row,
+        example,
         Row(
             "how far the lines lie apart",
             "in the figure",
@@ -79,22 +80,22 @@ def fig_6(solves: Solves) -> Entry:
     ]
     numbers = {
         **curve_numbers(at),
-        "four_electrodes": curve_numbers(four),
+        "four_electrodes": curve_numbers(both["four"][0]),
         "distance_of_650_pC_mm": distance,
         "spread_of_lines": 0.01 * apart,
     }
-    caption = f"Charge of A under a triangle; the dotted line is the paper's example of {PAPER.contour_pC:g} pC."
+    caption = f"Charge of A under a triangle; the dotted line is the paper's example of {CONTOUR_PC:g} pC."
     return Entry("Fig. 6", caption, figure, rows, numbers)
 
 
 def _example(solves: Solves, at: Curves, smooth: Curves) -> tuple[Row, Array]:
     """The paper's example of a contour: distances (mm) at which the lines have 650 pC."""
-    contour = draw_contour(at, PAPER.contour_pC, solves.choices.degree)
+    contour = draw_contour(at, CONTOUR_PC, solves.choices.degree)
     knots = np.empty((0, 2)) if contour is None else contour.knots
     distance = np.linalg.norm(knots - at.mapping.origin, axis=1)
-    exact = np.array([np.interp(-PAPER.contour_pC, -q, smooth.mapping.distance) for q in smooth.own])
+    exact = np.array([np.interp(-CONTOUR_PC, -q, smooth.mapping.distance) for q in smooth.own])
     row = Row(
-        f"{PAPER.contour_pC:g} pC, distance from A on lines of 35° to 90°",
+        f"{CONTOUR_PC:g} pC, distance from A on lines of 35° to 90°",
         "x1 to x7, in the figure",
         f"{len(knots)} lines, {distance.min():.2f} to {distance.max():.2f} mm" if len(knots) else "not reached",
         f"by the field {exact.min():.2f} to {exact.max():.2f} mm; E, d31 and the probe's size are our choice",
@@ -108,17 +109,15 @@ def _at_distances(curves: Curves, percent: Array) -> str:
 
 def _spread(curves: Curves) -> Array:
     """Largest less smallest charge of the lines over their mean, at each distance."""
-    spread: Array = np.ptp(curves.own, axis=0) / curves.own.mean(axis=0)
-    return spread
+    return np.ptp(curves.own, axis=0) / curves.own.mean(axis=0)
 
 
 def fig_8(solves: Solves) -> Entry:
     """Rectangle, biaxial, from B; which line is uppermost."""
-    sensor = solves.choices.sensor("three")
-    curves, smooth = curves_of(solves, "rectangle", sensor, "B", PAPER.fig_8_deg)
-    circle, _ = curves_of(solves, "circle", sensor, "B", PAPER.fig_8_deg)
-    printed_length = solves.choices.printed_length
-    printed, _ = curves_of(solves, "rectangle", solves.choices.as_printed(), "B", PAPER.fig_8_deg, printed_length)
+    sensor, printed_length = solves.choices.sensor("three"), solves.choices.printed_length
+    curves, smooth = curves_of(solves, "rectangle", sensor, "B", FIG_8_DEG)
+    circle, _ = curves_of(solves, "circle", sensor, "B", FIG_8_DEG)
+    printed, _ = curves_of(solves, "rectangle", solves.choices.as_printed(), "B", FIG_8_DEG, printed_length)
     ratio, share = _best_ratio(solves)
     numbers = {
         **curve_numbers(curves),
@@ -129,35 +128,12 @@ def fig_8(solves: Solves) -> Entry:
         "best_d32_over_d31": ratio,
         "share_of_distances_in_order": share,
     }
-    caption = "Charge of B under a rectangle of 4 x 2 mm; on the right each line against the mean of all."
-    rows = [*_rows_of_order(curves, circle, printed), _row_of_ratio(ratio, share)]
-    return Entry("Fig. 8", caption, _draw_fig_8(curves, smooth), rows, numbers)
-
-
-def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
-    """The curves, and each over the mean of all."""
-    figure = new_figure(12.0, 5.2)
-    left, right = figure.subplots(1, 2)
-    draw_curves(left, curves, smooth)
-    left.set_title("Fig. 8: rectangular probe, biaxial film, 1 N")
-    mean = smooth.own.mean(axis=0)
-    for angle, charge in zip(np.rad2deg(curves.mapping.angle), smooth.own, strict=True):
-        colour, width, label = _line_style(float(angle))
-        right.plot(smooth.mapping.distance, 100.0 * (charge / mean - 1.0), lw=width, color=colour, label=label)
-    right.set(xlabel="distance from the centre of B, mm", ylabel="charge over the mean of the lines, %")
-    right.set_title("the same, against the mean of the lines")
-    right.grid(alpha=0.3)
-    right.legend()
-    return figure
-
-
-def _rows_of_order(curves: Curves, circle: Curves, printed: Curves) -> list[Row]:
-    """Which line is uppermost and lowermost: under the rectangle, under a circle, and with B where the text has it."""
     why = (
         "from our B 210° leads to the film's centre and 140° farthest from it; nearer the rim a press stretches the "
         "electrode less. Beside the electrode the rectangle's long side, along x, counts more"
     )
-    return [
+    in_order = f"140° uppermost and 240° lowermost at {100 * share:.0f} % of the distances"
+    rows = [
         Row("uppermost line at 4, 8, ... mm", "140° throughout", _extreme(curves, np.argmax), why),
         Row(
             "lowermost line at 4, 8, ... mm",
@@ -165,38 +141,41 @@ def _rows_of_order(curves: Curves, circle: Curves, printed: Curves) -> list[Row]
             _extreme(curves, np.argmin),
             "the reverse of the claim, farther out",
         ),
-        Row(
-            "under a circle",
-            "not given",
-            _both_extremes(circle),
-            "no corners: what is left is the place of the rim",
-        ),
+        Row("under a circle", "not given", _extremes(circle), "no corners: what is left is the place of the rim"),
         Row(
             "with B at 60° from the centre, as printed",
             "140° uppermost, 240° lowermost",
-            _both_extremes(printed),
+            _extremes(printed),
             "the layout's angles do not explain it",
         ),
+        Row(
+            "with another d32 over d31",
+            "not given",
+            in_order + (f", with d32/d31 = {ratio:.2f}" if share else ""),
+            f"{'explains it' if share == 1.0 else 'does not explain it'}; tried {RATIOS[0]:g} to {RATIOS[-1]:g}",
+        ),
     ]
+    caption = "Charge of B under a rectangle of 4 x 2 mm; on the right each line against the mean of all."
+    return Entry("Fig. 8", caption, _draw_fig_8(curves, smooth), rows, numbers)
 
 
-def _row_of_ratio(ratio: float, share: float) -> Row:
-    """Whether another d32 over d31 explains the order."""
-    return Row(
-        "with another d32 over d31",
-        "not given",
-        f"140° uppermost and 240° lowermost at {100 * share:.0f} % of the distances"
-        + (f", with d32/d31 = {ratio:.2f}" if share else ""),
-        f"{'explains it' if share == 1.0 else 'does not explain it'}; tried {RATIOS[0]:g} to {RATIOS[-1]:g}",
-    )
-
-
-def _line_style(angle: float) -> tuple[str, float, str | None]:
-    """Colour, width and label of a line: the two that the paper names stand out."""
-    for named, colour in zip(PAPER.fig_8_deg, COLOURS, strict=False):
-        if np.isclose(angle, named):
-            return colour, 2.4, f"{named:.0f}°"
-    return PRESSED, 0.7, "the others" if np.isclose(angle, 190.0) else None
+def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
+    """The curves, and each over the mean of all; the two lines that the paper names stand out."""
+    figure = new_figure(12.0, 5.2)
+    left, right = figure.subplots(1, 2)
+    draw_curves(left, curves, smooth)
+    left.set_title("Fig. 8: rectangular probe, biaxial film, 1 N")
+    others, mean = {"color": PRESSED, "lw": 0.7}, smooth.own.mean(axis=0)
+    styles = {190.0: others | {"label": "the others"}}
+    for named, colour in zip(FIG_8_DEG, COLOURS, strict=False):
+        styles[named] = {"color": colour, "lw": 2.4, "label": f"{named:.0f}°"}
+    for angle, charge in zip(np.rad2deg(curves.mapping.angle).round(6).tolist(), smooth.own, strict=True):
+        right.plot(smooth.mapping.distance, 100.0 * (charge / mean - 1.0), **styles.get(angle, others))
+    right.set(xlabel="distance from the centre of B, mm", ylabel="charge over the mean of the lines, %")
+    right.set_title("the same, against the mean of the lines")
+    right.grid(alpha=0.3)
+    right.legend()
+    return figure
 
 
 def _angles(curves: Curves, extreme: Extreme) -> list[float]:
@@ -209,21 +188,22 @@ def _extreme(curves: Curves, extreme: Extreme) -> str:
     return ", ".join(f"{angle:.0f}°" for angle in _angles(curves, extreme))
 
 
-def _both_extremes(curves: Curves) -> str:
+def _extremes(curves: Curves) -> str:
     return f"uppermost {_extreme(curves, np.argmax)}; lowermost {_extreme(curves, np.argmin)}"
 
 
 def _best_ratio(solves: Solves) -> tuple[float, float]:
     """d32 over d31 with which the order of Fig. 8 holds at most distances, and the share of them."""
     sensor = solves.choices.sensor("three")
-    directions = (Piezo(d31=1.0, d32=0.0), Piezo(d31=0.0, d32=1.0))
-    sensors = [replace(sensor, piezo=piezo) for piezo in directions]
-    parts = [curves_of(solves, "rectangle", taking, "B", PAPER.fig_8_deg)[0].own for taking in sensors]
+    by_d31, by_d32 = (
+        curves_of(solves, "rectangle", replace(sensor, piezo=piezo), "B", FIG_8_DEG)[0].own
+        for piezo in (Piezo(d31=1.0, d32=0.0), Piezo(d31=0.0, d32=1.0))
+    )
     best = (0.0, 0.0)
-    for ratio in RATIOS:
-        charge = parts[0] + ratio * parts[1]
+    for ratio in RATIOS.tolist():
+        charge = by_d31 + ratio * by_d32
         share = float(np.mean((charge.argmax(axis=0) == 0) & (charge.argmin(axis=0) == len(charge) - 1)))
-        best = max(best, (share, float(ratio)))
+        best = max(best, (share, ratio))
     return best[1], best[0]
 
 
@@ -231,11 +211,9 @@ def fig_12(solves: Solves) -> Entry:
     """Triangle, uniaxial, from A, beside biaxial."""
     figure = new_figure(12.0, 5.2)
     numbers, rows = {}, []
-    for axes, layout in zip(figure.subplots(1, 2), ("three", "four"), strict=True):
-        name = "A"
-        degrees = FIG_6_DEG if layout == "three" else FOUR_DEG
-        uniaxial, smooth = curves_of(solves, "triangle", solves.choices.sensor(layout, "uniaxial"), name, degrees)
-        biaxial, _ = curves_of(solves, "triangle", solves.choices.sensor(layout), name, degrees)
+    for axes, (layout, degrees) in zip(figure.subplots(1, 2), FROM_A_DEG.items(), strict=True):
+        uniaxial, smooth = curves_of(solves, "triangle", solves.choices.sensor(layout, "uniaxial"), "A", degrees)
+        biaxial, _ = curves_of(solves, "triangle", solves.choices.sensor(layout), "A", degrees)
         draw_curves(axes, uniaxial, smooth)
         axes.set_title(f"Fig. 12: triangular probe, uniaxial, {layout} electrodes, 1 N")
         apart = [100.0 * _spread(curves) for curves in (biaxial, uniaxial)]
@@ -248,15 +226,6 @@ def fig_12(solves: Solves) -> Entry:
                 "d31 : d32 = 20 : 2 pC/N, our choice, weighs the radial against the hoop stress by the angle",
             )
         )
-        numbers[layout] = {
-            **curve_numbers(uniaxial),
-            "spread": (0.01 * apart[1]).tolist(),
-            "spread_biaxial": (0.01 * apart[0]).tolist(),
-        }
-    return Entry(
-        "Fig. 12",
-        "Charge of A on a uniaxial film under a triangle of 4 mm, with three and with four electrodes.",
-        figure,
-        rows,
-        numbers,
-    )
+        numbers[layout] = {**curve_numbers(uniaxial), "spread": 0.01 * apart[1], "spread_biaxial": 0.01 * apart[0]}
+    caption = "Charge of A on a uniaxial film under a triangle of 4 mm, with three and with four electrodes."
+    return Entry("Fig. 12", caption, figure, rows, numbers)

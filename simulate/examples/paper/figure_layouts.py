@@ -4,31 +4,35 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from choices import PAPER
-from entry import Entry, Row
+from choices import ELEMENTS, FIG_8_DEG
 from matplotlib.collections import LineCollection
+from page import Entry, Row
 from solves import FINEST, FORCE, MESHES, Solves
 
 from isocharge.common.arrays import Array
-from isocharge.simulate import Equilibrium
+from isocharge.simulate import Equilibrium, Sensor
 from isocharge.simulate.contours.charge_curves import Mapping
 from isocharge.simulate.forward.readout import contact_charge
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.plots.contours import draw_mapping
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
-from isocharge.simulate.sensor.sensor import Sensor
 
-FIG_4_DEG, FIG_7_DEG = (35.0, 145.0), PAPER.fig_8_deg
-"""Lines from A, the half that Fig. 6 shows and its mirror image; lines from B."""
+FIG_4_DEG = (35.0, 145.0)
+"""Lines from A, the half that Fig. 6 shows and its mirror image."""
+
+TOUCHED = 1e-3
+"""Share of the probe that must lie on an electrode to count: less is the round-off of areas."""
 
 
 def fig_1(solves: Solves) -> Entry:
     """The principle: three distances."""
-    sensor = solves.choices.sensor("three")
-    centres, at = np.array([e.centre for e in sensor.electrodes]), np.array(solves.choices.shown)
+    sensor, at = solves.choices.sensor("three"), np.array(solves.choices.shown)
+    centres = np.array([e.centre for e in sensor.electrodes])
     distance = np.linalg.norm(centres - at, axis=1)
-    meeting, second = trilaterate(centres, distance), _mirrored(centres[0], centres[1], at)
+    meeting = trilaterate(centres, distance)
+    along = (centres[1] - centres[0]) / np.linalg.norm(centres[1] - centres[0])
+    second = 2.0 * (centres[0] + along * ((at - centres[0]) @ along)) - at
     figure = new_figure(6.4, 6.0)
     axes = figure.subplots()
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
@@ -59,15 +63,7 @@ def trilaterate(centres: Array, distance: Array) -> Array:
     """Eq. 1 for three circles, shape (2,): each difference of two of them is linear in the position."""
     matrix = 2.0 * (centres[1:] - centres[0])
     right = distance[0] ** 2 - distance[1:] ** 2 + np.sum(centres[1:] ** 2, axis=1) - np.sum(centres[0] ** 2)
-    position: Array = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    return position
-
-
-def _mirrored(first: Array, second: Array, at: Array) -> Array:
-    """Mirror image in the line through two points."""
-    along = (second - first) / np.linalg.norm(second - first)
-    mirrored: Array = 2.0 * (first + along * ((at - first) @ along)) - at
-    return mirrored
+    return np.linalg.lstsq(matrix, right, rcond=None)[0]
 
 
 def fig_2(solves: Solves) -> Entry:
@@ -80,14 +76,14 @@ def fig_2(solves: Solves) -> Entry:
     draw_electrodes(axes, sensor, highlight="A")
     axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="Fig. 2: mapping scheme")
     figure.legend(fontsize=8, loc="outside lower center", ncols=2)
-    step, turn = float(np.diff(mapping.distance)[0]), float(np.rad2deg(np.diff(mapping.angle)[0]))
+    step, angle_step = float(np.diff(mapping.distance)[0]), float(np.rad2deg(np.diff(mapping.angle)[0]))
     length = f"{mapping.distance[-1]:g} mm"
     return Entry(
         "Fig. 2",
         "Lines and circles about the centre of an electrode; a press at each intersection.",
         figure,
         [
-            Row("radial and angular increments", "4 mm, 10°", f"{step:g} mm, {turn:g}°", "as given"),
+            Row("radial and angular increments", "4 mm, 10°", f"{step:g} mm, {angle_step:g}°", "as given"),
             Row("length of the lines", "not given", length, "our choice: across the working area from any electrode"),
         ],
     )
@@ -101,79 +97,31 @@ def fig_3(solves: Solves) -> Entry:
     for axes, shown, title in ((left, sensor, "Fig. 3: layout, equilateral"), (right, printed, "as the text has it")):
         draw_electrodes(axes, shown)
         draw_working_area(axes, shown.film.radius, "clamped rim")
-        corners = np.array([e.centre for e in shown.electrodes] + [shown.electrodes[0].centre])
+        corners = np.array([e.centre for e in (*shown.electrodes, shown.electrodes[0])])
         axes.plot(*corners.T, color=FELT, lw=0.8, label="between the centres")
         axes.set(xlim=(-47, 47), ylim=(-47, 47), aspect="equal", xlabel="x (drawn), mm", ylabel="y, mm", title=title)
     left.legend(fontsize=8, loc="lower left")
-    (sides, angles), (printed_sides, _) = _triangle(sensor), _triangle(printed)
-    directions = ", ".join(f"{angle:.0f}°" for angle in angles)
+    (sides, equal, directions), (printed_sides, unequal, _) = _triangle(sensor), _triangle(printed)
     why = "60° and 120° are the directions from A to B and C; from the centre they give no equilateral triangle"
     return Entry(
         "Fig. 3",
         "Three electrodes of 3 mm, 10 mm from the centre of a film clamped at 45 mm.",
         figure,
         [
-            Row("sides of the triangle", "equal", _lengths(sides), "by construction"),
+            Row("sides of the triangle", "equal", equal, "by construction"),
             Row("angles to B and C", "60° and 120° from the centre", f"{directions} from A", why),
-            Row(
-                "sides, with 60° and 120° from the centre",
-                "equal",
-                _lengths(printed_sides),
-                "the sentence contradicts it",
-            ),
+            Row("sides, with 60° and 120° from the centre", "equal", unequal, "the sentence contradicts it"),
         ],
         {"sides_mm": sides, "sides_as_printed_mm": printed_sides},
     )
 
 
-def _triangle(sensor: Sensor) -> tuple[list[float], list[float]]:
-    """Sides AB, BC, CA (mm) and directions from A to B and C (degrees)."""
+def _triangle(sensor: Sensor) -> tuple[list[float], str, str]:
+    """Sides AB, BC, CA, mm, the same for people, and the directions from A to B and C for people."""
     a, b, c = (complex(*e.centre) for e in sensor.electrodes)
-    return [abs(b - a), abs(c - b), abs(a - c)], [float(np.rad2deg(np.angle(z - a))) for z in (b, c)]
-
-
-def _lengths(sides: list[float]) -> str:
-    return ", ".join(f"{side:.2f}" for side in sides) + " mm"
-
-
-def _scheme(solves: Solves, heading: str, electrode: str, angles: tuple[float, float]) -> Entry:
-    sensor = solves.choices.sensor("three")
-    ends = (np.deg2rad(angles[0]), np.deg2rad(angles[1]))
-    mapping = Mapping.lines(sensor, electrode, ends, length=solves.choices.length)
-    figure = new_figure(6.8, 6.8)
-    axes = figure.subplots()
-    draw_mapping(axes, mapping)
-    draw_electrodes(axes, sensor, highlight=electrode)
-    draw_working_area(axes, solves.choices.radius, f"working area, {solves.choices.radius:g} mm")
-    draw_probe(axes, solves.choices.triangle, (float(mapping.points[3, 1, 0]), float(mapping.points[3, 1, 1])), "probe")
-    frame_film(axes, sensor, mapping.radius, f"{heading}: lines from {electrode}")
-    figure.legend(fontsize=8, loc="outside lower center", ncols=4)
-    over = touching(solves, sensor, mapping)
-    overlap = dict(zip(sensor.electrode_names, over.sum(axis=0).tolist(), strict=True))
-    overlaps = f"{over.any(axis=1).sum()} of {len(over)} presses: " + ", ".join(
-        f"{n} on {e}" for e, n in overlap.items()
-    )
-    return Entry(
-        heading,
-        f"Lines from electrode {electrode} at {angles[0]:g}° to {angles[1]:g}° from the drawn direction.",
-        figure,
-        [Row("probe over an electrode", "a small overlap with B in some", overlaps, "triangle of 4 mm, our choice")],
-        {"presses_over_an_electrode": overlap},
-    )
-
-
-TOUCHED = 1e-3
-"""Share of the probe that must lie on an electrode to count: less is the round-off of areas."""
-
-
-def touching(solves: Solves, sensor: Sensor, mapping: Mapping) -> np.ndarray:
-    """Which presses of a scheme overlap which electrode under the triangle, shape (n, n_electrode)."""
-    pressed = replace(
-        sensor, piezo=replace(sensor.piezo, d33=-1.0)
-    )  # so that the contact's charge is the share covered
-    points = mapping.points.reshape(-1, 2)
-    covered = [contact_charge(pressed, solves.choices.triangle, (x, y), FORCE) for x, y in points]
-    return np.asarray(np.array(covered) > TOUCHED)
+    sides = [abs(b - a), abs(c - b), abs(a - c)]
+    directions = ", ".join(f"{np.rad2deg(np.angle(z - a)):.0f}°" for z in (b, c))
+    return sides, ", ".join(f"{side:.2f}" for side in sides) + " mm", directions
 
 
 def fig_4(solves: Solves) -> Entry:
@@ -183,56 +131,68 @@ def fig_4(solves: Solves) -> Entry:
 
 def fig_7(solves: Solves) -> Entry:
     """The scheme from B."""
-    return _scheme(solves, "Fig. 7", "B", FIG_7_DEG)
+    return _scheme(solves, "Fig. 7", "B", FIG_8_DEG)
+
+
+def _scheme(solves: Solves, heading: str, electrode: str, degrees: tuple[float, float]) -> Entry:
+    sensor, (first, last) = solves.choices.sensor("three"), np.deg2rad(degrees)
+    mapping = Mapping.lines(sensor, electrode, (first, last), length=solves.choices.length)
+    figure = new_figure(6.8, 6.8)
+    axes = figure.subplots()
+    draw_mapping(axes, mapping)
+    draw_electrodes(axes, sensor, highlight=electrode)
+    draw_working_area(axes, solves.choices.radius, f"working area, {solves.choices.radius:g} mm")
+    draw_probe(axes, solves.choices.triangle, (float(mapping.points[3, 1, 0]), float(mapping.points[3, 1, 1])), "probe")
+    frame_film(axes, sensor, mapping.radius, f"{heading}: lines from {electrode}")
+    figure.legend(fontsize=8, loc="outside lower center", ncols=4)
+    over = contact_charges(solves, sensor, mapping.points.reshape(-1, 2), -1.0) > TOUCHED
+    overlap = dict(zip(sensor.electrode_names, over.sum(axis=0).tolist(), strict=True))
+    overlaps = f"{over.any(axis=1).sum()} of {len(over)} presses: " + ", ".join(
+        f"{n} on {e}" for e, n in overlap.items()
+    )
+    return Entry(
+        heading,
+        f"Lines from electrode {electrode} at {degrees[0]:g}° to {degrees[1]:g}° from the drawn direction.",
+        figure,
+        [Row("probe over an electrode", "a small overlap with B in some", overlaps, "triangle of 4 mm, our choice")],
+        {"presses_over_an_electrode": overlap},
+    )
+
+
+def contact_charges(solves: Solves, sensor: Sensor, points: Array, d33: float) -> Array:
+    """Charges by the pressure of a triangle at (x, y), shape (n, 2), with d33 in pC/N: (n, n_electrode), pC."""
+    pressed = replace(sensor, piezo=replace(sensor.piezo, d33=d33))
+    return np.array([contact_charge(pressed, solves.choices.triangle, (x, y), FORCE) for x, y in points])
 
 
 def fig_5(solves: Solves) -> Entry:
     """The mesh, and what its fineness is worth."""
-    unknowns, error, seconds = mesh_errors(solves)
+    (*charges, finest), (*unknowns, _), (*seconds, _) = zip(*solves.meshes, strict=True)
+    error = np.abs(np.array(charges) / finest - 1.0).max(axis=1)
     figure = new_figure(15.0, 5.0)
     whole, near, errors = figure.subplots(1, 3)
-    for axes, reach, title in ((whole, 46.0, "Fig. 5: mesh, whole film"), (near, 8.0, "at the probe")):
-        _draw_mesh(axes, solves)
-        x, y = (0.0, 0.0) if axes is whole else (solves.shown.at[0], solves.shown.at[1])
+    for axes, (x, y), reach, title in (
+        (whole, (0.0, 0.0), 46.0, "Fig. 5: mesh, whole film"),
+        (near, solves.shown.at, 8.0, "at the probe"),
+    ):
+        _draw_mesh(axes, solves.shown)
         draw_electrodes(axes, solves.choices.sensor("three"), names=axes is near, ink="#2e6f9e")
         axes.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", title=title)
         axes.set(xlabel="x, mm", ylabel="y, mm")
-    _draw_mesh_errors(errors, unknowns, error)
-    return Entry(
-        "Fig. 5",
-        "Elements under a triangular probe: the whole film, at the probe, and the error against the unknowns.",
-        figure,
-        _rows_of_mesh(solves.shown, unknowns, error, seconds),
-        {
-            "unknowns": unknowns.tolist(),
-            "worst_relative_error": error.tolist(),
-            "cpu_s": seconds.tolist(),
-            "meshes_order_around_rings_rim": [*MESHES],
-            "finest": FINEST,
-        },
-    )
-
-
-def _draw_mesh_errors(axes: Any, unknowns: Array, error: Array) -> None:
-    """Error of a charge against the size of the mesh."""
-    axes.loglog(unknowns, 100.0 * error, "o-", color=FELT, label="ours, the shown press")
-    axes.axhline(0.1, color=INK, lw=0.8, ls=":", label="0.1 %")
-    axes.set_xticks(unknowns, [f"{n:,}" for n in unknowns])
-    axes.minorticks_off()
-    axes.set(xlabel="unknowns", ylabel="worst charge against the finest mesh, %", title="error against mesh")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=8)
-
-
-def _rows_of_mesh(shown: Equilibrium, unknowns: Array, error: Array, seconds: Array) -> list[Row]:
-    """How many elements, and whether they are enough."""
-    enough = int(np.argmax(error < 1e-3))
-    order, count = shown.mesh.resolution.order, shown.mesh.template.nodes.shape[0]
-    return [
+    errors.loglog(unknowns, 100.0 * error, "o-", color=FELT, label="ours, the shown press")
+    errors.axhline(0.1, color=INK, lw=0.8, ls=":", label="0.1 %")
+    errors.set_xticks(unknowns, [f"{n:,}" for n in unknowns])
+    errors.minorticks_off()
+    errors.set(xlabel="unknowns", ylabel="worst charge against the finest mesh, %", title="error against mesh")
+    errors.grid(alpha=0.3, which="both")
+    errors.legend(fontsize=8)
+    enough, mesh = int(np.argmax(error < 1e-3)), solves.shown.mesh
+    rows = [
         Row(
             "elements",
-            f"{PAPER.elements[0]:,} to {PAPER.elements[1]:,} triangles",
-            f"{count} quadrilaterals of order {order}, {3 * shown.mesh.template.n_node} unknowns",
+            f"{ELEMENTS[0]:,} to {ELEMENTS[1]:,} triangles",
+            f"{mesh.template.nodes.shape[0]} quadrilaterals of order {mesh.resolution.order}, "
+            f"{3 * mesh.template.n_node} unknowns",
             "high order on a mesh that follows the probe; the solution is smooth outside of it",
         ),
         Row(
@@ -243,20 +203,26 @@ def _rows_of_mesh(shown: Equilibrium, unknowns: Array, error: Array, seconds: Ar
             "CalculiX 3 %: too many for a good element, and not enough for one like SHELL63",
         ),
     ]
+    return Entry(
+        "Fig. 5",
+        "Elements under a triangular probe: the whole film, at the probe, and the error against the unknowns.",
+        figure,
+        rows,
+        {
+            "unknowns": unknowns,
+            "worst_relative_error": error.tolist(),
+            "cpu_s": seconds,
+            "meshes_order_around_rings_rim": [*MESHES],
+            "finest": FINEST,
+        },
+    )
 
 
-def mesh_errors(solves: Solves) -> tuple[Array, Array, Array]:
-    """Unknowns, worst relative error of a charge against the finest mesh, CPU seconds of every mesh but that."""
-    charges, unknowns, seconds = zip(*solves.meshes, strict=True)
-    error = np.abs(np.array(charges[:-1]) / charges[-1] - 1.0).max(axis=1)
-    return np.array(unknowns[:-1]), error, np.array(seconds[:-1])
-
-
-def _draw_mesh(axes: Any, solves: Solves) -> None:
-    shown = solves.shown
+def _draw_mesh(axes: Any, shown: Equilibrium) -> None:
+    """Edges of the elements, and the probe."""
     along, one = np.linspace(-1.0, 1.0, 13), np.ones(13)
     xi, eta = np.concatenate([along, one, -along, -one]), np.concatenate([-one, along, one, -along])
-    turn = shown.film.radius * np.exp(1j * np.angle(complex(*shown.at)))
-    z = shown.mesh.points @ tensor_values(shown.mesh.resolution.order, xi, eta).T * turn
+    turned = shown.film.radius * np.exp(1j * np.angle(complex(*shown.at)))
+    z = shown.mesh.points @ tensor_values(shown.mesh.resolution.order, xi, eta).T * turned
     axes.add_collection(LineCollection(list(np.stack([z.real, z.imag], axis=-1)), colors=INK, linewidths=0.5))
     draw_probe(axes, shown.probe, shown.at)

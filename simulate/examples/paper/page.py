@@ -1,10 +1,12 @@
-"""The page and the numbers: paper.md and paper.json."""
+"""What each figure gives to the page, and the page: paper.md and paper.json."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 from choices import Choices
-from entry import Entry
+from matplotlib.figure import Figure
 
 from isocharge.common.json_values import plain_values
 
@@ -19,6 +21,44 @@ same numbers are in `paper.json`.
 """
 
 
+HEADS = ("what", "paper", "ours", "what explains it")
+"""Heads of the columns of a table of rows."""
+
+
+class Row(NamedTuple):
+    """One number or claim: what, the paper's value, ours, and what explains the difference."""
+
+    what: str
+    paper: str
+    ours: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One figure or section of the page.
+
+    Attributes:
+        heading: "Fig. 6", "Eq. 4", ...
+        caption: What the figure shows.
+        figure: The picture.
+        rows: Numbers and claims.
+        numbers: For programs, units in the keys.
+    """
+
+    heading: str
+    caption: str
+    figure: Figure | None = None
+    rows: Sequence[Row] = ()
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def slug(self) -> str:
+        """File name of the picture, without suffix: "fig-06"."""
+        word, _, number = self.heading.lower().partition(". ")
+        return f"{word}-{int(number):02d}"
+
+
 def page(entries: Sequence[Entry], choices: Choices, seconds: float) -> str:
     """The whole page as Markdown."""
     film = choices.sensor("three").film
@@ -29,38 +69,23 @@ def page(entries: Sequence[Entry], choices: Choices, seconds: float) -> str:
         f"Working area: {choices.radius:g} mm, up to {choices.presses} presses spread over it. Computed in "
         f"{seconds:.0f} s."
     )
-    parts = [INTRODUCTION, settings, "\n## Table\n", _table(entries)]
+    rows = [(entry.heading, *row) for entry in entries for row in entry.rows]
+    parts = [INTRODUCTION, settings, "\n## Table\n", _table(("figure", *HEADS), rows)]
     for entry in entries:
         parts.append(f"\n## {entry.heading}\n\n{entry.caption}")
         if entry.figure is not None:
             parts.append(f"\n![{entry.heading}: {entry.caption}]({entry.slug}.png)\n\n[as SVG]({entry.slug}.svg)")
         else:
-            parts.append("\n" + _table([entry], headings=False))
+            parts.append("\n" + _table(HEADS, entry.rows))
     return "\n".join(parts) + "\n"
 
 
-def _table(entries: Sequence[Entry], headings: bool = True) -> str:
-    lines = ["| figure | what | paper | ours | what explains it |", "|---|---|---|---|---|"]
-    if not headings:
-        lines = ["| what | paper | ours | what explains it |", "|---|---|---|---|"]
-    for entry in entries:
-        for row in entry.rows:
-            cells = [row.what, row.paper, row.ours, row.why]
-            lines.append("| " + " | ".join([entry.heading, *cells] if headings else cells) + " |")
-    return "\n".join(lines)
-
-
-def numbers(entries: Sequence[Entry]) -> dict[str, object]:
-    """Everything by heading, rows included, as plain values."""
-    return {
-        entry.heading: {
-            **entry.numbers,
-            "rows": [{"what": r.what, "paper": r.paper, "ours": r.ours, "why": r.why} for r in entry.rows],
-        }
-        for entry in entries
-    }
+def _table(heads: Sequence[str], rows: Sequence[tuple[str, ...]]) -> str:
+    lines = ["| " + " | ".join(cells) + " |" for cells in (heads, *rows)]
+    return "\n".join([lines[0], "|---" * len(heads) + "|", *lines[1:]])
 
 
 def as_json(entries: Sequence[Entry]) -> str:
-    """The numbers as JSON; NaN becomes null."""
-    return json.dumps(plain_values(numbers(entries)), indent=1, allow_nan=False) + "\n"
+    """The numbers by heading, rows included, as JSON; NaN becomes null."""
+    numbers = {entry.heading: {**entry.numbers, "rows": [row._asdict() for row in entry.rows]} for entry in entries}
+    return json.dumps(plain_values(numbers), indent=1, allow_nan=False) + "\n"

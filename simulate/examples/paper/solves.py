@@ -3,30 +3,32 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from time import process_time
 from typing import Any
 
 import numpy as np
-from choices import PAPER, Choices
+from choices import CUBICS, FIG_8_DEG, Choices
 from scipy.optimize import least_squares
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import SolveError
-from isocharge.common.progress import report
+from isocharge.common.progress import track
+from isocharge.simulate import (
+    ChargeSpline,
+    Equilibrium,
+    Film,
+    ForwardMap,
+    Probe,
+    Resolution,
+    Sensor,
+    SolveSettings,
+    Theory,
+    press,
+    touch_charge,
+)
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from isocharge.simulate.execution.workers import in_order
-from isocharge.simulate.forward.charge_spline import ChargeSpline
-from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.forward.readout import touch_charge
-from isocharge.simulate.mechanics.theory import Theory
-from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.numerics.disk import lattice
-from isocharge.simulate.sensor.film import Film
-from isocharge.simulate.sensor.probe import Probe
-from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.solver.equilibrium import Equilibrium
-from isocharge.simulate.solver.press import press
-from isocharge.simulate.solver.settings import SolveSettings
 
 FORCE = 1.0
 """Force of the paper's presses, N."""
@@ -42,77 +44,46 @@ FINEST = (8, 12, 7, 2)
 CHAIN_ACCURACY = 2e-3
 """Relative error of a charge in the comparison of thicknesses, where some tenths of a percent cannot be seen."""
 
+TAUT = 0.5
+"""Pretension of the film that the contours assume to be slack, MPa."""
 
-@dataclass(frozen=True)
-class SolveJob:
-    """Single presses to solve, the same way each: charges of some sensors.
+UNSUSPECTED = 24
+"""Number of presses with each probe or film that the contours do not assume."""
 
-    Attributes:
-        sensors: All with the same film.
-        probe: The footprint.
-        at: (x, y) of each, mm.
-        force: Of each, N; each is started from the one before.
-        accuracy: Target for the relative error of a charge.
-    """
+Places = Sequence[tuple[float, float]]
 
-    sensors: tuple[Sensor, ...]
-    probe: Probe
-    at: tuple[tuple[float, float], ...]
-    force: tuple[float, ...]
-    accuracy: float = 1e-3
+Job = Callable[[], Any]
 
 
-def solve_presses(job: SolveJob) -> Array:
-    """Touch charges, shape (n_sensor, n_press, n_electrode), pC; all sensors have as many electrodes."""
+def call(job: Job) -> Any:
+    """Run a job, which a worker process can receive."""
+    return job()
+
+
+def run_all(jobs: Sequence[Job], title: str, executor: Executor | None) -> list[Any]:
+    """Results of jobs, in their order."""
+    return list(track(in_order(executor, call, jobs), title, len(jobs)))
+
+
+def solve_presses(
+    sensor: Sensor, probe: Probe, places: Places, forces: Sequence[float], accuracy: float = 1e-3
+) -> Array:
+    """Touch charges at (x, y), mm, under forces, N; each is started from the one before; (n_press, n_electrode), pC."""
     start: Equilibrium | None = None
     charge = []
-    for at, force in zip(job.at, job.force, strict=True):
-        start = press(job.sensors[0].film, job.probe, at, force, SolveSettings(accuracy=job.accuracy), start=start)
-        charge.append([touch_charge(sensor, start) for sensor in job.sensors])
-    return np.moveaxis(np.array(charge), 1, 0)
+    for at, force in zip(places, forces, strict=True):
+        start = press(sensor.film, probe, at, force, SolveSettings(accuracy=accuracy), start=start)
+        charge.append(touch_charge(sensor, start))
+    return np.array(charge)
 
 
-@dataclass(frozen=True)
-class MapJob:
-    """A forward map to build at 1 N."""
-
-    sensor: Sensor
-    probe: Probe
-    radius: float
-
-
-def build_map(job: MapJob) -> ForwardMap:
-    """The forward map of a job."""
-    return ForwardMap.build(job.sensor, job.probe, job.radius, (FORCE, FORCE))
-
-
-@dataclass(frozen=True)
-class MeshJob:
-    """One press on one mesh."""
-
-    sensor: Sensor
-    probe: Probe
-    at: tuple[float, float]
-    mesh: tuple[int, int, int, int]
-
-
-def solve_mesh(job: MeshJob) -> tuple[Array, int, float]:
-    """Charges, unknowns and CPU seconds; NaN charges where the mesh gives no equilibrium."""
+def solve_mesh(
+    sensor: Sensor, probe: Probe, at: tuple[float, float], mesh: tuple[int, int, int, int]
+) -> tuple[Array, int, float]:
+    """One press on one mesh: charges, unknowns and CPU seconds."""
     began, theory = process_time(), Theory(stretching=True, bending=True, pretensioned=False)
-    try:
-        solved = press(
-            job.sensor.film, job.probe, job.at, FORCE, SolveSettings(theory=theory, resolution=Resolution(*job.mesh))
-        )
-    except SolveError:
-        return np.full(len(job.sensor.electrodes), np.nan), 0, process_time() - began
-    charge = touch_charge(job.sensor, solved)
-    return charge, 3 * solved.mesh.template.n_node, process_time() - began
-
-
-def run(job: tuple[Callable[[Any], Any], Any]) -> Any:
-    """Run a job: a function and its argument, which a worker process can receive."""
-    function, argument = job
-    return function(argument)
+    solved = press(sensor.film, probe, at, FORCE, SolveSettings(theory=theory, resolution=Resolution(*mesh)))
+    return touch_charge(sensor, solved), 3 * solved.mesh.template.n_node, process_time() - began
 
 
 @dataclass(frozen=True)
@@ -126,7 +97,7 @@ class Solves:
         eq_4: Position (x, y) of eq. 4's press, mm, and the ratio of our charges to the paper's at this position.
         chains: Charges of the films of `choices`, shape (n_thickness, n_pretension, n_force, 3), pC.
         meshes: Of MESHES and FINEST: charges, unknowns, CPU seconds.
-        variants: Charges of named variations, see `_variants`.
+        variants: Charges with other probes and films than our choice, by name, at `sample`, shape (n, 3), pC.
         shown: The film under one triangular press, for its mesh and stress.
     """
 
@@ -145,8 +116,8 @@ class Solves:
     def scheme(self, probe: str, sensor: Sensor) -> tuple[Curves, ...]:
         """Charge curves from every electrode, as far to both sides of the centre as contours need."""
         forward_map = self.forward_map(probe, sensor)
-        names, length = sensor.electrode_names, self.choices.length
-        return tuple(Curves.of(forward_map, Mapping.lines(sensor, name, length=length), FORCE) for name in names)
+        lines = (Mapping.lines(sensor, name, length=self.choices.length) for name in sensor.electrode_names)
+        return tuple(Curves.of(forward_map, mapping, FORCE) for mapping in lines)
 
     def charges(self, probe: str, sensor: Sensor, at: Array) -> Array:
         """Touch charges of presses of 1 N at (x, y), shape (n, 2), mm; (n, n_electrode), pC."""
@@ -155,93 +126,76 @@ class Solves:
     @property
     def places(self) -> Array:
         """Presses spread over the working area, shape (n, 2), mm."""
-        z = self.choices.radius * lattice(self.choices.presses) * np.exp(0.1j)  # off the lines of symmetry
-        return np.stack([z.real, z.imag], axis=1)
+        return spread(self.choices.radius, self.choices.presses)
+
+    def changes(self, name: str) -> Array:
+        """Relative changes of the charges that a variation makes, over the presses of the variations, shape (n, 3)."""
+        charge = self.charges("triangle", self.choices.sensor("three"), sample(self.choices))
+        return self.variants[name] / charge - 1.0
+
+
+def spread(radius: float, most: int) -> Array:
+    """Places of a lattice off the lines of symmetry, shape (n, 2), mm."""
+    z = radius * lattice(most) * np.exp(0.1j)
+    return np.stack([z.real, z.imag], axis=1)
+
+
+def sample(choices: Choices) -> Array:
+    """Positions of the presses of the variations, shape (n, 2), mm."""
+    return spread(0.9 * choices.radius, min(UNSUSPECTED, choices.presses))
 
 
 def solve_all(choices: Choices, executor: Executor | None) -> Solves:
     """Solve everything."""
-    sensor = choices.sensor("three")
-    first = _map_jobs(choices)
-    variants = _variants(choices)
-    meshes = [(solve_mesh, MeshJob(sensor, choices.triangle, choices.shown, mesh)) for mesh in (*MESHES, FINEST)]
-    chains = len(choices.thickness) * len(choices.pretension)
-    jobs = _Jobs(executor, len(first) + len(variants) + len(meshes) + chains)
-    results = jobs.run(
-        [*((build_map, job) for job in first.values()), *((solve_presses, j) for j in variants.values()), *meshes]
-    )
-    maps = dict(zip(first, results, strict=False))
-    varied = dict(zip(variants, results[len(first) :], strict=False))
-    eq_4 = find_eq_4(replace(maps["triangle"], sensor=sensor), choices)
-    chain_results = jobs.run([(solve_presses, job) for job in _chain_jobs(choices, eq_4[0])])
-    charges = np.array(chain_results)[:, 0].reshape(
-        len(choices.thickness), len(choices.pretension), len(choices.force), -1
-    )
+    sensor, maps, variants = choices.sensor("three"), _map_jobs(choices), _variant_jobs(choices)
+    meshes = [partial(solve_mesh, sensor, choices.triangle, choices.shown, mesh) for mesh in (*MESHES, FINEST)]
+    solved = iter(run_all([*maps.values(), *variants.values(), *meshes], "solving", executor))
+    forward_maps = {name: next(solved) for name in maps}
+    varied = {name: next(solved) for name in variants}
+    eq_4 = find_eq_4(forward_maps["triangle"], choices)
+    films = [
+        replace(sensor.film, thickness=thickness, pretension=pretension)
+        for thickness in choices.thickness
+        for pretension in choices.pretension
+    ]
+    places = (eq_4[0],) * len(choices.force)
+    chains = [
+        partial(solve_presses, replace(sensor, film=film), choices.triangle, places, choices.force, CHAIN_ACCURACY)
+        for film in films
+    ]
+    charges = np.array(run_all(chains, "solving films", executor))
+    charges = charges.reshape(len(choices.thickness), len(choices.pretension), *charges.shape[1:])
     shown = press(sensor.film, choices.triangle, choices.shown, FORCE)
-    return Solves(choices, maps, eq_4, charges, tuple(results[len(first) + len(variants) :]), varied, shown)
+    return Solves(choices, forward_maps, eq_4, charges, tuple(solved), varied, shown)
 
 
-class _Jobs:
-    """Runs jobs and counts those that are done."""
-
-    def __init__(self, executor: Executor | None, total: int) -> None:
-        self._executor, self._done, self._total = executor, 0, total
-
-    def run(self, jobs: Sequence[tuple[Callable[[Any], Any], Any]]) -> list[Any]:
-        results = []
-        for result in in_order(self._executor, run, jobs):
-            results.append(result)
-            self._done += 1
-            report("solving", self._done, self._total)
-        return results
-
-
-def _map_jobs(choices: Choices) -> dict[str, MapJob]:
+def _map_jobs(choices: Choices) -> dict[str, Job]:
+    """Forward maps as far out as the schemes press."""
     sensor = choices.sensor("three")
-    layouts = (sensor, choices.sensor("four"))
-    lines = [Mapping.lines(s, name, length=choices.length) for s in layouts for name in s.electrode_names]
-    reach = SLACK * max(mapping.radius for mapping in lines)
-    ends = (np.deg2rad(PAPER.fig_8_deg[0]), np.deg2rad(PAPER.fig_8_deg[1]))
-    printed = SLACK * Mapping.lines(choices.as_printed(), "B", ends, length=choices.printed_length).radius
+    lines = [
+        Mapping.lines(layout, name, length=choices.length)
+        for layout in (sensor, choices.sensor("four"))
+        for name in layout.electrode_names
+    ]
+    reach = max(mapping.radius for mapping in lines)
+    first, last = np.deg2rad(FIG_8_DEG)
+    printed = Mapping.lines(choices.as_printed(), "B", (first, last), length=choices.printed_length).radius
     return {
-        "rectangle": MapJob(sensor, choices.rectangle, max(reach, printed)),
-        "triangle": MapJob(sensor, choices.triangle, reach),
-        "circle": MapJob(sensor, choices.circle, reach),
+        name: partial(ForwardMap.build, sensor, probe, SLACK * radius, (FORCE, FORCE))
+        for name, probe, radius in (
+            ("rectangle", choices.rectangle, max(reach, printed)),
+            ("triangle", choices.triangle, reach),
+            ("circle", choices.circle, reach),
+        )
     }
 
 
-def _chain_jobs(choices: Choices, at: tuple[float, float]) -> list[SolveJob]:
-    """Charge against force of every film, at the place of eq. 4."""
-    sensor, count = choices.sensor("three"), len(choices.force)
-    return [
-        SolveJob((replace(sensor, film=film),), choices.triangle, (at,) * count, choices.force, CHAIN_ACCURACY)
-        for film in (
-            replace(sensor.film, thickness=thickness, pretension=pretension)
-            for thickness in choices.thickness
-            for pretension in choices.pretension
-        )
-    ]
-
-
-TAUT = 0.5
-"""Pretension of the film that the contours assume to be slack, MPa."""
-
-UNSUSPECTED = 24
-"""Number of presses with each probe or film that the contours do not assume."""
-
-
-def sample(choices: Choices) -> tuple[tuple[float, float], ...]:
-    """Positions (x, y) of the presses of the variations, mm."""
-    places = 0.9 * choices.radius * lattice(min(UNSUSPECTED, choices.presses)) * np.exp(0.1j)
-    return tuple((float(z.real), float(z.imag)) for z in places)
-
-
-def _variants(choices: Choices) -> dict[str, SolveJob]:
+def _variant_jobs(choices: Choices) -> dict[str, Job]:
     """Presses with another probe or film than our choice, by name; at the same places, 1 N, paper's readout."""
-    sensor, at = choices.sensor("three"), sample(choices)
+    sensor, places = choices.sensor("three"), [(float(x), float(y)) for x, y in sample(choices)]
 
-    def presses(film: Film, probe: Probe) -> SolveJob:
-        return SolveJob((replace(sensor, film=film),), probe, at, (FORCE,) * len(at))
+    def presses(film: Film, probe: Probe) -> Job:
+        return partial(solve_presses, replace(sensor, film=film), probe, places, [FORCE] * len(places))
 
     jobs = {f"probe {probe.notation}": presses(sensor.film, probe) for probe in choices.probes}
     jobs[f"pretension {TAUT:g} MPa"] = presses(replace(sensor.film, pretension=TAUT), choices.triangle)
@@ -255,13 +209,12 @@ def _variants(choices: Choices) -> dict[str, SolveJob]:
 def find_eq_4(forward_map: ForwardMap, choices: Choices) -> tuple[tuple[float, float], float]:
     """Position (x, y) of eq. 4's press, mm, from the ratios of its charges at 1 N; our charges over the paper's."""
     table = ChargeSpline.of(forward_map, 1.2 * choices.radius, choices.spacing)
-    papers = np.array([sum(cubic) for cubic in PAPER.cubics])
+    papers = np.array([sum(cubic) for cubic in CUBICS])
 
-    def log_ratio_misfit(at: Array) -> Array:
+    def log_ratio_residuals(at: Array) -> Array:
         charge = table.first_order(at[None], FORCE)[0][0]
-        misfit: Array = np.log(charge[1:] / charge[0]) - np.log(papers[1:] / papers[0])
-        return misfit
+        return np.log(charge[1:] / charge[0]) - np.log(papers[1:] / papers[0])
 
-    position = least_squares(log_ratio_misfit, np.array([0.0, -4.0])).x
+    position = least_squares(log_ratio_residuals, np.array([0.0, -4.0])).x
     factor = table.first_order(position[None], FORCE)[0][0] / papers
     return (float(position[0]), float(position[1])), float(np.mean(factor))

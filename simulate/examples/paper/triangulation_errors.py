@@ -3,18 +3,16 @@
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from choices import PAPER
-from solves import FORCE, Solves, sample
+from choices import ERROR_MM
+from solves import FORCE, Solves, run_all, sample
 
 from isocharge.common.arrays import Array
-from isocharge.common.progress import track
-from isocharge.simulate import ChargeSpline, Triangulation
+from isocharge.simulate import ChargeSpline, Triangulation, noise_model
 from isocharge.simulate.contours.fix import Fix, Meeting
 from isocharge.simulate.contours.graphical_method import DrawnTriangulation
-from isocharge.simulate.execution.workers import in_order
-from isocharge.simulate.measuring_chain.noise_file import noise_model
 
 LAYOUTS = ("three", "four")
 
@@ -60,13 +58,11 @@ class Errors:
 
     def numbers(self) -> dict[str, object]:
         """For programs."""
-        states = {meeting.name: int(np.sum(self.fix.status == meeting)) for meeting in Meeting}
-        quantiles = {f"p{share}_mm": self.percentile(share) for share in (25, 50, 75, 95)}
         return {
             "presses": len(self.at),
-            **states,
-            **quantiles,
-            "percentile_of_0.122_mm": self.share_below(PAPER.error_mm),
+            **{meeting.name: int(np.sum(self.fix.status == meeting)) for meeting in Meeting},
+            **{f"p{share}_mm": self.percentile(share) for share in (25, 50, 75, 95)},
+            "percentile_of_0.122_mm": self.share_below(ERROR_MM),
         }
 
 
@@ -91,48 +87,32 @@ class Accuracy:
     @classmethod
     def of(cls, solves: Solves, executor: Executor | None) -> "Accuracy":
         """Triangulate."""
-        degrees = [degree for degree in DEGREES if degree <= solves.choices.degree]
-        jobs = [(solves, layout, degree, False) for layout in LAYOUTS for degree in degrees]
-        jobs += [(solves, layout, solves.choices.degree, True) for layout in LAYOUTS]
-        located = in_order(executor, _locate, [_graphical_job(*job) for job in jobs])
-        results = list(track(located, "triangulating", len(jobs)))
-        drawn = {(layout, degree): errors for (_, layout, degree, _), errors in zip(jobs[:-2], results, strict=False)}
-        field, noisy, mistaken = {}, {}, {}
-        for layout in LAYOUTS:
-            forward_map = solves.forward_map("triangle", solves.choices.sensor(layout))
-            radius, spacing = BEYOND * solves.choices.radius, solves.choices.spacing
-            contours = Triangulation(ChargeSpline.of(forward_map, radius, spacing))
-            charge = solves.charges("triangle", forward_map.sensor, solves.places)
-            field[layout] = Errors(contours.locate(charge, FORCE), solves.places)
-            noisy[layout] = Errors(contours.locate(_noisy(charge), FORCE), solves.places)
-            if layout == "three":
-                at = np.array(sample(solves.choices))
-                mistaken = {name: Errors(contours.locate(q[0], FORCE), at) for name, q in solves.variants.items()}
-        return cls(drawn, field, noisy, dict(zip(LAYOUTS, results[-2:], strict=True)), mistaken)
-
-
-def _noisy(charge: Array) -> Array:
-    return noise_model("reference").add(charge, np.random.default_rng(SEED))
-
-
-def _graphical_job(solves: Solves, layout: str, degree: int, noise: bool) -> tuple[DrawnTriangulation, Array, Array]:
-    """A job for a worker process: curves and charges, without the large forward maps."""
-    sensor = solves.choices.sensor(layout)
-    charge = solves.charges("triangle", sensor, solves.places)
-    return (
-        DrawnTriangulation(solves.scheme("triangle", sensor), degree),
-        solves.places,
-        _noisy(charge) if noise else charge,
-    )
-
-
-def _locate(job: tuple[DrawnTriangulation, Array, Array]) -> Errors:
-    contours, at, charge = job
-    return Errors(contours.locate(charge), at)
-
-
-def largest_change(solves: Solves, name: str) -> float:
-    """Largest relative change of a charge that a variation makes, over the presses of the variations."""
-    at = np.array(sample(solves.choices))
-    charge = solves.charges("triangle", solves.choices.sensor("three"), at)
-    return float(np.abs(solves.variants[name][0] / charge - 1.0).max())
+        choices, places, noise = solves.choices, solves.places, noise_model("reference")
+        sensors = {layout: choices.sensor(layout) for layout in LAYOUTS}
+        clean = {layout: solves.charges("triangle", sensor, places) for layout, sensor in sensors.items()}
+        noisy = {layout: noise.add(charge, np.random.default_rng(SEED)) for layout, charge in clean.items()}
+        drawings = [
+            (layout, degree, clean[layout]) for layout in LAYOUTS for degree in DEGREES if degree <= choices.degree
+        ]
+        drawings += [(layout, choices.degree, noisy[layout]) for layout in LAYOUTS]
+        schemes = {layout: solves.scheme("triangle", sensor) for layout, sensor in sensors.items()}
+        jobs = [
+            partial(DrawnTriangulation(schemes[layout], degree).locate, charge) for layout, degree, charge in drawings
+        ]
+        drawn = [Errors(fix, places) for fix in run_all(jobs, "triangulating", executor)]
+        fields = {
+            layout: Triangulation(
+                ChargeSpline.of(solves.forward_map("triangle", sensor), BEYOND * choices.radius, choices.spacing)
+            )
+            for layout, sensor in sensors.items()
+        }
+        return cls(
+            {(layout, degree): errors for (layout, degree, _), errors in zip(drawings[:-2], drawn, strict=False)},
+            {layout: Errors(fields[layout].locate(clean[layout], FORCE), places) for layout in LAYOUTS},
+            {layout: Errors(fields[layout].locate(noisy[layout], FORCE), places) for layout in LAYOUTS},
+            dict(zip(LAYOUTS, drawn[-2:], strict=True)),
+            {
+                name: Errors(fields["three"].locate(charge, FORCE), sample(choices))
+                for name, charge in solves.variants.items()
+            },
+        )
