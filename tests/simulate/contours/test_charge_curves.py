@@ -15,6 +15,7 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
+from kept import kept
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
@@ -23,9 +24,8 @@ DEG = np.pi / 180.0
 
 @pytest.fixture(scope="module")
 def film() -> ForwardMap:
-    return ForwardMap.build(
-        SENSOR, Circle(1.0), 17.0, (1.0, 1.0), SolveSettings(theory=MEMBRANE, resolution=Resolution(5, 8, 5))
-    )
+    settings = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
+    return kept(ForwardMap.build, SENSOR, Circle(1.0), 9.0, (1.0, 1.0), settings)
 
 
 def test_the_papers_scheme():
@@ -45,23 +45,16 @@ def test_without_angles_lines_go_to_both_sides_of_the_centre():
 
 
 def test_curves_are_presses(film):
-    curves = Curves.of(film, Mapping.lines(SENSOR, "A", (35 * DEG, 90 * DEG), length=16.0), 1.0)
-    for line, step in ((0, 0), (3, 1), (6, 3)):
+    curves = Curves.of(film, Mapping.lines(SENSOR, "A", (60 * DEG, 90 * DEG), length=16.0), 1.0)
+    for line, step in ((0, 0), (3, 3)):
         at = tuple(curves.mapping.points[line, step])
         direct = touch_charge(SENSOR, press(SENSOR.film, Circle(1.0), at, 1.0, SolveSettings(theory=MEMBRANE)))
         np.testing.assert_allclose(curves.charge[line, step], direct, rtol=2e-3)
     np.testing.assert_array_equal(curves.own, curves.charge[..., 0])
 
 
-def test_lines_of_a_mirror_image_are_mirrored(film):
-    """B and C lie symmetric about the y axis, and so does a circle."""
-    b = Curves.of(film, Mapping.lines(SENSOR, "B", (150 * DEG, 270 * DEG), length=12.0), 1.0)
-    c = Curves.of(film, Mapping.lines(SENSOR, "C", (-90 * DEG, 30 * DEG), length=12.0), 1.0)
-    np.testing.assert_allclose(b.own, c.own[::-1], rtol=1e-5)
-
-
 def test_polynomials_are_numpys(film):
-    curves = Curves.of(film, Mapping.lines(SENSOR, "A", (40 * DEG, 80 * DEG), length=16.0), 1.0)
+    curves = Curves.of(film, Mapping.lines(SENSOR, "A", (60 * DEG, 90 * DEG), length=16.0), 1.0)
     for line, polynomial in zip(curves.own, curves.polynomials(2), strict=True):
         expected = np.polyval(np.polyfit(curves.mapping.distance, line, 2), [5.0, 13.0])
         np.testing.assert_allclose(polynomial(np.array([5.0, 13.0])), expected, rtol=1e-9)
@@ -72,12 +65,11 @@ def test_polynomials_are_numpys(film):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"angles": (90 * DEG, 35 * DEG)}, "expected MIN <= MAX, got 90 to 35 degrees"),
-        ({"angles": (np.nan, 1.0)}, "expected MIN <= MAX"),
-        ({"angle_step": 0.0}, "expected a positive number, got 0 degrees"),
-        ({"step": 0.0}, "0 < step <= length, got a step of 0 mm"),
-        ({"step": 30.0}, "a step of 30 mm and lines of 20 mm"),
-        ({"step": 1e-6}, "at most 100000 presses"),
+        ({"angles": (90 * DEG, 35 * DEG)}, "expected first <= last angle .*, got 90 to 35 degrees"),
+        ({"angles": (np.nan, 1.0)}, "expected first <= last angle"),
+        ({"angle_step": 0.0}, "degrees in steps of 0"),
+        ({"step": 0.0}, "0 < step <= length, got .* in steps of 0 mm"),
+        ({"step": 30.0}, "lines of 20 mm in steps of 30 mm"),
         ({"electrode": "E"}, "no electrode 'E' on three-25um-biaxial: it has A, B, C"),
     ],
 )

@@ -34,18 +34,16 @@ class Candidates:
         press: Number of the press, shape (n,).
         contact: (x, y, F), shape (n, 3), mm and N.
         spread: Distance from a meeting of the contours, shape (n,), mm; infinite before the search.
-        triples: Number of triples of electrodes that the position is the average of, shape (n,).
     """
 
     press: Integers
     contact: Array
     spread: Array
-    triples: Integers
 
     @classmethod
     def begin(cls, press: Integers, contact: Array) -> "Candidates":
         """Candidates to start from."""
-        return cls(press, contact, np.full(press.size, np.inf), np.zeros(press.size, dtype=np.intp))
+        return cls(press, contact, np.full(press.size, np.inf))
 
     def __getitem__(self, part: np.ndarray) -> "Candidates":
         return Candidates(*(getattr(self, column.name)[part] for column in fields(self)))
@@ -59,7 +57,7 @@ class Candidates:
         """These candidates, moved where the new contact is nearer to a meeting."""
         nearer = spread < self.spread
         contact = np.where(nearer[:, None], contact, self.contact)
-        return Candidates(self.press, contact, np.where(nearer, spread, self.spread), self.triples)
+        return Candidates(self.press, contact, np.where(nearer, spread, self.spread))
 
     def distinct(self, tolerance: float) -> "Candidates":
         """Candidates sorted by press and spread, without those within `tolerance` (mm) of a better one."""
@@ -125,22 +123,19 @@ class SeedGrid:
         below = np.minimum(share.astype(int), max(self.logs.size - 2, 0))
         above, node = np.minimum(below + 1, self.logs.size - 1), np.arange(len(self.at))
         weight = (share - below)[..., None]
-        charge: Array = (1.0 - weight) * self.nodal[below, node] + weight * self.nodal[above, node]
-        return charge
+        return np.asarray((1.0 - weight) * self.nodal[below, node] + weight * self.nodal[above, node])
 
     def matching_force(self, charge: Array) -> Array:
         """Force at which each node has the total of the charges (n, n_electrode), shape (n, n_node), N."""
         totals, total = self.nodal.sum(axis=2), charge.sum(axis=1)
         sign = np.sign(totals.sum())  # with negative coefficients the charges fall with the force
         columns = [np.interp(sign * total, sign * column, self.logs) for column in totals.T]
-        force: Array = np.exp(np.stack(columns, axis=1))
-        return force
+        return np.asarray(np.exp(np.stack(columns, axis=1)))
 
     def distance(self, charge: Array, force: Array) -> Array:
         """Root mean square distance from each node to the contours of charges (n, n_electrode); (n, n_node), mm."""
         away = (self.charge(force) - charge[:, None]) / (self.growth(force)[..., None] * self.slope)
-        distance: Array = np.sqrt(np.mean(away**2, axis=2))
-        return distance
+        return np.asarray(np.sqrt(np.mean(away**2, axis=2)))
 
     def lowest(self, distance: Array, most: int) -> tuple[Integers, Integers]:
         """Nodes with a smaller distance than their neighbours, at most `most` per press: (press, node), each (n,)."""

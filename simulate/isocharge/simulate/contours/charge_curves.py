@@ -19,9 +19,6 @@ STEP, LENGTH, ANGLE_STEP, HALF_ANGLE = 4.0, 20.0, np.deg2rad(10.0), np.deg2rad(7
 """Distance between presses on a line, mm; length of the lines, mm; angle between lines, rad; largest angle to both
 sides of the film's centre, rad. Step and angle are the paper's, the others our choice."""
 
-MOST_PRESSES = 100_000
-"""Largest number of presses of a scheme: more point to a mistake in the units."""
-
 
 @dataclass(frozen=True)
 class Mapping:
@@ -61,13 +58,18 @@ class Mapping:
 
         Raises:
             SensorError: If there is no such electrode.
-            SceneError: If angles, steps or length give no press, or more than MOST_PRESSES.
+            SceneError: If angles, steps or length give no press.
         """
         centre = sensor.electrodes[electrode_index(sensor, electrode)].centre
         x, y = sensor.calibration.place(np.array(centre))
         inwards = np.arctan2(-y, -x) % (2.0 * np.pi)
         first, last = angles if angles is not None else (inwards - HALF_ANGLE, inwards + HALF_ANGLE)
-        _check_lines(first, last, angle_step, step, length)
+        if not (-np.inf < first <= last < np.inf and 0.0 < angle_step < np.inf and 0.0 < step <= length < np.inf):
+            raise SceneError(
+                f"expected first <= last angle and 0 < step <= length, got {np.rad2deg(first):g} to "
+                f"{np.rad2deg(last):g} degrees in steps of {np.rad2deg(angle_step):g}, and lines of {length:g} mm in "
+                f"steps of {step:g} mm"
+            )
         angle = np.arange(first, last - 1e-9, angle_step)
         distance: Array = step * np.arange(1.0, int(length / step * (1.0 + 1e-9)) + 1.0)
         return cls(electrode, (float(x), float(y)), np.append(angle, last), distance)
@@ -76,8 +78,7 @@ class Mapping:
     def points(self) -> Array:
         """Positions (x, y) of the presses, shape (n_line, n_step, 2), mm."""
         direction = np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
-        points: Array = np.array(self.origin) + self.distance[None, :, None] * direction[:, None]
-        return points
+        return np.asarray(np.array(self.origin) + self.distance[None, :, None] * direction[:, None])
 
     @property
     def radius(self) -> float:
@@ -88,18 +89,6 @@ class Mapping:
         """The same lines with `count` presses from the first to the last."""
         distance = np.linspace(self.distance[0], self.distance[-1], count)
         return Mapping(self.electrode, self.origin, self.angle, distance)
-
-
-def _check_lines(first: float, last: float, angle_step: float, step: float, length: float) -> None:
-    if not (np.isfinite([first, last]).all() and first <= last):
-        raise SceneError(f"angles: expected MIN <= MAX, got {np.rad2deg(first):g} to {np.rad2deg(last):g} degrees")
-    if not (np.isfinite(angle_step) and angle_step > 0.0):
-        raise SceneError(f"step of the angle: expected a positive number, got {np.rad2deg(angle_step):g} degrees")
-    if not (np.isfinite([step, length]).all() and 0.0 < step <= length):
-        raise SceneError(f"expected 0 < step <= length, got a step of {step:g} mm and lines of {length:g} mm")
-    presses = ((last - first) / angle_step + 2.0) * length / step
-    if presses > MOST_PRESSES:
-        raise SceneError(f"expected at most {MOST_PRESSES} presses on the lines, got {presses:.3g}; take larger steps")
 
 
 @dataclass(frozen=True)
@@ -133,8 +122,7 @@ class Curves:
     @property
     def own(self) -> Array:
         """Charge of the electrode that the lines leave from, shape (n_line, n_step), pC."""
-        charge: Array = self.charge[..., self.electrodes.index(self.mapping.electrode)]
-        return charge
+        return np.asarray(self.charge[..., self.electrodes.index(self.mapping.electrode)])
 
     def polynomials(self, degree: int) -> Sequence[Polynomial]:
         """The paper's fit: charge (pC) of the mapping's electrode as a polynomial of the distance (mm) on each line.

@@ -47,19 +47,16 @@ class Fix:
         spread: Largest distance of a crossing from the mean of its triple, or, with the force unknown, root mean square
             distance of the contours from the position; shape (n,), mm.
         status: A `Meeting` for each press, shape (n,).
-        triples: How many triples of electrodes the position is the average of; 0 with the force unknown; shape (n,).
     """
 
     contact: Array
     spread: Array
     status: Integers
-    triples: Integers
 
     @property
     def found(self) -> Booleans:
         """Whether each press has a position, shape (n,)."""
-        found: Booleans = self.status == Meeting.met
-        return found
+        return np.asarray(self.status == Meeting.met)
 
 
 def check_triangulation(electrodes: tuple[str, ...], tolerance: float) -> None:

@@ -6,7 +6,6 @@ ends). Two contours are intersected as splines; the three crossings that lie tog
 `field_contours` and `triangulation` do the same from the field, without the error of the drawing.
 """
 
-from collections.abc import Mapping as Map
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -47,8 +46,7 @@ class DrawnContour:
     @property
     def points(self) -> Array:
         """Points along the spline, shape (n, 2), mm."""
-        points: Array = self._spline(self._parameters)
-        return points
+        return np.asarray(self._spline(self._parameters))
 
     @cached_property
     def _spline(self) -> CubicSpline:
@@ -59,8 +57,7 @@ class DrawnContour:
     def _parameters(self) -> Array:
         knots = self._spline.x
         inner = np.linspace(knots[:-1], knots[1:], PER_SPAN, endpoint=False, axis=1).ravel()
-        parameters: Array = np.append(inner, knots[-1])
-        return parameters
+        return np.asarray(np.append(inner, knots[-1]))
 
     def crossings(self, other: "DrawnContour") -> Array:
         """Positions where two contours cross, shape (n, 2), mm."""
@@ -156,33 +153,32 @@ class DrawnTriangulation:
         """
         charge = as_charges(charge, self.electrodes)
         rows = [self._locate_one(row) for row in charge]
-        at, spread, status, triples = (np.array([row[i] for row in rows]) for i in range(4))
+        at, spread, status = (np.array([row[i] for row in rows]) for i in range(3))
         contact = np.column_stack([at.reshape(-1, 2), np.full(len(charge), self.curves[0].force)])
-        return Fix(contact, spread, status.astype(np.intp), triples.astype(np.intp))
+        return Fix(contact, spread, status.astype(np.intp))
 
-    def _locate_one(self, charge: Array) -> tuple[Array, float, Meeting, int]:
-        """Position, spread, whether the contours meet, and the number of triples that do."""
+    def _locate_one(self, charge: Array) -> tuple[Array, float, Meeting]:
+        """Position, spread, and whether the contours meet."""
         contours = [contour for contour in self.contours(charge) if contour is not None]
         if len(contours) < len(charge):
-            return NOWHERE, np.nan, Meeting.no_contour, 0
+            return NOWHERE, np.nan, Meeting.no_contour
         pairs = {(i, j): contours[i].crossings(contours[j]) for i, j in combinations(range(len(contours)), 2)}
-        met = [self._meeting(pairs, triple) for triple in combinations(range(len(contours)), 3)]
-        good = [(mean, spread) for mean, spread, status in met if status is Meeting.met]
+        triples = combinations(range(len(contours)), 3)
+        meetings = [self._meeting([pairs[pair] for pair in combinations(triple, 2)]) for triple in triples]
+        good = [(mean, spread) for mean, spread, status in meetings if status is Meeting.met]
         if not good:
-            twice = any(status is Meeting.twice for _, _, status in met)
-            return NOWHERE, np.nan, Meeting.twice if twice else Meeting.apart, 0
-        return np.mean([mean for mean, _ in good], axis=0), max(spread for _, spread in good), Meeting.met, len(good)
+            return NOWHERE, np.nan, max(status for _, _, status in meetings)  # twice rather than apart
+        return np.mean([mean for mean, _ in good], axis=0), max(spread for _, spread in good), Meeting.met
 
-    def _meeting(self, pairs: Map[tuple[int, int], Array], triple: tuple[int, ...]) -> tuple[Array, float, Meeting]:
-        """Mean and spread of the crossings of three contours that lie together most closely."""
-        corners = [np.array(c) for c in product(*(pairs[pair] for pair in combinations(triple, 2)))]
-        means = [c.mean(axis=0) for c in corners]
-        spreads = [float(np.linalg.norm(c - m, axis=1).max()) for c, m in zip(corners, means, strict=True)]
-        order = np.argsort(spreads)
-        if not spreads or spreads[order[0]] > self.tolerance:
+    def _meeting(self, pairs: list[Array]) -> tuple[Array, float, Meeting]:
+        """Mean and spread of those crossings of three pairs of contours that lie together most closely."""
+        corners = np.array([*product(*pairs)]).reshape(-1, 3, 2)
+        means = corners.mean(axis=1)
+        spreads = np.linalg.norm(corners - means[:, None], axis=2).max(axis=1)
+        if spreads.min(initial=np.inf) > self.tolerance:
             return NOWHERE, np.nan, Meeting.apart
-        best = order[0]
-        rivals = [i for i in order[1:] if np.linalg.norm(means[i] - means[best]) > APART]
-        if rivals and spreads[rivals[0]] <= AMBIGUOUS * spreads[best]:
+        best = spreads.argmin()
+        rivals = spreads[np.linalg.norm(means - means[best], axis=1) > APART]
+        if rivals.min(initial=np.inf) <= AMBIGUOUS * spreads[best]:
             return NOWHERE, np.nan, Meeting.twice
-        return means[best], spreads[best], Meeting.met
+        return means[best], float(spreads[best]), Meeting.met

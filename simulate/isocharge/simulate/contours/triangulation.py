@@ -92,7 +92,7 @@ class Triangulation:
         return self._in_chunks(as_charges(charge, self.charge_map.electrodes), None)
 
     def _in_chunks(self, charge: Array, force: Array | None) -> Fix:
-        parts = [Fix(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp))]
+        parts = [Fix(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.intp))]
         for start in range(0, len(charge), CHUNK):
             rows = slice(start, start + CHUNK)
             parts.append(self._located(charge[rows], None if force is None else force[rows]))
@@ -117,11 +117,11 @@ class Triangulation:
         status[(matches == 0) & self._grid.out_of_reach(charge, force)] = Meeting.no_contour
         status[second <= np.maximum(AMBIGUOUS * best, RESOLVED)] = Meeting.twice
         met = status == Meeting.met
-        contact, triples = np.full((count, 3), np.nan), np.zeros(count, dtype=np.intp)
-        contact[met], triples[met] = candidates.contact[first[met]], candidates.triples[first[met]]
+        contact = np.full((count, 3), np.nan)
+        contact[met] = candidates.contact[first[met]]
         if force is not None:
             contact[:, 2] = force
-        return Fix(contact, best, status, triples)
+        return Fix(contact, best, status)
 
     # Starting points
 
@@ -166,7 +166,7 @@ class Triangulation:
         """The mean of each triple's crossings near a candidate, averaged over the triples that meet there."""
         count = len(self.charge_map.electrodes)
         crossing = {pair: self._crossing(charge, near, pair) for pair in combinations(range(count), 2)}
-        total, met, spread = np.zeros((len(near.press), 2)), np.zeros_like(near.triples), np.zeros_like(near.spread)
+        total, met, spread = np.zeros((len(near.press), 2)), np.zeros_like(near.press), np.zeros_like(near.spread)
         for triple in combinations(range(count), 3):
             corners = np.stack([crossing[pair] for pair in combinations(triple, 2)], axis=1)
             mean = corners.mean(axis=1)
@@ -176,7 +176,7 @@ class Triangulation:
             spread[good] = np.maximum(spread[good], distance[good])
             met += good
         contact = np.column_stack([total / np.maximum(met, 1)[:, None], near.contact[:, 2]])
-        return Candidates(near.press, contact, spread, met)[met > 0].distinct(APART)
+        return Candidates(near.press, contact, spread)[met > 0].distinct(APART)
 
     def _crossing(self, charge: Array, near: Candidates, pair: tuple[int, int]) -> Array:
         """Crossing of two contours, by Newton's method from each candidate; shape (n, 2), NaN if they do not cross."""

@@ -5,14 +5,12 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle as Disk
 from matplotlib.ticker import ScalarFormatter
 
-from isocharge.common.arrays import Array
 from isocharge.simulate.layout.case import KNOWN
 from isocharge.simulate.layout.design import Design, ErrorMap
-from isocharge.simulate.plots.figure import FELT, INK, new_figure
-from isocharge.simulate.plots.film import draw_electrodes
+from isocharge.simulate.plots.figure import FELT, new_figure
+from isocharge.simulate.plots.film import draw_electrodes, draw_working_area
 from isocharge.simulate.sensor.sensor import Sensor
 
 LARGEST = 10.0
@@ -35,26 +33,20 @@ def error_maps_picture(design: Design) -> Figure:
     every = figure.subplots(1, len(layouts), squeeze=False)[0]
     for axes, (sensor, errors) in zip(every, layouts, strict=True):
         shown = _draw_errors(axes, sensor, errors, norm)
-        axes.add_patch(Disk((0, 0), case.radius, fill=False, ls=":", color=INK))
+        draw_working_area(axes, case.radius)
         axes.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x, mm", ylabel="y, mm", aspect="equal")
     bar = figure.colorbar(shown, ax=list(every), label="least position error (rms), mm", shrink=0.85, extend="max")
-    for axis in ("major", "minor"):
-        getattr(bar.ax.yaxis, f"set_{axis}_formatter")(ScalarFormatter())
+    bar.ax.yaxis.set_major_formatter(ScalarFormatter())
+    bar.ax.yaxis.set_minor_formatter(ScalarFormatter())
     known = "everything else known" if case.nuisances == KNOWN else "with what nobody knows exactly"
     figure.suptitle(f"{case.force:g} N, {case.probe.notation}, noise {case.noise.name}, {known}")
     return figure
 
 
 def _draw_errors(axes: Any, sensor: Sensor, errors: ErrorMap, norm: LogNorm) -> Any:
-    """Errors on their square grid as an image, the worst place, and the electrodes."""
-    x = np.unique(errors.presses[:, 0])
-    step, half = float(x[1] - x[0]), len(x) // 2
-    index = np.round(errors.presses / step).astype(int) + half
-    image: Array = np.full((len(x), len(x)), np.nan)
-    image[index[:, 1], index[:, 0]] = errors.unknown
-    edge = step * (half + 0.5)
+    """Errors as colours, the worst place, and the electrodes."""
     draw_electrodes(axes, sensor)
     axes.plot(*errors.presses[np.argmax(errors.unknown)], "x", color=FELT, ms=9, mew=2)
     worst, rms = errors.unknown.max(), np.sqrt(np.mean(errors.unknown**2))
     axes.set_title(f"{sensor.name}\nworst {worst:.3g} mm (cross), rms {rms:.3g} mm")
-    return axes.imshow(image, origin="lower", extent=(-edge, edge, -edge, edge), norm=norm, cmap="viridis")
+    return axes.tripcolor(*errors.presses.T, errors.unknown, norm=norm, cmap="viridis", shading="gouraud")

@@ -40,8 +40,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 def shades(count: int) -> Array:
     """Colours of lines that have an order, from dark to pale: RGBA, shape (count, 4)."""
-    colours: Array = colormaps["viridis"](np.linspace(0.0, PALEST, count))
-    return colours
+    return np.asarray(colormaps["viridis"](np.linspace(0.0, PALEST, count)))
 
 
 def check_picture(path: Path) -> None:

@@ -7,7 +7,6 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from isocharge.common.arrays import Array
 from isocharge.simulate.identifiability.identification import Identification, LimitMap
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_circle, draw_electrodes
@@ -36,10 +35,10 @@ def identification_picture(identification: Identification) -> Figure:
 
 def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMap) -> Any:
     """Position errors under one force as colours, with folds, working area and electrodes to scale."""
-    position, error = _closed(limit_map.rings.position), _closed(limit_map.position)
+    x, y = limit_map.rings.position.reshape(-1, 2).T
     levels = np.geomspace(SMALLEST_MM, LARGEST_MM, 25)
-    shown = np.clip(error, SMALLEST_MM, LARGEST_MM)
-    shades = axes.contourf(position[..., 0], position[..., 1], shown, levels, norm=LogNorm(), cmap="viridis")
+    shown = np.clip(limit_map.position.ravel(), SMALLEST_MM, LARGEST_MM)
+    shades = axes.tricontourf(x, y, shown, levels, norm=LogNorm(), cmap="viridis")
     folds = identification.area.folds
     axes.plot(*folds.T, ".", color=FELT, ms=3)
     draw_circle(axes, identification.area.radius, ls="--", lw=1.8, color="white")
@@ -50,13 +49,6 @@ def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMa
     axes.set(title=title, xlabel="x, mm", ylabel="y, mm", aspect="equal")
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
     return shades
-
-
-def _closed(values: Array) -> Array:
-    """Values on rings, shape (n_ring, n_angle, ...), with the first angle again at the end and the centre as a ring."""
-    around = np.concatenate([values, values[:, :1]], axis=1)
-    centre = np.broadcast_to(values[:1].mean(axis=1, keepdims=True), around[:1].shape)
-    return np.concatenate([centre, around])
 
 
 def _draw_distance(axes: Any, identification: Identification) -> None:
