@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from svgelements import SVG, Path
 
-from isocharge.simulate import Electrode, built_in_sensors, load_sensor
+from isocharge.simulate import Electrode, load_sensor
 from isocharge.simulate.artwork.drawing import RULER, draw_layout, to_dxf, to_svg
 from isocharge.simulate.artwork.leads import straight_leads
 
@@ -16,7 +16,7 @@ MICROMETRE = 1e-3
 """In mm."""
 
 
-@pytest.fixture(params=[*built_in_sensors(), "shapes"])
+@pytest.fixture(params=["four-25um-biaxial-15mm", "shapes"])
 def sensor(request):
     if request.param != "shapes":
         return load_sensor(request.param)

@@ -5,9 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
-from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
@@ -32,6 +30,7 @@ from isocharge.simulate.identifiability.folds import (
 from isocharge.simulate.identifiability.identification import LimitMap
 from isocharge.simulate.identifiability.nearest_contact import nearest_contact
 from isocharge.simulate.numerics.disk import Rings
+from kept import kept
 
 REFERENCE = noise_model("reference")
 CREASE = 3.0
@@ -92,19 +91,13 @@ INNER = ((-0.9, 1.4), (8.7, 11.4), (15.2, -18.1), (-14.7, -5.3))
 @pytest.fixture(scope="module")
 def film():
     """One family of presses: other layouts and coefficients are only read differently."""
-    return ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0), 11.5)
+    return kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0), 11.5, FORCES)
 
 
 @pytest.fixture(scope="module")
 def charges(film):
     """By sensor, each made once."""
     return cache(lambda name: ChargeSpline.of(replace(film, sensor=load_sensor(name)), spacing=0.4))
-
-
-@pytest.fixture(scope="module")
-def area(charges):
-    """Working areas by sensor, each found once."""
-    return cache(lambda name: working_area(charges(name), REFERENCE, search_pairs=False))
 
 
 @pytest.mark.parametrize("extra", [None, 0.0], ids=["three charges", "a fourth that tells nothing"])
@@ -154,12 +147,10 @@ def test_a_weak_spot_between_the_rings_ends_the_area():
 
 def test_no_ring_within_the_area_errs_more_than_is_allowed(film):
     """Beside an electrode within the area the error rises between one ring and the next."""
-    charges = ChargeSpline.of(squares(film, *INNER))
-    for error in (0.3, 1.0):
-        working = working_area(charges, REFERENCE, search_pairs=False, error=error)
-        worst = limits_at(charges, Rings.spread(working.radius).contacts(0.05), REFERENCE).position.max()
-        assert worst <= error
-        assert working.radius == pytest.approx(working.error_radius, abs=0.101)
+    charges = ChargeSpline.of(squares(film, *INNER), 9.0, 0.3)
+    working = working_area(charges, REFERENCE, search_pairs=False, error=0.3)
+    assert limits_at(charges, Rings.spread(working.radius).contacts(0.05), REFERENCE).position.max() <= 0.3
+    assert working.radius == pytest.approx(working.error_radius, abs=0.101)
 
 
 def test_four_charges_lose_rank_at_a_point():
@@ -180,9 +171,9 @@ def test_a_map_that_bends_sharply_loses_no_rank():
         assert len(folds_of(within(model, 0.5), rings)) == 0
 
 
-@pytest.mark.parametrize("force", [0.05, 1.0])
-def test_an_electrode_within_the_area_is_no_fold(film, force):
+def test_an_electrode_within_the_area_is_no_fold(film):
     """A grid of 0.1 mm shows none; neighbours 0.3 mm apart did seem to turn over 1.7 mm from the centre."""
+    force = 0.05
     charges = ChargeSpline.of(squares(film, *INNER), 4.0)
     coarse, steps = Rings.spread(4.0, 13, 60), 0.1 * np.arange(-39, 40)
     scaled = coarse.per_ring(scaled_derivatives(charges, coarse.contacts(force), REFERENCE))
@@ -199,7 +190,7 @@ def test_an_electrode_within_the_area_is_no_fold(film, force):
     assert not along.any()
 
 
-def test_the_nearest_fold_is_that_of_a_grid_of_a_tenth_of_a_millimetre(charges, area):
+def test_the_nearest_fold_is_that_of_a_grid_of_a_tenth_of_a_millimetre(charges):
     """Brute force, with derivatives by differences: signs of det J."""
     model = charges("three-25um-uniaxial")
     steps = 0.1 * np.arange(-50, 51)
@@ -207,40 +198,23 @@ def test_the_nearest_fold_is_that_of_a_grid_of_a_tenth_of_a_millimetre(charges, 
     contact = np.stack([x, y, np.full(x.size, 0.316)], axis=1)
     sign = np.sign(np.linalg.det(differences(model.charges, contact, (0.01, 0.01, 1e-3))))
     turned = sign != sign[x.size // 2]
-    assert area("three-25um-uniaxial").fold_radius == pytest.approx(np.hypot(x, y)[turned].min(), abs=0.1)
-
-
-def test_coarse_rings_find_the_same_nearest_fold(charges):
-    for name in ("three-25um-biaxial", "three-25um-uniaxial", "four-25um-biaxial"):
-        nearest = [
-            np.hypot(*folds_of(charges(name), rings)[0])
-            for rings in (Rings.spread(11.5, 200, 360), Rings.spread(11.5, 50, 90))
-        ]
-        assert nearest[0] == pytest.approx(nearest[1], abs=0.1)
+    folds = find_folds(model, Rings.spread(11.5), 0.316, REFERENCE).points
+    assert np.hypot(*folds[0]) == pytest.approx(np.hypot(x, y)[turned].min(), abs=0.1)
 
 
 def test_six_electrodes_on_a_circle_fold_there_and_one_in_the_middle_unfolds_three(film):
     circle = [(10.0 * np.cos(a), 10.0 * np.sin(a)) for a in np.pi / 3.0 * np.arange(6)]
     six, middle = (
-        working_area(ChargeSpline.of(squares(film, *places), spacing=0.4), REFERENCE, search_pairs=False)
+        folds_of(ChargeSpline.of(squares(film, *places), spacing=0.4))
         for places in (circle, [(0.0, 0.0), *circle[::2]])
     )
-    assert 9.7 < six.fold_radius < 10.1
-    assert "both sides of the points where it loses rank" in six.summary
-    assert np.isinf(middle.fold_radius)
-    assert (middle.radius, middle.bound) == (11.5, "search")
+    assert 9.7 < np.hypot(*six[0]) < 10.1
+    assert len(middle) == 0
 
 
 def test_a_third_electrode_in_the_middle_folds_at_once(film):
     charges = ChargeSpline.of(squares(film, (0.0, 0.0), (8.66, 5.0), (-8.66, 5.0)), 3.0)
-    working = working_area(charges, REFERENCE, search_pairs=False)
-    assert 0.1 < working.fold_radius < 0.3
-    assert "both sides of the fold" in working.summary
-
-
-def test_two_charges_determine_nothing():
-    with pytest.raises(SceneError, match="expected at least three electrodes, got 2"):
-        working_area(shaped_charges(lambda x, _: x), REFERENCE)
+    assert 0.1 < np.hypot(*folds_of(charges)[0]) < 0.3
 
 
 def test_turning_over_is_the_sign_of_the_determinant():
@@ -288,7 +262,6 @@ def test_the_crease_bounds_the_working_area():
     assert working.fold_radius == pytest.approx(CREASE, abs=0.06)
     assert working.bound == "fold"
     assert working.radius == working.unambiguous_radius == pytest.approx(2.9, abs=0.11)
-    assert "folds 3" in working.summary
 
 
 def test_the_allowed_error_bounds_it_earlier():
@@ -297,17 +270,11 @@ def test_the_allowed_error_bounds_it_earlier():
     ring = working.error_radius * np.exp(2j * np.pi * np.arange(360) / 360)
     contact = np.stack([ring.real, ring.imag, np.full(360, 0.05)], axis=1)
     assert limits_at(creased(), contact, REFERENCE).position.max() == pytest.approx(0.2, rel=0.01)
-    assert "exceeds 0.2 mm at 0.05 N" in working.summary
 
 
 def test_where_nothing_ends_it_the_search_does():
     working = working_area(creased(radius=1.0), REFERENCE, error=1000.0)
     assert (working.radius, working.bound) == (1.0, "search")
-    assert "search ended at 1 mm" in working.summary
-
-
-def test_where_nothing_is_determined_there_is_none():
-    assert working_area(creased(), REFERENCE, error=1e-3, search_pairs=False).radius == 0.0
 
 
 @pytest.mark.parametrize(
@@ -315,12 +282,11 @@ def test_where_nothing_is_determined_there_is_none():
     [
         ("three-25um-biaxial", (9.3, 10.1), (7.0, 8.5)),
         ("three-25um-uniaxial", (0.0, 5.0), (0.0, 3.0)),
-        ("four-25um-biaxial", (8.0, np.inf), (7.8, 10.0)),
         ("four-25um-uniaxial", (8.0, np.inf), (7.8, 10.0)),
     ],
 )
-def test_folds_and_areas_are_those_of_the_prototype(area, name, folds, radius):
-    found = area(name)
+def test_folds_and_areas_are_those_of_the_prototype(charges, name, folds, radius):
+    found = working_area(charges(name), REFERENCE, search_pairs=False)
     assert folds[0] < found.fold_radius <= folds[1]
     assert radius[0] < found.radius < radius[1]
 
@@ -333,41 +299,10 @@ def test_pairs_of_a_biaxial_film_are_mirror_images_in_the_electrodes_circle(char
     assert np.median(product) == pytest.approx(100.0, rel=0.05)
 
 
-def test_another_solver_finds_the_pairs(charges):
-    """SciPy's least squares, started at a pair, stays there; started all over the film, it meets no nearer pair."""
-    model = charges("three-25um-uniaxial")
-    pairs = find_ambiguous_pairs(model, REFERENCE, 0.2, places=400)
-
-    def contact_of(unknown):
-        position = 11.4 * unknown[:2] / max(1.0, np.hypot(*unknown[:2]))
-        return np.array([*position, np.clip(np.exp(unknown[2]), 0.05, 2.0)])
-
-    def residuals(unknown, charge):
-        return (model.charges(contact_of(unknown)[None])[0] - charge) / REFERENCE.sigma(charge)
-
-    def solve(start, charge):
-        solved = least_squares(residuals, [*(start[:2] / 11.4), np.log(start[2])], args=(charge,), xtol=1e-12)
-        return contact_of(solved.x), np.linalg.norm(solved.fun)
-
-    for first, second in zip(pairs.first[:5], pairs.second[:5], strict=True):
-        contact, error = solve(second, model.charges(first[None])[0])
-        assert error < 3.1
-        assert np.hypot(*(contact - first)[:2]) > 1.0
-    rng = np.random.default_rng(0)
-    for angle in rng.uniform(-np.pi, np.pi, 6):
-        known = np.array([0.5 * pairs.radius * np.cos(angle), 0.5 * pairs.radius * np.sin(angle), 0.2])
-        for start in rng.uniform(-1.0, 1.0, (4, 2)) * 0.7 * pairs.radius:
-            contact, error = solve(np.array([*start, 0.2]), model.charges(known[None])[0])
-            ambiguous = error < 0.5 and np.hypot(*(contact - known)[:2]) > 1.0
-            assert not ambiguous or np.hypot(*contact[:2]) > 0.9 * pairs.radius
-
-
 @pytest.mark.parametrize(
     ("name", "radius", "force", "position", "relative"),
     [
         ("three-25um-biaxial", 8.0, 1.0, 0.07, 0.0024),
-        ("three-25um-biaxial", 8.0, 0.1, 0.19, 0.0065),
-        ("four-25um-biaxial", 10.0, 1.0, 0.05, 0.002),
         ("four-25um-biaxial", 10.0, 0.1, 0.13, 0.005),
     ],
 )

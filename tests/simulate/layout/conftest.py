@@ -4,6 +4,7 @@ import pytest
 
 from isocharge.simulate import Circle, load_sensor
 from isocharge.simulate.layout.charge_table import ChargeTable
+from kept import kept
 
 RADIUS = 4.0
 
@@ -15,4 +16,5 @@ def sensor():
 
 @pytest.fixture(scope="session")
 def tables(sensor):
-    return {s.name: ChargeTable.solve(s, Circle(1.0), 1.0, RADIUS) for s in (sensor, load_sensor("four-25um-uniaxial"))}
+    sensors = (sensor, load_sensor("four-25um-uniaxial"))
+    return {s.name: kept(ChargeTable.solve, s, Circle(1.0), 1.0, RADIUS) for s in sensors}

@@ -14,8 +14,7 @@ TOLERANCE = (3e-4, 0.01, 0.01, 1e-3, 0.03, 1e-3)
 """For each column, of its largest value; the differences by place and probe radius cross the kink under the probe."""
 
 
-@pytest.mark.parametrize("at", [(0.7, 0.2), (-1.3, 3.1)])
-@pytest.mark.parametrize("name", ["four-25um-biaxial", "four-25um-uniaxial"])
+@pytest.mark.parametrize(("name", "at"), [("four-25um-biaxial", (0.7, 0.2)), ("four-25um-uniaxial", (-1.3, 3.1))])
 def test_rows_are_the_charges_of_presses_and_their_derivatives(tables, name, at):
     rows = tables[name].rows(np.array([at]), CENTRES, 3.0, (TRIANGLE,))[0]
     sensor, settings = load_sensor(name), SolveSettings(theory=theory_for(load_sensor(name), Circle(1.0), (1.0, 1.0)))

@@ -5,12 +5,14 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from isocharge.simulate import ForwardMap
-from isocharge.simulate.identifiability.layout_assessment import assess_layout
+from isocharge.common.errors import SolveError
+from isocharge.simulate import ChargeSpline, Domain, ForwardMap, FunctionMap, limits_at
 from isocharge.simulate.layout import case as case_module
+from isocharge.simulate.layout import design as design_module
 from isocharge.simulate.layout import search as search_module
 from isocharge.simulate.layout.case import KNOWN, DesignCase, WeightMap
-from isocharge.simulate.layout.design import design
+from isocharge.simulate.layout.charge_table import ChargeTable
+from isocharge.simulate.layout.design import UNAMBIGUOUS, ambiguities, design
 from isocharge.simulate.layout.search import Search, random_layouts
 
 
@@ -19,16 +21,18 @@ def case_of(sensor, **changes):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _coarse():
-    """A quarter of the presses of the fine grid, and of the random layouts."""
+def _rough(tables):
+    """Fewer presses and layouts, and a table that is solved already."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(case_module, "CELLS", 25)
-        patch.setattr(search_module, "STARTS", 6)
+        patch.setattr(case_module, "CELLS", 20)
+        patch.setattr(case_module, "PRESSES", 100)
+        patch.setattr(search_module, "STARTS", 4)
+        patch.setattr(ChargeTable, "solve", staticmethod(lambda sensor, *_: tables[sensor.name]))
         yield
 
 
 @pytest.fixture(scope="module")
-def found(sensor, _coarse):
+def found(sensor, _rough):
     return design(case_of(sensor))
 
 
@@ -43,16 +47,19 @@ def test_three_electrodes_come_to_lie_on_a_wide_triangle(found, centres):
     assert np.abs(z) == pytest.approx(np.full(3, np.abs(z).mean()), rel=0.1)
     assert np.abs(z).min() > 7.0
     assert np.sort(np.mod(np.angle(z / z[0]), 2.0 * np.pi)) == pytest.approx(2.0 * np.pi / 3.0 * np.arange(3), abs=0.2)
-    assert found.unambiguous
+    assert (found.summary, found.unambiguous, found.refused) == (UNAMBIGUOUS, True, 0)
 
 
 def test_its_errors_are_those_of_the_forward_map(found):
-    """Another road: solve the new sensor's forward map, make splines, and assess the layout."""
-    forward_map = ForwardMap.build(found.sensor, found.case.probe, 4.0, (0.9, 1.1))
-    other = assess_layout(forward_map, found.case.noise, spacing=0.16, search_pairs=False)
-    assert found.after.known.max() == pytest.approx(other.worst, rel=5e-3)
-    assert np.sqrt(np.mean(found.after.known**2)) == pytest.approx(other.rms, rel=5e-3)
-    assert found.value == pytest.approx(other.worst, rel=5e-3)
+    """Another road: solve the new sensor's forward map, make splines, and take their limits."""
+    charges = ChargeSpline.of(ForwardMap.build(found.sensor, found.case.probe, 4.0, (1.0, 1.0)))
+    contact = np.column_stack([found.after.presses, np.ones(len(found.after.presses))])
+    limits = limits_at(charges, contact, found.case.noise).position
+    assert found.after.known == pytest.approx(limits, rel=0.02)
+    numbers = found.after.to_dict()["noise_alone"]
+    assert numbers["worst_mm"] == pytest.approx(limits.max(), rel=5e-3)
+    assert numbers["rms_mm"] == pytest.approx(np.sqrt(np.mean(limits**2)), rel=5e-3)
+    assert found.value == pytest.approx(limits.max(), rel=5e-3)
 
 
 def test_no_neighbour_is_much_better(found, centres, tables):
@@ -66,9 +73,45 @@ def test_other_goals_are_better_by_their_own_measure(centres, sensor, tables):
     right = WeightMap("right", np.array([[-4.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.1, 0.0, 1.0], [4.0, 0.0, 1.0]]))
     for goal in ("rms", right):
         search = Search(case_of(sensor, goal=goal), tables["four-25um-biaxial"])
-        best = search.refine(search.optima(*random_layouts(search.case))[0])
-        assert search.value(best) < 0.95 * search.value(centres)
+        value, *numbers = search.refine(search.optima(*random_layouts(search.case))[0])
+        best = np.reshape(numbers, (-1, 2))
+        assert value == pytest.approx(search.value(best))
+        assert value < 0.95 * search.value(centres)
         assert search.case.spare(best).min() > -1e-3
+
+
+def test_an_ambiguous_layout_is_refused(sensor, monkeypatch):
+    """The next one is taken; where all are ambiguous, the best."""
+    answers = iter(["it folds", UNAMBIGUOUS])
+    monkeypatch.setattr(Search, "refine", lambda _, places: np.append(places[0, 0], places))
+    monkeypatch.setattr(design_module, "ambiguities", lambda *_: next(answers))
+    second = design(case_of(sensor))
+    monkeypatch.setattr(design_module, "ambiguities", lambda *_: "it folds")
+    best = design(case_of(sensor))
+    assert (second.unambiguous, second.refused) == (True, 1)
+    assert (best.unambiguous, best.refused) == (False, 0)
+    assert best.value < second.value
+
+
+def test_what_is_ambiguous_is_said(sensor, monkeypatch):
+    """Charges that fold at x = 3 mm, with pairs on both sides; and charges that cannot be interpolated."""
+
+    def charges(contact):
+        x, y, force = contact.T
+        shapes = np.stack([4.0 + (x - x**2 / 6.0) / 3.0, 4.0 + 0.3 * y, np.full(len(x), 3.0)], axis=1)
+        return 300.0 * force[:, None] ** (2.0 / 3.0) * shapes
+
+    monkeypatch.setattr(ForwardMap, "build", lambda *_: FunctionMap(charges, ("A", "B", "C"), Domain(4.0, (0.05, 2.0))))
+    monkeypatch.setattr(ChargeSpline, "of", lambda charge_map: charge_map)
+    monkeypatch.setattr(design_module, "find_ambiguous_pairs", lambda *_: [1, 2])
+    text = "the map folds 3.0 mm from the centre; 6 pairs of contacts have the same charges"
+    assert ambiguities(case_of(sensor), sensor) == text
+
+    def refuse(*_):
+        raise SolveError("rough")
+
+    monkeypatch.setattr(ForwardMap, "build", refuse)
+    assert "could not be looked for" in ambiguities(case_of(sensor), sensor)
 
 
 @pytest.mark.slow

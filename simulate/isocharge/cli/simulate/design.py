@@ -53,8 +53,9 @@ def design_command(
         ),
     ] = False,
     keep: Annotated[
-        str, typer.Option("--keep", metavar="NAMES", help="Electrodes of SENSOR that stay, like A,B. (default: none)")
-    ] = "",
+        str | None,
+        typer.Option("--keep", metavar="NAMES", help="Electrodes of SENSOR that stay, like A,B. (default: none)"),
+    ] = None,
     side: Annotated[
         float | None,
         typer.Option("--side", metavar="MM", help="Side of the new squares, mm. (default: that of SENSOR's squares)"),
@@ -82,7 +83,7 @@ def design_command(
         electrodes,
         radius,
         goal=read_goal(goal),
-        keep=tuple(name.strip() for name in keep.split(",") if name.strip()),
+        keep=tuple(name.strip() for name in (keep or "").split(",") if name.strip()),
         probe=footprint,
         force=force,
         noise=noise_model(noise),

@@ -50,9 +50,10 @@ def straight_leads(sensor: Sensor, width: float = 0.3, clearance: float = 0.3) -
     for electrode in sorted(sensor.electrodes, key=lambda one: -float(np.hypot(*one.centre))):
         others = [other for other in sensor.electrodes if other != electrode]
         for path in _ways(centres[electrode.name], radius):
-            points = _sampled(path)
+            count = int(np.ceil(np.hypot(*(path[1] - path[0])) / SAMPLE)) + 1
+            points = path[0] + np.linspace(0.0, 1.0, count)[:, None] * (path[1] - path[0])
             away = [_from_box(points, other) - 0.5 * width for other in others]
-            away += [_from_points(points, _sampled(lead)) - width for lead in paths.values()]
+            away += [_from_lead(points, lead) - width for lead in paths.values()]
             if min(away, default=np.inf) >= clearance:
                 paths[electrode.name] = path
                 break
@@ -72,19 +73,14 @@ def _ways(centre: Array, radius: float) -> list[Array]:
     return ways
 
 
-def _sampled(path: Array) -> Array:
-    """Points of a path, `SAMPLE` apart at most, shape (n, 2), mm."""
-    count = int(np.ceil(np.hypot(*(path[1] - path[0])) / SAMPLE)) + 1
-    points: Array = path[0] + np.linspace(0.0, 1.0, count)[:, None] * (path[1] - path[0])
-    return points
-
-
 def _from_box(points: Array, electrode: Electrode) -> float:
     """Smallest distance of points from the box round an electrode, mm."""
     low, high = np.min(electrode.corners, axis=0), np.max(electrode.corners, axis=0)
     return float(np.hypot(*np.maximum(np.maximum(low - points, points - high), 0.0).T).min())
 
 
-def _from_points(points: Array, others: Array) -> float:
-    """Smallest distance between points and others, mm."""
-    return float(np.hypot(*np.moveaxis(points[:, None] - others, 2, 0)).min())
+def _from_lead(points: Array, lead: Array) -> float:
+    """Smallest distance of points from a lead, mm."""
+    start, along = lead[0], lead[1] - lead[0]
+    share = np.clip((points - start) @ along / (along @ along), 0.0, 1.0)
+    return float(np.hypot(*(points - start - share[:, None] * along).T).min())

@@ -4,7 +4,6 @@ A map without folds may still give two distant contacts the same charges, as a s
 The search for such pairs covers the whole film at once.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,24 +52,13 @@ class AmbiguousPairs:
         """No pair."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
-    @classmethod
-    def joined(cls, pairs: Sequence["AmbiguousPairs"]) -> "AmbiguousPairs":
-        """All pairs of several searches."""
-        every = [cls.none(), *pairs]
-        joined = cls(
-            *(np.concatenate([getattr(each, name) for each in every]) for name in ("first", "second", "distance"))
-        )
-        order = np.argsort(joined.outer_radius, kind="stable")
-        return cls(joined.first[order], joined.second[order], joined.distance[order])
-
     def __len__(self) -> int:
         return len(self.first)
 
     @property
     def outer_radius(self) -> Array:
         """Distance of the outer contact of each pair from the centre, shape (n,), mm."""
-        outer: Array = np.maximum(np.hypot(*self.first[:, :2].T), np.hypot(*self.second[:, :2].T))
-        return outer
+        return np.asarray(np.maximum(np.hypot(*self.first[:, :2].T), np.hypot(*self.second[:, :2].T)))
 
     @property
     def radius(self) -> float:
@@ -113,7 +101,9 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     second, distance = nearest_contact(charge_map, noise, charge[pairs], start)
     far = np.hypot(*(second - first[pairs])[:, :2].T) > apart[pairs]
     ambiguous = np.flatnonzero(far & (distance < INDISTINGUISHABLE_SIGMAS))
-    return AmbiguousPairs.joined([AmbiguousPairs(first[pairs[ambiguous]], second[ambiguous], distance[ambiguous])])
+    found = AmbiguousPairs(first[pairs[ambiguous]], second[ambiguous], distance[ambiguous])
+    order = np.argsort(found.outer_radius, kind="stable")
+    return AmbiguousPairs(found.first[order], found.second[order], found.distance[order])
 
 
 def _candidates(
@@ -147,7 +137,6 @@ def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Arr
     barycentric = barycentric_weights(nodes)
 
     def weights(logs: Array) -> Array:
-        by_force: Array = lagrange_values(nodes, barycentric, logs) * np.exp(EXPONENT * logs)[:, None]
-        return by_force
+        return np.asarray(lagrange_values(nodes, barycentric, logs) * np.exp(EXPONENT * logs)[:, None])
 
     return ForceProfile.of(weights, charge_map.domain.force_range), terms

@@ -5,7 +5,6 @@ With J = d(Q)/d(x, y, ln F, ...) the Fisher information is J' diag(i) J, i what 
 An estimator that knows the prior may do better where the charges say little: that is the Bayes limit, in train.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,10 +19,6 @@ Limits become some 1e7 times larger than the others instead of infinite."""
 
 NOTHING = 1e-60
 """Fisher information below which a parameter counts as unobservable: 1/mm^2 for x and y, dimensionless for ln F."""
-
-Nuisance = Callable[[Array], Array]
-"""From contacts (x, y, F), shape (n, 3), to how the charges change with what nobody knows: d(Q)/d(parameter) times the
-parameter's standard deviation, shape (n, n_electrode, n_parameter), pC. Parameters: the probe's radius, pretension."""
 
 
 @dataclass(frozen=True)
@@ -40,18 +35,12 @@ class CramerRao:
     @property
     def position(self) -> Array:
         """Root of the mean square distance from the true position, shape (n,), mm."""
-        position: Array = np.sqrt(self.covariance[:, 0, 0] + self.covariance[:, 1, 1])
-        return position
+        return np.asarray(np.sqrt(self.covariance[:, 0, 0] + self.covariance[:, 1, 1]))
 
     @property
     def force(self) -> Array:
         """Standard deviation of the force over the force, shape (n,)."""
-        return self.parameter(2)
-
-    def parameter(self, number: int) -> Array:
-        """Standard deviation of one parameter, shape (n,)."""
-        deviation: Array = np.sqrt(self.covariance[:, number, number])
-        return deviation
+        return np.asarray(np.sqrt(self.covariance[:, 2, 2]))
 
 
 def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Array | None = None) -> CramerRao:
@@ -61,9 +50,9 @@ def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Arra
         charge: Charges, shape (n, n_electrode), pC.
         jacobian: d(Q)/d(parameters), shape (n, n_electrode, p); the first three parameters are x, y, ln F.
         noise: Noise of the readings, with white noise above zero.
-        nuisance: Change of the charges by one prior standard deviation of each further unknown, shape
-            (n, n_electrode, n_parameter), pC. They are unknown too, but known to that standard deviation: their prior
-            adds to the information (Van Trees 1968, sec. 2.4.3).
+        nuisance: Change of the charges by one prior standard deviation of each further unknown, such as the probe's
+            radius or the pretension, shape (n, n_electrode, n_parameter), pC. Their priors add to the information
+            (Van Trees 1968, sec. 2.4.3).
     """
     prior = np.zeros(jacobian.shape[2])
     if nuisance is not None:
@@ -73,10 +62,9 @@ def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Arra
     return CramerRao(_invert(information + np.diag(prior)))
 
 
-def limits_at(charge_map: ChargeMap, contact: Array, noise: NoiseModel, nuisance: Nuisance | None = None) -> CramerRao:
-    """Limits at contacts (x, y, F), shape (n, 3), mm and N; `nuisance` says what else is unknown."""
-    unknown = None if nuisance is None else nuisance(contact)
-    return cramer_rao(*linearised(charge_map, contact), noise, unknown)
+def limits_at(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> CramerRao:
+    """Limits at contacts (x, y, F), shape (n, 3), mm and N."""
+    return cramer_rao(*linearised(charge_map, contact), noise)
 
 
 def _invert(information: Array) -> Array:
@@ -84,5 +72,4 @@ def _invert(information: Array) -> Array:
     size = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), NOTHING))
     both = size[:, :, None] * size[:, None, :]
     values, vectors = np.linalg.eigh(information / both)
-    inverse: Array = np.einsum("nik,nk,njk->nij", vectors, 1.0 / np.maximum(values, SMALLEST), vectors) / both
-    return inverse
+    return np.asarray(np.einsum("nik,nk,njk->nij", vectors, 1.0 / np.maximum(values, SMALLEST), vectors) / both)

@@ -20,6 +20,7 @@ Even without folds two contacts may have the same charges, see `ambiguous_pairs`
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import minimum_filter
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
@@ -41,21 +42,18 @@ COMPASS = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange
 def turned_over(first: Array, second: Array) -> Booleans:
     """Whether the map turns over between neighbours, given J / sigma of both, shape (..., n_electrode, 3): (...)."""
     products = np.einsum("...ei,...ej->...ij", _unit_columns(first), _unit_columns(second))
-    over: Booleans = np.linalg.det(products) < 0.0
-    return over
+    return np.asarray(np.linalg.det(products) < 0.0)
 
 
 def _unit_columns(jacobian: Array) -> Array:
     """Columns of unit length: the sign of a determinant is then not lost in rounding."""
-    unit: Array = jacobian / np.maximum(np.linalg.norm(jacobian, axis=-2, keepdims=True), np.finfo(float).tiny)
-    return unit
+    return np.asarray(jacobian / np.maximum(np.linalg.norm(jacobian, axis=-2, keepdims=True), np.finfo(float).tiny))
 
 
 def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> Array:
     """J / sigma of contacts (x, y, F): shape (n, 3) to (n, n_electrode, 3), 1/mm, 1/mm and without unit."""
     charge, slopes = linearised(charge_map, contact)
-    scaled: Array = slopes / noise.sigma(charge)[..., None]
-    return scaled
+    return np.asarray(slopes / noise.sigma(charge)[..., None])
 
 
 def singular_values(scaled: Array) -> Array:
@@ -147,7 +145,7 @@ class _FoldSearch:
     def weakest_places(self, rings: Rings, scaled: Array) -> Array:
         """Minima of the smallest singular value, followed downhill from those among the positions of the rings."""
         weakest = singular_values(scaled.reshape(-1, *scaled.shape[2:]))[:, -1].reshape(scaled.shape[:2])
-        lowest = _local_minima(weakest)
+        lowest = weakest == minimum_filter(weakest, 3, mode=("nearest", "wrap"))
         step = np.maximum(rings.distance[0], rings.distance * 2.0 * np.pi / scaled.shape[1])
         ring, _ = np.nonzero(lowest)  # not empty: the lowest value of all is one
         return self._downhill(rings.position[lowest], weakest[lowest], step[ring])
@@ -156,8 +154,7 @@ class _FoldSearch:
         """Those positions about which the map turns over: folds that no two neighbours on the rings enclose."""
         around = self.scaled((position[:, None] + 0.5 * FINEST * COMPASS).reshape(-1, 2))
         around = around.reshape(len(position), 8, *around.shape[1:])
-        folded: Array = position[turned_over(around[:, :4], around[:, 4:]).any(axis=1)]
-        return folded
+        return np.asarray(position[turned_over(around[:, :4], around[:, 4:]).any(axis=1)])
 
     def _downhill(self, position: Array, value: Array, step: Array) -> Array:
         """Minima of the smallest singular value near positions, by a compass search (Kolda, Lewis, Torczon 2003)."""
@@ -176,12 +173,3 @@ class _FoldSearch:
             step[active[~lower]] *= 0.5
             active = active[step[active] > 0.1 * FINEST]
         return position
-
-
-def _local_minima(values: Array) -> Booleans:
-    """Which values on rings, shape (n_ring, n_angle), are at most those of their eight neighbours."""
-    padded = np.pad(np.pad(values, ((0, 0), (1, 1)), mode="wrap"), ((1, 1), (0, 0)), constant_values=np.inf)
-    rows, columns = values.shape
-    shifts = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
-    lowest: Booleans = np.all([values <= padded[i : i + rows, j : j + columns] for i, j in shifts], axis=0)
-    return lowest

@@ -40,13 +40,11 @@ class ForceProfile:
 
     def charge(self, logs: Array, terms: Array) -> Array:
         """Charges at logarithms of forces, shape (n,), and terms (n, n_term, n_electrode): (n, n_electrode)."""
-        charge: Array = np.einsum("nk,nke->ne", self.weights(logs), terms)
-        return charge
+        return np.asarray(np.einsum("nk,nke->ne", self.weights(logs), terms))
 
     def slope(self, logs: Array, charge: Array) -> Array:
         """d(Q)/d(ln F), by the common exponent, of charges (n, n_electrode)."""
-        slope: Array = np.interp(logs, self.logs, self.exponent)[:, None] * charge
-        return slope
+        return np.asarray(np.interp(logs, self.logs, self.exponent)[:, None] * charge)
 
     def best(self, terms: Array, charge: Array, noise: NoiseModel) -> Array:
         """Logarithm of the force within the ends that explains charges (n, n_electrode) best, shape (n,)."""

@@ -40,6 +40,9 @@ USUAL_PROBE = Circle(1.0)
 MOST_PAIRS = 20
 """Most ambiguous pairs that the numbers for JSON list."""
 
+CONTACT = ("x_mm", "y_mm", "force_N")
+"""Keys of a contact in JSON."""
+
 IN_JSON: dict[Bound, str] = {"fold": "fold", "ambiguous pair": "twins", "error": "error", "search": "searched"}
 """Names of the bounds in files and JSON."""
 
@@ -126,6 +129,7 @@ class Identification:
     def to_dict(self) -> dict[str, Any]:
         """For JSON; infinite radii are None."""
         area = self.area
+        pairs = (area.pairs.first, area.pairs.second, area.pairs.distance)
         return {
             "sensor": self.sensor.name,
             "probe": self.probe.notation,
@@ -153,10 +157,12 @@ class Identification:
             },
             "folds_mm": area.folds.round(3).tolist(),
             "twins": [
-                {"first": _contact_row(first), "second": _contact_row(second), "sigmas_apart": float(distance)}
-                for first, second, distance in list(
-                    zip(area.pairs.first, area.pairs.second, area.pairs.distance, strict=True)
-                )[:MOST_PAIRS]
+                {
+                    "first": dict(zip(CONTACT, first.tolist(), strict=True)),
+                    "second": dict(zip(CONTACT, second.tolist(), strict=True)),
+                    "sigmas_apart": float(distance),
+                }
+                for first, second, distance in zip(*(column[:MOST_PAIRS] for column in pairs), strict=True)
             ],
         }
 
@@ -232,7 +238,3 @@ def _median(values: Array, weights: Array) -> float:
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
-
-
-def _contact_row(contact: Array) -> dict[str, float]:
-    return {"x_mm": float(contact[0]), "y_mm": float(contact[1]), "force_N": float(contact[2])}

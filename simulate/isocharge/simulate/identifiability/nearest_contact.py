@@ -109,5 +109,4 @@ def _nearest_rows(charge: Array, sigma: Array, known: Array, count: int) -> Inte
     """Numbers of the nearest candidates, shape (n, count): |Q - K|^2 multiplied out, one matrix product each."""
     weight = sigma**-2.0
     square = weight @ (known**2).T - 2.0 * (charge * weight) @ known.T
-    rows: Integers = np.argpartition(square, count - 1, axis=1)[:, :count]
-    return rows
+    return np.asarray(np.argpartition(square, count - 1, axis=1)[:, :count])

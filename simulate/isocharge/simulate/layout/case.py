@@ -226,13 +226,11 @@ class DesignCase:
         for electrode in self.stay:
             low, high = np.min(electrode.corners, axis=0), np.max(electrode.corners, axis=0)
             spare.append((np.maximum(low - places, places - high) - half).max(axis=1) - self.gap)
-        least: Array = np.min(spare, axis=0)
-        return least
+        return np.asarray(np.min(spare, axis=0))
 
     def apart(self, places: Array, others: Array) -> Array:
         """Distance to spare between squares at `places` (n, 2) and `others` (m, 2), shape (n, m), mm."""
-        away: Array = np.abs(places[:, None] - others).max(axis=2) - self.square_side - self.gap
-        return away
+        return np.asarray(np.abs(places[:, None] - others).max(axis=2) - self.square_side - self.gap)
 
     def spare(self, places: Array) -> Array:
         """All distances to spare of a layout, shape (n + n (n - 1) / 2,), mm: negative where a rule is broken."""

@@ -10,6 +10,7 @@ Polynomials interpolate in the distance and local cubics on the grid; an electro
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -87,9 +88,9 @@ class ChargeTable:
         resolution = needed_resolution(film, probe, (radius, 0.0), force, settings)
         distance = chebyshev_nodes(DISTANCES[int(radius > 0.25 * film.radius)], 0.0, radius)
         settings = replace(settings, resolution=resolution)
-        jobs = [_Job(film, probe, force, float(d), sensor.surface, settings) for d in distance]
-        solved = list(track(in_order(executor, _solve, jobs), "solving the film", len(jobs)))
-        stress = np.stack(solved).transpose(0, 3, 2, 1).reshape(3 * len(jobs), -1).astype(np.float32)
+        solve = partial(_stress_at, film, sensor.surface, probe, force, settings)
+        solved = list(track(in_order(executor, solve, distance.tolist()), "solving the film", len(distance)))
+        stress = np.stack(solved).transpose(0, 3, 2, 1).reshape(3 * len(distance), -1).astype(np.float32)
         return cls(film.radius, probe, (sensor.piezo.d31, sensor.piezo.d32), distance, stress)
 
     def rows(self, presses: Array, centres: Array, side: float, stay: tuple[Electrode, ...] = ()) -> Array:
@@ -195,41 +196,30 @@ def _row_weights(row: Array) -> tuple[Integers, Array]:
     return np.where(within, near, far + INSIDE), np.where(within, by_near, by_far)
 
 
-@dataclass(frozen=True)
-class _Job:
-    """Presses at one distance, mm."""
-
-    film: Film
-    probe: Circle
-    force: float
-    distance: float
-    surface: Surface
-    settings: SolveSettings
-
-
-def _solve(job: _Job) -> Array:
+def _stress_at(
+    film: Film, surface: Surface, probe: Circle, force: float, settings: SolveSettings, distance: float
+) -> Array:
     """Stress on the grid in the frame of the press, and its derivatives by all unknowns, shape (6, n_node, 3)."""
-    points, d, step = _grid_points(job), job.distance, SHIFT * job.probe.radius
-    first = press(job.film, job.probe, (d, 0.0), job.force, job.settings)
+    points, step = _grid_points(film.radius, probe.radius, distance), SHIFT * probe.radius
+    first = press(film, probe, (distance, 0.0), force, settings)
 
     def stress(x: float = 0.0, y: float = 0.0, log: float = 0.0, radius: float = 0.0, pretension: float = 0.0) -> Array:
-        film = replace(job.film, pretension=job.film.pretension + pretension)
-        force = job.force * float(np.exp(log))
-        solved = press(film, Circle(job.probe.radius + radius), (d + x, y), force, job.settings, start=first)
-        return touch_stress(solved, points, job.surface)
+        other, at = replace(film, pretension=film.pretension + pretension), (distance + x, y)
+        pressed = press(other, Circle(probe.radius + radius), at, force * float(np.exp(log)), settings, start=first)
+        return touch_stress(pressed, points, surface)
 
     derivatives = [
         (stress(**{name: size}) - stress(**{name: -size})) / (2.0 * size)
         for name, size in (("x", step), ("y", step), ("log", LOG_STEP), ("radius", step))
     ]
-    base = touch_stress(first, points, job.surface)
+    base = touch_stress(first, points, surface)
     return np.stack([base, *derivatives, (stress(pretension=PRETENSION_STEP) - base) / PRETENSION_STEP])
 
 
-def _grid_points(job: _Job) -> Array:
+def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Array:
     """Film points (x, y) of the grid under a press on the positive x axis, shape (n_node, 2), mm."""
-    a = job.film.radius
-    c, rho = automorphism_onto(np.array(job.distance / a), np.array(job.probe.radius / a))
+    a = film_radius
+    c, rho = automorphism_onto(np.array(distance / a), np.array(probe_radius / a))
     inside = rho * (1.0 - MARGIN) * np.linspace(0.0, 1.0, INSIDE)
     outside = (rho * (1.0 + MARGIN)) ** np.linspace(1.0, 0.0, OUTSIDE)
     z = np.concatenate([inside, outside])[:, None] * np.exp(2j * np.pi * np.arange(AROUND) / AROUND)

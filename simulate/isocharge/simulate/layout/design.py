@@ -13,15 +13,20 @@ from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.identifiability.layout_assessment import LayoutAssessment, assess_layout
+from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
+from isocharge.simulate.identifiability.folds import find_folds
 from isocharge.simulate.layout.case import KNOWN, DesignCase, Nuisances
 from isocharge.simulate.layout.charge_table import ChargeTable
 from isocharge.simulate.layout.position_error import ErrorModel
-from isocharge.simulate.layout.search import Refinement, Search, random_layouts, refine
+from isocharge.simulate.layout.search import Search, random_layouts
+from isocharge.simulate.numerics.disk import Rings
 from isocharge.simulate.sensor.sensor import Sensor
 
 DIGITS = 3
 """Places are rounded to a micrometre: decimals of a millimetre."""
+
+UNAMBIGUOUS = "no folds, no ambiguous pairs"
+"""What is said of a layout that has neither."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +63,7 @@ class Design:
         case: What was asked.
         sensor: The sensor with the new layout.
         value: What was made small, mm.
-        assessment: Limits, folds and ambiguous pairs of the new layout over the forces of use, by its forward map; None
-            if its charges cannot be interpolated.
+        summary: Folds and ambiguous pairs of the new layout over the forces of use, for people.
         refused: Number of better layouts that are ambiguous.
         before: Errors of the sensor that it began from; None if that has fewer than three electrodes.
         after: Errors of the new layout.
@@ -68,7 +72,7 @@ class Design:
     case: DesignCase
     sensor: Sensor
     value: float
-    assessment: LayoutAssessment | None
+    summary: str
     refused: int
     before: ErrorMap | None
     after: ErrorMap
@@ -76,14 +80,7 @@ class Design:
     @property
     def unambiguous(self) -> bool:
         """Whether no two contacts give the same charges, as far as known."""
-        return _is_unambiguous(self.assessment)
-
-    @property
-    def summary(self) -> str:
-        """What was found about folds and ambiguous pairs, for people."""
-        if self.assessment is None:
-            return "folds and ambiguous pairs could not be looked for: the charges vary too quickly"
-        return "no folds, no ambiguous pairs" if self.unambiguous else self.assessment.summary
+        return self.summary == UNAMBIGUOUS
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: the case, the layout, its errors and those of the sensor it began from, and what was checked."""
@@ -113,28 +110,34 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     places, starts = random_layouts(case)
     table = ChargeTable.solve(case.sensor, case.probe, case.force, case.radius, executor)
     search = Search(case, table)
-    jobs = [Refinement(search, optimum) for optimum in search.optima(places, starts)]
-    refined = sorted(track(in_order(executor, refine, jobs), "refining", len(jobs)), key=lambda row: float(row[0]))
+    optima = search.optima(places, starts)
+    refined = sorted(track(in_order(executor, search.refine, optima), "refining", len(optima)), key=lambda row: row[0])
     candidates = []
     for value, *numbers in track(refined, "looking for folds and ambiguous pairs"):
         sensor = case.layout(np.round(np.array(numbers).reshape(-1, 2), DIGITS))
-        candidates.append((sensor, value, assess(case, sensor)))
-        if _is_unambiguous(candidates[-1][2]):
+        candidates.append((sensor, float(value), ambiguities(case, sensor)))
+        if candidates[-1][2] == UNAMBIGUOUS:
             break
-    refused = len(candidates) - 1 if _is_unambiguous(candidates[-1][2]) else 0
-    sensor, value, assessment = candidates[refused]
+    refused = len(candidates) - 1 if candidates[-1][2] == UNAMBIGUOUS else 0
     before = error_map(case, table, case.sensor) if len(case.sensor.electrodes) >= 3 else None
-    return Design(case, sensor, float(value), assessment, refused, before, error_map(case, table, sensor))
+    return Design(case, *candidates[refused], refused, before, error_map(case, table, candidates[refused][0]))
 
 
-def assess(case: DesignCase, sensor: Sensor) -> LayoutAssessment | None:
-    """Limits, folds and ambiguous pairs of a layout over the forces of use; None if it cannot be interpolated."""
+def ambiguities(case: DesignCase, sensor: Sensor) -> str:
+    """Folds and ambiguous pairs of a layout over the forces of use by its forward map, for people."""
     low, high = min(DEFAULT_FORCE_RANGE[0], case.force), max(DEFAULT_FORCE_RANGE[1], case.force)
+    forces = sorted({low, case.force, high})
     try:
-        spline = ChargeSpline.of(ForwardMap.build(sensor, case.probe, case.radius, (low, high)))
+        charges = ChargeSpline.of(ForwardMap.build(sensor, case.probe, case.radius, (low, high)))
     except SolveError:
-        return None
-    return assess_layout(spline, case.noise, forces=sorted({low, case.force, high}))
+        return "folds and ambiguous pairs could not be looked for: the charges vary too quickly"
+    rings = Rings.spread(case.radius)
+    folds = np.concatenate([find_folds(charges, rings, force, case.noise).points for force in forces])
+    pairs = sum(len(find_ambiguous_pairs(charges, case.noise, force)) for force in forces)
+    found = [f"the map folds {np.hypot(*folds.T).min():.1f} mm from the centre"] if len(folds) else []
+    if pairs:
+        found.append(f"{pairs} pairs of contacts have the same charges")
+    return "; ".join(found) or UNAMBIGUOUS
 
 
 def error_map(case: DesignCase, table: ChargeTable, sensor: Sensor) -> ErrorMap:
@@ -145,7 +148,3 @@ def error_map(case: DesignCase, table: ChargeTable, sensor: Sensor) -> ErrorMap:
         return np.sqrt(ErrorModel.of(case.noise, nuisances).squared(rows))
 
     return ErrorMap(case.grid, errors(KNOWN), errors(case.nuisances))
-
-
-def _is_unambiguous(assessment: LayoutAssessment | None) -> bool:
-    return assessment is not None and not (len(assessment.folds) or len(assessment.pairs))

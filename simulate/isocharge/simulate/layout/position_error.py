@@ -41,8 +41,7 @@ class ErrorModel:
     def sensitivity(self, rows: Array) -> Array:
         """Rows (..., 6) to sqrt(W) A in units of the scale, shape (..., 5): how much each reading tells."""
         weight = np.sqrt(self.noise.information(rows[..., 0]))
-        sensitivity: Array = rows[..., 1:] * self.scale * weight[..., None]
-        return sensitivity
+        return np.asarray(rows[..., 1:] * self.scale * weight[..., None])
 
     def squared(self, rows: Array) -> Array:
         """Squared position errors, shape (n_press,), mm^2, from rows of shape (n_press, n_electrode, 6)."""
@@ -51,14 +50,12 @@ class ErrorModel:
 
 def inverse_information(sensitivity: Array) -> Array:
     """Inverse of the information of electrodes, (n_press, n_electrode, 5) to (n_press, 5, 5), in units of the scale."""
-    inverse: Array = np.linalg.inv(np.matmul(sensitivity.swapaxes(1, 2), sensitivity) + np.eye(sensitivity.shape[2]))
-    return inverse
+    return np.asarray(np.linalg.inv(np.matmul(sensitivity.swapaxes(1, 2), sensitivity) + np.eye(sensitivity.shape[2])))
 
 
 def position_variance(inverse: Array) -> Array:
     """Squared position error from the inverse information, shape (n_press,), mm^2."""
-    variance: Array = PRIOR[0] ** 2 * (inverse[:, 0, 0] + inverse[:, 1, 1])
-    return variance
+    return np.asarray(PRIOR[0] ** 2 * (inverse[:, 0, 0] + inverse[:, 1, 1]))
 
 
 def with_one_more(sensitivity: Array, candidates: Array) -> Array:
@@ -74,5 +71,4 @@ def with_one_more(sensitivity: Array, candidates: Array) -> Array:
     inverse = inverse_information(sensitivity)
     moved = inverse @ candidates
     gain = (moved[:, :2] ** 2).sum(axis=1) / (1.0 + (moved * candidates).sum(axis=1))
-    squared: Array = position_variance(inverse)[:, None] - PRIOR[0] ** 2 * gain
-    return squared
+    return np.asarray(position_variance(inverse)[:, None] - PRIOR[0] ** 2 * gain)

@@ -113,13 +113,34 @@ class Search:
         """The best different layouts that exchange reaches, each of shape (n_new, 2), mm, the best first."""
         case, side = self.case, self.case.square_side
         stay = self.model.sensitivity(self.table.rows(case.presses, places[:0], side, case.stay))
-        candidates = self.model.sensitivity(self.table.rows(case.presses, places, side))
-        apart = case.apart(places, places) >= 0.0
-        power = POWERS["worst" if case.goal == "worst" else "rms"]
-        grid = _Grid(np.ascontiguousarray(candidates.swapaxes(1, 2)), stay, apart, case.weights(case.presses), power)
-        found = sorted((grid.exchange(start) for start in track(layouts, "exchanging")), key=lambda one: one[0])
-        different = [found[0]]
-        for value, chosen in found:
+        squares = self.model.sensitivity(self.table.rows(case.presses, places, side))
+        candidates, apart = np.ascontiguousarray(squares.swapaxes(1, 2)), case.apart(places, places) >= 0.0
+        weight, power = case.weights(case.presses), POWERS["worst" if case.goal == "worst" else "rms"]
+
+        def errors_with(others: Integers) -> Array:
+            """Power of the mean error with one more square beside others at each place; infinite where too near."""
+            beside = np.concatenate([stay, candidates[:, :, others].swapaxes(1, 2)], axis=1)
+            squared = np.maximum(with_one_more(beside, candidates), 1e-12)
+            errors = np.average(squared ** (0.5 * power), axis=0, weights=weight)
+            errors[~apart[others].all(axis=0)] = np.inf
+            return np.asarray(errors)
+
+        def exchanged(start: Integers) -> tuple[float, Integers]:
+            """A layout that no exchange of a single square improves, and its value."""
+            chosen, best = start.copy(), np.inf
+            for _ in range(SWEEPS):
+                for i in range(len(chosen)):
+                    errors = errors_with(np.delete(chosen, i))
+                    chosen[i] = np.argmin(errors)
+                value = float(errors.min() ** (1.0 / power))
+                if value > best * (1.0 - SETTLED):
+                    break
+                best = value
+            return value, chosen
+
+        optima = sorted((exchanged(start) for start in track(layouts, "exchanging")), key=lambda optimum: optimum[0])
+        different = optima[:1]
+        for value, chosen in optima:
             if len(different) < FINALISTS and value > different[-1][0] * (1.0 + ALIKE):
                 different.append((value, chosen))
         return [places[chosen] for _, chosen in different]
@@ -133,11 +154,10 @@ class Search:
         squared = self.squared(places, presses)
         if self.case.goal != "worst":
             squared = np.average(squared, weights=self.case.weights(presses), keepdims=True)
-        logs: Array = 0.5 * np.log(squared)
-        return logs
+        return np.asarray(0.5 * np.log(squared))
 
     def refine(self, places: Array) -> Array:
-        """A better layout near one that keeps to the rules, shape (n_new, 2), mm."""
+        """A better layout near one that keeps to the rules: its value, mm, then its coordinates, (1 + 2 n_new,)."""
         reach, best = REACH, self.value(places)
         for _ in range(ROUNDS):
             moved = self._round(places, reach * self.case.square_side)
@@ -148,7 +168,7 @@ class Search:
                 reach *= 0.5
             else:
                 break
-        return places
+        return np.append(best, places)
 
     def _round(self, places: Array, reach: float) -> Array:
         """One sequence of quadratic programs, within `reach` (mm), for the presses that are worst now."""
@@ -172,55 +192,4 @@ class Search:
             constraints={"type": "ineq", "fun": spare},
             options={"maxiter": STEPS, "ftol": 1e-4, "eps": DIFFERENCE},
         )
-        moved: Array = solved.x[:-1].reshape(-1, 2)
-        return moved
-
-
-@dataclass(frozen=True)
-class _Grid:
-    """Places that are compared.
-
-    Attributes:
-        candidates: Sensitivity of a square at each place, shape (n_press, 5, n_place).
-        stay: That of the electrodes that stay, shape (n_press, n_stay, 5).
-        apart: Whether squares at two places keep their distance, shape (n_place, n_place).
-        weight: Of the presses, shape (n_press,).
-        power: Of the errors whose mean is made small.
-    """
-
-    candidates: Array
-    stay: Array
-    apart: np.ndarray
-    weight: Array
-    power: float
-
-    def exchange(self, start: Integers) -> tuple[float, Integers]:
-        """From one layout, numbers of places, to one that no exchange of a single square improves, and its value."""
-        chosen, best = start.copy(), np.inf
-        for _ in range(SWEEPS):
-            for i in range(len(chosen)):
-                others = np.delete(chosen, i)
-                beside = self.candidates[:, :, others].swapaxes(1, 2)
-                squared = with_one_more(np.concatenate([self.stay, beside], axis=1), self.candidates)
-                mean = np.average(np.maximum(squared, 1e-12) ** (0.5 * self.power), axis=0, weights=self.weight)
-                mean[~self.apart[others].all(axis=0)] = np.inf
-                chosen[i] = np.argmin(mean)
-                value = float(mean[chosen[i]] ** (1.0 / self.power))
-            if value > best * (1.0 - SETTLED):
-                break
-            best = value
-        return value, chosen
-
-
-@dataclass(frozen=True)
-class Refinement:
-    """A job for an executor: the search and one layout, shape (n_new, 2), mm."""
-
-    search: Search
-    places: Array
-
-
-def refine(job: Refinement) -> Array:
-    """The value of the refined layout, mm, and its coordinates, shape (1 + 2 n_new,)."""
-    places = job.search.refine(job.places)
-    return np.append(job.search.value(places), places)
+        return np.asarray(solved.x[:-1].reshape(-1, 2))
