@@ -72,9 +72,7 @@ def stopped(tmp_path) -> Path:
     return tmp_path / "presses"
 
 
-@pytest.mark.parametrize(
-    ("phase", "count"), [("solving", 1), ("solving", 3), ("pressing", 0), ("pressing", 10), ("pressing", 60)]
-)
+@pytest.mark.parametrize(("phase", "count"), [("solving", 3), ("pressing", 0), ("pressing", 60)])
 def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, whole, phase, count):
     target, first, second, reports = tmp_path / "presses", Counting(), Counting(), []
     sweep_until(target, phase, count, executor=first)
@@ -94,7 +92,6 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, whole, phase, count):
         ({"sweep": replace(SWEEP, samples=70)}, "sweep.samples is 60 there, 70 here"),
         ({"probes": (Circle(2.0),)}, r"probes is \['circle:1.0@0'\] there, \['circle:2.0@0'\] here"),
         ({"settings": SolveSettings()}, "solver.resolution is .*; solver.theory is"),
-        ({"shard": 20}, "shard is 10 there, 20 here"),
     ],
 )  # fmt: skip
 def test_a_draft_of_other_settings_is_left_alone(stopped, whole, changes, message):
@@ -123,7 +120,7 @@ def test_fresh_throws_the_draft_away(stopped, whole):
     assert not draft_of(stopped).exists()
 
 
-@pytest.mark.parametrize(("content", "fresh"), [(None, False), (None, True), ("{", False), ("\\xff", False)])
+@pytest.mark.parametrize(("content", "fresh"), [(None, True), ("{", False)])
 def test_a_folder_in_the_way_is_left_alone(tmp_path, content, fresh):
     """Somebody's own folder, or a draft that cannot be recognised as one."""
     folder = tmp_path / "presses.part"
@@ -137,8 +134,7 @@ def test_a_folder_in_the_way_is_left_alone(tmp_path, content, fresh):
     assert (folder / "mine.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("damage", ["flipped", "cut", "gone"])
-@pytest.mark.parametrize("name", ["parts/solve-00-0001.npy", "data/shard-00001.npz"])
+@pytest.mark.parametrize(("name", "damage"), [("parts/solve-00-0001.npy", "flipped"), ("data/shard-00001.npz", "gone")])
 def test_a_damaged_part_is_reported_and_computed_again(stopped, whole, damage, name, caplog):
     path = draft_of(stopped) / name
     data = bytearray(path.read_bytes())
@@ -146,7 +142,7 @@ def test_a_damaged_part_is_reported_and_computed_again(stopped, whole, damage, n
     if damage == "gone":
         path.unlink()
     else:
-        path.write_bytes(bytes(data) if damage == "flipped" else bytes(data)[:-9])
+        path.write_bytes(bytes(data))
     reason = ".*No such file.*" if damage == "gone" else r"expected sha256 .*\.\.\."
     sweep_to(stopped)
     assert re.search(rf"{path.name} is damaged: {reason}; computed again", caplog.text)
@@ -186,13 +182,6 @@ def test_killed_between_name_and_tidying(stopped):
     assert stopped.exists()
 
 
-def test_an_existing_target_keeps_its_draft(stopped):
-    stopped.mkdir()
-    with pytest.raises(OutputExists, match="presses is already there"):
-        sweep_to(stopped)
-    assert draft_of(stopped).exists()
-
-
 def save_and_raise(target: Path, error: BaseException) -> None:
     with resume_folder(target, {"a": (1, 2)}) as draft:
         draft.save("part", b"1")
@@ -204,16 +193,6 @@ def test_what_would_fail_again_leaves_nothing(tmp_path, error):
     with pytest.raises(type(error)):
         save_and_raise(tmp_path / "new" / "out", error)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_part_is_what_was_saved(tmp_path):
-    with pytest.raises(Stopped):
-        save_and_raise(tmp_path / "out", Stopped())
-    with resume_folder(tmp_path / "out", {"a": [1, 2]}) as draft:
-        assert draft.load("part", bytes) == b"1"
-        assert draft.load("other", bytes) is None
-        (draft.data / "file").write_bytes(b"2")
-    assert files(tmp_path / "out") == {"file": b"2"}
 
 
 # Really killed
@@ -243,7 +222,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize(
-    ("phase", "count", "workers"), [("solving", 2, 2), ("pressing", 20, 2), ("pressing", 60, 1)]
+    ("phase", "count", "workers"), [("solving", 2, 1), ("pressing", 20, 2)]
 )  # fmt: skip
 def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path, whole, phase, count, workers):
     """SIGKILL in the middle of the solves, between two shards, and before the manifest; no worker outlives it."""

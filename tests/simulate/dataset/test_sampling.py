@@ -23,7 +23,7 @@ sweeps = st.builds(
 )
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(sweeps, st.integers(1, 3))
 def test_every_press_is_inside_and_the_count_is_right(sweep, count):
     probes = PROBES[:count]
@@ -42,13 +42,6 @@ def test_every_press_is_inside_and_the_count_is_right(sweep, count):
     else:
         assert len(presses) == sweep.samples
         np.testing.assert_array_equal(presses.probe, np.arange(sweep.samples) % count)
-
-
-@settings(deadline=None, max_examples=30)
-@given(sweeps)
-def test_the_same_sweep_draws_the_same_presses(sweep):
-    for a, b in zip(vars(sweep.over(PROBES)).values(), vars(sweep.over(PROBES)).values(), strict=True):
-        assert a.tobytes() == b.tobytes()
 
 
 @pytest.mark.parametrize("sampling", ["sobol", "random"])
@@ -76,9 +69,9 @@ def test_force_place_and_rotation_are_independent():
     assert np.abs(np.triu(correlation, 1)[:, 3:]).max() < 0.05
 
 
-@pytest.mark.parametrize("probes", [1, 2, 3])
-def test_sobol_presses_fill_gaps_better_than_chance(probes):
+def test_sobol_presses_fill_gaps_better_than_chance():
     """What the Sobol points are for: a tenth of the discrepancy of independent draws, for every probe by itself."""
+    probes = 3
     presses = Sweep(samples=1024 * probes, seed=4).over(PROBES[:probes])
     chance = np.random.default_rng(4).random((1024, 2))
     for number in range(probes):
@@ -101,11 +94,6 @@ def test_one_probe_of_a_sweep_is_the_sweep():
     alone = Sweep(samples=100, seed=3).contacts()
     np.testing.assert_array_equal(Sweep(samples=100, seed=3).over(PROBES[:1]).contact, alone)
     np.testing.assert_array_equal(Sweep(samples=300, seed=3).over(PROBES).contact[::3], alone)
-
-
-def test_one_force_is_exact():
-    for sampling in ("sobol", "random", "grid"):
-        assert set(Sweep(samples=50, force_range=(0.3, 0.3), sampling=sampling).contacts()[:, 2].tolist()) == {0.3}
 
 
 # Grid
@@ -142,6 +130,8 @@ def test_a_lattice_has_one_spacing_and_as_many_points_as_fit():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"radius": -1.0}, "radius: expected a positive number"),
+        ({"radius": np.nan}, "radius: expected a positive number"),
         ({"samples": 0}, "samples: expected at least 1, got 0"),
         ({"samples": 10_000_001}, "samples: expected at most 10000000, got 10000001"),
         ({"orientation": "Random"}, "orientation: expected 'fixed' or 'random', got 'Random'"),

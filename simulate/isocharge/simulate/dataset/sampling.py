@@ -80,6 +80,8 @@ class Sweep:
     sampling: Sampling = "sobol"
 
     def __post_init__(self) -> None:
+        if not 0.0 < self.radius < np.inf:
+            raise SceneError(f"radius: expected a positive number of mm, got {self.radius:g}")
         if not 1 <= self.samples <= MOST_SAMPLES:
             bound = "at least 1" if self.samples < 1 else f"at most {MOST_SAMPLES}"
             raise SceneError(f"samples: expected {bound}, got {self.samples}")
@@ -126,14 +128,12 @@ class Sweep:
         if self.sampling == "random":
             return rng.random((count, 4))
         bits = int(np.ceil(np.log2(max(count, 2))))
-        unit: Array = qmc.Sobol(4, rng=rng).random_base2(bits)[:count]
-        return unit
+        return np.asarray(qmc.Sobol(4, rng=rng).random_base2(bits)[:count])
 
     def _force(self, share: Array) -> Array:
         """Forces (N) at shares of the range in ln F."""
         low, high = np.log(self.force_range)
-        force: Array = np.clip(np.exp(low + (high - low) * share), *self.force_range)
-        return force
+        return np.asarray(np.clip(np.exp(low + (high - low) * share), *self.force_range))
 
     def _grid(self, most: int, period: float) -> tuple[Complexes, Array, Array]:
         """At most `most` positions, forces and rotations: equal numbers of steps in each direction, then all forces
