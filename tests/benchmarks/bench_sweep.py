@@ -1,6 +1,6 @@
-"""100,000 labelled presses: wall time, memory, and the error of the charges against direct solves.
+"""100,000 labelled presses: wall time, memory, and the error of the charges against direct solves, as JSON.
 
-    python tests/benchmarks/bench_sweep.py [--samples 100000] [--workers 2] [--checks 120] [--seed 0] [--json]
+    python tests/benchmarks/bench_sweep.py [--samples 100000] [--workers 2] [--checks 120] [--seed 0]
 
 Three probes within 10 mm of the centre, 0.05 to 2 N, turned at random, as `isocharge simulate sweep` makes them, from
 the call to the finished dataset: start of the workers, solves, evaluation, checksums. Memory is the peak of the parent
@@ -15,9 +15,7 @@ import platform
 import resource
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,112 +28,26 @@ from isocharge.simulate import (
     SolveSettings,
     Sweep,
     load_sensor,
+    local_workers,
     parse_probe,
     press,
     read_dataset,
     run_sweep,
     touch_charge,
 )
-from isocharge.simulate.execution.workers import local_workers
+from isocharge.simulate.execution.workers import in_order
 
 PROBES = ("circle:1.0", "rectangle:4.0x2.0", "triangle:4.0")
 FINER = Resolution(order=7, around=16, rings=8, rim=2)
 
 
-@dataclass(frozen=True)
-class Run:
-    """What was measured.
-
-    Attributes:
-        seconds: From the call to the finished dataset.
-        solve_seconds: Of these, until the last map was solved and checked.
-        cpu_seconds: Of all processes, user and system.
-        memory_MB: Peak of the parent plus that of the largest worker for each worker.
-        solves: Equilibria.
-        within: Share of the charges within 0.1 %.
-        worst: Largest relative error, and that of each probe.
-    """
-
-    samples: int
-    workers: int
-    sensor: str
-    seconds: float
-    solve_seconds: float
-    cpu_seconds: float
-    memory_MB: float
-    parent_MB: float
-    worker_MB: float
-    solves: int
-    interpolation_error: float
-    checks: int
-    within: float
-    within_half: float
-    worst: float
-    worst_of: dict[str, float]
-
-
-def measure(sensor_name: str, samples: int, workers: int, checks: int, seed: int) -> Run:
-    sensor = load_sensor(sensor_name)
-    sweep = Sweep(10.0, (0.05, 2.0), samples, seed, "random")
-    began, solved_at = time.perf_counter(), []
-    with tempfile.TemporaryDirectory() as folder:
-        with (
-            local_workers(workers) as executor,
-            listening(lambda title, *_: solved_at.append(time.perf_counter()) if title == "pressing" else None),
-        ):
-            probes = [parse_probe(text) for text in PROBES]
-            run_sweep(Path(folder) / "presses", sensor, probes, sweep, executor=executor)
-        seconds = time.perf_counter() - began
-        usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-        parent, worker = (used.ru_maxrss / 1024 for used in usage)
-        dataset = read_dataset(Path(folder) / "presses")
-    errors = compare(dataset, checks, workers)
-    every = np.concatenate(list(errors.values()))
-    return Run(
-        samples=samples,
-        workers=workers,
-        sensor=sensor_name,
-        seconds=seconds,
-        solve_seconds=solved_at[0] - began,
-        cpu_seconds=sum(used.ru_utime + used.ru_stime for used in usage),
-        memory_MB=parent + (workers * worker if workers > 1 else 0.0),
-        parent_MB=parent,
-        worker_MB=worker,
-        solves=dataset.manifest["solver"]["solves"],
-        interpolation_error=dataset.manifest["solver"]["interpolation_error"],
-        checks=checks,
-        within=float((every < 1e-3).mean()),
-        within_half=float((every < 5e-3).mean()),
-        worst=float(every.max()),
-        worst_of={name: float(error.max()) for name, error in errors.items()},
-    )
-
-
-def compare(dataset: Dataset, checks: int, workers: int) -> dict[str, np.ndarray]:
-    """Relative errors of the charges of some presses of each probe, shape (n, n_electrode)."""
-    errors, rng = {}, np.random.default_rng(1)
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for name in PROBES:
-            rows = rng.permutation(np.flatnonzero(dataset.samples.probe == name))[: checks // len(PROBES)]
-            direct = np.array(
-                list(pool.map(solve, [dataset.sensor] * rows.size, map(press_of, [dataset] * rows.size, rows)))
-            )
-            errors[name] = np.abs(dataset.samples.charge_pC[rows] / direct - 1.0)
-    return errors
-
-
-def press_of(dataset: Dataset, row: int) -> tuple[str, float, float, float]:
-    """Probe, x and y in mm, force in N."""
-    samples = dataset.samples
-    probe = f"{samples.probe[row]}@{samples.orientation_deg[row]:.12g}"
-    return probe, float(samples.x_mm[row]), float(samples.y_mm[row]), float(samples.force_N[row])
-
-
-def solve(sensor, one: tuple[str, float, float, float]) -> np.ndarray:
-    """Touch charges, pC."""
-    probe, x, y, force = one
-    solved = press(sensor.film, parse_probe(probe), (x, y), force, SolveSettings(resolution=FINER))
-    return touch_charge(sensor, solved)
+def relative_error(dataset: Dataset, row: int) -> np.ndarray:
+    """Of the charges of a press, against a direct solve."""
+    samples, sensor = dataset.samples, dataset.sensor
+    probe = parse_probe(f"{samples.probe[row]}@{samples.orientation_deg[row]:.12g}")
+    at, force = (float(samples.x_mm[row]), float(samples.y_mm[row])), float(samples.force_N[row])
+    direct = touch_charge(sensor, press(sensor.film, probe, at, force, SolveSettings(resolution=FINER)))
+    return np.abs(samples.charge_pC[row] / direct - 1.0)
 
 
 def main() -> None:
@@ -145,34 +57,39 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--checks", type=int, default=120)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    run = measure(options.sensor, options.samples, options.workers, options.checks, options.seed)
-    machine = {
-        "cores": os.cpu_count(),
-        "load": os.getloadavg()[0],
-        "machine": platform.machine(),
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
+    sensor, sweep = load_sensor(options.sensor), Sweep(10.0, (0.05, 2.0), options.samples, options.seed, "random")
+    began, solved_at = time.perf_counter(), []
+
+    def listener(title: str, *_) -> None:
+        if title == "pressing":
+            solved_at.append(time.perf_counter())
+
+    with tempfile.TemporaryDirectory() as folder, local_workers(options.workers) as executor:
+        with listening(listener):
+            run_sweep(Path(folder) / "presses", sensor, [*map(parse_probe, PROBES)], sweep, executor=executor)
+        seconds, dataset = time.perf_counter() - began, read_dataset(Path(folder) / "presses")
+    parent, worker = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    rng, errors = np.random.default_rng(1), {}
+    with local_workers(options.workers) as executor:
+        for name in PROBES:
+            rows = rng.permutation(np.flatnonzero(dataset.samples.probe == name))[: options.checks // len(PROBES)]
+            errors[name] = np.array([*in_order(executor, partial(relative_error, dataset), rows.tolist())])
+    every = np.concatenate([*errors.values()])
+    result = vars(options) | {
+        "seconds": seconds,
+        "solve_seconds": solved_at[0] - began,
+        "cpu_seconds": sum(used.ru_utime + used.ru_stime for used in (parent, worker)),
+        "parent_MB": parent.ru_maxrss / 1024,
+        "worker_MB": worker.ru_maxrss / 1024,
+        **{key: dataset.manifest["solver"][key] for key in ("solves", "interpolation_error")},
+        "share_within_0.1_percent": float((every < 1e-3).mean()),
+        "share_within_0.5_percent": float((every < 5e-3).mean()),
+        "worst_percent": {name: 100.0 * float(error.max()) for name, error in errors.items()},
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}",
+        "versions": f"python {platform.python_version()}, numpy {np.__version__}, scipy {scipy.__version__}",
     }
-    if options.json:
-        print(json.dumps({**asdict(run), **machine}))
-        return
-    print(
-        f"{run.samples} presses on {run.sensor} with {', '.join(PROBES)}, {run.workers} workers: {run.seconds:.1f} s, "
-        f"of which {run.solve_seconds:.1f} s solving ({run.solves} solves, interpolated to "
-        f"{run.interpolation_error:.1e}); "
-        f"{run.cpu_seconds:.1f} s of CPU"
-    )
-    print(f"peak memory {run.memory_MB:.0f} MB: parent {run.parent_MB:.0f}, each worker {run.worker_MB:.0f}")
-    print(
-        f"charges of {run.checks} presses against direct solves: {run.within:.1%} within 0.1 %, {run.within_half:.1%} "
-        f"within 0.5 %, worst {run.worst:.2%} ("
-        + ", ".join(f"{name} {error:.2%}" for name, error in run.worst_of.items())
-        + ")"
-    )
-    print(", ".join(f"{name} {value}" for name, value in machine.items()))
+    print(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":
