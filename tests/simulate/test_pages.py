@@ -8,13 +8,9 @@ from textwrap import dedent
 import numpy as np
 
 import isocharge.simulate
-from isocharge.simulate import (
-    built_in_sensors,
-    load_amplifier,
-    noise_model,
-    sensor_from_dict,
-)
-from isocharge.simulate.dataset.card import COLUMNS
+from isocharge.simulate import built_in_sensors, load_amplifier, noise_model
+from isocharge.simulate.dataset.shards import COLUMNS
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
 DOCS = Path(__file__).parents[2] / "simulate" / "docs"
 DATASETS, FILES = ((DOCS / f"{name}.md").read_text("utf-8") for name in ("datasets", "files"))
@@ -27,7 +23,7 @@ def test_example_of_the_package():
     scope = {}
     exec(compile(lines, "isocharge.simulate", "exec"), scope)
     assert scope["charge"].shape == (3,)
-    assert np.all((scope["charge"] > 500e-12) & (scope["charge"] < 1600e-12))
+    assert np.all((scope["charge"] > 500.0) & (scope["charge"] < 1600.0))
 
 
 def test_everything_public_exists():
