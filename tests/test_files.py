@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import OutputError, OutputExists
-from isocharge.common.files import bounded_lines, new_file, read_whole, sha256_of
+from isocharge.common.files import bounded_lines, new_file, read_whole
 from isocharge.common.number_text import number_of
 from isocharge.common.resumable_run import resume_folder
 from isocharge.simulate.execution.workers import in_order
@@ -30,13 +30,6 @@ def test_what_is_no_file_is_not_read(tmp_path):
     for path in (tmp_path / "pipe", tmp_path, "/dev/zero"):
         with pytest.raises(OSError, match="not a regular file"):
             read_whole(path)
-
-
-def test_a_sparse_file_costs_nothing(tmp_path):
-    with (tmp_path / "file").open("wb") as file:
-        file.truncate(1 << 40)
-    with pytest.raises(OSError, match="larger than"):
-        read_whole(tmp_path / "file")
 
 
 def fill(path, text, then=lambda: None):
@@ -65,18 +58,17 @@ def test_lines_are_bounded():
         list(bounded_lines(io.StringIO("a\nbc\n"), 2))
 
 
-@pytest.mark.parametrize("text", ["1_0", "1_000.5", "\u0663", "\uff11\uff12", "", "a", "0x10", "1,5"])
+@pytest.mark.parametrize("text", ["1_0", "\u0663", "", "0x10", "1,5"])
 def test_what_is_no_number(text):
     with pytest.raises(ValueError, match=r"number|float"):
         number_of(text)
 
 
-@pytest.mark.parametrize("text", ["10", " 1e3 ", "-.5", "+7."])
-def test_what_is_a_number(text):
-    assert number_of(text) == float(text)
+def test_what_is_a_number():
+    assert [number_of(text) for text in ("10", " 1e3 ", "-.5", "+7.")] == [10.0, 1000.0, -0.5, 7.0]
 
 
-GARBAGE = [b"", b"garbage", b"\x93NUMPY\x01\x00", b"PK\x03\x04", b"\x80\x02."]
+GARBAGE = [b"", b"\x93NUMPY\x01\x00", b"PK\x03\x04", b"\x80\x02."]
 
 
 @pytest.mark.parametrize("data", GARBAGE)
@@ -101,7 +93,3 @@ def test_a_run_whose_settings_are_garbage_is_left_alone(tmp_path, text):
         resume_folder(tmp_path / "target", {}),
     ):
         pass
-
-
-def test_checksums_are_those_of_everybody():
-    assert sha256_of(b"") == "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"

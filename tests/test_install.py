@@ -66,17 +66,13 @@ def test_a_missing_extra_says_so_in_python_too(fresh, tmp_path, stage):
     assert f"pip install 'isocharge[{stage}]'" in done.stderr
 
 
-def test_serving_over_http_says_which_extra_is_missing(fresh, tmp_path):
-    done = run(fresh, "isocharge", "serve", "http", "--port", "0", cwd=tmp_path)
+@pytest.mark.parametrize(
+    ("words", "extra"), [("simulate point three-25um-biaxial", "simulate"), ("serve http --port 0", "http")]
+)
+def test_a_missing_extra_says_how_to_get_it(fresh, tmp_path, words, extra):
+    done = run(fresh, "isocharge", *words.split(), cwd=tmp_path)
     assert done.returncode == 1
-    assert "pip install 'isocharge[http]'" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-def test_a_missing_extra_says_how_to_get_it(fresh, tmp_path):
-    done = run(fresh, "isocharge", "simulate", "point", "three-25um-biaxial", cwd=tmp_path)
-    assert done.returncode == 1
-    assert "pip install 'isocharge[simulate]'" in done.stderr
+    assert f"pip install 'isocharge[{extra}]'" in done.stderr
     assert "Traceback" not in done.stderr
 
 

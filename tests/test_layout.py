@@ -1,4 +1,4 @@
-"""The portions of one namespace: none hides another, serving stays light, no file names a machine."""
+"""The packages of one namespace: none hides another, serving stays light, no file names a machine."""
 
 import json
 import subprocess
@@ -7,32 +7,31 @@ from pathlib import Path
 
 import pytest
 
+import isocharge.serve
+import isocharge.simulate
+import isocharge.train
+
 ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("folder", ["simulate", "train", "serve"])
 @pytest.mark.parametrize("namespace", ["isocharge", "isocharge/cli"])
-def test_no_portion_hides_the_others(folder, namespace):
+def test_no_package_hides_the_others(folder, namespace):
     assert not (ROOT / folder / namespace / "__init__.py").exists()
 
 
-def run(code: str) -> str:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-
-
-@pytest.mark.parametrize("portion", ["simulate", "train", "serve"])
-def test_public_names_are_few_and_hide_no_module(portion):
-    """`import isocharge.serve.stream as s` gives a module wherever there is one of that name."""
-    folder = ROOT / portion / "isocharge" / portion
-    modules = {path.stem for path in folder.iterdir()}
-    names = json.loads(run(f"import json, isocharge.{portion} as face; print(json.dumps(face.__all__))"))
-    assert len(names) <= 45
-    assert not set(names) & modules
+@pytest.mark.parametrize("face", [isocharge.simulate, isocharge.train, isocharge.serve])
+def test_public_names_are_few_and_hide_no_module(face):
+    """`import isocharge.serve.model as m` gives a module wherever there is one of that name."""
+    modules = {path.stem for path in Path(face.__file__).parent.iterdir()}
+    assert len(face.__all__) <= 45
+    assert not set(face.__all__) & modules
 
 
 def test_serving_loads_nothing_heavy():
     code = "import json, sys; import isocharge.serve; isocharge.serve.Predictor; print(json.dumps([*sys.modules]))"
-    loaded = set(json.loads(run(code)))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(json.loads(done.stdout))
     assert "onnxruntime" in loaded
     assert not loaded & {"torch", "scipy", "sklearn", "onnx", "matplotlib", "typer", "rich"}
     assert not loaded & {"isocharge.simulate", "isocharge.train", "isocharge.cli"}

@@ -99,14 +99,6 @@ def test_links_lead_somewhere(page):
         assert target.startswith("http") or (ROOT / page).parent.joinpath(target).exists(), target
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_files_that_are_named_exist(page):
-    """A path in backticks is a file of the project, or one that the examples make."""
-    for name in re.findall(r"`(?:python )?((?:tests|simulate|train|serve|models|isocharge)/[\w./-]+)", PAGES[page]):
-        made = name.startswith(("models/NAME", "models/mine"))
-        assert made or (ROOT / name).exists(), name
-
-
 def test_figures_of_the_released_models_are_their_cards():
     rows = re.findall(
         r"^\| `(\S+)` \| within (\S+) mm \| (\S+), (\S+) mm \| (\S+) % \|", PAGES["models/README.md"], re.M

@@ -139,12 +139,6 @@ def test_wheels_of_every_dependency_exist_for(version, extra, built, tmp_path):
     assert {"isocharge", "numpy", "onnxruntime"} <= names
 
 
-def test_the_pages_have_lines_to_install():
-    assert {".", ".[http]", ".[grpc]", ".[simulate]", ".[train]", ".[all]"} <= set(LINES)
-    extras = {extra for line in LINES for extra in re.findall(r"\[([\w,]+)\]", line)}
-    assert extras <= set(NEEDED)
-
-
 @pytest.mark.parametrize("line", LINES)
 def test_a_line_of_the_pages_installs_what_it_says(line, built, fresh, tmp_path):
     """The wheel stands for the folder or the name."""

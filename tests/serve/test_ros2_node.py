@@ -1,7 +1,6 @@
 """The example of a ROS 2 node, with a stand-in for rclpy, which cannot be had from a package index.
 
-Messages are made from the definitions of ROS 2 that rosbags ships, and are as strict as those that ROS generates: a
-field that a message has not, a value of another kind, an integer that does not fit are errors.
+Messages are made from the definitions of ROS 2 that rosbags ships.
 """
 
 import importlib.util
@@ -21,7 +20,6 @@ from isocharge.serve.export.ros_messages import pose_stamped, time_of, wrench_st
 
 NODE = Path(__file__).parents[2] / "serve" / "examples" / "ros2_node.py"
 ROS = get_typestore(Stores.ROS2_JAZZY)
-RANGES = {"int32": (-(1 << 31), (1 << 31) - 1), "uint32": (0, (1 << 32) - 1)}
 
 
 def new_message(name):
@@ -29,47 +27,12 @@ def new_message(name):
     fields = {}
     for field, (node, description) in ROS.fielddefs[name][1]:
         if node == Nodetype.NAME:
-            fields[field] = (description, new_message(description))
+            fields[field] = new_message(description)
         elif node == Nodetype.BASE:
-            zero = {"string": "", "float64": 0.0}.get(description[0], 0)
-            fields[field] = (description[0], 1.0 if (name, field) == ("geometry_msgs/msg/Quaternion", "w") else zero)
+            fields[field] = {"string": "", "float64": 0.0}.get(description[0], 0)
         else:
-            assert (node, description[0]) == (Nodetype.ARRAY, (Nodetype.BASE, ("float64", 0)))
-            fields[field] = ("array", np.zeros(description[1]))
-    return Message(name, fields)
-
-
-class Message:
-    """A message that takes only what ROS takes."""
-
-    def __init__(self, name, fields):
-        object.__setattr__(self, "name", name)
-        object.__setattr__(self, "kinds", {field: kind for field, (kind, _) in fields.items()})
-        for field, (_, value) in fields.items():
-            object.__setattr__(self, field, value)
-
-    def __setattr__(self, field, value):
-        kind = self.kinds[field]
-        if kind in RANGES:
-            assert type(value) is int
-            assert RANGES[kind][0] <= value <= RANGES[kind][1]
-        elif kind == "float64":
-            assert isinstance(value, float)
-        elif kind == "string":
-            assert isinstance(value, str)
-        else:
-            raise AssertionError(f"{field} is filled, not replaced")
-        object.__setattr__(self, field, value)
-
-    def cdr(self):
-        """The message in CDR, as rosbags writes it."""
-
-        def real(message):
-            kind = ROS.types[message.name]
-            values = (getattr(message, field) for field in message.kinds)
-            return kind(*(real(value) if isinstance(value, Message) else value for value in values))
-
-        return bytes(ROS.serialize_cdr(real(self), self.name))
+            fields[field] = np.zeros(description[1])
+    return ROS.types[name](**fields | ({"w": 1.0} if name.endswith("Quaternion") else {}))
 
 
 class Rclpy(types.ModuleType):
@@ -98,8 +61,8 @@ class Rclpy(types.ModuleType):
         self.qos = types.SimpleNamespace(qos_profile_sensor_data="sensor data")
 
     def take(self, topic, kind, message):
-        assert message.name == f"geometry_msgs/msg/{kind.__name__}"
-        self.messages.append((topic, message.cdr()))
+        assert message.__msgtype__ == f"geometry_msgs/msg/{kind.__name__}"
+        self.messages.append((topic, bytes(ROS.serialize_cdr(message, message.__msgtype__))))
 
 
 @pytest.fixture
@@ -162,8 +125,3 @@ def test_the_node_passes_over_what_is_no_number(rclpy, record):
     node = node_module().TouchNode()
     node.publish(record(force_N=None, contact=False))
     assert rclpy.messages == []
-
-
-def test_the_node_is_short():
-    code = [line for line in NODE.read_text("utf-8").splitlines() if line.strip()]
-    assert len(code) <= 50
