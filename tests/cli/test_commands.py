@@ -175,7 +175,7 @@ def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
 
 
 def test_a_fit_for_other_electrodes_is_refused(command, tmp_path):
-    presses, config, sweep = tmp_path / "presses", tmp_path / "four.toml", Sweep(3.0, (1.0, 1.0), samples=300)
+    presses, config, sweep = tmp_path / "presses", tmp_path / "four.toml", Sweep(3.0, (1.0, 1.0), samples=600)
     write_sweep(presses, kept(solve_maps, load_sensor(SENSOR), (Circle(1.0),), sweep), sweep)
     config.write_text("[network]\nelectrodes = 4\n")
     code, _, err = command("train", "fit", presses, "--config", config, "-o", tmp_path / "models" / "mine")

@@ -76,13 +76,6 @@ NewFolderOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to make for the results; it must not exist yet.")
 ]
 
-PictureOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--output", "-o", metavar="PICTURE", help="Also draw it, into a new .png, .svg or .pdf file. (default: no)"
-    ),
-]
-
 DeviceOption = Annotated[
     Path | None,
     typer.Option(
