@@ -251,7 +251,7 @@ def test_parts_of_runs_with_faults(tmp_path, attack):
 
         def read_state(data):
             run.save("weights", data)
-            run.load_as("weights", tensors)
+            run.load("weights", tensors)
 
         attack("files part", read_array, lambda rng: mutated(rng, array.getvalue()), 2_000)
         attack("files checkpoint", read_state, lambda rng: mutated(rng, state.getvalue()), 2_000)
