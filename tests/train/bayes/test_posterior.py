@@ -135,14 +135,6 @@ def test_deviations_are_as_large_as_errors(charges):
     assert squares == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 120))
 
 
-def test_finer_cells_change_nothing(charges):
-    contact, charge = spread(charges, 12, seed=4)
-    coarse, _ = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)
-    fine, _ = Posterior(charges, REFERENCE, charges.domain.radius, step=0.75).mean_and_std(charge)
-    rms = [np.sqrt(np.mean(np.sum((mean - contact)[:, :2] ** 2, axis=1))) for mean in (coarse, fine)]
-    assert rms[0] == pytest.approx(rms[1], rel=1e-3)
-
-
 def test_a_smaller_prior_knows_more(charges):
     charge = charges.charges(np.array([[3.9, 0.0, 0.1]]))
     wide = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)[1]

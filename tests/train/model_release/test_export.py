@@ -131,15 +131,6 @@ def test_a_wrong_graph_is_not_released(trained, held, graph, change, exported, m
         check_graph(export_onnx(exact, {}) if exported else graph, exact.predict, held, REFERENCE)
 
 
-def test_a_batch_answers_as_its_rows_do(held, session):
-    charge = held.noisy(REFERENCE, seed=0)[:20]
-    together = answers(session, charge)
-    for row in range(len(charge)):
-        alone = answers(session, charge[row : row + 1])
-        for one, all_of_them in zip(alone, together, strict=True):
-            assert np.allclose(one[0], all_of_them[row], rtol=1e-5, atol=1e-2)  # sums in another order
-
-
 def test_the_file_is_plain_onnx_that_another_runtime_computes(held, graph, session):
     """onnx's own reference implementation, in plain NumPy."""
     from onnx.reference import ReferenceEvaluator

@@ -1,19 +1,15 @@
 """A fit: repeatable, seeded, leaves the caller's settings alone, fails loudly, goes on after a kill."""
 
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import numpy as np
-import onnx
 import pytest
 import torch
 
 from isocharge.common.errors import ConfigError, InputError, OutputExists
 from isocharge.common.progress import listening
 from isocharge.common.resumable_run import resume_parts
-from isocharge.simulate import Circle, Dataset, NoiseModel, Samples, Sweep, read_dataset, run_sweep
+from isocharge.simulate import Dataset, NoiseModel, Samples
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, evaluate, fit
 from isocharge.train.training import descent
 from isocharge.train.training.fit import Split, fit_identity, teaching_loss, train_network
@@ -196,25 +192,3 @@ def test_a_killed_fit_goes_on_with_its_own_presses_and_settings_alone(dataset, t
     with listening(lambda *call: calls.append(call)), resume_parts(tmp_path / "it", identity) as run:
         assert torch.equal(weights(dataset, LONGER, run=run), whole)
     assert {title for title, *_ in calls} == {"training the misfit network"}
-
-
-@pytest.mark.slow
-def test_a_killed_command_goes_on(sensor, tmp_path):
-    """SIGKILL in the middle; the same command makes the same model as one that was left alone."""
-    run_sweep(tmp_path / "presses", sensor, (Circle(1.0),), Sweep(samples=3_000))
-    assert len(read_dataset(tmp_path / "presses").samples) == 3_000
-    (tmp_path / "config.toml").write_text("[training]\nsteps = 4000\nmisfit_steps = 300\nmisfit_charges = 2000\n")
-    command = [sys.executable, "-m", "isocharge.cli", "train", "fit", "presses", "--config", "config.toml", "-o"]
-    part = tmp_path / "broken" / "mine" / "1.part"
-    with subprocess.Popen([*command, "broken/mine"], cwd=tmp_path, stderr=subprocess.DEVNULL) as process:
-        deadline = time.monotonic() + 120.0
-        while not (part / "parts" / "contact.sha256").exists() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        process.kill()
-    assert part.is_dir()
-    assert not (tmp_path / "broken" / "mine" / "1").exists()
-    for folder in ("broken", "whole"):
-        subprocess.run([*command, f"{folder}/mine"], cwd=tmp_path, check=True, capture_output=True, timeout=200)
-    broken, whole = (onnx.load(tmp_path / name / "mine" / "1" / "model.onnx").graph for name in ("broken", "whole"))
-    assert broken == whole
-    assert not part.exists()

@@ -1,4 +1,1 @@
-"""`isocharge train ...`: one file a command.
-
-May import: train.bench, shared.
-"""
+"""`isocharge train ...`: one file a command."""

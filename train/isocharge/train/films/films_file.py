@@ -25,7 +25,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, ModelError
-from isocharge.common.files import read_whole
+from isocharge.common.files import read_whole, sha256_of
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.measuring_chain.noise import NoiseModel
@@ -51,17 +51,19 @@ FILE_UNITS = {"pretension": 1e6, "shift": 1e-3, "probe_radius": 1e-3}
 FILE_PC = 1e-12
 """Factor to white noise in the file, which is in C."""
 
-UNREADABLE = (
+DAMAGED = (
     OSError,
     ValueError,
     KeyError,
+    TypeError,
+    AttributeError,
     EOFError,
     NotImplementedError,
     zipfile.BadZipFile,
     lzma.LZMAError,
     zlib.error,
 )
-"""What NumPy and zipfile raise over damaged files."""
+"""What NumPy, zipfile and the model's parts raise over damaged files."""
 
 AGAIN = "copy the model's folder again, or train it again (isocharge train fit --films)"
 
@@ -105,15 +107,15 @@ def films_from_bytes(data: bytes, where: str) -> FilmsModel:
     Raises:
         ModelError: If they are damaged or of another format.
     """
-    arrays = _arrays(data, where)
     try:
+        arrays = _arrays(data)
         about = json.loads(str(arrays["about"]))
         if about["format"] != FORMAT:
             raise ModelError(f"{where}: format {about['format']} is not supported (this version reads {FORMAT})")
-        return _model(about, arrays, hashlib.sha256(data).hexdigest())
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        if isinstance(error, ModelError):
-            raise
+        return _model(about, arrays, sha256_of(data))
+    except ModelError:
+        raise
+    except DAMAGED as error:
         raise ModelError(f"{where}: damaged ({type(error).__name__}: {error}); {AGAIN}") from error
 
 
@@ -127,16 +129,13 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
     return buffer.getvalue()
 
 
-def _arrays(data: bytes, where: str) -> dict[str, np.ndarray]:
+def _arrays(data: bytes) -> dict[str, np.ndarray]:
     """All arrays but the checksum, which must be theirs."""
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        expected = str(arrays.pop("sha256"))
-    except UNREADABLE as error:
-        raise ModelError(f"{where}: damaged ({type(error).__name__}: {error}); {AGAIN}") from error
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    expected = str(arrays.pop("sha256"))
     if (actual := _checksum(arrays)) != expected:
-        raise ModelError(f"{where}: damaged: expected the checksum {expected:.12}..., got {actual:.12}...; {AGAIN}")
+        raise ValueError(f"expected the checksum {expected:.12}..., got {actual:.12}...")
     return arrays
 
 
