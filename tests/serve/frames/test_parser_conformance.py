@@ -125,7 +125,7 @@ ANY_BYTES = st.one_of(
 
 
 @every_format
-@settings(derandomize=True, max_examples=60)
+@settings(derandomize=True, max_examples=30)
 @given(data=st.data())
 def test_chunks_never_change_frames_or_counters(name, data):
     form = FORMATS[name]
@@ -149,7 +149,7 @@ def alone(form, frame):
 def loses_no_intact_frame(form, make):
     """The property: whatever stands between two frames damages nothing but itself."""
 
-    @settings(derandomize=True, database=None, phases=[Phase.generate], max_examples=60)
+    @settings(derandomize=True, database=None, phases=[Phase.generate], max_examples=40)
     @given(st.lists(st.tuples(st.none() | form.junk, form.frames), min_size=1, max_size=8))
     def check(pairs):
         parser = make()

@@ -211,7 +211,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     @cached_property
     def channels(self) -> tuple[Field, ...]:
         """The fields that are neither number, clock nor flags."""
-        return tuple(field for field in self.fields if field.name not in {SEQ, FLAGS, *TIMES_US})
+        return tuple(self.fields[at] for at, _ in self.columns.channels)
 
     @cached_property
     def check(self) -> Checksum:
