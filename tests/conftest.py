@@ -10,11 +10,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from hypothesis import settings
 
 from isocharge.cli.main import main
 from isocharge.common.extras import PACKAGES
 
 ROOT = Path(__file__).parents[1]
+
+settings.register_profile("patient", deadline=None)  # a busy machine is no fault of an example
+settings.load_profile("patient")
 
 signal.signal(
     signal.SIGINT, signal.default_int_handler
