@@ -16,7 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from isocharge.serve import ModelMetadata, PredictionRecord, Predictor, write_model
 from isocharge.serve.network.address import Address
-from isocharge.serve.network.http import App, HttpServer
+from isocharge.serve.network.http import HttpServer
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 
@@ -172,8 +172,8 @@ def start_http(stopping):
     """Start servers on loopback, in threads, each on a free port; they are stopped when the test ends."""
     started = []
 
-    def start(handler, *, token=None, tls=None, uds=None):
-        server = HttpServer(App(handler, token), Address(uds=uds), limits=handler.limits, tls=tls)
+    def start(handler, *, tls=None, uds=None):
+        server = HttpServer(handler, Address(uds=uds), tls=tls)
         thread = Thread(target=server.run)
         thread.start()
         started.append((server, thread))

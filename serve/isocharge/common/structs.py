@@ -41,6 +41,9 @@ LARGEST_FLOAT = sys.float_info.max
 MOST_TOML_BYTES, MOST_JSON_BYTES = 1 << 18, 1 << 22
 """Largest file of settings, bytes; Python reads TOML a hundred times slower than JSON."""
 
+MOST_EXAMINED = 1000
+"""Items of a list in which a fault is looked for; of one in a later item msgspec's own message is given."""
+
 _PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
 _DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_PART}\.[ \t]*+){{32}}")
 """A key with more dots than a table has levels: Python needs memory as the square of their number to read it."""
@@ -189,7 +192,7 @@ def _faults_inside(value: object, kind: Any, path: str) -> Iterator[str]:
     elif isinstance(value, list | tuple) and get_origin(kind) in (list, tuple):
         kinds = [item for item in get_args(kind) if item is not Ellipsis]
         if len(kinds) in (1, len(value)):
-            for number, item in enumerate(value):
+            for number, item in enumerate(value[:MOST_EXAMINED]):
                 yield from _faults(item, kinds[number % len(kinds)], f"{path}[{number + 1}]")
 
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from isocharge.serve.network.credentials import Token
 from isocharge.serve.network.grpc import grpc_server
-from isocharge.serve.network.http import App
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.traffic import LONGEST_TEXT, RequestLog, Traffic
@@ -36,8 +35,7 @@ def released(models):
 
 @pytest.fixture
 def app(released, lines):
-    handler = Handler(released, traffic=Traffic(RequestLog(lines.append, secret=SECRET)))
-    return App(handler, Token(SECRET))
+    return Handler(released, None, Traffic(RequestLog(lines.append, secret=SECRET)), Token(SECRET))
 
 
 def bearer(token=SECRET):
@@ -87,8 +85,8 @@ any_bytes = st.binary(max_size=60) | any_text.map(lambda text: text.encode("utf-
 @given(any_text, any_text, st.lists(st.tuples(any_bytes, any_bytes)), any_bytes, st.booleans())
 def test_no_client_can_forge_a_line_or_plant_a_secret(released, method, path, headers, body, knows):
     lines = []
-    handler = Handler(released, traffic=Traffic(RequestLog(lines.append, secret=SECRET)))
-    App(handler, Token(SECRET)).answer(method, path, [*headers, *bearer()] if knows else headers, body, ("::1", 1))
+    handler = Handler(released, None, Traffic(RequestLog(lines.append, secret=SECRET)), Token(SECRET))
+    handler.answer(method, path, [*headers, *bearer()] if knows else headers, body, ("::1", 1))
     (line,) = lines
     assert len(line) < 500
     assert not set(line) & set("\n\r\u2028\x85")
@@ -122,7 +120,7 @@ def test_messages_of_loggers_are_lines_too(lines):
 
 def test_calls_of_grpc_are_lines(app, lines):
     with (
-        grpc_server(app.handler, "127.0.0.1", 0, Token(SECRET)) as url,
+        grpc_server(app, "127.0.0.1", 0) as url,
         grpc.insecure_channel(url.removeprefix("grpc://")) as channel,
     ):
         ready = channel.unary_unary("/inference.GRPCInferenceService/ServerReady")
@@ -143,7 +141,7 @@ def test_calls_of_grpc_are_lines(app, lines):
 
 def test_what_could_not_be_read_is_a_line_too(app, lines, start_http):
     """Over a real socket: rubbish, then a request of which headers are too long."""
-    place = start_http(app.handler).url.removeprefix("http://").split(":")
+    place = start_http(app).url.removeprefix("http://").split(":")
     for sent in (b"rubbish\r\n\r\n", b"GET / HTTP/1.1\r\nx: " + b"a" * 20_000 + b"\r\n\r\n"):
         with socket.create_connection((place[0], int(place[1])), timeout=20) as connection:
             connection.sendall(sent)

@@ -20,7 +20,7 @@ from isocharge.serve.network.address import Address, check_exposure
 from isocharge.serve.network.credentials import Tls, Token
 
 with require("http"):
-    from isocharge.serve.network.http import App, HttpServer
+    from isocharge.serve.network.http import HttpServer
     from isocharge.serve.network.model_store import open_model_store
     from isocharge.serve.network.protocol import Handler
     from isocharge.serve.network.traffic import RequestLog, Traffic
@@ -83,9 +83,9 @@ def http_command(
         store = open_model_store(models)
         for reason in store.refusals():
             _tell(traffic, "warning", "refused", reason)
-        handler = Handler(store, traffic=traffic)
-        server = HttpServer(App(handler, secret), address, limits=handler.limits, tls=tls)
-        with closing(server), _grpc(handler, host, grpc_port, secret, tls) as grpc_url:
+        handler = Handler(store, traffic=traffic, token=secret)
+        server = HttpServer(handler, address, tls=tls)
+        with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:
             _tell(traffic, "info", "serving", ", ".join(served.metadata.label for served in store.all()))
             for url in filter(None, (server.url, grpc_url)):
                 announce(url)
@@ -115,13 +115,11 @@ def _tell(traffic: Traffic, level: str, event: str, message: str) -> None:
         traffic.log.message(level, event, message)
 
 
-def _grpc(
-    handler: Handler, host: str, port: int | None, token: Token | None, tls: Tls | None
-) -> AbstractContextManager[str]:
+def _grpc(handler: Handler, host: str, port: int | None, tls: Tls | None) -> AbstractContextManager[str]:
     """The gRPC server next to the HTTP server; yields its address, empty without a port."""
     if port is None:
         return nullcontext("")
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # its core would print what our errors say already
     with require("grpc"):
         from isocharge.serve.network.grpc import grpc_server
-    return grpc_server(handler, host, port, token, tls)
+    return grpc_server(handler, host, port, tls)

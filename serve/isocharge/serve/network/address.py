@@ -51,10 +51,10 @@ class Address:
         """
         try:
             return _listen_unix(self.uds, backlog) if self.uds else _listen_tcp(self.host, self.port, backlog)
-        except OSError as error:
-            if isinstance(error, ListenError):
-                raise
-            why = ADVICE.get(error.errno or 0, error.strerror or str(error))
+        except ListenError:
+            raise
+        except (OSError, UnicodeError) as error:
+            why = ADVICE.get(getattr(error, "errno", None) or 0, str(error))
             raise ListenError(f"cannot listen on {self.uds or f'{self.host}:{self.port}'}: {why}") from error
 
     def file(self) -> File | None:
@@ -99,33 +99,25 @@ def check_exposure(address: Address, *, has_token: bool) -> None:
 
 
 def _listen_tcp(host: str, port: int, backlog: int) -> socket.socket:
-    try:
-        infos = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    except (socket.gaierror, UnicodeError) as error:
-        raise ListenError(f"cannot listen on {host}:{port}: no such host ({error})") from error
-    family, kind, protocol, _, place = min(infos, key=lambda info: info[0] != socket.AF_INET)  # localhost is 127.0.0.1
-    return _listening(socket.socket(family, kind, protocol), place, backlog)
-
-
-def _listening(listening: socket.socket, place: object, backlog: int) -> socket.socket:
-    try:
-        # A port whose last user was killed is free at once; a port on which a program listens stays refused.
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind(place)  # type: ignore[arg-type]
-        listening.listen(backlog)
-    except BaseException:
-        listening.close()
-        raise
-    return listening
+    # A port whose last user was killed is free at once; a port on which a program listens stays refused.
+    return socket.create_server(
+        (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET, backlog=backlog
+    )
 
 
 def _listen_unix(path: Path, backlog: int) -> socket.socket:
     _remove_stale(path)
     before = os.umask(0o177)
+    listening = socket.socket(socket.AF_UNIX)
     try:
-        return _listening(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM), str(path), backlog)
+        listening.bind(str(path))
+        listening.listen(backlog)
+    except OSError:
+        listening.close()
+        raise
     finally:
         os.umask(before)
+    return listening
 
 
 def _remove_stale(path: Path) -> None:

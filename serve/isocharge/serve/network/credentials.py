@@ -59,16 +59,21 @@ class Token:
             )
         self._expected = b"Bearer " + token.encode()
 
-    def check(self, authorization: bytes) -> None:
-        """Check the value of an Authorization header, empty if there was none.
+    def fits(self, authorization: bytes) -> bool:
+        """Whether the value of an Authorization header, empty if there was none, carries the token.
 
         The name of the scheme has no case (RFC 9110, 11.1).
+        """
+        scheme, _, token = authorization.partition(b" ")
+        given = b"Bearer " + token.lstrip(b" ") if scheme.lower() == b"bearer" else authorization
+        return hmac.compare_digest(given, self._expected)
+
+    def check(self, authorization: bytes) -> None:
+        """Check the value of an Authorization header.
 
         Raises:
             TokenError: If it does not carry the token.
         """
-        scheme, _, token = authorization.partition(b" ")
-        given = b"Bearer " + token.lstrip(b" ") if scheme.lower() == b"bearer" else authorization
-        if not hmac.compare_digest(given, self._expected):
+        if not self.fits(authorization):
             sent = "a wrong one" if authorization else "none"
             raise TokenError(f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {sent}")

@@ -20,7 +20,7 @@ from prometheus_client.registry import Collector
 
 from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.statistics import LATENCY_NS, STAGES, Statistics
-from isocharge.serve.network.traffic import Kind, Traffic
+from isocharge.serve.network.traffic import Traffic
 
 CONTENT_TYPE = b"text/plain; version=0.0.4; charset=utf-8"
 """The format that every Prometheus reads, whatever it asks for."""
@@ -28,42 +28,30 @@ CONTENT_TYPE = b"text/plain; version=0.0.4; charset=utf-8"
 VERSION = ("model", "version")
 """Labels of what is counted for each version of a model."""
 
-INFERENCE = Kind("http", "/v2/models/{model}/infer", "200")
-"""What the models count instead of the handler."""
-
 BOUNDS = (*(f"{ns / 1e9:g}" for ns in LATENCY_NS), "+Inf")
-
 
 _Counters = dict[tuple[str, str], Statistics]
 
 
-class Metrics:
-    """The metrics of one server."""
+class Metrics(Collector):
+    """The metrics of one server; its families are built anew for each scrape."""
 
     def __init__(self, store: ModelStore, traffic: Traffic, server_version: str) -> None:
         """Report the models of a store and the traffic of their servers."""
+        self._store, self._traffic, self._version = store, traffic, server_version
         self._registry = CollectorRegistry(auto_describe=False)
-        self._registry.register(_Families(store, traffic, server_version))
+        self._registry.register(self)
         ProcessCollector(registry=self._registry)
 
     def text(self) -> bytes:
         """All metrics, in the format of CONTENT_TYPE."""
         return generate_latest(self._registry)
 
-
-class _Families(Collector):
-    """Families of metrics, built anew for each scrape."""
-
-    def __init__(self, store: ModelStore, traffic: Traffic, server_version: str) -> None:
-        self._store, self._traffic, self._version = store, traffic, server_version
-
     def collect(self) -> Iterable[Metric]:
         counters = self._store.counters()
         versions = {"version": self._version, "onnxruntime": ort.__version__}
         yield InfoMetricFamily("isocharge", "Versions of the server.", versions)
-        yield from chain(
-            _models(self._store), _traffic(self._traffic, counters), _inferences(counters), _latencies(counters)
-        )
+        yield from chain(_models(self._store), _traffic(self._traffic), _inferences(counters), _latencies(counters))
 
 
 def _models(store: ModelStore) -> Iterable[Metric]:
@@ -73,16 +61,15 @@ def _models(store: ModelStore) -> Iterable[Metric]:
         info.add_metric((loaded.metadata.name, loaded.version), facts)
     ready = GaugeMetricFamily("isocharge_model_ready", "1 if the version serves, 0 if it was refused.", labels=VERSION)
     for row in store.known():
-        ready.add_metric((row.name, row.version), row.state == "READY")
+        ready.add_metric((row["name"], row["version"]), row["state"] == "READY")
     return info, ready
 
 
-def _traffic(traffic: Traffic, counters: _Counters) -> Iterable[Metric]:
+def _traffic(traffic: Traffic) -> Iterable[Metric]:
     requests = CounterMetricFamily(
         "isocharge_requests", "Requests that were answered or refused.", labels=("transport", "route", "status")
     )
-    answered = sum(of.answered - of.over_grpc for of in counters.values())
-    for kind, count in sorted((traffic.requests() | {INFERENCE: answered}).items()):
+    for kind, count in sorted(traffic.requests().items()):
         requests.add_metric(kind, count)
     opened = GaugeMetricFamily("isocharge_open", "Open connections of HTTP, open calls of gRPC.", labels=("transport",))
     for transport, number in traffic.open.items():

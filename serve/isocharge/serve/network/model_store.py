@@ -45,37 +45,10 @@ class LoadedVersion:
 
     def press(self) -> BoundPress:
         """Bound memory for one press; each thread has its own."""
-        try:
-            return self._of_thread.press  # type: ignore[no-any-return]
-        except AttributeError:
-            self._of_thread.press = BoundPress(self.model.session, len(self.metadata.electrodes))
-            return self._of_thread.press  # type: ignore[no-any-return]
-
-
-@dataclass(frozen=True)
-class ModelVersions:
-    """The versions of one model that serve, and why others do not (version to reason)."""
-
-    versions: Mapping[int, LoadedVersion]
-    refused: Mapping[int, str]
-
-    @property
-    def latest(self) -> LoadedVersion | None:
-        """The highest version that serves."""
-        return self.versions[max(self.versions)] if self.versions else None
-
-
-NO_VERSIONS = ModelVersions({}, {})
-
-
-@dataclass(frozen=True)
-class IndexRow:
-    """One version in the repository index; `version` is empty for a model none of whose versions is known."""
-
-    name: str
-    version: str
-    state: str
-    reason: str
+        bound: BoundPress | None = getattr(self._of_thread, "press", None)
+        if bound is None:
+            bound = self._of_thread.press = BoundPress(self.model.session, len(self.metadata.electrodes))
+        return bound
 
 
 class ModelStore:
@@ -90,43 +63,39 @@ class ModelStore:
         Raises:
             ModelError: If there is no model, or no version passes its checks.
         """
-        self._folders = folders
-        self._turn = threading.Lock()
+        self._folders, self._turn = folders, threading.Lock()
         self._statistics: dict[tuple[str, int], Statistics] = {}
-        self._entries: dict[str, ModelVersions] = {}
-        self._answering: dict[tuple[str, str], LoadedVersion] = {}
+        self._serving: dict[tuple[str, str], LoadedVersion] = {}  # by name and version; without version, the highest
+        self._refused: dict[tuple[str, int], str] = {}
         for name, folder in folders().items():
-            self._put(name, self._load_versions(name, folder, {}))
-        if not self._answering:
+            self._load(name, folder)
+        if not self._serving:
             raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'no model was found'}")
 
     def get(self, name: str, version: str = "") -> LoadedVersion:
         """The model to answer with; the highest version if none is given.
 
         Raises:
-            ModelNotFound: If it does not serve; the message says what does.
+            ModelNotFound: If it does not serve; the message says what does, and why not this one.
         """
-        loaded = self._answering.get((name, version))
+        loaded = self._serving.get((name, version))
         if loaded is None:
-            raise ModelNotFound(self._why_not(name, version))
+            label = f"{name}/{version}" if version else name
+            serving = ", ".join(sorted(loaded.metadata.label for loaded in self.all())) or "no model"
+            reasons = [why for (of, v), why in sorted(self._refused.items()) if of == name and version in ("", str(v))]
+            said = [f"model {label!r:.200} is not found", f"serving: {serving}", *dict.fromkeys(reasons)]
+            raise ModelNotFound("; ".join(said))
         return loaded
 
     def label(self, name: str, version: str = "") -> str | None:
         """`name/version` of the model that would answer, None if none does."""
-        loaded = self._answering.get((name, version))
+        loaded = self._serving.get((name, version))
         return None if loaded is None else loaded.metadata.label
-
-    def _why_not(self, name: str, version: str) -> str:
-        """Why a model does not serve, and what does."""
-        entry = self._entries.get(name, NO_VERSIONS)
-        reasons = dict.fromkeys(reason for v, reason in sorted(entry.refused.items()) if version in ("", str(v)))
-        label = f"{name}/{version}" if version else name
-        serving = ", ".join(sorted(loaded.metadata.label for loaded in self.all())) or "no model"
-        return "; ".join([f"model {label!r:.200} is not found", f"serving: {serving}", *reasons])
 
     def all(self) -> list[LoadedVersion]:
         """Every version that serves, by name and version."""
-        return [loaded for _, entry in sorted(self._entries.items()) for _, loaded in sorted(entry.versions.items())]
+        serving = [loaded for (_, version), loaded in self._serving.items() if version]
+        return sorted(serving, key=lambda loaded: (loaded.metadata.name, loaded.metadata.version))
 
     def named(self, name: str) -> list[LoadedVersion]:
         """Every version of one model that serves, ascending.
@@ -137,13 +106,9 @@ class ModelStore:
         self.get(name)
         return [loaded for loaded in self.all() if loaded.metadata.name == name]
 
-    def versions(self, name: str) -> list[str]:
-        """Versions of a model that serve, ascending."""
-        return [str(version) for version in sorted(self._entries[name].versions)]
-
     def refusals(self) -> list[str]:
         """Why files were refused, a sentence for each version."""
-        return [reason for _, entry in sorted(self._entries.items()) for _, reason in sorted(entry.refused.items())]
+        return [reason for _, reason in sorted(self._refused.items())]
 
     def unready(self, *, full: bool) -> str:
         """Why the server is not ready, in a sentence; empty if it is.
@@ -151,22 +116,34 @@ class ModelStore:
         Args:
             full: With the reason for each version, which names files; without, only how many there are.
         """
-        if self.all():
+        if self._serving:
             return ""
-        rows = self.known()
+        reasons = [f"; {name}/{version}: {reason}" for (name, version), reason in sorted(self._refused.items())]
         if full:
-            return "no model is loaded" + "".join(f"; {row.name}/{row.version}: {row.reason}" for row in rows)
-        refused = sum(row.reason != UNLOADED for row in rows)
-        return f"no model is loaded (versions refused: {refused}, unloaded: {len(rows) - refused})"
+            return "no model is loaded" + "".join(reasons)
+        unloaded = list(self._refused.values()).count(UNLOADED)
+        return f"no model is loaded (versions refused: {len(reasons) - unloaded}, unloaded: {unloaded})"
 
-    def known(self) -> list[IndexRow]:
-        """Every version that serves or was refused."""
-        return [row for name, entry in sorted(self._entries.items()) for row in _rows(name, entry)]
+    def known(self) -> list[dict[str, str]]:
+        """Name, version, state and reason of every version that serves or was refused."""
+        refused, serving = self._refused, self._serving
+        versions = sorted({(loaded.metadata.name, loaded.metadata.version) for loaded in self.all()} | set(refused))
+        return [
+            {
+                "name": name,
+                "version": str(version),
+                "state": "READY" if (name, str(version)) in serving else "UNAVAILABLE",
+                "reason": refused.get((name, version), ""),
+            }
+            for name, version in versions
+        ]
 
-    def index(self) -> list[IndexRow]:
+    def index(self) -> list[dict[str, str]]:
         """Every version that serves or was refused, and models that nobody has loaded."""
-        entries = self._entries
-        return self.known() + [IndexRow(n, "", "UNAVAILABLE", "") for n in self._folders() if n not in entries]
+        known = self.known()
+        names = {row["name"] for row in known}
+        nothing = {"version": "", "state": "UNAVAILABLE", "reason": ""}
+        return known + [{"name": name} | nothing for name in self._folders() if name not in names]
 
     def counters(self) -> dict[tuple[str, str], Statistics]:
         """Counters of every version that has ever served, by name and version, as they are now."""
@@ -184,11 +161,9 @@ class ModelStore:
             folder = self._folders().get(name)
             if folder is None:
                 raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
-            known = self._entries.get(name)
-            entry = self._load_versions(name, folder, known.versions if known else {})
-            self._put(name, entry)
-        if entry.refused:
-            raise ModelError("; ".join(reason for _, reason in sorted(entry.refused.items())))
+            refused = self._load(name, folder)
+        if refused:
+            raise ModelError("; ".join(refused.values()))
 
     def unload(self, name: str) -> None:
         """Stop serving a model; requests that have begun finish.
@@ -197,34 +172,30 @@ class ModelStore:
             ModelNotFound: If it does not serve.
         """
         with self._turn:
-            self.get(name)
-            versions = self._entries[name].versions
-            self._put(name, ModelVersions({}, dict.fromkeys(versions, UNLOADED)))
+            self._put(name, [], {(name, loaded.metadata.version): UNLOADED for loaded in self.named(name)})
 
-    def _load_versions(self, name: str, folder: Path, old: Mapping[int, LoadedVersion]) -> ModelVersions:
-        """Load every version; in place of a refused one, the old one stays."""
-        versions, refused = {}, {}
+    def _load(self, name: str, folder: Path) -> dict[tuple[str, int], str]:
+        """Load every version; in place of a refused one, the old one stays. Why versions were refused."""
+        versions, refused = [], {}
         for version, path in version_folders(folder).items():
+            # counters go on when files are loaded again, as a counter never falls
+            statistics = self._statistics.setdefault((name, version), Statistics())
             try:
-                versions[version] = _load_version(name, version, path, self._statistics_of(name, version))
+                versions.append(_load_version(name, version, path, statistics))
             except Exception as error:  # a folder may be broken in any way, and must take no other model with it
-                refused[version] = _reason(path, error)
-                if version in old:
-                    versions[version] = old[version]
-        return ModelVersions(versions, refused)
+                refused[name, version] = _reason(path, error)
+                versions += filter(None, [self._serving.get((name, str(version)))])
+        self._put(name, versions, refused)
+        return refused
 
-    def _statistics_of(self, name: str, version: int) -> Statistics:
-        """The counters of a version; they go on when its files are loaded again, as a counter never falls."""
-        return self._statistics.setdefault((name, version), Statistics())
-
-    def _put(self, name: str, entry: ModelVersions) -> None:
-        """Change what serves in two assignments, so that a reader sees each change whole."""
-        answering = {key: loaded for key, loaded in self._answering.items() if key[0] != name}
-        answering |= {(name, str(version)): loaded for version, loaded in entry.versions.items()}
-        if entry.latest is not None:
-            answering[name, ""] = entry.latest
-        self._answering = answering
-        self._entries = self._entries | {name: entry}
+    def _put(self, name: str, versions: list[LoadedVersion], refused: dict[tuple[str, int], str]) -> None:
+        """Change what serves in one assignment, so that a reader sees each change whole."""
+        serving = {key: loaded for key, loaded in self._serving.items() if key[0] != name}
+        serving |= {(name, loaded.version): loaded for loaded in versions}
+        if versions:
+            serving[name, ""] = versions[-1]
+        self._refused = {key: reason for key, reason in self._refused.items() if key[0] != name} | refused
+        self._serving = serving
 
 
 def open_model_store(models: Path | None = None) -> ModelStore:
@@ -257,11 +228,3 @@ def _load_version(name: str, version: int, folder: Path, statistics: Statistics)
         )
     check_golden(model)
     return LoadedVersion(model, model.metadata, str(version), statistics)
-
-
-def _rows(name: str, entry: ModelVersions) -> list[IndexRow]:
-    versions = sorted(set(entry.versions) | set(entry.refused))
-    return [
-        IndexRow(name, str(v), "READY" if v in entry.versions else "UNAVAILABLE", entry.refused.get(v, ""))
-        for v in versions
-    ]

@@ -22,7 +22,6 @@ class Statistics:
         unchecked: Those of them whose misfit was not computed.
         alarms: Those of them whose misfit is above the limit of the model.
         answered, refused: Numbers of requests.
-        over_grpc: Those of the answered ones that came over gRPC, and not HTTP.
         latency: Answered requests by their time, those beyond the last of LATENCY_NS at the end.
         stages_ns: Time spent on the answered ones in each of STAGES.
         refused_ns: Time spent on the others.
@@ -33,7 +32,6 @@ class Statistics:
     unchecked: int = 0
     alarms: int = 0
     answered: int = 0
-    over_grpc: int = 0
     refused: int = 0
     latency: list[int] = field(default_factory=lambda: [0] * (len(LATENCY_NS) + 1))
     stages_ns: list[int] = field(default_factory=lambda: [0] * len(STAGES))
@@ -41,15 +39,7 @@ class Statistics:
     last_ms: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock, compare=False)
 
-    def succeeded(
-        self,
-        presses: int,
-        stages_ns: tuple[int, int, int],
-        unchecked: int = 0,
-        alarms: int = 0,
-        *,
-        over_grpc: bool = False,
-    ) -> None:
+    def succeeded(self, presses: int, stages_ns: tuple[int, int, int], unchecked: int = 0, alarms: int = 0) -> None:
         """Count an answered request.
 
         Args:
@@ -57,21 +47,14 @@ class Statistics:
             stages_ns: Its time in each of STAGES.
             unchecked: Rows whose misfit was not computed.
             alarms: Rows whose misfit is above the limit.
-            over_grpc: Whether it came over gRPC.
         """
-        read, ran, written = stages_ns
-        bucket, spent = bisect_left(LATENCY_NS, read + ran + written), self.stages_ns
         with self._lock:
             self.presses += presses
+            self.unchecked += unchecked
+            self.alarms += alarms
             self.answered += 1
-            self.latency[bucket] += 1
-            spent[0] += read
-            spent[1] += ran
-            spent[2] += written
-            if unchecked or alarms or over_grpc:
-                self.unchecked += unchecked
-                self.alarms += alarms
-                self.over_grpc += over_grpc
+            self.latency[bisect_left(LATENCY_NS, sum(stages_ns))] += 1
+            self.stages_ns = [before + ns for before, ns in zip(self.stages_ns, stages_ns, strict=True)]
             self.last_ms = time.time_ns() // 1_000_000
 
     def failed(self, ns: int) -> None:
@@ -88,7 +71,7 @@ class Statistics:
     def snapshot(self) -> "Statistics":
         """A copy, all of whose counters belong to the same moment."""
         with self._lock:
-            return replace(self, latency=[*self.latency], stages_ns=[*self.stages_ns], _lock=threading.Lock())
+            return replace(self, latency=[*self.latency], _lock=threading.Lock())
 
     def to_json(self) -> dict[str, Any]:
         """The counters under Triton's names; no request waits in a queue."""

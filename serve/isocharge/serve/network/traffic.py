@@ -105,20 +105,6 @@ class RequestLog(logging.Handler):
         return text if len(text) <= LONGEST_TEXT else f"{text[:half]} [...] {text[-half:]}"
 
 
-class Kind(NamedTuple):
-    """What requests are counted by.
-
-    Attributes:
-        transport: "http" or "grpc".
-        route: Name of what was asked for; "none" for what could not be read.
-        status: HTTP status, or name of the gRPC status.
-    """
-
-    transport: str
-    route: str
-    status: str
-
-
 class Traffic:
     """Counters of the servers of one process; any thread may add to them.
 
@@ -137,7 +123,7 @@ class Traffic:
         self._lock = threading.Lock()
 
     def count(self, transport: str, route: str, status: int | str) -> None:
-        """Count an answered request, an error being an answer too; arguments as in `Kind`."""
+        """Count an answered request, an error being an answer too."""
         key = transport, route, status
         with self._lock:
             self._requests[key] = self._requests.get(key, 0) + 1
@@ -148,8 +134,8 @@ class Traffic:
         if self.log is not None:
             self.log.exchange(exchange)
 
-    def requests(self) -> dict[Kind, int]:
-        """Requests so far."""
+    def requests(self) -> dict[tuple[str, str, str], int]:
+        """Requests so far, by transport, route and status."""
         with self._lock:
             counts = dict(self._requests)
-        return {Kind(transport, route, str(status)): count for (transport, route, status), count in counts.items()}
+        return {(transport, route, str(status)): count for (transport, route, status), count in counts.items()}

@@ -21,8 +21,8 @@ def serve(store):
     with ExitStack() as stack:
 
         def start(token=None, **limits):
-            handler = Handler(store, ServerLimits(**limits))
-            url = stack.enter_context(grpc_server(handler, "127.0.0.1", 0, token=token)).removeprefix("grpc://")
+            handler = Handler(store, ServerLimits(**limits), token=token)
+            url = stack.enter_context(grpc_server(handler, "127.0.0.1", 0)).removeprefix("grpc://")
             # a separate connection for each channel
             return lambda: stack.enter_context(grpc.insecure_channel(url, [("grpc.use_local_subchannel_pool", 1)]))
 

@@ -18,6 +18,8 @@ TRAILED = b"POST /one HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n3
 class Echo:
     """Answers with what it was asked."""
 
+    limits = ServerLimits()
+
     def blocks(self, _path):
         return False
 
@@ -81,7 +83,7 @@ def connect():
     with asyncio.Runner() as runner:
 
         def start():
-            connection = Connection(Echo(), ServerLimits(), set(), runner.get_loop())
+            connection = Connection(Echo(), set(), runner.get_loop())
             wire = Wire()
             connection.connection_made(wire)
             return connection, wire

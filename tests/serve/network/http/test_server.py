@@ -16,7 +16,7 @@ import trustme
 from isocharge.serve import Predictor
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.credentials import Tls, Token
-from isocharge.serve.network.http import App, HttpServer
+from isocharge.serve.network.http import HttpServer
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
 
@@ -227,7 +227,7 @@ def test_a_client_that_does_not_read(limited, film):
 @pytest.mark.parametrize("token", [None, Token("open sesame")])
 def test_trailers_without_end(store, start_http, token):
     """They are refused as headers are, before any token is looked at, and cost no memory."""
-    server = start_http(Handler(store), token=token)
+    server = start_http(Handler(store, token=token))
     head = b"POST %s HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\n" % INFER.encode()
     for endless in (b"a: b\r\n", b"a: " + b"b" * 1000):
         with connect(server) as connection:
@@ -238,7 +238,7 @@ def test_trailers_without_end(store, start_http, token):
 
 
 def test_a_token(store, start_http):
-    server = start_http(Handler(store), token=Token("open sesame"))
+    server = start_http(Handler(store, token=Token("open sesame")))
     assert post(server, Authorization="Bearer open sesame")[0] == 200
     for headers in ({}, {"Authorization": "Bearer open"}, {"Authorization": "open sesame"}):
         status, content = post(server, **headers)
@@ -284,7 +284,7 @@ def test_stopping_finishes_what_is_in_flight(handler, store, monkeypatch):
         load(name)
 
     monkeypatch.setattr(store, "load", slow)
-    server = HttpServer(App(handler), Address(), limits=handler.limits)
+    server = HttpServer(handler, Address())
     thread = Thread(target=server.run)
     thread.start()
     with ThreadPoolExecutor(1) as threads:
@@ -324,7 +324,7 @@ def test_a_client_that_asks_whether_to_go_on(server):
 
 
 def test_stopping_waits_for_a_request_that_has_begun(handler):
-    server = HttpServer(App(handler), Address(), limits=handler.limits)
+    server = HttpServer(handler, Address())
     thread = Thread(target=server.run)
     thread.start()
     with connect(server) as begun, connect(server) as idle:

@@ -12,16 +12,8 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-from isocharge.common.arrays import Singles
 from isocharge.common.errors import RequestError
-from isocharge.serve.network.protocol.infer import InferAnswer, InferRequest
-from isocharge.serve.network.protocol.tensors import (
-    UNSUPPORTED,
-    charges_from_bytes,
-    charges_from_values,
-    check_head,
-    check_outputs,
-)
+from isocharge.serve.network.protocol.request import InferAnswer, InferRequest, request_of
 
 SERVICE = "inference.GRPCInferenceService"
 
@@ -51,27 +43,32 @@ def read_infer(message: Any, electrodes: tuple[str, ...], batch: int) -> InferRe
     Raises:
         RequestError, ChargeError, TooLarge: If it is not one for a model with these electrodes.
     """
-    for holder in (*message.inputs, *message.outputs):
-        for name in UNSUPPORTED:
-            if name in holder.parameters:
-                raise RequestError(f"the parameters of {holder.name[:100]!r}: {name!r} is not supported by this server")
-    outputs = check_outputs([output.name for output in message.outputs])
-    charges = _charges(message, electrodes, batch)
-    return InferRequest(message.id, charges, outputs, frozenset(outputs if message.raw_input_contents else ()))
-
-
-def _charges(message: Any, electrodes: tuple[str, ...], batch: int) -> Singles:
     raw = message.raw_input_contents
-    if len(message.inputs) != 1 or len(raw) > 1:
-        raise RequestError(f"expected one input tensor, got {len(message.inputs)} and {len(raw)} raw contents")
-    (tensor,) = message.inputs
-    head = check_head(tensor.name, tensor.datatype, list(tensor.shape), electrodes, batch)
-    fields = {field.name for field, _ in tensor.contents.ListFields()}
-    if fields - (set() if raw else {CONTENTS[tensor.datatype]}):
-        raise RequestError(f"expected {CONTENTS[tensor.datatype]} or raw_input_contents, got {sorted(fields)}")
+    if len(raw) > 1:
+        raise RequestError(f"expected one input tensor, got {len(raw)} raw contents")
+    content = {
+        "id": message.id,
+        "inputs": [_input(tensor, raw) for tensor in message.inputs],
+        "outputs": [{"name": output.name, "parameters": _unsupported(output)} for output in message.outputs],
+        "parameters": {"binary_data_output": bool(raw)},
+    }
+    return request_of(content, raw[0] if raw else b"", electrodes, batch)
+
+
+def _input(tensor: Any, raw: Any) -> dict[str, Any]:
+    """A tensor as JSON would have it."""
+    parameters: dict[str, Any] = _unsupported(tensor)
+    content = {"name": tensor.name, "datatype": tensor.datatype, "shape": list(tensor.shape), "parameters": parameters}
     if raw:
-        return charges_from_bytes(raw[0], head, electrodes)
-    return charges_from_values(list(getattr(tensor.contents, CONTENTS[tensor.datatype])), head, electrodes)
+        parameters["binary_data_size"] = len(raw[0])
+    if tensor.HasField("contents") or not raw:
+        content["data"] = list(getattr(tensor.contents, CONTENTS.get(tensor.datatype, "fp32_contents")))
+    return content
+
+
+def _unsupported(tensor: Any) -> dict[str, bool]:
+    """The parameters of a tensor that change what a request means and that this server does not know."""
+    return {name: True for name in ("shared_memory_region", "classification") if name in tensor.parameters}
 
 
 def write_answer(answer: InferAnswer, message: Any) -> Any:

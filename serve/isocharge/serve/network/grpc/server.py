@@ -14,8 +14,8 @@ import grpc.aio
 import uvloop
 
 from isocharge.common.errors import ListenError
-from isocharge.serve.network.credentials import Tls, Token
-from isocharge.serve.network.grpc.service import Service, handlers
+from isocharge.serve.network.credentials import Tls
+from isocharge.serve.network.grpc.service import Service
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
 
@@ -27,15 +27,13 @@ STREAMS = 100
 
 
 @contextmanager
-def grpc_server(
-    handler: Handler, host: str, port: int, token: Token | None = None, tls: Tls | None = None
-) -> Iterator[str]:
+def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> Iterator[str]:
     """Serve for as long as the block lasts.
 
     Args:
-        handler: Handler of the HTTP server; its models and limits are used.
+        handler: Handler of the HTTP server; its models, limits and token are used. Clients send the token as metadata
+            `authorization`.
         host, port: Where to listen; port 0 takes a free one.
-        token: What clients must send, as metadata `authorization`; without it everybody is answered.
         tls: Certificate and key; without them the connection is plain.
 
     Yields:
@@ -51,7 +49,7 @@ def grpc_server(
             return asyncio.run_coroutine_threadsafe(coroutine, loop).result()
 
         place = f"[{host}]" if ":" in host else host
-        server, listening = run(_start(handler, f"{place}:{port}", token, tls))
+        server, listening = run(_start(handler, f"{place}:{port}", tls))
         try:
             yield f"{'grpcs' if tls else 'grpc'}://{place}:{listening}"
         finally:
@@ -73,11 +71,11 @@ def _event_loop() -> Iterator[asyncio.AbstractEventLoop]:
         loop.close()
 
 
-async def _start(handler: Handler, place: str, token: Token | None, tls: Tls | None) -> tuple[grpc.aio.Server, int]:
+async def _start(handler: Handler, place: str, tls: Tls | None) -> tuple[grpc.aio.Server, int]:
     """A server that answers, and the port that it listens on."""
     limits = handler.limits
     server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=2 * limits.connections)
-    server.add_generic_rpc_handlers((handlers(Service(handler), limits, token),))
+    server.add_generic_rpc_handlers((Service(handler).handlers(),))
     listening = _listen(server, place, tls)
     await server.start()
     return server, listening

@@ -3,7 +3,6 @@
 from isocharge.common.extras import require
 
 with require("http"):
-    from isocharge.serve.network.http.app import App
     from isocharge.serve.network.http.server import HttpServer
 
-__all__ = ["App", "HttpServer"]
+__all__ = ["HttpServer"]

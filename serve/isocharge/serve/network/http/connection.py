@@ -24,9 +24,7 @@ from typing import NamedTuple
 import httptools
 
 from isocharge.common.errors import TooLarge
-from isocharge.serve.network.http.app import App
-from isocharge.serve.network.limits import ServerLimits
-from isocharge.serve.network.protocol import Response
+from isocharge.serve.network.protocol import Handler, Response
 from isocharge.serve.network.protocol.response import error_response, refusal
 from isocharge.serve.network.traffic import Client
 
@@ -73,12 +71,10 @@ class Connection(asyncio.Protocol):
         has_asked: Whether a request was ever complete.
     """
 
-    def __init__(
-        self, app: App, limits: ServerLimits, connections: "set[Connection]", loop: asyncio.AbstractEventLoop
-    ) -> None:
+    def __init__(self, handler: Handler, connections: "set[Connection]", loop: asyncio.AbstractEventLoop) -> None:
         """Set up a connection of a server; `connections` are those that are open."""
         self.deadline, self.has_asked = math.inf, False
-        self._app, self._limits, self._connections, self._loop = app, limits, connections, loop
+        self._handler, self._limits, self._connections, self._loop = handler, handler.limits, connections, loop
         self._transport: asyncio.Transport
         self._client: Client = None
         self._phase = self._timed = Phase.IDLE
@@ -290,14 +286,14 @@ class Connection(asyncio.Protocol):
         head = self._head = Head(method, _path(self._url), self._headers, not self._parser.should_keep_alive())
         if self._answering:
             self._waiting.append((head, bytes(self._body)))
-        elif self._app.blocks(head.path):
+        elif self._handler.blocks(head.path):
             self._answer_in_thread(head, bytes(self._body))
         else:
             self._has_answered = True
             self._answer(head, bytes(self._body))
 
     def _answer(self, head: Head, body: bytes) -> None:
-        self._write(self._app.answer(head.method, head.path, head.headers, body, self._client), head)
+        self._write(self._handler.answer(head.method, head.path, head.headers, body, self._client), head)
 
     def _answer_in_thread(self, head: Head, body: bytes) -> None:
         self._answering = self._loop.create_task(self._answer_later(head, body))
@@ -306,12 +302,12 @@ class Connection(asyncio.Protocol):
     async def _answer_later(self, head: Head, body: bytes) -> None:
         """Answer in another thread, and then the requests that came behind, in their order."""
         request = head.method, head.path, head.headers, body, self._client
-        response = await asyncio.to_thread(self._app.answer, *request)
+        response = await asyncio.to_thread(self._handler.answer, *request)
         self._answering = None
         self._write(response, head)
         while self._waiting and self._answering is None:
             head, body = self._waiting.popleft()
-            if self._app.blocks(head.path):
+            if self._handler.blocks(head.path):
                 self._answer_in_thread(head, body)
             else:
                 self._answer(head, body)
@@ -357,7 +353,7 @@ class Connection(asyncio.Protocol):
             return
         self._is_refused = True
         self._unparsed.clear()
-        self._app.refused(response, self._client)
+        self._handler.refused(response, self._client)
         self._transport.write(_text_of(response, is_last=True))
         if self._transport.can_write_eof():
             self._transport.write_eof()

@@ -10,9 +10,8 @@ import uvloop
 
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.credentials import Tls
-from isocharge.serve.network.http.app import App
 from isocharge.serve.network.http.connection import Connection, close_overdue
-from isocharge.serve.network.limits import ServerLimits
+from isocharge.serve.network.protocol import Handler
 
 GRACE_SECONDS = 10.0
 """Time that requests which have begun get when the server stops, s."""
@@ -29,25 +28,24 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT)
 class HttpServer:
     """A server that listens from its construction until `close`, and answers while `run` runs."""
 
-    def __init__(self, app: App, address: Address, *, limits: ServerLimits, tls: Tls | None = None) -> None:
+    def __init__(self, handler: Handler, address: Address, *, tls: Tls | None = None) -> None:
         """Listen.
 
         Args:
-            app: Answers the requests.
+            handler: Answers the requests; its limits hold for the connections, too.
             address: Where to listen.
-            limits: Bounds of requests and connections.
             tls: Certificate and key; None for no TLS.
 
         Raises:
             InputError: If a TLS file cannot be used.
             ListenError: If the address is taken or impossible.
         """
-        self._app, self._address, self._limits = app, address, limits
+        self._handler, self._address, self._limits = handler, address, handler.limits
         self._tls = tls.context() if tls else None
         self._connections: set[Connection] = set()
         self._handshakes: set[asyncio.Task[None]] = set()
         self._is_stopped = False
-        app.watch_connections(lambda: len(self._connections))
+        handler.traffic.open["http"] = lambda: len(self._connections)
         self._socket = address.listen(BACKLOG)
         self._file = address.file()
         self.url = address.url(self._socket, secure=tls is not None)
@@ -113,7 +111,7 @@ class HttpServer:
 
     async def _begin(self, accepted: socket.socket, loop: asyncio.AbstractEventLoop) -> None:
         """Hand a socket over to its connection, after the TLS handshake if there is one."""
-        make = partial(Connection, self._app, self._limits, self._connections, loop)
+        make = partial(Connection, self._handler, self._connections, loop)
         seconds = self._limits.header_seconds if self._tls else None
         try:
             await loop.connect_accepted_socket(make, accepted, ssl=self._tls, ssl_handshake_timeout=seconds)

@@ -40,7 +40,7 @@ def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:
     widths = {INPUT: len(metadata.electrodes)}
     return {
         "name": metadata.name,
-        "versions": store.versions(metadata.name),
+        "versions": [other.version for other in store.named(metadata.name)],
         "platform": PLATFORM,
         "inputs": [_tensor(name, width) for name, width in widths.items()],
         "outputs": [_tensor(name, width) for name, width in OUTPUTS.items()],
@@ -82,4 +82,4 @@ def statistics_of(store: ModelStore, name: str = "", version: str = "") -> dict[
 
 def repository_index(store: ModelStore, *, ready: bool) -> list[dict[str, str]]:
     """Every version in the repository; with `ready`, only what serves."""
-    return [vars(row) for row in store.index() if row.state == "READY" or not ready]
+    return [row for row in store.index() if row["state"] == "READY" or not ready]

@@ -4,22 +4,24 @@ This module knows no transport. Everything but loading and unloading takes micro
 largest batch, and may be called from any thread; `blocks` says for which paths a server had better use another thread.
 """
 
+import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
 from typing import NamedTuple
 
 from isocharge.common.errors import ModelError, RequestError, UnknownPath, WrongMethod
+from isocharge.serve.network.credentials import Token
 from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.metrics import CONTENT_TYPE, Metrics
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol import describe
-from isocharge.serve.network.protocol.body import read_infer, read_object, write_answer
 from isocharge.serve.network.protocol.encoding import compress, decompress
 from isocharge.serve.network.protocol.infer import answer_inference
 from isocharge.serve.network.protocol.openapi import openapi
 from isocharge.serve.network.protocol.page import PAGE_HEADERS, page
+from isocharge.serve.network.protocol.request import read_infer, read_object, write_answer
 from isocharge.serve.network.protocol.response import Response, error_response, json_response, response_of
-from isocharge.serve.network.traffic import Traffic
+from isocharge.serve.network.traffic import Client, Exchange, Traffic
 
 Headers = Iterable[tuple[bytes, bytes]]
 """Names in lower case, values as they came."""
@@ -30,14 +32,18 @@ KNOWN_PATHS = 64
 MODELS, REPOSITORY = "/v2/models/", "/v2/repository/models/"
 
 
+OPEN = ("/v2/health/live", "/v2/health/ready")
+"""Paths that need no token: programs that start and watch servers have none."""
+
+
 class Request(NamedTuple):
     """A request with its body unpacked, the model that its path names, and whether all may be said to the client."""
 
     headers: Mapping[bytes, bytes]
     body: bytes
-    name: str = ""
-    version: str = ""
-    trusted: bool = True
+    name: str
+    version: str
+    trusted: bool
 
 
 Route = tuple[str, Callable[[Request], Response]]
@@ -45,18 +51,24 @@ Route = tuple[str, Callable[[Request], Response]]
 
 
 class Handler:
-    """Answers requests from the models of a store, and counts them."""
+    """Answers requests from the models of a store, counts them, and writes them into the log."""
 
-    def __init__(self, store: ModelStore, limits: ServerLimits | None = None, traffic: Traffic | None = None) -> None:
-        """`limits` bound body and batch, the others are for transports; they count in `traffic`, too."""
-        self.store = store
+    def __init__(
+        self,
+        store: ModelStore,
+        limits: ServerLimits | None = None,
+        traffic: Traffic | None = None,
+        token: Token | None = None,
+    ) -> None:
+        """`limits` bound body and batch, the others are for transports; without a token, everybody is answered."""
+        self.store, self.token = store, token
         self.limits = limits or ServerLimits()
         self.traffic = traffic or Traffic()
         metrics = Metrics(store, self.traffic, describe.server_metadata()["version"])
         self._fixed: dict[str, Route] = {
             "/": ("GET", self._page),
             "/metrics": ("GET", lambda _: response_of(200, CONTENT_TYPE, metrics.text())),
-            "/openapi.json": ("GET", lambda _: json_response(openapi(store, self.limits))),
+            "/openapi.json": ("GET", lambda _: json_response(openapi(store))),
             "/v2": ("GET", lambda _: json_response(describe.server_metadata())),
             "/v2/health/live": ("GET", lambda _: json_response({"live": True})),
             "/v2/health/ready": ("GET", self._ready),
@@ -70,16 +82,15 @@ class Handler:
             "stats": ("GET", self._stats),
             "infer": ("POST", self._infer),
         }
-        self._inference = self._of_model["infer"]
-        self._route = lru_cache(KNOWN_PATHS)(self._route_of)
-        self.label = lru_cache(KNOWN_PATHS)(self._label_of)
         self._of_repository: dict[str, Route] = {"load": ("POST", self._load), "unload": ("POST", self._unload)}
+        self._route = lru_cache(KNOWN_PATHS)(self._route_of)
+        self._label = lru_cache(KNOWN_PATHS)(self._label_of)
 
     def blocks(self, path: str) -> bool:
         """Whether answering this path may take longer than others should wait."""
         return path.startswith(REPOSITORY)
 
-    def answer(self, method: str, path: str, headers: Headers, body: bytes, *, trusted: bool = True) -> Response:
+    def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
         """Answer one request.
 
         Args:
@@ -87,26 +98,43 @@ class Handler:
             path: Without query, percent signs undone.
             headers: Headers of the request.
             body: Body of the request, perhaps compressed.
-            trusted: Whether the client may know everything; one without the token may not know names of files.
+            client: Who asks, for the log.
 
         Returns:
             The answer; an error is one, with the body {"error": "..."}. Nothing is raised.
         """
+        began = time.perf_counter_ns()
         try:
-            route, name, version = self._route(path)
-            if method != route[0] and (method, route[0]) != ("HEAD", "GET"):
-                raise WrongMethod(f"{path}: expected the method {route[0]}, got {method[:20]}", route[0])
-            fields = dict(headers)
-            self.limits.check_body(len(body))
-            if b"content-encoding" in fields:
-                body = decompress(body, fields[b"content-encoding"].lower(), self.limits.body_bytes)
-            response = route[1](Request(fields, body, name, version, trusted))
-            if route is self._inference:  # its model has counted it: a second counter would cost too much
-                return response
+            response = self._answer(method, path, dict(headers), body)
         except Exception as error:  # the one place where an error becomes an answer
             response = error_response(error)
-        self.traffic.count("http", self.label(path), response.status)
+        label, status, size = self._label(path), response.status, len(response.body)
+        self.traffic.count("http", label, status)
+        if self.traffic.log is not None:
+            model, ns = self._model_label(path), time.perf_counter_ns() - began
+            self.traffic.log.exchange(
+                Exchange("http", label, status, model, response.error, ns, len(body), size, client)
+            )
         return response
+
+    def refused(self, response: Response, client: Client = None) -> None:
+        """Count and log a refusal that did not come from here, as the request could not be read to its end."""
+        size = len(response.body)
+        self.traffic.note(Exchange("http", "none", response.status, None, response.error, 0, 0, size, client))
+
+    def _answer(self, method: str, path: str, fields: dict[bytes, bytes], body: bytes) -> Response:
+        trusted, authorization = True, fields.get(b"authorization", b"")
+        if self.token is not None and path in OPEN:
+            trusted = self.token.fits(authorization)
+        elif self.token is not None:
+            self.token.check(authorization)
+        route, name, version = self._route(path)
+        if method != route[0] and (method, route[0]) != ("HEAD", "GET"):
+            raise WrongMethod(f"{path}: expected the method {route[0]}, got {method[:20]}", route[0])
+        self.limits.check_body(len(body))
+        if b"content-encoding" in fields:
+            body = decompress(body, fields[b"content-encoding"].lower(), self.limits.body_bytes)
+        return route[1](Request(fields, body, name, version, trusted))
 
     def _route_of(self, path: str) -> tuple[Route, str, str]:
         """The route of a path, with the name and version of the model in it."""
@@ -124,7 +152,7 @@ class Handler:
             pass
         raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
 
-    def model_label(self, path: str) -> str | None:
+    def _model_label(self, path: str) -> str | None:
         """`name/version` of the model that serves under a path, None if there is none."""
         try:
             _, name, version = self._route(path)
@@ -151,11 +179,18 @@ class Handler:
         return json_response(describe.statistics_of(self.store, request.name, request.version))
 
     def _infer(self, request: Request) -> Response:
+        """The answer to an inference, the only one that is compressed: Triton's asyncio client unpacks no other."""
         loaded, headers = self.store.get(request.name, request.version), request.headers
         length = headers.get(b"inference-header-content-length")
         read = partial(read_infer, request.body, length, loaded.metadata.electrodes, self.limits.batch)
         body, json_length = answer_inference(loaded, read, write_answer)
-        return _infer_response(body, json_length, headers.get(b"accept-encoding", b""))
+        body, encoding = compress(body, headers.get(b"accept-encoding", b""))
+        response = response_of(200, b"application/json" if json_length is None else b"application/octet-stream", body)
+        if json_length is not None:
+            response.headers.append((b"inference-header-content-length", b"%d" % json_length))
+        if encoding:
+            response.headers.append((b"content-encoding", encoding))
+        return response
 
     def _ready(self, request: Request) -> Response:
         if why := self.store.unready(full=request.trusted):
@@ -183,14 +218,3 @@ class Handler:
         response = response_of(200, b"text/html; charset=utf-8", page(self.store).encode())
         response.headers.extend(PAGE_HEADERS)
         return response
-
-
-def _infer_response(body: bytes, json_length: int | None, accepted: bytes) -> Response:
-    """The answer to an inference, the only one that is compressed: Triton's asyncio client unpacks no other."""
-    body, encoding = compress(body, accepted) if accepted else (body, b"")
-    response = response_of(200, b"application/json" if json_length is None else b"application/octet-stream", body)
-    if json_length is not None:
-        response.headers.append((b"inference-header-content-length", b"%d" % json_length))
-    if encoding:
-        response.headers.append((b"content-encoding", encoding))
-    return response

@@ -1,0 +1,236 @@
+"""A request for an inference as charges, and the answer as bytes: JSON, then binary tensors if a header says so.
+
+gRPC's messages say the same in other words: they are read by `request_of`, too.
+"""
+
+import struct
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+import orjson
+from msgspec import Meta, Struct
+
+from isocharge.common.arrays import Singles
+from isocharge.common.errors import RequestError, TooLarge
+from isocharge.common.structs import convert
+from isocharge.serve.model.charges import as_singles, write_finite
+from isocharge.serve.model.session import INPUT, OUTPUTS
+
+DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
+"""Number types of charges, little-endian as the protocol has them."""
+
+Unsupported = Annotated[None, Meta(description="nothing, as this server does not support it")]
+
+
+class Parameters(Struct, frozen=True):
+    """Parameters of a request, an input or an output; unknown ones are ignored, as Triton does."""
+
+    binary_data: bool | None = None
+    binary_data_output: bool = False
+    binary_data_size: int | None = None
+    shared_memory_region: Unsupported = None
+    classification: Unsupported = None
+
+
+class InputTensor(Struct, frozen=True):
+    """Charges, pC; the numbers are looked at when the shape is known."""
+
+    name: Literal["charge_pC"]
+    datatype: Literal["FP32", "FP64"]
+    shape: list[int]
+    data: Annotated[Any, Meta(extra_json_schema={"type": "array", "description": "numbers, flat or in rows"})] = None
+    parameters: Parameters = Parameters()
+
+
+class OutputTensor(Struct, frozen=True):
+    """An output that is asked for."""
+
+    name: Literal["contact", "contact_std", "misfit"]
+    parameters: Parameters = Parameters()
+
+
+class InferBody(Struct, frozen=True):
+    """What a request says."""
+
+    inputs: Annotated[list[InputTensor], Meta(min_length=1, max_length=1, description="a list with one tensor")]
+    id: str = ""
+    outputs: list[OutputTensor] = []
+    parameters: Parameters = Parameters()
+
+
+class InferRequest(NamedTuple):
+    """Charges for a model, and which of its outputs to answer with.
+
+    Attributes:
+        id: Echoed in the answer; empty if the request has none.
+        charge_pC: Shape (n, electrodes), pC.
+        outputs: Names, in the order of the answer.
+        binary: Names of the outputs that are sent in binary.
+    """
+
+    id: str
+    charge_pC: Singles
+    outputs: tuple[str, ...]
+    binary: frozenset[str]
+
+
+class InferAnswer(NamedTuple):
+    """Outputs of a model for one request.
+
+    Attributes:
+        name, version: The model that answered.
+        id, binary: As in the request.
+        outputs: By name, shape (n, width).
+    """
+
+    name: str
+    version: str
+    id: str
+    outputs: dict[str, Singles]
+    binary: frozenset[str]
+
+
+def read_object(text: bytes) -> dict[str, Any]:
+    """A JSON object; no text at all counts as an empty one.
+
+    Raises:
+        RequestError: If it is anything else.
+    """
+    try:
+        content = orjson.loads(text) if text else {}
+    except orjson.JSONDecodeError as error:
+        raise RequestError(f"expected a JSON object, got {len(text)} bytes that are not JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise RequestError(f"expected a JSON object, got {content!r:.100}")
+    return content
+
+
+def read_infer(body: bytes, header_length: bytes | None, electrodes: tuple[str, ...], batch: int) -> InferRequest:
+    """The request in a body.
+
+    Args:
+        body: The body, not compressed.
+        header_length: Value of Inference-Header-Content-Length, None without binary data.
+        electrodes, batch: As in `request_of`.
+
+    Raises:
+        RequestError, ChargeError, TooLarge: As `request_of`.
+    """
+    if header_length is None:
+        return request_of(read_object(body), b"", electrodes, batch)
+    # isdigit first: int() accepts signs, blanks and underscores, and takes long for a long text.
+    if not header_length.isdigit() or len(header_length) > 12 or int(header_length) > len(body):
+        raise RequestError(
+            f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
+            f"got {header_length.decode('latin-1')!r:.50}"
+        )
+    end = int(header_length)
+    return request_of(read_object(body[:end]), memoryview(body)[end:], electrodes, batch)
+
+
+def request_of(
+    content: dict[str, Any], binary: bytes | memoryview, electrodes: tuple[str, ...], batch: int
+) -> InferRequest:
+    """The request that a JSON object makes.
+
+    Args:
+        content: The object as it came.
+        binary: The bytes after the JSON; the numbers of the input, if it announces them.
+        electrodes: Names of the model's electrodes.
+        batch: Presses that one request may have.
+
+    Raises:
+        RequestError: If it is not one for a model with these electrodes.
+        ChargeError: If a charge is not finite.
+        TooLarge: If there are more presses than `batch`.
+    """
+    body = convert(content, InferBody, "", RequestError)
+    wanted: dict[str, bool | None] = {output.name: output.parameters.binary_data for output in body.outputs}
+    if len(wanted) < len(body.outputs):
+        raise RequestError("outputs: expected each name once")
+    by_default = body.parameters.binary_data_output
+    wanted = wanted or dict.fromkeys(OUTPUTS)
+    in_binary = frozenset(name for name, flag in wanted.items() if (by_default if flag is None else flag))
+    return InferRequest(body.id, _charges(body.inputs[0], binary, electrodes, batch), tuple(wanted), in_binary)
+
+
+def _charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[str, ...], batch: int) -> Singles:
+    """Charges, shape (n, electrodes), pC; nothing of that size is touched before the shape is checked."""
+    shape, dtype, size = tensor.shape, DATATYPES[tensor.datatype], tensor.parameters.binary_data_size
+    if len(shape) != 2 or shape[0] < 1 or shape[1] != len(electrodes):
+        raise RequestError(
+            f"input {INPUT!r}: expected the shape [n, {len(electrodes)}] with n > 0, "
+            f"a column for each of {electrodes}, got {shape!r:.100}"
+        )
+    if shape[0] > batch:
+        raise TooLarge(f"input {INPUT!r}: expected at most {batch} presses in one request, got {shape[0]}")
+    if size is None and not binary:
+        return _from_values(tensor.data, shape, electrodes)
+    expected = shape[0] * shape[1] * dtype.itemsize
+    if not size == len(binary) == expected or tensor.data is not None:
+        raise RequestError(
+            f"expected either `data` or {expected} bytes after the JSON, announced by `binary_data_size` of the "
+            f"input and Inference-Header-Content-Length, got binary_data_size {size!r:.50} and {len(binary)} bytes"
+        )
+    # A copy: what follows a JSON text may lie at any address, and a runtime expects numbers at even ones.
+    return as_singles(np.frombuffer(binary, dtype).reshape(shape).copy(), electrodes)
+
+
+def _from_values(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
+    """Charges from a list of numbers, flat or nested as the shape."""
+    rows, columns = shape
+    # struct is several times faster than making and testing arrays, for a few numbers; it takes True as 1.0, so a list
+    # that holds one or the other is looked at below.
+    if type(values) is list and len(values) == rows * columns and not (True in values or False in values):
+        charges = np.empty(shape, np.float32)
+        if write_finite(partial(_packer(len(values)), charges.data, 0), values):
+            return charges
+    return _examined(values, shape, electrodes)
+
+
+@lru_cache(64)
+def _packer(count: int) -> Callable[..., None]:
+    """Packs this many float32 numbers into a buffer."""
+    return struct.Struct(f"={count}f").pack_into
+
+
+def _examined(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
+    """Charges from values that may be rows of numbers; the error says what is wrong with others."""
+    numbers = _as_array(values)
+    if numbers.dtype.kind not in "fiu" or list(numbers.shape) not in (shape, [shape[0] * shape[1]]):
+        raise RequestError(
+            f"input {INPUT!r}: expected `data`, numbers for the shape {shape}, flat or in rows, "
+            f"got {numbers.dtype} of shape {list(numbers.shape)}"
+        )
+    return as_singles(numbers.reshape(shape), electrodes)
+
+
+def _as_array(values: Any) -> np.ndarray[Any, Any]:
+    """An array of a list, or of lists in a list; true and false, which arrays take for 1 and 0, stay what they are."""
+    try:
+        rows = values if isinstance(values, list) and values and isinstance(values[0], list) else [values]
+        has_flags = any(type(row) is list and any(type(value) is bool for value in row) for row in rows)
+        return np.asarray(values, object if has_flags else None)
+    except (ValueError, OverflowError):
+        return np.array(None)
+
+
+def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
+    """Put an answer into bytes: the body, and where its JSON ends if binary tensors follow."""
+    content: dict[str, Any] = {"model_name": answer.name, "model_version": answer.version}
+    if answer.id:
+        content["id"] = answer.id
+    content["outputs"] = [_tensor(name, rows, name in answer.binary) for name, rows in answer.outputs.items()]
+    text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
+    if not answer.binary:
+        return text, None
+    parts = [rows.astype("<f4", copy=False).tobytes() for name, rows in answer.outputs.items() if name in answer.binary]
+    return b"".join([text, *parts]), len(text)
+
+
+def _tensor(name: str, rows: Singles, in_binary: bool) -> dict[str, Any]:
+    """One tensor, its numbers flat and row by row, or only their number of bytes."""
+    tensor: dict[str, Any] = {"name": name, "datatype": "FP32", "shape": rows.shape}
+    return tensor | ({"parameters": {"binary_data_size": rows.nbytes}} if in_binary else {"data": rows.ravel()})
