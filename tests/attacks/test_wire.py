@@ -27,6 +27,8 @@ from isocharge.serve.network.grpc.messages import METHODS, SERVICE
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 
+pytestmark = pytest.mark.xdist_group("clock")
+
 NAME = "three-25um-biaxial"
 MODELS = Path(__file__).parents[2] / "models"
 PATH = f"/v2/models/{NAME}/infer"
@@ -108,7 +110,7 @@ def bounded_memory(server):
     assert server.resident_bytes() - before < 200e6
 
 
-def send(place, data, timeout=5.0):
+def send(place, data, timeout=60.0):
     """What a server answers to bytes after which the client sends no more; nothing, if it hangs up."""
     answer = bytearray()
     with socket.create_connection(place, timeout=timeout) as connection, suppress(ConnectionError):
@@ -182,7 +184,7 @@ def test_grpc_bytes_with_faults(server, attack):
     frames = b"\0\0\0\4\0\0\0\0\0" + b"\0\0\5\1\4\0\0\0\1\x82\x86\x84\x41\0" + b"\0\0\4\3\0\0\0\0\1\0\0\0\2"
 
     def read(data):
-        with socket.create_connection(server.grpc, timeout=5.0) as connection, suppress(ConnectionError):
+        with socket.create_connection(server.grpc, timeout=60.0) as connection, suppress(ConnectionError):
             connection.sendall(data)
             select.select([connection], [], [], 0.005)
 
@@ -192,7 +194,7 @@ def test_grpc_bytes_with_faults(server, attack):
 
 def is_live(server):
     with grpc.insecure_channel(f"127.0.0.1:{server.grpc[1]}") as channel:
-        return METHODS["ServerLive"][1].FromString(channel.unary_unary(f"/{SERVICE}/ServerLive")(b"", timeout=5)).live
+        return METHODS["ServerLive"][1].FromString(channel.unary_unary(f"/{SERVICE}/ServerLive")(b"", timeout=60)).live
 
 
 def test_grpc_messages_with_faults(server, attack):
@@ -217,7 +219,7 @@ def test_grpc_messages_with_faults(server, attack):
         def read(case):
             name, data = case
             try:
-                METHODS[name][1].FromString(calls[name](data, timeout=5))
+                METHODS[name][1].FromString(calls[name](data, timeout=60))
             except grpc.RpcError as error:
                 if error.code().name not in ("INVALID_ARGUMENT", "NOT_FOUND", "RESOURCE_EXHAUSTED"):
                     raise
@@ -329,7 +331,7 @@ def test_half_handshakes(tmp_path, share):
                 half = stack.enter_context(socket.create_connection(server.http))
                 with suppress(ConnectionError):
                     half.sendall(hello[: rng.randrange(len(hello))])
-            plain = stack.enter_context(socket.create_connection(server.http, timeout=5))
+            plain = stack.enter_context(socket.create_connection(server.http, timeout=60))
             with trusted.wrap_socket(plain, server_hostname="127.0.0.1") as secure:
                 secure.sendall(REQUEST)
                 assert secure.recv(1 << 16).startswith(b"HTTP/1.1 200")

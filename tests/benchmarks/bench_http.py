@@ -22,6 +22,7 @@ import time
 import venv
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -55,28 +56,27 @@ class Connection:
     """One open connection that can have one request under way."""
 
     def __init__(self, address: Address) -> None:
-        self.socket = socket.socket(socket.AF_UNIX if isinstance(address, str) else socket.AF_INET)
-        try:
+        is_unix = isinstance(address, str)
+        self.socket = socket.socket(socket.AF_UNIX) if is_unix else socket.create_connection(address)
+        if is_unix:
             self.socket.connect(address)
-        except OSError:
-            self.socket.close()
-            raise
-        if not isinstance(address, str):
+        else:
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def send(self, request: bytes) -> None:
+    def ask(self, request: bytes) -> bytes:
+        """The body of an answer that must be good."""
         self.socket.sendall(request)
+        return self.receive()
 
     def receive(self) -> bytes:
-        """The body of an answer that must be good."""
-        data = self.socket.recv(1 << 20)
+        """The body of the answer to what was sent."""
+        data = b""
         while (end := data.find(b"\r\n\r\n")) < 0:
             data += self._more()
         head = data[:end].lower()
         if not head.startswith(b"http/1.1 200"):
             raise RuntimeError(f"expected an answer 200, got {data[:300]!r}")
-        start = head.index(b"content-length:") + len(b"content-length:")
-        size = end + 4 + int(head[start : (head + b"\r\n").index(b"\r\n", start)])
+        size = end + 4 + int(head.partition(b"content-length:")[2].split(b"\r\n")[0])
         while len(data) < size:
             data += self._more()
         return data[end + 4 :]
@@ -177,15 +177,15 @@ def start(stack: ExitStack, model: str, environments: Path | None) -> Contenders
     """Start every contender; without `environments`, only ours."""
     folder = find_model(model).resolve()
     path = f"/v2/models/{load_model(folder).metadata.name}/infer"
-    tcp, uds = _local_address(), str(_temporary_folder(stack) / "isocharge.sock")
+    tcp, uds = _local_address(), f"{stack.enter_context(tempfile.TemporaryDirectory())}/isocharge.sock"
     ours = [Path(sys.executable).with_name("isocharge"), "serve", "http", "--models", folder.parents[1]]
     stack.enter_context(running([*ours, "--port", str(tcp[1])], tcp))
     stack.enter_context(running([*ours, "--uds", uds], uds))
     contenders: Contenders = {"isocharge": (tcp, path), "isocharge, Unix socket": (uds, path)}
-    rivals = {"bare route": _start_bare, "FastAPI": _start_fastapi, "Triton": _start_triton}
-    for name, start_rival in rivals.items() if environments else ():
+    for name, start_rival in RIVALS.items() if environments else ():
         try:
-            contenders[name] = start_rival(stack, environments, folder / "model.onnx", path)
+            python = python_of("triton" if name == "Triton" else "fastapi", environments)
+            contenders[name] = start_rival(stack, python, folder / "model.onnx"), path
         except NotStarted as error:
             print(f"left out: {name}: {error}", file=sys.stderr)
     return contenders
@@ -195,42 +195,35 @@ def _local_address() -> tuple[str, int]:
     return "127.0.0.1", free_port()
 
 
-def _temporary_folder(stack: ExitStack) -> Path:
-    return Path(stack.enter_context(tempfile.TemporaryDirectory()))
-
-
-def _start_script(stack: ExitStack, python: Path, script: str, model: Path) -> Address:
+def _start_script(script: str, stack: ExitStack, python: Path, model: Path) -> Address:
     """Start a server of the folder `rivals`, which takes a port and a model file."""
     address = _local_address()
     stack.enter_context(running([python, HERE / "rivals" / script, str(address[1]), model], address))
     return address
 
 
-def _start_bare(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
-    return _start_script(stack, python_of("fastapi", environments), "bare_app.py", model), path
-
-
-def _start_fastapi(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
-    return _start_script(stack, python_of("fastapi", environments), "fastapi_app.py", model), path
-
-
-def _start_triton(stack: ExitStack, environments: Path, model: Path, path: str) -> tuple[Address, str]:
+def _start_triton(stack: ExitStack, python: Path, model: Path) -> Address:
     """Start Triton on the models as they stand."""
     address = _local_address()
-    command = [python_of("triton", environments), DEPLOY / "triton/start.py", model.parents[2]]
-    stack.enter_context(running([*command, "--port", str(address[1])], address))
-    return address, path
+    command = [python, DEPLOY / "triton/start.py", model.parents[2], "--port", str(address[1])]
+    stack.enter_context(running(command, address))
+    return address
+
+
+RIVALS = {
+    "bare route": partial(_start_script, "bare_app.py"),
+    "FastAPI": partial(_start_script, "fastapi_app.py"),
+    "Triton": _start_triton,
+}
 
 
 def latencies(address: Address, request: bytes, count: int) -> np.ndarray:
     """Durations of requests one after another on a new connection, us; the first one is thrown away."""
     connection, clock, durations = Connection(address), time.perf_counter_ns, np.empty(count)
-    connection.send(request)
-    connection.receive()
+    connection.ask(request)
     for i in range(count):
         begin = clock()
-        connection.send(request)
-        connection.receive()
+        connection.ask(request)
         durations[i] = clock() - begin
     connection.close()
     return durations / 1e3
@@ -257,45 +250,15 @@ def throughput(address: Address, request: bytes, seconds: float) -> float:
                     missing[number] = size
                     connection.send(request)
                     answers += 1
-    for connection in connections.values():
+    for connection in opened:
         connection.close()
     return answers / (now - begin)
-
-
-def core_seconds(address: Address, path: str, charges: np.ndarray, seconds: float) -> Iterator[dict[str, Any]]:
-    """What one core of our server answers: requests over the processor time that they took, of `/metrics`."""
-    before = _metrics(address)
-    for of in (charges[:1], charges):
-        throughput(address, json_request(path, of), seconds)
-        after = _metrics(address)
-        spent = after["process_cpu_seconds_total"] - before["process_cpu_seconds_total"]
-        model = f'{{model="{path.split("/")[3]}",version="1"}}'
-        answered, presses = (
-            after[f"isocharge_{name}{model}"] - before[f"isocharge_{name}{model}"]
-            for name in ("inference_seconds_count", "presses_total")
-        )
-        yield {
-            "presses": len(of),
-            "cpu_us_per_answer": round(1e6 * spent / answered, 1),
-            "answers_per_core_s": round(answered / spent),
-            "presses_per_core_s": round(presses / spent),
-        }
-        before = after
-
-
-def _metrics(address: Address) -> dict[str, float]:
-    """Samples of `/metrics` by name and labels."""
-    connection = Connection(address)
-    connection.send(b"GET /metrics HTTP/1.1\r\n\r\n")
-    lines = connection.receive().decode().splitlines()
-    connection.close()
-    return {name: float(value) for name, _, value in (of.rpartition(" ") for of in lines if not of.startswith("#"))}
 
 
 def _answer_size(address: Address, request: bytes) -> int:
     """Bytes of a good answer, its headers included."""
     connection = Connection(address)
-    connection.send(request)
+    connection.socket.sendall(request)
     time.sleep(0.2)
     data = connection.socket.recv(1 << 20)
     connection.close()
@@ -361,7 +324,6 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
                 rows(stock_client(address, path.split("/")[3], charges, asked.requests // 4), "JSON")
             ),
         }
-        tables["one core of the server"] = list(core_seconds(address, path, charges, asked.seconds))
         counts = {name: [throughput(*target, asked.seconds) for _ in range(2)] for name, target in one.items()}
     ours = np.mean(counts["isocharge"])
     tables["32 connections"] = [

@@ -16,8 +16,8 @@ import selectors
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import grpc
@@ -34,15 +34,19 @@ RELOADS = 10
 HTTP_CLIENTS, GRPC_CLIENTS, GRPC_SHARE = 10, 6, 0.25
 
 
+def presses(predictor: Predictor, seed: int) -> list[np.ndarray]:
+    """Charges of one press or of three, float32."""
+    rng, width = np.random.default_rng(seed), len(predictor.metadata.electrodes)
+    sizes = [1 if number % 4 else 3 for number in range(KINDS)]
+    return [rng.uniform(100.0, 1500.0, (size, width)).astype(np.float32) for size in sizes]
+
+
 def exchanges(predictor: Predictor, path: str, seed: int) -> list[tuple[bytes, bytes]]:
     """Requests, and the numbers that their answers must have, as bytes."""
-    rng, width = np.random.default_rng(seed), len(predictor.metadata.electrodes)
-    made = []
-    for number in range(KINDS):
-        charges = rng.uniform(100.0, 1500.0, (1 if number % 4 else 3, width)).astype(np.float32)
-        request = (json_request if number % 2 else binary_request)(path, charges)
-        made.append((request, _expected(predictor, charges)))
-    return made
+    return [
+        ((json_request if number % 2 else binary_request)(path, charges), _expected(predictor, charges))
+        for number, charges in enumerate(presses(predictor, seed))
+    ]
 
 
 def _expected(predictor: Predictor, charges: np.ndarray) -> bytes:
@@ -79,7 +83,7 @@ def soak(address: tuple[str, int], made: list[tuple[bytes, bytes]], count: int) 
             connection = Connection(address)
             request, expected = next(asked)
             waiting.register(connection.socket, selectors.EVENT_READ, [connection, expected])
-            connection.send(request)
+            connection.socket.sendall(request)
         while answers < count:
             for key, _ in waiting.select(10.0):
                 connection, expected = key.data
@@ -87,45 +91,28 @@ def soak(address: tuple[str, int], made: list[tuple[bytes, bytes]], count: int) 
                 if got != expected:
                     raise RuntimeError(f"answer {answers}: expected {expected!r}, got {got!r}")
                 request, key.data[1] = next(asked)
-                connection.send(request)
+                connection.socket.sendall(request)
                 answers += 1
                 if answers % 1000 == 0:
                     yield answers
 
 
-class GrpcClient(Thread):
-    """Asks and compares over a gRPC connection of its own."""
-
-    def __init__(self, address: tuple[str, int], predictor: Predictor, count: int, seed: int) -> None:
-        super().__init__()
-        self._address, self._predictor, self._count, self._seed = address, predictor, count, seed
-        self.failure: BaseException | None = None
-
-    def run(self) -> None:
-        try:
-            with grpc.insecure_channel(
-                "{}:{}".format(*self._address), [("grpc.use_local_subchannel_pool", 1)]
-            ) as channel:
-                self._ask(channel)
-        except BaseException as error:  # said by the main thread
-            self.failure = error
-
-    def _ask(self, channel: grpc.Channel) -> None:
-        request_type, response_type = METHODS["ModelInfer"]
+def ask_over_grpc(address: tuple[str, int], predictor: Predictor, count: int, seed: int) -> None:
+    """Ask and compare over a gRPC connection of its own."""
+    request_type, response_type = METHODS["ModelInfer"]
+    made = []
+    for charges in presses(predictor, seed):
+        tensor = {"name": "charge_pC", "datatype": "FP32", "shape": list(charges.shape)}
+        name = predictor.metadata.name
+        request = request_type(model_name=name, inputs=[tensor], raw_input_contents=[charges.tobytes()])
+        made.append((request, _expected(predictor, charges)))
+    with grpc.insecure_channel("{}:{}".format(*address), [("grpc.use_local_subchannel_pool", 1)]) as channel:
         infer = channel.unary_unary(
             f"/{SERVICE}/ModelInfer",
             request_serializer=request_type.SerializeToString,
             response_deserializer=response_type.FromString,
         )
-        rng, electrodes = np.random.default_rng(self._seed), len(self._predictor.metadata.electrodes)
-        made = []
-        for number in range(KINDS):
-            charges = rng.uniform(100.0, 1500.0, (1 if number % 4 else 3, electrodes)).astype(np.float32)
-            tensor = {"name": "charge_pC", "datatype": "FP32", "shape": list(charges.shape)}
-            name = self._predictor.metadata.name
-            request = request_type(model_name=name, inputs=[tensor], raw_input_contents=[charges.tobytes()])
-            made.append((request, _expected(self._predictor, charges)))
-        for request, expected in itertools.islice(itertools.cycle(made), self._count):
+        for request, expected in itertools.islice(itertools.cycle(made), count):
             got = b"".join(infer(request, timeout=60).raw_output_contents)
             if got != expected:
                 raise RuntimeError(f"gRPC: expected {expected!r}, got {got!r}")
@@ -133,8 +120,7 @@ class GrpcClient(Thread):
 
 def load_again(address: tuple[str, int], name: str) -> None:
     connection = Connection(address)
-    connection.send(http_request(f"/v2/repository/models/{name}/load", b""))
-    connection.receive()
+    connection.ask(http_request(f"/v2/repository/models/{name}/load", b""))
     connection.close()
 
 
@@ -149,11 +135,13 @@ def measure(asked: argparse.Namespace) -> dict[str, Any]:
     over_http = asked.requests - GRPC_CLIENTS * over_grpc
     loads, warm, grpc_address = 0, 0, ("127.0.0.1", free_port())
     ports = ["--port", str(address[1]), "--grpc-port", str(grpc_address[1])]
-    with running([*ours, "--models", folder.parents[1], *ports], address) as process:
+    command = [*ours, "--models", folder.parents[1], *ports]
+    with ThreadPoolExecutor(GRPC_CLIENTS) as threads, running(command, address) as process:
         begin = time.perf_counter()
-        clients = [GrpcClient(grpc_address, Predictor(folder), over_grpc, number) for number in range(GRPC_CLIENTS)]
-        for client in clients:
-            client.start()
+        clients = [
+            threads.submit(ask_over_grpc, grpc_address, Predictor(folder), over_grpc, number)
+            for number in range(GRPC_CLIENTS)
+        ]
         for answers in soak(address, made, over_http):
             if answers * RELOADS // over_http > loads:
                 load_again(address, name)
@@ -162,9 +150,7 @@ def measure(asked: argparse.Namespace) -> dict[str, Any]:
                 load_again(address, name)
                 warm = resident_bytes(process.pid)
         for client in clients:
-            client.join()
-            if client.failure is not None:
-                raise client.failure
+            client.result()
         seconds, end = time.perf_counter() - begin, resident_bytes(process.pid)
     return {
         "requests": asked.requests,

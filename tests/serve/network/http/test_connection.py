@@ -103,7 +103,7 @@ def byte_by_byte(data):
 
 
 @given(requests=st.lists(REQUESTS, min_size=1, max_size=6), prefix=st.sampled_from([b"", b"\r\n"]))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_a_request_in_one_piece_is_answered_as_byte_by_byte(connect, requests, prefix):
     """A known head is not parsed again, a byte is no head: both give the same answers."""
     requests = [prefix + each for each in requests for _ in range(2)]
@@ -111,7 +111,7 @@ def test_a_request_in_one_piece_is_answered_as_byte_by_byte(connect, requests, p
 
 
 @given(requests=st.lists(REQUESTS, min_size=1, max_size=6), cuts=st.lists(st.integers(1, 120), max_size=30))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_pieces_that_begin_and_end_anywhere(connect, requests, cuts):
     data = b"".join(each for each in requests for _ in range(2))
     pieces, rest = [], data

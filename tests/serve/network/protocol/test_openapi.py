@@ -28,6 +28,7 @@ def operations(handler, start_http):
     return [result.ok() for result in api.exclude(path_regex="unload").get_all_operations()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", GenerationMode, ids=lambda mode: mode.value)
 def test_the_server_does_what_its_document_says(operations, mode):
     assert len(operations) == 17

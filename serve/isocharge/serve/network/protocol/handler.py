@@ -4,6 +4,7 @@ This module knows no transport. Everything but loading and unloading takes micro
 largest batch, and may be called from any thread; `blocks` says for which paths a server had better use another thread.
 """
 
+import re
 import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
@@ -29,7 +30,8 @@ Headers = Iterable[tuple[bytes, bytes]]
 KNOWN_PATHS = 64
 """Paths whose route is remembered: those asked for last."""
 
-MODELS, REPOSITORY = "/v2/models/", "/v2/repository/models/"
+MODEL_PATH = re.compile(r"/v2/models/(?P<name>[^/]*)(/versions/(?P<version>[^/]+))?(/(?P<tail>\w+))?")
+REPOSITORY_PATH = re.compile(r"/v2/repository/models/(?P<name>[^/]*)/(?P<tail>\w+)")
 
 
 OPEN = ("/v2/health/live", "/v2/health/ready")
@@ -48,6 +50,18 @@ class Request(NamedTuple):
 
 Route = tuple[str, Callable[[Request], Response]]
 """The method that a path takes, and the function that answers."""
+
+
+class Found(NamedTuple):
+    """What is served under a path: its route, the path for the log and the counters, and the model that it names."""
+
+    route: Route | None
+    label: str
+    name: str = ""
+    version: str = ""
+
+
+NOT_FOUND = Found(None, "unknown")
 
 
 class Handler:
@@ -83,12 +97,11 @@ class Handler:
             "infer": ("POST", self._infer),
         }
         self._of_repository: dict[str, Route] = {"load": ("POST", self._load), "unload": ("POST", self._unload)}
-        self._route = lru_cache(KNOWN_PATHS)(self._route_of)
-        self._label = lru_cache(KNOWN_PATHS)(self._label_of)
+        self._find = lru_cache(KNOWN_PATHS)(self._find_path)
 
     def blocks(self, path: str) -> bool:
         """Whether answering this path may take longer than others should wait."""
-        return path.startswith(REPOSITORY)
+        return path.startswith("/v2/repository/models/")
 
     def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
         """Answer one request.
@@ -108,13 +121,12 @@ class Handler:
             response = self._answer(method, path, dict(headers), body)
         except Exception as error:  # the one place where an error becomes an answer
             response = error_response(error)
-        label, status, size = self._label(path), response.status, len(response.body)
-        self.traffic.count("http", label, status)
-        if self.traffic.log is not None:
-            model, ns = self._model_label(path), time.perf_counter_ns() - began
-            self.traffic.log.exchange(
-                Exchange("http", label, status, model, response.error, ns, len(body), size, client)
-            )
+        found, status, log = self._find(path), response.status, self.traffic.log
+        self.traffic.count("http", found.label, status)
+        if log is not None:
+            model, ns = self.store.label(found.name, found.version), time.perf_counter_ns() - began
+            sizes = len(body), len(response.body)
+            log.exchange(Exchange("http", found.label, status, model, response.error, ns, *sizes, client))
         return response
 
     def refused(self, response: Response, client: Client = None) -> None:
@@ -128,49 +140,30 @@ class Handler:
             trusted = self.token.fits(authorization)
         elif self.token is not None:
             self.token.check(authorization)
-        route, name, version = self._route(path)
-        if method != route[0] and (method, route[0]) != ("HEAD", "GET"):
-            raise WrongMethod(f"{path}: expected the method {route[0]}, got {method[:20]}", route[0])
+        route, _, name, version = self._find(path)
+        if route is None:
+            raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
+        expected, respond = route
+        if method != expected and (method, expected) != ("HEAD", "GET"):
+            raise WrongMethod(f"{path}: expected the method {expected}, got {method[:20]}", expected)
         self.limits.check_body(len(body))
         if b"content-encoding" in fields:
             body = decompress(body, fields[b"content-encoding"].lower(), self.limits.body_bytes)
-        return route[1](Request(fields, body, name, version, trusted))
+        return respond(Request(fields, body, name, version, trusted))
 
-    def _route_of(self, path: str) -> tuple[Route, str, str]:
-        """The route of a path, with the name and version of the model in it."""
+    def _find_path(self, path: str) -> Found:
+        """What is served under a path."""
         if path in self._fixed:
-            return self._fixed[path], "", ""
-        try:
-            if path.startswith(MODELS) and not path.endswith("/"):
-                name, *rest = path[len(MODELS) :].split("/")
-                version = rest[1] if rest[:1] == ["versions"] else ""
-                return self._of_model["/".join(rest[2:] if version else rest)], name, version
-            if path.startswith(REPOSITORY):
-                name, tail = path[len(REPOSITORY) :].split("/")
-                return self._of_repository[tail], name, ""
-        except (KeyError, IndexError, ValueError):
-            pass
-        raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
-
-    def _model_label(self, path: str) -> str | None:
-        """`name/version` of the model that serves under a path, None if there is none."""
-        try:
-            _, name, version = self._route(path)
-        except UnknownPath:
-            return None
-        return self.store.label(name, version)
-
-    def _label_of(self, path: str) -> str:
-        """The route of a path with `{model}` for the model's name, "unknown" for a path that is none."""
-        try:
-            route, _, _ = self._route(path)
-        except UnknownPath:
-            return "unknown"
-        for base, routes in ((f"{MODELS}{{model}}/", self._of_model), (f"{REPOSITORY}{{model}}/", self._of_repository)):
-            for tail, of_tail in routes.items():
-                if route is of_tail:
-                    return (base + tail).rstrip("/")
-        return path
+            return Found(self._fixed[path], path)
+        for pattern, base, routes in (
+            (MODEL_PATH, "/v2/models/{model}/", self._of_model),
+            (REPOSITORY_PATH, "/v2/repository/models/{model}/", self._of_repository),
+        ):
+            match = pattern.fullmatch(path)
+            if match is not None and (tail := match["tail"] or "") in routes:
+                version = match.groupdict().get("version") or ""
+                return Found(routes[tail], (base + tail).rstrip("/"), match["name"], version)
+        return NOT_FOUND
 
     def _loaded(self, request: Request) -> LoadedVersion:
         return self.store.get(request.name, request.version)
