@@ -1,5 +1,7 @@
 """Figures of merit against scikit-learn, SciPy and brute force; the computed sentences on made-up methods."""
 
+import re
+
 import numpy as np
 import pytest
 from sklearn.metrics import root_mean_squared_error
@@ -62,22 +64,25 @@ def test_true_deviations_cover_their_level():
 
 def method(name, kind, error, p50, *, per_second=1e5, given=False, answered=1.0):
     errors = Errors(error, error, error, 1.0, 1.0, answered)
-    times = {"p50_us": p50, "p95_us": p50, "p50_of_rounds_us": (p50, p50), "per_second": per_second}
-    return MethodRecord(name, "NumPy", kind, "", given, errors, None, None, **times, memory_bytes=1, fit_seconds=0.0)
+    return MethodRecord(name, "NumPy", kind, "", given, errors, None, None, p50, p50, per_second, 1, 0.0)
 
 
 @pytest.mark.parametrize(
-    ("others", "both", "sentence"),
+    ("other", "both", "sentence"),
     [
-        ([("near", "learnt", 0.21, 5.0)], [], "near (NumPy) (2 times as fast, 5 % more error)"),
-        ([("slow", "learnt", 0.3, 20.0)], [], "none of 1 other methods is faster"),
-        ([("better", "paper", 0.19, 4.0)], ["better (NumPy)"], "better (NumPy) (2.5 times as fast, 5 % less error)"),
-        ([("small", "network", 0.19, 5.0)], ["small (NumPy)"], "networks that give the contact alone"),
+        (
+            ("near", "learnt", 0.21, 5.0),
+            [],
+            "none of 1 .* is both .* .2 times as fast, 5 % more error",
+        ),
+        (("slow", "learnt", 0.3, 20.0), [], "none of 1 other methods is faster"),
+        (("better", "paper", 0.19, 4.0), ["better (NumPy)"], "1 of 1 other .* .2.5 times as fast, 5 % less error"),
+        (("small", "network", 0.19, 5.0), ["small (NumPy)"], "1 of 1 networks that give the contact alone"),
     ],
 )
-def test_what_is_faster_or_more_accurate_is_said(others, both, sentence):
+def test_what_is_faster_or_more_accurate_is_said(other, both, sentence):
     released = method("released", "network", 0.2, 10.0)
     silent = [method("given", "paper", 0.1, 1.0, given=True), method("rarely", "paper", 0.1, 1.0, answered=0.9)]
-    said = verdict([released, *silent, *(method(*other) for other in others)])
+    said = verdict([released, *silent, method(*other)])
     assert said["both"]["latency"] == both
-    assert sentence in said["sentences"][0]
+    assert re.search(sentence, said["sentences"][0])

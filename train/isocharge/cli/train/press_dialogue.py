@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterable
 from io import FileIO
 from queue import Empty, Queue
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from rich.console import Console
@@ -21,7 +21,7 @@ from isocharge.common.errors import InputError, PortLost, PressError
 from isocharge.serve.live.reading_stream import ReadingStream
 from isocharge.serve.live.steady_press import AWAY, Phase, PressWatch, SteadyPress, Watched
 from isocharge.serve.port.serial_port import Chunk
-from isocharge.train.calibration.session import Answer, PressSession, Reply, describe_press, read_answer
+from isocharge.train.calibration.session import PressSession, Reply, describe_press, read_answer
 
 SHOWN_S = 0.1
 """Time between two readings that are passed on while nothing else changes, s."""
@@ -62,16 +62,6 @@ class Ended(NamedTuple):
 
 class Stopped(Exception):
     """The person ends the session, or the input or the port is over."""
-
-
-class Events(Protocol):
-    """As `PressEvents`."""
-
-    def arm(self) -> None:
-        """Take only presses that begin from now on."""
-
-    def next(self) -> Watched | Typed | Ended:
-        """The next event."""
 
 
 class PressEvents:
@@ -209,7 +199,7 @@ class Screen:
 class Dialogue:
     """One session, from the first press to the last."""
 
-    def __init__(self, session: PressSession, events: Events, screen: Screen, taken: Taken) -> None:
+    def __init__(self, session: PressSession, events: PressEvents, screen: Screen, taken: Taken) -> None:
         """Put the parts together.
 
         Args:
@@ -247,30 +237,22 @@ class Dialogue:
         """
         first = _done(self._session, contacts)
         try:
-            self._await_tare()
+            self._until(Phase.waiting)  # a press before the tare would be lost, and all after it be taken for others
             self._screen.say("the film is tared: let the machine begin")
             for number, contact in enumerate(contacts[first:], start=first + 1):
                 self._screen.say(f"{number}. {describe_press(contact)}")
-                outcome = self._outcome()
-                if isinstance(outcome, SteadyPress):
-                    self._take(outcome, contact)
-                elif outcome == AWAY:
+                event = self._until(Phase.taken, Phase.refused)
+                if event.press is not None:
+                    self._screen.taken(event.press)
+                    self._take(event.press, contact)
+                elif event.reason == AWAY:
                     raise PortLost(
                         f"{AWAY}; let the machine go on with row {number} of its list, with the same command"
                     )
                 else:
-                    self._screen.say(f"   row {number} is left out: {outcome}")
+                    self._screen.say(f"   row {number} is left out: {event.reason}")
         except Stopped as end:
             raise InputError("the port ended before the last press of the list") from end
-
-    def _await_tare(self) -> None:
-        """Wait until the film is tared: a press before would be lost, and all after it be taken for others."""
-        while True:
-            event = self._next()
-            if isinstance(event, Watched):
-                if event.phase == Phase.waiting:
-                    return
-                self._screen.show(event)
 
     def _next(self) -> Watched | Typed:
         """The next event; Stopped at the end of the port or the input."""
@@ -279,81 +261,64 @@ class Dialogue:
             raise event.error or Stopped
         return event
 
-    def _outcome(self) -> SteadyPress | str | Answer:
-        """The next press, why it is refused, or what the person types meanwhile."""
+    def _until(self, *phases: Phase) -> Watched:
+        """The next reading in one of these phases; those before it are shown."""
         while True:
             event = self._next()
-            if isinstance(event, Typed):
-                if answer := self._read(event):
-                    return answer
-            elif event.press is not None:
-                self._screen.taken(event.press)
-                return event.press
-            elif event.phase == Phase.refused:
-                return event.reason
-            else:
+            if isinstance(event, Watched):
+                if event.phase in phases:
+                    return event
                 self._screen.show(event)
 
     def _one_press(self, *, asks: bool) -> None:
         """Propose a press until one is taken, or something else is to be proposed."""
-        proposed = self._session.proposed
+        proposed, press = self._session.proposed, None
         self._screen.say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")
-        while self._session.proposed is proposed:  # until it is skipped, or another press undone
-            self._events.arm()
-            outcome = self._outcome()
-            if isinstance(outcome, SteadyPress):
-                (self._ask if asks else self._take)(outcome, proposed.contact)
-                return
-            if isinstance(outcome, str):
-                self._screen.say(f"   not taken: {outcome}; press again")
-            elif outcome.reply == Reply.take:
-                self._screen.say("   press first: the question comes when the press is steady")
-            else:
-                self._obey(outcome)
-
-    def _ask(self, press: SteadyPress, proposed: Array) -> None:
-        """Ask whether the press was where it should be, until it is taken or given up."""
-        self._screen.say(QUESTION)
-        while True:
+        self._events.arm()
+        while press is not None or self._session.proposed is proposed:  # until another press is undone
             event = self._next()
-            answer = self._read(event) if isinstance(event, Typed) else None
-            if answer is None:
-                continue
-            if answer.reply == Reply.take:
-                if self._take(press, proposed if isinstance(answer.contact, str) else answer.contact):
+            if isinstance(event, Typed):
+                if self._is_over(event, press, proposed.contact):
                     return
-            elif answer.reply == Reply.undo and answer.number == "last":
-                self._screen.say("   this press is not taken")
-                return
+            elif press is not None:
+                continue  # readings while the question stands
+            elif event.press is not None:
+                self._screen.taken(event.press)
+                if not asks:
+                    self._take(event.press, proposed.contact)
+                    return
+                press = event.press
+                self._screen.say(QUESTION)
+            elif event.phase == Phase.refused:
+                self._screen.say(f"   not taken: {event.reason}; press again")
+                self._events.arm()
             else:
-                self._obey(answer)
-                if answer.reply == Reply.skip:
-                    return
+                self._screen.show(event)
 
-    def _read(self, typed: Typed) -> Answer | None:
-        """What was typed; None, and said, if it is no answer."""
+    def _is_over(self, typed: Typed, press: SteadyPress | None, proposed: Array) -> bool:
+        """Do what was typed, while a press is waited for or asked about: whether something else is to be proposed."""
         if typed.text is None:
             raise Stopped
         try:
-            return read_answer(typed.text)
+            answer = read_answer(typed.text)
+            if answer.reply == Reply.quit:
+                raise Stopped
+            if answer.reply == Reply.take and press is None:
+                self._screen.say("   press first: the question comes when the press is steady")
+            elif answer.reply == Reply.take and press is not None:
+                return self._take(press, proposed if isinstance(answer.contact, str) else answer.contact)
+            elif answer.reply == Reply.skip:
+                self._session.skip()
+            elif answer.number == "last" and press is not None:
+                self._screen.say("   this press is not taken")
+            else:
+                self._screen.say(f"   press {self._session.undo(answer.number)} is taken back")
+                self._say_summary()
+                return False
         except PressError as error:
             self._screen.say(f"   {error}")
-            return None
-
-    def _obey(self, answer: Answer) -> None:
-        """Skip, undo or end."""
-        if answer.reply == Reply.quit:
-            raise Stopped
-        if answer.reply == Reply.skip:
-            self._session.skip()
-            return
-        try:
-            number = self._session.undo(answer.number)
-        except PressError as error:
-            self._screen.say(f"   {error}")
-            return
-        self._screen.say(f"   press {number} is taken back")
-        self._say_summary()
+            return False
+        return answer.reply != Reply.take
 
     def _take(self, press: SteadyPress, contact: Array) -> bool:
         """Whether the session takes a press."""
@@ -376,4 +341,4 @@ def _done(session: PressSession, contacts: Array) -> int:
     if not len(session):
         return 0
     same = (np.isclose(contacts, session.presses.contact[-1], rtol=0.0, atol=1e-9, equal_nan=True)).all(axis=1)
-    return int(np.flatnonzero(same)[-1]) + 1 if same.any() else 0
+    return max(np.flatnonzero(same).tolist(), default=-1) + 1

@@ -3,14 +3,14 @@
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Booleans
 from isocharge.common.errors import ModelError
 from isocharge.common.files import write_whole
 from isocharge.common.progress import track
@@ -23,6 +23,7 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.baselines.networks import RELEASED, ReleasedModel, TrainedNetwork
 from isocharge.train.baselines.rival import FittingTask, Rival
 from isocharge.train.baselines.rivals import BOOSTING, GAUSS_NEWTON, LINEAR_BAND, POLYNOMIAL, TABLE, rivals
+from isocharge.train.calibration.diagnosis import outside
 from isocharge.train.data.measured import check_enough, held_out
 from isocharge.train.data.presses import LabelledPresses, domain_of, is_measured, presses_of, split_by_position
 from isocharge.train.model_release.release import model_domain
@@ -30,10 +31,9 @@ from isocharge.train.report import effects, maps, pictures
 from isocharge.train.report.case import EvaluationCase, press_on
 from isocharge.train.report.limits import BAYES, ErrorBounds
 from isocharge.train.report.measures import rounded
-from isocharge.train.report.methods import by_name, fit_all, records_of
+from isocharge.train.report.methods import by_name, fit_all, one_thread, records_of
 from isocharge.train.report.page import page
 from isocharge.train.report.settings import Settings
-from isocharge.train.report.timing import one_thread
 from isocharge.train.report.verdict import verdict
 from isocharge.train.training.source import TrainingData
 
@@ -94,7 +94,7 @@ def write_report(
         "format_version": FORMAT_VERSION,
         "command": command,
         "machine": machine(MEASURED_WITH),
-        "settings": settings.to_dict(),
+        "settings": asdict(settings),
     }
     identity = {**about, "datasets": [subject.identity() for subject in prepared]}
     with resume_folder(folder, identity, fresh=fresh) as run, one_thread():
@@ -275,20 +275,17 @@ def _drawings(section: dict[str, Any], case: EvaluationCase, draws: maps.Draws) 
     lines = {name: [level["errors"][name]["position_rms_mm"] for level in noise] for name in noise[0]["errors"]}
     return {
         "maps": lambda: pictures.error_maps(case.sensor, case.domain, draws),
-        "force": lambda: pictures.error_lines(force["force_N"], force["position_rms_mm"], RELEASED, "force, N"),
+        "force": lambda: pictures.error_lines(force["force_N"], force["position_rms_mm"], "force, N"),
         "calibration": lambda: pictures.calibration(section["calibration"]),
-        "noise": lambda: pictures.error_lines(effects.LEVELS, lines, RELEASED, "noise over reference"),
-        "effects": lambda: pictures.mismatch_effect(section["cases"], RELEASED, nominal),
+        "noise": lambda: pictures.error_lines(effects.LEVELS, lines, "noise over reference"),
+        "effects": lambda: pictures.mismatch_effect(section["cases"], nominal),
     }
 
 
 def _rows(dataset: Dataset, rows: Booleans) -> Dataset:
     """Some presses of a dataset."""
-    if rows.all():
-        return dataset
-    return replace(
-        dataset, samples=Samples(**{name: values[rows] for name, values in dataset.samples.columns().items()})
-    )
+    columns = dataset.samples.columns().items()
+    return replace(dataset, samples=Samples(**{name: values[rows] for name, values in columns}))
 
 
 def _known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
@@ -315,8 +312,8 @@ def _known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
     if domain.radius <= radius * SLACK:
         return dataset
     ranges = {**dataset.manifest.get("ranges", {}), "radius_mm": radius}
-    inside = _rows(dataset, _distance(dataset) <= radius)
-    return replace(inside, manifest={**dataset.manifest, "ranges": ranges})
+    inside = np.hypot(dataset.samples.x_mm, dataset.samples.y_mm) <= radius
+    return replace(_rows(dataset, inside), manifest={**dataset.manifest, "ranges": ranges})
 
 
 def _measured_known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
@@ -331,14 +328,7 @@ def _measured_known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
             f"model {model.label}: expected the electrodes {dataset.sensor.electrode_names} of the presses, got "
             f"{model.electrodes}; choose their own model with --model, or train one"
         )
-    samples, (low, high) = dataset.samples, model.force_range_N
-    inside = (_distance(dataset) <= model_domain(model).radius * SLACK) & (samples.charge_pC > 0.0).all(axis=1)
-    inside &= (samples.force_N * SLACK >= low) & (samples.force_N <= high * SLACK)
-    check_enough(int(inside.sum()), len(samples), dataset.sensor.name)
+    presses = LabelledPresses.of(dataset)
+    inside = ~outside(presses.contact, model_domain(model)) & (presses.charge > 0.0).all(axis=1)
+    check_enough(int(inside.sum()), len(presses), dataset.sensor.name)
     return replace(_rows(dataset, inside), manifest={})
-
-
-def _distance(dataset: Dataset) -> Array:
-    """Of every press from the centre, mm."""
-    distance: Array = np.hypot(dataset.samples.x_mm, dataset.samples.y_mm)
-    return distance

@@ -2,28 +2,32 @@
 
 import pickle
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import cycle
 
 import numpy as np
+import torch
+from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.common.progress import track
+from isocharge.serve.benchmark import Contender, Timing, take_turns
 from isocharge.train.baselines.linear_band import BAND
 from isocharge.train.baselines.networks import OnnxContact, ReleasedModel
 from isocharge.train.baselines.rival import FittingTask, Rival
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.report.measures import Errors, MethodRecord, mark_fronts, rounded
 from isocharge.train.report.settings import Settings
-from isocharge.train.report.timing import Call, durations
 
 TIMED = 64
 """Presses that single predictions go through in turn."""
 
-LONGEST_MS = 1000.0
-"""Where a batch takes longer than this, a 64th of it is timed."""
+LONGEST_S = 0.1
+"""Where a batch takes longer than this, a 64th of it is timed, s."""
 
 
 @dataclass(frozen=True)
@@ -72,17 +76,24 @@ def records_of(
     methods: Sequence[Method], test: LabelledPresses, settings: Settings, bayes: Array | None = None
 ) -> list[MethodRecord]:
     """A record for each method, timed when all of them are fitted; errors over the limit where `bayes` has contacts."""
-    singles = {method.rival.name: _singles(method.rival, test) for method in methods}
-    one = durations(singles, settings.rounds, settings.round_ms)
-    batches = {method.rival.name: _batch(method.rival, test, settings.batch) for method in methods}
-    calls = {
-        name: [partial(method.rival.regressor.predict, batches[name])] for name, method in by_name(methods).items()
-    }
-    many = durations(calls, rounds=3, round_ms=0.0, least=1)
-    per_second = {name: 1e6 * len(batches[name]) / float(np.median(many[name])) for name in many}
-    return mark_fronts(
-        [_record(method, test.contact, bayes, one[name], per_second[name]) for name, method in by_name(methods).items()]
-    )
+    rivals = [method.rival for method in methods]
+    singles = [Contender(rival.name, 1, _single(rival, test)) for rival in rivals]
+    batches = [_batch(rival, test, settings.batch) for rival in rivals]
+    timings = take_turns([*singles, *batches], settings.seconds * 2 * len(methods))
+    per_method = zip(methods, timings[: len(methods)], timings[len(methods) :], strict=True)
+    return mark_fronts([_record(method, test.contact, bayes, *timing) for method, *timing in per_method])
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """BLAS, OpenMP and torch on one thread for the block."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def by_name(methods: Sequence[Method]) -> dict[str, Method]:
@@ -90,28 +101,32 @@ def by_name(methods: Sequence[Method]) -> dict[str, Method]:
     return {method.rival.name: method for method in methods}
 
 
-def _singles(rival: Rival, test: LabelledPresses) -> list[Call]:
-    """One call for each press, ready to be timed; networks by the calls that bind their arrays once."""
+def _single(rival: Rival, test: LabelledPresses) -> Callable[[], object]:
+    """A call for one press, each time another; networks by the calls that bind their arrays once."""
     rows, regressor = rival.inputs(test.charge, test.contact[:, 2])[:TIMED], rival.regressor
     if isinstance(regressor, OnnxContact | ReleasedModel):
-        return [regressor.single(row) for row in rows]
-    return [partial(regressor.predict, row[None]) for row in rows]
+        calls = cycle([regressor.single(row) for row in rows])
+    else:
+        calls = cycle([partial(regressor.predict, row[None]) for row in rows])
+    return lambda: next(calls)()
 
 
-def _batch(rival: Rival, test: LabelledPresses, count: int) -> Array:
-    """Inputs of a batch: presses over and over; few where a first try says that all would take too long."""
+def _batch(rival: Rival, test: LabelledPresses, count: int) -> Contender:
+    """A call for a batch, presses over and over; for few where a first try says that all would take too long."""
     rows = rival.inputs(test.charge, test.contact[:, 2])
     batch = rows[np.arange(count) % len(rows)]
     few = batch[: max(1, count // 64)]
-    (taken,) = durations({rival.name: [partial(rival.regressor.predict, few)]}, 1, 0.0, least=1).values()
-    return batch if 1e-3 * float(taken.min()) * count / len(few) <= LONGEST_MS else few
+    begin = time.perf_counter()
+    rival.regressor.predict(few)
+    if (time.perf_counter() - begin) * count / len(few) > LONGEST_S:
+        batch = few
+    return Contender(rival.name, len(batch), partial(rival.regressor.predict, batch))
 
 
-def _record(method: Method, truth: Array, bayes: Array | None, durations_us: Array, per_second: float) -> MethodRecord:
+def _record(method: Method, truth: Array, bayes: Array | None, one: Timing, many: Timing) -> MethodRecord:
     rival, figures, band = method.rival, Errors.of(method.contact, truth), truth[:, 2] <= BAND
     if rival.given_force:
         figures = replace(figures, force_rms_percent=None, force_median_percent=None)
-    medians = np.median(durations_us, axis=1)
     return MethodRecord(
         name=rival.name,
         form=rival.computed_by,
@@ -121,10 +136,9 @@ def _record(method: Method, truth: Array, bayes: Array | None, durations_us: Arr
         errors=figures,
         errors_in_band=Errors.of(method.contact[band], truth[band]) if band.any() else None,
         over_bayes=None if bayes is None else over_bayes(method.contact, bayes, truth),
-        p50_us=float(np.median(durations_us)),
-        p95_us=float(np.percentile(durations_us, 95)),
-        p50_of_rounds_us=(float(medians.min()), float(medians.max())),
-        per_second=per_second,
+        p50_us=one.p50_us,
+        p99_us=one.p99_us,
+        per_second=many.presses_per_s,
         memory_bytes=_memory(rival),
         fit_seconds=method.fit_seconds,
     )

@@ -22,17 +22,18 @@ from isocharge.train.report.measures import MethodRecord, Plot
 GREY = "#8a95a5"
 """Colour of secondary lines."""
 
-LINES = ("#2b6cb0", "#2f7f6f", "#c47f17", "#7a5195", "#8c564b", "#4c9be8")
-"""Colours of methods where kinds do not tell them apart."""
-
 KINDS = {"paper": "#7a5195", "learnt": "#2f7f6f", "fitted map": "#c47f17", "network": "#2b6cb0"}
 """Colours of the kinds of methods."""
 
 MARKERS = "osv^DPX<>h"
 """Markers of the methods of one kind."""
 
-LIMIT_STYLES = {BAYES: "-", CRAMER_RAO: ":"}
-"""How the limits are drawn."""
+OWN_STYLES: dict[str, dict[str, Any]] = {
+    RELEASED: {"color": FELT, "marker": "*", "ms": 10, "lw": 2.0, "zorder": 3},
+    BAYES: {"color": INK, "marker": "", "ls": "-", "lw": 2.0},
+    CRAMER_RAO: {"color": INK, "marker": "", "ls": ":", "lw": 2.0},
+}
+"""How the released model and the limits are drawn; other methods take matplotlib's colours in turn."""
 
 AXES: dict[Plot, str] = {
     "latency": "time of one prediction, median, us",
@@ -59,7 +60,7 @@ def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: Mapping[str,
         marker, fill = next(markers[record.kind]), "white" if hollow else colour
         style: dict[str, Any] = {"color": colour, "mfc": fill, "marker": marker, "ms": 7}
         if record.name == RELEASED:
-            style |= {"color": FELT, "mfc": FELT, "marker": "*", "ms": 14}
+            style = {"color": FELT, "marker": "*", "ms": 14}
         axes.plot(record.cost(plot), record.error_mm, ls="", label=f"{record.name}, {record.error_mm:.3g} mm", **style)
     front = sorted((record.cost(plot), record.error_mm) for record in shown if plot in record.best_on)
     step = "steps-pre" if plot == "throughput" else "steps-post"
@@ -67,7 +68,7 @@ def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: Mapping[str,
     highest = max(record.error_mm for record in shown if not record.force_given)
     for name, value in limits.items():
         if value <= highest:  # unbiased near a fold: centimetres
-            axes.axhline(value, color=INK, ls=LIMIT_STYLES[name], zorder=1, label=f"{name}, {value:.3g} mm")
+            axes.axhline(value, color=INK, ls=OWN_STYLES[name]["ls"], zorder=1, label=f"{name}, {value:.3g} mm")
     _logarithmic(axes, AXES[plot], "position error, rms, mm")
     axes.xaxis.set_major_formatter("{x:,g}")
     if plot == "throughput":
@@ -102,58 +103,45 @@ def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Figure:
     return figure
 
 
-def error_lines(x: Sequence[float], lines: Mapping[str, Sequence[float | None]], released: str, label: str) -> Figure:
+def error_lines(x: Sequence[float], lines: Mapping[str, Sequence[float | None]], label: str) -> Figure:
     """Position errors of several methods, and the limits, against what `label` says."""
     figure = new_figure(8.0, 5.0)
     axes = figure.subplots()
-    for (name, values), style in zip(lines.items(), _styles(lines, released), strict=True):
-        axes.plot(x, np.array(values, dtype=float), label=name, **style)
+    for name, values in lines.items():
+        axes.plot(x, np.array(values, dtype=float), label=name, **_style(name))
     _logarithmic(axes, label, "position error, rms, mm")
     axes.legend(fontsize=8)
     return figure
 
 
-def _styles(names: Mapping[str, Any], released: str) -> list[dict[str, Any]]:
-    """A style for each method; the released model and the limits have their own."""
-    colours = cycle(LINES)
-    own = {released: {"color": FELT, "marker": "*", "ms": 10, "lw": 2.0, "zorder": 3}}
-    own |= {name: {"color": INK, "ls": style, "lw": 2.0} for name, style in LIMIT_STYLES.items()}
-    return [own.get(name) or {"color": next(colours), "marker": "o", "ms": 4, "lw": 1.3} for name in names]
+def _style(name: str) -> dict[str, Any]:
+    return {"marker": "o", "ms": 4, "lw": 1.3} | OWN_STYLES.get(name, {})
 
 
 def calibration(record: Mapping[str, Any]) -> Figure:
-    """Coverage of the released model's intervals against their nominal level, and the difference of both."""
-    figure = new_figure(9.5, 4.4)
-    left, right = figure.subplots(1, 2)
-    level = 100.0 * np.array(record["levels"])
-    left.axline((0.0, 0.0), slope=1.0, color=GREY, lw=1.0)
-    right.axhspan(-2.0, 2.0, color=GREY, alpha=0.15, lw=0)
-    for name, colour in zip(COORDINATES, (LINES[0], LINES[1], FELT), strict=True):
-        covered = 100.0 * np.array(record["coverage"][name])
-        left.plot(level, covered, ".-", color=colour, label=name)
-        right.plot(level, covered - level, ".-", color=colour)
-    left.set(xlabel="nominal level, %", ylabel="truths inside, %", aspect="equal", xlim=(0, 100), ylim=(0, 100))
-    right.set(xlabel="nominal level, %", ylabel="inside minus nominal, percentage points", xlim=(0, 100))
-    left.legend()
-    for axes in (left, right):
-        axes.grid(alpha=0.25, lw=0.5)
+    """Coverage of the released model's intervals less their nominal level."""
+    figure = new_figure(6.5, 4.4)
+    axes, level = figure.subplots(), 100.0 * np.array(record["levels"])
+    axes.axhspan(-2.0, 2.0, color=GREY, alpha=0.15, lw=0)
+    for name in COORDINATES:
+        axes.plot(level, 100.0 * np.array(record["coverage"][name]) - level, ".-", label=name)
+    axes.set(xlabel="nominal level, %", ylabel="truths inside minus nominal, percentage points", xlim=(0, 100))
+    axes.grid(alpha=0.25, lw=0.5)
+    axes.legend()
     return figure
 
 
-def mismatch_effect(cases: Sequence[Mapping[str, Any]], released: str, nominal: float | None) -> Figure:
+def mismatch_effect(cases: Sequence[Mapping[str, Any]], nominal: float | None) -> Figure:
     """Errors and alarms where the film, probe or chain is not as the models assume."""
-    some = [case for case in cases if case["group"] != "noise"]
-    labels = [f"{case['group']}: {case['case']}" for case in some]
+    some = {f"{case['group']}: {case['case']}": case for case in cases if case["group"] != "noise"}
     figure = new_figure(11.5, 1.9 + 0.36 * len(some))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1.0))
-    rows = [(label, case["errors"]) for label, case in zip(labels, some, strict=True) if case["errors"]]
-    names = rows[0][1]
-    for name, style in zip(names, _styles(names, released), strict=True):
-        errors = [error[name]["position_rms_mm"] for _, error in rows]
-        left.plot(errors, [label for label, _ in rows], **{**style, "ls": ""}, label=name)
-    if nominal:
-        left.axvline(nominal, color=FELT, lw=0.9, ls="--", label="as assumed")
-    bars = right.barh(labels, [case["alarms_percent"] for case in some], color=FELT, alpha=0.8, height=0.6)
+    answered = {label: case["errors"] for label, case in some.items() if case["errors"]}
+    for name in next(iter(answered.values())):
+        errors = [case[name]["position_rms_mm"] for case in answered.values()]
+        left.plot(errors, [*answered], **{**_style(name), "ls": ""}, label=name)
+    left.axvline(nominal or np.nan, color=FELT, lw=0.9, ls="--", label="as assumed")
+    bars = right.barh([*some], [case["alarms_percent"] for case in some.values()], color=FELT, alpha=0.8, height=0.6)
     right.bar_label(bars, fmt="{:g}", padding=3, fontsize=8)
     right.axvline(100.0 * FALSE_ALARMS, color=INK, lw=0.9, ls="--")
     left.set(xlabel="position error, rms, mm", xscale="log")

@@ -1,7 +1,6 @@
 """How much work a report is."""
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from isocharge.simulate.mechanics.theory import ACCURACY
 
@@ -16,8 +15,7 @@ class Settings:
         learn_from: Presses of the dataset that are used at most.
         sizes: Hidden layers of the networks.
         steps: Their optimiser steps.
-        rounds: Turns that every method has when time is taken.
-        round_ms: Length of a turn, ms.
+        seconds: Time in which single predictions of a method are timed, and the same for batches, s.
         batch: Presses in a batch.
         draws: Draws of the noise for maps and coverage of the released model.
         limited: Test presses that the Bayes limit is integrated for.
@@ -33,8 +31,7 @@ class Settings:
     learn_from: int = 200_000
     sizes: tuple[tuple[int, ...], ...] = ((16, 16), (32, 32), (64, 64, 64), (128, 128, 128))
     steps: int = 4_000
-    rounds: int = 12
-    round_ms: float = 8.0
+    seconds: float = 0.1
     batch: int = 4096
     draws: int = 20
     limited: int = 4096
@@ -44,20 +41,13 @@ class Settings:
     seed: int = 0
     quick: bool = False
 
-    def to_dict(self) -> dict[str, Any]:
-        """The settings as `report.json` has them."""
-        table = asdict(self)
-        table["worlds"] = table.pop("mismatch_cases")
-        return table
-
 
 QUICK = Settings(
     presses=512,
     learn_from=3000,
     sizes=((16, 16),),
     steps=150,
-    rounds=2,
-    round_ms=1.0,
+    seconds=0.01,
     batch=512,
     draws=4,
     limited=128,

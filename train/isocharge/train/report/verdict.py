@@ -19,40 +19,37 @@ def verdict(records: Sequence[MethodRecord]) -> dict[str, Any]:
         "sentences", and "both": for latency and throughput the labels of methods that are faster and more accurate.
     """
     released, others = records[0], [record for record in records[1:] if record.competes]
-    both = {plot: [record.label for record in others if _beats(record, released, plot)] for plot in WORDS}
-    rivals = [record for record in others if record.kind != "network"]
-    networks = [record for record in others if record.kind == "network"]
-    groups = [(rivals, "other methods"), (networks, "networks that give the contact alone")]
-    sentences = [_sentence(plot, released, group, words) for group, words in groups if group for plot in WORDS]
+    both = {
+        plot: [
+            record.label
+            for record in others
+            if record.error_mm < released.error_mm and _speed(record, released, plot) > 1.0
+        ]
+        for plot in WORDS
+    }
+    groups = {
+        "other methods": [record for record in others if record.kind != "network"],
+        "networks that give the contact alone": [record for record in others if record.kind == "network"],
+    }
+    sentences = [_sentence(plot, released, group, kind) for kind, group in groups.items() if group for plot in WORDS]
     return {"both": both, "sentences": sentences}
 
 
-def _faster(record: MethodRecord, released: MethodRecord, plot: Plot) -> bool:
-    return COST_SIGNS[plot] * record.cost(plot) < COST_SIGNS[plot] * released.cost(plot)
-
-
-def _beats(record: MethodRecord, released: MethodRecord, plot: Plot) -> bool:
-    return record.error_mm < released.error_mm and _faster(record, released, plot)
+def _speed(record: MethodRecord, released: MethodRecord, plot: Plot) -> float:
+    """How many times as fast as the released model a method is."""
+    return float((released.cost(plot) / record.cost(plot)) ** COST_SIGNS[plot])
 
 
 def _sentence(plot: Plot, released: MethodRecord, others: Sequence[MethodRecord], kind: str) -> str:
-    both = [record for record in others if _beats(record, released, plot)]
-    if both:
-        listed = "; ".join(_compared(record, released, plot) for record in both)
-        count = f"{len(both)} of {len(others)} {kind}"
-        return f"In {WORDS[plot]}, both faster and more accurate than the released model: {count}. {listed}."
-    faster = [record for record in others if _faster(record, released, plot)]
+    faster = [record for record in others if _speed(record, released, plot) > 1.0]
     if not faster:
         return f"In {WORDS[plot]}, none of {len(others)} {kind} is faster than the released model."
     nearest = min(faster, key=lambda record: record.error_mm)
+    both = sum(record.error_mm < released.error_mm for record in faster)
+    error = 100.0 * (nearest.error_mm / released.error_mm - 1.0)
+    more = f"{abs(error):.2g} % {'less' if error < 0.0 else 'more'} error"
     return (
-        f"In {WORDS[plot]}, none of {len(others)} {kind} is both faster and more accurate than the released model. Of "
-        f"those that are faster the most accurate is {_compared(nearest, released, plot)}."
+        f"In {WORDS[plot]}, {both or 'none'} of {len(others)} {kind} {'are' if both > 1 else 'is'} both faster and "
+        f"more accurate than the released model. Of those that are faster the most accurate is {nearest.label} "
+        f"({_speed(nearest, released, plot):.3g} times as fast, {more})."
     )
-
-
-def _compared(record: MethodRecord, released: MethodRecord, plot: Plot) -> str:
-    ratio = (released.cost(plot) / record.cost(plot)) ** COST_SIGNS[plot]
-    error = 100.0 * (record.error_mm / released.error_mm - 1.0)
-    more = f"{abs(error):.2g} % {'less' if error < 0.0 else 'more'} error" if error else "the same error"
-    return f"{record.label} ({ratio:.3g} times as fast, {more})"
