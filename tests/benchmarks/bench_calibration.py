@@ -5,7 +5,8 @@
 
 Films are drawn from the prior of the network for all films; presses are known to 0.1 mm and 1 %, charges have
 `reference` noise. Their truth comes from forward maps that are solved for each film, not from the family that the
-calibration uses, for the `--fine` films on which the slow alternatives run as well; the others take the family's.
+calibration uses, for the `--fine` films on which Gauss-Newton on the calibrated map runs as well; the others take the
+family's.
 Writes calibration.json and calibration.png.
 """
 
@@ -30,21 +31,12 @@ from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.baselines.gauss_newton import GaussNewton
 from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
 from isocharge.train.data.presses import draw_contacts
-from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.fit import likelihood_loss, start_loss, with_fresh_noise
-from isocharge.train.training.network import Features, InverseNetwork
 
 SENSORS = ("four-25um-biaxial", "three-25um-biaxial", "four-25um-uniaxial")
 COUNTS = (1, 3, 5, 8, 15, 30)
 POSITION_MM, FORCE = 0.1, 0.01
 CONTACTS = 1000
 """Fresh contacts on which errors are measured, for each film."""
-
-POOLED_FILMS, POOLED_PRESSES, POOLED_STEPS = 4000, 16, 5000
-"""What the network without context learns from, and for how long."""
-
-TUNING_STEPS = 300
-"""Steps of fine-tuning on the presses alone."""
 
 
 @lru_cache(maxsize=4)
@@ -81,83 +73,6 @@ def gains_only(problem: CalibrationProblem, presses: MeasuredPresses) -> np.ndar
     ratio = np.maximum(presses.charge_pC, 1.0) / np.maximum(expected, 1.0)
     parameters[-expected.shape[1] :] += np.median(np.log(ratio), axis=0)
     return parameters
-
-
-def fine_tuned(problem: CalibrationProblem, presses: MeasuredPresses, charge: np.ndarray, seed: int) -> np.ndarray:
-    """Contacts by the network of the described film, all of its weights tuned on the presses alone."""
-    network = problem.films.fold(problem.before.parameters)
-    layers = network.layers
-    weights = [torch.tensor(part) for layer in (*layers.hidden, layers.last) for part in layer]
-    weights.append(torch.tensor(layers.skip))
-    for weight in weights:
-        weight.requires_grad_(True)
-
-    def answers(charges: torch.Tensor) -> torch.Tensor:
-        logs = torch.log(charges.clamp(1.0, 1e6) / torch.tensor(network.typical))
-        value = logs
-        for number in range(len(layers.hidden)):
-            value = torch.tanh(value @ weights[2 * number] + weights[2 * number + 1])
-        return (value @ weights[-3] + weights[-2] + logs @ weights[-1])[:, :3]
-
-    random = torch.Generator().manual_seed(seed)
-    measured, contact = torch.tensor(presses.charge_pC), torch.tensor(presses.contact)
-    target = torch.stack([contact[:, 0], contact[:, 1], torch.log(contact[:, 2])], dim=1)
-    optimiser, scale = torch.optim.Adam(weights, lr=1e-3), torch.tensor(problem.domain.scale)
-    for _ in range(TUNING_STEPS):
-        noise = torch.hypot(torch.tensor(1.0).double(), 0.002 * measured)
-        noisy = measured + noise * torch.randn(measured.shape, generator=random, dtype=torch.float64)
-        loss = (((answers(noisy) - target) / scale) ** 2).mean()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    with torch.no_grad():
-        tuned = answers(torch.tensor(charge)).numpy()
-    return np.column_stack([tuned[:, :2], np.exp(tuned[:, 2])])
-
-
-def without_context(sensor: str) -> InverseNetwork:
-    """One network for all films that is not told the film: the mean over the films, by maximum likelihood."""
-    problem, rng = problem_of(sensor), np.random.default_rng(3)
-    parts = []
-    for parameters in problem.prior.draw(rng, POOLED_FILMS):
-        at = draw_contacts(rng, problem.domain, POOLED_PRESSES)
-        parts.append((at, problem.films.forward_map(parameters).charges(at)))
-    contact, charge = (np.concatenate(part) for part in zip(*parts, strict=True))
-    torch.manual_seed(0)
-    network = InverseNetwork(problem.domain, Features.fit(charge), (96, 96, 96), (8,))
-    charges, unit = torch.tensor(charge).float(), torch.tensor(problem.domain.to_unit(contact)).float()
-    held, warm_up = len(charges) // 10, POOLED_STEPS // 7
-
-    def loss_of(rows: torch.Tensor, step: int, random: torch.Generator) -> torch.Tensor:
-        answer = network.posterior(with_fresh_noise(charges[rows], problem.noise, random))
-        return (start_loss if step < warm_up else likelihood_loss)(*answer, unit[rows])
-
-    def loss(step: int, random: torch.Generator) -> torch.Tensor:
-        return loss_of(held + torch.randint(len(charges) - held, (1024,), generator=random), step, random)
-
-    def score() -> tuple[float, str]:
-        with torch.no_grad():
-            return loss_of(torch.arange(held), POOLED_STEPS, torch.Generator().manual_seed(5)).item(), ""
-
-    stage = TrainingStage("contact", network.contact, loss, score, POOLED_STEPS, warm_up)
-    Descent(stage, 0.005, POOLED_STEPS, 0).run()
-    return network.eval()
-
-
-def pooled_errors(job: tuple[str, int, int]) -> list[tuple[float, float]]:
-    """Errors of that network on the fresh contacts of every film."""
-    torch.set_num_threads(1)
-    sensor, first, count = job
-    problem, network = problem_of(sensor), without_context(sensor)
-    rows = []
-    for seed in range(first, first + count):
-        rng = np.random.default_rng([seed, 13])
-        at = draw_contacts(rng, problem.domain, CONTACTS)
-        film = problem.films.forward_map(problem.prior.draw(np.random.default_rng([seed, 7]), 1)[0])
-        with torch.no_grad():
-            answer = network(torch.tensor(problem.noise.add(film.charges(at), rng)).float())[0].double().numpy()
-        rows.append(errors(answer, at))
-    return rows
 
 
 def gauss_newton(problem: CalibrationProblem, parameters: np.ndarray, charge: np.ndarray) -> np.ndarray:
@@ -201,7 +116,6 @@ def study(job: tuple[str, int, bool]) -> dict[str, Any]:
             "seconds": seconds,
         }
         if fine:
-            row["fine_tuned"] = errors(fine_tuned(problem, presses[:count], test, seed), fresh)
             row["gauss_newton"] = errors(gauss_newton(problem, result.posterior.parameters, test), fresh)
         record["by_count"][count] = row
     return record
@@ -229,8 +143,7 @@ def summary(records: list[dict[str, Any]]) -> dict[str, Any]:
     }
     for count in COUNTS:
         rows = [record["by_count"][count] for record in records]
-        ratio = np.array([row["left"][0] / row["limit"][0] for row in rows])
-        force = np.array([row["left"][1] / row["limit"][1] for row in rows])
+        ratio, force = np.array([row["left"] for row in rows]).T / np.array([row["limit"] for row in rows]).T
         entry = {
             "left_mm": _rms(row["left"][0] for row in rows),
             "left_percent": _rms(row["left"][1] for row in rows),
@@ -245,7 +158,7 @@ def summary(records: list[dict[str, Any]]) -> dict[str, Any]:
             "bad": sum(row["bad"] for row in rows),
             "seconds_median": float(np.median([row["seconds"] for row in rows])),
         }
-        for method in ("gains_only", "fine_tuned", "gauss_newton"):
+        for method in ("gains_only", "gauss_newton"):
             values = [row[method] for row in rows if method in row]
             entry[method] = [_rms(value[axis] for value in values) for axis in (0, 1)] if values else None
         table[str(count)] = entry
@@ -262,15 +175,11 @@ def picture(tables: dict[str, dict[str, Any]], path: Path) -> None:
     rows = figure.subplots(2, len(tables), sharex=True, squeeze=False)
     styles = {
         "gains only": ("gains_only", "#c07a2c", "s"),
-        "network tuned on the presses alone, some films": ("fine_tuned", "#8a5aa8", "^"),
         "Gauss-Newton on the calibrated map, some films": ("gauss_newton", "#5a9a5a", "x"),
     }
     for column, (sensor, table) in enumerate(tables.items()):
         for axis, (axes, unit) in enumerate(zip(rows[:, column], ("mm", "percent"), strict=True)):
             axes.axhline(table["uncalibrated"][axis], color="#b03a3a", ls="--", label="no calibration")
-            axes.axhline(
-                table["without_context"][axis], color="#7a7a7a", ls="-.", label="one network, not told the film"
-            )
             for label, (key, colour, marker) in styles.items():
                 values = [table[str(n)][key][axis] if table[str(n)][key] else np.nan for n in COUNTS]
                 axes.plot(COUNTS, values, marker=marker, color=colour, lw=1.0, label=label)
@@ -310,8 +219,6 @@ def main() -> None:
             seeds = range(1000 * options.seed, 1000 * options.seed + options.films)
             jobs = [(sensor, seed, number < options.fine) for number, seed in enumerate(seeds)]
             tables[sensor] = summary(list(pool.map(study, jobs)))
-            pooled = pool.submit(pooled_errors, (sensor, seeds[0], options.films)).result()
-            tables[sensor]["without_context"] = [_rms(row[axis] for row in pooled) for axis in (0, 1)]
             counts = list(pool.map(covered, [(sensor, 500 + seed) for seed in range(options.coverage)]))
             inside, total = np.sum(counts, axis=0) if counts else (0, 0)
             tables[sensor]["coverage_95"] = float(inside / total) if total else None

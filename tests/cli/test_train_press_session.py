@@ -154,16 +154,19 @@ def test_a_port_that_goes_away_under_a_machine_ends_the_session():
 
 
 @pytest.fixture(scope="module")
-def film():
+def problem():
+    return CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
+
+
+@pytest.fixture(scope="module")
+def film(problem):
     """A film that a seed draws."""
-    problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
     return problem.charges.forward_map(problem.prior.draw(np.random.default_rng(3), 1)[0])
 
 
 @pytest.fixture(scope="module")
-def places():
-    problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
-    return np.array([press.contact for press in next_presses(problem, 8)])
+def places(problem):
+    return np.array([press.contact for press in next_presses(problem, 4)])
 
 
 def board(film, places, seed=0) -> Iterator[bytes]:
@@ -181,10 +184,11 @@ def board(film, places, seed=0) -> Iterator[bytes]:
 
 @pytest.fixture
 def desk(film, places, tmp_path, monkeypatch):
-    """A folder with the bytes of a board, and the list of the presses that it makes."""
+    """A folder with the bytes of a board, in two parts, and the list of the presses that it makes."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ISOCHARGE_CACHE", str(tmp_path / "cache"))
-    (tmp_path / "frames.bin").write_bytes(b"".join(board(film, places)))
+    (tmp_path / "some.bin").write_bytes(b"".join(board(film, places[:2])))
+    (tmp_path / "rest.bin").write_bytes(b"".join(board(film, places[2:], seed=1)))
     write_rows(tmp_path / "list.csv", places)
     return tmp_path
 
@@ -197,22 +201,29 @@ def write_rows(path, rows, names=()):
 CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial", "-o", "film")
 
 
-def test_eight_presses_of_a_machine_make_a_film_as_good_as_clean_presses_do(command, desk, film, places):
-    """The model's error on fresh clean charges of that film; and the same presses, clean, through the file."""
-    code, out, err = command(*CALIBRATE, "--port", "frames.bin", "--press-list", "list.csv", "--json")
+def test_presses_of_a_machine_make_a_film_as_good_as_clean_presses_do(command, desk, film, places):
+    """The port ends after two presses; the same command goes on with the third row. The model's error is on fresh clean
+    charges of that film, and the same presses, clean, go through the file."""
+    code, _, err = command(*CALIBRATE, "--port", "some.bin", "--press-list", "list.csv")
+    assert code == 2
+    assert "2 presses are in film/presses.part.csv; the same command goes on with them" in err
+    assert len(read_presses(desk / "film" / SESSION)) == 2
+    code, out, err = command(*CALIBRATE, "--port", "rest.bin", "--press-list", "list.csv", "--json")
     assert code == 0, err
+    assert "going on with 2 presses" in err
     *lines, end = map(json.loads, out.splitlines())
-    assert [line["press"] for line in lines] == list(range(1, 9))
+    assert [line["press"] for line in lines] == [3, 4]
     clean = film.charges(places)
-    taken = np.array([[line["charge_pC"][name] for name in NAMES] for line in lines])
-    assert (np.abs(taken - clean) < 5 * np.hypot(1.0, 0.002 * clean) * np.sqrt(1 / 90 + 1 / 50)).all()
+    taken = read_presses(desk / "film/1/presses.csv", NAMES)
+    assert [[line["charge_pC"][name] for name in NAMES] for line in lines] == taken.charge_pC[2:].tolist()
+    assert (np.abs(taken.charge_pC - clean) < 5 * np.hypot(1.0, 0.002 * clean) * np.sqrt(1 / 90 + 1 / 50)).all()
     assert lines[-1]["error_left"] == end["error_left"]
     assert not (desk / "film" / SESSION).exists()
-    np.testing.assert_array_equal(read_presses(desk / "film/1/presses.csv", NAMES).contact, places)
+    np.testing.assert_array_equal(taken.contact, places)
     write_rows(desk / "clean.csv", np.column_stack([places, clean]), NAMES)
     assert command("train", "calibrate", "clean.csv", "--sensor", "four-25um-biaxial", "-o", "clean")[0] == 0
     errors = {name: error_of(desk / name, film) for name in ("film", "clean")}
-    assert errors["film"] < 1.5 * errors["clean"] + 0.01, errors
+    assert errors["film"] < 1.5 * errors["clean"] + 0.02, errors
 
 
 def error_of(folder, film):
@@ -222,33 +233,17 @@ def error_of(folder, film):
     return float(np.sqrt(((answer.x_mm - contact[:, 0]) ** 2 + (answer.y_mm - contact[:, 1]) ** 2).mean()))
 
 
-def test_a_session_that_ends_early_goes_on_with_the_same_command(command, desk, film, places):
-    """The port ends after three presses: they are on disk; a machine then goes on with the fourth row."""
-    (desk / "some.bin").write_bytes(b"".join(board(film, places[:3])))
-    (desk / "rest.bin").write_bytes(b"".join(board(film, places[3:5], seed=1)))
-    write_rows(desk / "five.csv", places[:5])
-    code, _, err = command(*CALIBRATE, "--port", "some.bin", "--press-list", "five.csv")
-    assert code == 2
-    assert "3 presses are in film/presses.part.csv; the same command goes on with them" in err
-    assert len(read_presses(desk / "film" / SESSION)) == 3
-    code, _, err = command(*CALIBRATE, "--port", "rest.bin", "--press-list", "five.csv")
-    assert code == 0, err
-    assert "going on with 3 presses" in err
-    assert "4. 1.65 N" in err
-    np.testing.assert_array_equal(read_presses(desk / "film/1/presses.csv").contact, places[:5])
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ([], "expected PRESSES.csv, or --next K"),
         (["--next", "2"], "nothing is calibrated without PRESSES.csv"),
         (["list.csv", "--probe", "triangle:4.0"], "expected a round one"),
-        (["--port", "frames.bin", "list.csv"], "leave out PRESSES.csv, --next"),
+        (["--port", "some.bin", "list.csv"], "leave out PRESSES.csv, --next"),
         (["--press-list", "list.csv"], "belong to --port"),
-        (["--port", "frames.bin", "--press-list", "far.csv"], "far.csv, press 2: expected a press within 9"),
-        (["--port", "frames.bin", "--press-list", "half.csv"], "half.csv, line 2: expected both x_mm and y_mm"),
-        (["--port", "frames.bin", "--press-list", "nothing.csv"], "cannot be read"),
+        (["--port", "some.bin", "--press-list", "far.csv"], "far.csv, press 2: expected a press within 9"),
+        (["--port", "some.bin", "--press-list", "half.csv"], "half.csv, line 2: expected both x_mm and y_mm"),
+        (["--port", "some.bin", "--press-list", "nothing.csv"], "cannot be read"),
         (["--port", "noise.bin", "--press-list", "list.csv"], "no intact frame"),
     ],
 )

@@ -10,7 +10,7 @@ from isocharge.common.errors import DatasetError, ModelError, OutputExists
 from isocharge.serve import find_model
 from isocharge.simulate import Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
-from isocharge.train.report import QUICK, build, write_report
+from isocharge.train.report import QUICK, build, case, write_report
 from isocharge.train.report.methods import fit_all
 
 NAME = "three-25um-biaxial"
@@ -36,8 +36,11 @@ METHODS = {
 
 
 @pytest.fixture(scope="module")
-def report(dataset, tmp_path_factory):
-    """(folder, section of the record, page) of a report that was killed and went on with what it had solved."""
+def report(dataset, film, tmp_path_factory):
+    """(folder, section of the record, page) of a report that was killed and went on with the limits that it had.
+
+    The film is solved already.
+    """
     folder, parts = tmp_path_factory.mktemp("report") / "out", []
 
     def go_on(settings=SMALL):
@@ -53,13 +56,14 @@ def report(dataset, tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build, "fit_all", fit)
+        patch.setattr(case, "solve_maps", lambda *_, **__: (film,))
         with pytest.raises(KeyboardInterrupt):
             go_on()
         with pytest.raises(OutputExists, match="other settings"):
             go_on(replace(SMALL, seed=1))
         record = go_on()
     assert parts[0]
-    assert parts[1] == parts[0]  # nothing was solved again
+    assert parts[1] == parts[0]  # nothing was computed again
     assert json.loads((folder / "report.json").read_text("utf-8")) == json.loads(json.dumps(record))
     (section,) = record["datasets"]
     return folder, section, (folder / "report.md").read_text("utf-8")
@@ -121,14 +125,14 @@ def test_what_a_report_cannot_judge_is_refused(dataset, tmp_path):
     charge[17, 1] = np.nan
     stronger = replace(dataset, samples=replace(samples, force_N=2.0 * samples.force_N), manifest=solver)
     one_place = replace(dataset, samples=replace(samples, x_mm=np.ones(count), y_mm=np.ones(count)))
-    for case, error, message in [
+    for wrong, error, message in [
         (replace(dataset, sensor=load_sensor("three-25um-uniaxial")), ModelError, "with another piezo"),
         (stronger, ModelError, r"knows forces from 0.05 to 2 N, the dataset reaches from 0.1"),
         (one_place, DatasetError, f"50 positions, got {SMALL.learn_from} at 1"),
         (replace(dataset, samples=replace(samples, charge_pC=charge)), DatasetError, "sample 17"),
     ]:
         with pytest.raises(error, match=message):
-            write_report(tmp_path / "out", [(case, model)], SMALL)
+            write_report(tmp_path / "out", [(wrong, model)], SMALL)
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(OutputExists):
         write_report(tmp_path, [(dataset, model)], SMALL)

@@ -1,9 +1,12 @@
 """A film with a systematic error that no physics has, and presses on it."""
 
 import numpy as np
+import pytest
 
 from isocharge.serve import MeasuredPresses
+from isocharge.simulate import Circle, load_sensor
 from isocharge.simulate.forward.charge_map import Domain
+from isocharge.train import CalibrationProblem
 from isocharge.train.data.presses import draw_contacts
 
 DOMAIN = Domain(7.5, (0.06, 1.9))
@@ -25,3 +28,14 @@ def measured(truth, count, share=1.0, seed=3):
     contact[:, 2] *= np.exp(0.005 * rng.standard_normal(count))
     stds = np.full(count, 0.05), np.full(count, 0.005)
     return MeasuredPresses(contact, charge, *stds, truth.electrodes, tuple(range(2, count + 2)))
+
+
+@pytest.fixture(scope="session")
+def problem():
+    return CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
+
+
+@pytest.fixture(scope="session")
+def truth(problem):
+    """The forward map of a film that nobody described, one of those that a calibration knows."""
+    return problem.charges.forward_map(problem.prior.draw(np.random.default_rng(0), 1)[0])
