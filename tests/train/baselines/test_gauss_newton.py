@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 from tests.train.baselines.conftest import DOMAIN
 
-from isocharge.simulate import ChargeSpline, FunctionMap, noise_model
+from isocharge.simulate import FunctionMap, noise_model
 from isocharge.train.baselines.gauss_newton import GaussNewton
 from isocharge.train.baselines.triangulation import Triangulate
 from isocharge.train.data.presses import LabelledPresses, position_error
@@ -37,14 +37,14 @@ def scipy_cost(known, charge, start):
 
 
 def test_the_same_minimum_as_scipy_finds(search, known):
-    presses = known.presses(60, 7)
+    presses = known.presses(30, 7)
     charge = presses.noisy(NOISE, 8)
     expected = [scipy_cost(known, row[None], start) for row, start in zip(charge, presses.contact, strict=True)]
     np.testing.assert_allclose(cost(known, charge, search.predict(charge)), expected, rtol=1e-3, atol=1e-3)
 
 
 def test_the_same_minimum_on_the_edge(search, known):
-    contact = known.presses(40, 11).contact
+    contact = known.presses(20, 11).contact
     contact[:, :2] *= (8.0 * 1.02 / np.hypot(contact[:, 0], contact[:, 1]))[:, None]
     contact[::3, 2] = 2.05
     charge = known.charges(contact)
@@ -71,8 +71,8 @@ def test_its_own_series_answers_as_the_map_itself(search, known, task):
     assert np.median(position_error(series.predict(charge), search.predict(charge))) < 0.002
 
 
-def test_triangulation_finds_clean_presses(dataset, film):
-    spline, presses = ChargeSpline.of(film), LabelledPresses.of(dataset)[np.arange(60)]
+def test_triangulation_finds_clean_presses(dataset, spline):
+    presses = LabelledPresses.of(dataset)[np.arange(20)]
     for given in (False, True):
         method = Triangulate(spline, given_force=given).fit(presses.charge, presses.contact)
         inputs = np.column_stack([presses.charge, presses.contact[:, 2]]) if given else presses.charge

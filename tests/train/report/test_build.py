@@ -36,7 +36,7 @@ METHODS = {
 
 
 @pytest.fixture(scope="module")
-def report(dataset, film, tmp_path_factory):
+def report(dataset, film, spline, tmp_path_factory):
     """(folder, section of the record, page) of a report that was killed and went on with the limits that it had.
 
     The film is solved already.
@@ -57,6 +57,7 @@ def report(dataset, film, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build, "fit_all", fit)
         patch.setattr(case, "solve_maps", lambda *_, **__: (film,))
+        patch.setattr(build.ChargeSpline, "of", lambda _: spline)
         with pytest.raises(KeyboardInterrupt):
             go_on()
         with pytest.raises(OutputExists, match="other settings"):
