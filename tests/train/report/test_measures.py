@@ -64,7 +64,7 @@ def test_true_deviations_cover_their_level():
 
 def method(name, kind, error, p50, *, per_second=1e5, given=False, answered=1.0):
     errors = Errors(error, error, error, 1.0, 1.0, answered)
-    return MethodRecord(name, "NumPy", kind, "", given, errors, None, None, p50, p50, per_second, 1, 0.0)
+    return MethodRecord(name, "NumPy", kind, "", given, errors, None, p50, p50, per_second, 1, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -7,18 +7,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import onnx
 import onnxruntime as ort
 from onnx.utils import Extractor
-from sklearn.base import BaseEstimator, RegressorMixin
 
 from isocharge.common.arrays import Array
 from isocharge.serve import Predictor
 from isocharge.serve.model.session import INPUT, open_session
 from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.train.baselines.rival import GivenMethod
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 from isocharge.train.model_release.export import GraphBuilder, add_layers, make_model
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
@@ -30,7 +30,7 @@ RELEASED = "released network"
 """Name of the released model among the methods."""
 
 
-class OnnxContact(BaseEstimator, RegressorMixin):  # type: ignore[misc]
+class OnnxContact(GivenMethod):
     """A graph with the input `charge_pC` and the output `contact` in ONNX Runtime, as `Predictor` runs it.
 
     Attributes:
@@ -39,11 +39,6 @@ class OnnxContact(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
     def __init__(self, graph: bytes) -> None:
         self.graph = graph
-
-    def fit(self, charge: Array, contact: Array) -> "OnnxContact":
-        """It is fitted already."""
-        del charge, contact
-        return self
 
     def predict(self, charge: Array) -> Array:
         """Contacts, shape (n, 3)."""
@@ -87,7 +82,7 @@ class TrainedNetwork(OnnxContact):
     def __init__(self, data: TrainingData, hidden: tuple[int, ...], steps: int, noise: NoiseModel, seed: int) -> None:
         self.data, self.hidden, self.steps, self.noise, self.seed = data, hidden, steps, noise, seed
 
-    def fit(self, charge: Array, contact: Array) -> "TrainedNetwork":
+    def fit(self, charge: Array, contact: Array) -> Self:
         """Train on clean presses."""
         training = TrainingConfig(
             steps=self.steps, misfit_steps=1, misfit_charges=1000, hold_out=0.05, seed=self.seed, noise=self.noise
@@ -98,7 +93,7 @@ class TrainedNetwork(OnnxContact):
         return self
 
 
-class ReleasedModel(BaseEstimator, RegressorMixin):  # type: ignore[misc]
+class ReleasedModel(GivenMethod):
     """A model folder through `Predictor`: contact, standard deviations and misfit.
 
     Attributes:
@@ -107,11 +102,6 @@ class ReleasedModel(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-
-    def fit(self, charge: Array, contact: Array) -> "ReleasedModel":
-        """It is as released."""
-        del charge, contact
-        return self
 
     def predict(self, charge: Array) -> Array:
         """Contacts, shape (n, 3)."""

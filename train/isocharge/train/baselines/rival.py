@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
-from sklearn.base import clone
+from sklearn.base import BaseEstimator, RegressorMixin, clone
 from sklearn.model_selection import ParameterGrid
 
 from isocharge.common.arrays import Array
@@ -19,6 +19,15 @@ Kind = Literal["paper", "learnt", "fitted map", "network"]
 
 FIRST_COPY, VALIDATION_COPY = 1000, 999
 """Seeds of the noise, relative to the task's, on training and validation presses."""
+
+
+class GivenMethod(BaseEstimator, RegressorMixin):  # type: ignore[misc]
+    """A method that learns nothing from presses."""
+
+    def fit(self, charge: Array, contact: Array) -> Self:
+        """It is as it was given."""
+        del charge, contact
+        return self
 
 
 class Regressor(Protocol):
@@ -95,11 +104,6 @@ class Rival:
     given_force: bool = False
     choice: str = ""
 
-    @property
-    def label(self) -> str:
-        """Name and what computes it."""
-        return f"{self.name} ({self.computed_by})"
-
     def inputs(self, charge: Array, force: Array) -> Array:
         """What it is given of presses, shape (n, n_electrode) or one column more."""
         return np.column_stack([charge, force]) if self.given_force else charge
@@ -119,14 +123,15 @@ class Rival:
             answers = regressor.predict(self.inputs(task.validation_charge, task.validation.contact[:, 2]))
             errors.append(rms(position_error(answers, task.validation.contact)))
         best = int(np.argmin(errors))
-        words = [described(name, value) for name, value in tried[best].items()]
-        words += [f"{len(presses)} {'noisy' if self.copies else 'clean'} presses"]
-        words += [f"best of {len(tried)} by validation ({errors[best]:.3f} mm rms)"] if len(tried) > 1 else []
-        return replace(self, regressor=fitted[best], choice=self.choice or ", ".join(words))
+        chosen = [*map(described, tried[best].items()), f"{len(presses)} {'noisy' if self.copies else 'clean'} presses"]
+        if len(tried) > 1:
+            chosen.append(f"best of {len(tried)} by validation ({errors[best]:.3f} mm rms)")
+        return replace(self, regressor=fitted[best], choice=self.choice or ", ".join(chosen))
 
 
-def described(parameter: str, value: object) -> str:
-    """A parameter for people; factors of axes by the names of the axes."""
+def described(parameter: tuple[str, object]) -> str:
+    """A parameter, name and value, for people; factors of axes by the names of the axes."""
+    name, value = parameter
     if isinstance(value, Mapping):
         return ", ".join(f"{axis} axis x {factor:g}" for axis, factor in value.items())
-    return f"{parameter.rpartition('__')[2]} {value:g}" if isinstance(value, int | float) else f"{parameter} {value}"
+    return f"{name.rpartition('__')[2]} {value:g}" if isinstance(value, int | float) else f"{name} {value}"

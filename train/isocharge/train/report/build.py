@@ -189,13 +189,9 @@ class _Subject:
             "methods": records,
             "verdict": verdict(records),
             "by_force": maps.by_force(case.domain, test.contact, lines, limits.cramer_rao.position),
-            "worst_regions": maps.worst_regions(
-                case.domain, draws, limits.bayes, fitted[RELEASED].contact, test.contact
-            ),
             "calibration": maps.calibration(case.domain, draws),
             "alarm_threshold": rounded(threshold),
             "cases": different,
-            "without_one": effects.without_one_electrode(self.task, case, clean),
         }
         return section, _drawings(section, case, draws)
 

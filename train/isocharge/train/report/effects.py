@@ -11,8 +11,7 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import IsochargeError
 from isocharge.simulate import NoiseModel, parse_probe
 from isocharge.train.baselines.networks import ReleasedModel
-from isocharge.train.baselines.rival import FittingTask, Rival
-from isocharge.train.baselines.rivals import gauss_newton, polynomial_ridge
+from isocharge.train.baselines.rival import Rival
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.model_release.evaluate import about_1_N, alarm_threshold
 from isocharge.train.report.case import EvaluationCase, press_on
@@ -141,22 +140,3 @@ def threshold_of(released: ReleasedModel, clean: LabelledPresses, case: Evaluati
     """The misfit that 1 % of good test presses exceed."""
     seeds = range(case.seed + NOISE_SEED + 1, case.seed + NOISE_SEED + 1 + draws)
     return alarm_threshold(np.concatenate([released.answer(clean.noisy(case.noise, seed))[2] for seed in seeds]))
-
-
-def without_one_electrode(task: FittingTask, case: EvaluationCase, clean: LabelledPresses) -> list[dict[str, Any]]:
-    """A known dead electrode: methods fitted again to the charges that remain. Empty where fewer than three remain."""
-    names, records = case.sensor.electrode_names, []
-    if len(names) < 4:
-        return []
-    noisy = clean.noisy(case.noise, case.seed + NOISE_SEED)
-    for number, name in enumerate(names):
-        train, validation = (
-            replace(presses, charge=np.delete(presses.charge, number, axis=1))
-            for presses in (task.train, task.validation)
-        )
-        fewer = replace(task, train=train, validation=validation)
-        fitted = [rival.fit(fewer) for rival in (polynomial_ridge(fewer), gauss_newton(fewer))]
-        charge = np.delete(noisy, number, axis=1)
-        errors = {rival.name: Errors.of(rival.regressor.predict(charge), clean.contact) for rival in fitted}
-        records.append({"without": name, "errors": {rival: error.to_dict() for rival, error in errors.items()}})
-    return records

@@ -74,7 +74,6 @@ class MethodRecord:
         choice: Its hyperparameters and how they were chosen.
         force_given: Whether it was given the true force.
         errors: On all test presses.
-        errors_in_band: On those within the paper's linear band; None if there are none.
         over_bayes: Position error over the Bayes limit's on the same presses; None where there is no limit.
         p50_us, p99_us: Median and 99th percentile of the duration of one prediction.
         per_second: Predictions per second in batches.
@@ -89,7 +88,6 @@ class MethodRecord:
     choice: str
     force_given: bool
     errors: Errors
-    errors_in_band: Errors | None
     over_bayes: float | None
     p50_us: float
     p99_us: float

@@ -16,7 +16,6 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.common.progress import track
 from isocharge.serve.benchmark import Contender, Timing, take_turns
-from isocharge.train.baselines.linear_band import BAND
 from isocharge.train.baselines.networks import OnnxContact, ReleasedModel
 from isocharge.train.baselines.rival import FittingTask, Rival
 from isocharge.train.data.presses import LabelledPresses
@@ -124,7 +123,7 @@ def _batch(rival: Rival, test: LabelledPresses, count: int) -> Contender:
 
 
 def _record(method: Method, truth: Array, bayes: Array | None, one: Timing, many: Timing) -> MethodRecord:
-    rival, figures, band = method.rival, Errors.of(method.contact, truth), truth[:, 2] <= BAND
+    rival, figures = method.rival, Errors.of(method.contact, truth)
     if rival.given_force:
         figures = replace(figures, force_rms_percent=None, force_median_percent=None)
     return MethodRecord(
@@ -134,7 +133,6 @@ def _record(method: Method, truth: Array, bayes: Array | None, one: Timing, many
         choice=rival.choice,
         force_given=rival.given_force,
         errors=figures,
-        errors_in_band=Errors.of(method.contact[band], truth[band]) if band.any() else None,
         over_bayes=None if bayes is None else over_bayes(method.contact, bayes, truth),
         p50_us=one.p50_us,
         p99_us=one.p99_us,

@@ -6,9 +6,6 @@ The record is that of `report.json`, but for the methods, which are `MethodRecor
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from isocharge.train.baselines.linear_band import BAND
-from isocharge.train.baselines.networks import RELEASED
-from isocharge.train.baselines.rivals import LINEAR_BAND
 from isocharge.train.model_release.evaluate import FALSE_ALARMS
 from isocharge.train.report.effects import FARTHEST, GAIN_OFF, PRETENSION_OFF
 from isocharge.train.report.measures import MethodRecord
@@ -104,8 +101,7 @@ def _methods(section: Section) -> Iterator[str]:
     yield table(head, rows, left=2)
     yield (
         "Bold: nothing is both faster (one prediction) and more accurate. *Force given*: by the true force, which no "
-        "sensor knows. A share answered below 100 %: errors are of those presses only. Within the band up to "
-        f"{BAND:g} N, as the paper has it: {_band(records)}."
+        "sensor knows. A share answered below 100 %: errors are of those presses only."
     )
     yield from (_picture(section, name) for name in ("latency", "throughput", "memory"))
 
@@ -126,29 +122,10 @@ def _cells(record: MethodRecord) -> list[str]:
     return [f"**{cell}**" if cell else "" for cell in cells] if "latency" in record.best_on else cells
 
 
-def _band(records: Sequence[MethodRecord]) -> str:
-    """Errors of the linear band and of the released network where the band holds."""
-    both = [(record.name, record.errors_in_band) for record in records if record.name in (LINEAR_BAND, RELEASED)]
-    parts = [
-        f"{name} {errors.position_rms_mm:.3g} mm and {errors.force_rms_percent:.3g} %"
-        for name, errors in both
-        if errors and errors.position_rms_mm
-    ]
-    return "; ".join(parts) or "no presses"
-
-
 def _where(section: Section) -> Iterator[str]:
     yield "### Where the errors are"
     yield _picture(section, "maps")
     yield _picture(section, "force")
-    yield "Worst regions of the released model:"
-    ranges, figures = ("radius_mm", "angle_deg", "force_N"), ("position_rms_mm", "over_bayes", "force_rms_percent")
-    rows = [
-        [*(" to ".join(map(_number, region[k])) for k in ranges), *(_number(region[k]) for k in figures)]
-        for region in section["worst_regions"]
-    ]
-    head = ["from the centre, mm", "direction, deg", "force, N", "position rms, mm", "over Bayes", "force rms, %"]
-    yield table(head, rows, left=0)
 
 
 def _effects(section: Section) -> Iterator[str]:
@@ -164,21 +141,6 @@ def _effects(section: Section) -> Iterator[str]:
         f"Gains: every electrode off by {100 * GAIN_OFF:g} % rms, another draw for every press. Pretension: "
         f"{PRETENSION_OFF:g} MPa more than the models assume. Force and intervals are the released model's."
     )
-    records = section["without_one"]
-    if not records:
-        yield (
-            "A dead electrode leaves two charges of three, which cannot determine x, y and force: nothing is to be "
-            "fitted to them. What the model makes of it is in the table above."
-        )
-        return
-    yield "A dead electrode that is known to be dead leaves three charges; methods fitted again to those:"
-    head = [f"{name}: {figure}" for name in records[0]["errors"] for figure in ("position rms, mm", "force rms, %")]
-    figures = ("position_rms_mm", "force_rms_percent")
-    rows = [
-        [record["without"], *(_number(errors[key]) for errors in record["errors"].values() for key in figures)]
-        for record in records
-    ]
-    yield table(["without", *head], rows)
 
 
 def _case_cells(case: Mapping[str, Any], names: Sequence[str]) -> list[str]:
