@@ -109,13 +109,14 @@ def fit_correction(residuals: Residuals, seed: int = 0) -> Correction:
     reach = float(np.hypot(residuals.contact[:, 0], residuals.contact[:, 1]).max())
     domain = Domain(reach, (float(force.min()), float(force.max())))
     part = np.random.default_rng(seed).permutation(np.arange(len(residuals)) % FOLDS)
+    without = residuals.chi2(np.zeros_like(residuals.log_ratio))
     tried = [
         (score.sum(), degree, std, score)
         for degree in DEGREES
         for std, score in _scores(residuals, part, domain, degree)
     ]
     _, degree, std, score = min(tried, key=lambda entry: entry[:3])
-    gain = residuals.chi2(np.zeros_like(residuals.log_ratio)) - score
+    gain = without - score
     if gain.mean() <= CHANCE * gain.std() / np.sqrt(len(gain)):
         return Correction(domain, 1, 0.0, np.zeros((len(_degrees(1)), residuals.log_ratio.shape[1])), 0.0)
     normal, moment = _equations(residuals, domain, degree)
@@ -152,20 +153,22 @@ def _equations(residuals: Residuals, domain: Domain, degree: int) -> tuple[Array
 
 def _solve(normal: Array, moment: Array, degree: int, std: float) -> Array:
     """Coefficients, shape (n_term, n_electrode)."""
-    solution = cho_solve(cho_factor(normal + _prior(len(moment), degree, std)), moment)
-    return np.reshape(solution, (len(_degrees(degree)), -1))
+    solution: Array = cho_solve(cho_factor(normal + _prior(len(moment), degree, std)), moment)
+    return solution.reshape(len(_degrees(degree)), -1)
 
 
 def _prior(size: int, degree: int, std: float) -> Array:
     """Inverse covariance of the coefficients, shape (size, size)."""
     widths = std * FADING ** _degrees(degree).sum(axis=1)
-    return np.diag(np.repeat(widths**-2.0, size // len(widths)))
+    inverse: Array = np.diag(np.repeat(widths**-2.0, size // len(widths)))
+    return inverse
 
 
 def _degrees(degree: int) -> Integers:
     """Degrees of the terms in x, y and ln F, shape (n_term, 3)."""
     grid = np.indices((degree + 1, degree + 1, min(degree, FORCE_DEGREE) + 1)).reshape(3, -1).T
-    return np.asarray(grid[grid.sum(axis=1) <= degree])
+    chosen: Integers = grid[grid.sum(axis=1) <= degree]
+    return chosen
 
 
 def _terms(contact: Array, domain: Domain, degree: int) -> Array:

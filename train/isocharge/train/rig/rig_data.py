@@ -19,7 +19,6 @@ from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
-from isocharge.train.calibration.diagnosis import outside
 from isocharge.train.calibration.film_charges import CONTACT_STEPS
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.measured import check_enough, complete, held_out, presses_sha256
@@ -112,12 +111,13 @@ def _domain(rig: Rig, problem: CalibrationProblem | None) -> Domain:
 
 def _usable(rig: Rig, domain: Domain) -> MeasuredPresses:
     """Complete presses with positive charges within the domain; what is left out is said."""
-    presses, (low, high) = rig.presses.of_electrodes(rig.sensor.electrode_names, rig.sensor.name), domain.force_range
-    rules = {
+    presses = rig.presses.of_electrodes(rig.sensor.electrode_names, rig.sensor.name)
+    (x, y, force), (low, high) = presses.contact.T, domain.force_range
+    rules: dict[str, Booleans] = {
         "with an unknown place, force or charge": ~complete(presses),
-        "with a charge that is not positive": (presses.charge_pC <= 0.0).any(axis=1),
+        "with a charge that is not positive": np.asarray((presses.charge_pC <= 0.0).any(axis=1)),
         f"beyond {domain.radius:g} mm from the centre, or outside {low:.3g} to {high:.3g} N": (
-            outside(presses.contact, domain)
+            np.asarray((np.hypot(x, y) > domain.radius) | (force < low) | (force > high))
         ),
     }
     out, reasons = np.zeros(len(presses), dtype=np.bool_), []

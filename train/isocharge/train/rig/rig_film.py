@@ -117,11 +117,13 @@ def corrected_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Do
     residuals = residuals_of(presses, forward_map, noise)
     correction = fit_correction(residuals)
     chi2 = residuals.chi2(correction.log_factor(presses.contact))
-    good = chi2 <= GROSS * np.median(chi2)
-    if not good.all():
-        lines = list(presses[~good].lines[:10])
-        _log.warning("%d presses are left out, which are nothing like the others (lines %s)", (~good).sum(), lines)
-        residuals = residuals[good]
+    gross = chi2 > GROSS * np.median(chi2)
+    if gross.any():
+        count, lines = gross.sum(), list(presses[gross].lines[:10])
+        _log.warning(
+            "%d presses are left out, which are nothing like the others (lines %s); look at them", count, lines
+        )
+        residuals = residuals[~gross]
         correction = fit_correction(residuals)
     total = residuals.chi2(correction.log_factor(residuals.contact)).sum()
     freedom = max(residuals.log_ratio.size - correction.freedom, 1.0)
