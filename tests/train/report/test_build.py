@@ -13,6 +13,8 @@ from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train.report import QUICK, build, case, write_report
 from isocharge.train.report.methods import fit_all
 
+pytestmark = pytest.mark.timeout(900)  # every method and every picture in one fixture
+
 NAME = "three-25um-biaxial"
 SMALL = replace(QUICK, presses=128, learn_from=1500, steps=30, batch=64, seconds=1e-3, draws=2, limited=64, shapes=())
 PICTURES = {"latency", "throughput", "memory", "maps", "force", "calibration", "noise", "effects"}
