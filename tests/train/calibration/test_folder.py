@@ -12,7 +12,6 @@ from isocharge.serve import Predictor, load_model, read_presses, write_presses
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, read_earlier, write_calibration
 from isocharge.train.data.presses import draw_contacts
-from kept import kept
 
 CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial")
 
@@ -20,7 +19,7 @@ CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial")
 @pytest.fixture(scope="module")
 def film(tmp_path_factory, problem):
     """A film, presses on it, and the folder of its calibration."""
-    truth, presses = rig(problem, 6, seed=31)
+    truth, presses = rig(problem, 10, seed=31)
     result = calibrate(presses, problem)
     folder = tmp_path_factory.mktemp("films") / "mine"
     write_calibration(result, folder, "isocharge train calibrate ...")
@@ -31,7 +30,7 @@ def film(tmp_path_factory, problem):
 def test_the_model_is_right_about_the_film(film, problem):
     """On fresh charges, solved for this film and not by the family, with the model that a user opens."""
     truth, result, folder = film
-    forward_map, rng = kept(ForwardMap.build, *problem.prior.film(truth), 8.1), np.random.default_rng(1)
+    forward_map, rng = ForwardMap.build(*problem.prior.film(truth), 8.1), np.random.default_rng(1)
     at = draw_contacts(rng, problem.domain, 400)
     charge = problem.noise.add(forward_map.charges(at), rng)
 
@@ -73,10 +72,11 @@ def test_deviations_cover_what_is_left_of_the_film(film, problem):
     np.testing.assert_allclose(wider, np.hypot(1.0, result.left.position_mm / noise.position_mm), rtol=1e-4)
 
 
-def test_the_next_calibration_is_the_next_version(film):
+def test_the_next_calibration_is_the_next_version(film, problem):
     _, result, folder = film
+    again = calibrate(result.presses, replace(problem, earlier=read_earlier(folder, problem)))
     first = (folder / "1" / "model.onnx").read_bytes()
-    assert write_calibration(result, folder) == folder / "2"
+    assert write_calibration(again, folder) == folder / "2"
     assert (folder / "1" / "model.onnx").read_bytes() == first
     assert Predictor(folder).metadata.version == 2
     assert (folder / "calibration.json").read_bytes() == (folder / "2" / "calibration.json").read_bytes()
@@ -89,19 +89,10 @@ def test_a_folder_of_something_else_is_left_alone(film, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda _: "{", "expected JSON"),
-        (lambda table: table | {"correlations": [[1.0]]}, "expected 13 rows of as many numbers"),
-        (lambda table: table | {"parameters": {}}, "expected 'four-25um-biaxial' with pretension"),
-        (lambda table: {key: table[key] for key in table if key != "sensor"}, "sensor"),
-    ],
-)
-def test_a_damaged_earlier_calibration_is_refused(film, problem, tmp_path, change, message):
-    changed = change(json.loads((film[-1] / "1" / "calibration.json").read_text("utf-8")))
-    (tmp_path / "calibration.json").write_text(changed if isinstance(changed, str) else json.dumps(changed))
-    with pytest.raises(PressError, match=rf"calibration\.json: .*{message}"):
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"parameters": {}, "sensor": "x"}', "[" * 5000])
+def test_a_damaged_earlier_calibration_is_refused(problem, tmp_path, text):
+    (tmp_path / "calibration.json").write_text(text)
+    with pytest.raises(PressError, match=r"calibration\.json"):
         read_earlier(tmp_path, problem)
 
 
@@ -113,10 +104,12 @@ def test_an_earlier_calibration_of_another_sensor_is_refused(film):
 
 def test_the_command_does_it_all(film, tmp_path, command):
     presses, folder = film[-1].parent / "presses.csv", tmp_path / "film"
-    code, out, err = command(*CALIBRATE, presses, "--from", film[-1], "-o", folder, "--next", 2)
+    code, out, err = command(*CALIBRATE, presses, "-o", folder, "--next", 2)
     assert code == 0, err
     assert "Not knowing the film leaves" in out
     assert out.count("\npress ") == 2
+    table = json.loads(command(*CALIBRATE, presses, "--json", "--from", folder)[1])
+    assert (table["presses"], table["next"]) == (10, [])
     assert Predictor(folder).metadata.electrodes == ("A", "B", "C", "D")
 
 
@@ -128,7 +121,8 @@ def test_presses_are_proposed_before_the_first(command):
 
 def test_a_refused_file_leaves_no_folder(film, tmp_path, command):
     presses = film[1].presses
-    write_presses(tmp_path / "dead.csv", replace(presses, charge_pC=presses.charge_pC * [1.0, 1.0, 0.0, 1.0]))
-    code, _, err = command(*CALIBRATE, tmp_path / "dead.csv", "-o", tmp_path / "film")
-    assert (code, "electrode 'C' is dead" in err) == (2, True)
+    write_presses(tmp_path / "swapped.csv", replace(presses, charge_pC=presses.charge_pC[:, [1, 0, 2, 3]]))
+    code, _, err = command(*CALIBRATE, tmp_path / "swapped.csv", "-o", tmp_path / "film")
+    assert code == 2
+    assert "swapped" in err
     assert not (tmp_path / "film").exists()

@@ -11,9 +11,7 @@ import pytest
 
 from isocharge.serve import find_model
 from isocharge.serve.live.device import ANY_BOARD
-from isocharge.serve.model.model_folder import load_model
-from isocharge.train.export_c.device_header import device_header
-from isocharge.train.export_c.folder import FOR_BOARDS, export_c
+from isocharge.train.export_c.folder import export_c
 
 HERE = Path(__file__).parent
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -85,25 +83,20 @@ def build(tmp_path_factory):
     """Exports a model for a board and compiles it: `build(model, device, options)`; the same network only once."""
     networks = {}
 
-    def network(model, options):
-        if (model, options) not in networks:
-            folder = export_c(find_model(model), tmp_path_factory.mktemp("c") / "export")
+    def build(model, device=ANY_BOARD, options=("-O2",), compiler="gcc"):
+        folder = export_c(find_model(model), tmp_path_factory.mktemp("c") / "export", device)
+        if (model, compiler, options) not in networks:
             words = (*options, "-fPIC", "-c")
-            compile_strictly("gcc", folder, folder / "network.o", "isocharge_model.c", options=words)
-            networks[model, options] = folder
-        return networks[model, options]
-
-    def build(model, device=ANY_BOARD, options=("-O2",)):
-        export, folder = network(model, options), tmp_path_factory.mktemp("board")
-        electrodes = load_model(find_model(model)).metadata.electrodes
-        (folder / "isocharge_device.h").write_text(device_header(device, electrodes))
-        for name in ("isocharge_model.h", *FOR_BOARDS):
-            shutil.copy(export / name, folder)
-        parts = (HERE / "bridge.c", "isocharge_chain.c", "isocharge_frames.c", export / "network.o")
-        words = (*options, "-O1", "-fPIC", "-shared")
-        library = compile_strictly("gcc", folder, folder / "bridge.so", *parts, options=words)
-        source = (export / "isocharge_model.c").read_text()
-        return Exported(ctypes.CDLL(str(library)), len(electrodes), source)
+            networks[model, compiler, options] = compile_strictly(
+                compiler, folder, folder / "network.o", "isocharge_model.c", options=words
+            )
+        parts = (HERE / "bridge.c", "isocharge_chain.c", "isocharge_frames.c", networks[model, compiler, options])
+        library = compile_strictly(
+            compiler, folder, folder / "bridge.so", *parts, options=(*options, "-fPIC", "-shared")
+        )
+        header, source = ((folder / f"isocharge_model.{kind}").read_text() for kind in ("h", "c"))
+        electrodes = int(header.split("ISOCHARGE_ELECTRODES ")[1].split()[0])
+        return Exported(ctypes.CDLL(str(library)), electrodes, source)
 
     return build
 

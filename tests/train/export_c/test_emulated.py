@@ -39,7 +39,7 @@ def bench():
     ],
 )
 def test_golden_vectors_agree_and_instructions_are_counted(board, model, instructions, flash, bench, tmp_path):
-    counted = bench.measure(export_c(find_model(model), tmp_path / "c"), board, tmp_path)
+    counted = bench.measure(export_c(find_model(model), tmp_path / "c"), bench.BOARDS[board], tmp_path)
     assert counted["golden_vectors_agree"]
     assert counted["known_loop_of_4000"] == pytest.approx(4000, abs=2)
     assert instructions[0] < counted["instructions_per_prediction"] < instructions[1]

@@ -1,6 +1,5 @@
 """The folder of an export: whole or absent, its README true, its examples right."""
 
-import itertools
 import json
 import re
 import shutil
@@ -14,6 +13,7 @@ from isocharge.serve import (
     BinaryParser,
     Chunk,
     Contact,
+    Port,
     Predictor,
     TouchStream,
     device_from_table,
@@ -22,9 +22,6 @@ from isocharge.serve import (
     load_device,
 )
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.virtual_sensor.script import Faults, VirtualScript
-from isocharge.serve.virtual_sensor.sensor import VirtualSensor
-from isocharge.simulate.measuring_chain.noise_file import load_amplifier
 from isocharge.train.export_c.folder import export_c
 
 HERE = Path(__file__).parent
@@ -118,19 +115,19 @@ def check_records(records, expected):
             assert theirs[name] == (None if value is None else pytest.approx(value, rel=1e-4, abs=1e-4))
 
 
-def test_a_recording_gives_our_records_frame_by_frame(host, film, tmp_path):
+def test_a_recording_gives_our_records_frame_by_frame(host, start_command, tmp_path):
     """Bytes of the virtual sensor with a leak, drift, lost frames and damaged bytes, in C and in Python."""
     program, board = host
-    rows = ((0, 0, 0, 0), (1.5, 3, -2, 0), (1.502, 3, -2, 0.4), (2.2, -4, 1, 0.3), (2.202, -4, 1, 0), (3, 0, 0, 0))
-    measure = load_amplifier("bench").start(3, 400.0, np.random.default_rng(2))
-    sensor = VirtualSensor(
-        film.charges,
-        VirtualScript(rows).script(400.0),
-        noise=lambda charge, _: measure(charge),
-        faults=Faults(corrupt_share=0.0005, lose_share=0.01),
-    )
-    data = b"".join(itertools.islice(sensor.frames(), 1200))
-    expected = TouchStream(Predictor("three-25um-biaxial"), board).feed(Chunk(data, 0.0, 0))
+    (tmp_path / "play.toml").write_text("[faults]\ncorrupt_share = 0.0005\nlose_share = 0.01\n")
+    words = ("--noise", "bench", "--rate", "400", "--script", tmp_path / "play.toml", "--force-max", "0.5")
+    sensor = start_command("serve", "virtual", "three-25um-biaxial", *words)
+    stream, data, expected = TouchStream(Predictor("three-25um-biaxial"), board), b"", []
+    with Port(sensor.stdout.readline().strip()) as port:
+        for chunk in port:
+            data += chunk.data
+            expected += stream.feed(chunk)
+            if len(expected) > 1000:
+                break
     (tmp_path / "frames.bin").write_bytes(data)
     code, records, err = played(program, tmp_path / "frames.bin")
     assert (code, err) == (0, "")
@@ -138,11 +135,15 @@ def test_a_recording_gives_our_records_frame_by_frame(host, film, tmp_path):
     assert sum(record["contact"] for record in records) > 100
 
 
-def test_host_example_follows_a_port(host, film):
+def test_host_example_follows_a_port(exports, compile_c, start_command, tmp_path):
     """Contacts of the virtual sensor at the place of its script."""
-    rows = ((0, 3, -2, 0), (0.8, 3, -2, 0), (0.801, 3, -2, 0.5), (60, 3, -2, 0.5))
-    with VirtualSensor(film.charges, VirtualScript(rows).script(200.0)) as sensor:
-        code, records, err = played(host[0], sensor.url, 300)
+    rows = [[0, 3, -2, 0], [0.8, 3, -2, 0], [0.801, 3, -2, 0.5], [60, 3, -2, 0.5]]
+    (tmp_path / "script.toml").write_text(f"presses = {rows}\n")
+    program = compile_c("gcc", exports[0], tmp_path / "host", *EXAMPLE)
+    sensor = start_command(
+        "serve", "virtual", "three-25um-biaxial", "--noise", "clean", "--script", tmp_path / "script.toml"
+    )
+    code, records, err = played(program, sensor.stdout.readline().strip(), 300)
     assert (code, err, len(records)) == (0, "", 300)
     press = [[record["x_mm"], record["y_mm"], record["force_N"]] for record in records if record["contact"]]
     assert len(press) > 80

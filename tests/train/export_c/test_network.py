@@ -12,8 +12,7 @@ from onnx import helper, numpy_helper
 from isocharge.common.errors import ModelError
 from isocharge.serve import find_model, write_model
 from isocharge.serve.model.model_folder import load_model
-from isocharge.simulate import noise_model
-from isocharge.train.data.presses import draw_contacts
+from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 from isocharge.train.export_c.network import read_network
 from isocharge.train.model_release.export import export_onnx
 from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, PlainPerceptron
@@ -21,7 +20,7 @@ from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, PlainP
 FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0])
 """mm and N, and the floor that golden vectors have for the misfit."""
 
-MODELS = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-biaxial-student")
+MODELS = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial-films", "four-25um-biaxial-student")
 
 
 def answers(model, charge_pC):
@@ -34,10 +33,16 @@ def check_agreement(mine, theirs, limit=1e-5):
     assert np.all(np.abs(mine - theirs) <= limit * np.maximum(np.abs(theirs), FLOORS))
 
 
-def test_noisy_presses_agree_with_onnxruntime(film, build):
-    contact = draw_contacts(np.random.default_rng(0), film.domain, 3_000)
-    charge_pC = noise_model("reference").add(film.charges(contact), np.random.default_rng(1)).astype(np.float32)
-    check_agreement(build(MODELS[0]).predict(charge_pC), answers(MODELS[0], charge_pC))
+@pytest.mark.first_cases(1)
+@pytest.mark.parametrize("model", ["three-25um-biaxial", "four-25um-biaxial"])
+def test_ten_thousand_noisy_presses_agree_with_onnxruntime(model, build):
+    metadata = load_model(find_model(model)).metadata
+    film = ForwardMap.build(load_sensor(metadata.frame_id), Circle(1.0), 8.0, (0.1, 2.0))
+    rng = np.random.default_rng(0)
+    r, angle = 7.9 * np.sqrt(rng.random(10_000)), 2 * np.pi * rng.random(10_000)
+    contact = np.column_stack([r * np.cos(angle), r * np.sin(angle), 0.1 * 20.0 ** rng.random(10_000)])
+    charge_pC = noise_model("reference").add(film.charges(contact), rng).astype(np.float32)
+    check_agreement(build(model).predict(charge_pC), answers(model, charge_pC))
 
 
 @pytest.mark.parametrize("model", MODELS)
