@@ -1,14 +1,10 @@
-"""What the simulator's tests share: films, meshes, random fields, the independent reference cases."""
+"""What the simulator's tests share: films, meshes, random fields, forward maps."""
 
-import importlib.util
-import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,15 +17,13 @@ from isocharge.simulate import (
     Polygon,
     Probe,
     Resolution,
-    Sensor,
     Sweep,
     Theory,
     load_sensor,
 )
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.mesh.elements import Geometry
-from isocharge.simulate.mesh.placed_mesh import place
+from isocharge.simulate.mesh.placed_mesh import Geometry, place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template
 from kept import kept
@@ -37,89 +31,6 @@ from kept import kept
 DATA = Path(__file__).parents[1] / "data"
 TURNED = Polygon.rectangle(4.0, 2.0, 0.3)
 FULL = Theory(stretching=True, bending=True, pretensioned=False)
-
-
-# The independent reference cases
-
-
-@dataclass(frozen=True)
-class ReferenceCase:
-    """A press that an independent solver solved, with bending."""
-
-    film: Film
-    probe: Probe
-    at: tuple[float, float]
-    force: float
-    deflection: float
-    charges: dict[str, np.ndarray]
-
-    def sensor(self, key: str) -> Sensor:
-        """The sensor of a key such as "three-biaxial-area"."""
-        layout, kind, readout = key.split("-")
-        return replace(load_sensor(f"{layout}-25um-{kind}"), film=self.film, readout=readout)
-
-
-def _probe(about: dict[str, Any]) -> Probe:
-    angle = np.deg2rad(about.get("turn_deg", 0.0))
-    if about["shape"] == "circle":
-        return Circle(about["radius_mm"])
-    if about["shape"] == "rectangle":
-        return Polygon.rectangle(about["width_mm"], about["height_mm"], angle)
-    return Polygon.triangle(about["side_mm"], angle)
-
-
-def _read(name: str) -> list[ReferenceCase]:
-    document = json.loads((DATA / name).read_text("utf-8"))
-    film = document["film"]
-    return [
-        ReferenceCase(
-            film=Film(
-                film["radius_mm"],
-                case["thickness_um"] * 1e-3,
-                film["young_GPa"] * 1e3,
-                film["poisson"],
-                case["pretension_MPa"],
-            ),
-            probe=_probe(case["probe"]),
-            at=tuple(case["at_mm"]),
-            force=case["force_N"],
-            deflection=case["deflection_mm"],
-            charges={key: np.array(list(q.values())) for key, q in case["touch_charge_pC"].items()},
-        )
-        for case in document["cases"]
-    ]
-
-
-CASES, MORE_CASES = _read("film_cases.json"), _read("film_cases_skfem.json")
-
-
-def name_case(case: ReferenceCase) -> str:
-    """A test id."""
-    x, y = (round(value) for value in case.at)
-    turn = f"@{np.rad2deg(case.probe.angle):.0f}" if case.probe.angle else ""
-    return (
-        f"{case.film.thickness * 1e3:.0f}um-{case.film.pretension:g}MPa-{case.probe.notation}{turn}"
-        f"-at({x},{y})-{case.force:g}N"
-    )
-
-
-def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """`case` runs over the cases of film_cases.json, `further_case` over those of film_cases_skfem.json."""
-    for argument, cases in (("case", CASES), ("further_case", MORE_CASES)):
-        if argument in metafunc.fixturenames:
-            metafunc.parametrize(argument, cases, ids=name_case)
-
-
-@pytest.fixture(scope="session")
-def reference_cases() -> Callable[[float], list[ReferenceCase]]:
-    """The reference cases of film_cases.json of a thickness in um."""
-    return lambda thickness_um: [case for case in CASES if round(case.film.thickness * 1e3) == thickness_um]
-
-
-@pytest.fixture(scope="session")
-def further_cases() -> Callable[[float], list[ReferenceCase]]:
-    """Those of film_cases_skfem.json."""
-    return lambda thickness_um: [case for case in MORE_CASES if round(case.film.thickness * 1e3) == thickness_um]
 
 
 # Films and discrete problems
@@ -218,18 +129,6 @@ def made_up() -> Callable[..., Equilibrium]:
         )
 
     return make
-
-
-@pytest.fixture(scope="session")
-def skfem() -> ModuleType:
-    """The second solver, tests/simulate/film_skfem.py."""
-    path = Path(__file__).with_name("film_skfem.py")
-    spec = importlib.util.spec_from_file_location("film_skfem", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 # Forward maps and datasets

@@ -63,21 +63,21 @@ def plate_stiffness(film: Film) -> float:
 # Schwerin (1929): point load, Poisson 1/3
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
-def test_schwerin_point_load(share):
+def test_schwerin_point_load():
     """w = k (1 - (r/a)^(2/3)), N_r = 3 F / (4 pi k) (r/a)^(-2/3), N_theta = N_r / 3, away from a small probe."""
     film, force = replace(SLACK, poisson=1.0 / 3.0), TINY
     solved = press(
         film, Circle(0.02), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=Resolution(6, 8, 10))
     )
     k = np.cbrt(3.0 / np.pi * force * film.radius**2 / (film.young * film.thickness))
-    points = ring(share * film.radius)
-    np.testing.assert_allclose(deflection(solved, points), k * (1.0 - share ** (2 / 3)), rtol=2e-5)
-    radial, hoop, shear = radial_and_hoop(touch_stress(solved, points) * film.thickness, points)
-    expected = 3.0 * force / (4.0 * np.pi * k) * share ** (-2 / 3)
-    np.testing.assert_allclose(radial, expected, rtol=2e-5)
-    np.testing.assert_allclose(hoop, expected / 3.0, rtol=1e-4)
-    np.testing.assert_allclose(shear, 0.0, atol=1e-5 * expected)
+    for share in (0.2, 0.9):
+        points = ring(share * film.radius)
+        np.testing.assert_allclose(deflection(solved, points), k * (1.0 - share ** (2 / 3)), rtol=2e-5)
+        radial, hoop, shear = radial_and_hoop(touch_stress(solved, points) * film.thickness, points)
+        expected = 3.0 * force / (4.0 * np.pi * k) * share ** (-2 / 3)
+        np.testing.assert_allclose(radial, expected, rtol=2e-5)
+        np.testing.assert_allclose(hoop, expected / 3.0, rtol=1e-4)
+        np.testing.assert_allclose(shear, 0.0, atol=1e-5 * expected)
 
 
 # Green's functions of the disk, in film radii; z where it is read, c where a point presses
@@ -134,8 +134,7 @@ PLACES = [(0.0, 0.0), (8.0, -5.0), (-20.0, 10.0), (-3.0, 36.0)]
 # The linear membrane: a tension so large that the press does not change it
 
 
-@pytest.mark.parametrize("at", PLACES)
-@pytest.mark.parametrize("radius", [1.0, 4.0])
+@pytest.mark.parametrize(("at", "radius"), list(zip(PLACES, (4.0, 1.0, 4.0, 1.0), strict=True)))
 def test_taut_membrane_under_a_disk(at, radius):
     """Green's function is harmonic, so a disk pulls like a point."""
     probe = Circle(radius)
@@ -146,7 +145,7 @@ def test_taut_membrane_under_a_disk(at, radius):
     np.testing.assert_allclose(deflection(solved, points), expected, atol=1e-5 * expected.max())
 
 
-@pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
+@pytest.mark.parametrize("share", [0.02, 0.9])
 def test_taut_membrane_under_a_centred_disk(share):
     """w(0) = F / (2 pi T) (ln(a / R) + 1/2)."""
     solved = press(
@@ -159,10 +158,10 @@ def test_taut_membrane_under_a_centred_disk(share):
 POLYGONS = [Polygon.rectangle(4.0, 2.0, 0.5), Polygon.triangle(6.0, 1.0)]
 
 
-@pytest.mark.first_cases(2)
-@pytest.mark.parametrize("at", PLACES[1:])
-@pytest.mark.parametrize("probe", POLYGONS, ids=lambda probe: probe.name)
-def test_taut_membrane_under_a_polygon(at, probe):
+@pytest.mark.parametrize(
+    ("probe", "at"), [(POLYGONS[0], PLACES[1]), (POLYGONS[1], PLACES[2])], ids=["rectangle", "triangle"]
+)
+def test_taut_membrane_under_a_polygon(probe, at):
     solved = press(TAUT, probe, at, TINY, SolveSettings(accuracy=1e-5, theory=Theory(False, False, True)))
     points, z = read_outside(TAUT, probe, at)
     mean = over_polygon(harmonic, z, (complex(*at) + probe.outline) / TAUT.radius)
@@ -173,8 +172,7 @@ def test_taut_membrane_under_a_polygon(at, probe):
 # The clamped plate
 
 
-@pytest.mark.parametrize("at", PLACES)
-@pytest.mark.parametrize("radius", [0.2, 4.0])
+@pytest.mark.parametrize(("at", "radius"), list(zip(PLACES, (4.0, 0.2, 4.0, 0.2), strict=True)))
 def test_plate_under_a_disk(at, radius):
     """Small: Michell's point load. Large: the same, corrected for its size."""
     probe = Circle(radius)
@@ -189,7 +187,7 @@ def test_plate_under_a_disk(at, radius):
         np.testing.assert_allclose(deflection(solved, points), scale * michell(z, c), atol=1e-3 * exact.max())
 
 
-@pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
+@pytest.mark.parametrize("share", [0.02, 0.9])
 def test_plate_under_a_centred_disk(share):
     """w(0) = F (4 a^2 - 4 R^2 ln(a / R) - 3 R^2) / 64 pi D (Timoshenko and Woinowsky-Krieger 1959, art. 16)."""
     a, c = THICK.radius, share * THICK.radius
@@ -200,10 +198,10 @@ def test_plate_under_a_centred_disk(share):
     assert deflection(solved, np.zeros((1, 2)))[0] == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.first_cases(2)
-@pytest.mark.parametrize("at", PLACES[1:])
-@pytest.mark.parametrize("probe", POLYGONS, ids=lambda probe: probe.name)
-def test_plate_under_a_polygon(at, probe):
+@pytest.mark.parametrize(
+    ("probe", "at"), list(zip(POLYGONS, PLACES[2:0:-1], strict=True)), ids=["rectangle", "triangle"]
+)
+def test_plate_under_a_polygon(probe, at):
     solved = press(THICK, probe, at, TINY, SolveSettings(accuracy=1e-4, theory=Theory(False, True, False)))
     points, z = read_outside(THICK, probe, at)
     mean = over_polygon(michell, z, (complex(*at) + probe.outline) / THICK.radius)
@@ -211,7 +209,7 @@ def test_plate_under_a_polygon(at, probe):
     np.testing.assert_allclose(deflection(solved, points), expected, atol=1e-4 * expected.max())
 
 
-@pytest.mark.parametrize("tension_MPa", [0.01, 0.3, 10.0])
+@pytest.mark.parametrize("tension_MPa", [0.01, 10.0])
 def test_taut_plate_under_a_centred_disk(tension_MPa):
     """D lap lap w - N lap w = q: logarithm, parabola and modified Bessel functions, joined at the footprint's edge."""
     film = replace(SLACK, thickness=0.3, pretension=tension_MPa)
@@ -319,13 +317,12 @@ def test_stress_and_charge_that_a_uniform_load_induces(name, film, force):
     ],
     ids=["plate", "membrane", "taut plate"],
 )
-@pytest.mark.parametrize("probe", [Circle(2.0), POLYGONS[0]], ids=["circle", "rectangle"])
-def test_linear_theories_are_limits_of_the_nonlinear_ones(film, theory, probe):
+def test_linear_theories_are_limits_of_the_nonlinear_ones(film, theory):
     """At a tiny force, charges, not just deflections."""
     full = replace(theory, stretching=True)
     sensor = replace(load_sensor("three-25um-uniaxial"), film=film)
     solved = [
-        press(film, probe, (5.0, 3.0), 1e-5, SolveSettings(theory=each, resolution=Resolution(5, 8, 5, 1)))
+        press(film, POLYGONS[0], (5.0, 3.0), 1e-5, SolveSettings(theory=each, resolution=Resolution(5, 8, 5, 1)))
         for each in (theory, full)
     ]
     one, two = (touch_charge(sensor, each) for each in solved)
@@ -346,7 +343,7 @@ class Axisymmetric:
 
 
 def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float, at: np.ndarray) -> Axisymmetric:
-    """Solve for (u, phi = r S_r (1 + A^2 u'), w) in the scaled variables of mechanics.membrane, load one.
+    """Solve for (u, phi = r S_r (1 + A^2 u'), w) in the scaled variables of mechanics.energy, load one.
 
     Radial balance is phi' = S_theta (1 + A^2 u / r), vertical balance r S_r w' = - min(1, (r / R)^2) / 2 pi.
     """
@@ -389,9 +386,7 @@ def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float
     ("share", "force", "poisson", "tension"),
     [
         (0.02, 1e-7, 0.34, 0.0),  # von Karman
-        (0.5, 1e-7, 0.34, 0.0),
-        (0.98, 1e-7, 0.3, 0.0),
-        (0.02, 1e-7, 0.34, 0.4),
+        (0.98, 1e-7, 0.3, 0.4),
         (0.02, 5.0, 0.34, 0.0),  # Green-Lagrange, A^2 = 0.013
         (0.3, 100.0, 0.34, 0.2),  # far beyond any film: A^2 = 0.1
     ],

@@ -60,20 +60,13 @@ def mirrored(probe: Probe) -> Probe:
 AT = (6.0, 2.5)
 
 
-@pytest.mark.parametrize("film", FILMS)
-@pytest.mark.parametrize("readout", ["area", "edge"])
+@pytest.mark.parametrize(("film", "readout"), list(zip(FILMS, ["edge", "area"], strict=True)))
 def test_half_turn_swaps_opposite_electrodes(probe, film, readout):
     """Of an uniaxial film too."""
     sensor = sensor_of("four-25um-uniaxial", film, readout)
     first = charges(sensor, probe, AT)
     second = charges(sensor, probe.rotated(np.pi), turned(AT, 180.0))
     np.testing.assert_allclose(second, first[[2, 3, 0, 1]], **EXACT)
-
-
-def test_quarter_turn_passes_the_charges_on(probe):
-    sensor = sensor_of("four-25um-biaxial")
-    second = charges(sensor, probe.rotated(0.5 * np.pi), turned(AT, 90.0))
-    np.testing.assert_allclose(second, np.roll(charges(sensor, probe, AT), 1), **EXACT)
 
 
 def test_quarter_turn_of_an_uniaxial_film_swaps_the_coefficients(probe):
@@ -84,10 +77,9 @@ def test_quarter_turn_of_an_uniaxial_film_swaps_the_coefficients(probe):
     np.testing.assert_allclose(second, np.roll(charges(sensor, probe, AT), 1), **EXACT)
 
 
-@pytest.mark.parametrize("angle", [0.7, 2.0, -2.5])
-def test_turning_press_and_layout_turns_nothing(probe, angle):
+def test_turning_press_and_layout_turns_nothing(probe):
     """Any angle, with polygonal electrodes that turn along; biaxial, so that the film's axes do not show."""
-    sensor = sensor_of("four-25um-biaxial")
+    sensor, angle = sensor_of("four-25um-biaxial"), -2.5
     still = tuple(replace(e, square=False) for e in sensor.electrodes)
     c, s = np.cos(angle), np.sin(angle)
     along = tuple(replace(e, corners=tuple((c * x - s * y, s * x + c * y) for x, y in e.corners)) for e in still)
@@ -96,34 +88,12 @@ def test_turning_press_and_layout_turns_nothing(probe, angle):
     np.testing.assert_allclose(second, first, **EXACT)
 
 
-@pytest.mark.parametrize(("name", "order"), [("four-25um-uniaxial", [2, 1, 0, 3]), ("three-25um-uniaxial", [0, 2, 1])])
 @pytest.mark.parametrize("film", FILMS)
-def test_mirror(probe, film, name, order):
+def test_mirror(probe, film):
     """About the y axis."""
-    sensor = sensor_of(name, film)
+    sensor, order = sensor_of("three-25um-uniaxial", film), [0, 2, 1]
     second = charges(sensor, mirrored(probe), (-AT[0], AT[1]))
     np.testing.assert_allclose(second, charges(sensor, probe, AT)[order], rtol=2e-5)
-
-
-def test_third_of_a_turn_nearly_passes_the_charges_on(probe):
-    """The squares stay along the axes, so three electrodes are not exactly three-fold; small ones are."""
-    sensor = sensor_of("three-25um-biaxial")
-    tiny = tuple(replace(e, corners=_shrunk(e.corners, 0.01)) for e in sensor.electrodes)
-    sensor = replace(sensor, electrodes=tiny)
-    second = charges(sensor, probe.rotated(2.0 * np.pi / 3.0), turned(AT, 120.0))
-    np.testing.assert_allclose(second, np.roll(charges(sensor, probe, AT), 1), rtol=1e-4)
-
-
-def _shrunk(corners: tuple[tuple[float, float], ...], share: float) -> tuple[tuple[float, float], ...]:
-    centre = np.mean(corners, axis=0)
-    return tuple((float(x), float(y)) for x, y in centre + share * (np.array(corners) - centre))
-
-
-@pytest.mark.parametrize("name", ["three-25um-biaxial", "four-25um-biaxial"])
-@pytest.mark.parametrize("film", FILMS)
-def test_centred_press_gives_equal_electrodes_equal_charges(name, film):
-    charge = charges(sensor_of(name, film), Circle(1.0), (0.0, 0.0))
-    np.testing.assert_allclose(charge, charge[0], rtol=1e-4)
 
 
 @pytest.mark.parametrize("probe", [RECTANGLE, TRIANGLE, Polygon.rectangle(3.0, 3.0, 0.1)], ids=["2", "3", "4"])
@@ -159,18 +129,15 @@ def test_stress_is_mirror_symmetric_about_the_axis_of_the_press(film):
 
 
 SCALES = {
-    "larger": (7.0, 1.0),
-    "stiffer": (1.0, 40.0),
-    "both": (0.2, 1e-3),
+    "smaller and softer": (0.2, 1e-3),
     "other units": (1e3, 1e-6),  # forces stay in newtons
 }
 
 
 @pytest.mark.parametrize(("length", "modulus"), SCALES.values(), ids=SCALES.keys())
-@pytest.mark.parametrize("film", FILMS)
-def test_same_dimensionless_scene_gives_the_same_digits(probe, film, length, modulus):
+def test_same_dimensionless_scene_gives_the_same_digits(probe, length, modulus):
     """All lengths and the modulus scaled, pretension and force with them, F ~ E h a."""
-    sensor = sensor_of("four-25um-uniaxial", film)
+    sensor = sensor_of("four-25um-uniaxial", "taut 110 um")
     film = sensor.film
     other = Film(
         film.radius * length, film.thickness * length, film.young * modulus, film.poisson, film.pretension * modulus
@@ -193,13 +160,12 @@ def test_same_dimensionless_scene_gives_the_same_digits(probe, film, length, mod
     np.testing.assert_allclose(charge, touch_charge(sensor, first) * modulus * length**2, rtol=1e-9)
 
 
-@pytest.mark.parametrize("share", [2.0, 0.5])
-def test_a_membrane_knows_only_force_over_thickness(film, share):
+def test_a_membrane_knows_only_force_over_thickness(film):
     """Without bending, twice the thickness under twice the force is the same film."""
     theory, sensor = Theory(stretching=True, bending=False, pretensioned=False), load_sensor("four-25um-uniaxial")
-    other = replace(film, thickness=film.thickness * share)
+    other = replace(film, thickness=2.0 * film.thickness)
     one = press(film, RECTANGLE, AT, 1.0, SolveSettings(theory=theory, layer=0.05))
-    two = press(other, RECTANGLE, AT, share, SolveSettings(theory=theory, layer=0.05))
+    two = press(other, RECTANGLE, AT, 2.0, SolveSettings(theory=theory, layer=0.05))
     points = np.array([AT, (0.0, 0.0), (-20.0, 10.0)])
     np.testing.assert_allclose(deflection(two, points), deflection(one, points), rtol=1e-7)
     np.testing.assert_allclose(touch_charge(replace(sensor, film=other), two), touch_charge(sensor, one), rtol=1e-7)

@@ -33,16 +33,15 @@ with require("simulate"):
     from isocharge.simulate.measuring_chain.noise import NoiseModel
     from isocharge.simulate.measuring_chain.noise_file import load_amplifier, noise_model
     from isocharge.simulate.mechanics.theory import Theory
-    from isocharge.simulate.mesh.resolution import Resolution
-    from isocharge.simulate.sensor.electrode import Calibration, Electrode
+    from isocharge.simulate.mesh.blocks import Resolution
     from isocharge.simulate.sensor.film import Film, Piezo
     from isocharge.simulate.sensor.film_prior import FilmPrior, virtual_film
     from isocharge.simulate.sensor.probe import Circle, Polygon, Probe, parse_probe
-    from isocharge.simulate.sensor.sensor import Sensor
+    from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor
     from isocharge.simulate.sensor.sensor_file import built_in_sensors, load_sensor, write_sensor
     from isocharge.simulate.solver.equilibrium import Equilibrium, deflection, touch_stress
+    from isocharge.simulate.solver.load_case import SolveSettings
     from isocharge.simulate.solver.press import press
-    from isocharge.simulate.solver.settings import SolveSettings
 
 __all__ = [
     "Amplifier",

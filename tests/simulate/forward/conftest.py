@@ -4,9 +4,20 @@ from dataclasses import replace
 
 import pytest
 
-from isocharge.simulate import ChargeSpline, Circle, FilmPrior, ForwardMap, Sensor, load_sensor
+from isocharge.simulate import (
+    ChargeSpline,
+    Circle,
+    FilmPrior,
+    ForwardMap,
+    Resolution,
+    Sensor,
+    SolveSettings,
+    Theory,
+    load_sensor,
+)
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.sensor.film_prior import FilmSpread
+from kept import kept
 
 
 @pytest.fixture(scope="session")
@@ -21,8 +32,16 @@ def near_electrodes() -> Sensor:
 
 
 @pytest.fixture(scope="session")
-def three_spline(three_map: ForwardMap) -> ChargeSpline:
-    return ChargeSpline.of(three_map)
+def near_map(near_electrodes: Sensor) -> ForwardMap:
+    """A membrane, with few and cheap solves; the probe comes to lie on the electrodes."""
+    theory = Theory(stretching=True, bending=False, pretensioned=False)
+    settings = SolveSettings(theory=theory, resolution=Resolution(4, 8, 4))
+    return kept(ForwardMap.build, near_electrodes, Circle(1.0), 5.0, (0.3, 1.0), settings)
+
+
+@pytest.fixture(scope="session")
+def near_spline(near_map: ForwardMap) -> ChargeSpline:
+    return kept(ChargeSpline.of, near_map, spacing=0.25)
 
 
 @pytest.fixture(scope="session")
@@ -30,4 +49,4 @@ def film_family() -> tuple[FilmPrior, FilmFamily]:
     """Films of a narrow spread."""
     spread = FilmSpread(pretension=0.2, young=0.02, thickness=0.02, probe_radius=0.03)
     prior = FilmPrior(load_sensor("three-25um-biaxial"), Circle(1.0), spread)
-    return prior, FilmFamily.build(prior, radius=3.0, force_range=(0.8, 1.2), counts=(3, 3, 3, 2, 2))
+    return prior, kept(FilmFamily.build, prior, radius=3.0, force_range=(0.8, 1.2), counts=(3, 3, 3, 2, 2))

@@ -1,12 +1,13 @@
 """What every map from contacts to charges keeps: derivatives, domain, names."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from isocharge.common.errors import ChargeError, SceneError
-from isocharge.simulate import ChargeMap, Domain, FunctionMap
-from isocharge.simulate.forward.charge_map import differences, within
-from isocharge.simulate.forward.checks import as_charges, check_forces, check_radius
+from isocharge.simulate import ChargeMap, Domain, FunctionMap, load_sensor
+from isocharge.simulate.forward.charge_map import as_charges, check_forces, check_radius, differences, within
 from isocharge.simulate.numerics.disk import sunflower
 
 DOMAIN = Domain(5.0, (0.1, 2.0))
@@ -23,13 +24,13 @@ CHECKED = ("forward map", "spline", "film family")
 
 
 @pytest.fixture
-def charge_map(request, three_map, three_spline, film_family) -> ChargeMap:
+def charge_map(request, near_map, near_spline, film_family) -> ChargeMap:
     prior, family = film_family
     return {
-        "forward map": three_map,
-        "spline": three_spline,
+        "forward map": replace(near_map, sensor=load_sensor("four-25um-uniaxial")),  # with the electrodes farther out
+        "spline": near_spline,
         "film family": family.forward_map(*prior.film(prior.mean)),
-        "within": within(three_spline, 4.0),
+        "within": within(near_spline, 4.0),
         "function": FunctionMap(linear, ("A", "B"), DOMAIN),
     }[request.param]
 

@@ -16,30 +16,23 @@ from isocharge.simulate import (
     SolveSettings,
     Theory,
     load_sensor,
-    parse_probe,
     press,
     touch_charge,
 )
 from isocharge.simulate.forward.family import Family
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
+from kept import kept
 
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
-QUICK_SETTINGS = SolveSettings(theory=MEMBRANE, resolution=Resolution(5, 8, 4))
+QUICK_SETTINGS = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
 QUICK = {"radius": 4.0, "force_range": (0.7, 1.0), "settings": QUICK_SETTINGS}
 """A small family without bending: few and cheap solves."""
-PROBES = {"triangle": Polygon.triangle(2.5), "rotated rectangle": parse_probe("rectangle:4x2@30")}
 
 
 @pytest.fixture(scope="module")
-def four_map() -> ForwardMap:
-    """Wide enough that the probe comes to lie on the electrodes."""
-    return ForwardMap.build(load_sensor("four-25um-biaxial"), Circle(1.0), radius=10.0)
-
-
-@pytest.fixture(scope="module", params=PROBES.values(), ids=PROBES.keys())
-def oriented_map(request, near_electrodes) -> ForwardMap:
+def oriented_map(near_electrodes) -> ForwardMap:
     """A probe whose orientation matters; on the electrodes, for these are moved inwards."""
-    return ForwardMap.build(near_electrodes, request.param, **QUICK)
+    return kept(ForwardMap.build, near_electrodes, Polygon.triangle(2.5), **QUICK)
 
 
 def errors(forward_map: ForwardMap, contact: np.ndarray, rotation: np.ndarray | float = 0.0) -> np.ndarray:
@@ -66,18 +59,14 @@ def draw(forward_map: ForwardMap, count: int, seed: int) -> tuple[np.ndarray, np
     return np.column_stack([z.real, z.imag, force]), rng.uniform(-np.pi, np.pi, count)
 
 
-def test_presses_between_the_nodes_and_over_electrodes(three_map, four_map):
-    """Half of the second map's presses within 2 mm of an electrode's centre."""
-    contact, _ = draw(four_map, 12, seed=1)
-    rng = np.random.default_rng(2)
-    on = rng.uniform(8.0, 10.0, 6) * np.exp(1j * (0.5 * np.pi * rng.integers(0, 4, 6) + rng.uniform(-0.15, 0.15, 6)))
-    contact[:6, 0], contact[:6, 1] = on.real, on.imag
-    for error in (errors(three_map, draw(three_map, 12, seed=0)[0]), errors(four_map, contact)):
-        assert np.quantile(error, 0.95) < 1e-3
-        assert error.max() < 5e-3
+def test_presses_between_the_nodes_and_over_electrodes(three_map, near_map):
+    """All terms out to 8 mm, and a membrane with half of the presses on an electrode."""
+    contact, _ = draw(near_map, 8, seed=1)
+    contact[:4, :2] = [(4.9, 0.3), (0.2, 4.5), (-4.2, 0.0), (1.2, -4.5)]
+    for error in (errors(three_map, draw(three_map, 6, seed=0)[0]), errors(near_map, contact)):
+        assert error.max() < 1e-3
 
 
-@pytest.mark.first_cases(1)
 def test_random_orientations(oriented_map):
     """Over electrodes and beside them; the charges have the probe's period, and no shorter one."""
     error = errors(oriented_map, *draw(oriented_map, 10, seed=10))
@@ -89,38 +78,40 @@ def test_random_orientations(oriented_map):
     assert np.abs(oriented_map.charges(contact, rotation + 0.5 * period) / charge - 1.0).max() > 1e-2
 
 
-def test_orientation_adds_to_the_probes_own_angle(near_electrodes):
-    probe, family = Polygon.triangle(2.0), {**QUICK, "radius": 2.0}
-    plain, rotated = (ForwardMap.build(near_electrodes, each, **family) for each in (probe, probe.rotated(0.6)))
-    contact, rotation = draw(plain, 20, seed=12)
-    np.testing.assert_allclose(rotated.charges(contact, rotation), plain.charges(contact, rotation + 0.6), rtol=2e-3)
+def test_orientation_adds_to_the_probes_own_angle(oriented_map, near_electrodes):
+    probe = oriented_map.probe.rotated(0.6)
+    rotated = kept(ForwardMap.build, near_electrodes, probe, **{**QUICK, "radius": 2.0})
+    contact, rotation = draw(rotated, 20, seed=12)
+    np.testing.assert_allclose(
+        rotated.charges(contact, rotation), oriented_map.charges(contact, rotation + 0.6), rtol=2e-3
+    )
 
 
-def test_ends_of_the_domain_and_the_error_that_the_map_states(four_map):
-    radius, (low, high) = four_map.domain.radius, four_map.domain.force_range
+def test_ends_of_the_domain_and_the_error_that_the_map_states(near_map):
+    radius, (low, high) = near_map.domain.radius, near_map.domain.force_range
     ends = np.array([[radius, 0.0, low], [-radius, 0.0, high], [0.0, 0.0, low], [0.0, 0.0, high]])
-    assert errors(four_map, ends).max() < 1e-3
-    assert 0.0 < four_map.error <= INTERPOLATION_ERROR
-    assert errors(four_map, draw(four_map, 8, seed=3)[0]).max() < 3.0 * four_map.error
+    assert errors(near_map, ends).max() < 1e-3
+    assert 0.0 < near_map.error <= INTERPOLATION_ERROR
+    assert errors(near_map, draw(near_map, 6, seed=3)[0]).max() < 3.0 * near_map.error
 
 
 @pytest.mark.parametrize(
     "changes",
     [
         {"readout": "edge"},
-        {"piezo": load_sensor("four-25um-uniaxial").piezo},
-        {"calibration": replace(load_sensor("four-25um-biaxial").calibration, shift=(0.5, -1.0), rotation=0.2)},
+        {"piezo": load_sensor("four-25um-biaxial").piezo},
+        {"calibration": replace(load_sensor("four-25um-biaxial").calibration, shift=(0.5, -0.3), rotation=0.1)},
     ],
-    ids=["edge", "uniaxial", "calibrated"],
+    ids=["edge", "biaxial", "calibrated"],
 )
-def test_one_family_of_solves_serves_every_readout(four_map, changes):
-    other = replace(four_map, sensor=replace(four_map.sensor, **changes))
-    assert errors(other, draw(four_map, 5, seed=4)[0]).max() < 1e-3
+def test_one_family_of_solves_serves_every_readout(near_map, changes):
+    other = replace(near_map, sensor=replace(near_map.sensor, **changes))
+    assert errors(other, draw(near_map, 4, seed=4)[0]).max() < 1e-3
 
 
-def test_contact_pressure(four_map, oriented_map):
+def test_contact_pressure(near_map, oriented_map):
     """d33 counts on the electrode under the probe, however the probe is rotated."""
-    for plain in (four_map, oriented_map):
+    for plain in (near_map, oriented_map):
         sensor = replace(plain.sensor, piezo=replace(plain.sensor.piezo, d33=-30.0))
         contact, rotation = draw(plain, 40, seed=6)
         centres = np.array([electrode.centre for electrode in sensor.electrodes])
@@ -131,25 +122,19 @@ def test_contact_pressure(four_map, oriented_map):
 
 
 FILMS = {
-    "pretension": ({"pretension": 0.5}, Theory(stretching=True, bending=False, pretensioned=True)),
-    "plate": ({"thickness": 1.0}, Theory(stretching=False, bending=True, pretensioned=False)),
+    "pretension": ({"pretension": 0.5}, "middle", Theory(stretching=True, bending=False, pretensioned=True)),
+    "plate": ({"thickness": 1.0}, "middle", Theory(stretching=False, bending=True, pretensioned=False)),
+    "surface": ({}, "top", "auto"),
 }
 
 
-@pytest.mark.parametrize(("film", "theory"), FILMS.values(), ids=FILMS.keys())
-def test_other_films(near_electrodes, film, theory):
-    sensor = replace(near_electrodes, film=replace(near_electrodes.film, **film))
-    forward_map = ForwardMap.build(sensor, Circle(1.0), 4.0, (0.7, 1.0), replace(QUICK_SETTINGS, theory=theory))
-    assert errors(forward_map, draw(forward_map, 6, seed=7)[0]).max() < 1e-3
-
-
-def test_surface():
-    """Bending is in though nobody asked for it."""
-    sensor = replace(load_sensor("four-25um-uniaxial"), surface="top")
-    sensor = replace(sensor, film=replace(sensor.film, thickness=0.11))
-    forward_map = ForwardMap.build(sensor, Circle(1.0), radius=2.0, force_range=(0.7, 1.0))
-    assert forward_map.theory.bending
-    assert np.quantile(errors(forward_map, draw(forward_map, 6, seed=8)[0]), 0.9) < 2e-3
+@pytest.mark.parametrize(("film", "surface", "theory"), FILMS.values(), ids=FILMS.keys())
+def test_other_films(near_electrodes, film, surface, theory):
+    """Read at the surface, bending is in though nobody asked for it."""
+    sensor = replace(near_electrodes, film=replace(near_electrodes.film, **film), surface=surface)
+    forward_map = kept(ForwardMap.build, sensor, Circle(1.0), 2.0, (0.8, 1.0), SolveSettings(theory=theory))
+    assert forward_map.theory.bending == (film != {"pretension": 0.5})
+    assert errors(forward_map, draw(forward_map, 4, seed=7)[0]).max() < 1e-3
 
 
 def test_one_force():
@@ -170,10 +155,10 @@ def test_zero_force_is_no_charge_anywhere(three_map):
 def test_many_presses_are_each_of_them(three_map, oriented_map):
     """More than a chunk, and the order kept; untouched rows among them; also none."""
     for forward_map in (three_map, oriented_map):
-        contact, rotation = draw(forward_map, 600, seed=8)
+        contact, rotation = draw(forward_map, 300, seed=8)
         contact[::7, 2] = 0.0
         charge = forward_map.charges(contact, rotation)
-        for i in (0, 1, 255, 256, 300, 512, 599):
+        for i in (0, 1, 255, 256, 299):
             one = forward_map.charges(contact[i : i + 1], rotation[i : i + 1])[0]
             np.testing.assert_allclose(charge[i], one, rtol=1e-11)
     assert three_map.charges(np.empty((0, 3))).shape == (0, 3)
@@ -212,7 +197,7 @@ def test_map_over_most_of_the_film():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES.keys())
+@pytest.mark.parametrize("probe", [Polygon.triangle(2.5), Polygon.rectangle(4.0, 2.0, 0.5)], ids=["3", "4"])
 def test_the_usual_ranges(probe):
     """0.05 to 2 N, r <= 10 mm, random orientation, with bending: 95 % within 0.1 %, all within 0.5 %."""
     forward_map = ForwardMap.build(load_sensor("four-25um-uniaxial"), probe, radius=10.0)

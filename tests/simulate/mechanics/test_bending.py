@@ -7,7 +7,7 @@ from scipy.optimize import brentq
 from scipy.special import iv, jv
 
 from isocharge.simulate import Circle, Polygon, Resolution
-from isocharge.simulate.mechanics.bending import Bending
+from isocharge.simulate.mechanics.energy import Bending
 
 PROBES = [Circle(0.2), Polygon.triangle(0.4, 0.3), Polygon.rectangle(0.3, 0.2, 0.5)]
 FINE = Resolution(8, 8, 4)

@@ -87,7 +87,7 @@ def test_load_is_the_only_outer_force(elastic, mesh):
 @pytest.mark.parametrize("kind", ["taut plate", "plate"])
 def test_step_does_not_depend_on_the_shift(mesh, monkeypatch, kind, shift):
     """The linear solve with the carried Laplacian is (K + beta L^T M^-1 L) step = right, written out densely."""
-    monkeypatch.setattr("isocharge.simulate.mechanics.bending.SHIFT", shift)
+    monkeypatch.setattr("isocharge.simulate.mechanics.energy.SHIFT", shift)
     groups = GROUPS[kind]
     elastic, size = ElasticFilm(mesh.geometry, groups), 3 * mesh.template.n_node
     field, right = 0.3 * mesh.random_field(1), np.random.default_rng(2).standard_normal((mesh.template.n_node, 3))

@@ -8,7 +8,7 @@ from scipy.integrate import dblquad
 from scipy.spatial.transform import Rotation
 
 from isocharge.simulate import Circle, Polygon, Resolution
-from isocharge.simulate.mechanics.membrane import Membrane
+from isocharge.simulate.mechanics.energy import Membrane
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mechanics.stress import rotate_stress, strain, stress
 

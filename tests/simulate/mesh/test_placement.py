@@ -13,13 +13,12 @@ from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.sensor.probe import farthest
-from isocharge.simulate.solver.load_case import LoadCase
-from isocharge.simulate.solver.mesh_choice import choose_mesh
+from isocharge.simulate.solver.load_case import LoadCase, choose_mesh
 
 RADIUS = 45.0
 FILM = Film(RADIUS, 0.025, 3000.0, 0.34)
 FULL = Theory(stretching=True, bending=True, pretensioned=False)
-COMMON = settings(derandomize=True, deadline=None, max_examples=25)
+COMMON = settings(derandomize=True, deadline=None, max_examples=15)
 
 
 @st.composite
@@ -179,7 +178,7 @@ def test_footprint_edge_is_the_right_circle(distance, radius):
 
 
 @given(scene=presses())
-@settings(derandomize=True, deadline=None, max_examples=30)
+@COMMON
 def test_circle_round_a_polygon_is_on_the_film_and_holds_it(scene):
     probe, at, resolution, layer = scene
     placement = place(FILM, probe, at, resolution, layer).placement

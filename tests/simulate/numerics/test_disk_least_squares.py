@@ -1,10 +1,9 @@
 """Least squares over the unit disk times [-1, 1]: nearest points in closed form, and SciPy's constrained minimiser."""
 
 import numpy as np
-import pytest
 from scipy.optimize import minimize
 
-from isocharge.simulate.numerics.disk_least_squares import into_domain, minimise, minimise_one
+from isocharge.simulate.numerics.disk_least_squares import into_domain, minimise
 
 RNG = np.random.default_rng(0)
 TARGETS = np.concatenate([RNG.uniform(-1.0, 1.0, (60, 3)), 30.0 * RNG.normal(size=(60, 3)), [[0.0, 0.0, 5.0]]])
@@ -52,20 +51,6 @@ def test_no_point_is_nearer_by_scipy():
             options={"ftol": 1e-13},
         )
         assert (residual[row] ** 2).sum() <= solution.fun + 2e-6 * (1.0 + solution.fun)
-
-
-def test_one_problem_ends_where_it_does_among_many():
-    starts = into_domain(RNG.uniform(-1.0, 1.0, (20, 3)))
-    unit, residual = minimise(bent, starts)
-    for row in range(20):
-
-        def alone(at, row=row):
-            many, slopes = bent(np.array([row]), at[None])
-            return many[0], slopes[0]
-
-        end, square = minimise_one(alone, starts[row])
-        np.testing.assert_allclose(end, unit[row], atol=1e-9)
-        assert square == pytest.approx((residual[row] ** 2).sum(), rel=1e-9)
 
 
 def test_the_domain_is_reached_and_its_points_stay():

@@ -12,6 +12,7 @@ from isocharge.simulate.numerics.interpolation import (
     barycentric_weights,
     basis,
     chebyshev_nodes,
+    cubic_weights,
     lagrange_values,
     lobatto_nodes,
     lobatto_weights,
@@ -29,13 +30,6 @@ def test_nodes_are_the_extrema_of_the_legendre_polynomial_and_the_ends(order):
     assert nodes[-1] == 1.0
     assert legendre(order).deriv()(nodes[1:-1]) == pytest.approx(0.0, abs=1e-7 * order**4)
     np.testing.assert_allclose(nodes, -nodes[::-1], atol=1e-14)
-
-
-@pytest.mark.parametrize("order", ORDERS)
-def test_lobatto_weights_are_the_barycentric_ones(order):
-    """The closed form and the product over differences agree up to a common factor."""
-    ratio = lobatto_weights(order) / barycentric_weights(lobatto_nodes(order))
-    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-11)
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -82,3 +76,22 @@ def test_interpolation_on_one_node_is_a_constant():
     np.testing.assert_array_equal(
         lagrange_values(nodes, barycentric_weights(nodes), np.array([2.0, 3.5])), [[1.0], [1.0]]
     )
+
+
+# Local cubics
+
+
+def test_cubics_are_exact_everywhere():
+    polynomial = np.polynomial.Polynomial([1.0, -2.0, 0.3, 0.05])
+    at = np.array([-0.5, 0.0, 0.2, 1.7, 3.0, 5.9, 7.0, 7.4])
+    number, weights = cubic_weights(at, 8)
+    assert number.min() == 0
+    assert number.max() == 7
+    assert (weights * polynomial(number)).sum(axis=1) == pytest.approx(polynomial(at))
+
+
+def test_cubics_go_round_the_circle():
+    nodes = np.cos(2.0 * np.pi * np.arange(64) / 64)
+    at = np.array([-3.3, 0.1, 63.5, 70.2])
+    number, weights = cubic_weights(at, 64, periodic=True)
+    assert (weights * nodes[number]).sum(axis=1) == pytest.approx(np.cos(2.0 * np.pi * at / 64), abs=1e-5)

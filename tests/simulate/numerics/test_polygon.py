@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 from isocharge.simulate.numerics.polygon import area_in_disk, area_of, centroid_of, is_convex, overlap, shared_area
 
 SQUARE = np.array([0.0, 1.0, 1.0 + 1.0j, 1.0j])
-COMMON = settings(derandomize=True, deadline=None, max_examples=150)
+COMMON = settings(derandomize=True, deadline=None, max_examples=40)
 
 
 def corners_of(z: np.ndarray) -> np.ndarray:
@@ -75,10 +75,10 @@ def test_area_in_a_disk_is_bounded_and_additive_and_a_polygons_limit(a, x, y, ra
     assert -1e-9 * most <= common <= most * (1.0 + 1e-9)
     split = sum(area_in_disk(part, centre, radius) for part in halves(a))
     assert split == pytest.approx(common, abs=1e-9 + 1e-9 * most)
-    count = 400
+    count = 100
     nearly = radius / np.sqrt(np.sin(2 * np.pi / count) * count / (2 * np.pi))
     ring = centre + nearly * np.exp(2j * np.pi * np.arange(count) / count)
-    assert shared_area(a, ring) == pytest.approx(common, abs=2e-4 * np.pi * radius**2)
+    assert shared_area(a, ring) == pytest.approx(common, abs=2e-3 * np.pi * radius**2)
 
 
 @pytest.mark.parametrize(

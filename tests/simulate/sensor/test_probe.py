@@ -102,9 +102,9 @@ def test_any_text_is_a_probe_or_a_scene_error(text):
 
 @pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
 def test_impossible_sizes(size):
-    with pytest.raises(SceneError, match=f"probe radius: expected a positive number, got {size}"):
+    with pytest.raises(SceneError, match=f"probe radius: expected at least 0.02 mm, got {size:g} mm"):
         Circle(size)
-    with pytest.raises(SceneError, match=f"probe height: expected a positive number, got {size}"):
+    with pytest.raises(SceneError, match=f"probe height: expected at least 0.001 mm, got {size:g} mm"):
         Polygon.rectangle(1.0, size)
 
 
@@ -118,11 +118,11 @@ def test_sizes_in_metres_are_refused():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("circle:-1", "^probe radius: expected a positive number, got -1 mm in 'circle:-1'$"),
-        ("rectangle:4x-1", "^probe height: expected a positive number, got -1 mm"),
-        ("triangle:1e999", "^probe side: expected a positive number, got 1e999 mm"),
+        ("circle:-1", "^probe radius: expected at least 0.02 mm, got -1 mm$"),
+        ("rectangle:4x-1", "^probe height: expected at least 0.001 mm, got -1 mm"),
+        ("triangle:1e999", "^probe side: expected at least 0.001 mm, got inf mm"),
         ("polygon:0,0;0,0;0,0", "convex polygon"),
-        ("polygon:0,0;1e999,0;0,1", "expected finite corners"),
+        ("polygon:0,0;1e999,0;0,1", "expected 3 to 64 corners"),
     ],
 )
 def test_impossible_size_in_the_notation(text, message):

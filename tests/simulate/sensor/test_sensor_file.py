@@ -2,7 +2,6 @@
 
 import copy
 import json
-import re
 import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -136,7 +135,7 @@ def test_polygons_need_no_side():
 
 
 @given(path=st.sampled_from(CLOSED), key=st.text(min_size=1, max_size=12))
-@settings(derandomize=True, max_examples=100)
+@settings(derandomize=True, max_examples=30)
 def test_unknown_key_is_named(path, key):
     table = whole()
     if key in at(table, path):
@@ -174,6 +173,7 @@ def test_wrong_type_is_named(path):
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
+        (("piezo", "d32"), -2e-4, r"piezo d32: expected pC/N, got -0\.0002 pC/N"),
         (("film", "poisson"), 0.5, "film poisson: expected 0 <= poisson < 0.5, got 0.5"),
         (("film", "thickness_um"), -25.0, r"film\.thickness_um: expected a positive number, got -25\.0"),
         (("film", "radius_mm"), 1e300, r"film\.radius_mm: expected a number above 0 and at most 1e\+06, got 1e\+300"),
@@ -191,7 +191,7 @@ def test_wrong_type_is_named(path):
             {"polygon_mm": [3]},
             r"electrodes\.A\.polygon_mm\[1\]: expected \[x, y\] in mm",
         ),
-        (("electrodes", "A"), {"polygon_mm": []}, "electrode 'A': expected at least three corners"),
+        (("electrodes", "A"), {"polygon_mm": []}, "electrode 'A': expected 3 to 256 corners"),
         (
             ("electrodes", "B"),
             [25.0, 25.0],
@@ -206,25 +206,15 @@ def test_impossible_values(path, value, message):
         sensor_from_dict(table, "mine.toml")
 
 
-@pytest.mark.parametrize(
-    ("line", "other", "said"),
-    [
-        ("d32 = 2.0", "d32 = -2e-4", r"piezo\.d32 is -0\.0002 pC/N, beside 20 pC/N: expected 1 to 30 pC/N"),
-        ("B = [8.660254, 5.0]\n", "", r"one electrode \('A'\): .* three electrodes or more do"),
-        ("d31 = 20.0", "d31 = 0.0", None),
-        ("d32 = 2.0", "d32 = -0.03", None),
-    ],
-)
-def test_what_can_hardly_be_meant_gets_a_warning(tmp_path, line, other, said, command, caplog):
+def test_one_electrode_gets_a_warning(tmp_path, command, caplog):
     path = tmp_path / "mine.toml"
-    path.write_text(WHOLE.replace(line, other))
+    path.write_text(WHOLE.replace("B = [8.660254, 5.0]\n", ""))
     load_sensor(path)
-    assert len(caplog.messages) == bool(said)
-    if said:
-        assert re.match(f"{path}: {said}", caplog.messages[0])
-        code, out, err = command("simulate", "point", path, "--at", "1,2", "--json")
-        assert (code, json.loads(out)["status"]) == (0, "converged")
-        assert re.search(rf"{path}: {said}", err)
+    (said,) = caplog.messages
+    assert said.startswith(f"{path}: one electrode: its charge can be computed")
+    code, out, err = command("simulate", "point", path, "--at", "1,2", "--json")
+    assert (code, json.loads(out)["status"]) == (0, "converged")
+    assert said in err
 
 
 @pytest.mark.parametrize(
@@ -253,7 +243,7 @@ def test_too_many_electrodes_are_refused_at_once(tmp_path, count):
     good = (resources.files("isocharge.simulate") / "sensors/three-25um-biaxial.toml").read_text("utf-8")
     head, tail = good.split("side_mm = 3.0\n")
     path.write_text(head + "side_mm = 3.0\n" + "".join(f"e{k} = [0, 0]\n" for k in range(count)) + tail)
-    with pytest.raises(SensorError, match=r"larger than|at most 64") as caught:
+    with pytest.raises(SensorError, match=r"larger than|expected 1 to 64") as caught:
         load_sensor(path)
     assert len(str(caught.value)) < 500
 
@@ -349,7 +339,7 @@ def numbers(table: object) -> list[float]:
     shift=st.tuples(*[st.floats(-1.0, 1.0)] * 2),
     surface=st.sampled_from(["middle", "top", "bottom"]),
 )
-@settings(derandomize=True, max_examples=100, deadline=None)
+@settings(derandomize=True, max_examples=30, deadline=None)
 def test_what_is_written_is_loaded(name, shapes, film, piezo, gains, rotation, shift, surface, tmp_path_factory):
     gain = {shape.name: value for shape, value in zip(shapes, gains, strict=False) if value is not None}
     calibration = Calibration(gain, shift, rotation)

@@ -35,9 +35,8 @@ MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
             1.0,
             r"probe off the film: centre \(44\.5, 0\) mm, farthest .* circle:1\.0 45\.5 mm",
         ),
-        (Circle(45.0), (0.0, 0.0), 1.0, "probe off the film"),
         (Polygon.rectangle(10.0, 1.0), (39.9, 5.0), 1.0, r"off the film: centre \(39\.9, 5\) mm, .* rectangle"),
-        (Circle(1.0), (np.nan, 0.0), 1.0, r"position: expected two finite numbers, got \(nan, 0\.0\)"),
+        (Circle(1.0), (np.nan, 0.0), 1.0, r"probe off the film: centre \(nan, 0\) mm"),
         (
             Circle(1.0),
             (0.0, 0.0),
@@ -60,14 +59,13 @@ def test_a_probe_below_what_the_grading_resolves_is_refused(film):
         press(replace(film, radius=4500.0), Circle(0.03), (0.0, 0.0), 1.0)
 
 
-@pytest.mark.parametrize("point", [(46.0, 0.0), (-40.0, 30.0), (np.nan, 0.0)])
-def test_points_off_the_film_are_refused(film, point):
-    solved = press(film, Circle(1.0), (0.0, 0.0), 1.0)
-    points = np.array([(0.0, 0.0), (0.0, 45.0), point])
-    for read in (deflection, touch_stress):
+@pytest.mark.parametrize("read", [deflection, touch_stress])
+def test_points_off_the_film_are_refused(made_up, read):
+    solved = made_up(lambda x: np.zeros((len(x), 3)))
+    for point in ((-40.0, 30.0), (np.nan, 0.0)):
         with pytest.raises(SceneError, match=rf"point \({point[0]:.4g}, .*\) mm is off the film of radius 45 mm"):
-            read(solved, points)
-        read(solved, points[:2])
+            read(solved, np.array([(0.0, 45.0), point]))
+    read(solved, np.array([(0.0, 45.0)]))
 
 
 # Made-up fields
@@ -113,21 +111,19 @@ def test_rigid_rotation_has_no_stress_and_no_charge(film, made_up, surface):
 # Real ones
 
 
-@pytest.mark.parametrize("probe", [Circle(1.0), Polygon.triangle(4.0, 0.3)], ids=["circle", "triangle"])
-def test_clamped_rim_does_not_move(film, probe):
+def test_clamped_rim_does_not_move(film):
     angle = np.linspace(0.0, 2.0 * np.pi, 40)
     rim = film.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    assert np.abs(deflection(press(film, probe, (6.0, -5.0), 1.0), rim)).max() < 1e-12
+    assert np.abs(deflection(press(film, Polygon.triangle(4.0, 0.3), (6.0, -5.0), 1.0), rim)).max() < 1e-12
 
 
-@pytest.mark.parametrize("probe", [Circle(1.0), Polygon.rectangle(4.0, 2.0, 0.3)], ids=["circle", "rectangle"])
-def test_vertical_forces_balance_round_the_probe(film, probe):
+def test_vertical_forces_balance_round_the_probe(film):
     """The membrane's pull through a circle round the probe carries the force: F = integral of (S grad w) . n h ds.
 
     Independent of the solver's own residual: stress and deflection are read as a user reads them.
     """
-    at, radius, step = (6.0, -5.0), 5.0, 1e-3
-    solved = press(film, probe, at, 1.0, SolveSettings(theory=MEMBRANE, resolution=Resolution(7, 8, 6)))
+    probe, at, radius, step = Polygon.rectangle(4.0, 2.0, 0.3), (6.0, -5.0), 5.0, 1e-3
+    solved = press(film, probe, at, 1.0, SolveSettings(theory=MEMBRANE, resolution=Resolution(6, 8, 6)))
     angle = 2.0 * np.pi * np.arange(64) / 64
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = at + radius * normal
@@ -140,8 +136,9 @@ def test_vertical_forces_balance_round_the_probe(film, probe):
 
 def test_compression_near_the_rim_is_a_caution(film):
     """No wrinkles where the forward map works."""
-    for distance, taut in ((0.0, True), (0.5, True), (0.75, False)):
-        solved = press(film, Circle(1.0), (distance * film.radius, 0.0), 1.0, SolveSettings(theory=MEMBRANE))
+    for distance, taut in ((0.5, True), (0.75, False)):
+        settings = SolveSettings(theory=MEMBRANE, resolution=Resolution(5, 8, 5))
+        solved = press(film, Circle(1.0), (distance * film.radius, 0.0), 1.0, settings)
         wrinkles = [caution for caution in cautions(solved) if "may wrinkle" in caution]
         assert (principal_stress(solved)[0] > 0.0) == taut == (not wrinkles)
 
@@ -171,7 +168,7 @@ def test_principal_stress_is_that_of_the_points(film):
         assert surface != "middle" or (mean - radius).min() >= smallest - 0.02 * largest
 
 
-@pytest.mark.first_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_mesh_error_is_a_bound(film, seed):
     """Against a refined solve, for the worst charge over the press's largest, probes on electrodes and far out too."""
@@ -198,14 +195,13 @@ def test_mesh_error_is_a_bound(film, seed):
 def test_accuracy_is_reached(film):
     """And costs: a finer mesh for more digits."""
     sensor, scene = load_sensor("four-25um-uniaxial"), (film, Circle(1.0), (9.0, 1.0), 1.0)
-    exact = touch_charge(sensor, press(*scene, SolveSettings(theory=FULL, resolution=Resolution(10, 8, 8, 3))))
+    exact = touch_charge(sensor, press(*scene, SolveSettings(theory=FULL, resolution=Resolution(8, 8, 7, 2))))
     sizes = []
-    for accuracy in (1e-2, 1e-3, 1e-4):
+    for accuracy in (1e-3, 5e-4):
         solved = press(*scene, SolveSettings(accuracy=accuracy, theory=FULL))
         assert np.abs(touch_charge(sensor, solved) / exact - 1.0).max() < accuracy
         sizes.append(solved.field.size)
-    assert sizes == sorted(sizes)
-    assert sizes[0] < sizes[-1]
+    assert sizes[0] < sizes[1]
 
 
 def test_estimates_where_they_are_singular(film):

@@ -19,20 +19,17 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.mesh.elements import Geometry
-from isocharge.simulate.mesh.placed_mesh import place
+from isocharge.simulate.mesh.placed_mesh import Geometry, place
 from isocharge.simulate.solver.error_estimate import estimated_error, mesh_error, relative_difference
-from isocharge.simulate.solver.load_case import LoadCase
-from isocharge.simulate.solver.mesh_choice import needs_second_mesh
+from isocharge.simulate.solver.load_case import LoadCase, needs_second_mesh
 from isocharge.simulate.solver.press import needed_resolution, resampled
 
 FILM = Film(45.0, 0.025, 3000.0, 0.34)
 INNER = (Circle(1.0), (8.0, 2.0), 1.0)
-NEAR_THE_RIM = (Circle(1.0), (33.0, 5.0), 1.0)
-LARGE_POLYGON = (Polygon.rectangle(8.0, 2.0), (3.0, 0.0), 1.0)
+NEAR_THE_RIM = (Circle(2.0), (28.0, 0.0), 0.1)
 
 
-@pytest.mark.parametrize("scene", [INNER, NEAR_THE_RIM, LARGE_POLYGON], ids=["inner", "rim", "large polygon"])
+@pytest.mark.parametrize("scene", [INNER, NEAR_THE_RIM], ids=["inner", "rim"])
 def test_needed_resolution_is_that_of_the_press(scene):
     assert needed_resolution(FILM, *scene) == press(FILM, *scene).mesh.resolution
 
@@ -86,7 +83,7 @@ def worst_error(film: Film, rough, fine) -> float:
     return float(max(errors))
 
 
-@pytest.mark.first_cases(3)
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
 def test_mesh_error_bounds_the_difference_from_a_finer_mesh(scene):
     """Against a mesh two orders higher with more rings, evenly and at the rim."""
@@ -101,7 +98,7 @@ def test_mesh_error_bounds_the_difference_from_a_finer_mesh(scene):
     assert worst_error(film, solved, refined) <= mesh_error(solved) < 0.01
 
 
-@pytest.mark.parametrize("probe", [Circle(1.0), Polygon.rectangle(4.0, 2.0, 0.3)])
+@pytest.mark.parametrize("probe", [Circle(1.0), Polygon.rectangle(4.0, 2.0, 0.3)], ids=["circle", "rectangle"])
 def test_a_resampled_field_is_the_same_field(probe: Probe):
     """Up: the same polynomials, to round-off; and down again."""
     solved = press(FILM, probe, (6.0, 1.0), 1.0)
@@ -142,8 +139,9 @@ def test_where_a_second_mesh_is_needed(probe, distance, accuracy, needed):
 
 def test_press_on_two_meshes_starts_its_neighbour():
     """Although its mesh is of a higher order than the neighbour's first."""
-    first = press(FILM, Circle(1.0), (36.0, 0.0), 1.0)
-    cold, warm = (press(FILM, Circle(1.0), (36.0, 0.0), 1.05, start=start) for start in (None, first))
+    probe, at, force = NEAR_THE_RIM
+    first = press(FILM, probe, at, force)
+    cold, warm = (press(FILM, probe, at, 1.05 * force, start=start) for start in (None, first))
     assert first.proven_error is not None
     assert warm.mesh.resolution == cold.mesh.resolution
     assert warm.iterations < cold.iterations
@@ -159,7 +157,8 @@ def test_wrinkling_on_a_finer_mesh_is_an_error():
 
 def test_meshes_with_different_equilibria_are_an_error(monkeypatch):
     """Meshes that differ by a tenth are not two views of one film; by less, the difference is the estimate."""
-    scene = FILM, Circle(1.0), (32.0, 0.0), 1.0
+    scene = FILM, *NEAR_THE_RIM
+    monkeypatch.setattr("isocharge.simulate.solver.press.MOST_ORDERS", 1)
     monkeypatch.setattr("isocharge.simulate.solver.press.relative_difference", lambda *_: 0.09)
     assert estimated_error(press(*scene)) == pytest.approx(0.09)
     monkeypatch.setattr("isocharge.simulate.solver.press.relative_difference", lambda *_: 0.11)

@@ -13,30 +13,28 @@ from isocharge.simulate.solver import newton
 from isocharge.simulate.solver.assembly import Assembly, Factor
 from isocharge.simulate.solver.newton import schwerin_start
 
-FORCES = (1e-5, 1e-3, 0.1, 1.0, 10.0)
+FORCES = (1e-5, 0.1, 10.0)
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
 FULL = Theory(stretching=True, bending=True, pretensioned=False)
 PROBES = {"circle": Circle(1.0), "rectangle": Polygon.rectangle(4.0, 2.0, 0.4)}
 FAILING = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 3), tolerance=1e-30)
 
 
-@pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES.keys())
 @pytest.mark.parametrize(
-    ("changes", "theory"),
+    ("probe", "changes", "theory"),
     [
-        ({}, MEMBRANE),
-        ({}, FULL),
-        ({"thickness": 1.0}, FULL),
-        ({"pretension": 1e-3}, FULL),
-        ({"pretension": 1.0}, FULL),
-        ({"pretension": 20.0}, FULL),
+        ("rectangle", {}, MEMBRANE),
+        ("circle", {}, FULL),
+        ("circle", {"thickness": 1.0}, FULL),
+        ("rectangle", {"pretension": 1e-3}, FULL),
+        ("circle", {"pretension": 20.0}, FULL),
     ],
     ids=str,
 )
 def test_every_force_converges_from_flat(film, changes, theory, probe):
     """No help from the user: no force steps, no tension, no start."""
     for force in FORCES:
-        solved = press(replace(film, **changes), probe, (5.0, 3.0), force, SolveSettings(theory=theory))
+        solved = press(replace(film, **changes), PROBES[probe], (5.0, 3.0), force, SolveSettings(theory=theory))
         assert solved.residual <= 1e-7 or "round-off" in solved.message
         assert solved.iterations <= 20
 
@@ -45,8 +43,6 @@ def test_every_force_converges_from_flat(film, changes, theory, probe):
     ("probe", "at", "force"),
     [
         (Circle(1.0), (0.0, 30.0), 5.0),
-        (Circle(1.0), (0.0, 42.0), 1e-3),
-        (Circle(13.5), (1.0, 1.0), 5.0),
         (Circle(40.5), (1.0, 1.0), 1e-4),
     ],
 )
@@ -54,7 +50,7 @@ def test_presses_near_the_rim_and_of_large_probes_converge(film, probe, at, forc
     assert press(film, probe, at, force).iterations <= 20
 
 
-@pytest.mark.parametrize("resolution", [Resolution(2, 8, 3), Resolution(6, 8, 6, 1), Resolution(5, 16, 8)], ids=str)
+@pytest.mark.parametrize("resolution", [Resolution(2, 8, 3), Resolution(5, 16, 5, 1)], ids=str)
 def test_every_mesh_converges(film, resolution):
     settings = SolveSettings(theory=FULL, resolution=resolution)
     assert press(film, Circle(1.0), (8.0, 0.0), 1.0, settings).iterations <= 12
@@ -87,12 +83,6 @@ def test_start_of_another_mesh_is_not_used(film):
     for start in (coarse, other):
         solved = press(*scene, SolveSettings(resolution=cold.mesh.resolution), start=start)
         np.testing.assert_array_equal(solved.field, cold.field)
-
-
-def test_start_of_a_much_thicker_film_still_converges(film):
-    settings = SolveSettings(theory=FULL)
-    thick = press(replace(film, thickness=1.0), Circle(1.0), (5.0, 0.0), 1.0, settings)
-    assert press(film, Circle(1.0), (5.0, 0.0), 1e-3, settings, start=thick).status == "converged"
 
 
 def test_a_failure_raises_a_full_sentence_or_is_a_status(film, monkeypatch):
@@ -152,8 +142,7 @@ def test_press_too_near_the_rim_is_refused(film):
         press(film, Circle(0.9999), (44.0, 0.0), 1.0)
 
 
-@pytest.mark.parametrize("pretension", [0.0, 0.1, 10.0])
-@pytest.mark.parametrize("thickness", [0.025, 1.0])
+@pytest.mark.parametrize(("pretension", "thickness"), [(0.0, 0.025), (10.0, 0.025), (0.1, 1.0)])
 def test_start_has_about_the_right_height(film, pretension, thickness):
     """Within a factor of two of the solution in slack, taut and thick films alike; flat on the rim."""
     film = replace(film, pretension=pretension, thickness=thickness)

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.sensor.electrode import Electrode
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor import Electrode, Sensor
 
 SAMPLE = 0.1
 """Distance of the points of a lead at which its clearance is checked, mm."""

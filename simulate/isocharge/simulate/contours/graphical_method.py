@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 from isocharge.common.arrays import Array
 from isocharge.simulate.contours.charge_curves import Curves
 from isocharge.simulate.contours.fix import AMBIGUOUS, APART, TOLERANCE, Fix, Meeting, check_triangulation
-from isocharge.simulate.forward.checks import as_charges
+from isocharge.simulate.forward.charge_map import as_charges
 
 DEGREE = 4
 """Degree of the polynomial along a line: our choice, since lower degrees miss the charge near the electrode."""

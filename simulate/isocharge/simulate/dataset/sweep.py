@@ -34,7 +34,7 @@ from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
-from isocharge.simulate.solver.settings import SolveSettings
+from isocharge.simulate.solver.load_case import SolveSettings
 
 SHARD = 16384
 """Samples per shard."""

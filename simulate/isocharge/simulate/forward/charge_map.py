@@ -1,4 +1,4 @@
-"""The map from contacts to charges: one protocol that everything speaks that gives or needs charges."""
+"""The map from contacts to charges: one protocol that everything speaks that gives or needs charges; its checks."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -6,8 +6,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from isocharge.common.arrays import Array
-from isocharge.common.errors import SceneError
+from isocharge.common.arrays import Array, Booleans
+from isocharge.common.errors import ChargeError, SceneError
 
 STEPS = (0.05, 0.05, 1e-3)
 """Steps of the central differences in x and y (mm) and in ln F (dimensionless)."""
@@ -66,11 +66,10 @@ class Domain:
         Raises:
             SceneError: With the first contact that lies outside.
         """
-        distance, force = np.hypot(contact[:, 0], contact[:, 1]), contact[:, 2]
-        low, high = self.force_range
-        inside = (distance <= self.radius * SLACK) & (force >= low / SLACK) & (force <= high * SLACK)
+        inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.radius * SLACK
+        inside &= _are_within(contact[:, 2], self.force_range)
         if not inside.all():
-            i = int(np.argmin(inside))
+            i, (low, high) = int(np.argmin(inside)), self.force_range
             x, y, f = contact[i]
             raise SceneError(
                 f"press {i} at ({x:.4g}, {y:.4g}) mm with {f:.4g} N is outside the {source}: expected at most "
@@ -181,3 +180,68 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
     values = np.asarray(function(np.concatenate(moved))).reshape(3, 2, len(contact), -1)
     slopes = (values[:, 0] - values[:, 1]) / (2.0 * np.array(steps))[:, None, None]
     return np.moveaxis(slopes, 0, 2)
+
+
+def check_forces(force: Array | float, force_range: tuple[float, float], source: str) -> None:
+    """Refuse forces outside a range (N); `source` says what has it.
+
+    Raises:
+        SceneError: If a force lies outside.
+    """
+    forces = np.atleast_1d(force)
+    inside = _are_within(forces, force_range)
+    if not inside.all():
+        i, (low, high) = int(np.argmin(inside)), force_range
+        which = f"force of press {i}" if forces.size > 1 else "force"
+        raise SceneError(f"{which}: expected {low:g} to {high:g} N, which the {source} covers, got {forces[i]:g} N")
+
+
+def _are_within(force: Array, force_range: tuple[float, float]) -> Booleans:
+    """Which forces lie in a range; NaN does not."""
+    within: Booleans = (force >= force_range[0] / SLACK) & (force <= force_range[1] * SLACK)
+    return within
+
+
+def check_radius(radius: float, largest: float, source: str) -> None:
+    """Refuse a radius (mm) that is not positive or larger than `largest`; `source` says what has that limit.
+
+    Raises:
+        SceneError: If the radius lies outside.
+    """
+    if not 0.0 < radius <= largest * SLACK:
+        raise SceneError(f"radius: expected up to the {source}'s {largest:g} mm, got {radius:g} mm")
+
+
+def check_determined(electrodes: int) -> None:
+    """Refuse sensors whose charges cannot determine a contact anywhere.
+
+    Raises:
+        SceneError: If there are fewer than three electrodes.
+    """
+    if electrodes < 3:
+        raise SceneError(
+            f"expected at least three electrodes, got {electrodes}: x, y and the force are three unknowns, so with "
+            "fewer charges a whole line of contacts has the same ones; add an electrode"
+        )
+
+
+def as_charges(charge: Array, electrode_names: tuple[str, ...]) -> Array:
+    """Charges of presses as float64, one for each electrode.
+
+    Args:
+        charge: Charges, shape (n, n_electrode), pC.
+        electrode_names: In the order of the charges.
+
+    Raises:
+        ChargeError: If the charges are not finite or not one for each electrode.
+    """
+    charge = np.asarray(charge, dtype=float)
+    count = len(electrode_names)
+    if charge.ndim != 2 or charge.shape[1] != count:
+        raise ChargeError(f"expected charges of shape (n, {count}) for {electrode_names}, got shape {charge.shape}")
+    if not np.isfinite(charge).all():
+        row, column = np.argwhere(~np.isfinite(charge))[0]
+        raise ChargeError(
+            f"charge of {electrode_names[column]!r} in press {row}: expected a finite number, got {charge[row, column]}"
+        )
+    return charge

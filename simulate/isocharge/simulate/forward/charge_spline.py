@@ -7,7 +7,6 @@ between forces in the same way, so at its force nodes nothing is lost.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.interpolate import NdBSpline
@@ -15,8 +14,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.charge_map import ChargeMap, Domain
-from isocharge.simulate.forward.checks import check_radius
+from isocharge.simulate.forward.charge_map import ChargeMap, Domain, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.numerics.disk import lattice, onto_disk, sunflower
@@ -135,15 +133,11 @@ class ChargeSpline:
         slope = np.einsum("nk,nkei->nei", weights, self.slopes(position))
         return np.einsum("nk,nke->ne", weights, terms), slope, np.einsum("nk,nke->ne", change, terms)
 
-    def scale(self, force: Array | float) -> Any:
-        """Approximate dependence of the charges on the force (N), dimensionless; a polynomial in ln F corrects it."""
-        return amplitude_squared(self.film, force)
-
     def by_force(self, logs: Array) -> Array:
         """Weights of the table's forces at logarithms of forces, shape (...) to (..., n_term): Q = weights @ terms."""
         nodes = np.log(self.force)
         weights = lagrange_values(nodes, barycentric_weights(nodes), logs.ravel())
-        weights *= self.scale(np.exp(logs.ravel()))[:, None]
+        weights *= amplitude_squared(self.film, np.exp(logs.ravel()))[:, None]
         return weights.reshape(*logs.shape, nodes.size)
 
     def terms(self, position: Array) -> Array:

@@ -1,6 +1,6 @@
 """A family of presses of one probe: where it is solved, and how presses between are interpolated."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -18,9 +18,8 @@ from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
-from isocharge.simulate.solver.load_case import check_press
+from isocharge.simulate.solver.load_case import SolveSettings, check_press
 from isocharge.simulate.solver.press import press
-from isocharge.simulate.solver.settings import SolveSettings
 
 ROTATIONS = 7
 """Smallest number of orientations: only the first harmonics of the rim, far from the probe, reach the probe."""
@@ -91,12 +90,12 @@ class Family:
         The settings give theory, mesh and width of the thin rings, the same for all members.
         """
         chains = [
-            _Chain(sensor.film, probe.rotated(float(rotation)), sensor.surface, float(distance), self.force, settings)
+            Chain(sensor.film, probe.rotated(float(rotation)), float(distance), self.force, sensor.surface, settings)
             for distance in self.distance
             for rotation in self.solved_rotations
         ]
-        solved = track(in_order(executor, _solve_chain, chains), "solving the film", len(chains))
-        return np.stack(list(solved)).reshape(self.distance.size, self.solved_rotations.size, self.force.size, -1)
+        solved = solve_chains(chains, executor)
+        return solved.reshape(self.distance.size, self.solved_rotations.size, self.force.size, -1)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
         """Fields of all orientations from those that were solved, each node in its rotated place.
@@ -150,22 +149,35 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
 
 
 @dataclass(frozen=True)
-class _Chain:
-    """Presses of one distance (mm) and orientation, in the order of their forces (N), by a probe rotated as it is."""
+class Chain:
+    """Presses on one film at one place that differ by their forces; each is solved from the one before.
+
+    Attributes:
+        film: The film.
+        probe: The footprint, rotated as it is.
+        distance: Of its centroid from the centre, mm.
+        forces: N, in their order.
+        surface: Where in the thickness the stress is read.
+        settings: Theory, mesh and width of the thin rings.
+    """
 
     film: Film
     probe: Probe
-    surface: Surface
     distance: float
     forces: Array
+    surface: Surface
     settings: SolveSettings
 
 
-def _solve_chain(chain: _Chain) -> Array:
-    """Scaled stress at the nodes for each force, solved from the one before; shape (n_force, ...)."""
+def solve_chains(chains: Sequence[Chain], executor: Executor | None) -> Array:
+    """Scaled stress at the nodes, seen from the probe, shape (n_chain, n_force, n_element * n_local * 3)."""
+    return np.stack(list(track(in_order(executor, _solve_chain, chains), "solving the film", len(chains))))
+
+
+def _solve_chain(chain: Chain) -> Array:
     start: Equilibrium | None = None
     rows = []
-    for force in chain.forces:
-        start = press(chain.film, chain.probe, (chain.distance, 0.0), float(force), chain.settings, start=start)
+    for force in chain.forces.tolist():
+        start = press(chain.film, chain.probe, (chain.distance, 0.0), force, chain.settings, start=start)
         rows.append(rotate_stress(nodal_stress(start, chain.surface), -chain.probe.angle).ravel())
     return np.stack(rows)

@@ -17,6 +17,7 @@ In a file, coefficients and modes are integers of 16 bits, each mode with its ow
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import product
 from typing import Any, cast, get_args
 
 import numpy as np
@@ -25,26 +26,36 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, SceneError, SolveError
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.forward.family import Family, check_family
-from isocharge.simulate.forward.film_grid import (
-    AXES,
-    COUNTS,
-    THEORY,
-    FilmGrid,
-    FilmLimits,
-    decompose,
-    limits_of,
-    solve_films,
-)
+from isocharge.simulate.forward.family import Chain, Family, check_family, solve_chains
 from isocharge.simulate.forward.forward_map import ForwardMap, relative_error
-from isocharge.simulate.mesh.resolution import Resolution
+from isocharge.simulate.mechanics.theory import Theory
+from isocharge.simulate.mesh.blocks import Resolution
+from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.solver.load_case import layer_for
+from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 from isocharge.simulate.solver.press import needed_resolution
-from isocharge.simulate.solver.settings import SolveSettings
+
+AXES = ("distance", "load", "tension", "thickness", "reach")
+"""The numbers that a press of a film is described by, in the order of the grid's axes."""
+
+COUNTS = (5, 12, 8, 2, 5)
+"""Nodes along each axis."""
+
+SOFTENING = 4e-4
+"""Added to the tension before its logarithm is taken: about the strain that a press of 0.05 N induces, below which the
+pretension makes no difference."""
+
+MODES_LEFT = 8e-5
+"""Share of the stresses that the modes may leave out: root mean square, each node's stress relative to its own size."""
+
+THEORY = Theory(stretching=True, bending=True, pretensioned=True)
+"""All terms: a family holds slack films and taut ones."""
+
+FilmLimits = dict[str, tuple[float, float]]
+"""Smallest and largest value along each of `AXES`, all dimensionless."""
 
 LARGEST_ERROR = 2e-3
 """Largest relative error of any charge against direct solves that a family may have, dimensionless: the lightest
@@ -55,6 +66,56 @@ CHECKS = 24
 
 SLACK = 1e-9
 """Relative tolerance of the limits: rounding of units."""
+
+
+@dataclass(frozen=True)
+class FilmGrid:
+    """Nodes of a family, one array for each of `AXES`, ascending.
+
+    Attributes:
+        distance: Of the press from the film's centre over the film's radius a.
+        load: F / (E h a).
+        tension: Pretension over E.
+        thickness: h / a.
+        reach: Radius of the probe over a.
+    """
+
+    distance: Array
+    load: Array
+    tension: Array
+    thickness: Array
+    reach: Array
+
+    @classmethod
+    def spread(cls, limits: FilmLimits, counts: tuple[int, ...] = COUNTS) -> "FilmGrid":
+        """Chebyshev nodes between the limits: of load, reach and softened tension in the logarithm."""
+        axes = {name: (_stretched(name, low), _stretched(name, high)) for name, (low, high) in limits.items()}
+        nodes = [chebyshev_nodes(count, *axes[name]) for name, count in zip(AXES, counts, strict=True)]
+        return cls(*(_unstretched(name, values) for name, values in zip(AXES, nodes, strict=True)))
+
+    def weights(self, axis: str, at: float) -> Array:
+        """Interpolation weights of an axis at one value, shape (n_node,)."""
+        nodes = _stretched(axis, getattr(self, axis))
+        weights: Array = lagrange_values(nodes, barycentric_weights(nodes), np.array([_stretched(axis, at)]))[0]
+        return weights
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of nodes along each axis."""
+        return tuple(getattr(self, name).size for name in AXES)
+
+
+def _stretched(axis: str, value: Array | float) -> Any:
+    """The coordinate in which an axis is interpolated by polynomials."""
+    if axis in ("load", "reach"):
+        return np.log(value)
+    return np.log(value + SOFTENING) if axis == "tension" else value
+
+
+def _unstretched(axis: str, value: Array) -> Array:
+    if axis in ("load", "reach"):
+        return np.exp(value)
+    return np.maximum(np.exp(value) - SOFTENING, 0.0) if axis == "tension" else value
 
 
 @dataclass(frozen=True)
@@ -108,7 +169,7 @@ class FilmFamily:
             SolveError: If an equilibrium or the interpolation error is not reached.
         """
         domain, film, surface = Domain(radius, force_range), prior.sensor.film, prior.sensor.surface
-        limits = limits_of(prior, domain)
+        limits = _limits_of(prior, domain)
         grid, a = FilmGrid.spread(limits, counts), film.radius
         check_family(film, Circle(limits["reach"][1] * a), domain)
         middle = float(np.sqrt(force_range[0] * force_range[1]))
@@ -117,7 +178,7 @@ class FilmFamily:
         smallest = Circle(limits["reach"][0] * a)
         resolution = needed_resolution(film, smallest, (radius, 0.0), middle, settings)
         settings = replace(settings, resolution=resolution)
-        coefficients, modes = decompose(solve_films(film, surface, grid, settings, executor))
+        coefficients, modes = _decompose(_solve_films(film, surface, grid, settings, executor))
         family = cls(film.poisson, surface, limits, grid, resolution, layer, coefficients, modes, np.nan)
         error = _check_against_solves(family, prior, domain)
         if error > LARGEST_ERROR:
@@ -231,3 +292,48 @@ def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain, 
         force = float(low * (high / low) ** rng.random())
         errors.append(relative_error(forward_map, distance, angle, force))
     return max(errors)
+
+
+def _limits_of(prior: FilmPrior, domain: Domain) -> FilmLimits:
+    """All that the presses of a domain can be on the films that a calibration may find."""
+    low, high = (dict(zip(prior.names, bound.tolist(), strict=True)) for bound in prior.bounds)
+    film, a = prior.sensor.film, prior.sensor.film.radius
+    stiffness = [film.young * film.thickness * a * np.exp(bound["young"] + bound["thickness"]) for bound in (low, high)]
+    softest = film.young * np.exp(low["young"])
+    return {
+        "distance": (0.0, domain.radius / a),
+        "load": (domain.force_range[0] / stiffness[1], domain.force_range[1] / stiffness[0]),
+        "tension": (low["pretension"] / softest, high["pretension"] / softest),
+        "thickness": (film.thickness / a * np.exp(low["thickness"]), film.thickness / a * np.exp(high["thickness"])),
+        "reach": ((prior.probe.radius + low["probe_radius"]) / a, (prior.probe.radius + high["probe_radius"]) / a),
+    }
+
+
+def _solve_films(
+    film: Film, surface: Surface, grid: FilmGrid, settings: SolveSettings, executor: Executor | None
+) -> Array:
+    """Scaled stress at the nodes of the template, shape (*grid.shape, n_element * n_local * 3)."""
+    a, chains = film.radius, []
+    for distance, tension, thickness, reach in product(grid.distance, grid.tension, grid.thickness, grid.reach):
+        other = replace(film, pretension=float(tension) * film.young, thickness=float(thickness) * a)
+        forces = grid.load[::-1] * film.young * other.thickness * a
+        chains.append(Chain(other, Circle(float(reach) * a), float(distance) * a, forces, surface, settings))
+    rows = solve_chains(chains, executor)[:, ::-1]
+    by_axis = rows.reshape(*(grid.shape[axis] for axis in (0, 2, 3, 4, 1)), -1)
+    return np.moveaxis(by_axis, 4, 1)
+
+
+def _decompose(stress: Array) -> tuple[Array, Array]:
+    """Coefficients and modes of scaled stresses of shape (..., n): the fewest that leave out `MODES_LEFT`.
+
+    Every node counts relative to its own stress: the peak under the probe would else hide the electrodes.
+    """
+    flat = stress.reshape(-1, stress.shape[-1])
+    size = np.repeat(np.sqrt((flat.reshape(len(flat), -1, 3) ** 2).sum(axis=2).mean(axis=0)), 3)
+    relative = flat / size
+    values, vectors = np.linalg.eigh(relative.T @ relative)
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    left = np.sqrt(np.maximum(1.0 - np.cumsum(values) / values.sum(), 0.0))
+    count = int(np.argmax(left <= MODES_LEFT)) + 1
+    modes = vectors[:, :count].T
+    return (relative @ modes.T).reshape(*stress.shape[:-1], count), modes * size

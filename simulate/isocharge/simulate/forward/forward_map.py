@@ -23,15 +23,14 @@ from isocharge.simulate.forward.readout import COARSE, FINE, NEAR, ReadoutPoints
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mechanics.theory import Theory, theory_for
+from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.simulate.solver.load_case import layer_for
+from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
-from isocharge.simulate.solver.settings import SolveSettings
 
 CHUNK = 256
 """Presses evaluated at once: keeps the working arrays within some 100 MB."""

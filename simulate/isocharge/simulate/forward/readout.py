@@ -16,11 +16,10 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SensorError
-from isocharge.simulate.numerics.polygon import area_in_disk, shared_area
-from isocharge.simulate.numerics.quadrature import gauss_line, gauss_polygon, gauss_square
-from isocharge.simulate.sensor.electrode import Electrode
+from isocharge.simulate.numerics.interpolation import gauss_line, gauss_square
+from isocharge.simulate.numerics.polygon import area_in_disk, gauss_polygon, shared_area
 from isocharge.simulate.sensor.probe import Circle, Probe
-from isocharge.simulate.sensor.sensor import Readout, Sensor
+from isocharge.simulate.sensor.sensor import Electrode, Readout, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
 
 DIRECT, FINE, COARSE = 20, 12, 4
@@ -111,21 +110,11 @@ def _covered(corners: Array, probe: Probe, at: complex) -> float:
     return shared_area(electrode, at + probe.outline)
 
 
-def pretension_charge(sensor: Sensor) -> Array:
-    """Reading without load, from the uniform pretension, shape (n_electrode,), pC; touch charges count from it."""
-    per_area = (sensor.piezo.d31 + sensor.piezo.d32) * sensor.film.pretension
-    return _per_area(sensor, per_area)
-
-
 def thermal_charge(sensor: Sensor, step: float) -> Array:
     """Pyroelectric charge of a uniform temperature step (K), shape (n_electrode,), pC: the same on equal electrodes."""
-    return _per_area(sensor, sensor.piezo.pyro * step)
-
-
-def _per_area(sensor: Sensor, density: float) -> Array:
-    """Reading of a uniform charge density (pC/mm^2), shape (n_electrode,), pC."""
-    reading: Array = sensor.gains * np.array([electrode.area for electrode in sensor.electrodes]) * density
-    return reading
+    areas = np.array([electrode.area for electrode in sensor.electrodes])
+    charge: Array = sensor.gains * areas * sensor.piezo.pyro * step
+    return charge
 
 
 def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tuple[Array, Array]:

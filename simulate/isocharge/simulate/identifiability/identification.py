@@ -10,9 +10,8 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.common.json_values import finite_or_none
-from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.forward.charge_map import ChargeMap, check_determined
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
-from isocharge.simulate.forward.checks import check_determined
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import scaled_derivatives, singular_values

@@ -6,9 +6,8 @@ from typing import Literal
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.forward.charge_map import ChargeMap, check_determined
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
-from isocharge.simulate.forward.checks import check_determined
 from isocharge.simulate.identifiability.ambiguous_pairs import AmbiguousPairs, find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import find_folds

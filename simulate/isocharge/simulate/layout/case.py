@@ -12,12 +12,11 @@ from isocharge.common.errors import InputError
 from isocharge.common.files import read_whole
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.family import check_family
-from isocharge.simulate.measuring_chain.levels import NOISE_LEVELS
 from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.measuring_chain.noise_file import NOISE_LEVELS
 from isocharge.simulate.numerics.disk import lattice, square_grid
-from isocharge.simulate.sensor.electrode import Calibration, Electrode
 from isocharge.simulate.sensor.probe import Circle
-from isocharge.simulate.sensor.sensor import Sensor, electrode_index
+from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor, electrode_index
 
 FEWEST, MOST = 3, 8
 """Numbers of electrodes of a design."""

@@ -20,17 +20,19 @@ from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.readout import electrode_rule
 from isocharge.simulate.mechanics.theory import theory_for
 from isocharge.simulate.mesh.conformal_map import automorphism_onto
-from isocharge.simulate.numerics.cubic import cubic_weights
-from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
-from isocharge.simulate.numerics.quadrature import gauss_square
-from isocharge.simulate.sensor.electrode import Electrode
+from isocharge.simulate.numerics.interpolation import (
+    barycentric_weights,
+    chebyshev_nodes,
+    cubic_weights,
+    gauss_square,
+    lagrange_values,
+)
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.probe import Circle
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor import Electrode, Sensor
 from isocharge.simulate.solver.equilibrium import touch_stress
-from isocharge.simulate.solver.load_case import layer_for
+from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
-from isocharge.simulate.solver.settings import SolveSettings
 
 COLUMNS = ("charge", "x", "y", "ln force", "probe radius", "pretension")
 """Columns of a row: the charge, pC, and its derivatives, per mm, 1 and MPa."""

@@ -3,8 +3,7 @@
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
-from isocharge.simulate.mesh.blocks import Blocks
-from isocharge.simulate.mesh.resolution import Resolution
+from isocharge.simulate.mesh.blocks import Blocks, Resolution
 
 CLEARANCE = 0.4
 """Gap between a polygon's farthest corner and the circle round it, in units of that corner's distance."""

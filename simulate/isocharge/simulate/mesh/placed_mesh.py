@@ -1,18 +1,63 @@
-"""The mesh of one press: a template, where it lies on the film, and its geometry there."""
+"""The mesh of one press: a template, where it lies on the film, and its elements there, ready for integration."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
-from isocharge.simulate.mesh.elements import Geometry, film_gradient
+from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.mesh.template import Template, template_for
-from isocharge.simulate.numerics.interpolation import tensor_basis
+from isocharge.simulate.numerics.interpolation import (
+    gauss_reference_square,
+    lobatto_nodes,
+    lobatto_quadrature,
+    tensor_basis,
+)
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """The elements of a template where it lies on the film, ready for integration.
+
+    Attributes:
+        nodes: Node numbers, shape (n_element, n_local).
+        gradient: d(basis)/d(X1, X2) at the quadrature points, shape (n_element, n_point, 2, n_local).
+        weights: Integration weights, shape (n_element, n_point); they add up to the meshed area.
+        load: Share of the load on each node's W, shape (n_node,); adds up to one over the number of copies.
+        mass: Lumped share of the area of each element's nodes, shape (n_element, n_local).
+    """
+
+    nodes: Integers
+    gradient: Array
+    weights: Array
+    load: Array
+    mass: Array
+
+    @classmethod
+    def build(cls, template: Template, points: Complexes) -> "Geometry":
+        """Integrate over elements whose nodes lie at film points; a footprint's load is spread uniformly over it."""
+        values, by_local, weights, at_nodes, node_weights = _quadrature(template.resolution.order)
+        gradient, jacobian = _film_gradient(by_local[:, None], points)
+        area = jacobian * weights
+        inner = template.footprint
+        share = area[inner] @ values
+        load = np.bincount(template.nodes[inner].ravel(), share.ravel(), template.n_node)
+        mass = _jacobian(at_nodes[:, None], points)[-1] * node_weights
+        return cls(template.nodes, gradient, area, load / (template.copies * area[inner].sum()), mass)
+
+    @property
+    def stacked(self) -> Array:
+        """The gradient with points and derivatives along one axis, shape (n_element, n_point * 2, n_local)."""
+        return self.gradient.reshape(len(self.gradient), -1, self.gradient.shape[-1])
+
+    def gather(self, local: Array) -> Array:
+        """Add up element contributions of shape (n_element, n_local) at the nodes, shape (n_node,)."""
+        gathered: Array = np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64)
+        return gathered
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +107,7 @@ class PlacedMesh:
     def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:
         """d(basis)/d(X1, X2) at points of elements, shape (n, 2, n_local)."""
         _, by_local = tensor_basis(self.resolution.order, xi, eta)
-        return film_gradient(by_local[:, :, None, :], self.points[element])[0][:, 0]
+        return _film_gradient(by_local[:, :, None, :], self.points[element])[0][:, 0]
 
     def node_derivatives(self, values: Array) -> Array:
         """Derivatives by (X1, X2) at the nodes of every element, of values at those nodes.
@@ -81,7 +126,7 @@ class PlacedMesh:
     def _node_gradient(self) -> Array:
         """d(basis)/d(X1, X2) at the nodes of every element, shape (n_element, n_local, 2, n_local)."""
         _, by_local = tensor_basis(self.resolution.order, self.template.xi, self.template.eta)
-        return film_gradient(by_local[:, None], self.points)[0]
+        return _film_gradient(by_local[:, None], self.points)[0]
 
 
 def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> PlacedMesh:
@@ -89,3 +134,42 @@ def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolut
     template = template_for(probe, resolution)
     rotated = probe.rotated(-float(np.arctan2(at[1], at[0])))
     return PlacedMesh(template, Placement.of(template, rotated, np.array(np.hypot(*at)), film.radius, layer), layer)
+
+
+@lru_cache(maxsize=16)
+def _quadrature(order: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Gauss points: basis (n_point, n_local), local derivatives (2, n_point, n_local), weights (n_point,).
+
+    And for the nodes themselves: local derivatives (2, n_local, n_local), Gauss-Lobatto weights (n_local,).
+    """
+    xi, eta, weights = gauss_reference_square(order + 1)
+    nodes, node_weight = lobatto_nodes(order), lobatto_quadrature(order)
+    node_xi, node_eta = np.meshgrid(nodes, nodes)
+    return (
+        *tensor_basis(order, xi, eta),
+        weights,
+        tensor_basis(order, node_xi.ravel(), node_eta.ravel())[1],
+        np.outer(node_weight, node_weight).ravel(),
+    )
+
+
+def _film_gradient(by_local: Array, points: np.ndarray) -> tuple[Array, Array]:
+    """Gradients of the basis on the film.
+
+    Args:
+        by_local: d(basis)/d(xi, eta), shape (2, n_element or 1, n_point, n_local).
+        points: Film positions of the nodes as complex numbers, shape (n_element, n_local).
+
+    Returns:
+        d(basis)/d(X1, X2), shape (n_element, n_point, 2, n_local), and the Jacobian determinant (n_element, n_point).
+    """
+    x_xi, x_eta, y_xi, y_eta, determinant = _jacobian(by_local, points)
+    inverse = np.stack([y_eta, -y_xi, -x_eta, x_xi], axis=-1) / determinant[..., None]
+    inverse = inverse.reshape(*determinant.shape, 2, 2)
+    return np.einsum("epab,bepn->epan", inverse, by_local), determinant
+
+
+def _jacobian(by_local: Array, points: np.ndarray) -> tuple[Array, Array, Array, Array, Array]:
+    tangent = np.einsum("kepn,en->kep", by_local, points)
+    (x_xi, x_eta), (y_xi, y_eta) = tangent.real, tangent.imag
+    return x_xi, x_eta, y_xi, y_eta, x_xi * y_eta - x_eta * y_xi

@@ -5,9 +5,8 @@ from functools import lru_cache
 import numpy as np
 
 from isocharge.common.arrays import Complexes, Integers
-from isocharge.simulate.mesh.blocks import Blocks
+from isocharge.simulate.mesh.blocks import Blocks, Resolution
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.mesh.resolution import Resolution
 from isocharge.simulate.sensor.probe import Circle, Polygon, Probe
 
 SAMPLE_REACH, SAMPLE_DISTANCE, SAMPLE_LAYER = 0.1, 0.1, 0.05

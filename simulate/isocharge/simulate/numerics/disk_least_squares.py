@@ -69,28 +69,6 @@ def minimise(residuals: Residuals, start: Array, steps: int = MOST_STEPS) -> tup
     return unit, residual
 
 
-def minimise_one(
-    residuals: Callable[[Array], tuple[Array, Array]], start: Array, steps: int = MOST_STEPS
-) -> tuple[Array, float]:
-    """As `minimise` for one problem, without the bookkeeping of many: a point (3,) of D, and |r|^2 there."""
-    unit, damping = start, FIRST
-    residual, slopes = residuals(unit)
-    square = float(residual @ residual)
-    for _ in range(steps):
-        trial = bounded_step(unit, residual, slopes, damping)
-        new_residual, new_slopes = residuals(trial)
-        new_square = float(new_residual @ new_residual)
-        change = (new_square - square) / (1.0 + new_square)
-        if change <= ROUNDING:
-            unit, residual, slopes, square = trial, new_residual, new_slopes, new_square
-            damping = max(damping * EASIER, LEAST)
-        else:
-            damping = damping * HARDER
-        if abs(change) < CHANGE or damping > MOST:
-            break
-    return unit, square
-
-
 def bounded_step(unit: Array, residual: Array, slopes: Array, damping: Array | float) -> Array:
     """Where a damped step ends, within D.
 

@@ -1,6 +1,6 @@
-"""Lagrange polynomials on Gauss-Lobatto nodes: values and derivatives anywhere on the reference interval [-1, 1].
+"""Lagrange polynomials on Gauss-Lobatto and Chebyshev nodes, local cubics on even grids, and Gauss rules.
 
-Everything goes through the barycentric form, which is stable at any order (Berrut and Trefethen 2004).
+The polynomials go through the barycentric form, which is stable at any order (Berrut and Trefethen 2004).
 """
 
 from functools import lru_cache
@@ -8,16 +8,14 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import eval_legendre, roots_jacobi
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Integers
 
 
 @lru_cache(maxsize=32)
 def lobatto_nodes(order: int) -> Array:
     """Gauss-Lobatto-Legendre nodes, shape (order + 1,), ascending from -1 to 1: the extrema of P_order and the ends."""
     interior = roots_jacobi(order - 1, 1.0, 1.0)[0] if order > 1 else np.empty(0)
-    nodes = np.concatenate([[-1.0], interior, [1.0]])
-    nodes.flags.writeable = False
-    return nodes
+    return _frozen(np.concatenate([[-1.0], interior, [1.0]]))
 
 
 @lru_cache(maxsize=32)
@@ -26,27 +24,26 @@ def lobatto_weights(order: int) -> Array:
 
     Wang, Huybrechs and Vandewalle (2014): the square root of the quadrature weight, with alternating sign.
     """
-    nodes = lobatto_nodes(order)
-    weights: Array = 1.0 / eval_legendre(order, nodes)
-    weights /= np.abs(weights).max()
-    weights.flags.writeable = False
-    return weights
+    weights: Array = 1.0 / eval_legendre(order, lobatto_nodes(order))
+    return _frozen(weights / np.abs(weights).max())
 
 
 @lru_cache(maxsize=32)
 def lobatto_quadrature(order: int) -> Array:
     """Weights of the Gauss-Lobatto rule on `lobatto_nodes`, shape (order + 1,): exact up to degree 2 order - 1."""
-    weights: Array = np.asarray(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2))
-    weights.flags.writeable = False
-    return weights
+    return _frozen(np.asarray(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2)))
 
 
 @lru_cache(maxsize=32)
 def modal_matrix(order: int) -> Array:
     """Matrix from values on `lobatto_nodes` to Legendre coefficients, shape (order + 1, order + 1)."""
-    matrix: Array = np.linalg.inv(np.polynomial.legendre.legvander(lobatto_nodes(order), order)).astype(np.float64)
-    matrix.flags.writeable = False
-    return matrix
+    return _frozen(np.linalg.inv(np.polynomial.legendre.legvander(lobatto_nodes(order), order)).astype(np.float64))
+
+
+def _frozen(values: Array) -> Array:
+    """The same array, which cannot be written to: it is cached."""
+    values.flags.writeable = False
+    return values
 
 
 def chebyshev_nodes(count: int, low: float, high: float) -> Array:
@@ -94,8 +91,7 @@ def derivative_matrix(order: int) -> Array:
     matrix = weights[None, :] / weights[:, None] / difference
     np.fill_diagonal(matrix, 0.0)
     np.fill_diagonal(matrix, -matrix.sum(axis=1))
-    matrix.flags.writeable = False
-    return matrix
+    return _frozen(matrix)
 
 
 def basis(order: int, at: Array) -> tuple[Array, Array]:
@@ -119,3 +115,43 @@ def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
 
 def _product(a: Array, b: Array) -> Array:
     return (b[:, :, None] * a[:, None, :]).reshape(len(a), b.shape[1] * a.shape[1])
+
+
+def cubic_weights(at: Array, count: int, periodic: bool = False) -> tuple[Integers, Array]:
+    """Weights of the four neighbours of places between the nodes 0, 1, ..., count - 1.
+
+    Args:
+        at: Places in steps of the grid, any shape; beyond an end they are extrapolated.
+        count: Number of nodes, at least four.
+        periodic: Whether node `count` is node 0 again.
+
+    Returns:
+        Numbers of the neighbours and their weights, each of shape (..., 4).
+    """
+    first = np.floor(at).astype(np.intp) - 1
+    if not periodic:
+        first = np.clip(first, 0, count - 4)
+    t = (at - first)[..., None]
+    a, b, c, d = t, t - 1.0, t - 2.0, t - 3.0
+    weights = np.concatenate([-b * c * d / 6.0, a * c * d / 2.0, -a * b * d / 2.0, a * b * c / 6.0], axis=-1)
+    number = first[..., None] + np.arange(4)
+    return number % count if periodic else number, weights
+
+
+def gauss_line(count: int) -> tuple[Array, Array]:
+    """Gauss points on [0, 1] and shares, which add up to one; each of shape (count,)."""
+    at, weight = np.polynomial.legendre.leggauss(count)
+    return 0.5 * (at + 1.0), 0.5 * weight
+
+
+def gauss_reference_square(count: int) -> tuple[Array, Array, Array]:
+    """Gauss points (xi, eta) on [-1, 1]^2, xi fast, and their weights, which add up to 4; each of shape (count^2,)."""
+    line, weight = np.polynomial.legendre.leggauss(count)
+    xi, eta = np.meshgrid(line, line)
+    return xi.ravel(), eta.ravel(), np.outer(weight, weight).ravel()
+
+
+def gauss_square(count: int) -> tuple[Array, Array]:
+    """Gauss points on [0, 1]^2, shape (count^2, 2), and shares, which add up to one."""
+    xi, eta, weights = gauss_reference_square(count)
+    return 0.5 * (np.stack([xi, eta], axis=1) + 1.0), 0.25 * weights

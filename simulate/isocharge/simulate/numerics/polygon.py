@@ -1,10 +1,11 @@
-"""Convex polygons and disks in the plane: area, centroid, convexity, and how much of one lies in another."""
+"""Convex polygons and disks in the plane: area, centroid, convexity, how much of one lies in another, and integrals."""
 
 from itertools import pairwise
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
+from isocharge.simulate.numerics.interpolation import gauss_square
 
 
 def area_of(corners: Array) -> float:
@@ -85,3 +86,19 @@ def _sector_of_edge(start: complex, end: complex, radius: float) -> float:
     turns = [np.angle(b * np.conj(a)) if a != 0.0 and b != 0.0 else 0.0 for a, b in pairwise(points)]
     triangle = -0.5 * height * (inside[1] - inside[0])
     return float(triangle + 0.5 * radius**2 * (turns[0] + turns[2]))
+
+
+def gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
+    """Gauss points of a convex polygon, shape (n, 2), and shares, which add up to one.
+
+    A fan of triangles from the first corner, each a square folded onto a triangle (Duffy 1982).
+    """
+    unit, share = gauss_square(count)
+    s, t = unit[:, :1], unit[:, 1:]
+    points, shares = [], []
+    for second, third in pairwise(corners[1:]):
+        one, two = second - corners[0], third - corners[0]
+        points.append(corners[0] + s * ((1.0 - t) * one + t * two))
+        shares.append(share * s[:, 0] * (one[0] * two[1] - one[1] * two[0]))
+    total = np.concatenate(shares)
+    return np.concatenate(points), total / total.sum()

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from isocharge.common.errors import SensorError
-from isocharge.simulate.sensor.size_check import check_megapascals, check_millimetres
+from isocharge.simulate.sensor.size_check import check_length, check_stress
 
 Surface = Literal["middle", "top", "bottom"]
 """Where in the thickness the stress is read; the probe touches the top."""
@@ -14,11 +14,11 @@ Surface = Literal["middle", "top", "bottom"]
 LEAST_RADIUS, LEAST_THICKNESS = 1.0, 1e-4
 """Smallest radius and thickness of a film, mm: smaller numbers are in metres."""
 
-LEAST_PIEZO = 1e-6
-"""Smallest coefficient d31, d32 or d33 other than 0, pC/N: smaller numbers are in C/N."""
+LEAST_PIEZO = 1e-3
+"""Smallest coefficient d31, d32 or d33 other than 0, pC/N: smaller numbers are in C/N; PVDF has 1 to 30 pC/N."""
 
-MOST_YOUNG, MOST_PRETENSION = 1e7, 1e4
-"""Largest Young's modulus and pretension of a film, MPa: larger numbers are in pascals."""
+LEAST_YOUNG, MOST_YOUNG, MOST_PRETENSION = 1e-6, 1e7, 1e4
+"""Bounds of Young's modulus and of the pretension of a film, MPa: larger numbers are in pascals."""
 
 
 @dataclass(frozen=True)
@@ -40,18 +40,12 @@ class Film:
     pretension: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, unit in (("radius", "mm"), ("thickness", "mm"), ("young", "MPa")):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0.0):
-                raise SensorError(f"film {name}: expected a positive number, got {value:.6g} {unit}")
-        check_millimetres("film radius", self.radius, LEAST_RADIUS, SensorError)
-        check_millimetres("film thickness", self.thickness, LEAST_THICKNESS, SensorError)
-        check_megapascals("film young", self.young, MOST_YOUNG, SensorError)
+        check_length("film radius", self.radius, LEAST_RADIUS, SensorError)
+        check_length("film thickness", self.thickness, LEAST_THICKNESS, SensorError)
+        check_stress("film young", self.young, LEAST_YOUNG, MOST_YOUNG, SensorError)
+        check_stress("film pretension", self.pretension, 0.0, MOST_PRETENSION, SensorError)
         if not 0.0 <= self.poisson < 0.5:
             raise SensorError(f"film poisson: expected 0 <= poisson < 0.5, got {self.poisson}")
-        if not (np.isfinite(self.pretension) and self.pretension >= 0.0):
-            raise SensorError(f"film pretension: expected zero or tension (>= 0 MPa), got {self.pretension}")
-        check_megapascals("film pretension", self.pretension, MOST_PRETENSION, SensorError)
         if self.thickness > 0.1 * self.radius:
             raise SensorError(
                 f"film thickness: expected at most a tenth of the radius ({self.radius:g} mm), "
@@ -69,11 +63,10 @@ class Piezo:
     pyro: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("d31", "d32", "d33", "pyro"):
-            if not np.isfinite(getattr(self, name)):
-                raise SensorError(f"piezo {name}: expected a finite number, got {getattr(self, name)}")
-            if name != "pyro" and 0.0 < abs(getattr(self, name)) < LEAST_PIEZO:
-                d = getattr(self, name)
+        for name, d in vars(self).items():
+            if not np.isfinite(d):
+                raise SensorError(f"piezo {name}: expected a finite number, got {d}")
+            if name != "pyro" and 0.0 < abs(d) < LEAST_PIEZO:
                 raise SensorError(f"piezo {name}: expected pC/N, got {d:.6g} pC/N; {d:.6g} C/N are {1e12 * d:.6g} pC/N")
         if self.d31 == 0.0 and self.d32 == 0.0:
             raise SensorError("piezo d31 and d32 are both 0: such a film gives no charge")

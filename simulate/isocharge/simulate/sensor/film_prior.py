@@ -21,10 +21,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError, SensorError
-from isocharge.simulate.sensor.electrode import Calibration
-from isocharge.simulate.sensor.film import Film, Piezo
 from isocharge.simulate.sensor.probe import Circle
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor import Calibration, Sensor
 
 SHARED = ("pretension", "young", "thickness", "d31", "d32", "shift_x", "shift_y", "rotation", "probe_radius")
 """Parameters that every film has; gains follow, one for each electrode."""
@@ -138,23 +136,20 @@ class FilmPrior:
         Raises:
             SensorError: If there can be no such sensor: electrodes moved off the film, or a negative pretension.
         """
-        values = dict(zip(self.names, (float(value) for value in parameters), strict=True))
-        before = self.sensor.calibration
-        described, piezo = self.sensor.film, self.sensor.piezo
-        gains = {
-            name: before.gain.get(name, 1.0) * float(np.exp(values[f"gain {name}"]))
-            for name in self.sensor.electrode_names
-        }
+        values = dict(zip(self.names, parameters.tolist(), strict=True))
+        factors = dict(zip(self.names, np.exp(parameters).tolist(), strict=True))
+        film, piezo, before = self.sensor.film, self.sensor.piezo, self.sensor.calibration
         shift = (before.shift[0] + values["shift_x"], before.shift[1] + values["shift_y"])
+        gains = {name: before.gain.get(name, 1.0) * factors[f"gain {name}"] for name in self.sensor.electrode_names}
         sensor = replace(
             self.sensor,
-            film=_film(described, values),
-            piezo=Piezo(
-                piezo.d31 * float(np.exp(values["d31"])),
-                piezo.d32 * float(np.exp(values["d32"])),
-                piezo.d33,
-                piezo.pyro,
+            film=replace(
+                film,
+                young=film.young * factors["young"],
+                thickness=film.thickness * factors["thickness"],
+                pretension=values["pretension"],
             ),
+            piezo=replace(piezo, d31=piezo.d31 * factors["d31"], d32=piezo.d32 * factors["d32"]),
             calibration=Calibration(gains, shift, before.rotation + values["rotation"]),
         )
         return sensor, Circle(self.probe.radius + values["probe_radius"])
@@ -173,7 +168,8 @@ class FilmPrior:
             )
         for what, value, expected in (
             ("readout", (sensor.readout, sensor.surface), (described.readout, described.surface)),
-            ("film radius (mm) and poisson", _round_film(sensor.film), _round_film(described.film)),
+            ("film radius (mm)", round(sensor.film.radius, 6), round(described.film.radius, 6)),
+            ("film poisson", round(sensor.film.poisson, 9), round(described.film.poisson, 9)),
             ("d33 (pC/N)", sensor.piezo.d33, described.piezo.d33),
         ):
             if value != expected:
@@ -213,21 +209,8 @@ def _centres(sensor: Sensor) -> str:
     return ", ".join(f"{name} at ({x:.4g}, {y:.4g})" for name, x, y in places[:8]) + " mm" + ", ..." * (len(places) > 8)
 
 
-def _round_film(film: Film) -> tuple[float, float]:
-    return round(film.radius, 6), round(film.poisson, 9)
-
-
 def _ratio(value: float, described: float) -> float:
     return 1.0 if value == described == 0.0 else value / described if described else 0.0
-
-
-def _film(described: Film, values: dict[str, float]) -> Film:
-    return replace(
-        described,
-        young=described.young * float(np.exp(values["young"])),
-        thickness=described.thickness * float(np.exp(values["thickness"])),
-        pretension=values["pretension"],
-    )
 
 
 def virtual_film(sensor: Sensor, probe: Circle, seed: int) -> tuple[Sensor, Circle]:

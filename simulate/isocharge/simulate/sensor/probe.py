@@ -15,7 +15,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError, cut
 from isocharge.simulate.numerics.polygon import area_of, centroid_of, is_convex
-from isocharge.simulate.sensor.size_check import check_millimetres
+from isocharge.simulate.sensor.size_check import check_length
 
 NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 
@@ -30,8 +30,9 @@ NOTATION = re.compile(
 MOST_CORNERS = 64
 """Largest number of corners of a polygon: beyond it a circle gives the same charges with fewer unknowns."""
 
-LEAST_REACH = 0.02
-"""Smallest distance of a footprint's farthest point from its centroid, mm: smaller numbers are in metres."""
+LEAST_REACH, LEAST_SIDE = 0.02, 1e-3
+"""Smallest distance of a footprint's farthest point from its centroid, and smallest side, mm: smaller numbers are in
+metres."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,7 @@ class Circle:
     radius: float
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.radius) and self.radius > 0.0):
-            raise SceneError(f"probe radius: expected a positive number, got {self.radius} mm")
-        check_millimetres("probe radius", self.radius, LEAST_REACH, SceneError)
+        check_length("probe radius", self.radius, LEAST_REACH, SceneError)
 
     @property
     def notation(self) -> str:
@@ -101,28 +100,28 @@ class Polygon:
             raise SceneError(
                 f"probe: expected corners relative to their centroid, got {at.tolist()} mm; use Polygon.of"
             )
-
-        check_millimetres("probe reach", self.reach, LEAST_REACH, SceneError)
+        check_length("probe reach", self.reach, LEAST_REACH, SceneError)
 
     @classmethod
     def of(cls, corners: Array, angle: float = 0.0, name: str = "polygon") -> "Polygon":
         """From corners (x, y) anywhere, anticlockwise, shape (n, 2), mm: they are moved onto their centroid."""
         at = np.asarray(corners, dtype=float)
-        if at.ndim == 2 and at.shape[0] >= 3 and at.shape[1] == 2 and is_convex(at):
+        if at.ndim == 2 and at.shape[0] >= 3 and at.shape[1] == 2 and np.isfinite(at).all() and is_convex(at):
             at = at - centroid_of(at)
         return cls(tuple((float(x), float(y)) for x, y in at), angle, name)
 
     @classmethod
     def rectangle(cls, width: float, height: float, angle: float = 0.0) -> "Polygon":
         """Sides along x and y, mm."""
-        _check_positive(width=width, height=height)
+        for name, value in (("width", width), ("height", height)):
+            check_length(f"probe {name}", value, LEAST_SIDE, SceneError)
         x, y = 0.5 * width, 0.5 * height
         return cls(((x, y), (-x, y), (-x, -y), (x, -y)), angle, "rectangle")
 
     @classmethod
     def triangle(cls, side: float, angle: float = 0.0) -> "Polygon":
         """Equilateral, one corner to +y; side in mm."""
-        _check_positive(side=side)
+        check_length("probe side", side, LEAST_SIDE, SceneError)
         turn = np.exp(1j * (0.5 * np.pi + 2.0 * np.pi / 3.0 * np.arange(3))) * side / np.sqrt(3.0)
         return cls(tuple((float(z.real), float(z.imag)) for z in turn), angle, "triangle")
 
@@ -182,9 +181,6 @@ def parse_probe(text: str) -> Probe:
             f"probe {cut(text)!r}: expected 'circle:R', 'rectangle:WxH', 'triangle:S' or 'polygon:X,Y;X,Y;X,Y' in mm, "
             "each optionally rotated as in 'triangle:4.0@30' (degrees)"
         )
-    for size in ("radius", "width", "height", "side"):
-        if match[size] is not None and not 0.0 < float(match[size]) < np.inf:
-            raise SceneError(f"probe {size}: expected a positive number, got {match[size]} mm in {cut(text)!r}")
     angle = float(np.deg2rad(float(match["angle"] or 0.0)))
     if match["circle"]:
         return Circle(float(match["radius"]))
@@ -193,15 +189,7 @@ def parse_probe(text: str) -> Probe:
     if match["triangle"]:
         return Polygon.triangle(float(match["side"]), angle)
     corners = np.array([[float(value) for value in corner.split(",")] for corner in match["corners"].split(";")])
-    if not np.isfinite(corners).all():
-        raise SceneError(f"probe {cut(text)!r}: expected finite corners")
     return Polygon.of(corners, angle)
-
-
-def _check_positive(**sizes: float) -> None:
-    for name, value in sizes.items():
-        if not (np.isfinite(value) and value > 0.0):
-            raise SceneError(f"probe {name}: expected a positive number, got {value} mm")
 
 
 def _tidy(value: float) -> float:

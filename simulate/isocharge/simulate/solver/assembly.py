@@ -4,7 +4,7 @@ A node inside an element touches no other element, so its unknowns are eliminate
 and only the skeleton is factorised: 2.3 times fewer unknowns at order 4. Everything that depends on the template alone
 (numbering, sparsity, where each entry goes) is done once.
 
-Unknowns per node are U1, U2, W and, with bending, the carried Laplacian (see `mechanics.bending`). On the rim
+Unknowns per node are U1, U2, W and, with bending, the carried Laplacian (see `mechanics.energy`). On the rim
 the first three are fixed; on the line of symmetry of a half template U2 is.
 """
 
@@ -15,7 +15,7 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.simulate.mesh.resolution import Resolution
+from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.template import Template, template
 
 

@@ -16,8 +16,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.json_values import finite_or_none
 from isocharge.simulate.mechanics.theory import bending_length, modelling_error
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
-from isocharge.simulate.numerics.interpolation import modal_matrix
-from isocharge.simulate.numerics.quadrature import gauss_reference_square
+from isocharge.simulate.numerics.interpolation import gauss_reference_square, modal_matrix
 from isocharge.simulate.solver.equilibrium import (
     Equilibrium,
     deflection,

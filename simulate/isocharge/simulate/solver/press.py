@@ -10,9 +10,8 @@ from isocharge.common.errors import SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.mesh.elements import Geometry
-from isocharge.simulate.mesh.placed_mesh import PlacedMesh
-from isocharge.simulate.mesh.resolution import Resolution
+from isocharge.simulate.mesh.blocks import Resolution
+from isocharge.simulate.mesh.placed_mesh import Geometry, PlacedMesh
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.film import Film
@@ -20,10 +19,14 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.solver.assembly import Assembly, assembly
 from isocharge.simulate.solver.equilibrium import Equilibrium, principal_stress
 from isocharge.simulate.solver.error_estimate import relative_difference, shape_error
-from isocharge.simulate.solver.load_case import LoadCase
-from isocharge.simulate.solver.mesh_choice import choose_mesh, needs_second_mesh, too_near_the_rim
+from isocharge.simulate.solver.load_case import (
+    LoadCase,
+    SolveSettings,
+    choose_mesh,
+    needs_second_mesh,
+    too_near_the_rim,
+)
 from isocharge.simulate.solver.newton import GUARD_BELOW, NewtonResult, schwerin_start, solve_linear, solve_newton
-from isocharge.simulate.solver.settings import SolveSettings
 
 MOST_ORDERS = 3
 """Largest number of orders that are tried beyond the first mesh."""

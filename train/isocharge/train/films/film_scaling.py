@@ -16,7 +16,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.forward.film_grid import SOFTENING
+from isocharge.simulate.forward.film_family import SOFTENING
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 
 DRAWS = 4096
