@@ -158,9 +158,7 @@ def test_taut_membrane_under_a_centred_disk(share):
 POLYGONS = [Polygon.rectangle(4.0, 2.0, 0.5), Polygon.triangle(6.0, 1.0)]
 
 
-@pytest.mark.parametrize(
-    ("probe", "at"), [(POLYGONS[0], PLACES[1]), (POLYGONS[1], PLACES[2])], ids=["rectangle", "triangle"]
-)
+@pytest.mark.parametrize(("probe", "at"), [(POLYGONS[0], PLACES[1]), (POLYGONS[1], PLACES[2])], ids=str)
 def test_taut_membrane_under_a_polygon(probe, at):
     solved = press(TAUT, probe, at, TINY, SolveSettings(accuracy=1e-5, theory=Theory(False, False, True)))
     points, z = read_outside(TAUT, probe, at)
@@ -198,9 +196,7 @@ def test_plate_under_a_centred_disk(share):
     assert deflection(solved, np.zeros((1, 2)))[0] == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("probe", "at"), list(zip(POLYGONS, PLACES[2:0:-1], strict=True)), ids=["rectangle", "triangle"]
-)
+@pytest.mark.parametrize(("probe", "at"), [(POLYGONS[0], PLACES[2]), (POLYGONS[1], PLACES[1])], ids=str)
 def test_plate_under_a_polygon(probe, at):
     solved = press(THICK, probe, at, TINY, SolveSettings(accuracy=1e-4, theory=Theory(False, True, False)))
     points, z = read_outside(THICK, probe, at)

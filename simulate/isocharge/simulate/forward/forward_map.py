@@ -197,9 +197,9 @@ class ForwardMap:
         scale = self.sensor.film.young * amplitude_squared(self.sensor.film, force)
         scaled: Array = charge * scale[:, None]
         if self.sensor.piezo.d33 != 0.0:
-            for i, e in zip(*np.nonzero(near), strict=True):
+            for i in np.flatnonzero(near.any(axis=1)):
                 probe = self.probe.rotated(float(orientation[i]))
-                scaled[i, e] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])[e]
+                scaled[i] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])
         return scaled
 
     @cached_property
