@@ -115,19 +115,13 @@ def load_sensor(sensor: str | Path) -> Sensor:
     if not path.is_file():
         names = ", ".join(built_in_sensors())
         raise SensorError(f"no sensor {str(sensor)!r}: it is neither a built-in name ({names}) nor a file")
-<<<<<<< HEAD
     described = sensor_from_dict(read_toml(path, "a sensor file", SensorError, dict[str, Any]), str(path))
-    for caution in _cautions(described):
-        log.warning("%s: %s", path, caution)
-=======
-    described = sensor_from_dict(read_toml(path, "a sensor file", SensorError), str(path))
     if len(described.electrodes) == 1:
         log.warning(
             "%s: one electrode: its charge can be computed, but one charge does not determine x, y and force; three "
             "electrodes or more do",
             path,
         )
->>>>>>> db22e54 (Core of the simulator: modules that say one thing are one module, one chain of solves, one check of sizes; tests on smaller maps)
     return described
 
 
