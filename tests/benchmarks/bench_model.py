@@ -11,65 +11,54 @@ import json
 from typing import Any
 
 import numpy as np
-from bench_predictor import machine
 
 from isocharge.serve import Predictor
+from isocharge.serve.benchmark import machine
 from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
-from isocharge.train.bayes.limit import BayesLimit, Scene, bayes_estimate
-from isocharge.train.data.alarms import alarm_threshold
-from isocharge.train.data.domain import inner_radius
+from isocharge.train.bayes.limit import BayesLimit, BayesProblem, bayes_estimate
+from isocharge.train.model_release.evaluate import alarm_threshold
 from isocharge.train.report.measures import coverage
 
 RELEASED = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial")
-BEYOND_MM = ((0.5, 1.0), (1.0, 2.0))
-APART_MM = 8.0
+BEYOND = ((0.5, 1.0), (1.0, 2.0))
+"""Rings outside the working area, mm."""
+APART = 8.0
+"""Distance of two presses at once, mm."""
 NOISE = noise_model("reference")
+LEVELS = np.array([0.68, 0.95])
 
 
 class Bench:
     """One model, the simulator's charges some way beyond its working area, and a seed."""
 
     def __init__(self, model: str, seed: int) -> None:
-        self.model, self.seed = Predictor(model), seed
+        self.model, self.rng = Predictor(model), np.random.default_rng([seed, 1])
         about = self.model.metadata
-        self.radius_mm = inner_radius(about.working_area_mm)
-        self.forces_N = about.force_range_N
-        self.film = ForwardMap.build(
-            sensor_from_dict(about.sensor), Circle(1e-3), 1e-3 * (self.radius_mm + BEYOND_MM[-1][1]), self.forces_N
-        )
-        self.rng = np.random.default_rng([seed, 1])
+        corners = np.array(about.working_area_mm) @ [1.0, 1j]
+        self.radius = float(np.abs(0.5 * (corners + np.roll(corners, 1))).min())
+        self.presses = Sweep(self.radius, about.force_range_N, 40_000, seed, sampling="random").contacts()
+        reach = self.radius + BEYOND[-1][1]
+        self.film = ForwardMap.build(sensor_from_dict(about.sensor), Circle(1.0), reach, about.force_range_N)
 
-    def presses(self, count: int) -> np.ndarray:
-        """(x_mm, y_mm, force_N) spread like the prior, shape (count, 3)."""
-        sweep = Sweep(1e-3 * self.radius_mm, self.forces_N, count, self.seed, sampling="random")
-        x, y, force, _ = sweep.presses()
-        return np.stack([1e3 * x, 1e3 * y, force], axis=1)
+    def ring(self, count: int, force: float, least: float, most: float) -> np.ndarray:
+        """Contacts uniform between two radii, shape (count, 3)."""
+        z = np.sqrt(self.rng.uniform(least**2, most**2, count)) * np.exp(2j * np.pi * self.rng.random(count))
+        return np.stack([z.real, z.imag, np.full(count, force)], axis=1)
 
-    def ring(self, count: int, least_mm: float = 0.0, most_mm: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Places uniform between two radii (least, most), mm; within the working area by default."""
-        most_mm = self.radius_mm if most_mm is None else most_mm
-        r = np.sqrt(self.rng.uniform(least_mm**2, most_mm**2, count))
-        angle = self.rng.uniform(0.0, 2.0 * np.pi, count)
-        return r * np.cos(angle), r * np.sin(angle)
-
-    def charge(self, x_mm: np.ndarray, y_mm: np.ndarray, force_N: np.ndarray | float) -> np.ndarray:
-        """Clean charges, C."""
-        return self.film.forward(1e-3 * x_mm, 1e-3 * y_mm, np.broadcast_to(force_N, x_mm.shape))
-
-    def answers(self, charge: np.ndarray) -> Any:
-        """The model's, to charges with noise."""
-        return self.model.predict_batch(1e12 * NOISE.add(charge, self.rng))
+    def answers(self, charge: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Contacts, their standard deviations, and misfits of the model, for charges with noise."""
+        found = np.stack(self.model.predict_batch(charge), axis=1).astype(float)
+        return found[:, :3], found[:, 3:6], found[:, 6]
 
 
 def against_limit(bench: Bench, count: int) -> dict[str, Any]:
     """Errors of model and posterior mean on the same noisy charges."""
-    truth = bench.presses(count)
-    charge_pC = 1e12 * NOISE.add(bench.charge(*truth.T), bench.rng)
-    scene = Scene(bench.film.sensor, bench.film.probe, bench.radius_mm, bench.forces_N, NOISE)
-    least = BayesLimit.of(*bayes_estimate(scene, charge_pC, forward_map=bench.film), truth)
-    answers = np.stack(bench.model.predict_batch(charge_pC), axis=1).astype(float)
-    mine = BayesLimit.of(answers[:, :3], answers[:, 3:6], truth)
+    truth = bench.presses[:count]
+    charge = NOISE.add(bench.film.charges(truth), bench.rng)
+    problem = BayesProblem(bench.film.sensor, bench.film.probe, bench.radius, bench.film.domain.force_range, NOISE)
+    least = BayesLimit.of(*bayes_estimate(problem, charge, charge_map=bench.film), truth)
+    mine = BayesLimit.of(*bench.answers(charge)[:2], truth)
     return {
         "presses": count,
         "position_rms_mm": mine.position_rms_mm,
@@ -81,73 +70,67 @@ def against_limit(bench: Bench, count: int) -> dict[str, Any]:
 
 def intervals(bench: Bench, count: int) -> dict[str, Any]:
     """Least and largest share of presses in the 68 and 95 % intervals: of all, and of thirds by radius and force."""
-    truth, levels = bench.presses(count), np.array([0.68, 0.95])
-    answers = np.stack(bench.answers(bench.charge(*truth.T)), axis=1).astype(float)
-    contact, std = answers[:, :3], answers[:, 3:6]
+    truth = bench.presses[:count]
+    contact, std, _ = bench.answers(NOISE.add(bench.film.charges(truth), bench.rng))
     orders = (np.argsort(np.hypot(truth[:, 0], truth[:, 1])), np.argsort(truth[:, 2]))
     thirds = [rows for order in orders for rows in np.array_split(order, 3)]
-    of_all = coverage(contact, std, truth, levels)
-    of_thirds = np.stack([coverage(contact[rows], std[rows], truth[rows], levels) for rows in thirds])
-    return {
-        "presses": count,
-        **{f"{level:.0%} of all": _ends(of_all[k]) for k, level in enumerate(levels)},
-        **{f"{level:.0%} of a third": _ends(of_thirds[:, k]) for k, level in enumerate(levels)},
-    }
-
-
-def _ends(shares: np.ndarray) -> list[float]:
-    return [float(shares.min()), float(shares.max())]
+    shares = np.stack([coverage(contact[rows], std[rows], truth[rows], LEVELS) for rows in thirds])
+    of_all = coverage(contact, std, truth, LEVELS)
+    found: dict[str, Any] = {"draws": count}
+    for k, level in enumerate(LEVELS):
+        found[f"{level:.0%} of all"] = [float(of_all[k].min()), float(of_all[k].max())]
+        found[f"{level:.0%} of a third"] = [float(shares[:, k].min()), float(shares[:, k].max())]
+    return found
 
 
 def faults(bench: Bench, count: int) -> dict[str, Any]:
     """Shares of presses flagged, with the limit that one good press in a hundred exceeds."""
-    good = bench.answers(bench.charge(*bench.presses(count).T)).misfit
-    limit = alarm_threshold(good)
+
+    def misfits(charge: np.ndarray) -> np.ndarray:
+        return bench.answers(NOISE.add(charge, bench.rng))[2]
+
+    limit = alarm_threshold(misfits(bench.film.charges(bench.presses[:count])))
 
     def flagged(charge: np.ndarray) -> float:
-        return float(np.mean(bench.answers(charge).misfit > limit))
+        return float(np.mean(misfits(charge) > limit))
 
-    x, y = bench.ring(count)
-    one, electrodes = bench.charge(x, y, 1.0), range(len(bench.film.sensor.electrodes))
-    found = {"good presses of 1 N": flagged(one)}
+    inside = bench.ring(count, 1.0, 0.0, bench.radius)
+    one = bench.film.charges(inside)
+    found = {"limit": limit, "good presses of 1 N": flagged(one)}
+    channels = np.eye(one.shape[1])
     for name, gain in (("one gain 20 % low", 0.8), ("one gain 20 % high", 1.2), ("one electrode dead", 0.0)):
-        found[name] = min(flagged(one * np.where(np.arange(len(electrodes)) == k, gain, 1.0)) for k in electrodes)
-    angle = bench.rng.uniform(0.0, 2.0 * np.pi, count)
-    beside = x + APART_MM * np.cos(angle), y + APART_MM * np.sin(angle)
-    both = np.hypot(*beside) <= bench.radius_mm
-    for force_N in (0.5, 1.0):
-        pair = [bench.charge(a[both], b[both], force_N) for a, b in ((x, y), beside)]
-        found[f"two presses of {force_N:g} N, {APART_MM:g} mm apart"] = flagged(pair[0] + pair[1])
-    for least, most in BEYOND_MM:
-        outside = bench.ring(count, bench.radius_mm + least, bench.radius_mm + most)
-        found[f"outside by {least:g} to {most:g} mm"] = flagged(bench.charge(*outside, 1.0))
-    return {"limit": limit, **found}
+        found[name] = min(flagged(one * (1.0 + (gain - 1.0) * channel)) for channel in channels)
+    beside = inside + bench.ring(count, 0.0, APART, APART)
+    both = np.hypot(beside[:, 0], beside[:, 1]) <= bench.radius
+    for force in (0.5, 1.0):
+        pair = sum(bench.film.charges(contact[both] * [1.0, 1.0, force]) for contact in (inside, beside))
+        found[f"two presses of {force:g} N, {APART:g} mm apart"] = flagged(pair)
+    for least, most in BEYOND:
+        outside = bench.ring(count, 1.0, bench.radius + least, bench.radius + most)
+        found[f"outside by {least:g} to {most:g} mm"] = flagged(bench.film.charges(outside))
+    return found
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("models", nargs="*", default=RELEASED, metavar="MODEL")
     parser.add_argument("--presses", type=int, default=6000, help="against the limit")
-    parser.add_argument("--draws", type=int, default=40000, help="for intervals and faults")
+    parser.add_argument("--draws", type=int, default=40000, help="for intervals and faults, at most 40000")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    results: dict[str, Any] = {"machine": machine(), "seed": options.seed, "models": {}}
-    for model in options.models:
-        bench = Bench(model, options.seed)
-        results["models"][model] = {
-            "radius_mm": bench.radius_mm,
-            "limit": against_limit(bench, options.presses),
-            "intervals": intervals(bench, options.draws),
-            "faults": faults(bench, options.draws),
-        }
-        if not options.json:
-            print(f"{model}, within {bench.radius_mm:.2f} mm")
-            for part in ("limit", "intervals", "faults"):
-                for name, value in results["models"][model][part].items():
-                    print(f"  {name:<42} {np.array2string(np.asarray(value), precision=4)}")
-    if options.json:
-        print(json.dumps(results, indent=1))
+    asked = parser.parse_args()
+    results = {}
+    for model in asked.models:
+        bench = Bench(model, asked.seed)
+        results[model] = (
+            against_limit(bench, asked.presses) | intervals(bench, asked.draws) | faults(bench, asked.draws)
+        )
+        if not asked.json:
+            print(f"{model}, within {bench.radius:.2f} mm")
+            for name, value in results[model].items():
+                print(f"  {name:<42} {np.array2string(np.asarray(value), precision=4)}")
+    if asked.json:
+        print(json.dumps({"machine": machine(), "seed": asked.seed, "models": results}, indent=1))
 
 
 if __name__ == "__main__":
