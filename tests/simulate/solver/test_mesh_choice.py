@@ -148,13 +148,6 @@ def test_press_on_two_meshes_starts_its_neighbour():
     assert worst_error(FILM, warm, cold) < 1e-5
 
 
-@pytest.mark.slow
-def test_wrinkling_on_a_finer_mesh_is_an_error():
-    """A film of 7 um under 9 N beside the rim wrinkles."""
-    with pytest.raises(SolveError, match="wrinkles"):
-        press(Film(45.0, 0.007, 3000.0, 0.3), Polygon.triangle(2.6, 0.3), (39.2, 0.0), 8.9)
-
-
 def test_meshes_with_different_equilibria_are_an_error(monkeypatch):
     """Meshes that differ by a tenth are not two views of one film; by less, the difference is the estimate."""
     scene = FILM, *NEAR_THE_RIM
