@@ -11,8 +11,7 @@ from contourpy import LineType, contour_generator
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError, SensorError
-from isocharge.simulate.forward.charge_map import ChargeMap
-from isocharge.simulate.forward.checks import check_forces
+from isocharge.simulate.forward.charge_map import ChargeMap, check_forces
 
 GRID = 0.2
 """Largest side of the squares of the trace, mm: contours bend by some um within one."""
