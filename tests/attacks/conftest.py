@@ -1,6 +1,6 @@
 """How a reader is attacked and judged.
 
-An input may be refused by an error of ours, or be taken. It may raise nothing else, and take neither seconds nor memory.
+An input may be refused by an error of ours, or be taken. It may raise nothing else, take no seconds and no memory.
 `make attack` sends more than a million; the part in `make test` sends the same kinds, a hundredth of each.
 """
 
