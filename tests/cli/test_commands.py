@@ -191,11 +191,11 @@ BAD = [
     (("simulate", "point", SENSOR, "--at", "44.5,0"), 2, "SceneError: probe off the film: centre (44.5, 0) mm"),
     (("simulate", "point", SENSOR, "--at", "3"), 2, "InputError: --at: expected two numbers in mm"),
     (("simulate", "point", SENSOR, "--probe", "cube:1"), 2, "SceneError: probe 'cube:1'"),
-    (("simulate", "point", SENSOR, "--probe", "circle:0"), 2, "SceneError: probe radius: expected a positive number"),
+    (("simulate", "point", SENSOR, "--probe", "circle:0"), 2, "SceneError: probe radius: expected at least 0.02 mm"),
     (
         ("simulate", "point", SENSOR, "--probe", "rectangle:4x0"),
         2,
-        "SceneError: probe height: expected a positive number",
+        "SceneError: probe height: expected at least 0.001 mm",
     ),
     (("simulate", "point", SENSOR, "--theory", "magic"), 2, "SceneError: theory: expected one of"),
     (("simulate", "point", SENSOR, "--accuracy", "0"), 2, "InputError: --accuracy: expected"),

@@ -98,7 +98,7 @@ def open_page(chromium, free_port):
         page = contexts[-1].new_page()
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
-        page.goto(f"http://127.0.0.1:{free_port}/")
+        page.goto(f"http://127.0.0.1:{free_port}/", timeout=120_000)
         wait_for(page, "isocharge.page.film?.history.latest != null")
         return page
 

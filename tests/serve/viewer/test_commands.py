@@ -74,7 +74,7 @@ def touched(rows, _):
 
 def test_a_press_is_on_the_page_where_it_is_and_the_stream_goes_on_without_it(board, start):
     process, url = start("stream", "linear", "--port", board.url, "--output", "none")
-    rows, state = follow(url, lambda rows, state: touched(rows, state) and "counters" in state)
+    rows, state = follow(url, lambda rows, state: touched(rows, state) and state.get("rate_Hz"))
     contacts = rows[(rows["flags"] & CONTACT_BIT) != 0]
     assert np.median(contacts["x_mm"]) == pytest.approx(3.0, abs=0.01)
     assert np.median(contacts["force_N"]) == pytest.approx(1.0, abs=0.01)
