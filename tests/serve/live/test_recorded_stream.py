@@ -1,10 +1,11 @@
 """A recording gives the same records again, whatever happened meanwhile."""
 
+import base64
 import errno
 import json
 import os
 import time
-from itertools import islice
+from itertools import count, islice
 
 import numpy as np
 import pytest
@@ -99,6 +100,30 @@ def test_replay_ends_with_the_last_record_that_was_taken(tmp_path, film, predict
     """Whoever takes ten records finds ten in the recording, although the chunk of the last one holds more frames."""
     path = tmp_path / "touch.rec"
     lines = list(islice(following(path, chunks(film, cuts=200), predictor, DEVICE), 10))
+    assert played(path, predictor) == lines
+
+
+@pytest.mark.parametrize("where", ["base64.b64encode", "json.dumps", "os.lseek", "os.write"])
+def test_replay_ends_with_the_last_record_wherever_the_recorder_was_interrupted(
+    tmp_path, film, predictor, monkeypatch, where
+):
+    """Ctrl-C while the thirtieth chunk is written: before a part of it, or after."""
+    path, calls = tmp_path / "touch.rec", count()
+    module, name = where.split(".")
+    act = getattr({"base64": base64, "json": json, "os": os}[module], name)
+
+    def interrupted(*arguments, **options):
+        done = act(*arguments, **options) if where == "os.write" else None
+        if next(calls) == 30:
+            raise KeyboardInterrupt
+        return done if where == "os.write" else act(*arguments, **options)
+
+    monkeypatch.setattr(f"isocharge.serve.port.recording.{where}", interrupted)
+    lines = []
+    with pytest.raises(KeyboardInterrupt):
+        lines.extend(following(path, chunks(film), predictor, DEVICE))
+    monkeypatch.undo()
+    assert 10 < len(lines) < 60
     assert played(path, predictor) == lines
 
 

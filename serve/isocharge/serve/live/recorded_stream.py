@@ -37,6 +37,7 @@ class RecordedStream:
         """
         self._stream, self._recorder = stream, recorder
         self._borrowed = recorder  # whoever opened it closes it
+        self._under_way: tuple[Chunk, list[str]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
         self._load_requested: Load | None = None
         self._loading: Future[Predictor] | None = None
@@ -80,7 +81,7 @@ class RecordedStream:
         """Records, each with its line of JSON, until the chunks end.
 
         A chunk is recorded when its last record was taken. Close the generator before the recorder: so the chunk that
-        is under way is written, too.
+        is under way is written, too, wherever Ctrl-C came.
 
         Raises:
             As `isocharge.serve.live.stream.stream`.
@@ -91,20 +92,21 @@ class RecordedStream:
                     self._take_model()
                 while self._requests:
                     self._requests.popleft()()
-                yield from self._records(chunk)
+                lines: list[str] = []
+                self._under_way = (chunk, lines)
+                for record in self._stream.feed(chunk):
+                    lines.append(record.to_json())
+                    yield record, lines[-1]
+                self._record_chunk()
             self._stream.finish()
         finally:
+            self._record_chunk()
             self._end_recording()
 
-    def _records(self, chunk: Chunk) -> Iterator[tuple[PredictionRecord, str]]:
-        lines: list[str] = []
-        try:
-            for record in self._stream.feed(chunk):
-                lines.append(record.to_json())
-                yield record, lines[-1]
-        finally:
-            if self._recorder is not None:
-                self._recorder.chunk(chunk, lines)
+    def _record_chunk(self) -> None:
+        if self._recorder is not None and self._under_way is not None:
+            self._recorder.chunk(*self._under_way)
+        self._under_way = None
 
     def _record(self, recorder: Recorder | None) -> None:
         self._end_recording()

@@ -90,6 +90,7 @@ class Recorder:
             self._header["name"] = name
         self._descriptor = -1
         self._good = 0
+        self._last: Chunk | None = None
 
     def __enter__(self) -> Self:
         """Create the file.
@@ -117,10 +118,12 @@ class Recorder:
         os.close(self._descriptor)
 
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
-        """Write a chunk and the lines of its records."""
+        """Write a chunk and the lines of its records, once: after an interruption it may be given again."""
+        if chunk is self._last:
+            return
         data = base64.b64encode(chunk.data).decode()
         head = json.dumps({"chunk": [chunk.timestamp, chunk.clock_ns, chunk.outage_s, data]})
-        self._write("\n".join([head, *records]))
+        self._write("\n".join([head, *records]), chunk)
 
     def tare(self) -> None:
         """Write a request for a new tare."""
@@ -134,12 +137,13 @@ class Recorder:
         """Write a marker."""
         self._write(json.dumps({"marker": list(marker)}))
 
-    def _write(self, lines: str) -> None:
-        """Write whole lines or none."""
+    def _write(self, lines: str, chunk: Chunk | None = None) -> None:
+        """Write whole lines or none, over what an interruption left of them."""
         if self.failed:
             return
         data = f"{lines}\n".encode()
         try:
+            os.lseek(self._descriptor, self._good, os.SEEK_SET)
             unwritten = memoryview(data)
             while unwritten:
                 unwritten = unwritten[os.write(self._descriptor, unwritten) :]
@@ -149,6 +153,7 @@ class Recorder:
             log.error("%s: recording stopped (%s); what was written until now is whole", self.path, error.strerror)
             return
         self._good += len(data)
+        self._last = chunk
 
 
 class Event(NamedTuple):
