@@ -120,9 +120,13 @@ def test_a_viewer_that_takes_nothing_is_left(start_page, viewer, monkeypatch):
 
     async def stall(client):
         client.socket.transport.pause_reading()
-        for number in range(200):
+        for number in range(4000):  # as many as it takes until the server is gone
             page.reader.tell(note="x" * 50_000, number=number)
             await asyncio.sleep(0.005)
+            if number % 50 == 0:
+                await client.socket.ping()
+            if client.socket.transport.is_closing():
+                break
         client.socket.transport.resume_reading()
         while True:
             await asyncio.wait_for(client.socket.recv(), 20)
