@@ -27,15 +27,9 @@ signal.signal(
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark the later cases of a test with `first_cases(n)` as slow, before slow tests are left out.
-
-    One worker runs a file; all files that look at a clock are one worker's, and begin at once, as they mostly wait.
-    """
+    """Mark the later cases of a test with `first_cases(n)` as slow, before slow tests are left out."""
     seen = Counter()
-    items.sort(key=lambda item: item.get_closest_marker("xdist_group") is None)
     for item in items:
-        if item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(item.path.relative_to(ROOT).as_posix()))
         if marker := item.get_closest_marker("first_cases"):
             test = item.nodeid.partition("[")[0]
             seen[test] += 1
