@@ -62,7 +62,7 @@ class RiggedScreen(Screen):
     """Reads what is proposed, and answers what is asked."""
 
     def __init__(self, keyboard):
-        super().__init__(NAMES, live=False)
+        super().__init__(NAMES)
         self.keyboard, self.proposed = keyboard, None
 
     def say(self, sentence):

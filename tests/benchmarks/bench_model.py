@@ -57,8 +57,8 @@ def against_limit(bench: Bench, count: int) -> dict[str, Any]:
     truth = bench.presses[:count]
     charge = NOISE.add(bench.film.charges(truth), bench.rng)
     problem = BayesProblem(bench.film.sensor, bench.film.probe, bench.radius, bench.film.domain.force_range, NOISE)
-    least = BayesLimit.of(*bayes_estimate(problem, charge, charge_map=bench.film), truth)
-    mine = BayesLimit.of(*bench.answers(charge)[:2], truth)
+    least = BayesLimit.of(bayes_estimate(problem, charge, charge_map=bench.film)[0], truth)
+    mine = BayesLimit.of(bench.answers(charge)[0], truth)
     return {
         "presses": count,
         "position_rms_mm": mine.position_rms_mm,

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from isocharge.cli.train.press_dialogue import Dialogue, Ended, Screen, Typed
+from isocharge.cli.train.press_dialogue import Dialogue, Screen, Stopped
 from isocharge.common.errors import PortLost
 from isocharge.serve import Frame, Predictor, encode_frame, read_presses
 from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, Watched
@@ -66,7 +66,9 @@ class Script:
         self.armed += 1
 
     def next(self):
-        return self.events.pop(0)
+        if isinstance(event := self.events.pop(0), Exception):
+            raise event
+        return event
 
 
 STEADY = Watched(Phase.taken, press=SteadyPress(np.full(4, 500.0), np.ones(4), np.ones(4), 0.7, 0.5, 100, ()))
@@ -81,7 +83,7 @@ def refused(reason):
 def dialogue(*events, asks=True, contacts=None):
     """The session after a dialogue with a person, or with a machine that makes the presses of a list."""
     session, script, taken = FakeSession(), Script(*events), []
-    talk = Dialogue(session, script, Screen(NAMES, live=False), lambda *_: taken.append(len(session)))
+    talk = Dialogue(session, script, Screen(NAMES), lambda *_: taken.append(len(session)))
     if contacts is None:
         talk.with_person(asks=asks)
     else:
@@ -91,7 +93,7 @@ def dialogue(*events, asks=True, contacts=None):
 
 
 def test_enter_takes_a_press_as_proposed(capsys):
-    session, _, taken = dialogue(HELD, STEADY, Typed(""), STEADY, Typed("1.5 2 0.9"), STEADY, Typed("? ? 0.5"))
+    session, _, taken = dialogue(HELD, STEADY, "", STEADY, "1.5 2 0.9", STEADY, "? ? 0.5")
     assert session.taken[:2] == [(0.0, 0.0, 1.0), (1.5, 2.0, 0.9)]
     assert np.isnan(session.taken[2][:2]).all()
     assert taken == [1, 2, 3]
@@ -109,15 +111,15 @@ FIRST, SECOND, THIRD = ((float(x), 0.0, 1.0) for x in range(3))
 @pytest.mark.parametrize(
     ("events", "taken", "said"),
     [
-        ([STEADY, Typed(""), Typed("q")], [FIRST], "so much is known"),
-        ([STEADY, Typed("q")], [], ""),
-        ([STEADY, Typed(None)], [], ""),
-        ([Ended(None)], [], ""),
-        ([STEADY, Typed("u"), STEADY, Typed(""), Typed("u"), Typed("q")], [], "press 1 is taken back"),
-        ([STEADY, Typed(""), STEADY, Typed("u 1"), Typed(""), Typed("q")], [SECOND], "press 1 is taken back"),
-        ([Typed("s"), STEADY, Typed("s"), STEADY, Typed(""), Typed("q")], [(0.2, 0.0, 1.0)], "(0.2, 0.0) mm"),
-        ([Typed("what?"), STEADY, Typed("1 2"), Typed("1 2 3"), Typed("q")], [(1.0, 2.0, 3.0)], "got '1 2'"),
-        ([Typed(""), STEADY, Typed("q")], [], "press first"),
+        ([STEADY, "", "q"], [FIRST], "so much is known"),
+        ([STEADY, "q"], [], ""),
+        ([STEADY, Stopped()], [], ""),
+        ([Stopped()], [], ""),
+        ([STEADY, "u", STEADY, "", "u", "q"], [], "press 1 is taken back"),
+        ([STEADY, "", STEADY, "u 1", "", "q"], [SECOND], "press 1 is taken back"),
+        (["s", STEADY, "s", STEADY, "", "q"], [(0.2, 0.0, 1.0)], "(0.2, 0.0) mm"),
+        (["what?", STEADY, "1 2", "1 2 3", "q"], [(1.0, 2.0, 3.0)], "got '1 2'"),
+        (["", STEADY, "q"], [], "press first"),
     ],
 )
 def test_what_is_typed_is_done(events, taken, said, capsys):
@@ -126,7 +128,7 @@ def test_what_is_typed_is_done(events, taken, said, capsys):
 
 
 def test_a_press_that_is_refused_is_asked_for_again(capsys):
-    session, script, _ = dialogue(refused("it moves"), refused(AWAY), STEADY, Typed(""), Typed("q"))
+    session, script, _ = dialogue(refused("it moves"), refused(AWAY), STEADY, "", "q")
     assert session.taken == [FIRST]
     assert script.armed == 4
     assert "not taken: it moves; press again" in capsys.readouterr().err

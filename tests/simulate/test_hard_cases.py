@@ -72,3 +72,11 @@ def check(seed: int) -> str:
 @pytest.mark.parametrize("seed", [0, 2, 3, 12, 17])
 def test_converges_or_says_why(seed):
     check(seed)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+def test_many_converge_or_say_why():
+    """300 more; refusals are rare."""
+    outcome = [check(seed) for seed in range(100, 400)]
+    assert outcome.count("converged") > 0.95 * len(outcome)

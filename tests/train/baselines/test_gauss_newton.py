@@ -7,7 +7,7 @@ from tests.train.baselines.conftest import DOMAIN
 
 from isocharge.simulate import FunctionMap, noise_model
 from isocharge.train.baselines.gauss_newton import GaussNewton
-from isocharge.train.baselines.triangulation import Triangulate
+from isocharge.train.baselines.paper import Triangulate
 from isocharge.train.data.presses import LabelledPresses, position_error
 
 NOISE = noise_model("reference")

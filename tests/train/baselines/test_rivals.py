@@ -10,8 +10,8 @@ from tests.train.baselines.conftest import KnownMap
 from isocharge.common.errors import DatasetError
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines.learned import stretched, whitening
+from isocharge.train.baselines.paper import affine_maps
 from isocharge.train.baselines.rivals import polynomial_ridge, rivals
-from isocharge.train.baselines.table import affine_maps
 from isocharge.train.data.presses import LabelledPresses, position_error
 
 ALLOWED = {

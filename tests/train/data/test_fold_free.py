@@ -10,8 +10,7 @@ from isocharge.common.errors import DatasetError
 from isocharge.simulate import Domain, Electrode, Sweep, load_sensor, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, release
-from isocharge.train.data.charge_field import ChargeField
-from isocharge.train.data.fold_free import invertible_domain
+from isocharge.train.data.charge_field import ChargeField, invertible_domain
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 
 TINY = FitConfig(

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle
-from isocharge.train.data.measured import dataset_of, held_out
-from isocharge.train.data.presses import is_measured
+from isocharge.train.data.presses import dataset_of, held_out, is_measured
 
 
 def contacts(count: int, seed: int) -> np.ndarray:

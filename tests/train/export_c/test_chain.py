@@ -7,7 +7,7 @@ from isocharge.common.errors import DeviceError, TareError
 from isocharge.serve import Predictor, device_from_table
 from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
 from isocharge.serve.signal_chain.chain import ChainState, advance
-from isocharge.train.export_c.device_header import device_header
+from isocharge.train.export_c.folder import device_header
 
 BITS = {TARE: 1, SATURATED: 2, NEGATIVE: 4, THERMAL: 8, BLIND: 16, INVALID: 32}
 TARE_FAILED = 64

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import press, touch_charge
-from isocharge.train.films.film_scaling import FilmScaling
+from isocharge.train.films.conditional_network import FilmScaling
 
 AT, FORCE = (3.0, -4.0), 0.3
 

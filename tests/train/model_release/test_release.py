@@ -15,8 +15,7 @@ from isocharge.serve.model.repository import model_names
 from isocharge.simulate import Circle, Domain, ForwardMap, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit, release
-from isocharge.train.data.measured import held_out
-from isocharge.train.data.presses import draw_contacts
+from isocharge.train.data.presses import draw_contacts, held_out
 from isocharge.train.model_release.evaluate import simulated_errors
 from kept import kept
 

@@ -3,16 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-import onnx
 import pytest
 from msgspec import structs
-from onnx import numpy_helper
 
 from isocharge.common.errors import DatasetError, ModelError
 from isocharge.serve import Predictor
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import FitConfig, NetworkConfig, StudentCase, TrainingConfig, fit, release, student_data
-from isocharge.train.model_release.student import MOST_PARAMETERS, parameters, student_config
 
 STUDENT = FitConfig(
     network=NetworkConfig(hidden=(24, 24), misfit_hidden=(16, 16), weights="int8"),
@@ -27,8 +24,7 @@ def teacher(fitted, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def student(teacher, dataset, tmp_path_factory):
-    data = student_data(teacher.folder, dataset, STUDENT.network)
-    return release(fit(data, STUDENT), tmp_path_factory.mktemp("students") / "small")
+    return release(fit(student_data(teacher.folder, dataset), STUDENT), tmp_path_factory.mktemp("students") / "small")
 
 
 def test_it_answers_as_its_teacher_does_and_names_it(teacher, student, dataset):
@@ -43,20 +39,10 @@ def test_it_answers_as_its_teacher_does_and_names_it(teacher, student, dataset):
     assert "answers of `teacher/1`" in (student.folder / "card.md").read_text()
 
 
-def test_the_numbers_of_the_file_are_counted(student):
-    graph = onnx.load(student.folder / "model.onnx").graph
-    floats = [numpy_helper.to_array(each) for each in graph.initializer if each.data_type == onnx.TensorProto.FLOAT]
-    assert sum(each.size for each in floats if each.size > 1) == parameters(STUDENT.network, 3)
-    assert parameters(student_config().network, 8) <= MOST_PARAMETERS
-
-
-def test_what_is_no_student_of_it_is_refused(teacher, dataset):
-    large = NetworkConfig(hidden=(64, 64), misfit_hidden=(16, 16))
-    with pytest.raises(ModelError, match=r"at most 6000 weights and biases.*make 7\d\d\d; take narrower layers"):
-        student_data(teacher.folder, dataset, large)
+def test_presses_on_another_sensor_are_refused(teacher, dataset):
     other = replace(dataset, sensor=load_sensor("four-25um-biaxial"))
     with pytest.raises(DatasetError, match="on the sensor of the model teacher/1, 'three-25um-biaxial', got presses"):
-        student_data(teacher.folder, other, STUDENT.network)
+        student_data(teacher.folder, other)
 
 
 def test_its_case_is_what_the_teacher_knows(teacher, dataset):

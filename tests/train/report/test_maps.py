@@ -4,7 +4,7 @@ import numpy as np
 
 from isocharge.simulate import Domain
 from isocharge.train.data.presses import draw_contacts
-from isocharge.train.report.maps import by_force
+from isocharge.train.report.studies import by_force
 
 DOMAIN = Domain(8.0, (0.05, 2.0))
 

@@ -17,8 +17,7 @@ from isocharge.simulate import (
     virtual_film,
     write_dataset,
 )
-from isocharge.train.data.measured import dataset_of, held_out
-from isocharge.train.data.presses import draw_contacts
+from isocharge.train.data.presses import dataset_of, draw_contacts, held_out
 from isocharge.train.report import QUICK, write_report
 
 NAME, PROBE = "three-25um-biaxial", Circle(1.0)

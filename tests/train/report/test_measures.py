@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from sklearn.metrics import root_mean_squared_error
 
-from isocharge.train.report.measures import Errors, MethodRecord, coverage, pareto
-from isocharge.train.report.verdict import verdict
+from isocharge.serve.benchmark import Timing
+from isocharge.train.baselines.rivals import GivenMethod, Rival
+from isocharge.train.report.measures import Errors, MethodRecord, coverage, pareto, verdict
 
 
 def contacts(count, seed):
@@ -63,8 +64,9 @@ def test_true_deviations_cover_their_level():
 
 
 def method(name, kind, error, p50, *, per_second=1e5, given=False, answered=1.0):
-    errors = Errors(error, error, error, 1.0, 1.0, answered)
-    return MethodRecord(name, "NumPy", kind, "", given, errors, None, p50, p50, per_second, 1, 0.0)
+    rival = Rival(name, kind, "NumPy", GivenMethod(), given_force=given)
+    timings = Timing(name, 1, 1, p50, p50, 1e6 / p50), Timing(name, 64, 1, 1.0, 1.0, per_second)
+    return MethodRecord(rival, Errors(error, error, error, 1.0, 1.0, answered), None, *timings, 1, 0.0)
 
 
 @pytest.mark.parametrize(

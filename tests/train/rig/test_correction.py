@@ -6,7 +6,7 @@ from tests.train.rig.conftest import systematic
 
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.data.presses import draw_contacts
-from isocharge.train.rig.correction import Residuals, fit_correction
+from isocharge.train.rig.rig_film import Residuals, fit_correction
 
 
 def contacts(rng, count, radius=8.0):

@@ -10,8 +10,7 @@ from isocharge.common.errors import PressError
 from isocharge.serve import Predictor, check_presses, read_presses
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from isocharge.train import FitConfig, NetworkConfig, Rig, TrainingConfig, fit, release, rig_data
-from isocharge.train.data.measured import held_out
-from isocharge.train.data.presses import draw_contacts
+from isocharge.train.data.presses import draw_contacts, held_out
 from kept import kept
 
 TINY = FitConfig(

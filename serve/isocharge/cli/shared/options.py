@@ -1,5 +1,6 @@
 """Arguments and options that stand in several commands, and the numbers that their texts hold."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -84,6 +85,20 @@ DeviceOption = Annotated[
 ]
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text. (default: text)")]
+
+
+def refuse(mistakes: Mapping[str, object]) -> None:
+    """Refuse what was asked for, before anything is computed.
+
+    Args:
+        mistakes: Message to whether it holds; the first that does is said.
+
+    Raises:
+        InputError: If one holds.
+    """
+    for message, holds in mistakes.items():
+        if holds:
+            raise InputError(message)
 
 
 def board_of(path: Path | None) -> "Device":

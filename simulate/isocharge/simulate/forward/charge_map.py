@@ -43,7 +43,8 @@ class Domain:
     def to_unit(self, contact: Array) -> Array:
         """Contacts (x, y, F), shape (n, 3), to [-1, 1]^3: (x, y, ln F), centred and scaled."""
         logs = np.stack([contact[:, 0], contact[:, 1], np.log(contact[:, 2])], axis=1)
-        return np.asarray((logs - self.centre) / self.scale)
+        unit: Array = (logs - self.centre) / self.scale
+        return unit
 
     def to_contact(self, unit: Array) -> Array:
         """The inverse of `to_unit`: shape (..., 3) to (x, y, F), shape (..., 3)."""
@@ -197,7 +198,8 @@ def check_forces(force: Array | float, force_range: tuple[float, float], source:
 
 def _are_within(force: Array, force_range: tuple[float, float]) -> Booleans:
     """Which forces lie in a range; NaN does not."""
-    return np.asarray((force >= force_range[0] / SLACK) & (force <= force_range[1] * SLACK))
+    within: Booleans = (force >= force_range[0] / SLACK) & (force <= force_range[1] * SLACK)
+    return within
 
 
 def check_radius(radius: float, largest: float, source: str) -> None:

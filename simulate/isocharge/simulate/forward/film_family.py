@@ -96,7 +96,8 @@ class FilmGrid:
     def weights(self, axis: str, at: float) -> Array:
         """Interpolation weights of an axis at one value, shape (n_node,)."""
         nodes = _stretched(axis, getattr(self, axis))
-        return np.asarray(lagrange_values(nodes, barycentric_weights(nodes), np.array([_stretched(axis, at)]))[0])
+        weights: Array = lagrange_values(nodes, barycentric_weights(nodes), np.array([_stretched(axis, at)]))[0]
+        return weights
 
     @property
     def shape(self) -> tuple[int, ...]:

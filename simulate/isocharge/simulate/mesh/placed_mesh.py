@@ -56,7 +56,8 @@ class Geometry:
 
     def gather(self, local: Array) -> Array:
         """Add up element contributions of shape (n_element, n_local) at the nodes, shape (n_node,)."""
-        return np.asarray(np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64))
+        gathered: Array = np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64)
+        return gathered
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +87,8 @@ class PlacedMesh:
     @property
     def node_points(self) -> Complexes:
         """Film points of the nodes, shape (n_node,), in film radii."""
-        return np.asarray(self.points.ravel()[self.template.first_seen])
+        nodes: Complexes = self.points.ravel()[self.template.first_seen]
+        return nodes
 
     @cached_property
     def geometry(self) -> Geometry:

@@ -113,12 +113,14 @@ class Placement:
     def to_film(self, z: Complexes) -> Complexes:
         """Template points, shape (..., n), to film points (unit radius)."""
         c = self.c[..., None]
-        return np.asarray((z + c) / (1.0 + c * z))
+        points: Complexes = (z + c) / (1.0 + c * z)
+        return points
 
     def to_template(self, points: Complexes) -> Complexes:
         """Film points (unit radius), shape (..., n), to template points."""
         c = self.c[..., None]
-        return np.asarray((points - c) / (1.0 - c * points))
+        z: Complexes = (points - c) / (1.0 - c * points)
+        return z
 
     def element_points(self, blocks: Blocks) -> Complexes:
         """Film points of every element's nodes for one placement, shape (n_element, (order + 1)^2), unit radius."""
@@ -161,7 +163,8 @@ class Placement:
 
         def edge(number: Integers) -> Array:
             start, end = (np.take_along_axis(angles, number, axis=1) for angles in (self.start, self.end))
-            return np.asarray(start + depth * (end - start))
+            at: Array = start + depth * (end - start)
+            return at
 
         angle = np.angle(z)
         if not blocks.half:
@@ -217,4 +220,5 @@ class Placement:
 def _left(start: Complexes, end: Complexes, at: Complexes) -> Array:
     """Distance of points to the left of directed lines."""
     direction = end - start
-    return np.asarray(((at - start) * np.conj(direction)).imag / np.maximum(np.abs(direction), 1e-300))
+    left: Array = ((at - start) * np.conj(direction)).imag / np.maximum(np.abs(direction), 1e-300)
+    return left

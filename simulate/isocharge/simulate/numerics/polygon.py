@@ -19,7 +19,8 @@ def centroid_of(corners: Array) -> Array:
     origin = corners.mean(axis=0)
     at, following = corners - origin, np.roll(corners - origin, -1, axis=0)
     cross = at[:, 0] * following[:, 1] - at[:, 1] * following[:, 0]
-    return np.asarray(origin + np.sum((at + following) * cross[:, None], axis=0) / (3.0 * cross.sum()))
+    centroid: Array = origin + np.sum((at + following) * cross[:, None], axis=0) / (3.0 * cross.sum())
+    return centroid
 
 
 def is_convex(corners: Array) -> bool:

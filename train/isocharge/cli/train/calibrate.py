@@ -8,17 +8,13 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
-from isocharge.cli.shared.options import DeviceOption, FreshOption, JsonOption, ProbeOption
+from isocharge.cli.shared.options import DeviceOption, FreshOption, JsonOption, ProbeOption, refuse
 from isocharge.cli.shared.terminal import say, this_command
 from isocharge.cli.train.press_session import PressPort, calibrate_at_port
-from isocharge.common.errors import InputError
 from isocharge.common.json_values import plain_values
-from isocharge.simulate.sensor.probe import parse_probe
-from isocharge.simulate.sensor.sensor_file import load_sensor
-from isocharge.train.calibration.calibrate import calibrate
-from isocharge.train.calibration.contact_error import ProposedPress, next_presses
+from isocharge.simulate import load_sensor, parse_probe
+from isocharge.train import CalibrationProblem, ProposedPress, calibrate, next_presses
 from isocharge.train.calibration.folder import SESSION, read_earlier, result_table, write_calibration
-from isocharge.train.calibration.problem import CalibrationProblem
 
 
 def calibrate_command(
@@ -144,16 +140,22 @@ def calibrate_command(
 
 
 def _check_usage(file: Path | None, output: Path | None, next_count: int, port: str | None, *, of_port: bool) -> None:
-    """Refuse arguments that contradict each other, before anything is computed."""
-    if port is not None and (file is not None or next_count):
-        raise InputError(
-            "--port: presses come from the port and are proposed one by one; leave out PRESSES.csv, --next"
-        )
-    if port is not None and output is None:
-        raise InputError("--port: expected --output FOLDER for the presses and the model, got none")
-    if port is None and of_port:
-        raise InputError("--yes, --press-list, --fresh and --device belong to --port; give the port of the sensor")
-    if port is None and file is None and not next_count:
-        raise InputError("expected PRESSES.csv, or --next K for presses to begin with, or --port URL, got none of them")
-    if port is None and file is None and output is not None:
-        raise InputError("--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out")
+    """Refuse arguments that contradict each other."""
+    file_alone, nothing = port is None, port is None and file is None
+    refuse(
+        {
+            "--port: presses come from the port and are proposed one by one; leave out PRESSES.csv, --next": (
+                port and (file or next_count)
+            ),
+            "--port: expected --output FOLDER for the presses and the model, got none": port and output is None,
+            "--yes, --press-list, --fresh and --device belong to --port; give the port of the sensor": (
+                file_alone and of_port
+            ),
+            "expected PRESSES.csv, or --next K for presses to begin with, or --port URL, got none of them": (
+                nothing and not next_count
+            ),
+            "--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out": (
+                nothing and output
+            ),
+        }
+    )

@@ -30,7 +30,7 @@ def distil_command(
     fresh: FreshOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Train a small network on the answers of MODEL, for microcontrollers: at most 6,000 weights and biases.
+    """Train a small network on the answers of MODEL, for microcontrollers: some 5,000 weights and biases.
 
     It has the inputs and outputs of MODEL: contact, standard deviations and misfit. Presses within MODEL's working area
     and forces are simulated first. `isocharge train export-c` turns the student into C.
@@ -48,7 +48,7 @@ def distil_command(
     check_target(output, version, case.sensor.electrode_names)
     with shown_progress():
         presses = simulated_presses(case.sensor, case.probes, case.domain.radius, case.domain.force_range)
-    data = student_data(folder, presses, settings.network)
+    data = student_data(folder, presses)
 
     def train(run: ResumableRun) -> Release:
         return release(fit(data, settings, run=run), output, version=version, command=this_command())

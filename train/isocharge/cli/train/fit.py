@@ -15,6 +15,7 @@ from isocharge.cli.shared.options import (
     RadiusOption,
     most_workers,
     radius_mm_of,
+    refuse,
 )
 from isocharge.cli.shared.simulated_presses import simulated_presses
 from isocharge.cli.shared.terminal import shown_progress, this_command
@@ -143,15 +144,17 @@ def _presses(dataset: Path | None, sensor: str | None, probes: list[str], radius
 
 def _rig(file: Path, sensor: str | None, probes: list[str], radius: str, stds: tuple[float, float]) -> Rig:
     """Measured presses of a file."""
-    if not file.exists():
-        raise InputError(f"{file}: expected a dataset folder, or a CSV file of measured presses; there is neither")
-    if sensor is None:
-        raise InputError(f"{file}: a file of measured presses needs --sensor SENSOR, which says what was pressed")
-    if radius == "auto":
-        raise InputError("--radius: expected a number of mm with measured presses, got auto")
-    if len(probes) != 1:
-        raise InputError(f"--probe: expected the one that made the presses, got {', '.join(probes)}")
-    described = load_sensor(sensor)
+    refuse(
+        {
+            f"{file}: expected a dataset folder, or a CSV file of measured presses; there is neither": (
+                not file.exists()
+            ),
+            f"{file}: a file of measured presses needs --sensor SENSOR, which says what was pressed": not sensor,
+            "--radius: expected a number of mm with measured presses, got auto": radius == "auto",
+            f"--probe: expected the one that made the presses, got {', '.join(probes)}": len(probes) != 1,
+        }
+    )
+    described = load_sensor(str(sensor))
     presses = read_presses_of(file, described.electrode_names, *stds)
     return Rig(presses, described, parse_probe(probes[0]), radius_mm_of(radius))
 
@@ -160,15 +163,15 @@ def _films(
     dataset: Path | None, sensor: str | None, probes: list[str], radius: str, config: Path | None
 ) -> tuple[FilmPrior, FilmsConfig]:
     """The films that a sensor may be, and how a network for all of them is fitted."""
-    if dataset:
-        raise InputError("--films: expected --sensor SENSOR alone, got presses, which are of one film")
-    if config:
-        raise InputError("--films: expected no --config: its settings are for one film; leave it out")
-    if sensor is None:
-        raise InputError("expected either a DATASET folder or --sensor SENSOR, got neither")
-    if radius == "auto":
-        raise InputError("--films: expected --radius in mm, got auto: the working area differs from film to film")
-    pressing = [parse_probe(text) for text in probes]
-    if len(pressing) != 1 or not isinstance(pressing[0], Circle):
+    refuse(
+        {
+            "--films: expected --sensor SENSOR alone, got presses, which are of one film": dataset,
+            "--films: expected no --config: its settings are for one film; leave it out": config,
+            "expected either a DATASET folder or --sensor SENSOR, got neither": not sensor,
+            "--films: expected --radius in mm, got auto: the working area differs from film to film": radius == "auto",
+        }
+    )
+    probe = parse_probe(probes[0])
+    if len(probes) != 1 or not isinstance(probe, Circle):
         raise InputError(f"--films: expected one round probe (circle:RADIUS), got {', '.join(probes)}")
-    return FilmPrior(load_sensor(sensor), pressing[0]), FilmsConfig(radius=radius_mm_of(radius))
+    return FilmPrior(load_sensor(str(sensor)), probe), FilmsConfig(radius=radius_mm_of(radius))

@@ -3,34 +3,23 @@
 A machine that makes the presses of a list is asked nothing: its presses are taken in their order.
 """
 
-import sys
 import threading
 from collections.abc import Callable, Iterable
 from io import FileIO
-from queue import Empty, Queue
-from typing import NamedTuple, Self
+from queue import Queue
+from typing import Self
 
 import numpy as np
-from rich.console import Console
-from rich.markup import escape
-from rich.status import Status
 
 from isocharge.cli.shared.terminal import say
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, PortLost, PressError
-from isocharge.serve.live.reading_stream import ReadingStream
+from isocharge.serve import Chunk, ReadingStream
 from isocharge.serve.live.steady_press import AWAY, Phase, PressWatch, SteadyPress, Watched
-from isocharge.serve.port.serial_port import Chunk
-from isocharge.train.calibration.session import PressSession, Reply, describe_press, read_answer
+from isocharge.train.calibration.session import PressSession, describe_press, read_answer
 
-SHOWN_S = 0.1
-"""Time between two readings that are passed on while nothing else changes, s."""
-
-POLL_S = 0.1
-"""How long to wait for an event before Ctrl-C is looked for, s."""
-
-PLAIN_S = 1.0
-"""Time between two lines of a settling press where there is no terminal, s."""
+LINE_S = 1.0
+"""Time between two lines about a press that settles, s."""
 
 PHASES = {
     Phase.taring: "taring: leave the film alone",
@@ -46,18 +35,6 @@ KEYS = "   (type s to skip this place, u to undo the last press, q to end)"
 
 Taken = Callable[[PressSession, SteadyPress], None]
 """Called after each press that is in the session."""
-
-
-class Typed(NamedTuple):
-    """A line that was typed; None at the end of the input."""
-
-    text: str | None
-
-
-class Ended(NamedTuple):
-    """The port ends: with an error, or because a file is over."""
-
-    error: Exception | None
 
 
 class Stopped(Exception):
@@ -83,7 +60,7 @@ class PressEvents:
             keyboard: Descriptor of the keyboard; None for no keyboard.
         """
         self._chunks, self._stream, self._watch, self._keyboard = chunks, stream, watch, keyboard
-        self._queue: Queue[tuple[int, Watched | Typed | Ended]] = Queue()
+        self._queue: Queue[tuple[int, Watched | str | Exception]] = Queue()
         self._stop, self._armed = threading.Event(), 0
         self._reader = threading.Thread(target=self._read_port, name="press port", daemon=True)
 
@@ -103,70 +80,57 @@ class PressEvents:
         """From now on, take only a press that has not begun yet."""
         self._armed += 1
 
-    def next(self) -> Watched | Typed | Ended:
-        """The next event; readings from before the last `arm` are left out."""
+    def next(self) -> Watched | str:
+        """The next reading or line that was typed; readings from before the last `arm` are left out.
+
+        Raises:
+            Stopped: At the end of the port or of the input.
+            IsochargeError: Of the port.
+        """
         while True:
-            try:
-                armed, event = self._queue.get(timeout=POLL_S)
-            except Empty:
-                continue
-            if isinstance(event, Typed | Ended) or armed == self._armed:
+            armed, event = self._queue.get()
+            if isinstance(event, Exception):
+                raise event
+            if isinstance(event, str) or armed == self._armed:
                 return event
 
     def _read_port(self) -> None:
-        error = None
         try:
             self._watch_port()
-        except Exception as reason:  # passed on to the thread that asks
-            error = reason
-        self._queue.put((self._armed, Ended(error)))
+            self._queue.put((0, Stopped()))
+        except Exception as error:  # passed on to the thread that asks
+            self._queue.put((0, error))
 
     def _watch_port(self) -> None:
-        armed, last_phase, last_s = self._armed, None, -1.0
+        armed = self._armed
         for chunk in self._chunks:
             if self._stop.is_set():
                 return
             if armed != self._armed:
-                armed, last_phase = self._armed, None
+                armed = self._armed
                 self._watch.arm()
-            for timed in self._stream.feed(chunk):
-                watched = self._watch.feed(timed)
-                if watched.phase is not last_phase or timed.time.clock_s - last_s >= SHOWN_S or watched.press:
-                    last_phase, last_s = watched.phase, timed.time.clock_s
-                    self._queue.put((armed, watched))
+            for reading in self._stream.feed(chunk):
+                self._queue.put((armed, self._watch.feed(reading)))
         self._stream.finish()
 
     def _read_keyboard(self, keyboard: int) -> None:
         for line in FileIO(keyboard, closefd=False):  # unbuffered: no lock that is held when the program ends
-            self._queue.put((0, Typed(line.decode(errors="replace"))))
-        self._queue.put((0, Typed(None)))
+            self._queue.put((0, line.decode(errors="replace")))
+        self._queue.put((0, Stopped()))
 
 
 class Screen:
-    """What a person sees on stderr: sentences, and the charges as they settle, in one living line on a terminal."""
+    """What a person sees on stderr: sentences, and now and then the charges as they settle."""
 
-    def __init__(self, electrodes: tuple[str, ...], live: bool | None = None) -> None:
-        """Set up.
-
-        Args:
-            electrodes: Names, in the order of the charges.
-            live: Whether to draw a living line; by default if stderr is a terminal.
-        """
+    def __init__(self, electrodes: tuple[str, ...]) -> None:
+        """Set up; `electrodes` are names, in the order of the charges."""
         self._electrodes = electrodes
-        self._live = sys.stderr.isatty() if live is None else live
-        self._status: Status | None = None
         self._last: tuple[str, float] = ("", 0.0)
 
     def say(self, sentence: str) -> None:
-        """A sentence; the living line gives way."""
-        self.rest()
+        """A sentence."""
+        self._last = ("", 0.0)
         say(sentence)
-
-    def rest(self) -> None:
-        """Take the living line away."""
-        if self._status is not None:
-            self._status.stop()
-        self._status, self._last = None, ("", 0.0)
 
     def show(self, watched: Watched) -> None:
         """The charges of a reading, and what the watch waits for."""
@@ -177,12 +141,7 @@ class Screen:
             line += f", {watched.held_s:.1f} s: {self._charges(watched.charge_pC)}"
         line += f" ({watched.reason})" if watched.reason else ""
         phase, shown_s = self._last
-        if self._live:
-            if self._status is None:
-                self._status = Console(stderr=True).status("")
-                self._status.start()
-            self._status.update(escape(line))
-        elif watched.phase != phase or watched.held_s - shown_s >= PLAIN_S:
+        if watched.phase != phase or watched.held_s - shown_s >= LINE_S:
             self._last = watched.phase, watched.held_s
             say(line)
 
@@ -254,17 +213,10 @@ class Dialogue:
         except Stopped as end:
             raise InputError("the port ended before the last press of the list") from end
 
-    def _next(self) -> Watched | Typed:
-        """The next event; Stopped at the end of the port or the input."""
-        event = self._events.next()
-        if isinstance(event, Ended):
-            raise event.error or Stopped
-        return event
-
     def _until(self, *phases: Phase) -> Watched:
         """The next reading in one of these phases; those before it are shown."""
         while True:
-            event = self._next()
+            event = self._events.next()
             if isinstance(event, Watched):
                 if event.phase in phases:
                     return event
@@ -276,8 +228,8 @@ class Dialogue:
         self._screen.say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")
         self._events.arm()
         while press is not None or self._session.proposed is proposed:  # until another press is undone
-            event = self._next()
-            if isinstance(event, Typed):
+            event = self._events.next()
+            if isinstance(event, str):
                 if self._is_over(event, press, proposed.contact):
                     return
             elif press is not None:
@@ -295,19 +247,17 @@ class Dialogue:
             else:
                 self._screen.show(event)
 
-    def _is_over(self, typed: Typed, press: SteadyPress | None, proposed: Array) -> bool:
+    def _is_over(self, typed: str, press: SteadyPress | None, proposed: Array) -> bool:
         """Do what was typed, while a press is waited for or asked about: whether something else is to be proposed."""
-        if typed.text is None:
-            raise Stopped
         try:
-            answer = read_answer(typed.text)
-            if answer.reply == Reply.quit:
+            answer = read_answer(typed)
+            if answer.reply == "quit":
                 raise Stopped
-            if answer.reply == Reply.take and press is None:
+            if answer.reply == "take" and press is None:
                 self._screen.say("   press first: the question comes when the press is steady")
-            elif answer.reply == Reply.take and press is not None:
+            elif answer.reply == "take" and press is not None:
                 return self._take(press, proposed if isinstance(answer.contact, str) else answer.contact)
-            elif answer.reply == Reply.skip:
+            elif answer.reply == "skip":
                 self._session.skip()
             elif answer.number == "last" and press is not None:
                 self._screen.say("   this press is not taken")
@@ -318,7 +268,7 @@ class Dialogue:
         except PressError as error:
             self._screen.say(f"   {error}")
             return False
-        return answer.reply != Reply.take
+        return answer.reply != "take"
 
     def _take(self, press: SteadyPress, contact: Array) -> bool:
         """Whether the session takes a press."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import typer
 from msgspec.structs import replace
 
 from isocharge.cli.shared.options import board_of
@@ -16,13 +15,11 @@ from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, Screen
 from isocharge.common.errors import InputError, PressError
 from isocharge.common.json_values import plain_values
-from isocharge.serve.live.reading_stream import ReadingStream
+from isocharge.serve import ReadingStream, open_source
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress
-from isocharge.serve.port.source import open_source
 from isocharge.serve.prediction.measured_presses import read_press_list, read_presses
-from isocharge.train.calibration.calibrate import CalibrationResult
+from isocharge.train import CalibrationProblem, CalibrationResult
 from isocharge.train.calibration.folder import SESSION, check_calibration_folder, error_table, save_session
-from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.session import FEWEST_TO_SAY, PressSession
 
 
@@ -76,23 +73,23 @@ def calibrate_at_port(
             session.check(contact)
         except PressError as error:
             raise PressError(f"{port.press_list}, press {number}: {error}") from error
-    with _presses_stay(session, folder):
-        screen = Screen(problem.electrodes)
+    taken = partial(_print_press, machine=contacts is not None) if json_lines else lambda *_: None
+    try:
         with _events(port, problem) as events:
-            taken = partial(_print_press, machine=contacts is not None) if json_lines else lambda *_: None
-            dialogue = Dialogue(session, events, screen, taken)
-            try:
-                if contacts is None:
-                    dialogue.with_person(asks=not port.yes)
-                else:
-                    dialogue.with_machine(contacts)
-            finally:
-                screen.rest()
+            dialogue = Dialogue(session, events, Screen(problem.electrodes), taken)
+            if contacts is None:
+                dialogue.with_person(asks=not port.yes)
+            else:
+                dialogue.with_machine(contacts)
         if len(session) < FEWEST_TO_SAY:
             raise PressError(f"expected {FEWEST_TO_SAY} presses or more for a calibration, got {len(session)}")
         if session.result is None:
             raise PressError(session.refusal)
-        return session.result
+    except BaseException:
+        if len(session):
+            say(f"{len(session)} presses are in {folder / SESSION}; the same command goes on with them")
+        raise
+    return session.result
 
 
 def _session(port: PressPort, problem: CalibrationProblem, folder: Path) -> PressSession:
@@ -129,22 +126,6 @@ def _keyboard() -> int:
             "there is no input to answer questions from; give --yes for presses that are where they are proposed, or "
             "--press-list FILE for those of a machine"
         ) from error
-
-
-@contextmanager
-def _presses_stay(session: PressSession, folder: Path) -> Iterator[None]:
-    """Say where the presses are if the session does not end well."""
-    try:
-        yield
-    except BaseException as error:
-        stopped = isinstance(error, KeyboardInterrupt)
-        saved = f"{len(session)} presses are in {folder / SESSION}; the same command goes on with them"
-        if stopped:
-            say(f"stopped: {saved if len(session) else 'no press was taken'}")
-            raise typer.Exit(1) from None
-        if len(session):
-            say(saved)
-        raise
 
 
 def _print_press(session: PressSession, press: SteadyPress, *, machine: bool) -> None:

@@ -14,7 +14,7 @@ from isocharge.common.errors import InputError, ModelError
 from isocharge.common.resumable_run import refuse_finished
 from isocharge.serve import find_model
 from isocharge.simulate import Dataset, load_sensor, parse_probe, read_dataset
-from isocharge.train.data.measured import dataset_of
+from isocharge.train.data.presses import dataset_of
 from isocharge.train.report import QUICK, Settings, write_report
 
 

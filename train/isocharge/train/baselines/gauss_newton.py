@@ -9,9 +9,8 @@ from scipy.spatial import cKDTree
 from sklearn.base import BaseEstimator, RegressorMixin
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.charge_map import ChargeMap, Domain
+from isocharge.simulate import ChargeMap, Domain, NoiseModel
 from isocharge.simulate.identifiability.nearest_contact import explain
-from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.baselines.learned import whitening
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.presses import LabelledPresses, split_by_position

@@ -51,16 +51,14 @@ def whitening() -> Pipeline:
 
 def logarithms(charge: Array) -> Array:
     """ln(max(Q, 1 pC)), the same shape."""
-    logs: Array = np.log(np.maximum(charge, LOWEST_CHARGE))
-    return logs
+    return np.asarray(np.log(np.maximum(charge, LOWEST_CHARGE)))
 
 
 def stretched(values: Array, force: float, rest: float) -> Array:
     """Whitened logarithms with the force's axis, and those after the third, times a factor."""
     factors = np.full(values.shape[1], rest)
     factors[:3] = force, 1.0, 1.0
-    scaled: Array = values * factors
-    return scaled
+    return np.asarray(values * factors)
 
 
 class AfterLinear(BaseEstimator, RegressorMixin):  # type: ignore[misc]
@@ -77,8 +75,7 @@ class AfterLinear(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
     def predict(self, values: Array) -> Array:
         """Their sum."""
-        answers: Array = self.linear_.predict(values) + self.regressor_.predict(values)
-        return answers
+        return np.asarray(self.linear_.predict(values) + self.regressor_.predict(values))
 
 
 class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]

@@ -18,7 +18,7 @@ from isocharge.common.arrays import Array
 from isocharge.serve import Predictor
 from isocharge.serve.model.session import INPUT, open_session
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.train.baselines.rival import GivenMethod
+from isocharge.train.baselines.rivals import GivenMethod
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 from isocharge.train.model_release.export import GraphBuilder, add_layers, make_model
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig

@@ -14,14 +14,8 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
-from isocharge.simulate.dataset.sampling import Sweep
-from isocharge.simulate.forward.charge_spline import ChargeSpline
-from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.measuring_chain.noise_file import noise_model
+from isocharge.simulate import ChargeSpline, ForwardMap, NoiseModel, Probe, Sensor, Sweep, noise_model
 from isocharge.simulate.numerics.statistics import rms
-from isocharge.simulate.sensor.probe import Probe
-from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.train.bayes.posterior import Posterior
 
 PRESSES = 4000
@@ -59,8 +53,6 @@ class BayesLimit:
         presses: Number of presses.
         position_median_mm, position_rms_mm, position_p95_mm: Of the distance from the true position.
         force_median_percent, force_rms_percent: Of the relative error of the force.
-        expected_position_rms_mm, expected_force_rms_percent: What the posterior's own standard deviations say; they
-            vary less from one set of presses to another.
     """
 
     presses: int
@@ -69,12 +61,10 @@ class BayesLimit:
     position_p95_mm: float
     force_median_percent: float
     force_rms_percent: float
-    expected_position_rms_mm: float
-    expected_force_rms_percent: float
 
     @classmethod
-    def of(cls, contact: Array, std: Array, truth: Array) -> "BayesLimit":
-        """From estimates, their standard deviations and the true contacts (x, y, F), each (n, 3), mm and N."""
+    def of(cls, contact: Array, truth: Array) -> "BayesLimit":
+        """From estimates and the true contacts (x, y, F), each (n, 3), mm and N."""
         position = np.hypot(*(contact - truth)[:, :2].T)
         force = 100.0 * (contact[:, 2] / truth[:, 2] - 1.0)
         return cls(
@@ -84,8 +74,6 @@ class BayesLimit:
             position_p95_mm=float(np.percentile(position, 95)),
             force_median_percent=float(np.median(np.abs(force))),
             force_rms_percent=rms(force),
-            expected_position_rms_mm=rms(np.hypot(*std[:, :2].T)),
-            expected_force_rms_percent=100.0 * rms(std[:, 2] / contact[:, 2]),
         )
 
 
@@ -141,4 +129,4 @@ def bayes_limit(
     charges = charge_map or problem.forward_map(executor)
     contact = Sweep(problem.radius, problem.force_range, presses, seed, sampling="random").contacts()
     charge = problem.noise.add(charges.charges(contact), np.random.default_rng([seed, 1]))
-    return BayesLimit.of(*bayes_estimate(problem, charge, charge_map=charges, executor=executor), contact)
+    return BayesLimit.of(bayes_estimate(problem, charge, charge_map=charges, executor=executor)[0], contact)

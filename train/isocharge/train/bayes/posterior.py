@@ -22,12 +22,11 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import ChargeError, InputError
 from isocharge.common.progress import track
+from isocharge.simulate import ChargeSpline, NoiseModel
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import SLACK
-from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.identifiability.folds import singular_values
 from isocharge.simulate.identifiability.force_profile import ForceProfile
-from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import onto_disk
 
 CHUNK = 64

@@ -9,8 +9,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from isocharge.common.errors import PressError
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
-from isocharge.simulate.sensor.probe import Circle
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate import Circle, Sensor
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity
 from isocharge.train.calibration.contacts import PressData
 from isocharge.train.calibration.diagnosis import check_before, explain, find_mistakes, outside

@@ -89,8 +89,7 @@ class AdjustedContacts(NamedTuple):
     @property
     def chi2(self) -> Array:
         """Sum of squared residuals of each press, shape (n,)."""
-        chi2: Array = (self.residual**2).sum(axis=1)
-        return chi2
+        return np.asarray((self.residual**2).sum(axis=1))
 
 
 def projected(by_parameter: Array, slopes: Array) -> Array:
@@ -102,8 +101,7 @@ def projected(by_parameter: Array, slopes: Array) -> Array:
     """
     normal = np.einsum("nki,nkj->nij", slopes, slopes)
     moved = np.linalg.solve(normal, np.einsum("nki,nkp->nip", slopes, by_parameter))
-    across: Array = by_parameter - np.einsum("nki,nip->nkp", slopes, moved)
-    return across
+    return np.asarray(by_parameter - np.einsum("nki,nip->nkp", slopes, moved))
 
 
 def with_force(contact: Array) -> Array:

@@ -118,8 +118,7 @@ def _shares(charge: Array) -> Array:
     """Typical charge of each channel over that of the others, from charges of shape (n, n_electrode)."""
     typical = np.nanmedian(np.abs(charge), axis=0)
     others = [np.median(np.delete(typical, number)) for number in range(typical.size)]
-    shares: Array = typical / np.maximum(others, 1e-9)
-    return shares
+    return np.asarray(typical / np.maximum(others, 1e-9))
 
 
 def _expected(charges: FilmCharges, contact: Array) -> Array:

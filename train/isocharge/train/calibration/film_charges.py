@@ -6,13 +6,11 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.simulate import Circle, Film, ForwardMap
 from isocharge.simulate.forward.charge_map import Domain, differences
 from isocharge.simulate.forward.film_family import FilmFamily
-from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.numerics.disk import onto_disk
-from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
-from isocharge.simulate.sensor.probe import Circle
 
 STEP = 0.005
 """Step of the differences by a parameter, in standard deviations of its prior: the map is smooth on that scale."""
@@ -110,8 +108,7 @@ class FilmCharges:
         columns["d31"] = charge - columns["d32"]
         shared = np.stack([columns[name] for name in SHARED], axis=2)
         gains = charge[:, :, None] * np.eye(charge.shape[1])
-        by_parameter: Array = np.concatenate([shared, gains], axis=2) * self.prior.std
-        return by_parameter
+        return np.asarray(np.concatenate([shared, gains], axis=2) * self.prior.std)
 
     def _by_step(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
         """Derivative by one parameter; by the thickness at one load F / (E h a), which is bending's part alone."""
@@ -121,5 +118,4 @@ class FilmCharges:
         moved[number] += step if parameters[number] + step <= high[number] else -step
         change = moved[number] - parameters[number]
         at = contact * [1.0, 1.0, np.exp(change)] if name == "thickness" else contact
-        derivative: Array = (self.charges(moved, at) - charge) / change
-        return derivative
+        return np.asarray((self.charges(moved, at) - charge) / change)

@@ -14,7 +14,6 @@ nothing is lost.
 """
 
 import json
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,6 @@ from isocharge.train.calibration.calibrate import CalibrationResult
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.picture import calibration_picture
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
-from isocharge.train.calibration.quantities import Quantity
 from isocharge.train.model_release.release import release
 from isocharge.train.training.source import Provenance
 
@@ -177,6 +175,11 @@ def _card(result: CalibrationResult, about: ModelMetadata) -> str:
     sensor, probe = result.film
     low, high = about.force_range_N
     sentences = "\n".join(f"- {sentence}" for sentence in result.summary)
+    rows = "\n".join(
+        f"| `{quantity.name}` | {quantity.meaning} | {quantity.value:.4g} | {quantity.std:.2g} | "
+        f"{quantity.before_std:.2g} | {'yes' if quantity.identified else 'no'} |"
+        for quantity in result.quantities.values()
+    )
     return f"""# {about.name}, version {about.version}: a calibrated film
 
 The sensor `{sensor.name}`, calibrated on {len(result.presses)} presses with `{probe.notation}` (radius as found).
@@ -186,7 +189,15 @@ The model answers within {result.problem.domain.radius:g} mm of the centre, {low
 
 ![error left, quantities, misses]({PICTURE})
 
-{_quantities(result.quantities)}
+## The film
+
+| quantity | what it is | value | standard deviation | before | identified |
+|---|---|---|---|---|---|
+{rows}
+
+Identified: the presses at least halved its standard deviation. `sensor.toml` has single parameters, of which only the
+combinations above are known; `calibration.json` has their correlations.
+
 ## The model on this film
 
 On fresh simulated presses of the film as calibrated, with noise:
@@ -205,23 +216,6 @@ What not knowing the film leaves comes on top; `contact_std` has it in, as a com
 ```bash
 {about.made_with.get("command") or "(made by a program, see metadata)"}
 ```
-"""
-
-
-def _quantities(table: Mapping[str, Quantity]) -> str:
-    rows = "\n".join(
-        f"| `{quantity.name}` | {quantity.meaning} | {quantity.value:.4g} | {quantity.std:.2g} | "
-        f"{quantity.before_std:.2g} | {'yes' if quantity.identified else 'no'} |"
-        for quantity in table.values()
-    )
-    return f"""## The film
-
-| quantity | what it is | value | standard deviation | before | identified |
-|---|---|---|---|---|---|
-{rows}
-
-Identified: the presses at least halved its standard deviation. `sensor.toml` has single parameters, of which only the
-combinations above are known; `calibration.json` has their correlations.
 """
 
 

@@ -9,11 +9,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, SceneError, SensorError
 from isocharge.serve.model.repository import find_model, model_names, repositories
-from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.sensor.film_prior import FilmPrior
-from isocharge.simulate.sensor.probe import Circle, Probe
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate import Circle, Domain, FilmPrior, NoiseModel, Probe, Sensor
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.films.films_file import FILE, read_films
 from isocharge.train.films.films_model import FilmsModel

@@ -8,7 +8,6 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import Literal
 
 import numpy as np
@@ -33,13 +32,11 @@ EXPECTED_ANSWER = (
 )
 
 
-class Reply(StrEnum):
-    """What a person wants."""
+Reply = Literal["take", "skip", "undo", "quit"]
+"""What a person wants."""
 
-    take = "take"
-    skip = "skip"
-    undo = "undo"
-    quit = "quit"
+WORDS: dict[str, Reply] = {"": "take", "take": "take", "s": "skip", "skip": "skip", "q": "quit", "quit": "quit"}
+"""What stands for it."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +64,10 @@ def read_answer(text: str) -> Answer:
         PressError: If it is something else; says what is expected.
     """
     word = text.strip().lower()
-    if word in ("", *Reply, "s", "q"):
-        return Answer(Reply({"s": "skip", "q": "quit"}.get(word, word or "take")))
+    if word in WORDS:
+        return Answer(WORDS[word])
     if undo := re.fullmatch(r"(?:u|undo)\s*(\d*)", word):
-        return Answer(Reply.undo, number=int(undo[1]) if undo[1] else "last")
+        return Answer("undo", number=int(undo[1]) if undo[1] else "last")
     cells = [cell.strip() for cell in (word.split(",") if "," in word else word.split())] * (3 if word == "?" else 1)
     known = [cell not in ("", "?") for cell in cells]
     try:
@@ -79,7 +76,7 @@ def read_answer(text: str) -> Answer:
         contact = np.empty(0)
     if contact.shape != (3,) or not np.array_equal(np.isfinite(contact), known):
         raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")
-    return Answer(Reply.take, contact)
+    return Answer("take", contact)
 
 
 class PressSession:

@@ -9,10 +9,8 @@ everything. Few electrodes make a space small enough to be covered.
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate import ChargeMap, NoiseModel, noise_model
 from isocharge.simulate.identifiability.nearest_contact import CANDIDATES, explain, search
-from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}

@@ -3,12 +3,13 @@
 from collections.abc import Iterable
 from importlib import resources
 from string import Template
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-LINE = 110
+LINE = 109
 """Columns of a line of numbers."""
 
 
@@ -39,14 +40,8 @@ def c_doubles(values: Iterable[float]) -> str:
 def c_array(name: str, values: NDArray[Any]) -> str:
     """A constant array of one dimension, of float or signed char, from values of any shape, in the order of rows."""
     whole = values.dtype == np.int8
-    lines, line = [], ""
-    for value in values.ravel():
-        word = f"{value}, " if whole else f"{c_float(value)}, "
-        if len(line) + len(word) > LINE:
-            lines.append(line.rstrip())
-            line = ""
-        line += word
-    numbers = "\n    ".join([*lines, line.rstrip(", ")])
+    words = ", ".join(map(str if whole else c_float, values.ravel()))
+    numbers = "\n    ".join(wrap(f"{words},", LINE, break_on_hyphens=False)).rstrip(",")
     return f"static const {'signed char' if whole else 'float'} {name}[{values.size}] = {{\n    {numbers}\n}};\n"
 
 

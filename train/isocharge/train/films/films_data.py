@@ -16,11 +16,10 @@ import numpy as np
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import DatasetError
 from isocharge.common.progress import track
+from isocharge.simulate import NoiseModel, Piezo
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain, FunctionMap, linearised
 from isocharge.simulate.forward.film_family import FilmFamily
-from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.sensor.film import Piezo
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 from isocharge.train.data.misfit_charges import draw_misfit_examples
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses, draw_contacts
@@ -57,9 +56,6 @@ class FilmPresses:
 
     def __len__(self) -> int:
         return len(self.parameters)
-
-    def __getitem__(self, films: slice) -> "FilmPresses":
-        return FilmPresses(self.parameters[films], self.contact[films], self.response[films])
 
     def charge(self) -> Array:
         """Clean charges of the films as they are, shape (n_film, n_press, n_electrode), pC."""

@@ -26,14 +26,11 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, ModelError
 from isocharge.common.files import read_whole, sha256_of
-from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate import Circle, Domain, NoiseModel
 from isocharge.simulate.forward.film_family import FilmFamily
-from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread
-from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
-from isocharge.train.films.conditional_network import ConditionalWeights
-from isocharge.train.films.film_scaling import FilmScaling
+from isocharge.train.films.conditional_network import ConditionalWeights, FilmScaling
 from isocharge.train.films.films_model import FilmsModel
 
 FILE = "films.npz"

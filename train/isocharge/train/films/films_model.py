@@ -8,14 +8,10 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
-from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate import Domain, FilmPrior, ForwardMap, NoiseModel
 from isocharge.simulate.forward.film_family import FilmFamily
-from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
-from isocharge.train.films.conditional_network import ConditionalWeights
-from isocharge.train.films.film_scaling import FilmScaling
+from isocharge.train.films.conditional_network import ConditionalWeights, FilmScaling
 from isocharge.train.training.fit import Fitted
 from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, answer_units
 from isocharge.train.training.source import Provenance

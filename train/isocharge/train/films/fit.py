@@ -12,15 +12,12 @@ from torch import Tensor
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.resumable_run import ResumableRun
-from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate import Domain, NoiseModel, noise_model
 from isocharge.simulate.forward.film_family import FilmFamily
-from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.measuring_chain.noise_file import noise_model
 from isocharge.simulate.sensor.film_prior import REACH, SHARED, FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.misfit_charges import misfit_noise
-from isocharge.train.films.conditional_network import ConditionalPerceptron, ConditionalWeights, FilmInputs
-from isocharge.train.films.film_scaling import FilmScaling
+from isocharge.train.films.conditional_network import ConditionalPerceptron, ConditionalWeights, FilmInputs, FilmScaling
 from isocharge.train.films.films_data import (
     D31,
     D32,

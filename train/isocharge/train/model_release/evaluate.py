@@ -5,8 +5,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.simulate.dataset.shards import Dataset
-from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate import Dataset, NoiseModel
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.presses import LabelledPresses, position_error

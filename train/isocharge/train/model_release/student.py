@@ -1,4 +1,4 @@
-"""A small student of a model, for microcontrollers: 6,000 numbers at most, the same inputs and outputs.
+"""A small student of a model, for microcontrollers: some 5,000 numbers, the same inputs and outputs.
 
 The student has two hidden layers instead of three, narrow enough for 40 kB of flash. Its contacts and deviations are
 the model's; its misfit is learned from exact searches, as the model's was.
@@ -13,20 +13,13 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, ModelError
 from isocharge.common.files import sha256_of
-from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.prediction.predictor import Predictor
-from isocharge.simulate.dataset.shards import Dataset
-from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.sensor.probe import Probe, parse_probe
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.serve import ModelMetadata, Predictor
+from isocharge.simulate import Dataset, Domain, Probe, Sensor, parse_probe
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train.model_release.evaluate import HELD_PRESSES
 from isocharge.train.model_release.release import model_domain
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.training.source import Teacher, TrainingData
-
-MOST_PARAMETERS = 6_000
-"""Weights and biases of a student's graph, zeros between its two perceptrons included."""
 
 
 def student_config(weights: Literal["float32", "int8"] = "float32") -> FitConfig:
@@ -67,16 +60,14 @@ class StudentCase:
         return cls(sensor_from_dict(dict(about.sensor)), probes, model_domain(about))
 
 
-def student_data(model: Path, dataset: Dataset, network: NetworkConfig) -> TrainingData:
+def student_data(model: Path, dataset: Dataset) -> TrainingData:
     """What a student is fitted to: presses, and the answers of a model to them.
 
     Args:
         model: The model's version folder.
         dataset: Clean charges of the model's sensor, such as a sweep over its `StudentCase`.
-        network: Sizes of the student.
 
     Raises:
-        ModelError: If the student would have more than `MOST_PARAMETERS`.
         DatasetError: If the dataset is of another sensor, or cannot train an inverse.
     """
     predictor = Predictor(model)
@@ -86,12 +77,6 @@ def student_data(model: Path, dataset: Dataset, network: NetworkConfig) -> Train
             f"expected presses on the sensor of the model {about.label}, {about.sensor['name']!r}, got presses on "
             f"{dataset.sensor.name!r}; simulate them on the model's own sensor"
         )
-    if (count := parameters(network, len(about.electrodes))) > MOST_PARAMETERS:
-        raise ModelError(
-            f"network.hidden: a student has at most {MOST_PARAMETERS} weights and biases, so that it fits a "
-            f"microcontroller; {list(network.hidden)} beside {list(network.misfit_hidden)} make {count}; take "
-            "narrower layers"
-        )
 
     def answer(charge: Array) -> tuple[Array, Array]:
         columns = np.stack(predictor.predict_batch(charge), axis=1).astype(float)
@@ -99,11 +84,3 @@ def student_data(model: Path, dataset: Dataset, network: NetworkConfig) -> Train
 
     checksum = sha256_of((model / "model.onnx").read_bytes())
     return replace(TrainingData.of(dataset), teacher=Teacher(about.label, checksum, answer))
-
-
-def parameters(network: NetworkConfig, electrodes: int) -> int:
-    """Numbers in the graph of a network whose perceptrons run side by side."""
-    widths = [first + second for first, second in zip(network.hidden, network.misfit_hidden, strict=True)]
-    answers = 6 + electrodes
-    layers = zip([electrodes, *widths], [*widths, answers], strict=True)
-    return sum(before * after + after for before, after in layers) + electrodes * answers + electrodes

@@ -21,20 +21,34 @@ from isocharge.simulate import ChargeSpline, Dataset, Samples
 from isocharge.simulate.plots.figure import save_picture
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.baselines.networks import RELEASED, ReleasedModel, TrainedNetwork
-from isocharge.train.baselines.rival import FittingTask, Rival
-from isocharge.train.baselines.rivals import BOOSTING, GAUSS_NEWTON, LINEAR_BAND, POLYNOMIAL, TABLE, rivals
+from isocharge.train.baselines.rivals import (
+    BOOSTING,
+    GAUSS_NEWTON,
+    LINEAR_BAND,
+    POLYNOMIAL,
+    TABLE,
+    FittingTask,
+    Rival,
+    rivals,
+)
 from isocharge.train.calibration.diagnosis import outside
-from isocharge.train.data.measured import check_enough, held_out
-from isocharge.train.data.presses import LabelledPresses, domain_of, is_measured, presses_of, split_by_position
+from isocharge.train.data.presses import (
+    LabelledPresses,
+    check_enough,
+    domain_of,
+    held_out,
+    is_measured,
+    presses_of,
+    split_by_position,
+)
+from isocharge.train.model_release.evaluate import alarm_threshold
 from isocharge.train.model_release.release import model_domain
-from isocharge.train.report import effects, maps, pictures
-from isocharge.train.report.case import EvaluationCase, press_on
-from isocharge.train.report.limits import BAYES, ErrorBounds
-from isocharge.train.report.measures import rounded
-from isocharge.train.report.methods import by_name, fit_all, one_thread, records_of
+from isocharge.train.report import pictures, studies
+from isocharge.train.report.case import BAYES, ErrorBounds, EvaluationCase, Settings, press_on
+from isocharge.train.report.measures import rounded, verdict
+from isocharge.train.report.methods import fit_all, records_of
 from isocharge.train.report.page import page
-from isocharge.train.report.settings import Settings
-from isocharge.train.report.verdict import verdict
+from isocharge.train.training.fit import threads_and_seed
 from isocharge.train.training.source import TrainingData
 
 FORMAT_VERSION = 1
@@ -96,8 +110,14 @@ def write_report(
         "machine": machine(MEASURED_WITH),
         "settings": asdict(settings),
     }
-    identity = {**about, "datasets": [subject.identity() for subject in prepared]}
-    with resume_folder(folder, identity, fresh=fresh) as run, one_thread():
+    identity = {
+        **about,
+        "datasets": [
+            {"dataset_sha256": each.dataset.sha256, "models": list(map(str, (each.released.folder, *each.students)))}
+            for each in prepared
+        ],
+    }
+    with resume_folder(folder, identity, fresh=fresh) as run, threads_and_seed(1, settings.seed):
         sections = [subject.measure(run.data, stem, run.keeping(stem)) for stem, subject in _stems(prepared).items()]
         write_whole(run.data / "report.md", page({**about, "datasets": sections}).encode())
         plain = [{**section, "methods": [method.to_dict() for method in section["methods"]]} for section in sections]
@@ -147,10 +167,6 @@ class _Subject:
         own = tuple(path for path in dict.fromkeys(students) if Predictor(path).metadata.sensor == about.sensor)
         return cls(dataset, ReleasedModel(model), own, task, case, settings, held)
 
-    def identity(self) -> dict[str, Any]:
-        """What its figures depend on, beside the settings."""
-        return {"dataset_sha256": self.dataset.sha256, "models": [str(self.released.folder), *map(str, self.students)]}
-
     def measure(self, folder: Path, stem: str, executor: Executor) -> dict[str, Any]:
         """Everything about this dataset: its section of the record, its pictures written."""
         section, drawings = self._measured() if self.held is not None else self._simulated(executor)
@@ -173,23 +189,23 @@ class _Subject:
         charges = ChargeSpline.of(exact[0])
         limits = ErrorBounds.of(case, charges, clean, test.charge[: settings.limited], executor)
         methods, _ = fit_all([*self._models(), *rivals(self.task, charges), *self._networks()], self.task, test)
-        records, fitted = records_of(methods, test, settings, limits.bayes), by_name(methods)
-        draws = maps.Draws.of(released, clean, case, settings.draws)
-        threshold = effects.threshold_of(released, clean, case, settings.draws)
+        records, fitted = records_of(methods, test, settings, limits.bayes), {each.rival.name: each for each in methods}
+        draws = studies.Draws.of(released, clean, case, settings.draws)
+        threshold = alarm_threshold(draws.misfit)
         compared = [fitted[name].rival for name in COMPARED]
         contacts = {name: fitted[name].contact for name in (RELEASED, *COMPARED)}
         lines = contacts if limits.bayes is None else {BAYES: limits.bayes, **contacts}
         different = [
-            effects.measured(deviation, RELEASED, released, compared, threshold)
-            for deviation in effects.deviations(case, clean, settings, executor)
+            studies.measured(deviation, RELEASED, released, compared, threshold)
+            for deviation in studies.deviations(case, clean, settings, executor)
         ]
         section = {
             **self._about(len(test)),
             "limits": limits.record(test.contact),
             "methods": records,
             "verdict": verdict(records),
-            "by_force": maps.by_force(case.domain, test.contact, lines, limits.cramer_rao.position),
-            "calibration": maps.calibration(case.domain, draws),
+            "by_force": studies.by_force(case.domain, test.contact, lines, limits.cramer_rao.position),
+            "calibration": studies.calibration(draws),
             "alarm_threshold": rounded(threshold),
             "cases": different,
         }
@@ -264,7 +280,7 @@ class _Subject:
         }
 
 
-def _drawings(section: dict[str, Any], case: EvaluationCase, draws: maps.Draws) -> Drawings:
+def _drawings(section: dict[str, Any], case: EvaluationCase, draws: studies.Draws) -> Drawings:
     """The pictures of a simulated dataset beside those of speed."""
     force, nominal = section["by_force"], section["methods"][0].errors.position_rms_mm
     noise = [deviation for deviation in section["cases"] if deviation["group"] == "noise"]
@@ -273,7 +289,7 @@ def _drawings(section: dict[str, Any], case: EvaluationCase, draws: maps.Draws) 
         "maps": lambda: pictures.error_maps(case.sensor, case.domain, draws),
         "force": lambda: pictures.error_lines(force["force_N"], force["position_rms_mm"], "force, N"),
         "calibration": lambda: pictures.calibration(section["calibration"]),
-        "noise": lambda: pictures.error_lines(effects.LEVELS, lines, "noise over reference"),
+        "noise": lambda: pictures.error_lines(studies.LEVELS, lines, "noise over reference"),
         "effects": lambda: pictures.mismatch_effect(section["cases"], nominal),
     }
 

@@ -1,4 +1,4 @@
-"""Figures of merit: errors of contacts, and which methods nothing beats."""
+"""Figures of merit: errors of contacts, which methods nothing beats, and a sentence on the released model."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -8,7 +8,9 @@ import numpy as np
 from scipy.stats import norm
 
 from isocharge.common.arrays import Array
+from isocharge.serve.benchmark import Timing
 from isocharge.simulate.numerics.statistics import rms
+from isocharge.train.baselines.rivals import Rival
 from isocharge.train.data.presses import position_error
 
 
@@ -51,10 +53,6 @@ class Errors:
             answered=rounded(float(np.mean(answered))) or 0.0,
         )
 
-    def to_dict(self) -> dict[str, float | None]:
-        """For JSON."""
-        return asdict(self)
-
 
 Plot = Literal["latency", "throughput", "memory"]
 """A plot of the error against a cost."""
@@ -65,46 +63,37 @@ COST_SIGNS: dict[Plot, float] = {"latency": 1.0, "throughput": -1.0, "memory": 1
 
 @dataclass(frozen=True)
 class MethodRecord:
-    """What the report says about a method in one form.
+    """What the report says about a method.
 
     Attributes:
-        name: The method.
-        form: What computes it.
-        kind: "paper", "learnt", "fitted map" or "network".
-        choice: Its hyperparameters and how they were chosen.
-        force_given: Whether it was given the true force.
+        rival: The method, fitted.
         errors: On all test presses.
         over_bayes: Position error over the Bayes limit's on the same presses; None where there is no limit.
-        p50_us, p99_us: Median and 99th percentile of the duration of one prediction.
-        per_second: Predictions per second in batches.
+        one: Durations of single predictions.
+        many: Durations of batches.
         memory_bytes: Serialised size.
-        fit_seconds: Duration of fitting all forms.
+        fit_seconds: Duration of fitting.
         best_on: Plots on which no method is better in both error and cost.
     """
 
-    name: str
-    form: str
-    kind: str
-    choice: str
-    force_given: bool
+    rival: Rival
     errors: Errors
     over_bayes: float | None
-    p50_us: float
-    p99_us: float
-    per_second: float
+    one: Timing
+    many: Timing
     memory_bytes: int
     fit_seconds: float
     best_on: tuple[Plot, ...] = ()
 
     @property
     def label(self) -> str:
-        """Name and form."""
-        return f"{self.name} ({self.form})"
+        """Name, and what computes it."""
+        return f"{self.rival.name} ({self.rival.computed_by})"
 
     @property
     def competes(self) -> bool:
         """Whether it answers what the others answer: all presses, from the charges alone."""
-        return not self.force_given and self.errors.answered == 1.0
+        return not self.rival.given_force and self.errors.answered == 1.0
 
     @property
     def error_mm(self) -> float:
@@ -113,12 +102,27 @@ class MethodRecord:
 
     def cost(self, plot: Plot) -> float:
         """The figure along the plot's axis: us, predictions per second or bytes."""
-        return {"latency": self.p50_us, "throughput": self.per_second, "memory": float(self.memory_bytes)}[plot]
+        memory = float(self.memory_bytes)
+        return {"latency": self.one.p50_us, "throughput": self.many.presses_per_s, "memory": memory}[plot]
 
     def to_dict(self) -> dict[str, Any]:
         """As in `report.json`."""
-        figures = {key: rounded(getattr(self, key)) for key in ("p50_us", "p99_us", "per_second", "fit_seconds")}
-        return {"label": self.label, **asdict(self), **figures}
+        return {
+            "label": self.label,
+            "name": self.rival.name,
+            "form": self.rival.computed_by,
+            "kind": self.rival.kind,
+            "choice": self.rival.choice,
+            "force_given": self.rival.given_force,
+            "errors": asdict(self.errors),
+            "over_bayes": self.over_bayes,
+            "p50_us": rounded(self.one.p50_us),
+            "p99_us": rounded(self.one.p99_us),
+            "per_second": rounded(self.many.presses_per_s),
+            "memory_bytes": self.memory_bytes,
+            "fit_seconds": rounded(self.fit_seconds),
+            "best_on": self.best_on,
+        }
 
 
 def mark_fronts(records: Sequence[MethodRecord]) -> list[MethodRecord]:
@@ -146,12 +150,60 @@ def pareto(cost: Array, error: Array) -> np.ndarray:
     """
     lower = (cost[None] <= cost[:, None]) & (error[None] <= error[:, None])
     strictly = (cost[None] < cost[:, None]) | (error[None] < error[:, None])
-    front: np.ndarray = ~(lower & strictly).any(axis=1) & np.isfinite(cost) & np.isfinite(error)
-    return front
+    return np.asarray(~(lower & strictly).any(axis=1) & np.isfinite(cost) & np.isfinite(error))
 
 
 def coverage(contact: Array, std: Array, truth: Array, levels: Array) -> Array:
     """Share of truths within the central interval of each nominal level, Gaussian; shape (n_level, 3) for x, y, F."""
     deviation = np.abs(contact - truth) / std
-    within: Array = np.mean(deviation[None] <= norm.ppf(0.5 + 0.5 * levels)[:, None, None], axis=1)
-    return within
+    return np.asarray(np.mean(deviation[None] <= norm.ppf(0.5 + 0.5 * levels)[:, None, None], axis=1))
+
+
+WORDS: dict[Plot, str] = {"latency": "single predictions", "throughput": "batches"}
+"""The plots that are compared, and their names in a sentence."""
+
+
+def verdict(records: Sequence[MethodRecord]) -> dict[str, Any]:
+    """Which methods beat the released model, in sentences and as labels.
+
+    Args:
+        records: Of all methods, the released one first.
+
+    Returns:
+        "sentences", and "both": for latency and throughput the labels of methods that are faster and more accurate.
+    """
+    released, others = records[0], [record for record in records[1:] if record.competes]
+    both = {
+        plot: [
+            record.label
+            for record in others
+            if record.error_mm < released.error_mm and _speed(record, released, plot) > 1.0
+        ]
+        for plot in WORDS
+    }
+    groups = {
+        "other methods": [record for record in others if record.rival.kind != "network"],
+        "networks that give the contact alone": [record for record in others if record.rival.kind == "network"],
+    }
+    sentences = [_sentence(plot, released, group, kind) for kind, group in groups.items() if group for plot in WORDS]
+    return {"both": both, "sentences": sentences}
+
+
+def _speed(record: MethodRecord, released: MethodRecord, plot: Plot) -> float:
+    """How many times as fast as the released model a method is."""
+    return float((released.cost(plot) / record.cost(plot)) ** COST_SIGNS[plot])
+
+
+def _sentence(plot: Plot, released: MethodRecord, others: Sequence[MethodRecord], kind: str) -> str:
+    faster = [record for record in others if _speed(record, released, plot) > 1.0]
+    if not faster:
+        return f"In {WORDS[plot]}, none of {len(others)} {kind} is faster than the released model."
+    nearest = min(faster, key=lambda record: record.error_mm)
+    both = sum(record.error_mm < released.error_mm for record in faster)
+    error = 100.0 * (nearest.error_mm / released.error_mm - 1.0)
+    more = f"{abs(error):.2g} % {'less' if error < 0.0 else 'more'} error"
+    return (
+        f"In {WORDS[plot]}, {both or 'none'} of {len(others)} {kind} {'are' if both > 1 else 'is'} both faster and "
+        f"more accurate than the released model. Of those that are faster the most accurate is {nearest.label} "
+        f"({_speed(nearest, released, plot):.3g} times as fast, {more})."
+    )

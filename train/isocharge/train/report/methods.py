@@ -2,25 +2,22 @@
 
 import pickle
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import cycle
 
 import numpy as np
-import torch
-from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.common.progress import track
 from isocharge.serve.benchmark import Contender, Timing, take_turns
 from isocharge.train.baselines.networks import OnnxContact, ReleasedModel
-from isocharge.train.baselines.rival import FittingTask, Rival
+from isocharge.train.baselines.rivals import FittingTask, Rival
 from isocharge.train.data.presses import LabelledPresses
+from isocharge.train.report.case import Settings
 from isocharge.train.report.measures import Errors, MethodRecord, mark_fronts, rounded
-from isocharge.train.report.settings import Settings
 
 TIMED = 64
 """Presses that single predictions go through in turn."""
@@ -83,23 +80,6 @@ def records_of(
     return mark_fronts([_record(method, test.contact, bayes, *timing) for method, *timing in per_method])
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """BLAS, OpenMP and torch on one thread for the block."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-def by_name(methods: Sequence[Method]) -> dict[str, Method]:
-    """The methods by their names."""
-    return {method.rival.name: method for method in methods}
-
-
 def _single(rival: Rival, test: LabelledPresses) -> Callable[[], object]:
     """A call for one press, each time another; networks by the calls that bind their arrays once."""
     rows, regressor = rival.inputs(test.charge, test.contact[:, 2])[:TIMED], rival.regressor
@@ -126,20 +106,8 @@ def _record(method: Method, truth: Array, bayes: Array | None, one: Timing, many
     rival, figures = method.rival, Errors.of(method.contact, truth)
     if rival.given_force:
         figures = replace(figures, force_rms_percent=None, force_median_percent=None)
-    return MethodRecord(
-        name=rival.name,
-        form=rival.computed_by,
-        kind=rival.kind,
-        choice=rival.choice,
-        force_given=rival.given_force,
-        errors=figures,
-        over_bayes=None if bayes is None else over_bayes(method.contact, bayes, truth),
-        p50_us=one.p50_us,
-        p99_us=one.p99_us,
-        per_second=many.presses_per_s,
-        memory_bytes=_memory(rival),
-        fit_seconds=method.fit_seconds,
-    )
+    over_limit = None if bayes is None else over_bayes(method.contact, bayes, truth)
+    return MethodRecord(rival, figures, over_limit, one, many, _memory(rival), method.fit_seconds)
 
 
 def over_bayes(contact: Array, bayes: Array, truth: Array) -> float | None:

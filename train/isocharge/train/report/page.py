@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from isocharge.train.model_release.evaluate import FALSE_ALARMS
-from isocharge.train.report.effects import FARTHEST, GAIN_OFF, PRETENSION_OFF
 from isocharge.train.report.measures import MethodRecord
+from isocharge.train.report.studies import FARTHEST, GAIN_OFF, PRETENSION_OFF
 
 Section = Mapping[str, Any]
 
@@ -29,7 +29,7 @@ def _summary(section: Section) -> Iterator[str]:
     yield f"**{section['sensor']}**, released model `{section['model']['label']}`:\n"
     yield (
         f"- It errs by {errors.position_rms_mm:.3g} mm rms ({errors.position_median_mm:.3g} mm median) and by "
-        f"{errors.force_rms_percent:.3g} % of the force, and takes {released.p50_us:.3g} us for one press."
+        f"{errors.force_rms_percent:.3g} % of the force, and takes {released.one.p50_us:.3g} us for one press."
     )
     if released.over_bayes:
         bayes = limits["bayes"]
@@ -52,19 +52,13 @@ def _simulated(section: Section) -> Iterator[str]:
         "that no method has seen. One process, one thread."
     )
     yield from _methods(section)
-    yield from _where(section)
+    yield "### Where the errors are"
+    yield _picture(section, "maps")
+    yield _picture(section, "force")
     yield "### Whether the deviations are true"
     yield _picture(section, "calibration")
-    rows = [
-        [part["where"], *(f"{100 * part[level][c]:.1f}" for level in COVERAGES for c in ("x", "y", "force"))]
-        for part in section["calibration"]["parts"]
-    ]
-    yield table(["presses", "68 %: x", "y", "force", "95 %: x", "y", "force"], rows)
     yield from _effects(section)
     yield from _choices(section["methods"])
-
-
-COVERAGES = ("coverage_68", "coverage_95")
 
 
 def _measured(section: Section) -> Iterator[str]:
@@ -97,7 +91,9 @@ def _methods(section: Section) -> Iterator[str]:
             positions = [_number(limit.get(f"position_{figure}_mm")) for figure in ("rms", "median", "p95")]
             rows.append([name, "", *positions, ratio, _number(limit["force_rms_percent"]), "", "", "", ""])
     records: Sequence[MethodRecord] = section["methods"]
-    rows += [_cells(record) for record in sorted(records, key=lambda r: (r.errors.position_rms_mm or 1e9, r.p50_us))]
+    rows += [
+        _cells(record) for record in sorted(records, key=lambda r: (r.errors.position_rms_mm or 1e9, r.one.p50_us))
+    ]
     yield table(head, rows, left=2)
     yield (
         "Bold: nothing is both faster (one prediction) and more accurate. *Force given*: by the true force, which no "
@@ -109,23 +105,17 @@ def _methods(section: Section) -> Iterator[str]:
 def _cells(record: MethodRecord) -> list[str]:
     errors = record.errors
     cells = [
-        record.name + (f" ({100 * errors.answered:.3g} % answered)" if errors.answered < 1.0 else ""),
-        record.form,
+        record.rival.name + (f" ({100 * errors.answered:.3g} % answered)" if errors.answered < 1.0 else ""),
+        record.rival.computed_by,
         *(_number(value) for value in (errors.position_rms_mm, errors.position_median_mm, errors.position_p95_mm)),
         _number(record.over_bayes),
         _number(errors.force_rms_percent),
-        _number(record.p50_us),
-        _number(record.p99_us),
-        f"{record.per_second:,.0f}",
+        _number(record.one.p50_us),
+        _number(record.one.p99_us),
+        f"{record.many.presses_per_s:,.0f}",
         f"{record.memory_bytes:,}",
     ]
     return [f"**{cell}**" if cell else "" for cell in cells] if "latency" in record.best_on else cells
-
-
-def _where(section: Section) -> Iterator[str]:
-    yield "### Where the errors are"
-    yield _picture(section, "maps")
-    yield _picture(section, "force")
 
 
 def _effects(section: Section) -> Iterator[str]:
@@ -134,8 +124,8 @@ def _effects(section: Section) -> Iterator[str]:
     yield _picture(section, "effects")
     threshold = _number(section["alarm_threshold"])
     yield f"Position error rms, mm, and alarms of the released model (misfit above {threshold}):"
-    names = list(next(case["errors"] for case in section["cases"] if case["errors"]))
-    head = ["what is different", *names, "force rms, %", "68 % intervals hold, %", "alarms, %", "at 1 N"]
+    names = list(section["cases"][0]["errors"])
+    head = ["what is different", *names, "force rms, %", "68 % intervals hold, %", "alarms, %"]
     yield table(head, (_case_cells(case, names) for case in section["cases"]))
     yield (
         f"Gains: every electrode off by {100 * GAIN_OFF:g} % rms, another draw for every press. Pretension: "
@@ -144,17 +134,14 @@ def _effects(section: Section) -> Iterator[str]:
 
 
 def _case_cells(case: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    errors = case["errors"]
-    positions = [_number(errors[name]["position_rms_mm"]) if errors else "" for name in names]
-    force = _number(errors[names[0]]["force_rms_percent"]) if errors else ""
-    inside = "" if case["coverage_68"] is None else f"{100 * case['coverage_68']:.1f}"
-    alarms = [_number(case["alarms_percent"]), _number(case["alarms_percent_about_1N"])]
-    return [f"{case['group']}: {case['case']}", *positions, force, inside, *alarms]
+    positions = [_number(case["errors"][name]["position_rms_mm"]) for name in names]
+    force, inside = _number(case["errors"][names[0]]["force_rms_percent"]), f"{100 * case['coverage_68']:.1f}"
+    return [f"{case['group']}: {case['case']}", *positions, force, inside, _number(case["alarms_percent"])]
 
 
 def _choices(records: Sequence[MethodRecord]) -> Iterator[str]:
     yield "### Choices"
-    rows = [[record.name, record.choice, _number(record.fit_seconds)] for record in records]
+    rows = [[record.rival.name, record.rival.choice, _number(record.fit_seconds)] for record in records]
     yield table(["method", "chosen", "fitting, s"], rows, left=2)
 
 

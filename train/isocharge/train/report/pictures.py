@@ -14,10 +14,11 @@ from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
 from isocharge.train.baselines.networks import RELEASED
+from isocharge.train.data.presses import position_error
 from isocharge.train.model_release.evaluate import FALSE_ALARMS
-from isocharge.train.report.limits import BAYES, CRAMER_RAO
-from isocharge.train.report.maps import COORDINATES, Draws
+from isocharge.train.report.case import BAYES, CRAMER_RAO
 from isocharge.train.report.measures import MethodRecord, Plot
+from isocharge.train.report.studies import COORDINATES, Draws
 
 GREY = "#8a95a5"
 """Colour of secondary lines."""
@@ -56,16 +57,18 @@ def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: Mapping[str,
     shown = [record for record in records if record.errors.position_rms_mm]
     markers = {kind: cycle(MARKERS) for kind in KINDS}
     for record in sorted(shown, key=lambda record: record.error_mm):
-        colour, hollow = KINDS[record.kind], record.force_given or record.errors.answered < 1.0
-        marker, fill = next(markers[record.kind]), "white" if hollow else colour
+        colour, hollow = KINDS[record.rival.kind], not record.competes
+        marker, fill = next(markers[record.rival.kind]), "white" if hollow else colour
         style: dict[str, Any] = {"color": colour, "mfc": fill, "marker": marker, "ms": 7}
-        if record.name == RELEASED:
+        if record.rival.name == RELEASED:
             style = {"color": FELT, "marker": "*", "ms": 14}
-        axes.plot(record.cost(plot), record.error_mm, ls="", label=f"{record.name}, {record.error_mm:.3g} mm", **style)
+        axes.plot(
+            record.cost(plot), record.error_mm, ls="", label=f"{record.rival.name}, {record.error_mm:.3g} mm", **style
+        )
     front = sorted((record.cost(plot), record.error_mm) for record in shown if plot in record.best_on)
     step = "steps-pre" if plot == "throughput" else "steps-post"
     axes.plot(*zip(*front, strict=True), ls="--", color=INK, lw=1.0, drawstyle=step, zorder=1, label="unbeaten")
-    highest = max(record.error_mm for record in shown if not record.force_given)
+    highest = max(record.error_mm for record in shown if not record.rival.given_force)
     for name, value in limits.items():
         if value <= highest:  # unbiased near a fold: centimetres
             axes.axhline(value, color=INK, ls=OWN_STYLES[name]["ls"], zorder=1, label=f"{name}, {value:.3g} mm")
@@ -91,7 +94,10 @@ def _logarithmic(axes: Any, x: str, y: str) -> None:
 def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Figure:
     """Root-mean-square errors of the released model over the film."""
     figure = new_figure(11.5, 5.0)
-    labels = {"position error, rms, mm": draws.position, "relative force error, rms, %": draws.force_percent}
+    labels = {
+        "position error, rms, mm": position_error(draws.contact, draws.truth),
+        "relative force error, rms, %": 100.0 * (draws.contact[:, 2] / draws.truth[:, 2] - 1.0),
+    }
     for axes, (label, values) in zip(figure.subplots(1, 2), labels.items(), strict=True):
         cells = axes.hexbin(*draws.truth[:, :2].T, values, gridsize=22, reduce_C_function=rms, cmap="viridis", lw=0.1)
         cells.set_clip_path(Circle((0, 0), domain.radius, transform=axes.transData))
@@ -136,10 +142,9 @@ def mismatch_effect(cases: Sequence[Mapping[str, Any]], nominal: float | None) -
     some = {f"{case['group']}: {case['case']}": case for case in cases if case["group"] != "noise"}
     figure = new_figure(11.5, 1.9 + 0.36 * len(some))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1.0))
-    answered = {label: case["errors"] for label, case in some.items() if case["errors"]}
-    for name in next(iter(answered.values())):
-        errors = [case[name]["position_rms_mm"] for case in answered.values()]
-        left.plot(errors, [*answered], **{**_style(name), "ls": ""}, label=name)
+    for name in cases[0]["errors"]:
+        errors = [case["errors"][name]["position_rms_mm"] for case in some.values()]
+        left.plot(errors, [*some], **{**_style(name), "ls": ""}, label=name)
     left.axvline(nominal or np.nan, color=FELT, lw=0.9, ls="--", label="as assumed")
     bars = right.barh([*some], [case["alarms_percent"] for case in some.values()], color=FELT, alpha=0.8, height=0.6)
     right.bar_label(bars, fmt="{:g}", padding=3, fontsize=8)

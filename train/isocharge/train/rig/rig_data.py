@@ -12,17 +12,19 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import ModelError, SceneError
 from isocharge.common.files import sha256_of
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text
-from isocharge.simulate.dataset.shards import Dataset, Samples
-from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.measuring_chain.noise_file import noise_model
-from isocharge.simulate.sensor.probe import Probe
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate import Dataset, Domain, ForwardMap, Probe, Samples, Sensor, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.film_charges import CONTACT_STEPS
 from isocharge.train.calibration.problem import CalibrationProblem
-from isocharge.train.data.measured import check_enough, complete, held_out, presses_sha256
-from isocharge.train.data.presses import SOLVER, LabelledPresses, draw_contacts
+from isocharge.train.data.presses import (
+    SOLVER,
+    LabelledPresses,
+    check_enough,
+    complete,
+    draw_contacts,
+    held_out,
+    presses_sha256,
+)
 from isocharge.train.rig.rig_film import RigFilm, calibrated_film, corrected_film
 from isocharge.train.training.source import Provenance, TrainingData
 

@@ -21,16 +21,11 @@ from torch import Tensor
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ConfigError
 from isocharge.common.resumable_run import ResumableRun
-from isocharge.simulate.dataset.shards import Dataset
-from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate import Dataset, Domain, NoiseModel, Sensor
 from isocharge.simulate.numerics.statistics import rms
-from isocharge.simulate.sensor.sensor import Sensor
-from isocharge.train.data.charge_field import ChargeField
-from isocharge.train.data.fold_free import invertible_domain
-from isocharge.train.data.measured import held_out
+from isocharge.train.data.charge_field import ChargeField, invertible_domain
 from isocharge.train.data.misfit_charges import draw_misfit_examples, misfit_noise
-from isocharge.train.data.presses import LabelledPresses, split_by_position
+from isocharge.train.data.presses import LabelledPresses, held_out, split_by_position
 from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.folding import FoldedNetwork, fold_network
@@ -206,12 +201,13 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
 def threads_and_seed(count: int, seed: int) -> Iterator[None]:
     """Seed and thread count for the block, the caller's restored after it.
 
-    BLAS is held to the same number: its threads spin at barriers, and a busy second core makes them many times slower.
+    BLAS and OpenMP are held to the same number: their threads spin at barriers, and a busy second core makes them many
+    times slower.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
-        with threadpool_limits(count, user_api="blas"), torch.random.fork_rng(devices=[]):
+        with threadpool_limits(count), torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             yield
     finally:

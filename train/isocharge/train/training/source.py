@@ -7,9 +7,7 @@ import numpy as np
 from torch import Tensor
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.dataset.shards import Dataset
-from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate import Dataset, Domain, Sensor
 from isocharge.train.data.presses import LabelledPresses, domain_of, presses_of
 from isocharge.train.training.network import as_tensor
 
