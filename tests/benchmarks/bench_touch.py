@@ -4,7 +4,7 @@
 
 The model's sensor is pressed with a circle of 1 mm and 1 N at random places of its working area; the frames of the
 amplifier `bench` go through the whole path, bytes to records, without a port. The device file knows tau to 0.5 % and
-the gains to 0.2 % (and once not at all). `--warm` adds a temperature step of 0.5 K in 5 s while 0.5 N press, for a
+the gains to 0.2 % (and once not at all). `--warm` adds a temperature step of 0.5 K of the air while 0.5 N press, for a
 model of four electrodes, and says where temperature can be told from force; `--unplug N` pulls a terminal N times.
 """
 
@@ -125,7 +125,7 @@ def nothing(predictor, film, part, seed):
 
 
 def warming(predictor, film, part, seed):
-    """A step of 0.5 K in 5 s in a press of 14 s: how far the force moves, and where warming cannot be told."""
+    """A step of 0.5 K of the air in a press of 14 s: how far the force moves, and where warming cannot be told."""
     part, rng, out = replace(part, step=0.5, step_at=REST_S + 3.0), np.random.default_rng(seed), {}
     before, after = (round((REST_S + t) * RATE_HZ) for t in (2.5, 12.0))
     for radius_mm in (0.5, 2.0, 4.0, 6.0, 7.5):

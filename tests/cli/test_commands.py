@@ -102,6 +102,7 @@ def test_an_unfinished_sweep_of_other_settings_is_kept_unless_fresh(command, tmp
     code, _, err = command(*SMALL, *words, "-o", tmp_path / "presses")
     assert code == 0
     assert f"293 presses in {tmp_path / 'presses'}" in err
+    assert "caution: 1 N under circle:1.0 stress the film to 49 MPa, the limit is 45 MPa" in err
     assert not part.exists()
 
 
@@ -154,11 +155,11 @@ def test_a_thick_film(command, tmp_path):
 
 def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
     path = sensor_file(tmp_path)
-    path.write_text(re.sub(r"pyro_uC_per_m2_K = [0-9.]+", "pyro_uC_per_m2_K = 30.0", path.read_text()))
+    path.write_text(re.sub(r"pyro_uC_per_m2_K = [0-9.]+", "pyro_uC_per_m2_K = -30.0", path.read_text()))
     cold, said = point(command, path, "--force", 2.0)
     warm, _ = point(command, path, "--force", 2.0, "--temperature", 0.1)
     assert "caution: the film is stressed to" in said
-    assert warm["charge_pC"]["B"] - cold["charge_pC"]["B"] == pytest.approx(27.0)
+    assert warm["charge_pC"]["B"] - cold["charge_pC"]["B"] == pytest.approx(-27.0)
 
 
 def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
@@ -167,6 +168,7 @@ def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
     words = ("--sensor", "three-25um-uniaxial", "--config", quick(tmp_path), "--json", "-o", tmp_path / "models" / "u")
     code, out, err = command("train", "fit", *words)
     assert code == 0
+    assert "caution: 2 N under circle:1.0 stress the film to 74 MPa" in err
     folded = re.search(r"caution: the map from contacts to charges seems to fold about ([0-9.]+) mm", err)
     assert 1.5 < float(folded[1]) < 5.0
     answer = json.loads(out)

@@ -39,6 +39,7 @@ def test_a_design_is_a_folder_that_other_commands_read(command, tmp_path, monkey
     code, out, err = command(*words)
     assert code == 0, err
     assert "all 3 leads go straight to the rim" in err
+    assert "caution: 1 N under circle:1.0 stress the film to 49 MPa" in err
     assert sorted(path.name for path in folder.iterdir()) == FILES
     assert not draft.exists()
     numbers = json.loads((folder / "design.json").read_text())

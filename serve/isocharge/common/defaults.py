@@ -10,5 +10,8 @@ there, 10 mm from the centre."""
 DEFAULT_FORCE_RANGE = (0.05, 2.0)
 """Smallest and largest force, N. The released models cover it."""
 
+DEFAULT_STRESS_LIMIT = 45.0
+"""Largest stress of a film under a probe, MPa: drawn PVDF yields at 45 to 55."""
+
 MAX_BATCH = 4096
 """Presses in one request, and the largest batch that Triton may form; the model's graph itself takes any."""

@@ -13,8 +13,8 @@ from isocharge.simulate.contours.charge_curves import Mapping
 from isocharge.simulate.forward.readout import thermal_charge
 from isocharge.simulate.solver.equilibrium import principal_stress
 
-D33, PYRO, KELVIN = -30.0, 30.0, 0.1
-"""d33 (pC/N) and pyroelectric coefficient (pC/(mm^2 K)) of PVDF, and a step (K) that a finger makes easily."""
+D33, PYRO, KELVIN = -30.0, -30.0, 0.1
+"""d33 (pC/N) and pyroelectric coefficient (pC/(mm^2 K)) of PVDF with d31 > 0, and a step (K) that a finger makes."""
 
 
 def claims(solves: Solves, accuracy: Accuracy) -> Entry:
@@ -67,7 +67,7 @@ def _edges(solves: Solves) -> tuple[Row, dict[str, object]]:
 
 def _d33(solves: Solves) -> tuple[Row, dict[str, object]]:
     """The contact pressure where the probe covers part of B."""
-    sensor, whole = solves.choices.sensor("three"), -D33 * FORCE
+    sensor, whole = solves.choices.sensor("three"), -0.5 * D33 * FORCE
     points = Mapping.lines(sensor, "A", length=solves.choices.length).points.reshape(-1, 2)
     extra = contact_charges(solves, sensor, points, D33)
     share = extra / solves.charges("triangle", sensor, points)

@@ -145,7 +145,7 @@ def _scheme(solves: Solves, heading: str, electrode: str, degrees: tuple[float, 
     draw_probe(axes, solves.choices.triangle, (float(mapping.points[3, 1, 0]), float(mapping.points[3, 1, 1])), "probe")
     frame_film(axes, sensor, mapping.radius, f"{heading}: lines from {electrode}")
     figure.legend(fontsize=8, loc="outside lower center", ncols=4)
-    over = contact_charges(solves, sensor, mapping.points.reshape(-1, 2), -1.0) > TOUCHED
+    over = contact_charges(solves, sensor, mapping.points.reshape(-1, 2), -2.0 / FORCE) > TOUCHED
     overlap = dict(zip(sensor.electrode_names, over.sum(axis=0).tolist(), strict=True))
     overlaps = f"{over.any(axis=1).sum()} of {len(over)} presses: " + ", ".join(
         f"{n} on {e}" for e, n in overlap.items()

@@ -168,9 +168,13 @@ def with_d33(d33: float = -30.0, **changes) -> Sensor:
     ],
 )
 def test_contact_pressure_counts_where_it_lies_on_the_electrode(probe, at, covered):
-    """Q = -d33 F / (footprint) * overlap: positive for PVDF's negative d33; nothing on the others."""
+    """Positive for PVDF's negative d33; nothing on the others.
+
+    Balance through a film whose other face is free, s33(z) = -p (1/2 + z / h), has the mean -p / 2. So
+    Q = -d33 F / (2 footprint) * overlap.
+    """
     charge = contact_charge(with_d33(), probe, at, 0.7)
-    np.testing.assert_allclose(charge, [30.0 * 0.7 / probe.area * covered, 0.0, 0.0, 0.0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(charge, [0.5 * 30.0 * 0.7 / probe.area * covered, 0.0, 0.0, 0.0], rtol=1e-9, atol=1e-12)
 
 
 def test_contact_charge_is_in_the_touch_charge(film):
@@ -193,10 +197,29 @@ def test_contact_charge_follows_gain_and_place_of_the_electrodes():
 
 
 def test_thermal_charge():
-    """30 uC/(m^2 K) on 9 mm^2: 27 pC per 0.1 K (design, section 6), the same on every electrode; more on a larger."""
+    """-30 uC/(m^2 K) on 9 mm^2: -27 pC per 0.1 K, the same on every electrode; less on a smaller."""
     sensor = load_sensor("three-25um-biaxial")
     electrodes = (sensor.electrodes[0], TRIANGLE)
-    sensor = replace(sensor, piezo=replace(sensor.piezo, pyro=30.0), electrodes=electrodes)
+    sensor = replace(sensor, piezo=replace(sensor.piezo, pyro=-30.0), electrodes=electrodes)
     sensor = replace(sensor, calibration=Calibration(gain={"T": 0.5}))
-    np.testing.assert_allclose(thermal_charge(sensor, 0.1), [27.0, 0.5 * 24.0], rtol=1e-12)
-    np.testing.assert_allclose(thermal_charge(sensor, -0.2), [-54.0, -24.0], rtol=1e-12)
+    np.testing.assert_allclose(thermal_charge(sensor, 0.1), [-27.0, 0.5 * -24.0], rtol=1e-12)
+    np.testing.assert_allclose(thermal_charge(sensor, -0.2), [54.0, 24.0], rtol=1e-12)
+
+
+def test_signs_of_stretching_pressing_and_warming_are_those_of_one_thickness():
+    """A film of fixed dipoles, P the charge of one face over its area: dQ / Q = -dh / h, whatever changes h.
+
+    Tension s in both directions thins by 2 nu s / E, pressure p on a free film by p / (2 E), warming thickens by a dT.
+    """
+    polarization, young, poisson, expansion = 0.18e6, 3000.0, 0.34, 1.5e-4  # pC/mm^2, MPa, -, 1/K
+    d31, d33, pyro = polarization * poisson / young, -polarization / young, -polarization * expansion
+    sensor = load_sensor("three-25um-biaxial")
+    sensor = replace(sensor, piezo=Piezo(d31, d31, d33, pyro))
+    assert (round(d31, 1), round(d33), round(pyro)) == (20.4, -60, -27)  # PVDF: 20 to 23, -33, -27 to -30
+    stretched = charge_of(sensor, lambda x, y: (10.0 + 0.0 * x, 10.0 + 0.0 * y, 0.0))
+    np.testing.assert_allclose(stretched, 9.0 * polarization * 2.0 * poisson * 10.0 / young)
+    np.testing.assert_allclose(
+        stretched + thermal_charge(sensor, 2.0 * poisson * 10.0 / young / expansion), 0.0, atol=1e-9
+    )
+    pressed = contact_charge(sensor, Circle(5.0), sensor.electrodes[0].centre, np.pi * 25.0)[0]
+    assert pressed == pytest.approx(9.0 * polarization / (2.0 * young))

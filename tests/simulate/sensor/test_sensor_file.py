@@ -42,7 +42,7 @@ pretension_MPa = 0.5
 d31 = 20.0
 d32 = 2.0
 d33 = -30.0
-pyro_uC_per_m2_K = 30.0
+pyro_uC_per_m2_K = -30.0
 
 [electrodes]
 side_mm = 3.0
@@ -107,7 +107,7 @@ def test_every_key_arrives(tmp_path):
     assert load_sensor(path) == Sensor(
         "mine",
         Film(30.0, 9 * 1e-3, 2500.0, 0.34, 0.5),
-        Piezo(20.0, 2.0, -30.0, 30.0),
+        Piezo(20.0, 2.0, -30.0, -30.0),
         (Electrode.of_square("A", (0.0, -10.0), 3.0), Electrode.of_square("B", (8.660254, 5.0), 3.0)),
         "edge",
         "top",

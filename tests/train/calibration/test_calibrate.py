@@ -10,6 +10,7 @@ from tests.train.calibration.conftest import presses_of, rig
 from isocharge.common.errors import ModelError, PressError, SceneError
 from isocharge.simulate import Circle, Polygon, load_sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
+from isocharge.simulate.solver.stress_limit import largest_stress
 from isocharge.train import CalibrationProblem, calibrate, next_presses
 from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
 from isocharge.train.calibration.diagnosis import find_mistakes
@@ -126,6 +127,16 @@ def test_proposed_presses_tell_more_than_random_ones(problem):
         information = np.eye(mean.size) + information_of(problem, mean, at).sum(axis=0)
         at_random.append(sensitivity.left(np.linalg.inv(information)).position_mm)
     assert left[-1] < 0.8 * np.median(at_random)
+
+
+def test_proposed_presses_leave_no_dent(problem):
+    """Without a limit the hardest would be 1.65 N."""
+    film, most = problem.sensor.film, {}
+    for limit in (45.0, 20.0, np.inf):
+        presses = next_presses(replace(problem, stress_limit=limit), 5)
+        most[limit] = max(press.force_N for press in presses)
+        assert largest_stress(film, problem.probe, most[limit]) <= limit
+    assert most[20.0] < most[45.0] < most[np.inf] == pytest.approx(1.65)
 
 
 def test_an_earlier_calibration_is_the_prior_of_the_next(problem):

@@ -1,15 +1,17 @@
-"""Who solves for a command, and the radius of a sweep."""
+"""Who solves for a command, the radius of a sweep, and what its presses do to the film."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 
 from isocharge.cli.shared.options import most_workers, radius_mm_of
 from isocharge.cli.shared.terminal import say
-from isocharge.common.errors import InputError
-from isocharge.simulate import Probe, Sensor, noise_model, working_area
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
+from isocharge.common.errors import InputError, IsochargeError
+from isocharge.simulate import Film, Probe, Sensor, noise_model, working_area
 from isocharge.simulate.execution.workers import dask_workers, local_workers
 from isocharge.simulate.identifiability.identification import map_to_search
+from isocharge.simulate.solver.stress_limit import stress_caution
 
 SLACK = 1.0 + 1e-6
 """Factor on the radius that a map is asked for: rounding may put the outermost presses just outside it."""
@@ -45,3 +47,13 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
             "or give a radius in mm"
         )
     return radius
+
+
+def caution_of_stress(
+    film: Film, probes: Iterable[Probe], most_force: float, limit: float = DEFAULT_STRESS_LIMIT
+) -> None:
+    """Say which probes stress the film beyond a limit (MPa) at the largest force (N)."""
+    for probe in probes:
+        with suppress(IsochargeError):  # what asked for the press meets the same error, and says it
+            if caution := stress_caution(film, probe, most_force, limit):
+                say(f"caution: {caution}")

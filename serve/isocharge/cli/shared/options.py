@@ -41,6 +41,13 @@ RadiusOption = Annotated[
     ),
 ]
 
+StressLimitOption = Annotated[
+    float,
+    typer.Option(
+        "--stress-limit", metavar="MPA", min=0.0, help="Largest stress of the film under the probe, MPa; PVDF yields."
+    ),
+]
+
 WorkersOption = Annotated[
     int | None,
     typer.Option(

@@ -220,7 +220,10 @@ def _missing(
     if capture.frames[0].t_us is None and device.leak is not None:
         yield "a device clock (t_us, t_ms or t_s): without it the leak is undone by arrival times, which jitter"
     if device.leak is None:
-        yield "the amplifier's time constants ([leak] tau_s in a device file): without them held presses fade"
+        yield (
+            "the amplifier's time constants ([leak] tau_s in a device file), of its circuit: without them held presses "
+            "fade; what fades by creep of the film, slower and slower, must not go there"
+        )
 
 
 def _missing_in(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:

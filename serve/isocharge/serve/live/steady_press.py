@@ -6,6 +6,7 @@ count as touch. A press that saturates an amplifier, moves, creeps, or ends too 
 """
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
@@ -14,6 +15,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE
+from isocharge.serve.live.fading import cause_of_fading
 from isocharge.serve.live.reading_stream import TimedReading
 from isocharge.serve.signal_chain.chain import Reading
 
@@ -25,12 +27,15 @@ AWAY = "the port was away: leave the film alone until it is tared"
 
 TOO_SOON = (
     "pressed too soon after the last touch: leave the film alone for half a second before; if that does not help, the "
-    "amplifier leaks: a device file needs [leak]"
+    "amplifier leaks: a device file needs [leak] with the time constant of its circuit"
 )
 """Why a press is refused before which there was no rest."""
 
 LEAST_REST = 3
 """Frames of rest before a touch, at least."""
+
+AS_CALM = 2.0
+"""Scatter over the least of the press up to which a window is of a held press: beyond it the probe leaves."""
 
 ALIKE = 0.3
 """Largest difference of the charges' relative slopes, over their mean, at which all electrodes change alike."""
@@ -136,6 +141,7 @@ class PressWatch:
         self._rest_pC = np.zeros(len(electrodes))
         self._begin_s = self._end_s = self._check_s = -np.inf
         self._reason, self._calmest_pC, self._has_rest = "", np.inf, False
+        self._sizes: list[tuple[float, float]] = []
 
     def arm(self) -> None:
         """From now on, take only a press that has not begun yet."""
@@ -179,6 +185,7 @@ class PressWatch:
         self._rest_pC = np.mean(rest, axis=0) if rest else np.zeros(len(self._electrodes))
         self._rest.clear()
         self._window.clear()
+        self._sizes.clear()
         self._phase, self._begin_s, self._check_s, self._reason = Phase.settling, t_s, t_s, ""
         self._calmest_pC = np.inf
 
@@ -196,12 +203,16 @@ class PressWatch:
             self._check_s = t_s
             noise_pC = reading.tare.noise_pC if reading.tare else np.zeros_like(charge_pC)
             press = self._measured(t_s)
-            reason = unsteadiness(rule, press, noise_pC, self._electrodes)
+            calm = press.scatter_pC.max() <= AS_CALM * self._calmest_pC
+            self._calmest_pC = min(self._calmest_pC, float(press.scatter_pC.max()))
+            if calm and press.held_s >= 2.0 * press.window_s:  # the probe has landed before the window
+                self._sizes.append((press.held_s - 0.5 * press.window_s, float(np.abs(press.charge_pC).mean())))
+            reason = unsteadiness(rule, press, noise_pC, self._electrodes, self._sizes)
             if not reason:
                 self._phase = Phase.lift
                 return Watched(Phase.taken, press=press)
-            if press.scatter_pC.max() <= self._calmest_pC:  # not that of a window in which the probe leaves
-                self._calmest_pC, self._reason = float(press.scatter_pC.max()), reason
+            if calm:
+                self._reason = reason
         if t_s - self._begin_s > rule.latest_s:
             reason = self._reason or "too few frames come"
             return self._refuse(f"not steady within {rule.latest_s:g} s: {reason}", Phase.lift)
@@ -223,7 +234,13 @@ class PressWatch:
         return Watched(Phase.refused, reason=reason)
 
 
-def unsteadiness(rule: SteadyRule, press: SteadyPress, noise_pC: Array, electrodes: tuple[str, ...]) -> str:
+def unsteadiness(
+    rule: SteadyRule,
+    press: SteadyPress,
+    noise_pC: Array,
+    electrodes: tuple[str, ...],
+    sizes: Sequence[tuple[float, float]],
+) -> str:
     """Why a press is not steady, a part of a sentence; empty if it is.
 
     Args:
@@ -231,6 +248,7 @@ def unsteadiness(rule: SteadyRule, press: SteadyPress, noise_pC: Array, electrod
         press: A window of it.
         noise_pC: Standard deviation of each charge at rest, shape (n_electrode,), pC.
         electrodes: Names, for the reason.
+        sizes: Times since the touch, s, and mean magnitudes of the charges, pC, of the windows so far.
     """
     size_pC = float(np.abs(press.charge_pC).mean())
     noise_pC = np.hypot(noise_pC, rule.noise_share * size_pC)
@@ -242,10 +260,10 @@ def unsteadiness(rule: SteadyRule, press: SteadyPress, noise_pC: Array, electrod
     allowed_pC = rule.drift_share * np.maximum(np.abs(press.charge_pC), size_pC) + rule.drift_sigmas * error_pC
     if (np.abs(press.drift_pC) <= allowed_pC).all():
         return ""
-    return _drift_words(press)
+    return _drift_words(press, sizes)
 
 
-def _drift_words(press: SteadyPress) -> str:
+def _drift_words(press: SteadyPress, sizes: Sequence[tuple[float, float]]) -> str:
     """What changes: the force, if all charges change alike, or the place."""
     share_per_s = press.drift_pC / np.maximum(np.abs(press.charge_pC), 1e-9) / press.window_s
     mean = float(share_per_s.mean())
@@ -254,6 +272,6 @@ def _drift_words(press: SteadyPress) -> str:
     if mean > 0.0:
         return f"the charges rise by {100.0 * mean:.2g} % per second: hold the force"
     return (
-        f"the charges fall by {-100.0 * mean:.2g} % per second on all electrodes alike: hold the force; or the "
-        f"amplifier leaks: then put [leak] tau_s = {-1.0 / mean:.2g} into a device file"
+        f"the charges fall by {-100.0 * mean:.2g} % per second on all electrodes alike: hold the force; "
+        f"{cause_of_fading(sizes)}"
     )

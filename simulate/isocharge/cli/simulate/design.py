@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import executor_for
+from isocharge.cli.shared.forward_maps import caution_of_stress, executor_for
 from isocharge.cli.shared.options import (
     ForceOption,
     FreshOption,
@@ -12,9 +12,11 @@ from isocharge.cli.shared.options import (
     NoiseOption,
     ProbeOption,
     SensorArgument,
+    StressLimitOption,
     WorkersOption,
 )
 from isocharge.cli.shared.terminal import say, shown_progress
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
 from isocharge.common.resumable_run import draft_of, refuse_finished, resume_parts
 from isocharge.simulate import Circle, load_sensor, noise_model, parse_probe
@@ -64,6 +66,7 @@ def design_command(
     force: ForceOption = 1.0,
     noise: NoiseOption = "reference",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the search; the same seed, the same design.")] = 0,
+    stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
     fresh: FreshOption = False,
 ) -> None:
@@ -91,6 +94,7 @@ def design_command(
         side=side,
         seed=seed,
     )
+    caution_of_stress(case.sensor.film, [footprint], force, stress_limit)
     identity = {
         "made_by": code_fingerprint(),
         "sensor": sensor_to_dict(case.sensor),

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import executor_for, sweep_radius
+from isocharge.cli.shared.forward_maps import caution_of_stress, executor_for, sweep_radius
 from isocharge.cli.shared.options import (
     PROBE_HELP,
     ClusterOption,
@@ -15,10 +15,11 @@ from isocharge.cli.shared.options import (
     NewFolderOption,
     RadiusOption,
     SensorArgument,
+    StressLimitOption,
     WorkersOption,
 )
 from isocharge.cli.shared.terminal import say, shown_progress
-from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.resumable_run import draft_of, refuse_finished
 from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
 
@@ -58,6 +59,7 @@ def sweep_command(
         ),
     ] = Sampling.sobol,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the presses; the same seed, the same data.")] = 0,
+    stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
     fresh: FreshOption = False,
@@ -70,6 +72,7 @@ def sweep_command(
     """
     film_sensor, probes = load_sensor(sensor), [parse_probe(text) for text in probe or ["circle:1.0"]]
     refuse_finished(output)
+    caution_of_stress(film_sensor.film, probes, force[1], stress_limit)
     try:
         with executor_for(workers, cluster) as executor, shown_progress():
             reach = sweep_radius(radius, film_sensor, probes, force)

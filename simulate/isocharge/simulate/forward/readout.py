@@ -91,14 +91,16 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
-    """Charge of the contact pressure on the electrodes, d33 * s33 with s33 = -pressure, shape (n_electrode,), pC.
+    """Charge of the contact pressure on the electrodes, d33 * mean(s33), shape (n_electrode,), pC.
 
-    Only the part of an electrode under the footprint counts; a negative d33, as PVDF has, gives a positive charge.
+    The film hangs free: through its thickness s33 goes from -pressure under the probe to 0 at the other face, so its
+    mean is -pressure / 2, by symmetry also where the film is sheared; -pressure would need a rigid back. Only the part
+    of an electrode under the footprint counts; a negative d33, as PVDF has, gives a positive charge.
     """
     if sensor.piezo.d33 == 0.0:
         return np.zeros(len(sensor.electrodes))
     covered = [_covered(sensor.calibration.place(np.array(e.corners)), probe, complex(*at)) for e in sensor.electrodes]
-    charge: Array = -sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered)
+    charge: Array = -0.5 * sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered)
     return charge
 
 
@@ -111,7 +113,11 @@ def _covered(corners: Array, probe: Probe, at: complex) -> float:
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:
-    """Pyroelectric charge of a uniform temperature step (K), shape (n_electrode,), pC: the same on equal electrodes."""
+    """Pyroelectric charge of a uniform temperature step, shape (n_electrode,), pC: the same on equal electrodes.
+
+    `step` is in K, positive for warming, which takes charge from a PVDF film with d31 > 0. The clamp is taken to expand
+    as the film does: what a rim holds back is stress, and belongs to the pretension.
+    """
     areas = np.array([electrode.area for electrode in sensor.electrodes])
     charge: Array = sensor.gains * areas * sensor.piezo.pyro * step
     return charge

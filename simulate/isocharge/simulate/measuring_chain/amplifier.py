@@ -20,8 +20,16 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
-PVDF_PYRO = 30.0 * 9.0
-"""Pyroelectric charge per temperature of a PVDF electrode of 9 mm^2, pC/K: 30 uC/(m^2 K)."""
+PVDF_PYRO = -30.0 * 9.0
+"""Pyroelectric charge per temperature of a PVDF electrode of 9 mm^2, pC/K: -30 uC/(m^2 K).
+
+Negative where a press gives positive charges (d31 > 0): warming thickens the film, a press thins it."""
+
+FILM_TIME = 1.78e-3 * 1.2 * 0.025 / (2.0 * 1e-5)
+"""Time in which a PVDF film of 25 um follows the temperature of the air at both faces, s: 2.7.
+
+Density times specific heat times thickness over twice the heat transfer: 1.78 g/cm^3, 1.2 J/(g K) and 10 W/(m^2 K),
+free convection and radiation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,11 +44,12 @@ class Amplifier:
         hum_frequency: Hz.
         offset: Standard deviation of a channel's constant output, pC.
         bias: Current that every channel integrates, pC/s; its sign differs.
-        pyro: Charge per temperature, pC/K, on every electrode.
-        temperature_rms: Root mean square of the film's slow temperature drift, K.
-        temperature_time: Time constant of that drift, s: two first-order lags in series, as of a film with mass.
-        step: Temperature step, K.
+        pyro: Charge of warming, pC/K, on every electrode; negative for PVDF with d31 > 0.
+        temperature_rms: Root mean square of the film's temperature drift, K.
+        temperature_time: Time constant of the air's drift, s: a calm room wanders over minutes.
+        step: Temperature step of the air, K.
         step_at, step_time: Start and duration of the temperature step, s.
+        film_time: Time constant with which the film follows the air, s.
         limit: Largest charge that can be read, pC; infinite for any.
         bits: Resolution of the converter between both limits; 0 for no converter.
     """
@@ -55,10 +64,11 @@ class Amplifier:
     bias: float = 0.0
     pyro: float = PVDF_PYRO
     temperature_rms: float = 0.0
-    temperature_time: float = 20.0
+    temperature_time: float = 120.0
     step: float = 0.0
     step_at: float = 10.0
-    step_time: float = 5.0
+    step_time: float = 1.0
+    film_time: float = FILM_TIME
     limit: float = math.inf
     bits: int = 0
 
@@ -108,9 +118,9 @@ class Measurement:
     _warmth: tuple[float, float] = field(init=False)
 
     def __post_init__(self) -> None:
-        deviation = math.sqrt(2.0) * self.amplifier.temperature_rms
-        first, second = deviation * self.rng.standard_normal(2)
-        self._warmth = first, 0.5 * first + 0.5 * second  # the stationary law of a lag behind a lag
+        first, second = self.amplifier.temperature_rms * self.rng.standard_normal(2)
+        share = self._share_of_air
+        self._warmth = first / math.sqrt(share), math.sqrt(share) * first + math.sqrt(1.0 - share) * second
         self._charge = np.full_like(self.gain, self.amplifier.pyro * self._warmth[1])
         self._output = np.zeros_like(self.gain)
         if math.isfinite(self.amplifier.tau):
@@ -126,16 +136,22 @@ class Measurement:
         noisy = self.amplifier.noise.add(output + self.amplifier.hum * np.sin(turn), self.rng)
         return self._convert(noisy)
 
+    @property
+    def _share_of_air(self) -> float:
+        """Variance of the film's drift over the air's, by the stationary law of a lag behind a lag."""
+        return self.amplifier.temperature_time / (self.amplifier.temperature_time + self.amplifier.film_time)
+
     def _temperature(self, time: Array) -> Array:
-        """Temperature above its mean, shape (n,), K."""
+        """Temperature of the film above its mean, shape (n,), K: a lag behind the air, whose drift is one, too."""
         part = self.amplifier
-        keep = math.exp(-1.0 / (self.rate * part.temperature_time))
-        kicks = math.sqrt(2.0 * (1.0 - keep * keep)) * part.temperature_rms * self.rng.standard_normal(time.size)
-        first = lfilter([1.0], [1.0, -keep], kicks, zi=[keep * self._warmth[0]])[0]
-        second = lfilter([1.0 - keep], [1.0, -keep], first, zi=[keep * self._warmth[1]])[0]
-        self._warmth = float(first[-1]), float(second[-1])
-        warm: Array = second + part.step * np.clip((time - part.step_at) / part.step_time, 0.0, 1.0)
-        return warm
+        of_air, of_film = (math.exp(-1.0 / (self.rate * lag)) for lag in (part.temperature_time, part.film_time))
+        kick = math.sqrt((1.0 - of_air * of_air) / self._share_of_air) * part.temperature_rms
+        kicks = kick * self.rng.standard_normal(time.size)
+        drift = lfilter([1.0], [1.0, -of_air], kicks, zi=[of_air * self._warmth[0]])[0]
+        air = drift + part.step * np.clip((time - part.step_at) / part.step_time, 0.0, 1.0)
+        film: Array = lfilter([1.0 - of_film], [1.0, -of_film], air, zi=[of_film * self._warmth[1]])[0]
+        self._warmth = float(drift[-1]), float(film[-1])
+        return film
 
     def _integrate(self, film: Array) -> Array:
         """The amplifier's output, shape (n, electrodes), pC."""

@@ -54,6 +54,7 @@ KEYS = {
     "step": "temperature_step_K",
     "step_at": "temperature_step_at_s",
     "step_time": "temperature_step_time_s",
+    "film_time": "film_time_s",
     "limit": "limit_pC",
 }
 """Keys of the file that are not called as the attributes of `Amplifier`."""
@@ -72,12 +73,13 @@ class AmplifierFile(Settings, frozen=True, rename=KEYS):
     hum_frequency: Positive | None = None
     offset: NotNegative | None = None
     bias: NotNegative | None = None
-    pyro: NotNegative | None = None
+    pyro: Finite | None = None
     temperature_rms: NotNegative | None = None
     temperature_time: Positive | None = None
     step: Finite | None = None
     step_at: Finite | None = None
     step_time: Positive | None = None
+    film_time: Positive | None = None
     limit: PositiveOrInfinite | None = None
     bits: Annotated[int, Meta(ge=0, le=32)] | None = None
 

@@ -55,7 +55,18 @@ class Film:
 
 @dataclass(frozen=True)
 class Piezo:
-    """Piezoelectric strain coefficients d31, d32, d33 in pC/N and the pyroelectric one in pC/(mm^2 K)."""
+    """Piezoelectric strain coefficients in pC/N, and the pyroelectric one.
+
+    Charge counts as positive as that of a stretch does where d31 > 0. PVDF is polarised by what it holds in its
+    thickness: what thins the film raises the charge, what thickens it lowers it. So beside d31 = 20 pC/N it has
+    d33 = -33 (pressure thins) and pyro = -30 (heat thickens; Kepler and Anderson 1978), whatever data sheets print
+    without a sign. A film that is wired the other way round has all signs turned.
+
+    Attributes:
+        d31, d32: Charge of tension along x and y, pC/N.
+        d33: Charge of tension through the thickness, pC/N.
+        pyro: Charge of warming a film that is free to expand, pC/(mm^2 K).
+    """
 
     d31: float
     d32: float

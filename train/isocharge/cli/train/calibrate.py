@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
-from isocharge.cli.shared.options import DeviceOption, FreshOption, JsonOption, ProbeOption, refuse
+from isocharge.cli.shared.options import DeviceOption, FreshOption, JsonOption, ProbeOption, StressLimitOption, refuse
 from isocharge.cli.shared.terminal import say, this_command
 from isocharge.cli.train.press_session import PressPort, calibrate_at_port
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.json_values import plain_values
 from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, ProposedPress, calibrate, next_presses
@@ -47,6 +48,7 @@ def calibrate_command(
         int,
         typer.Option("--next", metavar="K", min=0, max=100, help="Propose this many presses that would tell most."),
     ] = 0,
+    stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     earlier: Annotated[
         Path | None,
         typer.Option(
@@ -106,7 +108,7 @@ def calibrate_command(
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
     _check_usage(file, output, next_count, port, of_port=yes or press_list is not None or fresh or device is not None)
-    problem = CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models)
+    problem = replace(CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models), stress_limit=stress_limit)
     if earlier is not None:
         problem = replace(problem, earlier=read_earlier(earlier, problem))
     result = None

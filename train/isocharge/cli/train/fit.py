@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import sweep_radius
+from isocharge.cli.shared.forward_maps import caution_of_stress, sweep_radius
 from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
 from isocharge.cli.shared.options import (
     PROBE_HELP,
@@ -107,6 +107,7 @@ def fit_command(
     if films:
         prior, sizes = _films(dataset, sensor, probes, radius, config)
         check_target(output, version, prior.sensor.electrode_names)
+        caution_of_stress(prior.sensor.film, [prior.probe], sizes.force_range[1])
 
         def train_films(run: ResumableRun) -> Release:
             with local_workers(most_workers(None)) as executor:
@@ -124,6 +125,7 @@ def fit_command(
         else:
             data = _presses(dataset, sensor, probes, radius)
     check_target(output, version, data.sensor.electrode_names)
+    caution_of_stress(data.sensor.film, map(parse_probe, data.probes), data.domain.force_range[1])
 
     def train(run: ResumableRun) -> Release:
         return release(fit(data, settings, run=run), output, version=version, command=this_command())

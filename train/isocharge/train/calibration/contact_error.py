@@ -20,7 +20,6 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.prediction.measured_presses import FORCE_STD, POSITION_STD_MM
-from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 
@@ -187,10 +186,12 @@ def next_presses(
 
     Raises:
         PressError: If every place is to be avoided.
+        SceneError: If even the smallest force exceeds the stress limit.
     """
     film = film or problem.before
     sensitivity = ContactSensitivity.at(problem, film.parameters)
-    candidates = _candidates(problem.domain, np.empty((0, 2)) if avoid_mm is None else avoid_mm)
+    avoid_mm = np.empty((0, 2)) if avoid_mm is None else avoid_mm
+    candidates = _candidates(problem.domain.radius, problem.proposed_forces, avoid_mm)
     offered = information_of(problem, film.parameters, candidates, position_std_mm, force_std)
     cost, proposed, information = sensitivity.cost(), [], np.linalg.inv(film.covariance)
     for _ in range(count):
@@ -203,13 +204,13 @@ def next_presses(
     return proposed
 
 
-def _candidates(domain: Domain, avoid_mm: Array) -> Array:
+def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array) -> Array:
     """Presses to compare, on a grid that a person can set, shape (n, 3)."""
-    at, (low, high) = domain.radius * sunflower(PLACES), domain.force_range
+    at, (low, high) = radius * sunflower(PLACES), force_range
     places = np.unique(np.round(np.column_stack([at.real, at.imag]) / ROUND_MM) * ROUND_MM, axis=0)
     distance = np.hypot(*np.moveaxis(places[:, None] - avoid_mm, 2, 0))
-    places = places[(distance > AVOIDED_MM).all(axis=1) & (np.hypot(*places.T) <= domain.radius)]
+    places = places[(distance > AVOIDED_MM).all(axis=1) & (np.hypot(*places.T) <= radius)]
     if not len(places):
-        raise PressError(f"no place within {domain.radius:.3g} mm of the centre is left to press; skip fewer")
+        raise PressError(f"no place within {radius:.3g} mm of the centre is left to press; skip fewer")
     forces = np.maximum(np.round(low * (high / low) ** np.array(FORCES) / ROUND_N) * ROUND_N, ROUND_N)
     return np.array([(x, y, force) for x, y in places for force in np.unique(np.clip(forces, low, high))])

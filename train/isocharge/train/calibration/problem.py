@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import ModelError, SceneError, SensorError
 from isocharge.serve.model.repository import find_model, model_names, repositories
 from isocharge.simulate import Circle, Domain, FilmPrior, NoiseModel, Probe, Sensor
+from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.films.films_file import FILE, read_films
 from isocharge.train.films.films_model import FilmsModel
@@ -50,6 +52,7 @@ class CalibrationProblem:
         films: The network for all films of the layout.
         earlier: An earlier calibration of this film, as `read_earlier` gives it; what the sensor's file says if absent.
         map_error: Error of the films' charges that is allowed for beside the noise, a share of the charge.
+        stress_limit: Largest stress of the film in a press that is proposed, MPa.
 
     Example:
         >>> problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))  # doctest: +SKIP
@@ -62,6 +65,7 @@ class CalibrationProblem:
     films: FilmsModel
     earlier: FilmEstimate | None = None
     map_error: float = 0.0
+    stress_limit: float = DEFAULT_STRESS_LIMIT
 
     @classmethod
     def of(cls, sensor: Sensor, probe: Probe, models: Path | None = None) -> "CalibrationProblem":
@@ -97,6 +101,16 @@ class CalibrationProblem:
     def domain(self) -> Domain:
         """Where contacts shall be right."""
         return self.films.domain
+
+    @cached_property
+    def proposed_forces(self) -> tuple[float, float]:
+        """Smallest and largest force of a press that is proposed, N: those of the domain within the stress limit.
+
+        Raises:
+            SceneError: If the smallest force already exceeds the limit.
+        """
+        domain = self.domain.force_range
+        return domain[0], force_within_stress(self.sensor.film, self.probe, self.stress_limit, domain)
 
     @cached_property
     def noise(self) -> NoiseModel:

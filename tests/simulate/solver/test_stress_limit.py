@@ -1,0 +1,43 @@
+"""Stress under the hardest press, and the force that keeps it below a limit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.common.errors import SceneError
+from isocharge.simulate import Circle, load_sensor
+from isocharge.simulate.solver.stress_limit import force_within_stress, largest_stress, stress_caution
+
+FILM, TIP = load_sensor("four-25um-biaxial").film, Circle(1.0)
+
+
+def test_stress_of_a_slack_membrane_grows_with_the_force_to_two_thirds():
+    """So does every stress in it (Foeppl 1907), and at 0.3 um bending adds nothing; to what the mesh resolves."""
+    thin = replace(FILM, thickness=3e-4, pretension=0.0)
+    assert largest_stress(thin, TIP, 0.008) / largest_stress(thin, TIP, 0.001) == pytest.approx(4.0, rel=0.03)
+
+
+def test_stress_of_a_plate():
+    """6 M / h^2, M = F (1 + nu) / (4 pi) (ln(a / R) + R^2 / (4 a^2)) at the middle (Timoshenko 1959, art. 19)."""
+    plate, radius = replace(FILM, thickness=2.0, pretension=0.0), 5.0
+    a, nu = plate.radius, plate.poisson
+    moment = (1.0 + nu) / (4.0 * np.pi) * (np.log(a / radius) + radius**2 / (4.0 * a**2))
+    assert largest_stress(plate, Circle(radius), 1.0) == pytest.approx(6.0 * moment / 2.0**2, rel=0.01)
+
+
+@pytest.mark.parametrize(("force", "stress"), [(1.0, 49.0), (1.65, 66.0), (2.0, 74.0)])
+def test_a_tip_of_1_mm_makes_pvdf_yield(force, stress):
+    assert largest_stress(FILM, TIP, force) == pytest.approx(stress, rel=0.05)
+    assert f"{force:g} N under circle:1.0 stress the film to {stress:.0f} MPa" in stress_caution(FILM, TIP, force)
+    assert not stress_caution(FILM, TIP, force, 80.0)
+
+
+def test_force_within_a_stress():
+    force = force_within_stress(FILM, TIP, 45.0, (0.05, 2.0))
+    assert largest_stress(FILM, TIP, force) == pytest.approx(45.0, rel=2e-3)
+    assert force_within_stress(FILM, TIP, 80.0, (0.05, 2.0)) == 2.0
+    with pytest.raises(
+        SceneError, match=r"stress limit: expected more than 8\.\d+ MPa, which 0\.05 N under circle:1\.0"
+    ):
+        force_within_stress(FILM, TIP, 5.0, (0.05, 2.0))
