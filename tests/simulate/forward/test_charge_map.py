@@ -1,12 +1,10 @@
 """What every map from contacts to charges keeps: derivatives, domain, names."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from isocharge.common.errors import ChargeError, SceneError
-from isocharge.simulate import ChargeMap, Domain, FunctionMap, load_sensor
+from isocharge.simulate import ChargeMap, Domain, FunctionMap
 from isocharge.simulate.forward.charge_map import as_charges, check_forces, check_radius, differences, within
 from isocharge.simulate.numerics.disk import sunflower
 
@@ -24,15 +22,16 @@ CHECKED = ("forward map", "spline", "film family")
 
 
 @pytest.fixture
-def charge_map(request, near_map, near_spline, film_family) -> ChargeMap:
-    prior, family = film_family
-    return {
-        "forward map": replace(near_map, sensor=load_sensor("four-25um-uniaxial")),  # with the electrodes farther out
-        "spline": near_spline,
-        "film family": family.forward_map(*prior.film(prior.mean)),
-        "within": within(near_spline, 4.0),
-        "function": FunctionMap(linear, ("A", "B"), DOMAIN),
-    }[request.param]
+def charge_map(request) -> ChargeMap:
+    if request.param == "forward map":
+        return request.getfixturevalue("three_map")
+    if request.param == "film family":
+        prior, family = request.getfixturevalue("film_family")
+        return family.forward_map(*prior.film(prior.mean))
+    if request.param == "function":
+        return FunctionMap(linear, ("A", "B"), DOMAIN)
+    spline = request.getfixturevalue("near_spline")
+    return spline if request.param == "spline" else within(spline, 4.0)
 
 
 def contacts(domain: Domain, count: int = 60, share: float = 0.97) -> np.ndarray:
@@ -43,6 +42,11 @@ def contacts(domain: Domain, count: int = 60, share: float = 0.97) -> np.ndarray
 
 @pytest.mark.parametrize("charge_map", [*CHECKED, "within", "function"], indirect=True)
 def test_a_map_keeps_the_protocol(charge_map):
+    """Derivatives are those of the charges, over another step.
+
+    On the mesh that `press` chooses they agree within 2e-4 of the largest; at order 4 the kinks between the elements of
+    a membrane would leave 5e-3.
+    """
     contact = contacts(charge_map.domain, share=0.7)
     charge, slope = charge_map.charges(contact), charge_map.derivatives(contact)
     assert charge.shape == (60, len(charge_map.electrodes))
@@ -52,7 +56,7 @@ def test_a_map_keeps_the_protocol(charge_map):
         ahead[:, axis] = contact[:, axis] + step if axis < 2 else contact[:, 2] * np.exp(step)
         behind[:, axis] = contact[:, axis] - step if axis < 2 else contact[:, 2] * np.exp(-step)
         expected = (charge_map.charges(ahead) - charge_map.charges(behind)) / (2.0 * step)
-        np.testing.assert_allclose(slope[..., axis], expected, atol=1e-2 * np.abs(expected).max())
+        np.testing.assert_allclose(slope[..., axis], expected, atol=5e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("charge_map", CHECKED, indirect=True)

@@ -8,6 +8,7 @@ import pytest
 from isocharge.common.errors import SceneError
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Resolution, SolveSettings, Theory, load_sensor
 from isocharge.simulate.numerics.disk import sunflower
+from kept import kept
 
 RADIUS = 5.0
 
@@ -27,13 +28,17 @@ def test_charges_are_the_maps(near_map, near_spline):
 
 
 def test_contact_pressure_on_electrodes_is_in(near_map):
-    """d33 adds charges that go with the force itself, not with the amplitude's square."""
-    sensor = near_map.sensor
+    """d33 adds charges that go with the force itself, not with the amplitude's square.
+
+    Their slope has a kink where the footprint's edge meets an electrode's corner: of them knots that are 0.5 mm apart
+    leave 1.1 %, and 0.25 mm apart 0.2 %.
+    """
+    sensor, contact = near_map.sensor, spread(100)
     pressed = replace(near_map, sensor=replace(sensor, piezo=replace(sensor.piezo, d33=-30.0)))
-    table, contact = ChargeSpline.of(pressed, spacing=0.5), spread(100)
-    expected = pressed.charges(contact)
-    assert np.abs(expected - near_map.charges(contact)).max() > 10.0
-    assert np.abs(table.charges(contact) - expected).max() < 0.03 * np.abs(expected).max()
+    with_d33, without = (kept(ChargeSpline.of, each, spacing=0.5).charges(contact) for each in (pressed, near_map))
+    extra = pressed.charges(contact) - near_map.charges(contact)
+    assert np.abs(extra).max() > 10.0
+    np.testing.assert_allclose(with_d33 - without, extra, atol=0.015 * np.abs(extra).max())
 
 
 def test_first_order_is_charges_and_derivatives_and_beyond_the_edge_those_of_the_edge(near_spline):

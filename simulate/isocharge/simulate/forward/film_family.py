@@ -331,9 +331,12 @@ def _decompose(stress: Array) -> tuple[Array, Array]:
     flat = stress.reshape(-1, stress.shape[-1])
     size = np.repeat(np.sqrt((flat.reshape(len(flat), -1, 3) ** 2).sum(axis=2).mean(axis=0)), 3)
     relative = flat / size
-    values, vectors = np.linalg.eigh(relative.T @ relative)
+    few = len(relative) < relative.shape[1]  # the smaller of both products has the same values
+    values, vectors = np.linalg.eigh(relative @ relative.T if few else relative.T @ relative)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
     left = np.sqrt(np.maximum(1.0 - np.cumsum(values) / values.sum(), 0.0))
     count = int(np.argmax(left <= MODES_LEFT)) + 1
     modes = vectors[:, :count].T
+    if few:
+        modes = modes @ relative / np.sqrt(values[:count, None])
     return (relative @ modes.T).reshape(*stress.shape[:-1], count), modes * size

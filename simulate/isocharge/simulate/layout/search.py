@@ -105,6 +105,11 @@ class Search:
         """Presses of the fine grid, shape (n, 2), mm; goals other than the worst error need no finer one."""
         return self.case.grid if self.case.goal == "worst" else self.case.presses
 
+    @cached_property
+    def weights(self) -> Array:
+        """What the presses of the fine grid count in the goal, shape (n,)."""
+        return self.case.weights(self.fine)
+
     def squared(self, places: Array, presses: Array) -> Array:
         """Squared errors of a layout under presses, shape (n_press,), mm^2."""
         return self.model.squared(self.table.rows(presses, places, self.case.square_side, self.case.stay))
@@ -150,10 +155,10 @@ class Search:
         return float(np.exp(self._logs(places, self.fine).max()))
 
     def _logs(self, places: Array, presses: Array) -> Array:
-        """Logarithms of the errors that count: of each press, or one of their mean."""
+        """Logarithms of the errors that count: of each press, or one of their mean over the fine grid."""
         squared = self.squared(places, presses)
         if self.case.goal != "worst":
-            squared = np.average(squared, weights=self.case.weights(presses), keepdims=True)
+            squared = np.average(squared, weights=self.weights, keepdims=True)
         return np.asarray(0.5 * np.log(squared))
 
     def refine(self, places: Array) -> Array:

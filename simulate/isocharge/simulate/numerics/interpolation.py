@@ -144,14 +144,16 @@ def gauss_line(count: int) -> tuple[Array, Array]:
     return 0.5 * (at + 1.0), 0.5 * weight
 
 
+@lru_cache(maxsize=32)
 def gauss_reference_square(count: int) -> tuple[Array, Array, Array]:
     """Gauss points (xi, eta) on [-1, 1]^2, xi fast, and their weights, which add up to 4; each of shape (count^2,)."""
     line, weight = np.polynomial.legendre.leggauss(count)
     xi, eta = np.meshgrid(line, line)
-    return xi.ravel(), eta.ravel(), np.outer(weight, weight).ravel()
+    return _frozen(xi.ravel()), _frozen(eta.ravel()), _frozen(np.outer(weight, weight).ravel())
 
 
+@lru_cache(maxsize=32)
 def gauss_square(count: int) -> tuple[Array, Array]:
     """Gauss points on [0, 1]^2, shape (count^2, 2), and shares, which add up to one."""
     xi, eta, weights = gauss_reference_square(count)
-    return 0.5 * (np.stack([xi, eta], axis=1) + 1.0), 0.25 * weights
+    return _frozen(0.5 * (np.stack([xi, eta], axis=1) + 1.0)), _frozen(0.25 * weights)
