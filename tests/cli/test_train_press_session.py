@@ -11,9 +11,7 @@ from isocharge.cli.train.press_dialogue import Dialogue, Screen, Stopped
 from isocharge.common.errors import PortLost
 from isocharge.serve import Frame, Predictor, encode_frame, read_presses
 from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, Watched
-from isocharge.simulate import Circle, load_sensor
-from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.measuring_chain.noise_file import load_amplifier
+from isocharge.simulate import Circle, Domain, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration.folder import SESSION
 from isocharge.train.data.presses import draw_contacts

@@ -39,12 +39,6 @@ class KnownMap:
         square = self.quadratic * (bent**2).sum(axis=1)[:, None] * sign
         return np.exp(self.level + 2.0 / 3.0 * np.log(contact[:, 2:]) + self.slope * bent @ self.directions.T + square)
 
-    def contacts(self, charge):
-        logs = np.log(charge)
-        mean = logs.mean(axis=1, keepdims=True)
-        bent = (logs - mean) @ self.directions / (0.5 * self.count * self.slope)
-        return np.column_stack([self.bend * np.arcsinh(bent / self.bend), np.exp(1.5 * (mean - self.level))])
-
     def presses(self, count, seed):
         contact = draw_contacts(np.random.default_rng(seed), DOMAIN, count)
         return LabelledPresses(contact, self.charges(contact))

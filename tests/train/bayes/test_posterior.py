@@ -1,5 +1,6 @@
-"""The posterior against closed forms, brute force, and itself."""
+"""The posterior against closed forms, brute force, and itself; the Bayes limit from it."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,7 +8,10 @@ import pytest
 from scipy import stats
 
 from isocharge.common.errors import ChargeError, InputError
-from isocharge.simulate import Domain, NoiseModel, noise_model
+from isocharge.common.resumable_run import resume_parts
+from isocharge.simulate import Circle, Domain, NoiseModel, noise_model
+from isocharge.train import BayesLimit, BayesProblem, bayes_estimate, bayes_limit
+from isocharge.train.bayes import posterior
 from isocharge.train.bayes.posterior import Posterior
 from isocharge.train.data.presses import draw_contacts
 
@@ -48,11 +52,6 @@ def spread(charges, count, seed):
     rng = np.random.default_rng(seed)
     contact = draw_contacts(rng, charges.domain, count)
     return contact, REFERENCE.add(charges.charges(contact), rng)
-
-
-@pytest.fixture
-def charges(spline):
-    return spline
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -105,53 +104,41 @@ def brute_force(charges, noise, charge, centre, reach, count):
     return mean, std
 
 
-@pytest.mark.parametrize("contact", [(2.0, -3.0, 1.0), (7.2, 3.4, 0.0503), (0.1, 0.0, 1.995)])
-def test_as_brute_force(charges, contact):
-    charge = REFERENCE.add(charges.charges(np.array([contact])), np.random.default_rng(1))
-    mean, std = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)
-    centre, reach = mean[0].copy(), 7.0 * std[0]
-    centre[2], reach[2] = np.log(mean[0, 2]), 7.0 * std[0, 2] / mean[0, 2]
-    expected_mean, expected_std = brute_force(charges, REFERENCE, charge[0], centre, reach, (200, 200, 24))
+@pytest.mark.parametrize(
+    ("noise", "contact"),
+    [
+        (REFERENCE, (7.2, 3.4, 0.0503)),
+        (REFERENCE, (0.1, 0.0, 1.995)),
+        (NoiseModel("loud", 1.0, 0.05), (1.0, 2.0, 0.4)),  # the likelihood's 1 / sigma moves the mean by a tenth
+    ],
+)
+def test_as_brute_force(spline, noise, contact):
+    charge = spline.charges(np.array([contact])) + (noise is REFERENCE) * np.array([[0.5, -1.0, 0.3]])
+    mean, std = Posterior(spline, noise, spline.domain.radius).mean_and_std(charge)
+    centre, reach = np.append(mean[0, :2], np.log(mean[0, 2])), 6.5 * np.append(std[0, :2], std[0, 2] / mean[0, 2])
+    expected_mean, expected_std = brute_force(spline, noise, charge[0], centre, reach, (120, 120, 40))
     assert std[0] == pytest.approx(expected_std, rel=0.01)
     assert (np.abs(mean[0] - expected_mean) < 0.01 * expected_std).all()
 
 
-def test_noise_that_grows_with_the_charge_speaks_for_small_ones(charges):
-    """The likelihood's 1 / sigma counts: it moves the mean by a tenth of a deviation here."""
-    loud = NoiseModel("loud", 1.0, 0.05)
-    charge = charges.charges(np.array([[1.0, 2.0, 0.4]]))
-    mean, std = Posterior(charges, loud, charges.domain.radius).mean_and_std(charge)
-    centre, reach = np.append(mean[0, :2], np.log(mean[0, 2])), 6.0 * np.append(std[0, :2], std[0, 2] / mean[0, 2])
-    expected_mean, expected_std = brute_force(charges, loud, charge[0], centre, reach, (60, 60, 60))
-    assert std[0] == pytest.approx(expected_std, rel=0.01)
-    assert (np.abs(mean[0] - expected_mean) < 0.01 * expected_std).all()
-
-
-def test_deviations_are_as_large_as_errors(charges):
+def test_deviations_are_as_large_as_errors(spline):
     """Simulated presses and their noise: the squares of error over deviation are one on average."""
-    contact, charge = spread(charges, 120, seed=3)
-    mean, std = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)
+    contact, charge = spread(spline, 120, seed=3)
+    mean, std = Posterior(spline, REFERENCE, spline.domain.radius).mean_and_std(charge)
     squares = np.mean(((mean - contact) / std) ** 2, axis=0)
     assert squares == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 120))
 
 
-def test_a_smaller_prior_knows_more(charges):
-    charge = charges.charges(np.array([[3.9, 0.0, 0.1]]))
-    wide = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(charge)[1]
-    narrow = Posterior(charges, REFERENCE, 4.0).mean_and_std(charge)[1]
-    assert narrow[0, 0] < 0.8 * wide[0, 0]
-
-
-def test_charges_of_nothing_still_give_an_answer(charges):
+def test_charges_of_nothing_still_give_an_answer(spline):
     """What no press gives: the nearest that the prior knows, finite."""
-    mean, std = Posterior(charges, REFERENCE, charges.domain.radius).mean_and_std(np.array([[0.0, -5.0, 1e6]]))
+    mean, std = Posterior(spline, REFERENCE, spline.domain.radius).mean_and_std(np.array([[0.0, -5.0, 1e6]]))
     assert np.isfinite(mean).all()
     assert np.isfinite(std).all()
-    assert np.hypot(*mean[0, :2]) <= charges.domain.radius * (1.0 + 1e-12)
+    assert np.hypot(*mean[0, :2]) <= spline.domain.radius * (1.0 + 1e-12)
 
 
-def test_bad_input_is_refused(charges):
-    posterior = Posterior(charges, REFERENCE, charges.domain.radius)
+def test_bad_input_is_refused(spline):
+    posterior = Posterior(spline, REFERENCE, spline.domain.radius)
     with pytest.raises(ChargeError, match=r"shape \(n, 3\), n at least 1, got shape \(2, 4\)"):
         posterior.mean_and_std(np.ones((2, 4)))
     with pytest.raises(ChargeError, match="finite"):
@@ -160,3 +147,41 @@ def test_bad_input_is_refused(charges):
         replace(posterior, noise=noise_model("clean"))
     with pytest.raises(InputError, match="up to 8 mm"):
         replace(posterior, radius=9.0)
+
+
+@pytest.fixture
+def problem(sensor):
+    return BayesProblem(sensor, Circle(1.0))
+
+
+def test_the_limit_is_what_the_estimates_give(problem, spline):
+    limit = bayes_limit(problem, 40, seed=5, charge_map=spline)
+    assert 0.05 < limit.position_median_mm < limit.position_rms_mm < 0.4
+    assert limit.presses == 40
+
+
+def test_errors_by_hand():
+    truth = np.array([[0.0, 0.0, 1.0], [1.0, 1.0, 2.0]])
+    limit = BayesLimit.of(truth + np.array([[0.3, 0.4, 0.01], [0.0, 0.0, 0.0]]), truth)
+    assert limit.position_rms_mm == pytest.approx(0.5 / np.sqrt(2.0))
+    assert limit.position_median_mm == pytest.approx(0.25)
+    assert limit.force_rms_percent == pytest.approx(1.0 / np.sqrt(2.0))
+    assert limit.position_p95_mm == pytest.approx(0.475)
+    assert limit.force_median_percent == pytest.approx(0.5)
+
+
+def test_who_computes_does_not_matter_and_a_run_keeps_it(problem, film, spline, tmp_path, monkeypatch):
+    monkeypatch.setattr(posterior, "CHUNK", 2)
+    charge = film.charges(np.array([[3.0, -2.0, 1.5], [0.0, 1.0, 0.2], [-5.0, 5.0, 0.7]]))
+    here = bayes_estimate(problem, charge, charge_map=spline)
+    assert here[0] == pytest.approx(np.array([[3.0, -2.0, 1.5], [0.0, 1.0, 0.2], [-5.0, 5.0, 0.7]]), abs=0.05)
+    with ThreadPoolExecutor(2) as pool, resume_parts(tmp_path / "it", {}) as run:
+        there = bayes_estimate(problem, charge, charge_map=spline, executor=run.keeping("bayes", pool))
+        kept = bayes_estimate(problem, 0.0 * charge, charge_map=spline, executor=run.keeping("bayes", pool))
+    np.testing.assert_array_equal(here, there)
+    np.testing.assert_array_equal(here, kept)  # loaded, whatever the charges are now
+
+
+def test_a_map_of_other_forces_is_refused(sensor, spline):
+    with pytest.raises(InputError, match="expected the problem's"):
+        bayes_estimate(BayesProblem(sensor, Circle(1.0), force_range=(0.1, 1.0)), np.ones((1, 3)), charge_map=spline)

@@ -9,9 +9,10 @@ from tests.train.calibration.conftest import rig
 
 from isocharge.common.errors import ModelError, PressError
 from isocharge.serve import Predictor, load_model, read_presses, write_presses
-from isocharge.simulate import Circle, ForwardMap, load_sensor
+from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, read_earlier, write_calibration
 from isocharge.train.data.presses import draw_contacts
+from kept import kept
 
 CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial")
 
@@ -30,8 +31,9 @@ def film(tmp_path_factory, problem):
 def test_the_model_is_right_about_the_film(film, problem):
     """On fresh charges, solved for this film and not by the family, with the model that a user opens."""
     truth, result, folder = film
-    forward_map, rng = ForwardMap.build(*problem.prior.film(truth), 8.1), np.random.default_rng(1)
-    at = draw_contacts(rng, problem.domain, 400)
+    domain, rng = Domain(5.0, (0.3, 1.0)), np.random.default_rng(1)
+    forward_map = kept(ForwardMap.build, *problem.prior.film(truth), domain.radius, domain.force_range)
+    at = draw_contacts(rng, domain, 400)
     charge = problem.noise.add(forward_map.charges(at), rng)
 
     def error_mm(model) -> float:
@@ -121,8 +123,7 @@ def test_presses_are_proposed_before_the_first(command):
 
 def test_a_refused_file_leaves_no_folder(film, tmp_path, command):
     presses = film[1].presses
-    write_presses(tmp_path / "swapped.csv", replace(presses, charge_pC=presses.charge_pC[:, [1, 0, 2, 3]]))
-    code, _, err = command(*CALIBRATE, tmp_path / "swapped.csv", "-o", tmp_path / "film")
-    assert code == 2
-    assert "swapped" in err
+    write_presses(tmp_path / "m.csv", replace(presses, contact=presses.contact / [1e3, 1e3, 1.0]))
+    code, _, err = command(*CALIBRATE, tmp_path / "m.csv", "-o", tmp_path / "film")
+    assert (code, "were they written in metres" in err) == (2, True)
     assert not (tmp_path / "film").exists()

@@ -6,7 +6,7 @@ from tests.train.calibration.conftest import presses_of
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses
-from isocharge.train import PressSession, calibrate, next_presses
+from isocharge.train import PressSession, next_presses
 from isocharge.train.calibration.session import read_answer
 
 
@@ -39,24 +39,22 @@ def plan(problem):
     return next_presses(problem, 8)
 
 
-def test_five_presses_make_a_film_known_as_well_as_their_plan_says(problem, plan):
+def test_presses_make_a_film_known_as_well_as_their_plan_says(problem, plan):
     """The plan is linearised at the described film; the errors are those of the contacts on the film that was drawn."""
     bench = Bench(problem, plan)
-    bench.press(5)
+    bench.press(3)
     result, session = bench.session.result, bench.session
-    assert result.left.position_mm < 2.0 * plan[4].position_mm
+    assert result.left.position_mm < 2.0 * plan[2].position_mm
     unit = (result.posterior.parameters - bench.parameters) / problem.prior.std
     assert (
         unit @ np.linalg.solve(result.posterior.covariance, unit) < 40.0
     )  # 13 parameters: one film in 4000 is farther
     assert f"{result.left.position_mm:.2g} mm and {result.left.force_percent:.2g} % are left" in session.summary[0]
-    alone = calibrate(bench.saved[-1], problem)
-    np.testing.assert_array_equal(alone.posterior.parameters, result.posterior.parameters)
-    assert [presses.lines for presses in bench.saved[:3]] == [(1,), (1, 2), (1, 2, 3)]
-    for until in (1.0, 0.05, 0.0):
-        again = PressSession(problem, save=bench.saved.append, presses=bench.saved[4], until=until)
+    assert [presses.lines for presses in bench.saved] == [(1,), (1, 2), (1, 2, 3)]
+    for until in (10.0, 0.0):
+        again = PressSession(problem, save=bench.saved.append, presses=bench.saved[2], until=until)
         assert (again.presses, again.summary, again.proposed) == (session.presses, session.summary, session.proposed)
-        assert again.enough == (until == 1.0)
+        assert again.enough == (until == 10.0)
 
 
 def test_every_change_is_saved_before_anything_is_computed(problem, plan):
@@ -89,7 +87,7 @@ def test_undo_takes_back_the_last_press_or_any(problem, plan):
 
 def test_a_place_that_is_skipped_is_not_proposed_again(problem, plan):
     bench, skipped = Bench(problem, plan), []
-    for _ in range(4):
+    for _ in range(2):
         proposed = bench.session.proposed
         assert all(np.hypot(proposed.x_mm - x, proposed.y_mm - y) > 1.0 for x, y in skipped)
         skipped.append((proposed.x_mm, proposed.y_mm))
@@ -99,10 +97,10 @@ def test_a_place_that_is_skipped_is_not_proposed_again(problem, plan):
 
 
 def test_a_press_at_another_place_than_said_is_named(problem, plan):
-    bench = Bench(problem, plan, 7)
+    bench = Bench(problem, plan, 5)
     bench.session.take(bench.charge(np.array([2.0, 3.0, 1.0])), np.array([5.0, 0.0, 1.0]))
-    assert bench.session.result.bad_lines == (8,)
-    assert bench.session.summary[1].startswith("Press 8, 1.00 N at (5.0, 0.0) mm, fits no film that the others fit")
+    assert bench.session.result.bad_lines == (6,)
+    assert bench.session.summary[1].startswith("Press 6, 1.00 N at (5.0, 0.0) mm, fits no film that the others fit")
 
 
 @pytest.mark.slow

@@ -1,11 +1,15 @@
-"""The signal chain in C against ours, frame by frame."""
+"""The signal chain and the binary frame in C against ours, frame by frame and on any bytes."""
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from isocharge.common.errors import DeviceError, TareError
-from isocharge.serve import Predictor, device_from_table
+from isocharge.serve import BinaryParser, Predictor, device_from_table, encode_frame
 from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
+from isocharge.serve.frames.frame import T_US_MODULUS, Frame
+from isocharge.serve.port.device_clock import DeviceClock
 from isocharge.serve.signal_chain.chain import ChainState, advance
 from isocharge.train.export_c.folder import device_header
 
@@ -109,7 +113,10 @@ def test_states_and_charges_are_ours_frame_by_frame(board, build, misfit):
 
 @pytest.mark.parametrize("board", ["any board", "leak", "gain and limit", "hum"])
 def test_single_precision_is_within_a_twentieth_of_a_picocoulomb(board, build, misfit):
-    exported = build("four-25um-biaxial", device(board), options=("-O2", "-DISOCHARGE_CHAIN_FLOAT"))
+    """And nothing in it becomes a double on the way, which a small processor would have to emulate."""
+    exported = build(
+        "four-25um-biaxial", device(board), options=("-O2", "-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion")
+    )
     values, t_s, dt_s, limited, tare = recording(board, seed=4)
     values[np.abs(values) > 1e30] = np.inf
     mine = ours(device(board).chain(("A", "B", "C", "D")), values, t_s, dt_s, limited, tare, misfit)
@@ -137,3 +144,62 @@ def test_a_film_that_is_never_quiet_is_said_at_the_same_frame(build):
 def test_a_tare_that_no_state_holds_is_refused():
     with pytest.raises(DeviceError, match=r"board: tare.frames: expected a whole number from 1 to 10000.*got 50000"):
         device_header(device_from_table({"tare": {"frames": 50_000}}, "board"), ("A", "B", "C"))
+
+
+SINGLE = st.floats(width=32, allow_nan=False)
+FRAMES = st.builds(
+    Frame,
+    seq=st.integers(0, 65535),
+    t_us=st.integers(0, T_US_MODULUS - 1),
+    values=st.lists(SINGLE, max_size=255).map(tuple),
+    flags=st.integers(0, 255),
+)
+LONG = st.binary(min_size=1050, max_size=1100)
+PIECES = st.one_of(FRAMES.map(encode_frame), st.binary(max_size=40), st.just(b"\0"), LONG)
+DAMAGE = st.lists(st.tuples(st.integers(0, 3000), st.integers(0, 255)), max_size=3)
+
+
+@pytest.fixture(scope="module")
+def exported(build):
+    return build("three-25um-biaxial")
+
+
+@given(pieces=st.lists(PIECES, max_size=6), damage=DAMAGE)
+@settings(max_examples=300, deadline=None)
+def test_any_bytes_give_the_frames_and_counters_of_ours(exported, pieces, damage):
+    data = bytearray(b"".join(pieces) + b"\0")
+    for place, value in damage:
+        data[place % len(data)] = value
+    data += b"\0"
+    parser = BinaryParser()
+    frames = [(frame.seq, frame.t_us, frame.flags, frame.values) for frame in parser.feed(bytes(data))]
+    counts = parser.counts
+    theirs, their_counts = exported.frames(bytes(data))
+    np.testing.assert_equal(theirs, frames)
+    assert their_counts == (counts.frames, counts.crc_errors, counts.malformed, counts.bytes_dropped)
+
+
+@given(frame=FRAMES)
+@settings(max_examples=200, deadline=None)
+def test_frames_are_written_as_ours(exported, frame):
+    assert exported.encode(frame.seq, frame.t_us, frame.flags, frame.values) == encode_frame(frame)
+
+
+@pytest.mark.parametrize("n", [0, 1, 60, 61, 62, 63, 124, 125, 126, 255])
+def test_frames_without_a_zero_are_cut_at_254_bytes(exported, n):
+    frame = Frame(0x0101, 0x01010101, (np.frombuffer(b"\1\1\1\1" * n, np.float32)).tolist(), 1)
+    assert exported.encode(frame.seq, frame.t_us, frame.flags, frame.values) == encode_frame(frame)
+    assert exported.frames(encode_frame(frame))[0] == [(frame.seq, frame.t_us, 1, tuple(frame.values))]
+
+
+def test_the_clock_wraps_and_restarts_as_ours(exported):
+    rng = np.random.default_rng(0)
+    t_us = (4_294_000_000 + np.cumsum(rng.integers(0, 20_000, 500))) % T_US_MODULUS
+    t_us[300:] = (t_us[300:] - t_us[300] + 17) % T_US_MODULUS  # the board was reset
+    t_us[400:] = (t_us[400:] + (1 << 31) + 500_000) % T_US_MODULUS  # half its range ahead counts as back
+    clock = DeviceClock()
+    times = [clock.read(int(t), T_US_MODULUS, 0.0) for t in t_us]
+    t_s, dt_s = exported.clock(t_us)
+    np.testing.assert_allclose(t_s, [time.clock_s for time in times], rtol=1e-15)
+    np.testing.assert_allclose(dt_s, [time.step_s for time in times], rtol=1e-15)
+    assert clock.restarts == 2

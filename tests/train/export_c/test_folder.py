@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,18 @@ from isocharge.serve import (
     BinaryParser,
     Chunk,
     Contact,
-    Port,
+    Faults,
+    Frame,
     Predictor,
     TouchStream,
+    VirtualSensor,
     device_from_table,
     encode_frame,
     find_model,
     load_device,
+    wander,
 )
-from isocharge.serve.frames.frame import Frame
+from isocharge.simulate import load_amplifier
 from isocharge.train.export_c.folder import export_c
 
 HERE = Path(__file__).parent
@@ -115,19 +119,15 @@ def check_records(records, expected):
             assert theirs[name] == (None if value is None else pytest.approx(value, rel=1e-4, abs=1e-4))
 
 
-def test_a_recording_gives_our_records_frame_by_frame(host, start_command, tmp_path):
-    """Bytes of the virtual sensor with a leak, drift, lost frames and damaged bytes, in C and in Python."""
+def test_a_recording_gives_our_records_frame_by_frame(host, film, tmp_path):
+    """Bytes of a virtual board with a leak, drift, lost frames and damaged bytes, in C and in Python."""
     program, board = host
-    (tmp_path / "play.toml").write_text("[faults]\ncorrupt_share = 0.0005\nlose_share = 0.01\n")
-    words = ("--noise", "bench", "--rate", "400", "--script", tmp_path / "play.toml", "--force-max", "0.5")
-    sensor = start_command("serve", "virtual", "three-25um-biaxial", *words)
-    stream, data, expected = TouchStream(Predictor("three-25um-biaxial"), board), b"", []
-    with Port(sensor.stdout.readline().strip()) as port:
-        for chunk in port:
-            data += chunk.data
-            expected += stream.feed(chunk)
-            if len(expected) > 1000:
-                break
+    amplifier = load_amplifier("bench").start(3, 400.0, np.random.default_rng(0))
+    play = wander(seed=1, seconds=6.0, rate_Hz=400.0, force_range_N=(0.05, 0.5))
+    faults = Faults(corrupt_share=0.0005, lose_share=0.01)
+    sensor = VirtualSensor(film.charges, play, noise=lambda q, _: amplifier(q), faults=faults)
+    data = b"".join(islice(sensor.frames(), 2400))
+    expected = list(TouchStream(Predictor("three-25um-biaxial"), board).feed(Chunk(data, 0.0, 0)))
     (tmp_path / "frames.bin").write_bytes(data)
     code, records, err = played(program, tmp_path / "frames.bin")
     assert (code, err) == (0, "")
@@ -135,6 +135,7 @@ def test_a_recording_gives_our_records_frame_by_frame(host, start_command, tmp_p
     assert sum(record["contact"] for record in records) > 100
 
 
+@pytest.mark.slow
 def test_host_example_follows_a_port(exports, compile_c, start_command, tmp_path):
     """Contacts of the virtual sensor at the place of its script."""
     rows = [[0, 3, -2, 0], [0.8, 3, -2, 0], [0.801, 3, -2, 0.5], [60, 3, -2, 0.5]]

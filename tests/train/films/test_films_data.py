@@ -28,18 +28,6 @@ def test_parts_gains_and_coefficients_give_the_films_charges(films, d33):
     assert np.hypot(drawn.contact[..., 0], drawn.contact[..., 1]).max() <= films.domain.radius * (1 + 1e-6)
 
 
-def test_films_drawn_anew_are_films(films):
-    """Other coefficients and gains on stored presses: the same as that film's own charges."""
-    drawn = draw_film_presses(films.prior, films.family, films.domain, 2, 20, seed=2)
-    others = drawn.parameters.copy()
-    others[:, 3:5] += [0.2, -0.3]
-    others[:, 9:] -= 0.07
-    for parameters, contact, charge in zip(
-        others, drawn.contact, replace(drawn, parameters=others).charge(), strict=True
-    ):
-        np.testing.assert_allclose(charge, charges(films.prior, films.family, parameters, contact), rtol=2e-5)
-
-
 def test_the_draw_does_not_depend_on_who_draws(films, monkeypatch):
     monkeypatch.setattr(films_data, "CHUNK", 2)
     with ThreadPoolExecutor(2) as pool:

@@ -1,23 +1,114 @@
-"""A tiny fit end to end: it learns, goes on where it was stopped, and leaves a folder that serves."""
+"""A tiny fit of all films end to end, going on where it was stopped; its file, read back and refused where damaged."""
 
+import io
+import json
+import zipfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from isocharge.common.errors import ModelError
 from isocharge.common.progress import listening
 from isocharge.common.resumable_run import resume_parts
 from isocharge.serve import Predictor, check_golden, load_model
+from isocharge.simulate import load_sensor, noise_model
+from isocharge.simulate.sensor.film_prior import FilmSpread
 from isocharge.train import FilmsConfig, fit_films, read_films, release_films
-from isocharge.train.films import films_data
+from isocharge.train.films import films_data, films_file
 from isocharge.train.films import fit as films_fit
 from isocharge.train.films import release as films_release
+from isocharge.train.films.films_file import FILE, films_bytes, films_from_bytes
 from isocharge.train.films.fit import films_identity
 from isocharge.train.films.release import evaluate_films
 from isocharge.train.training import descent
 
+
+@pytest.fixture(scope="module")
+def data(random_films):
+    return films_bytes(random_films(load_sensor("four-25um-biaxial"))[0])
+
+
+def test_read_is_written(data, random_films):
+    written, again = random_films(load_sensor("four-25um-biaxial"))[0], films_from_bytes(data, FILE)
+    assert (again.prior, again.domain, again.noise) == (written.prior, written.domain, written.noise)
+    for part in ("contact", "misfit"):
+        weights, read = getattr(written, part).arrays, getattr(again, part).arrays
+        assert weights.keys() == read.keys()
+        for name, values in weights.items():
+            step = np.abs(values).max(axis=-1, keepdims=True) / 2047
+            assert (np.abs(read[name] - values) <= 0.51 * step).all(), name
+
+
+def test_what_a_released_file_says_is_written_again(films, pytestconfig):
+    """Sensor, spread, domain and noise, which the file has in m, Pa and C; and weights of twelve bits stay the same."""
+    path = pytestconfig.rootpath / "models" / "four-25um-biaxial-films" / "1" / FILE
+    with np.load(path) as released, np.load(io.BytesIO(films_bytes(films))) as again:
+        assert json.loads(str(again["about"])) == json.loads(str(released["about"]))
+        assert np.abs(again["contact.bases.1"].astype(int) - released["contact.bases.1"]).max() <= 1
+    assert films.prior.spread == FilmSpread()
+    assert films.prior.probe.radius == 1.0
+    assert films.noise == noise_model("reference")
+
+
+def test_a_missing_file_says_what_it_belongs_to(tmp_path):
+    with pytest.raises(ModelError, match=r"films\.npz: cannot be read .* `isocharge train fit --films` writes it"):
+        read_films(tmp_path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.9999])
+def test_a_torn_file_is_damaged(data, tmp_path, share):
+    (tmp_path / FILE).write_bytes(data[: int(share * len(data))])
+    with pytest.raises(ModelError, match=r"films\.npz: damaged"):
+        read_films(tmp_path)
+
+
+def altered(data, **changes):
+    """The file with some arrays replaced or (None) left out, under its old checksum or a new one."""
+    with np.load(io.BytesIO(data)) as file:
+        arrays = {name: file[name] for name in file.files if name != "sha256"}
+    arrays = {name: value for name, value in (arrays | changes).items() if value is not None}
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays, sha256=np.array(films_file._checksum(arrays)))
+    return buffer.getvalue()
+
+
+def test_another_format_is_named(data):
+    with np.load(io.BytesIO(data)) as file:
+        about = json.loads(str(file["about"]))
+    newer = altered(data, about=np.array(json.dumps(about | {"format": 2})))
+    with pytest.raises(ModelError, match="format 2 is not supported"):
+        films_from_bytes(newer, FILE)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"mean": np.zeros(3)},
+        {"whitening": np.zeros((4, 3))},
+        {"contact.skip": None},
+        {"contact.skip": np.zeros((2, 2), np.int16)},
+        {"family.modes": None},
+        {"about": np.array("[]")},
+    ],
+    ids=str,
+)
+def test_what_does_not_fit_together_is_damaged(data, changes):
+    with pytest.raises(ModelError, match=r"films\.npz: damaged"):
+        films_from_bytes(altered(data, **changes), FILE)
+
+
+def test_no_pickle_is_loaded():
+    """A file that carries code is refused, not run."""
+    buffer = io.BytesIO()
+    np.savez(buffer, about=np.array([print], dtype=object), sha256=np.array(""))
+    with pytest.raises(ModelError, match="damaged"):
+        films_from_bytes(buffer.getvalue(), FILE)
+    assert zipfile.is_zipfile(io.BytesIO(buffer.getvalue()))
+
+
 TINY = FilmsConfig(
-    hidden=(24, 24), misfit_hidden=(16, 16), films=48, presses=32, watched=8, steps=300, misfit_films=3,
+    hidden=(24, 24), misfit_hidden=(16, 16), films=32, presses=32, watched=8, steps=240, misfit_films=2,
     misfit_charges=24, near_films=4, misfit_steps=40, batch_films=16, batch_presses=32,
 )  # fmt: skip
 SHORT = replace(TINY, films=16, presses=16, watched=4, steps=30, misfit_films=2, misfit_charges=8, near_films=2)
@@ -83,17 +174,3 @@ def test_the_film_that_is_assumed_has_the_lower_error(films):
     assert np.array_equal(errors.parameters, films.prior.mean)
     assert not np.array_equal(films.prior.mean, films.prior.described)
     assert errors.known["position_rms_mm"] < 0.5 * errors.unknown["position_rms_mm"]
-
-
-def test_errors_are_those_of_the_definition(films, monkeypatch):
-    """One film by hand, without noise."""
-    clean = replace(films, noise=replace(films.noise, white=0.0, gain=0.0))
-    (parameters,) = clean.prior.draw(np.random.default_rng(films_release.SEED), 1)
-    contacts = []
-    draw = films_release.draw_contacts
-    monkeypatch.setattr(films_release, "draw_contacts", lambda *a: contacts.append(draw(*a)) or contacts[-1])
-    errors = evaluate_films(clean, 1, 50).known
-    contact = clean.fold(parameters).predict(clean.forward_map(parameters).charges(contacts[0]))[0]
-    square = ((contact - contacts[0])[:, :2] ** 2).sum(axis=1)
-    assert errors["position_rms_mm"] == pytest.approx(np.sqrt(square.mean()), rel=1e-3)
-    assert errors["position_rms_worst_film_mm"] == errors["position_rms_mm"]

@@ -13,9 +13,7 @@ from isocharge.simulate import (
     ForwardMap,
     load_sensor,
     noise_model,
-    read_dataset,
     virtual_film,
-    write_dataset,
 )
 from isocharge.train.data.presses import dataset_of, draw_contacts, held_out
 from isocharge.train.report import QUICK, write_report
@@ -37,16 +35,9 @@ def presses():
 
 
 @pytest.fixture(scope="module")
-def folder(presses, tmp_path_factory):
-    """The presses as a dataset folder: no solver in its manifest."""
-    dataset = dataset_of(presses, load_sensor(NAME), PROBE)
-    return write_dataset(tmp_path_factory.mktemp("data") / "rig", dataset.sensor, [dataset.samples], {})
-
-
-@pytest.fixture(scope="module")
-def section(folder, tmp_path_factory):
+def section(presses, tmp_path_factory):
     out = tmp_path_factory.mktemp("report") / "out"
-    record = write_report(out, [(read_dataset(folder), find_model(NAME))], QUICK)
+    record = write_report(out, [(dataset_of(presses, load_sensor(NAME), PROBE), find_model(NAME))], QUICK)
     return record["datasets"][0], (out / "report.md").read_text("utf-8")
 
 

@@ -1,4 +1,4 @@
-"""Figures of merit against scikit-learn, SciPy and brute force; the computed sentences on made-up methods."""
+"""Figures of merit against scikit-learn, SciPy, brute force and planted errors; sentences on made-up methods."""
 
 import re
 
@@ -7,8 +7,11 @@ import pytest
 from sklearn.metrics import root_mean_squared_error
 
 from isocharge.serve.benchmark import Timing
+from isocharge.simulate import Domain
 from isocharge.train.baselines.rivals import GivenMethod, Rival
+from isocharge.train.data.presses import draw_contacts
 from isocharge.train.report.measures import Errors, MethodRecord, coverage, pareto, verdict
+from isocharge.train.report.studies import by_force
 
 
 def contacts(count, seed):
@@ -88,3 +91,17 @@ def test_what_is_faster_or_more_accurate_is_said(other, both, sentence):
     said = verdict([released, *silent, method(*other)])
     assert said["both"]["latency"] == both
     assert re.search(sentence, said["sentences"][0])
+
+
+DOMAIN = Domain(8.0, (0.05, 2.0))
+
+
+def test_errors_fall_into_the_bins_of_their_forces():
+    truth = draw_contacts(np.random.default_rng(0), DOMAIN, 3000)
+    edges = np.geomspace(0.05, 2.0, 13)
+    strong = (truth[:, 2] > edges[10]) & (truth[:, 2] < edges[11])
+    contact = truth + np.where(strong, 0.5, 0.1)[:, None] * [0.6, 0.8, 0.0]
+    found = by_force(DOMAIN, truth, {"method": contact}, np.full(3000, 0.2))
+    np.testing.assert_allclose(found["position_rms_mm"]["Cramér-Rao"], 0.2, rtol=1e-3)
+    np.testing.assert_allclose(found["position_rms_mm"]["method"], [0.1] * 10 + [0.5, 0.1], rtol=1e-3)
+    np.testing.assert_allclose(found["force_N"][10] ** 2, edges[10] * edges[11], rtol=1e-3)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from isocharge.serve import MeasuredPresses
-from isocharge.simulate import Circle, load_sensor
-from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate import Circle, Domain, load_sensor
 from isocharge.train import CalibrationProblem
 from isocharge.train.data.presses import draw_contacts
 

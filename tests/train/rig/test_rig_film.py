@@ -7,8 +7,50 @@ import pytest
 from tests.train.rig.conftest import DOMAIN, measured, systematic
 
 from isocharge.simulate import noise_model
+from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.data.presses import draw_contacts
-from isocharge.train.rig.rig_film import calibrated_film, corrected_film
+from isocharge.train.rig.rig_film import Residuals, calibrated_film, corrected_film, fit_correction
+
+
+def contacts(rng, count, radius=8.0):
+    return draw_contacts(rng, Domain(radius, (0.05, 2.0)), count)
+
+
+def residuals(seed, count, truth, std=0.004):
+    """Log ratios with correlated errors, as a rig that misreads places makes them."""
+    rng = np.random.default_rng(seed)
+    contact = contacts(rng, count)
+    slopes = rng.normal(size=(count, 4, 2))
+    covariance = std**2 * (np.eye(4) + 4.0 * slopes @ slopes.transpose(0, 2, 1))
+    noise = np.einsum("nef,nf->ne", np.linalg.cholesky(covariance), rng.normal(size=(count, 4)))
+    return Residuals(contact, truth(contact) + noise, covariance)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_planted_correction_comes_back(seed):
+    correction = fit_correction(residuals(seed, 200, systematic))
+    fresh = contacts(np.random.default_rng(100 + seed), 1000, 7.5)
+    left = correction.log_factor(fresh) - systematic(fresh)
+    assert np.sqrt(np.mean(left**2)) < 0.25 * np.sqrt(np.mean(systematic(fresh) ** 2))
+    assert 4.0 < correction.freedom < 200.0
+
+
+def test_noise_alone_is_not_corrected():
+    """At two standard errors, at most one of six draws may look like a correction; then a tiny one."""
+    corrections = [fit_correction(residuals(seed, 60, lambda contact: 0.0 * systematic(contact))) for seed in range(6)]
+    real = [correction for correction in corrections if not correction.nothing]
+    assert len(real) <= 1
+    fresh = contacts(np.random.default_rng(5), 500)
+    assert all(np.sqrt(np.mean(each.log_factor(fresh) ** 2)) < 0.004 for each in real)
+
+
+def test_beyond_the_presses_it_stays():
+    correction = fit_correction(residuals(0, 200, systematic))
+    far = np.array([[12.0, 5.0, 1.0], [3.0, 4.0, 50.0]])
+    nearest = far.copy()
+    nearest[0, :2] *= correction.domain.radius / np.hypot(*far[0, :2])
+    nearest[1, 2] = correction.domain.force_range[1]
+    np.testing.assert_allclose(correction.log_factor(far), correction.log_factor(nearest), rtol=1e-12)
 
 
 def left(film, truth, share):
@@ -29,7 +71,7 @@ def test_what_calibration_cannot_take_the_correction_does(problem, truth):
 
 def test_a_film_that_physics_explains_is_not_corrected(problem, truth, caplog):
     """Nor by a press that was misread: it is left out."""
-    presses = measured(truth, 50, 0.0)
+    presses = measured(truth, 24, 0.0)
     presses.charge_pC[7, 2] *= 3.0
     film = calibrated_film(presses, problem, DOMAIN)
     assert film.calibration.bad_lines == (9,)
@@ -37,7 +79,7 @@ def test_a_film_that_physics_explains_is_not_corrected(problem, truth, caplog):
     assert film.correction.nothing
     assert left(film, truth, 0.0)[1] < 0.5
     assert not film.scattered
-    assert film.scatter == pytest.approx(1.0, abs=0.3)
+    assert film.scatter == pytest.approx(1.0, abs=0.4)
 
 
 def test_a_described_film_is_corrected_by_many_presses(truth, caplog):
