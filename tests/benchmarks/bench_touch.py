@@ -28,8 +28,8 @@ from isocharge.serve import (
     encode_frame,
 )
 from isocharge.serve.benchmark import machine
-from isocharge.simulate import Circle, ForwardMap, load_amplifier, sensor_from_dict
-from isocharge.train.data.domain import inner_radius
+from isocharge.simulate import Circle, ForwardMap, load_amplifier
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
 RATE_HZ, REST_S, PRESS_S, PAUSE_S, RAMP_S = 200.0, 4.0, 1.5, 1.5, 0.1
 
@@ -177,7 +177,8 @@ def main():
     parser.add_argument("--json", action="store_true", help="one JSON object")
     asked = parser.parse_args()
     predictor, part = Predictor(asked.model), load_amplifier("bench")
-    radius_mm = inner_radius(predictor.metadata.working_area_mm)
+    corners = np.array(predictor.metadata.working_area_mm) @ [1.0, 1j]
+    radius_mm = float(np.abs(0.5 * (corners + np.roll(corners, 1))).min())
     film = ForwardMap.build(sensor_from_dict(dict(predictor.metadata.sensor)), Circle(1.0), radius_mm)
     result = {
         "gains to 0.2 %": accuracy(predictor, film, part, asked.presses, 0.002, asked.seed),

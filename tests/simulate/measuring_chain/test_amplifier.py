@@ -104,10 +104,10 @@ def test_surgery_is_bench_but_worse():
 
 def test_file_changes_what_it_says(tmp_path):
     path = tmp_path / "mine.toml"
-    path.write_text('like = "bench"\nwhite_pC = 0.5\ntau_s = 1\ngain_mismatch = 0.002\nbits = 12\n')
+    path.write_text('like = "bench"\nwhite_pC = 0.5\ntau_s = 1\ngain_mismatch = 0.002\nbits = 12\npyro_pC_per_K = 90\n')
     part = load_amplifier(str(path))
     assert (part.noise.name, part.noise.white, part.tau) == ("mine", 0.5, 1.0)
-    assert (part.gain_mismatch, part.bits, part.hum, part.limit) == (0.002, 12, 1.0, 1500.0)
+    assert (part.gain_mismatch, part.bits, part.hum, part.limit, part.pyro) == (0.002, 12, 1.0, 1500.0, 90.0)
 
 
 @pytest.mark.parametrize(

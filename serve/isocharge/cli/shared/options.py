@@ -43,9 +43,7 @@ RadiusOption = Annotated[
 
 StressLimitOption = Annotated[
     float,
-    typer.Option(
-        "--stress-limit", metavar="MPA", min=0.0, help="Largest stress of the film under the probe, MPa; PVDF yields."
-    ),
+    typer.Option("--stress-limit", metavar="MPA", min=0.0, help="Largest stress of the film under the probe, MPa."),
 ]
 
 WorkersOption = Annotated[

@@ -106,7 +106,7 @@ class VirtualScript(Settings, frozen=True):
         presses: Rows (seconds, x_mm, y_mm, force_N), interpolated linearly; nothing touches where the force is 0.
             Without rows, presses are random.
         faults: Between board and reader.
-        temperature_step_K: Temperature step of the film after 10 s, K; None leaves it to the amplifier.
+        temperature_step_K: Temperature step of the air after 10 s, K; None leaves it to the amplifier.
         drift_pC_per_s: Drift from the bias current, pC/s; likewise.
         limit_pC: Largest charge that the converter reads, pC; likewise.
     """
