@@ -1,9 +1,7 @@
 """What the simulator's tests share: films, meshes, random fields, forward maps."""
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -144,10 +142,3 @@ def three_map() -> ForwardMap:
 def small_dataset(three_map: ForwardMap, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of 500 samples; not to be written to."""
     return write_sweep(tmp_path_factory.mktemp("data") / "presses", (three_map,), Sweep(samples=500, seed=7))
-
-
-@pytest.fixture(scope="session")
-def two_processes() -> Iterator[ProcessPoolExecutor]:
-    """Workers that share nothing with this process."""
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        yield pool

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 from solves import Solves
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure, shades
+from isocharge.simulate.plots.figure import COLOURS, FELT, INK, finish_axes, new_axes, shades
 
 BAND = 0.02
 """Largest difference of normalised charges that count as the same, dimensionless."""
@@ -101,8 +101,7 @@ def eq_4(solves: Solves) -> Entry:
         ]
         for thickness, of_thickness in zip(choices.thickness, solves.chains, strict=True)
     ]
-    figure = new_figure(15.5, 9.6)
-    (curve, exponent), (misfit, bent) = figure.subplots(2, 2)
+    figure, ((curve, exponent), (misfit, bent)) = new_axes(15.5, 9.6, 2, 2)
     _draw_curves(curve, films)
     _draw_exponents(exponent, films)
     _draw_grid(misfit, films, "distance from eq. 4's cubic, 0.25 to 2 N", [[f.misfit for f in row] for row in films], 3)
@@ -244,10 +243,8 @@ def _draw_curves(axes: Any, films: list[list[ChargeForce]]) -> None:
     for film, colour in zip(chosen, COLOURS, strict=False):
         label = f"{film.name}, {film.at_1_N:.{0 if film.at_1_N > 100.0 else 1}f} pC at 1 N"
         axes.plot(FINE, film.charge(FINE) / film.at_1_N, color=colour, lw=1.6, label=label)
-    axes.set(xlabel="force, N", ylabel="charge of A over its value at 1 N", title="Eq. 4: charge against force")
     axes.set_ylim(0, 3)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    finish_axes(axes, "force, N", "charge of A over its value at 1 N", "Eq. 4: charge against force")
 
 
 def _draw_exponents(axes: Any, films: list[list[ChargeForce]]) -> None:
@@ -257,9 +254,8 @@ def _draw_exponents(axes: Any, films: list[list[ChargeForce]]) -> None:
     axes.semilogx(FINE, [taut.exponent(f) for f in FINE], "--", color=FELT, label=taut.name)
     for level in (2.0 / 3.0, 1.0, 2.0):
         axes.axhline(level, color=INK, lw=0.6, ls=":")
-    axes.set(xlabel="force, N", ylabel="d(ln charge) / d(ln force)", title="local exponent, no pretension (one with)")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    title, place = "local exponent, no pretension (one with)", {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
+    finish_axes(axes, "force, N", "d(ln charge) / d(ln force)", title, **place)
 
 
 def _draw_grid(axes: Any, films: list[list[ChargeForce]], title: str, values: list[list[float]], digits: int) -> None:

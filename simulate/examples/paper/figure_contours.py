@@ -16,7 +16,7 @@ from isocharge.simulate.contours.field_contours import ContourField
 from isocharge.simulate.contours.fix import Meeting
 from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTriangulation
 from isocharge.simulate.plots.contours import draw_contours
-from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
+from isocharge.simulate.plots.figure import COLOURS, FELT, INK, finish_axes, new_axes
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 
 LEVELS, AREA = 8, 11.5
@@ -33,8 +33,7 @@ def fig_9(solves: Solves, accuracy: Accuracy) -> Entry:
     charges = solves.charges("triangle", sensor, np.array([at]))[0]
     spline = ChargeSpline.of(solves.forward_map("triangle", sensor), reach, solves.choices.spacing)
     field = ContourField(spline, FORCE)
-    figure = new_figure(6.6, 7.0)
-    axes = figure.subplots()
+    figure, axes = new_axes(6.6, 7.0)
     for name, charge, colour in zip(sensor.electrode_names, charges, COLOURS, strict=False):
         draw_contours(axes, field.contours(name, float(charge)), colour, f"{name}, {charge:.0f} pC")
     draw_electrodes(axes, sensor)
@@ -62,8 +61,7 @@ def fig_10(solves: Solves, accuracy: Accuracy) -> Entry:
     charge = solves.charges("triangle", sensor, np.array([at]))
     contours, fix = [c for c in triangulation.contours(charge[0]) if c is not None], triangulation.locate(charge)
     error_mm = float(np.hypot(*(fix.contact[0, :2] - at)))
-    figure = new_figure(16.5, 5.6)
-    whole, near, distribution = figure.subplots(1, 3)
+    figure, (whole, near, distribution) = new_axes(16.5, 5.6, columns=3)
     for axes in (whole, near):
         for contour, colour in zip(contours, COLOURS, strict=False):
             axes.plot(*contour.points.T, color=colour, lw=1.3, label=f"{contour.electrode}, {contour.charge:.0f} pC")
@@ -144,10 +142,8 @@ def _distributions(axes: Any, accuracy: Accuracy, degree: int) -> None:
         share = 100.0 * (np.arange(rising.size) + 0.5) / rising.size
         axes.semilogx(rising, share, style, color=colour, label=label)
     axes.axvline(ERROR_MM, color=INK, lw=1.0, ls=":", label=f"the paper's {ERROR_MM:g} mm")
-    axes.set(xlabel="distance from the press, mm", ylabel="presses found with at most this error, %")
-    axes.set_title("over the working area")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    share = "presses found with at most this error, %"
+    finish_axes(axes, "distance from the press, mm", share, "over the working area")
 
 
 def fig_11(solves: Solves) -> Entry:
@@ -183,8 +179,7 @@ def fig_11(solves: Solves) -> Entry:
 
 def _draw_fig_11(choices: Choices, sensor: Sensor, field: ContourField) -> Figure:
     """On the left the contours of all electrodes, on the right those of the first with their charges."""
-    figure = new_figure(12.6, 6.6)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = new_axes(12.6, 6.6, columns=2)
     for name, colour in zip(sensor.electrode_names, COLOURS, strict=False):
         levels = field.even_charges(name, LEVELS)
         pieces = [piece for charge in levels for piece in field.contours(name, charge)]

@@ -15,7 +15,7 @@ from isocharge.simulate import Piezo, Sensor
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from isocharge.simulate.contours.graphical_method import draw_contour
 from isocharge.simulate.plots.contours import draw_curves
-from isocharge.simulate.plots.figure import COLOURS, PRESSED, new_figure
+from isocharge.simulate.plots.figure import COLOURS, PRESSED, finish_axes, new_axes
 
 FROM_A_DEG = {"three": (35.0, 90.0), "four": (110.0, 250.0)}
 """First and last line from A, by layout."""
@@ -51,9 +51,10 @@ def curve_numbers(curves: Curves) -> dict[str, object]:
 
 def fig_6(solves: Solves) -> Entry:
     """Triangle, biaxial, from A; three electrodes as in the paper, and four."""
-    figure, sensors = new_figure(12.6, 5.2), {layout: solves.choices.sensor(layout) for layout in FROM_A_DEG}
+    figure, pair = new_axes(12.6, 5.2, columns=2)
+    sensors = {layout: solves.choices.sensor(layout) for layout in FROM_A_DEG}
     both = {name: curves_of(solves, "triangle", sensors[name], "A", degrees) for name, degrees in FROM_A_DEG.items()}
-    for axes, (layout, (curves, line)) in zip(figure.subplots(1, 2), both.items(), strict=True):
+    for axes, (layout, (curves, line)) in zip(pair, both.items(), strict=True):
         draw_curves(axes, curves, line)
         axes.axhline(CONTOUR_PC, color="k", lw=0.8, ls=":")
         axes.annotate(f"{CONTOUR_PC:g} pC", (4, CONTOUR_PC), fontsize=8, va="bottom")
@@ -161,8 +162,7 @@ def fig_8(solves: Solves) -> Entry:
 
 def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
     """The curves, and each over the mean of all; the two lines that the paper names stand out."""
-    figure = new_figure(12.0, 5.2)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = new_axes(12.0, 5.2, columns=2)
     draw_curves(left, curves, smooth)
     left.set_title("Fig. 8: rectangular probe, biaxial film, 1 N")
     others, mean = {"color": PRESSED, "lw": 0.7}, smooth.own.mean(axis=0)
@@ -171,10 +171,8 @@ def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
         styles[named] = {"color": colour, "lw": 2.4, "label": f"{named:.0f}°"}
     for angle, charge in zip(np.rad2deg(curves.mapping.angle).round(6).tolist(), smooth.own, strict=True):
         right.plot(smooth.mapping.distance, 100.0 * (charge / mean - 1.0), **styles.get(angle, others))
-    right.set(xlabel="distance from the centre of B, mm", ylabel="charge over the mean of the lines, %")
-    right.set_title("the same, against the mean of the lines")
-    right.grid(alpha=0.3)
-    right.legend()
+    ratio, title = "charge over the mean of the lines, %", "the same, against the mean of the lines"
+    finish_axes(right, "distance from the centre of B, mm", ratio, title)
     return figure
 
 
@@ -209,9 +207,9 @@ def _best_ratio(solves: Solves) -> tuple[float, float]:
 
 def fig_12(solves: Solves) -> Entry:
     """Triangle, uniaxial, from A, beside biaxial."""
-    figure = new_figure(12.0, 5.2)
+    figure, pair = new_axes(12.0, 5.2, columns=2)
     numbers, rows = {}, []
-    for axes, (layout, degrees) in zip(figure.subplots(1, 2), FROM_A_DEG.items(), strict=True):
+    for axes, (layout, degrees) in zip(pair, FROM_A_DEG.items(), strict=True):
         uniaxial, smooth = curves_of(solves, "triangle", solves.choices.sensor(layout, "uniaxial"), "A", degrees)
         biaxial, _ = curves_of(solves, "triangle", solves.choices.sensor(layout), "A", degrees)
         draw_curves(axes, uniaxial, smooth)

@@ -15,7 +15,7 @@ from isocharge.simulate.contours.charge_curves import Mapping
 from isocharge.simulate.forward.readout import contact_charge
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.plots.contours import draw_mapping
-from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
+from isocharge.simulate.plots.figure import COLOURS, FELT, INK, finish_axes, new_axes
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 
 FIG_4_DEG = (35.0, 145.0)
@@ -33,8 +33,7 @@ def fig_1(solves: Solves) -> Entry:
     meeting = trilaterate(centres, distance)
     along = (centres[1] - centres[0]) / np.linalg.norm(centres[1] - centres[0])
     second = 2.0 * (centres[0] + along * ((at - centres[0]) @ along)) - at
-    figure = new_figure(6.4, 6.0)
-    axes = figure.subplots()
+    figure, axes = new_axes(6.4, 6.0)
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
     for name, centre, r, colour in zip("abc", centres, distance, COLOURS, strict=False):
         axes.plot(*centre, "s", color=colour)
@@ -70,8 +69,7 @@ def fig_2(solves: Solves) -> Entry:
     """The mapping scheme about one electrode."""
     sensor = solves.choices.sensor("three")
     mapping = Mapping.lines(sensor, "A", (0.0, 2.0 * np.pi - np.deg2rad(10.0)), length=solves.choices.length)
-    figure = new_figure(6.4, 6.2)
-    axes = figure.subplots()
+    figure, axes = new_axes(6.4, 6.2)
     draw_mapping(axes, mapping)
     draw_electrodes(axes, sensor, highlight="A")
     axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="Fig. 2: mapping scheme")
@@ -92,8 +90,7 @@ def fig_2(solves: Solves) -> Entry:
 def fig_3(solves: Solves) -> Entry:
     """The layout with three sensing elements, and as the text has it."""
     sensor, printed = solves.choices.sensor("three"), solves.choices.as_printed()
-    figure = new_figure(11.0, 5.6)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = new_axes(11.0, 5.6, columns=2)
     for axes, shown, title in ((left, sensor, "Fig. 3: layout, equilateral"), (right, printed, "as the text has it")):
         draw_electrodes(axes, shown)
         draw_working_area(axes, shown.film.radius, "clamped rim")
@@ -137,8 +134,7 @@ def fig_7(solves: Solves) -> Entry:
 def _scheme(solves: Solves, heading: str, electrode: str, degrees: tuple[float, float]) -> Entry:
     sensor, (first, last) = solves.choices.sensor("three"), np.deg2rad(degrees)
     mapping = Mapping.lines(sensor, electrode, (first, last), length=solves.choices.length)
-    figure = new_figure(6.8, 6.8)
-    axes = figure.subplots()
+    figure, axes = new_axes(6.8, 6.8)
     draw_mapping(axes, mapping)
     draw_electrodes(axes, sensor, highlight=electrode)
     draw_working_area(axes, solves.choices.radius, f"working area, {solves.choices.radius:g} mm")
@@ -169,8 +165,7 @@ def fig_5(solves: Solves) -> Entry:
     """The mesh, and what its fineness is worth."""
     (*charges, finest), (*unknowns, _), (*seconds, _) = zip(*solves.meshes, strict=True)
     error = np.abs(np.array(charges) / finest - 1.0).max(axis=1)
-    figure = new_figure(15.0, 5.0)
-    whole, near, errors = figure.subplots(1, 3)
+    figure, (whole, near, errors) = new_axes(15.0, 5.0, columns=3)
     for axes, (x, y), reach, title in (
         (whole, (0.0, 0.0), 46.0, "Fig. 5: mesh, whole film"),
         (near, solves.shown.at, 8.0, "at the probe"),
@@ -183,9 +178,7 @@ def fig_5(solves: Solves) -> Entry:
     errors.axhline(0.1, color=INK, lw=0.8, ls=":", label="0.1 %")
     errors.set_xticks(unknowns, [f"{n:,}" for n in unknowns])
     errors.minorticks_off()
-    errors.set(xlabel="unknowns", ylabel="worst charge against the finest mesh, %", title="error against mesh")
-    errors.grid(alpha=0.3, which="both")
-    errors.legend(fontsize=8)
+    finish_axes(errors, "unknowns", "worst charge against the finest mesh, %", "error against mesh")
     enough, mesh = int(np.argmax(error < 1e-3)), solves.shown.mesh
     rows = [
         Row(

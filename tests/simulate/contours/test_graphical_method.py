@@ -49,16 +49,6 @@ def test_lines_that_do_not_reach_the_charge_give_no_contour():
     assert draw_contour(curves_of(LAYOUTS["three"], "A"), 5e3) is None
 
 
-def test_crossings_are_those_of_the_splines():
-    sensor = LAYOUTS["three"]
-    a, b = (draw_contour(curves_of(sensor, name), float(charge_at(np.array(9.5))), 3) for name in "AB")
-    crossings = a.crossings(b)
-    assert len(crossings) == 2
-    for crossing in crossings:
-        for electrode in sensor.electrodes[:2]:
-            assert np.linalg.norm(crossing - electrode.centre) == pytest.approx(9.5, rel=1e-3)
-
-
 def test_straight_contours_cross_where_lines_do():
     one = DrawnContour("A", 1.0, np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))
     other = DrawnContour("B", 1.0, np.array([[0.0, 1.0], [2.0, 0.0]]))

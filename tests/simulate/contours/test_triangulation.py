@@ -1,5 +1,7 @@
 """Triangulation against circles (trilateration is classical), against presses, and in its refusals."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -55,13 +57,17 @@ def draw(count: int, seed: int, radius: float = 7.0, forces: tuple[float, float]
     return np.stack([r * np.cos(angle), r * np.sin(angle), np.exp(rng.uniform(*np.log(forces), count))], axis=1)
 
 
-def intersections(first, second, r1, r2) -> np.ndarray:
-    """Where two circles meet, shape (2, 2), NaN where they do not: the textbook formula."""
-    between = np.linalg.norm(second - first)
-    along = (between**2 + r1**2 - r2**2) / (2.0 * between)
-    across = np.sqrt(r1**2 - along**2)
-    unit = (second - first) / between
-    return first + along * unit + across * np.array([[1.0], [-1.0]]) * np.array([-unit[1], unit[0]])
+def corners(centres: np.ndarray, radii: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Where each pair of three circles meets, nearest to `at`, by the textbook formula; shape (3, 2), mm."""
+    nearest = []
+    for (first, r1), (second, r2) in combinations(zip(centres, radii, strict=True), 2):
+        between = np.linalg.norm(second - first)
+        along = (between**2 + r1**2 - r2**2) / (2.0 * between)
+        unit = (second - first) / between
+        aside = np.sqrt(r1**2 - along**2) * np.array([-unit[1], unit[0]])
+        both = first + along * unit + np.array([aside, -aside])
+        nearest.append(both[np.argmin(np.linalg.norm(both - at, axis=1))])
+    return np.array(nearest)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -81,27 +87,19 @@ def test_the_mean_of_three_crossings_is_the_textbooks():
     assert fix.found.sum() > 50
     radii = distances(charge, contact[:, 2])
     for i in np.flatnonzero(fix.found):
-        corners = []
-        for a, b in ((0, 1), (0, 2), (1, 2)):
-            both = intersections(centres[a], centres[b], radii[i, a], radii[i, b])
-            corners.append(both[np.argmin(np.linalg.norm(both - contact[i, :2], axis=1))])
-        mean = np.mean(corners, axis=0)
+        crossings = corners(centres, radii[i], contact[i, :2])
+        mean = crossings.mean(axis=0)
         np.testing.assert_allclose(fix.contact[i, :2], mean, atol=1e-4)
-        assert fix.spread[i] == pytest.approx(np.linalg.norm(corners - mean, axis=1).max(), abs=1e-4)
+        assert fix.spread[i] == pytest.approx(np.linalg.norm(crossings - mean, axis=1).max(), abs=1e-4)
 
 
 def test_four_electrodes_average_four_triples():
     charge_map, centres, contact = round_map(CENTRES["four"]), CENTRES["four"], np.array([[1.5, 2.5, 1.0]])
     charge = charge_map.charges(contact) * (1.0 + 0.003 * np.array([1.0, -1.0, 0.5, -0.5]))
     fix = Triangulation(charge_map).locate(charge, 1.0)
-    radii, crossing = distances(charge, 1.0)[0], {}
-    for a in range(4):
-        for b in range(a + 1, 4):
-            both = intersections(centres[a], centres[b], radii[a], radii[b])
-            crossing[a, b] = both[np.argmin(np.linalg.norm(both - contact[0, :2], axis=1))]
-    triples = [(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)]
-    means = [np.mean([crossing[a, b], crossing[a, c], crossing[b, c]], axis=0) for a, b, c in triples]
-    np.testing.assert_allclose(fix.contact[0, :2], np.mean(means, axis=0), atol=1e-4)
+    radii = distances(charge, 1.0)[0]
+    triples = [corners(centres[[*three]], radii[[*three]], contact[0, :2]) for three in combinations(range(4), 3)]
+    np.testing.assert_allclose(fix.contact[0, :2], np.mean(triples, axis=(0, 1)), atol=1e-4)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

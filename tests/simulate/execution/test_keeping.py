@@ -13,43 +13,35 @@ from isocharge.simulate.execution.workers import in_order
 
 
 class Squares:
-    """A function of a job that notes its calls."""
+    """A function of a job that notes its calls, and is interrupted at one of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, stop_at: int | None = None) -> None:
         self.calls: list[int] = []
+        self.stop_at = stop_at
 
     def __call__(self, number: int) -> np.ndarray:
+        if number == self.stop_at:
+            raise KeyboardInterrupt
         self.calls.append(number)
         return np.array([number**2, np.pi * number])
 
 
-def squares_of(executor: Executor | None, numbers, function=None) -> list[list[float]]:
-    return [result.tolist() for result in in_order(executor, function or Squares(), numbers)]
+def kept_squares(folder: Path, squares: Squares, executor: Executor | None = None) -> list[list[float]]:
+    """Two calls of one run."""
+    with resume_parts(folder, {}) as run:
+        keeping = run.keeping("solve", executor)
+        return [result.tolist() for numbers in (range(5), [7]) for result in in_order(keeping, squares, numbers)]
 
 
 @pytest.mark.parametrize("threads", [0, 3])
 def test_results_of_a_stopped_run_are_loaded(tmp_path, threads):
     """Two were computed before the third failed: they are not computed again, the others are; also in a second call."""
-    executor = ThreadPoolExecutor(threads) if threads else None
-    expected = squares_of(None, range(5)) + squares_of(None, [7])
     with pytest.raises(KeyboardInterrupt):
-        compute_two_and_stop(tmp_path / "out")
+        kept_squares(tmp_path / "out", Squares(stop_at=2))
     squares = Squares()
-    with resume_parts(tmp_path / "out", {}) as run:
-        keeping = run.keeping("solve", executor)
-        assert squares_of(keeping, range(5), squares) + squares_of(keeping, [7], squares) == expected
-        assert sorted(path.stem for path in run.folder.rglob("*.npy")) == [f"solve-{n:04d}" for n in range(6)]
+    results = kept_squares(tmp_path / "out", squares, ThreadPoolExecutor(threads) if threads else None)
+    assert results == [[n**2, np.pi * n] for n in (0, 1, 2, 3, 4, 7)]
     assert sorted(squares.calls) == [2, 3, 4, 7]
-
-
-def compute_two_and_stop(folder: Path) -> None:
-    def fail_at_two(number: int) -> np.ndarray:
-        if number == 2:
-            raise KeyboardInterrupt
-        return Squares()(number)
-
-    with resume_parts(folder, {}) as run:
-        squares_of(run.keeping("solve"), range(5), fail_at_two)
 
 
 def test_an_error_of_a_task_is_raised_and_not_kept(tmp_path):
@@ -59,7 +51,7 @@ def test_an_error_of_a_task_is_raised_and_not_kept(tmp_path):
     with resume_parts(tmp_path / "out", {}) as run, ThreadPoolExecutor(1) as pool:
         for executor in (None, pool):
             with pytest.raises(ZeroDivisionError):
-                squares_of(run.keeping("solve", executor), [1], refuse)
+                next(in_order(run.keeping("solve", executor), refuse, [1]))
         assert run.is_empty()
 
 

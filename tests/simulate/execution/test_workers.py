@@ -36,13 +36,9 @@ def expected(tmp_path_factory) -> dict[str, bytes]:
         return sweep_with(executor, tmp_path_factory.mktemp("one") / "presses")
 
 
-def test_bytes_from_two_processes_are_the_same(tmp_path, expected):
-    with local_workers(2) as executor:
-        assert sweep_with(executor, tmp_path / "presses") == expected
-
-
-def test_bytes_from_a_pool_of_ones_own_are_the_same(tmp_path, expected):
-    with ThreadPoolExecutor(3) as executor:
+@pytest.mark.parametrize("pool", [local_workers, ThreadPoolExecutor], ids=["processes", "a pool of one's own"])
+def test_bytes_from_two_workers_are_the_same(tmp_path, expected, pool):
+    with pool(2) as executor:
         assert sweep_with(executor, tmp_path / "presses") == expected
 
 

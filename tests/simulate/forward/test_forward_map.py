@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SceneError, SolveError
-from isocharge.common.progress import listening
 from isocharge.simulate import (
     Circle,
     Domain,
@@ -206,29 +205,9 @@ def test_the_usual_ranges(probe):
     assert error.max() < 5e-3
 
 
-def test_result_does_not_depend_on_the_executor(two_processes):
-    told = []
-    sensor, family = load_sensor("three-25um-biaxial"), {**QUICK, "force_range": (0.9, 1.0), "radius": 1.0}
-    with listening(lambda *step: told.append(step[1:3])):
-        here = ForwardMap.build(sensor, Circle(1.0), **family)
-    there = ForwardMap.build(sensor, Circle(1.0), **family, executor=two_processes)
-    assert here.table.tobytes() == there.table.tobytes()
-    assert here.error == there.error
-    assert told == [(done, 5) for done in range(1, 6)]
-
-
 # Where a family is solved
 
 DOMAIN = Domain(8.0, (0.05, 2.0))
-
-
-def test_nodes_are_chebyshevs_in_the_distance_and_in_the_logarithm_of_the_force():
-    family = Family.spread(DOMAIN, (8, 3), 0.0)
-    low, high = np.log([0.05, 2.0])
-    np.testing.assert_allclose(family.distance, 4.0 * (1.0 + np.polynomial.chebyshev.chebpts1(8)), rtol=1e-12)
-    expected = 0.5 * (low + high) + 0.5 * (high - low) * np.polynomial.chebyshev.chebpts1(3)
-    np.testing.assert_allclose(np.log(family.force), expected, rtol=1e-12)
-    assert family.rotation.tolist() == [0.0]
 
 
 @pytest.mark.parametrize(("folds", "rotations"), [(1, 14), (2, 14), (3, 15), (4, 16)])

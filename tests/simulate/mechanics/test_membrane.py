@@ -142,8 +142,3 @@ def test_patch_of_uniform_strain_is_exact(mesh, tension):
     boundary = mesh.template.on_rim | mesh.template.on_axis
     assert np.abs(forces[~boundary]).max() < 1e-12
     assert np.abs(forces[boundary]).max() > 1e-2
-
-
-def test_gradient_of_a_linear_function_is_constant(mesh):
-    slope = np.einsum("epan,en->epa", mesh.geometry.gradient, (mesh.points @ [2.0, -3.0])[mesh.template.nodes])
-    np.testing.assert_allclose(slope - [2.0, -3.0], 0.0, atol=1e-11)

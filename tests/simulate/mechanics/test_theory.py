@@ -11,7 +11,6 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Film, Polygon, SolveSettings, Theory, load_sensor, press, touch_charge
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared
 from isocharge.simulate.mechanics.theory import (
-    bending_length,
     choose_theory,
     modelling_error,
     theory_by_name,
@@ -110,15 +109,6 @@ def test_amplitude_solves_its_cubic(thickness, pretension, force, poisson):
     groups = DimensionlessGroups.of(film, force, bending=True)
     assert groups.height == pytest.approx(1.0, rel=1e-6)
     assert 0.0 <= groups.induced <= 1.0 + 1e-6
-
-
-def test_bending_length_follows_thickness_and_force(film):
-    """l / a with l = sqrt(D / N): slack, the cube root of the force divides it; tension is in N."""
-    thin, taut = thick(film, 0.001), thick(film, 0.025, 20.0)
-    assert bending_length(thin, 8e-3) == pytest.approx(0.5 * bending_length(thin, 1e-3), rel=1e-2)
-    stiffness = taut.young * taut.thickness**3 / (12.0 * (1.0 - taut.poisson**2))
-    expected = np.sqrt(stiffness / (taut.pretension * taut.thickness)) / taut.radius
-    assert bending_length(taut, 1e-6) == pytest.approx(expected, rel=1e-4)
 
 
 def test_theory_for_a_sensor_serves_all_forces_and_the_surface(film):

@@ -12,7 +12,6 @@ from isocharge.simulate import Circle, Film, Polygon, Probe, Resolution, SolveSe
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, template_for
-from isocharge.simulate.sensor.probe import farthest
 from isocharge.simulate.solver.load_case import LoadCase, choose_mesh
 
 RADIUS = 45.0
@@ -70,20 +69,6 @@ def accuracy(film: np.ndarray, placement: Placement) -> np.ndarray:
     """1e-9 of the size of the elements nearby: those of a small probe are small, those at a near rim too."""
     (distance,), room = np.abs(film[None] - placement.corners.mean()), 1.0 - np.abs(placement.corners).max()
     return 1e-9 * np.minimum(1.0, np.maximum(distance, 1e-3 * room) + np.ptp(np.abs(placement.corners)) + 1e-3)
-
-
-@given(scene=presses(), seed=st.integers(0, 2**32 - 1))
-@COMMON
-def test_locate_inverts_element_points(scene, seed):
-    """Points inside of every element are found in that element, at their local coordinates."""
-    probe, at, resolution, layer = scene
-    placement, mesh = place(FILM, probe, at, resolution, layer).placement, template_for(probe, resolution)
-    xi, eta = np.random.default_rng(seed).uniform(-0.98, 0.98, (2, 4))
-    film = exact_points(placement, mesh, xi, eta).ravel()
-    element, found_xi, found_eta = (found[0] for found in placement.batch().locate(mesh, film[None]))
-    np.testing.assert_array_equal(element, np.repeat(np.arange(mesh.n_element), 4))
-    np.testing.assert_allclose(found_xi.reshape(-1, 4) - xi, 0.0, atol=1e-6)
-    np.testing.assert_allclose(found_eta.reshape(-1, 4) - eta, 0.0, atol=1e-6)
 
 
 @given(scene=presses(), seed=st.integers(0, 2**32 - 1))
@@ -175,41 +160,3 @@ def test_footprint_edge_is_the_right_circle(distance, radius):
     np.testing.assert_allclose(np.abs(placement.to_film(ring)), 1.0, atol=1e-13)
     film = np.sqrt(np.linspace(0.0, 1.0, 99)) * np.exp(1j * np.arange(99.0))
     np.testing.assert_allclose(placement.to_film(placement.to_template(film)), film, atol=1e-10)
-
-
-@given(scene=presses())
-@COMMON
-def test_circle_round_a_polygon_is_on_the_film_and_holds_it(scene):
-    probe, at, resolution, layer = scene
-    placement = place(FILM, probe, at, resolution, layer).placement
-    ring = placement.to_film(placement.rho * np.exp(2j * np.pi * np.arange(400) / 400))
-    assert np.abs(ring).max() < 1.0
-    assert np.abs(placement.corners).max() == pytest.approx(
-        farthest(probe, at) / RADIUS, abs=0.8 * probe.reach / RADIUS
-    )
-    assert np.all(np.abs(placement.to_template(placement.corners)) < placement.rho)
-
-
-def test_area_converges_exponentially_with_the_order():
-    error = []
-    for order in (2, 4, 6):
-        mesh = place(FILM, Circle(5.0), (18.0, 0.0), Resolution(order, 8, 4), 0.05)
-        error.append(abs(2.0 * mesh.geometry.weights.sum() - np.pi))
-    assert error[1] < error[0] / 50.0
-    assert error[2] < error[1] / 50.0
-
-
-def test_placement_of_many_is_each_of_them():
-    probe, resolution = Polygon.triangle(0.1), Resolution(3, 8, 3, 1)
-    mesh, distance, rotation = template_for(probe, resolution), np.array([0.0, 0.2, 0.7]), np.array([0.0, 1.0, -2.0])
-    many = Placement.of(mesh, probe, distance, 1.0, 0.05, rotation)
-    for i in range(3):
-        alone = Placement.of(mesh, probe.rotated(rotation[i]), distance[i], 1.0, 0.05)
-        for name in ("c", "rho", "corners", "start", "end", "depth"):
-            np.testing.assert_allclose(getattr(many, name)[i], getattr(alone, name), atol=1e-12)
-    film = np.array([[0.1 + 0.2j, 0.75 - 0.03j, -0.9j, 0.0]] * 3)
-    together = many.locate(mesh, film)
-    for i in range(3):
-        alone = many[np.array([i])].locate(mesh, film[i : i + 1])
-        for one, every in zip(alone, together, strict=True):
-            np.testing.assert_array_equal(one[0], every[i])

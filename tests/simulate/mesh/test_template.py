@@ -69,29 +69,3 @@ def test_template_is_half_a_disk_for_circles_only(built):
     assert built.half == (built.corners == 0)
     assert built.copies == (2 if built.half else 1)
     assert built.on_axis.any() == built.half
-
-
-def test_elements_are_permuted_by_a_rotation_of_the_probe(built):
-    """Going round by one corner as often as there are corners is the identity; neighbours stay neighbours."""
-    if built.half:
-        return
-    every = np.arange(built.n_element)
-    once = built.rotated(1, built.n_corner)
-    assert sorted(once) == every.tolist()
-    again = every
-    for _ in range(built.n_corner):
-        again = once[again]
-    np.testing.assert_array_equal(again, every)
-    np.testing.assert_array_equal(built.rotated(0, 1), every)
-    shared = {frozenset((a, b)) for a, b in _neighbours(built)}
-    assert {frozenset((int(once[a]), int(once[b]))) for a, b in _neighbours(built)} == shared
-
-
-def _neighbours(mesh: Template) -> list[tuple[int, int]]:
-    seen: dict[frozenset, int] = {}
-    pairs = []
-    for number, edge in enumerate(edges_of(mesh)):
-        if edge in seen:
-            pairs.append((seen[edge], number // 4))
-        seen[edge] = number // 4
-    return pairs

@@ -56,23 +56,6 @@ def test_round_trip(width, height, angle):
             np.testing.assert_allclose(read.outline, probe.outline, rtol=0.0, atol=1e-10 * probe.reach)
 
 
-@given(
-    gaps=st.lists(st.floats(0.3, 1.0), min_size=3, max_size=20),
-    size=st.floats(0.05, 100.0),
-    angle=st.floats(-10.0, 10.0),
-    x=st.floats(-1.0, 1.0),
-    y=st.floats(-1.0, 1.0),
-)
-@COMMON
-def test_polygon_round_trip(gaps, size, angle, x, y):
-    direction = 2.0 * np.pi * np.cumsum(gaps) / np.sum(gaps)
-    corners = size * np.stack([x + np.cos(direction), y + np.sin(direction)], axis=1)
-    if np.max(np.diff(direction, append=direction[0] + 2.0 * np.pi)) > 0.95 * np.pi:
-        return
-    probe = Polygon.of(corners, angle)
-    np.testing.assert_allclose(again(probe).outline, probe.outline, rtol=0.0, atol=1e-8 * probe.reach)
-
-
 def test_notation_is_in_mm():
     assert Circle(0.3).notation == "circle:0.3"
     assert Polygon.rectangle(4.0, 2.0, 1.0).notation == "rectangle:4.0x2.0"

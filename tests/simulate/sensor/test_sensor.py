@@ -166,16 +166,6 @@ def test_rotation_by_the_layouts_own_angle_permutes():
     np.testing.assert_allclose(touch_charge(rotated, solved), expected, rtol=1e-12)
 
 
-def test_rotation_of_the_layout_is_the_press_rotated_back_on_a_biaxial_film(three):
-    """d31 = d32: only the trace counts."""
-    angle, z = np.deg2rad(25.0), complex(4.0, 2.0)
-    back = z * np.exp(-1j * angle)
-    rotated = replace(three, calibration=Calibration(rotation=angle))
-    charge = touch_charge(rotated, press(three.film, Circle(1.0), (z.real, z.imag), 1.0))
-    expected = touch_charge(three, press(three.film, Circle(1.0), (back.real, back.imag), 1.0))
-    np.testing.assert_allclose(charge, expected, rtol=1e-9)
-
-
 def test_sensors_are_values(three):
     assert three == load_sensor("three-25um-biaxial") != load_sensor("three-25um-uniaxial")
     assert three.film == Film(radius=45.0, thickness=0.025, young=3000.0, poisson=0.34)

@@ -53,9 +53,8 @@ def test_impossible_presses_are_refused(film, probe, at, force, message):
 
 
 def test_a_probe_below_what_the_grading_resolves_is_refused(film):
-    with pytest.raises(
-        SceneError, match=r"expected a reach of at least 1e-05 of the film's radius \(4500 mm\), got 0\.03"
-    ):
+    message = r"expected a reach of at least 1e-05 of the film's radius \(4500 mm\), got 0\.03"
+    with pytest.raises(SceneError, match=message):
         press(replace(film, radius=4500.0), Circle(0.03), (0.0, 0.0), 1.0)
 
 
@@ -86,15 +85,6 @@ def test_stress_of_a_linear_field_is_constant_and_rotated(film, made_up, at):
     np.testing.assert_allclose(nodal - local, 0.0, atol=1e-9 * np.abs(local).max())
 
 
-def test_deflection_of_a_linear_field_is_linear(made_up):
-    """To the mesh's accuracy: points are found by the exact map, the field lives on its interpolant."""
-    at, points = (-3.0, 4.0), np.random.default_rng(1).uniform(-25.0, 25.0, (50, 2))
-    angle = np.arctan2(at[1], at[0])
-    along, across = points @ [np.cos(angle), np.sin(angle)], points @ [-np.sin(angle), np.cos(angle)]
-    solved = made_up(lambda x: x @ np.array([[0.0, 0.0, 0.4], [0.0, 0.0, -0.6]]), at)
-    np.testing.assert_allclose(deflection(solved, points), np.sqrt(0.1) * (0.4 * along - 0.6 * across), atol=5e-4)
-
-
 @pytest.mark.parametrize("surface", ["middle", "top"])
 def test_rigid_rotation_has_no_stress_and_no_charge(film, made_up, surface):
     """Out of plane by 50 degrees, then by 20 in the plane."""
@@ -109,12 +99,6 @@ def test_rigid_rotation_has_no_stress_and_no_charge(film, made_up, surface):
 
 
 # Real ones
-
-
-def test_clamped_rim_does_not_move(film):
-    angle = np.linspace(0.0, 2.0 * np.pi, 40)
-    rim = film.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    assert np.abs(deflection(press(film, Polygon.triangle(4.0, 0.3), (6.0, -5.0), 1.0), rim)).max() < 1e-12
 
 
 def test_vertical_forces_balance_round_the_probe(film):

@@ -10,19 +10,15 @@ from isocharge.simulate import (
     Circle,
     Film,
     Polygon,
-    Probe,
     Resolution,
     SolveSettings,
-    Theory,
-    deflection,
     load_sensor,
     press,
     touch_charge,
 )
-from isocharge.simulate.mesh.placed_mesh import Geometry, place
-from isocharge.simulate.solver.error_estimate import estimated_error, mesh_error, relative_difference
+from isocharge.simulate.solver.error_estimate import estimated_error, mesh_error
 from isocharge.simulate.solver.load_case import LoadCase, needs_second_mesh
-from isocharge.simulate.solver.press import needed_resolution, resampled
+from isocharge.simulate.solver.press import needed_resolution
 
 FILM = Film(45.0, 0.025, 3000.0, 0.34)
 INNER = (Circle(1.0), (8.0, 2.0), 1.0)
@@ -41,21 +37,6 @@ def test_needed_resolution_is_known_without_a_solve_where_shapes_predict_the_err
     assert needed_resolution(FILM, *NEAR_THE_RIM, SolveSettings(resolution=given)) == given
     with pytest.raises(SceneError):
         needed_resolution(FILM, Circle(1.0), (44.5, 0.0), 1.0)
-
-
-def test_geometry_of_a_mesh_is_built_once(monkeypatch):
-    """For choice, solve and error estimate together: as often as meshes are tried, each other points."""
-    built, build = [], Geometry.build.__func__
-
-    def counted(cls, template, points):
-        built.append((template.resolution, points.tobytes()))
-        return build(cls, template, points)
-
-    monkeypatch.setattr(Geometry, "build", classmethod(counted))
-    for scene in (INNER, NEAR_THE_RIM):
-        built.clear()
-        assert mesh_error(press(FILM, *scene)) > 0.0
-        assert len(set(built)) == len(built) > 0
 
 
 # Two meshes
@@ -96,29 +77,6 @@ def test_mesh_error_bounds_the_difference_from_a_finer_mesh(scene):
     settings = SolveSettings(theory=solved.theory, resolution=finer, layer=solved.mesh.layer)
     refined = press(film, probe, at, force, settings, start=solved)
     assert worst_error(film, solved, refined) <= mesh_error(solved) < 0.01
-
-
-@pytest.mark.parametrize("probe", [Circle(1.0), Polygon.rectangle(4.0, 2.0, 0.3)], ids=["circle", "rectangle"])
-def test_a_resampled_field_is_the_same_field(probe: Probe):
-    """Up: the same polynomials, to round-off; and down again."""
-    solved = press(FILM, probe, (6.0, 1.0), 1.0)
-    before = solved.mesh.template
-    mesh = place(
-        FILM, probe, solved.at, replace(before.resolution, order=before.resolution.order + 3), solved.mesh.layer
-    )
-    raised = replace(solved, mesh=mesh, field=resampled(solved.field, before, mesh.template))
-    points = np.random.default_rng(0).uniform(-20.0, 20.0, (200, 2))
-    np.testing.assert_allclose(deflection(raised, points), deflection(solved, points), atol=1e-12 * FILM.radius)
-    np.testing.assert_allclose(resampled(raised.field, mesh.template, before), solved.field, atol=1e-12)
-
-
-def test_relative_difference_is_that_of_charges():
-    """Of charges, which go with the force where the theory is linear; nothing between a press and itself."""
-    settings = SolveSettings(theory=Theory(stretching=False, bending=True, pretensioned=True))
-    film = replace(FILM, pretension=5.0)
-    one, more = (press(film, Circle(1.0), (9.0, 0.0), force, settings) for force in (1e-5, 1.01e-5))
-    assert relative_difference(one, one) == 0.0
-    assert relative_difference(one, more) == pytest.approx(1.0 - 1.0 / 1.01**2, rel=1e-3)
 
 
 @pytest.mark.parametrize(

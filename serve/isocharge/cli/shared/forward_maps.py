@@ -1,13 +1,15 @@
-"""Who solves for a command, the radius of a sweep, and what its presses do to the film."""
+"""Who solves for a command, what a stopped one says, the radius of a sweep, and what its presses do to the film."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
 
 from isocharge.cli.shared.options import most_workers, radius_mm_of
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError, IsochargeError
+from isocharge.common.resumable_run import draft_of
 from isocharge.simulate import Film, Probe, Sensor, noise_model, working_area
 from isocharge.simulate.execution.workers import dask_workers, local_workers
 from isocharge.simulate.identifiability.identification import map_to_search
@@ -26,6 +28,18 @@ def executor_for(workers: int | None, cluster: str | None) -> AbstractContextMan
     if workers and cluster:
         raise InputError("expected either --workers or --cluster, got both")
     return dask_workers(cluster) if cluster else local_workers(most_workers(workers))
+
+
+@contextmanager
+def shown_run(target: Path) -> Iterator[None]:
+    """Progress of a resumable run as bars; if the user stops it, say that the same command goes on."""
+    try:
+        with shown_progress():
+            yield
+    except KeyboardInterrupt:
+        if (part := draft_of(target)).exists():
+            say(f"stopped; what is done is kept in {part}, and the same command goes on from there")
+        raise
 
 
 def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tuple[float, float]) -> float:

@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from isocharge.cli.shared.terminal import say, shown_progress
-from isocharge.common.resumable_run import ResumableRun, draft_of, resume_parts
+from isocharge.cli.shared.forward_maps import shown_run
+from isocharge.cli.shared.terminal import say
+from isocharge.common.resumable_run import ResumableRun, resume_parts
 from isocharge.train import Release
 
 ModelFolderOption = Annotated[
@@ -36,13 +37,8 @@ def release_resumably(
         fresh: Throw away what an earlier run left.
         json: Print the folder and the errors as one JSON object.
     """
-    try:
-        with resume_parts(target, identity, fresh=fresh) as run, shown_progress():
-            release = fit_and_release(run)
-    except KeyboardInterrupt:
-        if (part := draft_of(target)).exists():
-            say(f"stopped; what is done is kept in {part}, and the same command goes on from there")
-        raise
+    with shown_run(target), resume_parts(target, identity, fresh=fresh) as run:
+        release = fit_and_release(run)
     errors = release.metadata.errors
     if json:
         typer.echo(json_module.dumps({"folder": str(release.folder), "errors": dict(errors)}))

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import caution_of_stress, executor_for
+from isocharge.cli.shared.forward_maps import caution_of_stress, executor_for, shown_run
 from isocharge.cli.shared.options import (
     ForceOption,
     FreshOption,
@@ -15,10 +15,10 @@ from isocharge.cli.shared.options import (
     StressLimitOption,
     WorkersOption,
 )
-from isocharge.cli.shared.terminal import say, shown_progress
+from isocharge.cli.shared.terminal import say
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
-from isocharge.common.resumable_run import draft_of, refuse_finished, resume_parts
+from isocharge.common.resumable_run import refuse_finished, resume_parts
 from isocharge.simulate import Circle, load_sensor, noise_model, parse_probe
 from isocharge.simulate.artwork.design_folder import write_design
 from isocharge.simulate.artwork.leads import straight_leads
@@ -101,14 +101,13 @@ def design_command(
         "case": case.to_dict(),
         "weights": case.goal.table.tolist() if isinstance(case.goal, WeightMap) else None,
     }
-    try:
-        with resume_parts(output, identity, fresh=fresh) as run, executor_for(workers, None) as pool, shown_progress():
-            found = design(case, executor=run.keeping("design", pool))
-            write_design(found, output)
-    except KeyboardInterrupt:
-        if (part := draft_of(output)).exists():
-            say(f"stopped; what is done is kept in {part}, and the same command goes on from there")
-        raise
+    with (
+        shown_run(output),
+        resume_parts(output, identity, fresh=fresh) as run,
+        executor_for(workers, None) as pool,
+    ):
+        found = design(case, executor=run.keeping("design", pool))
+        write_design(found, output)
     typer.echo(_table(found))
     caution = "" if found.unambiguous else "caution: "
     say(f"{caution}{found.summary}; {straight_leads(found.sensor).summary}; files in {output}")

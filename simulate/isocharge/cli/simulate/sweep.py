@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import caution_of_stress, executor_for, sweep_radius
+from isocharge.cli.shared.forward_maps import caution_of_stress, executor_for, shown_run, sweep_radius
 from isocharge.cli.shared.options import (
     PROBE_HELP,
     ClusterOption,
@@ -18,9 +18,9 @@ from isocharge.cli.shared.options import (
     StressLimitOption,
     WorkersOption,
 )
-from isocharge.cli.shared.terminal import say, shown_progress
+from isocharge.cli.shared.terminal import say
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
-from isocharge.common.resumable_run import draft_of, refuse_finished
+from isocharge.common.resumable_run import refuse_finished
 from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
 
 
@@ -73,13 +73,8 @@ def sweep_command(
     film_sensor, probes = load_sensor(sensor), [parse_probe(text) for text in probe or ["circle:1.0"]]
     refuse_finished(output)
     caution_of_stress(film_sensor.film, probes, force[1], stress_limit)
-    try:
-        with executor_for(workers, cluster) as executor, shown_progress():
-            reach = sweep_radius(radius, film_sensor, probes, force)
-            sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)
-            run_sweep(output, film_sensor, probes, sweep, executor=executor, fresh=fresh)
-    except KeyboardInterrupt:
-        if (part := draft_of(output)).exists():
-            say(f"stopped; what is done is kept in {part}, and the same command goes on from there")
-        raise
+    with shown_run(output), executor_for(workers, cluster) as executor:
+        reach = sweep_radius(radius, film_sensor, probes, force)
+        sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)
+        run_sweep(output, film_sensor, probes, sweep, executor=executor, fresh=fresh)
     say(f"{json_module.loads((output / 'manifest.json').read_text())['samples']} presses in {output}")

@@ -60,16 +60,13 @@ def straight_leads(sensor: Sensor, width: float = 0.3, clearance: float = 0.3) -
     return Leads({name: paths[name] for name in centres if name in paths}, without, width)
 
 
-def _ways(centre: Array, radius: float) -> list[Array]:
-    """Straight ways from a place to the rim, the shortest first."""
-    outward = np.arctan2(centre[1], centre[0])
-    ways = []
-    for angle in outward + TURNS:
-        direction = np.array([np.cos(angle), np.sin(angle)])
-        along = float(centre @ direction)
-        length = np.sqrt(radius**2 - centre @ centre + along**2) - along
-        ways.append(np.stack([centre, centre + length * direction]))
-    return ways
+def _ways(centre: Array, radius: float) -> Array:
+    """Straight ways from a place to the rim, the shortest first, shape (n, 2, 2), mm."""
+    angle = np.arctan2(centre[1], centre[0]) + TURNS
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    along = direction @ centre
+    length = np.sqrt(radius**2 - centre @ centre + along**2) - along
+    return np.stack([np.broadcast_to(centre, direction.shape), centre + length[:, None] * direction], axis=1)
 
 
 def _from_box(points: Array, electrode: Electrode) -> float:

@@ -10,7 +10,7 @@ from scipy.ndimage import minimum_filter
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap
-from isocharge.simulate.numerics.disk import onto_disk
+from isocharge.simulate.numerics.disk import INSIDE, onto_disk
 
 NODE_SPACING = 0.6
 """Distance of the grid's nodes, mm: contours bend little on this scale."""
@@ -21,9 +21,6 @@ FORCES = 24
 FLAT = 0.02
 """Lower bound for the slope of a charge, relative to the electrode's median slope, dimensionless: where the charge map
 is flat, distance = difference / slope would be infinite."""
-
-INSIDE = 1.0 - 1e-9
-"""Radius that is searched, relative to the map's: rounding must not leave the disk."""
 
 
 @dataclass(frozen=True)

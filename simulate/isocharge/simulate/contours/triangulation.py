@@ -16,11 +16,11 @@ from itertools import combinations
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.contours.candidates import FLAT, INSIDE, Candidates, SeedGrid
+from isocharge.simulate.contours.candidates import FLAT, Candidates, SeedGrid
 from isocharge.simulate.contours.fix import AMBIGUOUS, APART, RESOLVED, TOLERANCE, Fix, Meeting, check_triangulation
 from isocharge.simulate.forward.charge_map import ChargeMap, as_charges, check_forces, linearised
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
-from isocharge.simulate.numerics.disk import onto_disk
+from isocharge.simulate.numerics.disk import INSIDE, onto_disk
 
 SECOND_SEARCH = 2.0
 """Distance from a meeting at which the search for a second one starts, in tolerances."""

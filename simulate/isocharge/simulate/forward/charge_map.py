@@ -43,8 +43,7 @@ class Domain:
     def to_unit(self, contact: Array) -> Array:
         """Contacts (x, y, F), shape (n, 3), to [-1, 1]^3: (x, y, ln F), centred and scaled."""
         logs = np.stack([contact[:, 0], contact[:, 1], np.log(contact[:, 2])], axis=1)
-        unit: Array = (logs - self.centre) / self.scale
-        return unit
+        return np.asarray((logs - self.centre) / self.scale)
 
     def to_contact(self, unit: Array) -> Array:
         """The inverse of `to_unit`: shape (..., 3) to (x, y, F), shape (..., 3)."""
@@ -198,8 +197,7 @@ def check_forces(force: Array | float, force_range: tuple[float, float], source:
 
 def _are_within(force: Array, force_range: tuple[float, float]) -> Booleans:
     """Which forces lie in a range; NaN does not."""
-    within: Booleans = (force >= force_range[0] / SLACK) & (force <= force_range[1] * SLACK)
-    return within
+    return np.asarray((force >= force_range[0] / SLACK) & (force <= force_range[1] * SLACK))
 
 
 def check_radius(radius: float, largest: float, source: str) -> None:

@@ -84,11 +84,8 @@ class ChargeSpline:
         film, force = forward_map.sensor.film, _force_nodes(forward_map)
         cells = int(np.clip(np.ceil(2.0 * domain.radius / spacing), *CELLS))
         at = domain.radius * _samples(cells)
-        contact = np.column_stack([at, np.empty(len(at))])
-        columns = []
-        for f in force.tolist():
-            contact[:, 2] = f
-            columns.append(forward_map.charges(contact) / amplitude_squared(film, f))
+        presses = [(f, np.column_stack([at, np.full(len(at), f)])) for f in force.tolist()]
+        columns = [forward_map.charges(contact) / amplitude_squared(film, f) for f, contact in presses]
         table = _least_squares(at, np.stack(columns, axis=1), domain.radius, cells)
         spline = cls(forward_map.electrodes, film, domain, force, table, np.nan)
         return replace(spline, error=_largest_error(spline, forward_map))
@@ -100,8 +97,7 @@ class ChargeSpline:
             SceneError: If a contact lies outside the domain.
         """
         self.domain.check(contact, "table")
-        charge: Array = np.einsum("nk,nke->ne", self.by_force(np.log(contact[:, 2])), self.terms(contact[:, :2]))
-        return charge
+        return np.asarray(np.einsum("nk,nke->ne", self.by_force(np.log(contact[:, 2])), self.terms(contact[:, :2])))
 
     def derivatives(self, contact: Array) -> Array:
         """d(Q)/d(x, y, ln F) of contacts (x, y, F): shape (n, 3) to (n, n_electrode, 3), pC/mm, pC/mm and pC.
@@ -142,8 +138,7 @@ class ChargeSpline:
 
     def terms(self, position: Array) -> Array:
         """Scaled charges at the table's forces: positions (x, y), shape (n, 2), mm, to (n, n_term, n_electrode)."""
-        terms: Array = self.table(position)
-        return terms
+        return np.asarray(self.table(position))
 
     def slopes(self, position: Array) -> Array:
         """Derivatives of `terms` by x and y, shape (n, n_term, n_electrode, 2), 1/mm."""
@@ -160,8 +155,7 @@ def _force_nodes(forward_map: ForwardMap) -> Array:
     low, high = np.log(forward_map.domain.force_range)
     if forward_map.sensor.piezo.d33 == 0.0 or low == high:
         return forward_map.family.force
-    nodes: Array = np.exp(chebyshev_nodes(forward_map.family.force.size + MORE_FORCES, low, high))
-    return nodes
+    return np.asarray(np.exp(chebyshev_nodes(forward_map.family.force.size + MORE_FORCES, low, high)))
 
 
 def _samples(cells: int) -> Array:

@@ -71,8 +71,7 @@ class Family:
         logs = np.log(self.force)
         by_force = lagrange_values(logs, barycentric_weights(logs), np.log(force))
         both = by_distance[:, :, None, None] * by_force[:, None, :, None]
-        weights: Array = (both * self._by_rotation(rotation)[:, None, None, :]).reshape(distance.size, -1)
-        return weights
+        return np.asarray((both * self._by_rotation(rotation)[:, None, None, :]).reshape(distance.size, -1))
 
     def _by_rotation(self, rotation: Array) -> Array:
         """Trigonometric interpolation on an even spread: each weight is a Dirichlet kernel, shape (n, n_rotation)."""
@@ -81,8 +80,7 @@ class Family:
         kernel = 1.0 + 2.0 * np.cos(phase).sum(axis=-1)
         if self.rotation.size % 2 == 0:
             kernel = kernel + np.cos(0.5 * self.rotation.size * (rotation[:, None] - self.rotation))
-        by_rotation: Array = kernel / self.rotation.size
-        return by_rotation
+        return np.asarray(kernel / self.rotation.size)
 
     def solve(self, sensor: Sensor, probe: Probe, settings: SolveSettings, executor: Executor | None) -> Array:
         """Scaled stress at the nodes, as `unfold` takes it: (n_distance, n_solved_rotation, n_force, ...).
@@ -113,8 +111,7 @@ class Family:
             rotate_stress(field[..., mesh.rotated(fold, self.folds), :, :], -2.0 * np.pi * fold / self.folds)
             for fold in range(self.folds)
         ]
-        unfolded: Array = np.concatenate(parts, axis=2).reshape(-1, solved.shape[-1])
-        return unfolded
+        return np.asarray(np.concatenate(parts, axis=2).reshape(-1, solved.shape[-1]))
 
     def probes_between(self, count: int) -> Iterator[tuple[float, float, float, float]]:
         """Presses to check the interpolation with: between the nodes and, last, at the edge of the family.

@@ -96,8 +96,7 @@ class FilmGrid:
     def weights(self, axis: str, at: float) -> Array:
         """Interpolation weights of an axis at one value, shape (n_node,)."""
         nodes = _stretched(axis, getattr(self, axis))
-        weights: Array = lagrange_values(nodes, barycentric_weights(nodes), np.array([_stretched(axis, at)]))[0]
-        return weights
+        return np.asarray(lagrange_values(nodes, barycentric_weights(nodes), np.array([_stretched(axis, at)]))[0])
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -212,8 +212,7 @@ class ForwardMap:
         corners = [self.sensor.calibration.place(np.array(e.corners)) for e in self.sensor.electrodes]
         centre = np.array([c.mean(axis=0) @ [1.0, 1j] for c in corners])
         reach = np.array([np.linalg.norm(c - c.mean(axis=0), axis=1).max() for c in corners])
-        near: np.ndarray = np.abs(at[:, None] - centre) < reach + self.probe.reach + NEAR
-        return near
+        return np.asarray(np.abs(at[:, None] - centre) < reach + self.probe.reach + NEAR)
 
     def _read(
         self,
@@ -238,8 +237,7 @@ class ForwardMap:
         local = np.matmul(values[:, None, :], nodal.reshape(*values.shape, 3)).reshape(*position.shape, 3)
         local[mirrored, 2] *= -1.0
         stress = rotate_stress(local, (angle if mesh.half else angle + frame[press_index])[:, None])
-        charge: Array = np.einsum("kpc,kpc->k", stress, readout.weights[electrode])
-        return charge
+        return np.asarray(np.einsum("kpc,kpc->k", stress, readout.weights[electrode]))
 
 
 def relative_error(

@@ -13,9 +13,9 @@ from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.force_profile import ForceProfile
-from isocharge.simulate.identifiability.nearest_contact import INSIDE, nearest_contact
+from isocharge.simulate.identifiability.nearest_contact import nearest_contact
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.numerics.disk import lattice
+from isocharge.simulate.numerics.disk import INSIDE, lattice
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 INDISTINGUISHABLE_SIGMAS = 3.0

@@ -24,9 +24,8 @@ from scipy.ndimage import minimum_filter
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
-from isocharge.simulate.identifiability.nearest_contact import INSIDE
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.numerics.disk import Rings, onto_disk
+from isocharge.simulate.numerics.disk import INSIDE, Rings, onto_disk
 
 FINEST = 0.02
 """Distance within which a map turns over at a fold, mm. Beside an electrode it may turn over within 0.1 mm and yet lose

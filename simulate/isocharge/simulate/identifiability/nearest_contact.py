@@ -11,13 +11,11 @@ from scipy.stats import qmc
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.numerics.disk import INSIDE
 from isocharge.simulate.numerics.disk_least_squares import MOST_STEPS, minimise
 
 STEPS = 8
 """Steps from a start that is near: most charges need five."""
-
-INSIDE = 1.0 - 1e-9
-"""Radius that is searched, relative to the map's: rounding must not leave the disk."""
 
 CANDIDATES = 4096
 """Contacts among which starts are chosen: spread over the domain, and a quarter as many along its rim."""

@@ -108,8 +108,7 @@ class Membrane:
         total = stress(strain(slope, self.groups.amplitude2), self.groups.poisson)
         traction = _tensor(total) @ self._stretch(slope) + self.groups.tension * self._scale * slope
         traction *= geometry.weights[..., None, None]
-        forces: Array = geometry.stacked.transpose(0, 2, 1) @ traction.reshape(len(traction), -1, 3)
-        return forces
+        return np.asarray(geometry.stacked.transpose(0, 2, 1) @ traction.reshape(len(traction), -1, 3))
 
     def tangent(self, field: Array) -> Array:
         """Second derivative of the energy, element by element.
@@ -181,8 +180,7 @@ class Bending:
     def laplacian(self, deflection: Array) -> Array:
         """lap W at the nodes, shape (n_node,), from W at the nodes."""
         weak = self._laplace @ deflection[self.geometry.nodes][..., None]
-        laplacian: Array = -self.geometry.gather(weak[..., 0]) / self._mass
-        return laplacian
+        return np.asarray(-self.geometry.gather(weak[..., 0]) / self._mass)
 
     def energy(self, deflection: Array) -> float:
         """Bending energy of a nodal deflection, shape (n_node,)."""
@@ -191,8 +189,7 @@ class Bending:
     def forces(self, deflection: Array) -> Array:
         """Gradient of the energy, element by element, shape (n_element, n_local)."""
         laplacian = self.laplacian(deflection)[self.geometry.nodes]
-        forces: Array = -self.stiffness * (self._laplace @ laplacian[..., None])[..., 0]
-        return forces
+        return np.asarray(-self.stiffness * (self._laplace @ laplacian[..., None])[..., 0])
 
     def extend(self, tangent: Array) -> Array:
         """Element matrices over (U1, U2, W, mu) from those over (U1, U2, W).

@@ -32,8 +32,7 @@ def enclosing_circle(corners: Complexes, at: Array) -> tuple[Array, Array]:
     def radius(centre: Array) -> Array:
         reach = np.abs(corners - centre[..., None]).max(axis=-1)
         room = np.minimum(CLEARANCE * reach, INNER_SHARE * gap)
-        total: Array = reach + room
-        return total
+        return np.asarray(reach + room)
 
     fits = at + radius(at) <= 1.0 - OUTER_SHARE * gap
     if np.all(fits):
@@ -87,8 +86,7 @@ def stretch_angles(angle: Array, factor: Array) -> Array:
     |z| = rho is carried onto its circle with the factor (1 - c rho) / (1 + c rho), rho = 1 onto the rim.
     """
     turns = 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
-    stretched: Array = turns + 2.0 * np.arctan(factor[..., None] * np.tan(0.5 * (angle - turns)))
-    return stretched
+    return np.asarray(turns + 2.0 * np.arctan(factor[..., None] * np.tan(0.5 * (angle - turns))))
 
 
 def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:

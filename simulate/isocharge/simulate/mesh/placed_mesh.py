@@ -56,8 +56,7 @@ class Geometry:
 
     def gather(self, local: Array) -> Array:
         """Add up element contributions of shape (n_element, n_local) at the nodes, shape (n_node,)."""
-        gathered: Array = np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64)
-        return gathered
+        return np.asarray(np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +86,7 @@ class PlacedMesh:
     @property
     def node_points(self) -> Complexes:
         """Film points of the nodes, shape (n_node,), in film radii."""
-        nodes: Complexes = self.points.ravel()[self.template.first_seen]
-        return nodes
+        return np.asarray(self.points.ravel()[self.template.first_seen])
 
     @cached_property
     def geometry(self) -> Geometry:

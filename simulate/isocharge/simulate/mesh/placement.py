@@ -113,14 +113,12 @@ class Placement:
     def to_film(self, z: Complexes) -> Complexes:
         """Template points, shape (..., n), to film points (unit radius)."""
         c = self.c[..., None]
-        points: Complexes = (z + c) / (1.0 + c * z)
-        return points
+        return np.asarray((z + c) / (1.0 + c * z))
 
     def to_template(self, points: Complexes) -> Complexes:
         """Film points (unit radius), shape (..., n), to template points."""
         c = self.c[..., None]
-        z: Complexes = (points - c) / (1.0 - c * points)
-        return z
+        return np.asarray((points - c) / (1.0 - c * points))
 
     def element_points(self, blocks: Blocks) -> Complexes:
         """Film points of every element's nodes for one placement, shape (n_element, (order + 1)^2), unit radius."""
@@ -163,8 +161,7 @@ class Placement:
 
         def edge(number: Integers) -> Array:
             start, end = (np.take_along_axis(angles, number, axis=1) for angles in (self.start, self.end))
-            at: Array = start + depth * (end - start)
-            return at
+            return np.asarray(start + depth * (end - start))
 
         angle = np.angle(z)
         if not blocks.half:
@@ -220,5 +217,4 @@ class Placement:
 def _left(start: Complexes, end: Complexes, at: Complexes) -> Array:
     """Distance of points to the left of directed lines."""
     direction = end - start
-    left: Array = ((at - start) * np.conj(direction)).imag / np.maximum(np.abs(direction), 1e-300)
-    return left
+    return np.asarray(((at - start) * np.conj(direction)).imag / np.maximum(np.abs(direction), 1e-300))

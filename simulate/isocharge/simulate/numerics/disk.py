@@ -6,11 +6,13 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 
+INSIDE = 1.0 - 1e-9
+"""Radius that is searched, relative to a map's: rounding must not leave the disk."""
+
 
 def onto_disk(position: Array, radius: float) -> Array:
     """Positions (x, y), shape (n, 2), those outside the disk moved onto its edge, in the unit of the radius."""
-    onto: Array = position / np.maximum(1.0, np.hypot(*position.T) / radius)[:, None]
-    return onto
+    return np.asarray(position / np.maximum(1.0, np.hypot(*position.T) / radius)[:, None])
 
 
 @dataclass(frozen=True)
@@ -54,20 +56,17 @@ def lattice(most: int) -> Complexes:
     ring = rings[np.searchsorted(np.cumsum(counts), max(most, 1), side="right") - 1]
     inside = np.flatnonzero(squared <= ring)
     inside = inside[np.lexsort((j[inside], i[inside], squared[inside]))]
-    points: Complexes = (i[inside] + 1j * j[inside]) / max(np.sqrt(ring), 1.0) * (1.0 - 1e-15)
-    return points
+    return np.asarray((i[inside] + 1j * j[inside]) / max(np.sqrt(ring), 1.0) * (1.0 - 1e-15))
 
 
 def square_grid(radius: float, spacing: float) -> Array:
     """Places of a square grid through the centre of a disk, shape (n, 2), in the unit of the radius."""
     count = int(radius / spacing * (1.0 + 1e-9))
     x, y = (axis.ravel() for axis in np.meshgrid(*[spacing * np.arange(-count, count + 1)] * 2))
-    places: Array = np.stack([x, y], axis=1)[np.hypot(x, y) <= radius * (1.0 + 1e-9)]
-    return places
+    return np.asarray(np.stack([x, y], axis=1)[np.hypot(x, y) <= radius * (1.0 + 1e-9)])
 
 
 def sunflower(count: int) -> Complexes:
     """`count` points x + iy spread evenly over the unit disk, from the inside out (Vogel 1979)."""
     number = np.arange(count)
-    points: Complexes = np.sqrt((number + 0.5) / count) * np.exp(1j * np.pi * (3.0 - np.sqrt(5.0)) * number)
-    return points
+    return np.asarray(np.sqrt((number + 0.5) / count) * np.exp(1j * np.pi * (3.0 - np.sqrt(5.0)) * number))

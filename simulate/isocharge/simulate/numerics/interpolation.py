@@ -49,8 +49,7 @@ def _frozen(values: Array) -> Array:
 def chebyshev_nodes(count: int, low: float, high: float) -> Array:
     """Chebyshev nodes of the first kind on [low, high], ascending, shape (count,)."""
     angle = (2.0 * np.arange(count, 0, -1) - 1.0) * np.pi / (2.0 * count)
-    nodes: Array = 0.5 * (low + high) + 0.5 * (high - low) * np.cos(angle)
-    return nodes
+    return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * np.cos(angle))
 
 
 def barycentric_weights(nodes: Array) -> Array:
@@ -58,8 +57,7 @@ def barycentric_weights(nodes: Array) -> Array:
     scale = 4.0 / np.ptp(nodes) if nodes.size > 1 else 1.0
     difference = (nodes[:, None] - nodes[None, :]) * scale
     np.fill_diagonal(difference, 1.0)
-    weights: Array = 1.0 / difference.prod(axis=1)
-    return weights
+    return np.asarray(1.0 / difference.prod(axis=1))
 
 
 def lagrange_values(nodes: Array, weights: Array, at: Array) -> Array:

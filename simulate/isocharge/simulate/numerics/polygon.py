@@ -19,8 +19,7 @@ def centroid_of(corners: Array) -> Array:
     origin = corners.mean(axis=0)
     at, following = corners - origin, np.roll(corners - origin, -1, axis=0)
     cross = at[:, 0] * following[:, 1] - at[:, 1] * following[:, 0]
-    centroid: Array = origin + np.sum((at + following) * cross[:, None], axis=0) / (3.0 * cross.sum())
-    return centroid
+    return np.asarray(origin + np.sum((at + following) * cross[:, None], axis=0) / (3.0 * cross.sum()))
 
 
 def is_convex(corners: Array) -> bool:

@@ -5,6 +5,7 @@ It needs matplotlib, so it is imported only where a picture is drawn.
 
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps, rc_context
@@ -36,6 +37,19 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def new_axes(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
+    """A figure and its axes, as matplotlib's `subplots` gives them; width and height in inches."""
+    figure = new_figure(width, height)
+    return figure, figure.subplots(rows, columns)
+
+
+def finish_axes(axes: Any, x: str, y: str, title: str = "", **legend: Any) -> None:
+    """Labels, grid and legend of a plot with lines."""
+    axes.set(xlabel=x, ylabel=y, title=title)
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(**{"fontsize": 8} | legend)
 
 
 def shades(count: int) -> Array:

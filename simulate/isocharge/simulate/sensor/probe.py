@@ -15,7 +15,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError, cut
 from isocharge.simulate.numerics.polygon import area_of, centroid_of, is_convex
-from isocharge.simulate.sensor.size_check import check_length
+from isocharge.simulate.sensor.size_check import check_length, tidy
 
 NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 
@@ -47,7 +47,7 @@ class Circle:
     @property
     def notation(self) -> str:
         """As on the command line, the radius in mm."""
-        return f"circle:{_tidy(self.radius)}"
+        return f"circle:{tidy(self.radius)}"
 
     @property
     def area(self) -> float:
@@ -130,10 +130,10 @@ class Polygon:
         """As on the command line, lengths in mm, without the angle."""
         at = np.array(self.corners)
         if self.name == "rectangle":
-            return f"rectangle:{_tidy(2.0 * at[0, 0])}x{_tidy(2.0 * at[0, 1])}"
+            return f"rectangle:{tidy(2.0 * at[0, 0])}x{tidy(2.0 * at[0, 1])}"
         if self.name == "triangle":
-            return f"triangle:{_tidy(float(np.linalg.norm(at[1] - at[0])))}"
-        return "polygon:" + ";".join(f"{_tidy(x)},{_tidy(y)}" for x, y in at)
+            return f"triangle:{tidy(float(np.linalg.norm(at[1] - at[0])))}"
+        return "polygon:" + ";".join(f"{tidy(x)},{tidy(y)}" for x, y in at)
 
     @property
     def area(self) -> float:
@@ -148,8 +148,7 @@ class Polygon:
     @property
     def outline(self) -> Complexes:
         """Corners as x + iy relative to the centroid, rotated, anticlockwise, shape (n,), mm."""
-        outline: Complexes = np.array(self.corners) @ np.array([1.0, 1j]) * np.exp(1j * self.angle)
-        return outline
+        return np.asarray(np.array(self.corners) @ np.array([1.0, 1j]) * np.exp(1j * self.angle))
 
     @property
     def period(self) -> float:
@@ -190,10 +189,6 @@ def parse_probe(text: str) -> Probe:
         return Polygon.triangle(float(match["side"]), angle)
     corners = np.array([[float(value) for value in corner.split(",")] for corner in match["corners"].split(";")])
     return Polygon.of(corners, angle)
-
-
-def _tidy(value: float) -> float:
-    return float(f"{value:.12g}")
 
 
 def farthest(probe: Probe, at: tuple[float, float]) -> float:

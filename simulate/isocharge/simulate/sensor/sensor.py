@@ -80,8 +80,7 @@ class Calibration:
     def place(self, points: Array) -> Array:
         """Layout positions, shape (..., 2), to positions on the real film."""
         c, s = np.cos(self.rotation), np.sin(self.rotation)
-        placed: Array = points @ np.array([[c, s], [-s, c]]) + np.array(self.shift)
-        return placed
+        return np.asarray(points @ np.array([[c, s], [-s, c]]) + np.array(self.shift))
 
 
 @dataclass(frozen=True)

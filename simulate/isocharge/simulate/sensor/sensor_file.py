@@ -25,6 +25,7 @@ from isocharge.common.structs import (
 from isocharge.common.toml_text import to_toml
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.sensor import Calibration, Electrode, Readout, Sensor
+from isocharge.simulate.sensor.size_check import tidy
 
 FARTHEST_MM = 1e6
 """Largest coordinate of a point, mm."""
@@ -143,16 +144,16 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
         "surface": sensor.surface,
         "film": film_to_dict(sensor.film),
         "piezo": {
-            "d31": _tidy(piezo.d31),
-            "d32": _tidy(piezo.d32),
-            "d33": _tidy(piezo.d33),
-            "pyro_uC_per_m2_K": _tidy(piezo.pyro),
+            "d31": tidy(piezo.d31),
+            "d32": tidy(piezo.d32),
+            "d33": tidy(piezo.d33),
+            "pyro_uC_per_m2_K": tidy(piezo.pyro),
         },
         "electrodes": _electrode_tables(sensor),
         "calibration": {
             "gain": dict(calibration.gain),
-            "shift_mm": [_tidy(value) for value in calibration.shift],
-            "rotation_deg": _tidy(float(np.rad2deg(calibration.rotation))),
+            "shift_mm": [tidy(value) for value in calibration.shift],
+            "rotation_deg": tidy(float(np.rad2deg(calibration.rotation))),
         },
     }
 
@@ -160,11 +161,11 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
 def film_to_dict(film: Film) -> dict[str, float]:
     """The table of a film in the sensor file."""
     return {
-        "radius_mm": _tidy(film.radius),
-        "thickness_um": _tidy(film.thickness * 1e3),
-        "young_GPa": _tidy(film.young * 1e-3),
+        "radius_mm": tidy(film.radius),
+        "thickness_um": tidy(film.thickness * 1e3),
+        "young_GPa": tidy(film.young * 1e-3),
         "poisson": film.poisson,
-        "pretension_MPa": _tidy(film.pretension),
+        "pretension_MPa": tidy(film.pretension),
     }
 
 
@@ -201,7 +202,7 @@ def write_sensor(sensor: Sensor, path: Path, comment: Iterable[str] = ()) -> Non
 
 def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
     """Squares share one side in the file; those of another side than the first are written as polygons."""
-    sides = {e.name: _tidy(e.corners[1][0] - e.corners[0][0]) for e in sensor.electrodes if e.square}
+    sides = {e.name: tidy(e.corners[1][0] - e.corners[0][0]) for e in sensor.electrodes if e.square}
     if sensor.readout == "edge" and len(set(sides.values())) > 1:
         raise SensorError(
             f"readout 'edge' needs squares, and in a sensor file all squares have one side: got {sides} mm"
@@ -210,16 +211,11 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
     tables: dict[str, Any] = {} if shared is None else {"side_mm": shared}
     for electrode in sensor.electrodes:
         if sides.get(electrode.name) == shared is not None:
-            tables[electrode.name] = [_tidy(value) for value in electrode.centre]
+            tables[electrode.name] = [tidy(value) for value in electrode.centre]
         else:
-            corners = [[_tidy(value) for value in corner] for corner in electrode.corners]
+            corners = [[tidy(value) for value in corner] for corner in electrode.corners]
             tables[electrode.name] = {"polygon_mm": corners}
     return tables
-
-
-def _tidy(value: float) -> float:
-    """Without the last digits that unit conversion leaves behind."""
-    return float(f"{value:.12g}")
 
 
 def _build(file: SensorTable) -> Sensor:

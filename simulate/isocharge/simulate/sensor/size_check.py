@@ -1,8 +1,13 @@
-"""Refusal of sizes that cannot be, and of those that were plainly given in metres and pascals."""
+"""Sizes: those that cannot be, or were plainly given in metres and pascals, are refused; others are written tidily."""
 
 import math
 
 from isocharge.common.errors import InputError
+
+
+def tidy(value: float) -> float:
+    """Without the last digits that unit conversion leaves behind."""
+    return float(f"{value:.12g}")
 
 
 def check_length(what: str, value: float, least: float, error: type[InputError]) -> None:

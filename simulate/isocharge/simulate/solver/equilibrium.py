@@ -78,8 +78,7 @@ def deflection(equilibrium: Equilibrium, points: Array) -> Array:
     element, xi, eta, _ = _locate(equilibrium, points)
     values = tensor_values(mesh.resolution.order, xi, eta)
     scaled = np.einsum("pn,pn->p", values, equilibrium.field[mesh.template.nodes[element], 2])
-    deflected: Array = equilibrium.film.radius * np.sqrt(equilibrium.groups.amplitude2) * scaled
-    return deflected
+    return np.asarray(equilibrium.film.radius * np.sqrt(equilibrium.groups.amplitude2) * scaled)
 
 
 def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "middle") -> Array:
@@ -143,10 +142,10 @@ def _bent_strain(equilibrium: Equilibrium, surface: Surface, hessian: Array) -> 
     """Scaled strain (E11, E22, 2 E12) of bending at a surface, `hessian` that of W."""
     film = equilibrium.film
     half = 0.5 * film.thickness / (film.radius * np.sqrt(equilibrium.groups.amplitude2))
-    bent: Array = (SIDE[surface] * half) * np.stack(
-        [hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1] + hessian[..., 1, 0]], axis=-1
+    return np.asarray(
+        (SIDE[surface] * half)
+        * np.stack([hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1] + hessian[..., 1, 0]], axis=-1)
     )
-    return bent
 
 
 def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, Array, Booleans]:
