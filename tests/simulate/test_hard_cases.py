@@ -72,5 +72,3 @@ def check(seed: int) -> str:
 @pytest.mark.parametrize("seed", [0, 2, 3, 12, 17])
 def test_converges_or_says_why(seed):
     check(seed)
-
-
