@@ -97,6 +97,16 @@ def test_a_press_that_creeps_moves_or_shakes_is_refused(change, reason):
     assert re.search(reason, refused.reason), refused.reason
 
 
+def test_each_press_fades_for_its_own_reason_and_not_for_being_released():
+    release = lambda t: min(1.0, 10.0 * (5.0 - t))  # noqa: E731
+    leak = held(5, lambda t: release(t) * math.exp(-t / 5.0))
+    creep = held(5, lambda t: release(t) * (1.0 - 0.3 * math.log10(t + 0.01)))
+    seen = watched(rest(1), leak, rest(1), creep, rest(1), leak, rest(1))
+    said = [one.reason for one in seen if one.phase is Phase.refused]
+    for words, reason in zip(("tau_s = 5 ", "the film creeps", "tau_s = 5 "), said, strict=True):
+        assert words in reason
+
+
 def test_a_trembling_hand_is_taken():
     """1 % of the charge at 9 Hz; the mean is right all the same."""
     (press,) = [one.press for one in watched(rest(1), held(4, lambda t: 1 + 0.014 * math.sin(56.0 * t))) if one.press]
