@@ -1,6 +1,6 @@
 """One press: CPU time against error, for several meshes, without and with bending.
 
-    python tests/benchmarks/bench_solve.py [--positions 20] [--seed 1] [--json] [--plot FILE.png]       (ten minutes)
+    python tests/benchmarks/bench_solve.py [--positions 20] [--seed 1] [--plot FILE.png]       (ten minutes)
 
 Time is the process CPU time of `press` (mesh, Newton) and `touch_charge` (readout) with imports, templates and symbolic
 work done, from flat ("cold") and from a press 0.5 mm away with a tenth more force ("warm"). Errors are of each charge,
@@ -147,17 +147,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="CPU time of one press against the error of its charges.")
     parser.add_argument("--positions", type=int, default=20, help="presses of each kind (default: 20)")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of tables")
     parser.add_argument("--plot", type=Path, help="write a picture")
     asked = parser.parse_args()
     result = record(asked.positions, asked.seed)
     if asked.plot:
         plot(result, asked.plot)
-    if asked.json:
-        print(json.dumps(result))
-        return
-    for row in result["meshes"] + result["chosen"]:
-        print(*(f"{name} {value}" for name, value in row.items()), sep=" | ")
+    for row in result.pop("meshes") + result.pop("chosen"):
+        print(json.dumps(row))
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

@@ -104,7 +104,7 @@ def allowed(case, sensor) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=[pytest.mark.slow] * (i % 4 > 0), id=str(case)) for i, case in enumerate(CASES)]
+    "case", [pytest.param(case, marks=[pytest.mark.slow] * (i % 9 > 0), id=str(case)) for i, case in enumerate(CASES)]
 )
 def test_charges_and_deflection(case):
     """Every charge of every layout, piezo type and readout, with the theory that the press gets by itself.

@@ -89,6 +89,3 @@ def test_where_charges_are_too_rough_the_search_is_smaller(monkeypatch):
     monkeypatch.setattr(ForwardMap, "build", build)
     assert map_to_search(SENSOR, Circle(1.0), (0.05, 2.0)) == "a map"
     assert asked == pytest.approx(12.0617 * np.array([1.0, 0.9, 0.81]), rel=1e-4)
-    monkeypatch.setattr(ForwardMap, "build", lambda *_, **__: build(None, None, 1000.0))
-    with pytest.raises(SolveError):
-        map_to_search(SENSOR, Circle(1.0), (0.05, 2.0))

@@ -35,12 +35,6 @@ def test_nuisances_are_marginalised(rows):
         assert value == pytest.approx(np.linalg.inv(information)[:2, :2].trace(), rel=1e-2)
 
 
-def test_unknown_gains_are_noise(rows):
-    more = ErrorModel.of(NoiseModel("more", 1.0, float(np.hypot(2e-3, 1e-2))), KNOWN)
-    unknown = ErrorModel.of(REFERENCE, Nuisances(0.0, 0.0, 1e-2))
-    assert unknown.squared(rows) == pytest.approx(more.squared(rows), rel=1e-12)
-
-
 def test_one_more_electrode_is_as_if_it_had_been_there(rows):
     model = ErrorModel.of(REFERENCE, UNKNOWN)
     sensitivity = model.sensitivity(rows)

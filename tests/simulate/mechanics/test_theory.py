@@ -179,11 +179,3 @@ def test_modelling_error_bounds_the_real_difference():
 @pytest.mark.parametrize("accuracy", [1e-3, 1e-2, 0.1])
 def test_modelling_error_bounds_the_real_difference_of_many_presses(accuracy):
     check_presses(6, 150, accuracy)
-
-
-def test_bending_matters_at_a_small_probe_on_a_taut_film(film):
-    """The bending length is as long as the probe is wide: a membrane's slopes there are not the film's."""
-    taut = thick(film, 0.02, 10.0)
-    error, bound, name = difference((taut, Circle(0.1), (5.0, 3.0), 1e-4), 1e-2)
-    assert error <= max(bound, 1e-5), (name, error, bound)
-    assert modelling_error(taut, Circle(0.1), 1e-4, Theory(True, False, True)) > 0.1

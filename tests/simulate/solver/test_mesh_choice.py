@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.common.errors import SceneError, SolveError
+from isocharge.common.errors import SolveError
 from isocharge.simulate import (
     Circle,
     Film,
     Polygon,
-    Resolution,
     SolveSettings,
     load_sensor,
     press,
@@ -28,15 +27,6 @@ NEAR_THE_RIM = (Circle(2.0), (28.0, 0.0), 0.1)
 @pytest.mark.parametrize("scene", [INNER, NEAR_THE_RIM], ids=["inner", "rim"])
 def test_needed_resolution_is_that_of_the_press(scene):
     assert needed_resolution(FILM, *scene) == press(FILM, *scene).mesh.resolution
-
-
-def test_needed_resolution_is_known_without_a_solve_where_shapes_predict_the_error(monkeypatch):
-    monkeypatch.setattr("isocharge.simulate.solver.press.press", lambda *_, **__: pytest.fail("solved a press"))
-    assert needed_resolution(FILM, *INNER).order == 5
-    given = Resolution(4, 8, 4)
-    assert needed_resolution(FILM, *NEAR_THE_RIM, SolveSettings(resolution=given)) == given
-    with pytest.raises(SceneError):
-        needed_resolution(FILM, Circle(1.0), (44.5, 0.0), 1.0)
 
 
 # Two meshes

@@ -8,8 +8,7 @@ import pytest
 
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import Circle, Polygon, Resolution, SolveSettings, Theory, load_sensor, press, touch_charge
-from isocharge.simulate.solver import newton
-from isocharge.simulate.solver.assembly import Assembly, Factor
+from isocharge.simulate.solver.assembly import Factor
 
 FORCES = (1e-5, 0.1, 10.0)
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
@@ -139,25 +138,3 @@ def test_linear_solve_is_corrected_and_says_so(film, monkeypatch, factor, conver
         return
     with pytest.raises(SolveError, match="too near to singular; residual"):
         press(*scene)
-
-
-@pytest.mark.parametrize("bending", [False, True])
-def test_tangent_is_used_again_while_that_pays(film, monkeypatch, bending):
-    """The same equilibrium as with a tangent for every step, from half as many of them."""
-    settings = SolveSettings(theory=Theory(stretching=True, bending=bending, pretensioned=False), tolerance=1e-10)
-    tangents, factor = [], Assembly.factor
-
-    def counted(self, matrix):
-        tangents.append(len(matrix))
-        return factor(self, matrix)
-
-    monkeypatch.setattr(Assembly, "factor", counted)
-    start = press(film, Circle(1.0), (5.0, 1.0), 1.0, settings)
-    fields, needed = [], []
-    for limit in (0.0, newton.CHORD_FROM):
-        monkeypatch.setattr(newton, "CHORD_FROM", limit)
-        tangents.clear()
-        fields.append(press(film, Circle(1.0), (5.5, 1.0), 1.1, settings, start=start).field)
-        needed.append(len(tangents))
-    np.testing.assert_allclose(fields[1], fields[0], atol=1e-9 * np.abs(fields[0]).max())
-    assert needed[1] <= 0.5 * needed[0]
