@@ -1,121 +1,94 @@
-"""A press session, closed: a board on a pseudo-terminal is pressed where the dialogue asks, by nobody."""
+"""A press session, closed: a machine presses where the dialogue asks, and answers that it did."""
 
 import os
-import queue
 import re
-import threading
-import time
+from queue import Queue
 
 import numpy as np
-import pytest
 
 from isocharge.cli.train.press_dialogue import QUESTION, Dialogue, PressEvents, Screen
-from isocharge.serve import Frame, Port, PressWatch, ReadingStream, encode_frame
-from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
+from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_frame
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, PressSession
-
-pytestmark = pytest.mark.xdist_group("clock")
 
 RATE_HZ = 200.0
 NAMES = ("A", "B", "C", "D")
 TARED = 400
 """Frames before the first press: the tare takes half of them."""
 
-SPEED = 5.0
-"""How many times as fast as its own clock says the board sends."""
 
-pytestmark = pytest.mark.xdist_group("clock")
+class Machine:
+    """Presses where it is told for a second, and presses Enter when it is asked.
 
+    Attributes:
+        orders: Contacts to press at, None for the end.
+        pressed: Where it pressed.
+    """
 
-class Rig(threading.Thread):
-    """A board with a machine: presses where it is told for a second, and answers Enter when it is asked."""
+    def __init__(self, film):
+        self.film, self.orders, self.pressed = film, Queue(), []
+        self.answers, self.keyboard = os.pipe()
 
-    def __init__(self, charges, parameters):
-        super().__init__(daemon=True)
-        self.port, self.orders, self.stop = PseudoPort(), queue.Queue(), threading.Event()
-        self._charges, self._parameters, self._rng = charges, parameters, np.random.default_rng(1)
-        self.pressed = []
+    def type(self, line):
+        os.write(self.keyboard, f"{line}\n".encode())
 
-    def run(self):
-        start = time.perf_counter()
-        for frame, charge in enumerate(self._played()):
-            self.stop.wait(max(0.0, start + frame / (SPEED * RATE_HZ) - time.perf_counter()))
-            if self.stop.is_set():
-                break
-            noisy = charge + np.hypot(1.0, 0.002 * charge) * self._rng.standard_normal(4) + 7.0
-            self.port.write_whole(encode_frame(Frame(frame % 65536, round(1e6 * frame / RATE_HZ), tuple(noisy))))
+    def chunks(self):
+        """What its board sends: it waits for an order before every press, so no clock is needed."""
+        rng = np.random.default_rng(1)
+        for frame, charge in enumerate(self.rows()):
+            noisy = charge + np.hypot(1.0, 0.002 * charge) * rng.standard_normal(4) + 7.0
+            yield Chunk(encode_frame(Frame(frame, round(1e6 * frame / RATE_HZ), tuple(noisy))), frame / RATE_HZ, 0)
 
-    def _played(self):
+    def rows(self):
         yield from np.zeros((TARED, 4))
-        while True:
-            yield from np.zeros((100, 4))
-            try:
-                contact = self.orders.get_nowait()
-            except queue.Empty:
-                continue
+        while (contact := self.orders.get()) is not None:
             self.pressed.append(contact)
-            yield from np.repeat(self._charges.charges(self._parameters, contact[None]), 200, axis=0)
+            yield from np.zeros((100, 4))
+            yield from np.repeat(self.film.charges(contact[None]), 200, axis=0)
+            yield from np.zeros((100, 4))
 
 
-class RiggedScreen(Screen):
+class ReadScreen(Screen):
     """Reads what is proposed, and answers what is asked."""
 
-    def __init__(self, keyboard):
+    def __init__(self, machine):
         super().__init__(NAMES)
-        self.keyboard, self.proposed = keyboard, None
+        self.machine, self.proposed = machine, None
 
     def say(self, sentence):
         super().say(sentence)
         if press := re.search(r"Press (\S+) N at \((\S+), (\S+)\) mm and hold", sentence):
             self.proposed = np.array([float(press[2]), float(press[3]), float(press[1])])
         if sentence == QUESTION:
-            os.write(self.keyboard, b"\n")
+            self.machine.type("")
 
 
-class RiggedEvents(PressEvents):
-    """Orders what is proposed when only new presses count; ends after the last."""
-
-    def order(self, rig, screen, most):
-        self.rig, self.screen, self.most = rig, screen, most
+class OrderedEvents(PressEvents):
+    """Orders what is proposed when only new presses count; ends after the third."""
 
     def arm(self):
         super().arm()
-        if len(self.rig.pressed) == self.most:
-            os.write(self.screen.keyboard, b"q\n")
+        if len(self.machine.pressed) == 3:
+            self.machine.type("q")
+            self.machine.orders.put(None)
         else:
-            self.rig.orders.put(self.screen.proposed)
+            self.machine.orders.put(self.screen.proposed)
 
 
 def test_a_film_that_nobody_knows_is_known_after_some_presses(capsys):
-    """Three presses."""
-    count = 3
     problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
-    charges = problem.charges
-    parameters = charges.prior.draw(np.random.default_rng(11), 1)[0]
+    parameters = problem.prior.draw(np.random.default_rng(11), 1)[0]
+    machine = Machine(problem.charges.forward_map(parameters))
     session = PressSession(problem, save=lambda _: None, until=0.0)
-    rig = Rig(charges, parameters)
-    answers, keyboard = os.pipe()
-    rig.start()
-    try:
-        with (
-            Port(rig.port.url, silence_s=30.0) as port,
-            RiggedEvents(port, ReadingStream(NAMES), PressWatch(NAMES), answers) as events,
-        ):
-            screen = RiggedScreen(keyboard)
-            events.order(rig, screen, count)
-            Dialogue(session, events, screen, lambda *_: None).with_person()
-    finally:
-        rig.stop.set()
-        rig.join()
-        rig.port.close()
-        os.close(answers)
-        os.close(keyboard)
+    screen = ReadScreen(machine)
+    with OrderedEvents(machine.chunks(), ReadingStream(NAMES), PressWatch(NAMES), machine.answers) as events:
+        events.machine, events.screen = machine, screen
+        Dialogue(session, events, screen, lambda *_: None).with_person()
     said = capsys.readouterr().err
-    np.testing.assert_allclose(session.presses.contact, rig.pressed, err_msg=said)
-    clean = charges.charges(parameters, session.presses.contact)
+    np.testing.assert_allclose(session.presses.contact, machine.pressed, err_msg=said)
+    clean = machine.film.charges(session.presses.contact)
     assert (np.abs(session.presses.charge_pC - clean) < 5 * np.hypot(1.0, 0.002 * clean) * 0.2).all()
-    deviation = (session.result.posterior.parameters - parameters) / charges.prior.std
+    deviation = (session.result.posterior.parameters - parameters) / problem.prior.std
     assert deviation @ np.linalg.solve(session.result.posterior.covariance, deviation) < 40.0  # 13 parameters
     assert session.result.left.position_mm < 0.3
-    assert said.count("are left by not knowing the film") == count - 1
+    assert said.count("are left by not knowing the film") == 2

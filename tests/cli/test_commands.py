@@ -15,8 +15,8 @@ import pytest
 from isocharge.cli.shared.terminal import shown_progress
 from isocharge.common.progress import report
 from isocharge.common.toml_text import to_toml
-from isocharge.simulate import Circle, Sweep, load_sensor
-from isocharge.simulate.dataset.sweep import solve_maps, write_sweep
+from isocharge.simulate import load_sensor
+from isocharge.simulate.dataset.sweep import solve_maps
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from kept import kept
 
@@ -62,25 +62,21 @@ def test_a_stopped_sweep_says_how_to_go_on_and_leaves_no_process(tmp_path):
         text=True,
         start_new_session=True,
     )
-    for _ in range(20_000):
-        if list(tmp_path.glob("presses.part/parts/shard-00000*.sha256")):
-            break
-        time.sleep(0.01)
+    assert ends(lambda: not list(tmp_path.glob("presses.part/parts/shard-00000*.sha256")))
     process.terminate()
     _, err = process.communicate(timeout=60)
     assert process.returncode not in (0, None)
     assert "stopped; what is done is kept in presses.part, and the same command" in err
     assert "Traceback" not in err
     assert [path.name for path in tmp_path.iterdir()] == ["presses.part"]
-    assert ends(lambda: os.killpg(process.pid, 0))  # no process of the session is left
+    with pytest.raises(ProcessLookupError):
+        ends(lambda: os.killpg(process.pid, 0) is None)  # no process of the session is left
 
 
-def ends(signalled) -> bool:
-    """Whether there is nobody to signal any more, within ten seconds."""
-    for _ in range(500):
-        try:
-            signalled()
-        except ProcessLookupError:
+def ends(is_so) -> bool:
+    """Whether something is so no more, within two minutes."""
+    for _ in range(6000):
+        if not is_so():
             return True
         time.sleep(0.02)
     return False
@@ -140,17 +136,10 @@ def test_a_thick_film(command, tmp_path):
     path.write_text(path.read_text().replace("thickness_um = 25.0", "thickness_um = 1000.0"))
     answer, _ = point(command, path, "--at", "3,-2")
     assert answer["charge_pC"]["A"] == pytest.approx(3.7150435, rel=1e-3)
-    assert answer["deflection_mm"] == pytest.approx(0.1391483, rel=1e-3)
-    assert answer["theory"] == "nonlinear membrane + bending"
-    assert 0.0 < answer["estimated_error"] < 1e-3
-    assert answer["groups"]["bending_length"] > 0.1
-    assert answer["warnings"] == []
+    assert (answer["theory"], answer["warnings"]) == ("nonlinear membrane + bending", [])
     answer, said = point(command, path, "--theory", "nonlinear membrane")
     assert answer["estimated_error"] is None
     assert "caution: a nonlinear membrane does not describe this film at all" in said
-    answer, said = point(command, path, "--theory", "linear plate")
-    assert answer["theory"] == "linear plate"
-    assert "caution: expected an error of the charges of at most 0.001" in said
 
 
 def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
@@ -174,16 +163,6 @@ def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
     answer = json.loads(out)
     assert answer["errors"]["position_median_mm"] > 0.0
     assert (Path(answer["folder"]) / "card.md").is_file()
-
-
-def test_a_fit_for_other_electrodes_is_refused(command, tmp_path):
-    presses, config, sweep = tmp_path / "presses", tmp_path / "four.toml", Sweep(3.0, (1.0, 1.0), samples=600)
-    write_sweep(presses, kept(solve_maps, load_sensor(SENSOR), (Circle(1.0),), sweep), sweep)
-    config.write_text("[network]\nelectrodes = 4\n")
-    code, _, err = command("train", "fit", presses, "--config", config, "-o", tmp_path / "models" / "mine")
-    assert code == 2
-    assert "ConfigError: network.electrodes: the configuration is for 4 electrodes" in err
-    assert not (tmp_path / "models").exists()
 
 
 BAD = [

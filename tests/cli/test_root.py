@@ -1,7 +1,6 @@
 """What every command line has: a version, and completion by the shell."""
 
 import os
-import re
 import subprocess
 import sys
 import tomllib
@@ -51,9 +50,3 @@ def test_the_version_costs_nothing_until_it_is_asked_for():
 def test_the_shell_completes_what_is_typed(typed, proposed):
     words = {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1), "_ISOCHARGE_COMPLETE": "complete_bash"}
     assert set(run(ISOCHARGE, **words).split()) == proposed
-
-
-def test_completion_can_be_installed(tmp_path):
-    run(ISOCHARGE, "--install-completion", "bash", HOME=str(tmp_path), _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")
-    (script,) = re.findall(r"source '?([^'\n]+)", (tmp_path / ".bashrc").read_text())
-    assert "_ISOCHARGE_COMPLETE" in Path(script).read_text()

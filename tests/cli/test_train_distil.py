@@ -48,10 +48,3 @@ def test_a_form_stands_in_one_place(command, tmp_path):
     code, _, err = command("train", "distil", *words)
     assert code == 2
     assert "--int8: expected no --config beside it" in err
-
-
-def test_a_model_that_is_not_there_is_said(command, tmp_path):
-    code, _, err = command("train", "distil", "nothing", "-o", str(tmp_path / "small"))
-    assert code == 2
-    assert "nothing" in err
-    assert not (tmp_path / "small").exists()

@@ -22,7 +22,6 @@ from isocharge.cli.shared.terminal import shown_progress, this_command
 from isocharge.cli.shared.training_run import ModelFolderOption, VersionOption, release_resumably
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
-from isocharge.common.files import refuse_existing
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import Circle, FilmPrior, load_sensor, local_workers, parse_probe, read_dataset
@@ -116,7 +115,8 @@ def fit_command(
 
         release_resumably(train_films, films_identity(prior, sizes), target, fresh=fresh, json=json)
         return
-    refuse_existing(target)
+    if sensor:  # before anything is simulated
+        check_target(output, version, load_sensor(sensor).electrode_names)
     settings = load_config(config) if config else FitConfig()
     with shown_progress():
         if dataset and not dataset.is_dir():
