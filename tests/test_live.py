@@ -1,7 +1,6 @@
 """The live path on what the simulator's amplifier makes of charges: two stages that know nothing of each other."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,10 +9,8 @@ from isocharge.serve import (
     Chain,
     Chunk,
     Frame,
-    Predictor,
     PressWatch,
     ReadingStream,
-    TouchStream,
     device_from_table,
     encode_frame,
 )
@@ -84,33 +81,6 @@ def test_first_reading_comes_within_50_ms_of_a_touch():
         _, contact = undo(part.start(3, RATE_HZ, np.random.default_rng(seed)), charge, seed)
         delays_s.append(np.flatnonzero(contact)[0] / RATE_HZ - 6.0)
     assert max(delays_s) < 0.05
-
-
-def unplugged(times, rest=200, away_s=1.0):
-    """Chunks of frames at rest and then of a press, with an outage between each of the pieces."""
-    rng, clock, out = np.random.default_rng(0), 1e9, []
-    for piece in range(times + 1):
-        for k in range(rest + 100):
-            charge = rng.normal(10.0, 0.3, 3) + (848.0 if k >= rest else 0.0)
-            frame = Frame(k % 65536, 5000 * k, tuple(charge))
-            out.append(Chunk(encode_frame(frame), clock, 0, away_s if piece and not k else 0.0))
-            clock += 0.005
-        clock += away_s
-    return out
-
-
-def test_stream_survives_unplugging_twenty_times():
-    """Every time the film is tared again, a press is detected again, and the record shows the outage."""
-    board = device_from_table({"leak": {"tau_s": 1e6}}, "test")
-    path = TouchStream(Predictor("three-25um-biaxial"), board)
-    records = [record for chunk in unplugged(20) for record in path.feed(chunk)]
-    came_back = [at for at, record in enumerate(records) if "reconnected" in record.flags]
-    assert (len(came_back), path.counts.outages, path.gaps.lost) == (20, 20, 0)
-    for start, end in pairwise([*came_back, len(records)]):
-        piece = records[start:end]
-        assert [record.tare_pC is None for record in piece] == [True] * 100 + [False] * 200
-        assert piece[-1].contact
-        assert (piece[-1].x_mm, piece[-1].y_mm, piece[-1].force_N) == pytest.approx((0.0, 0.0, 1.0), abs=0.1)
 
 
 PRESS_PC = np.array([800.0, 400.0, 300.0, 500.0])

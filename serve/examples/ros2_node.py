@@ -8,7 +8,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 
 from isocharge.serve import Port, Predictor, stream
-from isocharge.serve.export.ros_messages import DEFLECTION_STD, TURN_VARIANCE, time_of
+from isocharge.serve.export.record_messages import DEFLECTION_STD, TURN_VARIANCE, time_of
 
 
 class TouchNode(Node):

@@ -1,6 +1,5 @@
 """Every file that is read, truncated at each byte, with faults, with junk in its tables, and with what is no file."""
 
-import base64
 import io
 import json
 import re
@@ -267,20 +266,3 @@ def test_probes_with_faults(attack):
         lambda rng: mutated(rng, rng.choice(NOTATIONS).encode()).decode("utf-8", "replace"),
         30_000,
     )
-
-
-def test_chunks_of_recordings_with_junk(tmp_path, attack):
-    path = tmp_path / "junk.rec"
-    header = {"isocharge_recording": 1, "model": "linear/1", "policy": "every", "device": {}}
-    chunk = {"chunk": [1e9, 5, 0.0, base64.b64encode(b"abc").decode()]}
-    record = {"timestamp": 1e9, "latency_us": 5.0}
-
-    def read(lines):
-        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-        for event in Recording(path).events():
-            assert event.chunk is None or isinstance(event.chunk.data, bytes)
-
-    def lines(rng):
-        return with_junk(rng, header), chunk, with_junk(rng, chunk), with_junk(rng, record)
-
-    attack("files recording", read, lambda rng: lines(rng) if rng.random() < 0.3 else (header, *lines(rng)[1:]), 6_000)

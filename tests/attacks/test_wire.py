@@ -1,4 +1,4 @@
-"""What clients send: requests with faults, thousands at once, other protocols, half handshakes, calls without words.
+"""What clients send: requests with faults, thousands at once, other protocols, calls without words.
 
 The server is a process of its own. While each attack goes on, a client that means well asks one press after another:
 its answers are right, and 99 of 100 come within ten times of what they take when nobody attacks.
@@ -10,7 +10,6 @@ import re
 import select
 import signal
 import socket
-import ssl
 import subprocess
 import sys
 import threading
@@ -20,10 +19,9 @@ from pathlib import Path
 
 import grpc
 import pytest
-import trustme
 
 from attacks.faults import mutated, with_junk
-from isocharge.serve.network.grpc.messages import METHODS, SERVICE
+from isocharge.serve.network.grpc.service import METHODS, SERVICE
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 
@@ -66,11 +64,11 @@ print(sorted(waits)[int(0.99 * len(waits))])
 class Server:
     """A server process, its ports, and what it says on stderr."""
 
-    def __init__(self, folder, *words):
+    def __init__(self, folder):
         self.errors = (folder / "stderr").open("w+")
         command = [sys.executable, "-m", "isocharge.cli", "serve", "http", "--models", MODELS, "--port", "0"]
         self.process = subprocess.Popen(
-            [*map(str, command), "--grpc-port", "0", *words], stdout=subprocess.PIPE, stderr=self.errors, text=True
+            [*map(str, command), "--grpc-port", "0"], stdout=subprocess.PIPE, stderr=self.errors, text=True
         )
         urls = [self.process.stdout.readline().strip() for _ in range(2)]
         self.http, self.grpc = (("127.0.0.1", int(url.rpartition(":")[2])) for url in urls)
@@ -245,12 +243,6 @@ def flood(server, over, _):
                 return
 
 
-def pages(server, over, _):
-    """The most for the least: the page and the document, again and again."""
-    while not over.is_set():
-        check(send(server.http, b"GET / HTTP/1.1\r\n\r\nGET /openapi.json HTTP/1.1\r\n\r\n" * 4))
-
-
 def connections(server, over, rng):
     """Connections that begin a request and stop."""
     with ExitStack() as stack:
@@ -262,13 +254,6 @@ def connections(server, over, rng):
             time.sleep(0.1)
             if rng.random() < 0.1:
                 stack.close()
-
-
-def refusals(server, over, rng):
-    """What is refused, one after another."""
-    bad = (b"HELLO\r\n\r\n", b"GET /" + b"a" * 20_000 + b" HTTP/1.1\r\n\r\n", REQUEST.replace(b"[1, 3]", b"[9, 9]"))
-    while not over.is_set():
-        check(send(server.http, rng.choice(bad)))
 
 
 def silent_calls(server, over, _):
@@ -288,15 +273,7 @@ def silent_calls(server, over, _):
             call.cancel()
 
 
-def half_closed(server, over, _):
-    """Loads after which the client sends no more; others must not wait for them."""
-    load = b"POST /v2/repository/models/%s/load HTTP/1.1\r\nContent-Length: 0\r\n\r\n" % NAME.encode()
-    while not over.is_set():
-        check(send(server.http, load, timeout=20.0))
-        time.sleep(0.2)
-
-
-ATTACKS = (flood, pages, connections, refusals, silent_calls, half_closed)
+ATTACKS = (flood, connections, silent_calls)
 
 
 @pytest.mark.slow
@@ -314,25 +291,3 @@ def test_a_good_client_beside(server, kind):
         attacker.join()
     print(f"{kind.__name__}: p99 {1e6 * beside:.0f} us, quiet {1e6 * quiet:.0f} us, {beside / quiet:.1f} times")
     assert beside < 10.0 * quiet
-
-
-def test_half_handshakes(tmp_path, share):
-    """However many begin and fall silent, a client that finishes its own is served."""
-    authority = trustme.CA()
-    authority.issue_cert("127.0.0.1").private_key_and_cert_chain_pem.write_to_path(tmp_path / "both.pem")
-    trusted = ssl.create_default_context()
-    authority.configure_trust(trusted)
-    server, number = Server(tmp_path, "--tls-cert", str(tmp_path / "both.pem")), max(60, round(3_000 * share))
-    rng = random.Random(0)
-    hello = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + rng.randbytes(400)
-    for _ in range(number // 60):
-        with ExitStack() as stack:
-            for _ in range(60):
-                half = stack.enter_context(socket.create_connection(server.http))
-                with suppress(ConnectionError):
-                    half.sendall(hello[: rng.randrange(len(hello))])
-            plain = stack.enter_context(socket.create_connection(server.http, timeout=60))
-            with trusted.wrap_socket(plain, server_hostname="127.0.0.1") as secure:
-                secure.sendall(REQUEST)
-                assert secure.recv(1 << 16).startswith(b"HTTP/1.1 200")
-    server.end()

@@ -6,7 +6,7 @@ and the viewers. Reported: the reader's latency (last byte to record), the frame
 the newest sample when a viewer has it. With --browser, headless Chromium is one of the viewers and says how old its
 pictures are and how many a second it draws.
 
-    python tests/benchmarks/bench_live.py --rounds 4 --seconds 10 [--browser] [--rate-Hz 1000]
+    python tests/benchmarks/bench_live.py --rounds 4 --seconds 10 [--browser] [--rate-hz 1000]
 """
 
 import argparse
@@ -27,8 +27,7 @@ import numpy as np
 from websockets.asyncio.client import connect
 
 from isocharge.serve import Predictor, Recording, Script, VirtualSensor, wander
-from isocharge.serve.viewer.messages import HEADER
-from isocharge.serve.viewer.samples import SampleFormat
+from isocharge.serve.viewer.messages import HEADER, SampleFormat
 
 MODEL = "three-25um-biaxial"
 CHROMIUM = "/usr/bin/chromium"
@@ -164,7 +163,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--rate-Hz", type=float, default=1000.0)
+    parser.add_argument("--rate-hz", dest="rate_Hz", type=float, default=1000.0)
     parser.add_argument("--browser", action="store_true")
     options = parser.parse_args()
     context = multiprocessing.get_context("spawn")

@@ -27,7 +27,7 @@ from bench_http import Connection, binary_request, free_port, http_request, json
 from bench_predictor import machine
 
 from isocharge.serve import Predictor, find_model
-from isocharge.serve.network.grpc.messages import METHODS, SERVICE
+from isocharge.serve.network.grpc.service import METHODS, SERVICE
 
 KINDS = 1000
 RELOADS = 10

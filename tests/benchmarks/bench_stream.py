@@ -1,6 +1,6 @@
 """The live path over a pseudo-terminal: frames lost and repeated, how long a record takes, and how much of a core.
 
-    python tests/benchmarks/bench_stream.py [--model NAME|PATH] [--seconds 60] [--rate-Hz 1000] [--json]
+    python tests/benchmarks/bench_stream.py [--model NAME|PATH] [--seconds 60] [--rate-hz 1000] [--json]
 
 The virtual sensor plays in a process of its own; the reader's processor time is its own alone, all stages of the signal
 chain on, each record turned into a line of JSON. The latency is that of the record itself: from the arrival of the last
@@ -94,7 +94,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", default="three-25um-biaxial", help="model name or path")
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--rate-Hz", type=float, default=1000.0)
+    parser.add_argument("--rate-hz", dest="rate_Hz", type=float, default=1000.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true", help="one JSON object")
     asked = parser.parse_args()

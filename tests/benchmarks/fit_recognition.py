@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from isocharge.serve.recognition.described import WEIGHTS, described_frames
+from isocharge.serve.recognition.recognise import WEIGHTS, described_frames
 
 BOARDS = runpy.run_path(str(Path(__file__).parents[1] / "serve" / "recognition" / "test_described.py"))
 FACTORS = (0.5, 0.8, 1.25, 2.0)

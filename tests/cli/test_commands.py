@@ -153,7 +153,7 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
 
 def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
     """Three uniaxial electrodes fold within 8 mm, and the user is told."""
-    monkeypatch.setattr("isocharge.cli.shared.simulated_presses.SAMPLES", 4000)
+    monkeypatch.setattr("isocharge.cli.shared.forward_maps.SAMPLES", 4000)
     words = ("--sensor", "three-25um-uniaxial", "--config", quick(tmp_path), "--json", "-o", tmp_path / "models" / "u")
     code, out, err = command("train", "fit", *words)
     assert code == 0
@@ -213,7 +213,11 @@ BAD = [
         "SceneError: samples: expected at most",
     ),
     (("train", "fit", "--sensor", SENSOR, "-o", "a b"), 2, "ModelError: model name 'a b'"),
-    (("simulate", "sweep", SENSOR, "--samples", "50", "-o", "/proc/x"), 1, "OutputError: /proc/x cannot be written"),
+    (
+        ("simulate", "sweep", SENSOR, "--samples", "50", "-o", "/proc/x"),
+        1,
+        "OutputError: /proc/x.part cannot be written",
+    ),
     (("serve", "predict", SENSOR, "x.csv", "--models", "nope"), 2, "ModelError: nope: expected a folder of models"),
     (("serve", "predict", "no-such-model", "x.csv"), 2, "ModelError"),
     (("serve", "predict", SENSOR, "none.csv"), 2, "InputError: none.csv: cannot be read"),

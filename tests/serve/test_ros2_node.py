@@ -16,7 +16,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from isocharge.serve import Predictor, VirtualSensor, stream, wander
-from isocharge.serve.export.ros_messages import pose_stamped, time_of, wrench_stamped
+from isocharge.serve.export.record_messages import pose_stamped, time_of, wrench_stamped
 
 NODE = Path(__file__).parents[2] / "serve" / "examples" / "ros2_node.py"
 ROS = get_typestore(Stores.ROS2_JAZZY)

@@ -22,11 +22,10 @@ from cobs import cobs
 
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Predictor, TouchStream, load_device
-from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import Heard
-from isocharge.serve.examination.port_check import findings
-from isocharge.serve.port.request import Request
-from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
+from isocharge.serve.examination.port_check import device_text, findings
+from isocharge.serve.port.serial_line import Request
+from isocharge.serve.virtual_sensor.sensor import PseudoPort
 
 RATE_HZ = 400.0
 predictor = cache(Predictor)
@@ -125,20 +124,6 @@ def stuffed_by_slip(k, q):
     return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
 
 
-def sentence(k, q):
-    content = "PZT," + ",".join(map(str, [k % 1000, *counts(q, 0.02)]))
-    check = 0
-    for byte in content.encode():
-        check ^= byte
-    return f"${content}*{check:02X}\r\n".encode()
-
-
-def converter_of_eight(k, q):
-    """Eight inputs of 24 bits with a status byte, of which the first four are wired; a byte that ends the frame."""
-    wired = b"".join(i24(c, "big") for c in counts(q, 1e-3))
-    return b"\xa0" + bytes([k & 0xFF]) + wired + bytes(12) + b"\x00\xc0"
-
-
 def ticks(k, q):
     """A clock of 32768 Hz, a temperature, doubles' little sisters in big-endian, ones' complement of the sum."""
     data = b"\xff\xfa" + struct.pack(">IH4f", round(k * 81.92) & 0xFFFFFFFF, 2941 + k % 2, *q)
@@ -171,8 +156,6 @@ ZOO = {
     "JSON over UDP": Kind(other_names, url="udp://127.0.0.1:9"),
     "COBS": Kind(stuffed_by_cobs, {"pC_per_unit": 1e-3}),
     "SLIP": Kind(stuffed_by_slip, model=THREE),
-    "sentences": Kind(sentence, {"pC_per_unit": 0.02}),
-    "eight inputs": Kind(converter_of_eight, {"pC_per_unit": 1e-3}),
     "odd ticks": Kind(ticks),
 }
 
@@ -240,9 +223,9 @@ def test_a_board_gets_to_a_right_touch(name, written):
 @pytest.mark.parametrize(
     ("name", "asked"),
     [
-        ("offset binary", "--pC-per-unit NUMBER, negative"),
-        ("CSV counts, dead inputs", "--pC-per-unit NUMBER, negative"),
-        ("volts", "--feedback-pF"),
+        ("offset binary", "--pc-per-unit NUMBER, negative"),
+        ("CSV counts, dead inputs", "--pc-per-unit NUMBER, negative"),
+        ("volts", "--feedback-pf"),
     ],
 )
 def test_what_cannot_be_seen_is_asked_for(name, asked, written):

@@ -12,8 +12,7 @@ import typer
 
 from isocharge.cli.serve.app import serve_app
 from isocharge.cli.shared.lazy import lazy_group
-from isocharge.cli.shared.standard_streams import open_closed_streams
-from isocharge.cli.shared.terminal import say, warnings_to_stderr
+from isocharge.cli.shared.terminal import open_closed_streams, say, warnings_to_stderr
 from isocharge.cli.simulate.app import simulate_app
 from isocharge.cli.train.app import train_app
 from isocharge.common.errors import InputError, IsochargeError

@@ -7,7 +7,7 @@ import secrets
 import shutil
 import stat
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
@@ -82,12 +82,52 @@ def write_whole(path: Path, data: bytes) -> None:
         draft.unlink(missing_ok=True)
 
 
+class WholeWrites:
+    """A new file that takes data whole or not at all: as much of a file as its writers use."""
+
+    def __init__(self, path: Path) -> None:
+        """Create it.
+
+        Raises:
+            OutputExists: If it is already there.
+            OutputError: If it cannot be created.
+        """
+        refuse_existing(path)
+        with refusals_explained(path):
+            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        self._size = 0
+
+    def write(self, data: bytes) -> int:
+        """Write, over what an interruption left of a write; after an OSError the file is as it was before."""
+        unwritten = memoryview(data)
+        try:
+            os.lseek(self._descriptor, self._size, os.SEEK_SET)
+            while unwritten:
+                unwritten = unwritten[os.write(self._descriptor, unwritten) :]
+        except OSError:
+            os.ftruncate(self._descriptor, self._size)
+            raise
+        self._size += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Bytes that were written."""
+        return self._size
+
+    def flush(self) -> None:
+        """Nothing waits here."""
+
+    def close(self) -> None:
+        """Close it."""
+        os.close(self._descriptor)
+
+
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """Fill a file under a temporary name and give it its own when the block ends well; on an error nothing remains.
 
     Yields:
-        The temporary name, a sibling; the block creates the file.
+        The temporary name, a sibling; the block creates the file, or a folder.
 
     Raises:
         OutputExists: If `path` is already there, or another process creates it meanwhile.
@@ -96,14 +136,16 @@ def new_file(path: Path) -> Iterator[Path]:
     refuse_existing(path)
     draft = _draft_of(path)
     try:
-        with _refusals_explained(path):
+        with refusals_explained(path):
             yield draft
             sync_folder(draft)
-            refuse_existing(path)
-            draft.replace(path)
+            refuse_existing(path)  # another process may have been faster
+            draft.rename(path)
             sync_folder(path.parent)
     finally:
-        draft.unlink(missing_ok=True)
+        shutil.rmtree(draft, ignore_errors=True)
+        with suppress(OSError):
+            draft.unlink()
 
 
 @contextmanager
@@ -117,22 +159,14 @@ def new_folder(path: Path) -> Iterator[Path]:
         A temporary sibling to write into.
 
     Raises:
-        OutputExists: If `path` is already there, or another process creates it meanwhile.
-        OutputError: If the file system refuses.
+        As `new_file`.
     """
-    refuse_existing(path)
     missing = [parent for parent in path.parents if not parent.exists()]
-    draft = _draft_of(path)
     try:
-        with _refusals_explained(path):
+        with new_file(path) as draft:
             draft.mkdir(parents=True)
             yield draft
-            sync_folder(draft)
-            refuse_existing(path)  # another process may have been faster
-            draft.rename(path)
-            sync_folder(path.parent)
     finally:
-        shutil.rmtree(draft, ignore_errors=True)
         remove_empty(missing)
 
 
@@ -141,14 +175,14 @@ def _draft_of(path: Path) -> Path:
 
 
 @contextmanager
-def _refusals_explained(path: Path) -> Iterator[None]:
+def refusals_explained(path: Path, advice: str = "choose another output") -> Iterator[None]:
     """Turn the file system's errors into OutputError."""
     try:
         yield
     except OSError as error:
         if isinstance(error, IsochargeError | BrokenPipeError):  # a pipe is no matter of this file
             raise
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another output") from error
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}; {advice}") from error
 
 
 def remove_empty(folders: Iterable[Path]) -> None:

@@ -16,17 +16,18 @@ import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import InputError, OutputError, OutputExists, SolveError, TrainingError, cut
+from isocharge.common.errors import InputError, OutputExists, SolveError, TrainingError, cut
 from isocharge.common.files import (
     new_folder,
     read_whole,
+    refusals_explained,
     refuse_existing,
     remove_empty,
     sha256_of,
@@ -99,7 +100,7 @@ class ResumableRun:
             name: First part of the file names.
             executor: Runs the tasks; None runs them in this process.
         """
-        return _Keeping(self, name, executor or _InThisProcess())
+        return _Keeping(self, name, executor)
 
     def is_empty(self) -> bool:
         """Whether no part is finished yet."""
@@ -131,22 +132,10 @@ class ResumableRun:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-class _InThisProcess(Executor):
-    """Runs a task when it is submitted."""
-
-    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(function(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
 class _Keeping(Executor):
     """See `ResumableRun.keeping`."""
 
-    def __init__(self, run: ResumableRun, name: str, executor: Executor) -> None:
+    def __init__(self, run: ResumableRun, name: str, executor: Executor | None) -> None:
         self._run, self._name, self._executor, self._submitted = run, name, executor, 0
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -155,6 +144,11 @@ class _Keeping(Executor):
         kept: Future[Any] = Future()
         if (saved := self._run.load(part, _array)) is not None:
             kept.set_result(saved)
+            return kept
+        if self._executor is None:
+            result = function(*args, **kwargs)
+            self._run.save(part, _npy(result))
+            kept.set_result(result)
             return kept
         computed = self._executor.submit(function, *args, **kwargs)
         computed.add_done_callback(lambda _: self._keep(part, computed, kept))
@@ -252,7 +246,7 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
     begins = not folder.exists()
     try:
         if begins:
-            with output_errors(draft.target), new_folder(folder) as new:
+            with new_folder(folder) as new:
                 (new / "lock").touch()
                 write_whole(new / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
         with _lock(folder):
@@ -264,18 +258,9 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
         raise
 
 
-@contextmanager
-def output_errors(target: Path) -> Iterator[None]:
-    """Turn OSError into OutputError."""
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, OutputExists):
-            raise
-        cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
-        resume = f"what is done is kept in {draft_of(target)}; the same command goes on"
-        hint = "choose another output" if ResumableRun(target).is_empty() else resume
-        raise OutputError(f"{target} cannot be written: {cause.strerror or cause}; {hint}") from error
+def output_errors(target: Path) -> AbstractContextManager[None]:
+    """Turn the file system's errors into OutputError."""
+    return refusals_explained(target, f"the same command goes on with what {draft_of(target)} has, or choose another")
 
 
 @contextmanager

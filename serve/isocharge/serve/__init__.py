@@ -11,27 +11,24 @@ from typing import TYPE_CHECKING
 
 from isocharge.common.versions import version_attribute
 from isocharge.serve.examination.port_check import Examination, examine
-from isocharge.serve.frames.autodetect import AutoParser
 from isocharge.serve.frames.binary import BinaryParser, encode_frame
+from isocharge.serve.frames.formats import AutoParser
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.frames.text_encoder import encode_text
+from isocharge.serve.frames.text_lines import encode_text
 from isocharge.serve.live.device import Device, device_from_table, load_device
 from isocharge.serve.live.reading_stream import ReadingStream
 from isocharge.serve.live.steady_press import PressWatch
 from isocharge.serve.live.stream import Policy, TouchStream, stream
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.model_folder import Model, check_golden, load_model, write_model
-from isocharge.serve.model.repository import find_model
+from isocharge.serve.model.model_folder import Model, check_golden, find_model, load_model, write_model
 from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
-from isocharge.serve.port.serial_port import Chunk, Port
-from isocharge.serve.port.source import open_source
-from isocharge.serve.prediction.contact import Contact, Contacts
+from isocharge.serve.port.source import Chunk, Port, open_source
+from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses
 from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
-from isocharge.serve.prediction.validity import Validity
 from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.virtual_sensor.script import Faults, Script, wander
 from isocharge.serve.virtual_sensor.sensor import VirtualSensor

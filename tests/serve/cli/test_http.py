@@ -3,7 +3,6 @@
 import http.client
 import json
 import os
-import re
 import shutil
 import signal
 import socket
@@ -69,47 +68,6 @@ def test_killed_and_started_again(start):
     assert ask(url)[0] == 200
 
 
-def test_a_killed_server_s_unix_socket_is_taken_over(start, tmp_path):
-    path = tmp_path / "touch.sock"
-    for _ in range(2):
-        process = start("--uds", path)
-        assert process.stdout.readline() == f"unix:{path}\n"
-        process.kill()
-        process.wait()
-    process = start("--uds", path)
-    process.stdout.readline()
-    process.terminate()
-    process.wait(timeout=20)
-    assert not path.exists()
-
-
-def test_a_damaged_swap_while_serving(film, start, tmp_path):
-    film.write(tmp_path)
-    process = start("--port", 0, folder=tmp_path)
-    url = process.stdout.readline().strip()
-    before = ask(url)
-    good = (tmp_path / "linear/1/model.onnx").read_bytes()
-    (tmp_path / "linear/1/model.onnx").write_bytes(good[:-9])
-    status, content = ask(url, path="/v2/repository/models/linear/load", body="")
-    assert (status, "the file is damaged or changed" in content["error"]) == (400, True)
-    assert ask(url) == before
-    (tmp_path / "linear/1/model.onnx").write_bytes(good)
-    assert ask(url, path="/v2/repository/models/linear/load", body="") == (200, {})
-    assert ask(url) == before
-
-
-def test_what_is_refused_at_the_start_is_said(film, start, tmp_path):
-    film.write(tmp_path)
-    film.write(tmp_path, version=2)
-    (tmp_path / "linear/2/golden.json").unlink()
-    process = start("--port", 0, folder=tmp_path)
-    assert ask(process.stdout.readline().strip())[0] == 200
-    process.terminate()
-    refused, serving = process.communicate(timeout=20)[1].splitlines()
-    assert re.match(r"refused: .*linear/2/golden.json: missing; a model comes with its golden.json", refused)
-    assert serving == "serving linear/1; Ctrl-C stops"
-
-
 def test_bad_starts(start, models, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "damaged").mkdir()
@@ -136,12 +94,6 @@ def test_bad_starts(start, models, tmp_path):
         for process, code, said in cases:
             got, error = ended(process)
             assert (got, error[: len(said)]) == (code, said)
-
-
-def test_the_token_may_come_from_the_environment(start, monkeypatch):
-    monkeypatch.setitem(os.environ, "ISOCHARGE_TOKEN", "open sesame")
-    process = start("--port", 0)
-    assert ask(process.stdout.readline().strip())[0] == 401
 
 
 def test_the_log_in_json_is_json_line_by_line(film, start, tmp_path, monkeypatch):

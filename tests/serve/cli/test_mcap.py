@@ -1,15 +1,23 @@
-"""`serve stream --mcap` and `serve replay --mcap`: the lines on stdout, in a file that other tools open."""
+"""`serve stream --mcap` and `serve replay --mcap`: the lines on stdout, in a file that other tools open.
 
-import base64
+`serve plot`: a recording becomes a picture, whatever it holds.
+"""
+
 import errno
 import json
 import os
+import re
 import sys
 
+import numpy as np
 import pytest
+from matplotlib.image import imread
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
+
+from isocharge.cli.serve import plot
+from isocharge.serve import Chunk, Recorder
 
 pytestmark = pytest.mark.xdist_group("clock")
 
@@ -66,16 +74,6 @@ def test_a_damaged_recording_leaves_no_file(command, recorded, models, tmp_path)
     assert list(tmp_path.iterdir()) == [recording]
 
 
-def test_a_recording_of_another_age_is_refused_with_the_reason(command, recorded, frames, models, tmp_path):
-    (recording, _), path = recorded, tmp_path / "touch.mcap"
-    header = recording.read_text().splitlines()[0]
-    chunk = [-5.0, 1, 0.0, base64.b64encode(frames.read_bytes()).decode()]
-    record = json.dumps({"timestamp": -5.0, "latency_us": 1.0})
-    recording.write_text("\n".join([header, json.dumps({"chunk": chunk}), record, ""]))
-    code, _, err = command("serve", "replay", recording, "--models", models, "--mcap", path)
-    assert (code, "expected unix seconds from 1970 to 2038" in err, path.exists()) == (2, True, False)
-
-
 def test_a_live_stream_that_is_stopped_ends_its_file(board_until, models, run, tmp_path):
     path = tmp_path / "touch.mcap"
     with board_until(400) as board:
@@ -91,7 +89,7 @@ def test_a_full_disk_costs_the_file_and_an_exit_code(command, frames, models, tm
             raise OSError(errno.ENOSPC, "No space left on device")
         return os_write(descriptor, data)
 
-    monkeypatch.setattr("isocharge.serve.export.mcap_file.os.write", write)
+    monkeypatch.setattr("os.write", write)
     code, _, err = command("serve", "stream", "linear", "--port", frames, "--models", models, "--mcap", path)
     assert code == 1
     assert f"{path}: stopped (No space left on device); what was written until now is whole" in err
@@ -106,3 +104,108 @@ def test_without_the_extra(command, frames, models, tmp_path, monkeypatch):
     code, _, err = command("serve", "stream", "linear", "--port", frames, "--models", models, "--mcap", path)
     assert (code, path.exists()) == (1, False)
     assert "'mcap', which is not installed; pip install 'isocharge[record]'" in err
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """The figures that are drawn from now on."""
+    figures, save = [], plot.save_picture
+    monkeypatch.setattr(plot, "save_picture", lambda figure, path: figures.append(figure) or save(figure, path))
+    return figures
+
+
+def records_in(path):
+    records = map(json.loads, path.read_text().splitlines())
+    return [record for record in records if "timestamp" in record]
+
+
+def film_of(figure):
+    return next(axes for axes in figure.axes if axes.get_xlabel() == "x, mm")
+
+
+def bands_of(figure):
+    """Times and values that are drawn, shape (n, 2), by label; a line is a band of no height."""
+    bands = (band for axes in figure.axes for band in axes.collections if band.get_label()[0] != "_")
+    return {band.get_label(): np.concatenate([path.vertices for path in band.get_paths()]) for band in bands}
+
+
+def test_a_recording_is_drawn(command, recorded, models, tmp_path, figures):
+    picture, (path, _) = tmp_path / "touch.png", recorded
+    code, out, err = command("serve", "plot", path, "--models", models, "-o", picture)
+    assert (code, out) == (0, "")
+    assert f"drawn in {picture}: 300 records" in err
+    assert "drawn without electrodes" in err  # the sensor of this model has none
+    pixels = imread(picture)
+    assert pixels.shape[0] > 900
+    assert pixels.std() > 0.1
+    records, lines = records_in(path), {name: band[:, 1] for name, band in bands_of(figures[0]).items()}
+    contacts = [record for record in records if record["contact"]]
+    assert np.max(lines["force"]) == max(record["force_N"] for record in records)
+    assert np.min(lines["x"]) == min(record["x_mm"] for record in contacts)
+    assert np.max(lines["C"]) == max(r["charge_pC"]["C"] for r in records if r["charge_pC"])
+    words = [text.get_text() for axes in figures[0].axes for text in axes.get_yticklabels()]
+    assert {flag for record in records for flag in record["flags"]} <= set(words)
+    places = [np.asarray(points.get_offsets()) for points in film_of(figures[0]).collections]
+    path_mm = next(offsets for offsets in places if len(offsets) == len(contacts))
+    np.testing.assert_allclose(path_mm, [(record["x_mm"], record["y_mm"]) for record in contacts])
+
+
+def test_of_a_long_recording_no_peak_is_lost(command, recorded, models, tmp_path, monkeypatch, figures):
+    monkeypatch.setattr("isocharge.cli.serve.plot.MOST_GROUPS", 32)
+    assert command("serve", "plot", recorded[0], "--models", models, "-o", tmp_path / "touch.png")[0] == 0
+    records = records_in(recorded[0])
+    force, charge = (bands_of(figures[0])[name][:, 1] for name in ("force", "C"))
+    assert len(force) < 150
+    assert (force.min(), force.max()) == (0.0, max(record["force_N"] for record in records))
+    assert charge.max() == max(r["charge_pC"]["C"] for r in records if r["charge_pC"])
+
+
+def test_the_film_of_a_released_model_and_none(command, recorded, tmp_path, figures):
+    words = ("serve", "plot", recorded[0], "-o")
+    code, _, err = command(*words, tmp_path / "touch.svg", "--model", "four-25um-biaxial")
+    assert (code, "without" in err) == (0, False)
+    assert {"A", "B", "C", "D"} <= {text.get_text() for text in film_of(figures[0]).texts}
+    code, _, err = command(*words, tmp_path / "touch.png")
+    assert (code, "drawn without the film, whose model is not to be had: no model 'linear/1'" in err) == (0, True)
+
+
+def test_nothing_touched(command, models, tmp_path):
+    path, rest = tmp_path / "rest.rec", {"x_mm": None, "y_mm": None, "force_N": 0.0}
+    rest |= dict.fromkeys(("x_std_mm", "y_std_mm", "force_std_N", "misfit", "charge_pC", "charge_raw_pC"))
+    with Recorder(path, "linear/1", "every", {}) as recorder:
+        recorder.chunk(Chunk(b"", 1e9, 0, 0.0), [json.dumps({"timestamp": 1e9, "latency_us": 1.0, "flags": []} | rest)])
+    assert command("serve", "plot", path, "--models", models, "-o", tmp_path / "rest.png")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ([], "expected at least one record, got none"),
+        (['{"timestamp": 1.0}'], "line 2: damaged .*key 'x_mm' is missing"),
+        (["nonsense", "{}"], "line 2: damaged"),
+    ],
+)
+def test_what_cannot_be_drawn(command, tmp_path, lines, said):
+    path, picture = tmp_path / "touch.rec", tmp_path / "touch.png"
+    with Recorder(path, "linear/1", "every", {}):
+        pass
+    path.write_text(path.read_text() + "".join(f"{line}\n" for line in lines))
+    code, _, err = command("serve", "plot", path, "-o", picture)
+    assert (code, picture.exists()) == (2, False)
+    assert re.search(said, err)
+
+
+def test_lines_break_where_nothing_came(command, recorded, models, tmp_path, figures):
+    """An hour without records is no straight line."""
+    path, _ = recorded
+    lines = path.read_text().splitlines()
+    later = [json.loads(line) for line in lines[1:]]
+    for entry in later:
+        if "timestamp" in entry:
+            entry["timestamp"] += 3600.0
+    path.write_text("\n".join([*lines, *map(json.dumps, later), ""]))
+    assert command("serve", "plot", path, "--models", models, "-o", tmp_path / "touch.png")[0] == 0
+    minutes = bands_of(figures[0])["force"][:, 0]
+    assert minutes.max() == pytest.approx(60.0, abs=1.0)
+    force = next(b for axes in figures[0].axes for b in axes.collections if b.get_label() == "force")
+    assert len(force.get_paths()) == 2

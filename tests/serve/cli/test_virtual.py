@@ -146,7 +146,7 @@ def test_a_seed_is_one_draw(run, asked):
 def test_what_is_refused(run, asked, tmp_path):
     taken = tmp_path / "film"
     taken.write_text("mine")
-    with pytest.raises(OutputExists, match="film: the path exists already"):
+    with pytest.raises(OutputExists, match="film is already there"):
         run("virtual", SENSOR, "--link", taken, "--seconds", 0)
     assert taken.read_text() == "mine"
     with pytest.raises(InputError, match="the link cannot be made"):

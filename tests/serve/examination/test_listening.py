@@ -12,8 +12,8 @@ import pytest
 from isocharge.serve import examine
 from isocharge.serve.examination import listening
 from isocharge.serve.examination.listening import Heard, listen
-from isocharge.serve.port.request import Request
-from isocharge.serve.port.serial_port import Chunk
+from isocharge.serve.port.serial_line import Request
+from isocharge.serve.port.source import Chunk
 
 pytestmark = pytest.mark.xdist_group("clock")
 

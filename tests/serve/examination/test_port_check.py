@@ -1,4 +1,7 @@
-"""What the port check finds in the bytes of boards whose faults are known."""
+"""What the port check finds in the bytes of boards whose faults are known.
+
+Offset, noise, drift and hum of channels against the values that they were computed from.
+"""
 
 import json
 import re
@@ -9,12 +12,11 @@ import numpy as np
 import pytest
 
 from isocharge.cli.serve.doctor import report_lines
-from isocharge.common.errors import DeviceError, PortError
-from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text, examine
-from isocharge.serve.examination.device_text import device_text
+from isocharge.common.errors import DeviceError
+from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text
 from isocharge.serve.examination.listening import Heard
-from isocharge.serve.examination.port_check import findings
-from isocharge.serve.port.request import Request
+from isocharge.serve.examination.port_check import channel_health, device_text, findings
+from isocharge.serve.port.serial_line import Request
 
 RATE_HZ = 200.0
 FOUR = ("A", "B", "C", "D")
@@ -114,7 +116,7 @@ def test_inputs_that_do_not_live_are_ignored():
     assert report.device["channels"] == {"A": "1", "B": "3", "C": "4", "D": "6"}
     assert (report.unused, report.unit) == (("2", "5"), "counts")
     assert "life" not in missing(report)
-    assert "--pC-per-unit" in missing(report)
+    assert "--pc-per-unit" in missing(report)
     text = "\n".join(report_lines(report))
     assert "the channels are counts, not pC" in text
     assert "pC" not in text.partition("channel ")[2].splitlines()[0]
@@ -200,6 +202,25 @@ def test_a_file_that_does_not_fit_is_no_reason_to_be_silent():
     assert "bytes come, but no frames" in missing(report)
 
 
-def test_check_without_a_port():
-    with pytest.raises(PortError, match="cannot be opened"):
-        examine("/dev/ttyNone")
+def test_offset_drift_hum_and_noise_of_a_channel():
+    t, rng = np.arange(0.0, 4.0, 0.002), np.random.default_rng(0)
+    charge = 12.0 + 3.0 * t + 2.0 * np.sin(2 * np.pi * 50 * t + 1) + 0.5 * np.sin(2 * np.pi * 60 * t)
+    health = channel_health("A", charge + rng.normal(0, 0.3, t.size), t, 500.0)
+    assert health.offset_pC == pytest.approx(12.0 + 6.0, abs=0.1)
+    assert health.drift_pC_per_s == pytest.approx(3.0, abs=0.05)
+    assert health.hum_pC == pytest.approx((2.0, 0.5), abs=0.05)
+    assert health.noise_pC == pytest.approx(0.3, rel=0.05)
+
+
+def test_hum_above_half_the_rate_is_not_estimated():
+    t = np.arange(0.0, 4.0, 0.01)
+    assert channel_health("A", np.sin(t), t, 100.0).hum_pC == (None, None)
+
+
+def test_values_that_are_no_charges_are_counted_and_left_out():
+    t = np.arange(0.0, 4.0, 0.01)
+    charge = 7.0 + np.random.default_rng(0).normal(0.0, 0.3, t.size)
+    charge[[3, 90, 200]] = np.nan, 1e300, -np.inf
+    health = channel_health("A", charge, t, 100.0)
+    assert health.offset_pC == pytest.approx(7.0, abs=0.05)
+    assert (health.unusable, health.noise_pC) == (3, pytest.approx(0.3, rel=0.1))

@@ -4,6 +4,8 @@ Chunks never change frames or counters; what stands between two intact frames co
 that does is caught; damage gives no wrong frame where there is a checksum; noise gives no crash and no growth.
 
 The short runs are part of every test run; 10 million bytes for each format are in `make test-all`.
+
+Frame numbers: gaps, repeats and restarts.
 """
 
 import pickle
@@ -19,10 +21,10 @@ from hypothesis import strategies as st
 
 from isocharge.serve import AutoParser, BinaryParser, Frame, encode_frame, encode_text
 from isocharge.serve.frames.formats import frame_layout
-from isocharge.serve.frames.frame import Parser
-from isocharge.serve.frames.layout_parser import described_parser
+from isocharge.serve.frames.frame import Parser, SequenceGaps
+from isocharge.serve.frames.frame_layout import described_parser
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.frames.text_encoder import TEXT_FORMATS
+from isocharge.serve.frames.text_lines import TEXT_FORMATS
 from isocharge.serve.virtual_sensor.script import corrupt
 
 HEAD = [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
@@ -236,3 +238,38 @@ def test_fuzz_of_some_bytes(name):
 @every_format
 def test_fuzz_of_ten_million_bytes(name):
     check_fuzzed(name, 10_000_000, seed=1)
+
+
+def follow(*numbers):
+    gaps = SequenceGaps()
+    flags = [gaps.update(seq) for seq in numbers]
+    return (gaps.lost, gaps.repeated, gaps.restarts), flags
+
+
+def test_sequence_without_gaps_wraps():
+    counts, flags = follow(65534, 65535, 0, 1)
+    assert (counts, flags) == ((0, 0, 0), [()] * 4)
+
+
+def test_sequence_gaps_repeats_and_restarts():
+    counts, flags = follow(65530, 65533, 2, 2, 3, 0, 1)
+    assert counts == (2 + 4, 1, 1)
+    assert flags == [(), ("gap",), ("gap",), ("repeat",), (), ("restart",), ()]
+
+
+def test_numbers_of_one_byte_wrap_at_256():
+    gaps = SequenceGaps()
+    assert [gaps.update(seq, 256) for seq in (254, 255, 0, 3)] == [(), (), (), ("gap",)]
+    assert gaps.lost == 2
+
+
+def test_no_number_is_no_gap():
+    gaps = SequenceGaps()
+    assert [gaps.update(None), gaps.update(5), gaps.update(None), gaps.update(6)] == [()] * 4
+
+
+def test_a_new_connection_is_no_gap():
+    gaps = SequenceGaps()
+    gaps.update(5)
+    gaps.forget()
+    assert gaps.update(900) == ()

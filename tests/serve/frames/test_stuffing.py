@@ -1,10 +1,23 @@
-"""Byte stuffing against the documents that define it, and against another library."""
+"""Byte stuffing against the documents that define it, and against another library.
+
+Checksums against crcmod, the standard library and the check values of Cook's catalogue (of b"123456789").
+
+The binary frame against others' code and figures, and its parser against damage.
+"""
+
+import binascii
+import struct
+import zlib
 
 import pytest
 from cobs import cobs
+from crcmod.predefined import mkPredefinedCrcFun
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from isocharge.serve import BinaryParser, Frame, encode_frame
+from isocharge.serve.frames.binary import LONGEST_PIECE
+from isocharge.serve.frames.checksums import CHECKSUMS
 from isocharge.serve.frames.stuffing import STUFFINGS, cobs_decode, cobs_encode
 
 EXAMPLES = [
@@ -56,14 +69,6 @@ def test_cobs_equals_the_cobs_package(data):
     assert cobs_decode(cobs.encode(data)) == data
 
 
-@pytest.mark.parametrize("n", [253, 254, 255, 507, 508, 509])
-@pytest.mark.parametrize("tail", [b"", b"\0", b"\0x", b"x\0"])
-def test_cobs_about_the_block_length(n, tail):
-    data = b"x" * n + tail
-    assert cobs_encode(data) == cobs.encode(data)
-    assert cobs_decode(cobs_encode(data)) == data
-
-
 @settings(derandomize=True)
 @given(st.binary(min_size=1, max_size=300))
 def test_cobs_refuses_what_the_cobs_package_refuses(data):
@@ -74,3 +79,113 @@ def test_cobs_refuses_what_the_cobs_package_refuses(data):
             cobs_decode(data)
     else:
         assert cobs_decode(data) == expected
+
+
+CATALOGUE = {
+    "none": 0,
+    "crc-8/sae-j1850": 0x4B,
+    "sum-8": 0xDD,
+    "sum-16": 0x01DD,
+    "xor-8": 0x31,
+    "sum-8/negative": 0x23,
+    "sum-8/inverted": 0x22,
+    "fletcher-16": 0x1EDE,
+}
+
+OTHERS = {
+    "crc-8": mkPredefinedCrcFun("crc-8"),
+    "crc-8/maxim": mkPredefinedCrcFun("crc-8-maxim"),
+    "crc-16/arc": mkPredefinedCrcFun("crc-16"),
+    "crc-16/x-25": mkPredefinedCrcFun("x-25"),
+    "crc-16/xmodem": lambda data: binascii.crc_hqx(data, 0),
+    "crc-16/modbus": mkPredefinedCrcFun("modbus"),
+    "crc-16/kermit": mkPredefinedCrcFun("kermit"),
+    "crc-16/ccitt-false": lambda data: binascii.crc_hqx(data, 0xFFFF),
+    "crc-32": zlib.crc32,
+    "crc-32/iscsi": mkPredefinedCrcFun("crc-32c"),
+    "crc-32/mpeg-2": mkPredefinedCrcFun("crc-32-mpeg"),
+}
+
+
+@pytest.mark.parametrize("name", CHECKSUMS)
+def test_every_checksum_is_that_of_its_name(name):
+    compute = CHECKSUMS[name].compute
+    if name in CATALOGUE:
+        assert compute(b"123456789") == CATALOGUE[name]
+    else:
+        for data in (b"", b"123456789", bytes(range(256)), b"\xff" * 31):
+            assert compute(data) == OTHERS[name](data)
+
+
+FRAMES = st.builds(
+    Frame,
+    seq=st.integers(0, 2**16 - 1),
+    t_us=st.integers(0, 2**32 - 1),
+    values=st.lists(st.floats(width=32, allow_nan=False), max_size=8).map(tuple),
+    flags=st.integers(0, 255),
+)
+
+
+def piece(body):
+    """The bytes of a frame around its content: CRC-16/CCITT-FALSE and COBS by others."""
+    return cobs.encode(body + struct.pack("<H", binascii.crc_hqx(body, 0xFFFF))) + b"\0"
+
+
+def test_layout_of_a_frame():
+    """Against the layout of the design, packed by hand."""
+    body = bytes([1]) + struct.pack("<H", 0x1234) + struct.pack("<I", 0x89ABCDEF) + bytes([3, 1])
+    frame = Frame(seq=0x1234, t_us=0x89ABCDEF, values=(1.0, -2.5, 848.25), flags=1)
+    assert encode_frame(frame) == piece(body + struct.pack("<fff", 1.0, -2.5, 848.25))
+
+
+@pytest.mark.parametrize("n", [0, 1, 60, 61, 62, 255])
+def test_round_trip_of_any_number_of_charges(n):
+    frame = Frame(1, 2, tuple(k + 0.5 for k in range(n)))
+    assert len(encode_frame(frame)) <= LONGEST_PIECE + 1
+    assert BinaryParser().feed(encode_frame(frame)) == [frame]
+
+
+@settings(derandomize=True)
+@given(FRAMES, st.data())
+def test_every_flipped_bit_is_noticed(frame, data):
+    """A CRC catches every single error; one that makes or removes a zero shifts the frame's edges instead."""
+    good = encode_frame(frame)
+    at, bit = data.draw(st.integers(0, len(good) - 2)), data.draw(st.integers(0, 7))
+    bad = good[:at] + bytes([good[at] ^ 1 << bit]) + good[at + 1 :]
+    parser = BinaryParser()
+    assert parser.feed(bad + b"\0" + good) == [frame]
+    assert parser.counts.crc_errors + parser.counts.malformed >= 1
+
+
+@pytest.mark.parametrize(
+    ("data", "counter"),
+    [
+        (piece(b"\x02" + bytes(8)), "malformed"),  # another version
+        (piece(b"\x01" + bytes(6) + b"\x03\x00" + bytes(8)), "malformed"),  # three charges announced, two sent
+        (piece(b"\x01"), "malformed"),
+        (b"\x05ab\0", "malformed"),  # stuffing points beyond the end
+        (encode_frame(Frame(1, 2, (3.0,)))[:-2] + b"\x77\0", "crc_errors"),
+    ],
+)
+def test_piece_that_is_no_frame_is_counted(data, counter):
+    parser = BinaryParser()
+    assert parser.feed(data) == []
+    assert getattr(parser.counts, counter) == 1
+    assert parser.counts.bytes_dropped == len(data)
+
+
+def test_a_piece_of_a_megabyte_is_counted_once_and_the_next_frame_found():
+    parser, frame = BinaryParser(), Frame(7, 8, (9.0,))
+    for _ in range(1000):
+        assert parser.feed(b"\x55" * 1000) == []
+    assert parser.feed(b"\0" + encode_frame(frame)) == [frame]
+    assert (parser.counts.malformed, parser.counts.bytes_dropped) == (1, 1_000_001)
+
+
+@pytest.mark.parametrize("step", [1, 700, 5000])
+def test_overlong_piece_counts_the_same_however_it_is_cut(step):
+    data = b"\x01" * 2 * LONGEST_PIECE + b"\0"  # sound stuffing of zeros, so that only its length is wrong
+    parser = BinaryParser()
+    for at in range(0, len(data), step):
+        assert parser.feed(data[at : at + step]) == []
+    assert (parser.counts.malformed, parser.counts.crc_errors, parser.counts.bytes_dropped) == (1, 0, len(data))

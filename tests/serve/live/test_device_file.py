@@ -14,10 +14,10 @@ from isocharge.serve import (
     encode_frame,
     load_device,
 )
-from isocharge.serve.frames.layout_parser import DescribedParser
+from isocharge.serve.frames.frame_layout import DescribedParser
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.live.channels import ChannelPicker
 from isocharge.serve.live.device import ANY_BOARD, with_offset_limit
+from isocharge.serve.live.reading_stream import ChannelPicker
 from isocharge.serve.signal_chain.chain import ChainState, advance
 
 ELECTRODES = ("A", "B", "C")

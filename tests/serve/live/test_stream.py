@@ -8,7 +8,6 @@ import pytest
 
 from isocharge.common.errors import ChargeError, ModelError, PortError, TareError
 from isocharge.serve import (
-    BinaryParser,
     Chain,
     Chunk,
     Frame,
@@ -19,7 +18,7 @@ from isocharge.serve import (
     encode_frame,
     stream,
 )
-from isocharge.serve.frames.sequence import SequenceGaps
+from isocharge.serve.frames.frame import SequenceGaps
 from isocharge.serve.signal_chain.tare import TareRule
 
 pytestmark = pytest.mark.xdist_group("clock")
@@ -115,10 +114,6 @@ def test_press_outside_the_domain_is_flagged(film, play, press, flags):
     assert play(Frame(10, 0, tuple((pressed(film, **press) + OFFSET).tolist())))[0].flags == flags
 
 
-def test_charges_of_no_single_contact_are_flagged(play):
-    assert play(Frame(10, 0, (900.0, 900.0, -200.0)))[0].flags[-1] == "misfit"
-
-
 def test_flags_of_the_frame_are_in_the_record(film, play):
     charges = tuple((pressed(film) + OFFSET).tolist())
     gaps = SequenceGaps()
@@ -185,24 +180,6 @@ def test_bytes_that_are_no_frames_are_refused(predictor):
         PortError, match=r"no intact frame among the first \d+ bytes .*nothing recognised yet: check baud"
     ):
         list(stream(noise, predictor))
-
-
-def test_damage_costs_only_itself(film, play):
-    good = Frame(11, 0, tuple((pressed(film) + OFFSET).tolist()))
-    parser = BinaryParser()
-    damaged = bytearray(encode_frame(Frame(10, 0, good.values)))
-    damaged[5] ^= 0x40
-    parser.feed(bytes(damaged))
-    assert [r.contact for r in play(good, parser=parser)] == [True]
-    assert parser.counts.crc_errors + parser.counts.malformed == 1
-
-
-def test_order_of_records_does_not_depend_on_chunks(film, predictor):
-    rows = np.vstack([np.tile(OFFSET, (10, 1)), np.tile(pressed(film) + OFFSET, (10, 1))])
-    data = b"".join(map(encode_frame, frames(rows)))
-    bytewise = stream((Chunk(data[i : i + 1], 0.0, 0) for i in range(len(data))), predictor, CHAIN)
-    whole = stream([Chunk(data, 0.0, 0)], predictor, CHAIN)
-    assert [(r.seq, r.x_mm) for r in bytewise] == [(r.seq, r.x_mm) for r in whole]
 
 
 @pytest.fixture

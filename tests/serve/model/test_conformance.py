@@ -8,9 +8,8 @@ import pytest
 from google.protobuf import text_format
 from tritonclient.grpc.model_config_pb2 import TYPE_FP32, ModelConfig
 
-from isocharge.common.errors import ChargeError
 from isocharge.serve import Predictor, check_golden, find_model, load_model
-from isocharge.serve.model.repository import model_names
+from isocharge.serve.model.model_folder import model_names
 from isocharge.serve.model.session import OUTPUTS
 
 MODELS = Path(__file__).parents[3] / "models"
@@ -88,18 +87,3 @@ def test_one_press_equals_the_batch(model, released):
         *expected, expected_misfit = (column[row] for column in batch)
         assert contact == pytest.approx(expected, rel=1e-4, abs=1e-4)
         assert misfit == pytest.approx(expected_misfit, rel=1e-4, abs=1e-3)  # float32, sums in another order
-
-
-def test_wrong_width_names_the_electrodes(model, released):
-    electrodes = model.metadata.electrodes
-    with pytest.raises(ChargeError) as caught:
-        released.predict(np.ones(len(electrodes) + 1))
-    assert str(electrodes) in str(caught.value)
-
-
-def test_nan_names_its_electrode(model, released):
-    for column, name in enumerate(model.metadata.electrodes):
-        charges = np.full(len(model.metadata.electrodes), 800.0)
-        charges[column] = np.nan
-        with pytest.raises(ChargeError, match=f"'{name}'"):
-            released.predict(charges)

@@ -1,15 +1,22 @@
-"""The model folder: written whole or not at all, and read with suspicion."""
+"""The model folder: written whole or not at all, and read with suspicion.
+
+Models are found by name, version and path, in the documented order.
+
+Metadata are the same after a round trip through an ONNX file, and wrong ones are refused with the reason.
+"""
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from isocharge.common.errors import ChargeError, ModelError, OutputExists
 from isocharge.common.files import sha256_of
-from isocharge.serve import check_golden, load_model, write_model
+from isocharge.serve import ModelMetadata, check_golden, find_model, load_model, write_model
 from isocharge.serve.model.golden import make_golden
+from isocharge.serve.model.model_folder import model_names
 
 
 @pytest.fixture
@@ -201,3 +208,147 @@ def test_golden_check_sees_a_change_of_2e_5(own_model):
     golden.write_text(json.dumps(content))
     with pytest.raises(ModelError, match=r"contact\[3, 0\] is .*golden.json says"):
         check_golden(load_model(own_model))
+
+
+@pytest.fixture
+def roots(tmp_path, monkeypatch):
+    """Three repositories - given, from the environment, of the working folder - and nothing shipped."""
+    given, variable, current = (tmp_path / name for name in ("given", "variable", "work/models"))
+    monkeypatch.setenv("ISOCHARGE_MODELS", str(variable))
+    current.mkdir(parents=True)
+    given.mkdir()
+    monkeypatch.chdir(current.parent)
+    monkeypatch.setattr("isocharge.serve.model.model_folder._shipped", lambda: tmp_path / "shipped")
+    return {"given": given, "variable": variable, "current": current, "shipped": tmp_path / "shipped"}
+
+
+def put(root: Path, name: str = "m", version: str = "1") -> Path:
+    folder = root / name / version
+    folder.mkdir(parents=True)
+    (folder / "model.onnx").touch()
+    return folder.resolve()
+
+
+def test_first_repository_wins(roots):
+    first = []
+    for name in ("shipped", "current", "variable", "given"):
+        put(roots[name])
+        first.append(find_model("m", roots["given"]).resolve().parents[1])
+    assert first == [roots[name].resolve() for name in ("shipped", "current", "variable", "given")]
+
+
+def test_highest_version_is_by_number(roots):
+    for version in ("1", "10", "9", "011", "draft", ".11.abcd"):
+        put(roots["given"], version=version)
+    assert find_model("m", roots["given"]).name == "10"
+    assert find_model("m/1", roots["given"]).name == "1"
+
+
+def test_path_of_every_kind(roots):
+    folder = put(roots["given"])
+    for path in (folder.parent, folder, folder / "model.onnx"):
+        assert find_model(path) == find_model(str(path)) == folder
+
+
+def test_path_beside_us_is_found_when_no_model_has_the_name(roots):
+    folder = put(roots["current"].parent, "mine")
+    assert find_model("mine").resolve() == folder
+    shadow = put(roots["current"], "mine")
+    assert find_model("mine").resolve() == shadow
+    assert find_model("./mine").resolve() == folder
+    assert find_model(Path("mine")).resolve() == folder
+
+
+def test_what_is_no_model_is_ignored(roots):
+    put(roots["given"])
+    (roots["given"] / "README.md").touch()
+    (roots["given"] / "notes").mkdir()
+    assert model_names(roots["given"]) == ["m"]
+
+
+def test_missing_name_says_where_and_what(roots):
+    put(roots["given"], "three")
+    with pytest.raises(ModelError) as caught:
+        find_model("four", roots["given"])
+    message = str(caught.value)
+    assert "no model 'four'" in message
+    assert f"{roots['given']} (three)" in message
+    assert f"{roots['variable']} (no models)" in message
+
+
+def test_missing_path_says_what_was_expected(roots):
+    with pytest.raises(ModelError, match=r"nowhere/model.onnx: no model; expected a model folder"):
+        find_model("nowhere/model.onnx", roots["given"])
+
+
+def test_repository_that_was_named_must_be_there(roots):
+    put(roots["current"])
+    with pytest.raises(ModelError, match="nope: expected a folder of models"):
+        find_model("m", roots["given"] / "nope")
+
+
+WHERE = "models/linear/1/model.onnx"
+
+
+def test_props_round_trip(film):
+    metadata = film.metadata()
+    assert ModelMetadata.from_props(metadata.to_props(), WHERE) == metadata
+
+
+def test_foreign_props_are_left_alone(film):
+    props = film.metadata().to_props() | {"author": "not JSON"}
+    assert ModelMetadata.from_props(props, WHERE) == film.metadata()
+
+
+def test_label_and_frame(film):
+    assert (film.metadata().label, film.metadata().frame_id) == ("linear/1", "linear-film")
+
+
+def test_other_format_version(film):
+    props = film.metadata().to_props() | {"format_version": "2"}
+    with pytest.raises(ModelError) as caught:
+        ModelMetadata.from_props(props, WHERE)
+    assert str(caught.value) == (
+        f"{WHERE}: metadata format 2 is not supported (this version reads 1); export it again or upgrade isocharge"
+    )
+
+
+@pytest.mark.parametrize(
+    "key", ["format_version", "name", "sensor", "electrodes", "working_area_mm", "errors", "made_with"]
+)
+def test_missing_key_is_named(film, key):
+    props = film.metadata().to_props()
+    del props[key]
+    with pytest.raises(ModelError, match=f"^{WHERE}: metadata: key '{key}' is missing; export the model again$"):
+        ModelMetadata.from_props(props, WHERE)
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "said"),
+    [
+        ("name", '""', "expected letters, digits, '-', '_' and '.', got ''"),
+        ("version", "0", "expected a whole number from 1, got 0"),
+        ("version", "true", "got True"),
+        ("sensor", "{}", "key 'sensor.name' is missing"),
+        ("sensor", '{"name": 3}', "sensor.name: expected a text, got 3"),
+        ("electrodes", '["A", "A"]', "expected names that differ, got .'A', 'A'"),
+        ("electrodes", "[]", r"expected a list of texts, 1 or more, got \[\]"),
+        ("working_area_mm", "[[0, 0], [1, 0]]", "expected a list of lists, 3 or more"),
+        ("working_area_mm", "[[0, 0], [1, 0], [1]]", r"expected a list of 2 numbers, got \[1\]"),
+        ("force_range_N", "[2.0, 0.05]", r"expected a smaller and a larger number, got \[2.0, 0.05\]"),
+        ("force_range_N", "[0.05]", "expected a list of 2 numbers"),
+        ("errors", '{"position_mm": NaN}', "errors: expected JSON"),
+        ("probes", '"circle:1.0"', "expected a list of texts, 1 or more, got 'circle"),
+        ("noise", "{", "noise: expected JSON, got '{' "),
+        ("noise", "[" * 100_000, "noise: expected JSON"),
+    ],
+)
+def test_wrong_value_is_shown(film, key, text, said):
+    with pytest.raises(ModelError, match=rf"^{WHERE}: metadata: (?=.*{key}).*{said}.*; export the model again$"):
+        ModelMetadata.from_props(film.metadata().to_props() | {key: text}, WHERE)
+
+
+@pytest.mark.parametrize("value", [{"median_mm": float("nan")}, {"median_mm": object()}])
+def test_what_is_not_json_is_not_written(film, value):
+    with pytest.raises(ModelError, match="'errors': expected a JSON value"):
+        film.metadata(errors=value).to_props()

@@ -10,7 +10,7 @@ import pytest
 
 from isocharge.serve import find_model, load_model
 from isocharge.serve.model.golden import check_answers
-from isocharge.serve.model.repository import model_names
+from isocharge.serve.model.model_folder import model_names
 from isocharge.serve.model.session import OUTPUTS
 
 MODELS = Path(__file__).parents[3] / "models"

@@ -8,8 +8,7 @@ import pytest
 import trustme
 
 from isocharge.common.errors import InputError, ListenError, TokenError
-from isocharge.serve.network.address import Address, check_exposure
-from isocharge.serve.network.credentials import Tls, Token
+from isocharge.serve.network.address import Address, Tls, Token, check_exposure
 from isocharge.serve.network.http import HttpServer
 
 

@@ -114,44 +114,6 @@ def test_infer_with_defaults(client, module, film, tmp_path):
     assert said.get("model_version", said.get("modelVersion")) == "2"
 
 
-@pytest.mark.parametrize("version", ["1", "2"])
-def test_infer_with_a_version(client, module, film, version):
-    answer = client.infer("linear", [tensor(module, charges(film))], model_version=version)
-    said = plain(answer.get_response())
-    assert said.get("model_version", said.get("modelVersion")) == version
-
-
-def test_infer_from_doubles(client, module, film, tmp_path):
-    values = charges(film).astype(np.float64)
-    answer = client.infer("linear", [tensor(module, values, "FP64")])
-    np.testing.assert_array_equal(answer.as_numpy("contact"), expected(tmp_path, values)["contact"])
-
-
-def test_infer_some_outputs(client, module, film):
-    outputs = [module.InferRequestedOutput(name) for name in ("misfit", "contact")]
-    answer = client.infer("linear", [tensor(module, charges(film))], outputs=outputs)
-    said = plain(answer.get_response())
-    assert [output["name"] for output in said["outputs"]] == ["misfit", "contact"]
-    assert answer.as_numpy("contact_std") is None
-
-
-@pytest.mark.parametrize("binary_in", [False, True])
-@pytest.mark.parametrize("binary_out", [(False, False), (True, True), (True, False), (False, True)])
-def test_json_and_binary_mixed(handler, start_http, film, tmp_path, binary_in, binary_out):
-    client = tritonclient.http.InferenceServerClient(start_http(handler).url.removeprefix("http://"))
-    values = charges(film)
-    made = tritonclient.http.InferInput("charge_pC", list(values.shape), "FP32")
-    made.set_data_from_numpy(values, binary_data=binary_in)
-    outputs = [
-        tritonclient.http.InferRequestedOutput(name, binary_data=binary)
-        for name, binary in zip(("contact", "misfit"), binary_out, strict=True)
-    ]
-    answer = client.infer("linear", [made], outputs=outputs)
-    for name in ("contact", "misfit"):
-        np.testing.assert_array_equal(answer.as_numpy(name), expected(tmp_path, values)[name])
-    client.close()
-
-
 @pytest.mark.parametrize("way", ["gzip", "deflate"])
 @pytest.mark.parametrize("n", [1, 200])
 def test_compressed_both_ways(client, module, film, tmp_path, way, n):
@@ -219,18 +181,6 @@ def test_statistics(client, module, film):
     assert len(plain(client.get_inference_statistics()).popitem()[1]) == 2
 
 
-def test_errors_are_said(client, module, film):
-    for values, said in [
-        (charges(film)[:, :2], r"expected the shape \[n, 3\]"),
-        (np.full((1, 3), np.nan, np.float32), "finite charges .* electrode 'A'"),
-        (np.ones((5000, 3), np.float32), "at most 4096 presses"),
-    ]:
-        with pytest.raises(InferenceServerException, match=said):
-            client.infer("linear", [tensor(module, values)])
-    with pytest.raises(InferenceServerException, match=r"model 'cubic' is not found; serving: linear/1, linear/2"):
-        client.get_model_metadata("cubic")
-
-
 def test_a_stream_of_requests(handler, film, tmp_path):
     values, answers = charges(film), []
     with grpc_server(handler, "127.0.0.1", 0) as url:
@@ -243,3 +193,7 @@ def test_a_stream_of_requests(handler, film, tmp_path):
     assert [error is None for _, error in answers] == [True, False, True]
     assert "is not found" in str(answers[1][1])
     np.testing.assert_array_equal(answers[2][0].as_numpy("contact"), expected(tmp_path, values)["contact"])
+    counted = handler.answer("GET", "/metrics", [], b"").body
+    for status, count in (("OK", 2), ("NOT_FOUND", 1)):
+        line = f'{{route="ModelStreamInfer message",status="{status}",transport="grpc"}} {count}.0'
+        assert line.encode() in counted

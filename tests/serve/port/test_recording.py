@@ -1,7 +1,5 @@
 """The file of a recording: what it holds, what ends it, what is refused."""
 
-import os
-
 import pytest
 
 from isocharge.common.errors import OutputError, OutputExists, RecordingError
@@ -23,11 +21,6 @@ def recorded(tmp_path):
                 recorder.tare()
             recorder.chunk(chunk, [f'{{"timestamp": 1.0, "latency_us": {10.0 * k}}}' for k in range(number)])
     return path
-
-
-def test_header_says_how_it_was_recorded(recorded):
-    recording = Recording(recorded)
-    assert (recording.model, recording.policy, recording.device) == ("linear/1", "every", {"tare": {"frames": 10}})
 
 
 def test_events_are_those_that_were_recorded(recorded):
@@ -146,23 +139,3 @@ def test_moments_come_in_their_order_and_records_as_they_were_written(tmp_path):
         Event(CHUNKS[3]),
     ]
     assert list(recording.records(dict)) == [{"timestamp": 5.0, "latency_us": 7.0, "x_mm": 2.5}]
-
-
-def test_a_full_disk_ends_a_recording_with_a_whole_line(tmp_path, monkeypatch, caplog):
-    path, write = tmp_path / "touch.rec", os.write
-
-    def half(descriptor, data):
-        if os.fstat(descriptor).st_size > 200:
-            raise OSError(28, "No space left on device")
-        return write(descriptor, data[: max(1, len(data) // 2)])
-
-    with Recorder(path, "m/1", "every", {}) as recorder:
-        monkeypatch.setattr("os.write", half)
-        for chunk in CHUNKS:
-            recorder.chunk(chunk, [])
-    assert recorder.failed
-    assert "No space left on device" in caplog.text
-    events = list(Recording(path).events())
-    assert [event.chunk for event in events] == CHUNKS[: len(events)]
-    assert path.read_bytes().endswith(b"\n")
-    assert len(events) in (1, 2)

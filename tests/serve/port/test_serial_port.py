@@ -1,17 +1,30 @@
-"""Ports that exist, do not, fall silent and vanish."""
+"""Ports that exist, do not, fall silent and vanish.
+
+Files, pipes and ports by one name.
+
+UDP sockets as ports: datagrams are chunks, and lines without an end get one.
+
+Boards that are asked: when, and what comes back.
+"""
 
 import itertools
+import os
 import socket
 import threading
 import time
+import tty
+from itertools import pairwise
 from unittest import mock
 
 import pytest
 import serial
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from isocharge.common.errors import PortError, PortLost
-from isocharge.serve import Port
-from isocharge.serve.virtual_sensor.pseudo_port import PORT_BUFFER, PseudoPort
+from isocharge.common.errors import InputError, PortError, PortLost
+from isocharge.serve import Port, open_source
+from isocharge.serve.port.serial_line import QUIET_S, UNANSWERED_S, Asker, Request
+from isocharge.serve.virtual_sensor.sensor import PseudoPort
 
 pytestmark = pytest.mark.xdist_group("clock")
 
@@ -116,15 +129,6 @@ def test_a_port_without_a_descriptor_is_read_by_pyserial(monkeypatch, waiting):
     assert device.low_latency == [True]
 
 
-def test_pseudo_port_withholds_whole_frames(board):
-    frame, sent = b"\x01" * 24 + b"\0", 0
-    while board.write_whole(frame):
-        sent += 1
-        time.sleep(0.0005)
-    assert PORT_BUFFER - 50 < sent * 25 <= PORT_BUFFER
-    assert not board.write_whole(frame)
-
-
 @pytest.fixture
 def server():
     """A TCP server for one client at a time; `server.accept()` waits for the client."""
@@ -206,3 +210,194 @@ def test_silence_is_an_outage(board, caplog):
     talking.join()
     assert (chunk.data[:4], port.outages, len(caplog.records)) == (b"late", 1, 1)
     assert 0.4 < chunk.outage_s < 30.0
+
+
+def test_file_is_read_to_its_end(tmp_path):
+    path = tmp_path / "frames.bin"
+    path.write_bytes(bytes(range(256)) * 40)
+    with open_source(str(path)) as source:
+        chunks = list(source)
+    assert b"".join(chunk.data for chunk in chunks) == path.read_bytes()
+    assert {chunk.outage_s for chunk in chunks} == {0.0}
+
+
+def test_named_pipe_is_read_as_it_comes(tmp_path):
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    threading.Thread(target=path.write_bytes, args=(b"hello",)).start()
+    with open_source(str(path)) as source:
+        assert [chunk.data for chunk in source] == [b"hello"]
+
+
+def test_source_is_stdin(monkeypatch):
+    reader, writer = os.pipe()
+    os.write(writer, b"hello")
+    os.close(writer)
+    with os.fdopen(reader) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        with open_source("-") as source:
+            assert [chunk.data for chunk in source] == [b"hello"]
+
+
+@pytest.mark.parametrize("url", ["/dev/ttyNone", "socket://127.0.0.1:1", "loop://"])
+def test_source_of_any_other_name_is_a_port(url):
+    assert isinstance(open_source(url, reconnect=True), Port)
+
+
+def test_file_that_may_not_be_read(tmp_path, monkeypatch):
+    path = tmp_path / "frames.bin"
+    path.write_bytes(b"x")
+    monkeypatch.setattr("pathlib.Path.open", lambda *_, **__: (_ for _ in ()).throw(PermissionError(13, "not yours")))
+    with pytest.raises(InputError, match=r"frames.bin: cannot be read \(not yours\)"), open_source(str(path)):
+        pass
+
+
+@pytest.fixture
+def address():
+    """An address that nobody uses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()
+
+
+def received(address, *datagrams):
+    """What a port reads of datagrams that a board sends."""
+    with (
+        Port(f"udp://127.0.0.1:{address[1]}", silence_s=10.0) as port,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board,
+    ):
+        for datagram in datagrams:
+            board.sendto(datagram, address)
+        chunks = iter(port)
+        return [next(chunks).data for datagram in datagrams if datagram]
+
+
+def test_each_datagram_is_a_chunk(address):
+    sent = [b"\x00\xff" * 20, b"\x01", b"\x02\n" * 700]
+    assert received(address, *sent) == sent
+
+
+def test_lines_without_an_end_get_one(address):
+    text, bytes_ = [b'{"A": 1}', b"A:1\tB:2", "1 µC".encode()], [b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f"]
+    assert received(address, *text, *bytes_) == [*(line + b"\n" for line in text), *bytes_]
+
+
+def test_a_board_that_ends_its_lines_gets_no_more_ends(address):
+    assert received(address, b"1,2\n", b"3,", b"4\n") == [b"1,2\n", b"3,", b"4\n"]
+
+
+def test_silence(address):
+    with Port(f"udp://127.0.0.1:{address[1]}", silence_s=0.05) as port:
+        assert port.read(0.01) is None
+        with pytest.raises(PortError, match=r"no data for 0\.05 s"):
+            next(iter(port))
+
+
+def test_an_empty_datagram_is_no_silence(address):
+    assert received(address, b"\x01", b"", b"\x02") == [b"\x01", b"\x02"]
+    with Port(f"udp://127.0.0.1:{address[1]}", silence_s=0.05) as port, socket.socket(type=socket.SOCK_DGRAM) as board:
+        board.sendto(b"", address)
+        assert port.read(0.01) is None
+
+
+@pytest.mark.parametrize(
+    "url", ["udp://127.0.0.1", "udp://127.0.0.1:99999", "udp://127.0.0.1:9/x", "udp://300.0.0.1:9"]
+)
+def test_addresses_that_are_none(url):
+    with pytest.raises(PortError, match=f"{url}: cannot be opened"), Port(url):
+        pass
+
+
+def test_an_address_that_is_taken(address):
+    with Port(f"udp://127.0.0.1:{address[1]}"), pytest.raises(PortError, match="in use"):
+        Port(f"udp://127.0.0.1:{address[1]}").__enter__()
+
+
+class Clock:
+    """A clock that is set by hand."""
+
+    def __init__(self):
+        self.now_s = 100.0
+
+    def __call__(self):
+        return self.now_s
+
+
+def asker_at(clock, **settings):
+    return Asker(Request(b"?\n", **settings), clock)
+
+
+def test_the_next_request_waits_for_the_answer_and_for_the_rate():
+    clock = Clock()
+    asker = asker_at(clock, rate_Hz=100.0)
+    assert asker.wait_s() == 0.0
+    assert asker.asked() == b"?\n"
+    assert asker.wait_s() == pytest.approx(UNANSWERED_S)
+    clock.now_s += 0.003
+    assert asker.heard(b"1,2\n") == b"1,2\n"
+    assert asker.wait_s() == pytest.approx(0.007)
+    clock.now_s += 0.0069
+    asker.heard(b"3\n")
+    assert asker.wait_s() == pytest.approx(QUIET_S)
+
+
+def test_a_request_without_an_answer_is_repeated():
+    clock = Clock()
+    asker = asker_at(clock)
+    asker.asked()
+    clock.now_s += 0.5 * UNANSWERED_S
+    assert asker.wait_s() == pytest.approx(0.5 * UNANSWERED_S)
+    clock.now_s += 0.5 * UNANSWERED_S
+    assert asker.wait_s() == pytest.approx(0.0)
+    asker.asked()
+    asker.forget()
+    assert asker.wait_s() == 0.0
+
+
+@settings(derandomize=True)
+@given(st.binary(min_size=1, max_size=8), st.binary(max_size=20), st.lists(st.integers(0, 28), max_size=5))
+def test_the_echo_is_taken_out_however_it_is_cut(request_bytes, answer, cuts):
+    asker = Asker(Request(request_bytes, echo=True))
+    asker.asked()
+    stream = request_bytes + answer
+    at = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
+    assert b"".join(asker.heard(stream[a:b]) for a, b in pairwise(at)) == answer
+    assert asker.echo_share == 1.0
+
+
+def test_an_answer_that_is_no_echo_stays():
+    asker = Asker(Request(b"\x01\x04\x00", echo=True))
+    asker.asked()
+    assert asker.heard(b"\x02\x04\x00\x10") == b"\x02\x04\x00\x10"
+    assert asker.echo_share == 0.0
+
+
+def test_an_echo_is_counted_and_stays_where_it_is_not_expected():
+    asker = Asker(Request(b"?", echo=False))
+    asker.asked()
+    assert asker.heard(b"?1\n") == b"?1\n"
+    assert asker.echo_share == 1.0
+
+
+@pytest.mark.xdist_group("clock")
+def test_a_port_asks():
+    """A pseudo-terminal that answers each request with a line of its own, echo first."""
+    board, reader = os.openpty()
+    tty.setraw(reader)
+
+    def answer():
+        for number in range(10):
+            assert os.read(board, 100) == b"?"
+            os.write(board, b"?%d\n" % number)
+
+    answering = threading.Thread(target=answer)
+    answering.start()
+    with Port(os.ttyname(reader), request=Request(b"?", 200.0, echo=True), silence_s=5.0) as port:
+        got, chunks = b"", iter(port)
+        while got.count(b"\n") < 10:
+            got += next(chunks).data
+        assert port.echo_share == 1.0
+    answering.join()
+    os.close(board)
+    os.close(reader)
+    assert got.split(b"\n")[:10] == [b"%d" % k for k in range(10)]

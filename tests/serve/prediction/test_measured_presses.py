@@ -1,7 +1,6 @@
 """Measured presses: any spreadsheet's file is read, what is wrong is named, and writing loses nothing."""
 
 import csv
-import io
 
 import numpy as np
 import pytest
@@ -11,8 +10,8 @@ from hypothesis import strategies as st
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.prediction import measured_presses
-from isocharge.serve.prediction.csv_numbers import LARGEST
-from isocharge.serve.prediction.measured_presses import KINDS, read_press_list
+from isocharge.serve.prediction.measured_presses import KINDS, presses_text, read_press_list
+from isocharge.serve.prediction.table import LARGEST
 
 NAMES = ("A", "B", "C")
 HEADER = "x_mm,y_mm,force_N,A,B,C"
@@ -208,9 +207,8 @@ def test_what_is_written_is_read(presses, tmp_path_factory):
 
 
 def test_a_written_file_is_plain_csv(read):
-    text = io.StringIO()
-    write_presses(text, read(f"{HEADER}\n1,2,,10,,30\n"))
-    assert list(csv.DictReader(text.getvalue().splitlines())) == [
+    text = presses_text(read(f"{HEADER}\n1,2,,10,,30\n"))
+    assert list(csv.DictReader(text.splitlines())) == [
         {"x_mm": "1.0", "y_mm": "2.0", "force_N": "", "A": "10.0", "B": "", "C": "30.0"}
         | {"position_std_mm": "0.1", "force_std": "0.01"}
     ]

@@ -4,7 +4,6 @@ import math
 import pickle
 import re
 import tracemalloc
-from concurrent.futures import ThreadPoolExecutor
 from decimal import Decimal
 
 import numpy as np
@@ -15,7 +14,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import ChargeError, ModelError
 from isocharge.serve import Contact, Contacts, Predictor
-from isocharge.serve.prediction.bound_press import BoundPress
+from isocharge.serve.model.session import BoundPress
 
 PRESSES = st.lists(st.floats(0.0, 5000.0, width=32), min_size=3, max_size=3).filter(lambda q: sum(q) > 1.0)
 
@@ -150,23 +149,6 @@ def test_predict_into_allocates_no_array(predictor):
         predictor.predict_into(charges, out)
     (grown, _), _ = tracemalloc.get_traced_memory(), tracemalloc.stop()
     assert grown < 20_000  # an array each is 2 MB; onnxruntime holds up to 10 kB after other tests, however many calls
-
-
-def test_predictor_in_threads(film, models, predictor):
-    """One predictor for each thread, and one for all of them for batches, as the README says."""
-    charges = np.tile(film.golden_pC(), (50, 1))
-    expected = np.column_stack(predictor.predict_batch(charges))
-
-    def alone(_):
-        mine, rows = Predictor("linear", models=models), np.empty((len(charges), 7), np.float32)
-        for press, row in zip(charges, rows, strict=True):
-            mine.predict_into(press, row)
-        return rows
-
-    with ThreadPoolExecutor(4) as threads:
-        together = list(threads.map(lambda _: np.column_stack(predictor.predict_batch(charges)), range(20)))
-        for got in [*together, *threads.map(alone, range(4))]:
-            np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_bound_memory_that_is_not_shared_is_noticed(models, monkeypatch):

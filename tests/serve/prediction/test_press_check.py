@@ -2,18 +2,23 @@
 
 The model's standard deviations are 50 mm pC / sum of charges, and 7e-4 N for the force. Answers are moved by just such
 noise, so that chi-squared, its distribution and every share of the errors are known.
+
+The chi-squared distribution beside SciPy's.
 """
 
-import json
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from scipy import stats
+from scipy.special import gammaincc
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, Predictor, check_presses
-from isocharge.serve.prediction.agreement import Common, ErrorSummary
+from isocharge.serve.prediction.press_errors import Common, ErrorSummary, chi_squared_survival
 
 RIG_MM, RIG_SHARE = 0.05, 0.004
 
@@ -161,20 +166,6 @@ def test_electrodes_are_taken_by_their_names(predictor, measure):
         check_presses(predictor, replace(presses, electrodes=("A", "B", "D")))
 
 
-def test_to_dict_is_json(predictor, measure):
-    check = check_presses(predictor, measure(5, known=(False, True)))
-    values = json.loads(json.dumps(check.to_dict(), allow_nan=False))
-    assert values["fits"] is True
-    assert (values["position_mm"], values["shift_mm"], values["shift_std_mm"]) == (None, [None, None], [None, None])
-    assert values["force_percent"]["rms"] == pytest.approx(check.force_percent.rms)
-    assert values["force_scale"] == pytest.approx(1.0 + check.agreement.force.mean)
-    assert values["chi_squared_per_degree"] == pytest.approx(check.agreement.chi_squared / 5)
-    assert [press["line"] for press in values["each"]] == [2, 3, 4, 5, 6]
-    empty = check_presses(predictor, measure(5)[:0]).to_dict()
-    assert (empty["fits"], empty["chi_squared_per_degree"], empty["p_value"], empty["each"]) == (None, None, None, [])
-    json.dumps(empty, allow_nan=False)
-
-
 def test_common_part_is_the_weighted_mean():
     rng = np.random.default_rng(0)
     std = rng.uniform(0.5, 2.0, 500)
@@ -192,3 +183,19 @@ def test_summary_of_known_numbers():
     assert (summary.noise, summary.rig, summary.explained, summary.beyond) == (3**0.5, 0.5**0.5, 3.5**0.5, 3.0)
     assert ErrorSummary.of(np.array([1.0]), np.array([4.0]), np.array([0.0])).beyond == 0.0
     assert ErrorSummary.of(np.array([]), np.array([]), np.array([])) is None
+
+
+@given(degrees=st.integers(1, 2000), sigmas=st.floats(-4.0, 20.0))
+@example(degrees=1, sigmas=-0.7)
+@example(degrees=2, sigmas=0.0)
+@example(degrees=3_000_000, sigmas=2.0)
+@settings(derandomize=True, deadline=None)
+def test_as_scipy_has_it(degrees, sigmas):
+    statistic = max(0.0, degrees + sigmas * math.sqrt(2.0 * degrees))
+    expected = gammaincc(0.5 * degrees, 0.5 * statistic)
+    assert chi_squared_survival(statistic, degrees) == pytest.approx(expected, rel=1e-6 if degrees > 2000 else 1e-11)
+
+
+@pytest.mark.parametrize(("statistic", "expected"), [(0.0, 1.0), (math.inf, 0.0), (1e300, 0.0), (1e-320, 1.0)])
+def test_ends(statistic, expected):
+    assert chi_squared_survival(statistic, 3) == expected

@@ -11,8 +11,7 @@ import pytest
 from cobs import cobs
 
 from isocharge.serve import device_from_table
-from isocharge.serve.recognition.described import described_frames
-from isocharge.serve.recognition.recognise import recognise
+from isocharge.serve.recognition.recognise import described_frames, recognise
 
 FRAMES, RATE_HZ = 300, 200.0
 TYPES = ("i16", "u16", "i24", "u24", "i32", "f32")

@@ -10,11 +10,9 @@ import pytest
 from websockets.asyncio.client import connect
 
 from isocharge.serve.network.address import Address
-from isocharge.serve.viewer.description import describe_film
 from isocharge.serve.viewer.link import make_link
-from isocharge.serve.viewer.messages import HEADER
+from isocharge.serve.viewer.messages import HEADER, SampleFormat, describe_film
 from isocharge.serve.viewer.process import Page, run_page
-from isocharge.serve.viewer.samples import SampleFormat
 
 NAMES = ("A", "B", "C")
 

@@ -1,22 +1,40 @@
-"""What a page asks for: the known requests are read, anything else is refused with a reason."""
+"""What a page asks for: the known requests are read, anything else is refused with a reason.
+
+Samples of fixed size: what is written is what a reader of the documented layout reads; and many as few.
+
+The files of the page: small, whole, and of one mind with the server about what goes over the wire.
+"""
 
 import json
+import re
+import shutil
+import subprocess
+from importlib.resources import files
+from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from isocharge.common.deflection_field import points_mm, read_deflection_field
 from isocharge.common.errors import RequestError
 from isocharge.common.structs import parse_json
+from isocharge.serve import flags
 from isocharge.serve.viewer.messages import (
+    CONTACT_BIT,
+    FLAG_BITS,
     LiveRequest,
     Marker,
     Record,
     ReplayRequest,
+    SampleFormat,
     Seek,
     Speed,
     Tare,
+    coalesce,
     confirmed_number,
+    samples_message,
 )
 
 
@@ -77,3 +95,131 @@ def test_confirmations_have_four_bytes():
     assert confirmed_number(b"\x01\x02\x00\x00") == 513
     with pytest.raises(RequestError, match="four bytes"):
         confirmed_number(b"\x01")
+
+
+FORM = SampleFormat(("A", "B", "C"))
+
+
+def test_what_no_float32_holds_is_clipped(record):
+    form = SampleFormat(("A",))
+    sample = np.frombuffer(form.pack(record(charge_pC={"A": -1e300}, misfit=1e200)), form.dtype)[0]
+    assert sample["charge_pC"][0] == -np.finfo(np.float32).max
+    assert sample["misfit"] == np.finfo(np.float32).max
+
+
+def test_every_flag_has_a_bit_of_its_own():
+    words = {value for name, value in vars(flags).items() if name.isupper() and isinstance(value, str)}
+    assert set(FLAG_BITS) == words
+    assert len(set(FLAG_BITS.values())) == len(words)
+    assert max(FLAG_BITS.values()) < CONTACT_BIT
+
+
+def samples(force_N, bits=None):
+    """Samples 1 ms apart, contacts where the force is above zero."""
+    rows = np.zeros(len(force_N), FORM.dtype)
+    rows["timestamp"] = 1e-3 * np.arange(len(rows))
+    rows["force_N"] = force_N
+    rows["flags"] = np.where(np.array(force_N) > 0, CONTACT_BIT, 0) | (0 if bits is None else np.array(bits))
+    rows["records"] = 1
+    rows["latency_us"] = np.arange(len(rows))
+    return rows
+
+
+@given(
+    force_N=st.lists(st.floats(0, 2, width=32), min_size=1, max_size=400),
+    most=st.integers(1, 50),
+    seed=st.integers(0, 1000),
+)
+def test_runs_stand_for_all(force_N, most, seed):
+    bits = np.random.default_rng(seed).integers(0, 1 << 12, len(force_N))
+    rows = samples(force_N, bits)
+    shown = coalesce(rows, most)
+    assert len(shown) == min(most, len(rows))
+    assert shown["records"].sum() == len(rows)
+    assert np.bitwise_or.reduce(shown["flags"]) == np.bitwise_or.reduce(rows["flags"])
+    assert shown["latency_us"][-1] == len(rows) - 1
+    assert (np.diff(shown["timestamp"]) > 0).all()
+    assert set(shown["force_N"].tolist()) <= set(rows["force_N"].tolist())
+
+
+@given(start=st.integers(0, 90), most=st.integers(1, 30))
+def test_a_tap_is_shown(start, most):
+    force_N = np.zeros(100)
+    force_N[start : start + 3] = (0.5, 1.0, 0.4)
+    touching = coalesce(samples(force_N), most)
+    assert (touching["flags"] & CONTACT_BIT).any()
+    assert touching["force_N"].max() >= 0.4
+
+
+def test_the_newest_contact_counts():
+    """While something touches, what is shown is where it is now, not where it was pressed hardest."""
+    shown = coalesce(samples(np.linspace(2.0, 1.0, 64)), 1)
+    assert shown["timestamp"][0] == 0.063
+
+
+VIEWER = Path(str(files("isocharge.serve.viewer")))
+FILES = [path for folder in ("page", "fields") for path in (VIEWER / folder).rglob("*") if path.is_file()]
+OWN = [path for path in FILES if "vendor" not in path.parts and path.suffix in (".js", ".html", ".css")]
+
+
+@pytest.mark.parametrize("path", OWN, ids=lambda path: path.name)
+def test_nothing_is_fetched_from_elsewhere(path):
+    text = path.read_text("utf-8").replace("http://www.w3.org", "")
+    assert not re.search(r"https?://|//[a-z]+\.[a-z]|@import|url\([\"']", text)
+
+
+def node(script):
+    if shutil.which("node") is None:
+        pytest.skip("needs Node.js, which reads the page's modules as a browser does")
+    done = subprocess.run(["node", "--input-type=module", "-e", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_the_page_reads_what_the_server_writes(record):
+    form = SampleFormat(("A", "B", "C"))
+    changes = {
+        "charge_pC": {"A": 1.5, "B": None, "C": -3.0},
+        "y_mm": 2.5,
+        "flags": ("gap", "misfit"),
+        "latency_us": 9.0,
+    }
+    data = form.pack(record(**changes)) + form.pack(record(contact=False, x_mm=None, flags=()))
+    message = samples_message(77, 123.5, np.frombuffer(data, form.dtype), 4, begin_anew=True)
+    got = node(
+        f"""import {{ decode }} from "{(VIEWER / "page/decode.js").as_uri()}";
+        const bytes = Uint8Array.from([{",".join(map(str, message))}]);
+        console.log(JSON.stringify([decode(bytes.buffer, 3), decode(bytes.buffer.slice(0, 90), 3),
+          decode(new ArrayBuffer(3), 3), decode(bytes.buffer, 6)]));"""
+    )
+    whole, *broken = got
+    assert broken == [None, None, None]
+    assert (whole["number"], whole["sent_s"], whole["missed"], whole["beginsAnew"]) == (77, 123.5, 4, True)
+    first, second = whole["samples"]
+    assert first["charges"] == [1.5, None, -3.0]
+    assert (first["contact"], first["y"], first["t"], first["latency"]) == (True, 2.5, 1763600000.1234567, 9.0)
+    assert (second["contact"], second["x"], second["bits"]) == (False, None, 0)
+    assert bin(first["bits"]).count("1") == 2
+
+
+def test_the_page_interpolates_the_deflection():
+    """At the nodes of the table the page gives its numbers, turned and mirrored with the press."""
+    path = next((VIEWER / "fields").glob("*.json"))
+    field = read_deflection_field(path)
+    column, ring, angle, turn = 2, 9, 5, 0.7
+    distance = field.distance_mm[column]
+    at = points_mm(field.film["radius_mm"], field.probe_radius_mm, distance, np.array(field.rings), 13)[ring, angle]
+    for mirrored in (at, at.conjugate()):
+        place = mirrored * np.exp(1j * turn)
+        press = distance * np.exp(1j * turn)
+        got = node(
+            f"""import {{ readFileSync }} from "node:fs";
+            import {{ Deflection }} from "{(VIEWER / "page/deflection.js").as_uri()}";
+            const field = new Deflection(JSON.parse(readFileSync("{path}", "utf8")));
+            field.press({press.real}, {press.imag}, {field.force_N[1]});
+            const node = field.node({ring}, {angle if mirrored is at else 24 - angle});
+            const at = field.at({place.real}, {place.imag}), flat = (field.press(0, 0, 0), field.at(1, 1));
+            console.log(JSON.stringify([...node, at, flat]));"""
+        )
+        w = field.deflection_mm[1, column, ring, angle]
+        assert got == pytest.approx([place.real, place.imag, w, w, 0.0], abs=2e-3)

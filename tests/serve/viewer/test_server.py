@@ -1,6 +1,10 @@
-"""The page's server, asked by the stock WebSocket client and by others that mean no good."""
+"""The page's server, asked by the stock WebSocket client and by others that mean no good.
+
+Who may follow a film: the token, and pages of this server.
+"""
 
 import asyncio
+import base64
 import json
 import re
 import socket
@@ -14,9 +18,10 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 
+from isocharge.common.errors import OriginError, TokenError
+from isocharge.serve.network.address import Token
 from isocharge.serve.viewer import server
-from isocharge.serve.viewer.messages import Marker, Record, Tare
-from isocharge.serve.viewer.server import BYTES_AT_ONCE, VIEWERS, Budget
+from isocharge.serve.viewer.server import BYTES_AT_ONCE, VIEWERS, Access, Budget
 
 pytestmark = pytest.mark.xdist_group("clock")
 
@@ -27,19 +32,6 @@ def put(page, record, count, **changes):
     for k in range(count):
         changed = {"timestamp": end - 0.005 * (count - 1 - k), "seq": k} | changes
         page.reader.put(page.form.pack(record(**changed)))
-
-
-def test_samples_come_as_they_were_put(page, record, viewer):
-    async def talk(client):
-        await client.samples()
-        put(page, record, 3, x_mm=1.5, force_N=0.75)
-        return await client.samples()
-
-    header, rows = viewer(page, talk)
-    assert header[:3] == (1, 0, len(rows))
-    assert rows["x_mm"].tolist() == [1.5] * len(rows)
-    assert rows["force_N"][-1] == 0.75
-    assert rows["charge_pC"][-1][0] == 800.0625
 
 
 def test_a_new_viewer_sees_the_last_seconds(page, record, viewer):
@@ -133,23 +125,14 @@ def test_a_viewer_that_takes_nothing_is_left(start_page, viewer, monkeypatch):
 
     with pytest.raises(ConnectionClosedError, match="no close frame"):
         viewer(page, stall)
-    page.reader.tell(number="last")
+    while not page.reader.tell(number="last"):  # the link is full until the page looks at it again
+        time.sleep(0.01)
 
     async def wait_for_last(client):
         while (await client.text("state"))["number"] != "last":
             pass
 
     viewer(page, wait_for_last)
-
-
-def test_requests_reach_the_reader(page, viewer):
-    async def talk(client):
-        await client.ask(do="tare")
-        await client.ask(do="record", on=True)
-        await client.ask(do="marker", text="here")
-        return [await asyncio.to_thread(page.reader.request) for _ in range(3)]
-
-    assert viewer(page, talk) == [Tare(), Record(on=True), Marker("here")]
 
 
 def test_states_reach_the_viewer(page, viewer):
@@ -361,3 +344,38 @@ def test_files_of_the_page(page):
     session = json.loads(page.get("/session.json")[2])
     assert session["film"]["electrodes"] == ["A", "B", "C"]
     assert not session["is_replay"]
+
+
+def bearer(token):
+    return "bearer." + base64.urlsafe_b64encode(token.encode()).decode().rstrip("=")
+
+
+@pytest.mark.parametrize("host", [b"127.0.0.1:8001", b"localhost:8001", b"[::1]:8001", b"192.168.1.7"])
+def test_this_machine_s_page_is_answered(host):
+    Access().check({b"host": host, b"origin": b"http://" + host})
+
+
+@pytest.mark.parametrize(
+    "origin", [b"http://evil.example", b"null", b"http://127.0.0.1:9999", b"http://[", b"file://", b"\xff\xfe"]
+)
+def test_another_site_s_page_is_refused(origin):
+    with pytest.raises(OriginError):
+        Access().check({b"host": b"127.0.0.1:8001", b"origin": origin})
+
+
+def test_a_name_that_points_here_is_refused():
+    """DNS rebinding: the page and the server then have the same name, and it is not ours."""
+    headers = {b"host": b"evil.example:8001", b"origin": b"http://evil.example:8001"}
+    with pytest.raises(OriginError, match="this machine's address"):
+        Access().check(headers)
+    Access(host="evil.example").check(headers)  # that is the name on which it was told to listen
+    Access(Token("secret")).check(headers | {b"authorization": b"Bearer secret"})  # nobody has it by accident
+
+
+def test_token_by_header_or_subprotocol():
+    access, headers = Access(Token("s3cret?>~")), {b"host": b"127.0.0.1:1"}
+    access.check(headers | {b"authorization": b"Bearer s3cret?>~"})
+    access.check(headers, ["isocharge.live.1", bearer("s3cret?>~")])
+    for offered in ([], ["isocharge.live.1"], [bearer("other")], ["bearer.***"], ["bearer."], ["bearer.\u00e9"]):
+        with pytest.raises(TokenError):
+            access.check(headers, offered)

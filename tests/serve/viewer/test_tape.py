@@ -1,12 +1,17 @@
-"""Samples by number: the latest of a stream, all of a recording."""
+"""Samples by number: the latest of a stream, all of a recording.
 
+The link between the processes: the reader never waits, and what arrives is whole.
+"""
+
+import time
 from contextlib import closing
 
 import numpy as np
 import pytest
 
-from isocharge.serve.viewer.samples import SampleFormat
-from isocharge.serve.viewer.tape import PIECES, RecordedTape, Tape
+from isocharge.serve.viewer.hub import PIECES, RecordedTape, Tape
+from isocharge.serve.viewer.link import make_link
+from isocharge.serve.viewer.messages import SampleFormat
 
 FORM = SampleFormat(("A",))
 
@@ -64,3 +69,34 @@ def test_overview_has_the_largest_force_of_each_piece(recorded):
     assert len(overview) <= PIECES
     assert overview.index(1.5) / len(overview) == pytest.approx(0.5, abs=0.01)
     assert sum(force > 0 for force in overview) == 1
+
+
+SAMPLE = bytes(range(64))
+
+
+def test_samples_arrive_whole_and_in_order():
+    reader, page = make_link()
+    for number in range(100):
+        reader.put(bytes([number]) * 64)
+    data = page.take(64)
+    assert data == b"".join(bytes([number]) * 64 for number in range(100))
+    assert page.take(64) == b""
+    assert page.is_open
+    reader.close()
+    page.close_here()
+
+
+def test_a_reader_does_not_wait_for_a_page_that_takes_nothing():
+    reader, page = make_link()
+    began = time.perf_counter()
+    for _ in range(40_000):
+        reader.put(SAMPLE)
+    told = sum(reader.tell(counters={"frames": 1}, note="x" * 500) for _ in range(2000))
+    assert time.perf_counter() - began < 5.0
+    assert reader.dropped > 0
+    assert told < 2000
+    taken = len(b"".join(iter(lambda: page.take(64), b""))) // 64
+    assert taken + reader.dropped == 40_000
+    assert len(page.replies()) == told
+    reader.close()
+    page.close_here()

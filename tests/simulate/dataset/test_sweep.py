@@ -162,6 +162,8 @@ def test_a_sweep_that_leaves_the_film_leaves_nothing(tmp_path):
 
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(OutputError, match="file/presses cannot be written: Not a directory; choose another output"):
+    with pytest.raises(
+        OutputError, match=r"file/presses\.part cannot be written: Not a directory; choose another output"
+    ):
         run_sweep(tmp_path / "file" / "presses", SENSOR, (Circle(1.0),), small(), QUICK)
     assert (tmp_path / "file").read_text() == "mine"

@@ -11,7 +11,7 @@ from scipy.stats import halfnorm
 
 from isocharge.common.errors import DatasetError, ModelError, OutputExists
 from isocharge.serve import Predictor, find_model
-from isocharge.serve.model.repository import model_names
+from isocharge.serve.model.model_folder import model_names
 from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.train import (

@@ -1,30 +1,41 @@
-"""`isocharge demo`: all of isocharge once, on this machine: simulate, train, serve, show."""
+"""`isocharge demo`: all of isocharge once: simulate, train, serve, show; or a virtual film on the live page."""
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from itertools import count, islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import numpy as np
 import typer
+from scipy.stats import binned_statistic
 
-from isocharge.cli.demo.live_film import show_live_film
-from isocharge.cli.demo.page import draw_page
-from isocharge.cli.shared.live_page import LiveOption, page_address
+from isocharge.cli.shared.live_page import LiveOption, PageFeed, answering, live_page, page_address
 from isocharge.cli.shared.options import ConfigOption
-from isocharge.cli.shared.terminal import say, shown_progress, this_command
+from isocharge.cli.shared.terminal import say, shown_progress, this_command, until_stopped
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.arrays import Array
 from isocharge.common.files import new_folder
 from isocharge.common.progress import track
 from isocharge.serve import Port, Predictor, TouchStream, find_model, load_model
 from isocharge.serve.benchmark import in_process_contenders, press_charges, take_turns
+from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.live.stream import StreamTotals
-from isocharge.serve.virtual_sensor.pseudo_port import posix_modules
-from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, noise_model, press, read_dataset
+from isocharge.serve.network.address import Address
+from isocharge.serve.virtual_sensor.sensor import posix_modules
+from isocharge.simulate import Circle, Equilibrium, ForwardMap, Sweep, load_sensor, noise_model, press, read_dataset
 from isocharge.simulate.dataset.sweep import solve_maps, write_sweep
+from isocharge.simulate.plots.figure import FELT, PRESSED, new_figure, save_picture
+from isocharge.simulate.plots.film import (
+    draw_charge_map,
+    draw_deflection,
+    draw_electrodes,
+    draw_section,
+    draw_working_area,
+    frame_film,
+)
 from isocharge.train import fit, load_config, release
 
 SENSOR, SAMPLES, RATE_HZ, SEED = "three-25um-biaxial", 24_000, 200.0, 0
@@ -186,3 +197,88 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], fold
         ("results in", str(folder)),
     ]
     return "\n" + "\n".join(f"{name:<32} {value}" for name, value in rows)
+
+
+def show_live_film(sensor: str, rate_Hz: float, seed: int, address: Address, seconds: float | None) -> None:
+    """Play a virtual sensor, follow it with the released model, and show both on the live page.
+
+    Args:
+        sensor: Name of the sensor and of its model.
+        rate_Hz: Frames per second.
+        seed: Of the presses.
+        address: Where the page listens.
+        seconds: Time after which to stop; None for Ctrl-C.
+    """
+    predictor = Predictor(sensor)
+    with shown_progress():
+        forward_map = ForwardMap.build(load_sensor(sensor), Circle(1.0))
+    touch = TouchStream(predictor)
+    live = RecordedStream(touch)
+    with ExitStack() as stack:
+        stack.enter_context(until_stopped())
+        link, _ = stack.enter_context(live_page(address, None, sensor, predictor.metadata, find_model(sensor)))
+        board = stack.enter_context(virtual_sensor(forward_map, "reference", seed, rate_Hz))
+        port = stack.enter_context(Port(board.url))
+        stack.enter_context(answering(link, live, ("every", {}, "")))
+        say("Ctrl-C stops")
+        feed = PageFeed(link, touch, live)
+        for record, _ in stack.enter_context(closing(live.follow(port))):
+            feed.put(record)
+            if seconds is not None and touch.counts.records > seconds * rate_Hz:
+                break
+
+
+def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array, tested: Array, path: Path) -> None:
+    """Draw the page and write it.
+
+    Args:
+        forward_map: The film.
+        equilibrium: The press that is shown.
+        followed: Live presses: number, true and estimated (x, y, F), shape (n, 7), mm and N.
+        tested: Test presses, true and estimated, shape (m, 6).
+        path: The picture.
+    """
+    count = len(forward_map.electrodes)
+    figure = new_figure(15.0, 9.2)
+    top, bottom = cast(np.ndarray, figure.subfigures(2, 1))
+    left, middle, right = top.subplots(1, 3)
+    draw_deflection(left, equilibrium)
+    draw_electrodes(left, forward_map.sensor, names=False)
+    draw_section(middle, equilibrium)
+    _path(right, forward_map, followed)
+    maps = bottom.subplots(1, count + 1, width_ratios=(*(1.0,) * count, 1.25))
+    for number, (axes, name) in enumerate(zip(maps, forward_map.electrodes, strict=False)):
+        draw_charge_map(axes, forward_map, number)
+        draw_electrodes(axes, forward_map.sensor, highlight=name)
+        _frame(axes, forward_map, f"isocharge contours of {name} at 1 N, pC")
+    _error_against_force(maps[-1], tested[:, 2], np.hypot(*(tested[:, 3:5] - tested[:, :2]).T))
+    figure.suptitle(f"isocharge demo: {forward_map.sensor.name}, {forward_map.probe.notation}", fontsize=14)
+    save_picture(figure, path)
+
+
+def _frame(axes: Any, forward_map: ForwardMap, title: str) -> None:
+    draw_working_area(axes, forward_map.domain.radius)
+    frame_film(axes, forward_map.sensor, forward_map.domain.radius, title)
+
+
+def _path(axes: Any, forward_map: ForwardMap, followed: Array) -> None:
+    for number in np.unique(followed[:, 0]):
+        frames = followed[followed[:, 0] == number]
+        labels = ("pressed", "estimated") if number == followed[0, 0] else (None, None)
+        axes.plot(*frames[:, 1:3].T, color=PRESSED, lw=3.0, solid_capstyle="round", label=labels[0])
+        axes.plot(*frames[:, 4:6].T, color=FELT, lw=0.7, label=labels[1])
+    axes.legend(loc="upper right")
+    draw_electrodes(axes, forward_map.sensor)
+    _frame(axes, forward_map, "live path, through the port")
+
+
+def _error_against_force(axes: Any, force: Array, error: Array) -> None:
+    axes.loglog(force, error, ".", color=PRESSED, ms=2, alpha=0.5)
+    edges = np.geomspace(force.min(), force.max(), 13)
+    for share, style, label in ((50, "-", "median"), (95, "--", "95 %")):
+        line = binned_statistic(force, error, partial(np.percentile, q=share), edges).statistic
+        axes.plot(np.sqrt(edges[:-1] * edges[1:]), line, style, color=FELT, label=label)
+    axes.legend()
+    axes.set(title="position error of test presses", xlabel="force, N", ylabel="error, mm")
+    axes.set_ylim(bottom=2e-3)
+    axes.grid(alpha=0.3, which="both")

@@ -12,7 +12,7 @@ serve_app = lazy_group(
             "Follow a sensor live: a record for every frame of charges.",
         ),
         "replay": (
-            "isocharge.cli.serve.replay:replay_command",
+            "isocharge.cli.serve.stream:replay_command",
             "Play a recording again, as it was or with other settings.",
         ),
         "plot": ("isocharge.cli.serve.plot:plot_command", "Draw a recording."),

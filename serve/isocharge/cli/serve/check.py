@@ -8,11 +8,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
-from isocharge.cli.shared.options import JsonOption, ModelArgument
-from isocharge.serve.prediction.agreement import ErrorSummary
+from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
+from isocharge.cli.shared.options import JsonOption, ModelArgument, ModelsOption
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses
+from isocharge.serve.prediction.press_errors import ErrorSummary
 
 MOST_ROWS = 40
 """Presses in the table for people; of more, the worst are shown."""

@@ -3,20 +3,23 @@
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict
+from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from isocharge.cli.serve.options import ModelsOption, WaitOption, awaited
-from isocharge.cli.shared.options import DeviceOption, JsonOption, board_of
+from isocharge.cli.serve.records import WaitOption, awaited
+from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption
 from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError, IsochargeError
+from isocharge.common.files import refuse_existing, write_whole
 from isocharge.common.number_text import number_of
-
-if TYPE_CHECKING:
-    from isocharge.serve import Examination
-    from isocharge.serve.port.request import Request
+from isocharge.serve import Examination, Predictor, examine, load_device
+from isocharge.serve.examination.listening import BAUDS
+from isocharge.serve.examination.port_check import device_text
+from isocharge.serve.model.model_folder import model_names, repositories
+from isocharge.serve.port.serial_line import Request
 
 GAIN_METAVAR = "NUMBER|A=..,B=.."
 
@@ -53,7 +56,7 @@ def doctor_command(
     pC_per_unit: Annotated[
         str | None,
         typer.Option(
-            "--pC-per-unit",
+            "--pc-per-unit",
             metavar=GAIN_METAVAR,
             help="Charge of one unit that the board sends, pC; for the device file. (default: asked for)",
         ),
@@ -61,13 +64,13 @@ def doctor_command(
     V_per_unit: Annotated[
         str | None,
         typer.Option(
-            "--V-per-unit", metavar=GAIN_METAVAR, help="Voltage of one unit, V; with --feedback-pF. (default: none)"
+            "--v-per-unit", metavar=GAIN_METAVAR, help="Voltage of one unit, V; with --feedback-pf. (default: none)"
         ),
     ] = None,
     feedback_pF: Annotated[
         str | None,
         typer.Option(
-            "--feedback-pF", metavar=GAIN_METAVAR, help="Feedback capacitance of the amplifiers, pF. (default: none)"
+            "--feedback-pf", metavar=GAIN_METAVAR, help="Feedback capacitance of the amplifiers, pF. (default: none)"
         ),
     ] = None,
     request: Annotated[
@@ -79,7 +82,7 @@ def doctor_command(
         ),
     ] = None,
     request_Hz: Annotated[
-        float, typer.Option("--request-Hz", min=0.1, max=1e5, help="Rate of the requests, at most, Hz.")
+        float, typer.Option("--request-hz", min=0.1, max=1e5, help="Rate of the requests, at most, Hz.")
     ] = 100.0,
     json: JsonOption = False,
 ) -> None:
@@ -90,12 +93,6 @@ def doctor_command(
 
     Example: isocharge serve doctor --port /dev/ttyACM0 --write board.toml
     """
-    from json import dumps
-
-    from isocharge.common.files import refuse_existing
-    from isocharge.serve import Predictor, examine
-    from isocharge.serve.examination.listening import BAUDS
-
     if write is not None:
         refuse_existing(write)
     electrodes = Predictor(model, models=models).metadata.electrodes if model else ()
@@ -104,7 +101,7 @@ def doctor_command(
         awaited(port, wait),
         bauds=(baud,) if baud else BAUDS,
         seconds=seconds,
-        device=board_of(device),
+        device=load_device(device),
         electrodes=electrodes,
         gain={key: _setting(key, text) for key, text in settings.items() if text is not None},
         request=_request(request, request_Hz),
@@ -121,9 +118,6 @@ def doctor_command(
 
 def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
     """Names of the models with as many electrodes; those that cannot be read are left out."""
-    from isocharge.serve import Predictor
-    from isocharge.serve.model.repository import model_names, repositories
-
     names = dict.fromkeys(name for root in repositories(models) for name in model_names(root))
     for name in names:
         with suppress(IsochargeError):
@@ -139,13 +133,11 @@ def _setting(key: str, text: str) -> Any:
         pairs = (part.partition("=") for part in text.split(","))
         return {name.strip(): number_of(number.strip()) for name, _, number in pairs}
     except ValueError as error:
-        option = f"--{key.replace('_', '-')}"
+        option = f"--{key.replace('_', '-').lower()}"
         raise InputError(f"{option}: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}") from error
 
 
-def _request(text: str | None, rate_Hz: float) -> "Request | None":
-    from isocharge.serve.port.request import Request
-
+def _request(text: str | None, rate_Hz: float) -> Request | None:
     if text is None:
         return None
     try:
@@ -157,10 +149,7 @@ def _request(text: str | None, rate_Hz: float) -> "Request | None":
     return Request(data, rate_Hz)
 
 
-def _write(path: Path, examination: "Examination") -> None:
-    from isocharge.common.files import write_whole
-    from isocharge.serve.examination.device_text import device_text
-
+def _write(path: Path, examination: Examination) -> None:
     try:
         write_whole(path, device_text(examination).encode())
     except OSError as error:
@@ -168,7 +157,7 @@ def _write(path: Path, examination: "Examination") -> None:
     say(f"{path} written; use it with: isocharge serve stream MODEL --port {examination.url} --device {path}")
 
 
-def report_lines(examination: "Examination") -> Iterator[str]:
+def report_lines(examination: Examination) -> Iterator[str]:
     """An examination as text for people."""
     yield f"{examination.url} at {examination.baud} baud: {examination.format}"
     yield f"{examination.bytes_seen} bytes in {examination.seconds:.1f} s, {examination.rate_Hz:.1f} frames/s"

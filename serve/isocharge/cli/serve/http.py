@@ -9,15 +9,13 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.serve.options import LogFormat
+from isocharge.cli.serve.records import LogFormat
 from isocharge.cli.shared.live_page import TokenOption, given_token
-from isocharge.cli.shared.standard_streams import announce, write_stderr
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.terminal import announce, say, write_stderr
 from isocharge.common.errors import InputError
 from isocharge.common.extras import require
-from isocharge.serve.live.line_queue import LineQueue
-from isocharge.serve.network.address import Address, check_exposure
-from isocharge.serve.network.credentials import Tls, Token
+from isocharge.serve.live.outputs import LineQueue
+from isocharge.serve.network.address import Address, Tls, Token, check_exposure
 
 with require("http"):
     from isocharge.serve.network.http import HttpServer

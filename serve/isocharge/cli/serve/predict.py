@@ -1,7 +1,7 @@
 """`isocharge serve predict`: charges from a file to contacts."""
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext
 from io import TextIOWrapper
 from pathlib import Path
@@ -9,12 +9,11 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.serve.options import ModelsOption
-from isocharge.cli.shared.options import ModelArgument
-from isocharge.cli.shared.stopping import until_stopped
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.options import ModelArgument, ModelsOption
+from isocharge.cli.shared.terminal import say, until_stopped
 from isocharge.common.errors import InputError
 from isocharge.common.files import bounded_lines
+from isocharge.serve import Predictor, read_charges, table_records, write_contacts
 
 
 def predict_command(
@@ -38,14 +37,13 @@ def predict_command(
 
     Example: isocharge serve predict three-25um-biaxial presses.csv > contacts.csv
     """
-    from isocharge.serve import Predictor, read_charges, table_records, write_contacts
-
     predictor = Predictor(model, models=models)
     where = "stdin" if file == "-" else file
     charge_pC = read_charges(_lines(file), predictor.metadata.electrodes, where, say)
     with until_stopped():
         if json:
-            _print_lines(record.to_json() for record in table_records(charge_pC, predictor))
+            for record in table_records(charge_pC, predictor):
+                print(record.to_json(), flush=True)  # at once: a reader on a pipe waits for it
         else:
             write_contacts(predictor.predict_batch(charge_pC), sys.stdout, predictor.validity)
             sys.stdout.flush()
@@ -63,9 +61,3 @@ def _lines(file: str) -> Iterator[str]:
                     text.detach()  # or it closes stdin
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); expected a CSV file, or - for stdin") from error
-
-
-def _print_lines(lines: Iterable[str]) -> None:
-    """Print each line at once: a reader on a pipe waits for it."""
-    for line in lines:
-        print(line, flush=True)

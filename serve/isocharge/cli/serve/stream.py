@@ -1,4 +1,4 @@
-"""`isocharge serve stream`: prediction records from a port as they come."""
+"""`isocharge serve stream` and `serve replay`: prediction records from a port as they come, or from a recording."""
 
 import signal
 from collections import deque
@@ -6,39 +6,59 @@ from contextlib import ExitStack, closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from isocharge.cli.serve.options import (
+from isocharge.cli.serve.records import (
+    LATENCIES,
+    Lines,
     McapOption,
-    McapRecords,
+    McapOutput,
     McapRecordsOption,
-    ModelsOption,
     Output,
     OutputOption,
-    PolicyName,
     UdpOption,
     WaitOption,
     awaited,
-)
-from isocharge.cli.serve.record_output import (
-    LATENCIES,
-    McapOutput,
     in_turn,
     record_writer,
     summary,
     write_records,
 )
 from isocharge.cli.shared.live_page import LiveOption, PageFeed, TokenOption, answering, live_page, page_address
-from isocharge.cli.shared.options import DeviceOption, ModelArgument, board_of
-from isocharge.cli.shared.standard_streams import stdout_is_ready, stdout_writer
-from isocharge.cli.shared.stopping import on_signal, stop_after, unless_hung_up, until_stopped
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption
+from isocharge.cli.shared.terminal import (
+    on_signal,
+    say,
+    stdout_is_ready,
+    stdout_writer,
+    stop_after,
+    unless_hung_up,
+    until_stopped,
+)
 from isocharge.common.errors import InputError, ModelError
-
-if TYPE_CHECKING:
-    from isocharge.serve import Device, Predictor
+from isocharge.common.files import new_file
+from isocharge.serve import (
+    Policy,
+    Predictor,
+    RecordedClock,
+    Recorder,
+    Recording,
+    TouchStream,
+    check_golden,
+    device_from_table,
+    find_model,
+    load_device,
+    load_model,
+    open_source,
+)
+from isocharge.serve.export.record_messages import RecordEncoding
+from isocharge.serve.live.device import with_offset_limit
+from isocharge.serve.live.outputs import LineQueue
+from isocharge.serve.live.recorded_stream import RecordedStream, replay
+from isocharge.serve.port.recording import Marker
+from isocharge.serve.prediction.record import LONGEST_NAME, NAME, is_name
 
 
 def stream_command(
@@ -73,13 +93,13 @@ def stream_command(
         ),
     ] = None,
     mcap: McapOption = None,
-    mcap_records: McapRecordsOption = McapRecords.json,
+    mcap_records: McapRecordsOption = RecordEncoding.json,
     policy: Annotated[
-        PolicyName,
+        Policy,
         typer.Option(
             "--policy", help="If several frames come at once: a record for each of them, or for the latest alone."
         ),
-    ] = PolicyName.every,
+    ] = Policy.every,
     reconnect: Annotated[
         bool,
         typer.Option("--reconnect/--no-reconnect", help="If the port is lost: try for ever to open it again, or fail."),
@@ -97,7 +117,7 @@ def stream_command(
     offset_limit_pC: Annotated[
         float | None,
         typer.Option(
-            "--offset-limit-pC",
+            "--offset-limit-pc",
             min=0.0,
             help="Largest charge at rest that the tare accepts, pC. (default: 100, or as --device says)",
         ),
@@ -114,13 +134,13 @@ def stream_command(
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
-    from isocharge.serve import Policy, Predictor, Recorder, TouchStream, find_model, open_source
-    from isocharge.serve.live.line_queue import LineQueue
-    from isocharge.serve.live.recorded_stream import RecordedStream
-
+    if name is not None and not is_name(name):
+        raise InputError(f"--name: expected {NAME}, got {name[:LONGEST_NAME]!r}")
     address = None if live is None else page_address(live, token)
-    predictor, board = Predictor(model, models=models), _board(device, offset_limit_pC)
-    path = TouchStream(predictor, board, policy=Policy(policy.value), frame_id=_checked_name(name))
+    predictor, board = Predictor(model, models=models), load_device(device)
+    if offset_limit_pC is not None:
+        board = with_offset_limit(board, offset_limit_pC)
+    path = TouchStream(predictor, board, policy=policy, frame_id=name)
     latencies: deque[float] = deque(maxlen=LATENCIES)
     recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name or "") if record else None
     recorded = RecordedStream(path, recorder)
@@ -144,10 +164,9 @@ def stream_command(
             stack.enter_context(answering(page, recorded, header))
             feed = PageFeed(page, path, recorded)
             write = in_turn(write, lambda record, _: feed.put(record))
-        mcap_output = (
-            McapOutput(mcap, predictor.metadata.electrodes, mcap_records, source.is_live) if mcap is not None else None
-        )
-        if mcap_output:
+        mcap_output = None
+        if mcap is not None:
+            mcap_output = McapOutput(mcap, predictor.metadata.electrodes, mcap_records, source.is_live)
             put_line = stack.enter_context(mcap_output).put
             write = in_turn(lambda _, line: put_line(line), write)
         if recorder:
@@ -163,17 +182,8 @@ def stream_command(
         raise typer.Exit(1)
 
 
-def _board(device: Path | None, offset_limit_pC: float | None) -> "Device":
-    from isocharge.serve.live.device import with_offset_limit
-
-    board = board_of(device)
-    return board if offset_limit_pC is None else with_offset_limit(board, offset_limit_pC)
-
-
-def _load(model: str, models: Path | None) -> "Predictor":
+def _load(model: str, models: Path | None) -> Predictor:
     """The latest version of a model; it must answer on this machine as where it was trained."""
-    from isocharge.serve import Predictor, check_golden, find_model, load_model
-
     folder = find_model(model, models)
     loaded = load_model(folder)
     check_golden(loaded)
@@ -182,9 +192,70 @@ def _load(model: str, models: Path | None) -> "Predictor":
     return Predictor(folder)
 
 
-def _checked_name(name: str | None) -> str | None:
-    from isocharge.serve.prediction.record import LONGEST_NAME, NAME, is_name
+def replay_command(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Recording of `isocharge serve stream --record`.")],
+    model: Annotated[
+        str | None,
+        typer.Option("--model", metavar="MODEL", help="Model to use, name or path. (default: that of the recording)"),
+    ] = None,
+    models: ModelsOption = None,
+    device: DeviceOption = None,
+    real_time: Annotated[
+        bool, typer.Option("--real-time/--fast", help="Play at the pace of the recording, or as fast as possible.")
+    ] = False,
+    output: OutputOption = Output.json,
+    mcap: McapOption = None,
+    mcap_records: McapRecordsOption = RecordEncoding.json,
+    live: LiveOption = None,
+    token: TokenOption = None,
+) -> None:
+    """Play a recording of raw bytes again: the same model and device give the same records, bit for bit.
 
-    if name is not None and not is_name(name):
-        raise InputError(f"--name: expected {NAME}, got {name[:LONGEST_NAME]!r}")
-    return name
+    --device takes the place of the recorded description of the board, if that was wrong. With --live the recording is
+    there to be played, at any speed, until Ctrl-C.
+
+    Example: isocharge serve replay touch.rec --real-time
+    """
+    address = None if live is None else page_address(live, token)
+    recording, clock = Recording(file), RecordedClock()
+    predictor = Predictor(model or recording.model, models=models)
+    board = load_device(device) if device else device_from_table(recording.device, str(file))
+    path = TouchStream(predictor, board, policy=Policy(recording.policy), now_ns=clock, frame_id=recording.name or None)
+    load = None if model else partial(Predictor, models=models)
+    played = partial(replay, recording, path, clock, real_time=real_time, load=load)
+    latencies: deque[float] = deque(maxlen=LATENCIES)
+    with ExitStack() as stack:
+        stack.enter_context(until_stopped())
+        write = record_writer(stack, output, None, predictor.metadata.electrodes, stdout_writer())
+        file_output = stack.enter_context(ExitStack())
+        if mcap is not None:
+            write = in_turn(_mcap_writer(file_output, mcap, mcap_records, predictor.metadata.electrodes), write)
+        if address is None:
+            write_records(played(), write, latencies)
+        else:
+            folder = find_model(model or recording.model, models)
+            page = live_page(address, token, file.name, predictor.metadata, folder, is_recording=True)
+            link, _ = stack.enter_context(page)
+            feed = PageFeed(link, path)
+
+            def mark(marker: Marker) -> None:
+                link.tell(marker=[*marker])
+
+            write_records(played(on_marker=mark), in_turn(write, lambda record, _: feed.put(record)), latencies)
+            file_output.close()  # now, as Ctrl-C, the only end of the page, would throw the file away
+            link.tell(is_complete=True)
+            while link.request() is not None:  # until the page's process ends, or Ctrl-C
+                pass
+    say(summary(path, latencies))
+    if mcap is not None and not mcap.exists():
+        say(f"{mcap} was not written, because the replay was stopped before its end")
+        raise typer.Exit(1)
+
+
+def _mcap_writer(stack: ExitStack, path: Path, records: RecordEncoding, electrodes: tuple[str, ...]) -> Lines:
+    """What writes a record into the MCAP file, which exists once all of them are in it."""
+    from isocharge.serve.export.mcap_file import McapFile  # needs the extra `record`
+
+    draft = stack.enter_context(new_file(path))
+    file = stack.enter_context(McapFile(draft, electrodes, records))
+    return lambda _, line: file.write(line)

@@ -1,8 +1,6 @@
 """`isocharge serve virtual`: a sensor made of the simulator's forward map and amplifier."""
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
@@ -14,16 +12,15 @@ import typer
 
 from isocharge.cli.shared.forward_maps import SLACK
 from isocharge.cli.shared.options import ProbeOption, SensorArgument
-from isocharge.cli.shared.stopping import until_stopped
-from isocharge.cli.shared.terminal import say, shown_progress
+from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.common.errors import InputError, OutputExists
+from isocharge.common.errors import InputError
+from isocharge.common.files import refuse_existing
 from isocharge.serve import Script, encode_frame, encode_text, load_device
 from isocharge.serve.frames.frame_layout import FrameLayout
-from isocharge.serve.virtual_sensor.pseudo_port import posix_modules
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
-from isocharge.serve.virtual_sensor.sensor import Encode
+from isocharge.serve.virtual_sensor.sensor import Encode, posix_modules
 from isocharge.simulate import (
     Circle,
     ForwardMap,
@@ -107,7 +104,8 @@ def virtual_command(
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
     posix_modules()  # no pseudo-terminal: an error before anything is computed
-    _refuse_taken(link)
+    if link is not None:
+        refuse_existing(link)
     play = load_script(script) if script else VirtualScript()
     described, pressing = _played(sensor, probe, film)
     changes: dict[str, Any] = {"step": play.temperature_step_K, "bias": play.drift_pC_per_s, "limit": play.limit_pC}
@@ -119,7 +117,7 @@ def virtual_command(
     player = virtual_sensor(
         forward_map, amplifier, seed, rate, script=presses, encode=encode, faults=play.faults, link=link
     )
-    with until_stopped(), _link_errors(link), player:
+    with until_stopped(), player:
         print(player.port_path, flush=True)
         say(f"playing {sensor if film is None else f'film {film} of {sensor}'} at {rate:g} Hz; Ctrl-C stops")
         threading.Event().wait(seconds)
@@ -154,18 +152,3 @@ def _farthest(radius: float, presses: Script | None) -> float:
     if presses is None or not presses.touching.any():
         return radius
     return max(DEFAULT_RADIUS, SLACK * float(np.nanmax(np.hypot(presses.x_mm, presses.y_mm))))
-
-
-def _refuse_taken(link: Path | None) -> None:
-    if link is not None and (link.exists() or link.is_symlink()):
-        raise OutputExists(f"--link {link}: the path exists already; remove it or choose another path")
-
-
-@contextmanager
-def _link_errors(link: Path | None) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if link is None or error.filename2 != str(link):
-            raise
-        raise InputError(f"--link {link}: the link cannot be made ({error.strerror}); choose another path") from error

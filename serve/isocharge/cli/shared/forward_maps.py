@@ -1,16 +1,27 @@
-"""Who solves for a command, what a stopped one says, the radius of a sweep, and what its presses do to the film."""
+"""Who solves for a command, what a stopped one says, the radius of a sweep and its presses, their stress."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from isocharge.cli.shared.options import most_workers, radius_mm_of
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.resumable_run import draft_of
-from isocharge.simulate import Film, Probe, Sensor, noise_model, working_area
+from isocharge.simulate import (
+    Dataset,
+    Film,
+    Probe,
+    Sensor,
+    Sweep,
+    noise_model,
+    read_dataset,
+    run_sweep,
+    working_area,
+)
 from isocharge.simulate.execution.workers import dask_workers, local_workers
 from isocharge.simulate.identifiability.identification import map_to_search
 from isocharge.simulate.solver.stress_limit import stress_caution
@@ -71,3 +82,17 @@ def caution_of_stress(
         with suppress(IsochargeError):  # what asked for the press meets the same error, and says it
             if caution := stress_caution(film, probe, most_force, limit):
                 say(f"caution: {caution}")
+
+
+SAMPLES = 24_000
+"""Number of presses."""
+
+
+def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, force: tuple[float, float]) -> Dataset:
+    """A sweep within a radius (mm) and a range of forces (N), else with its defaults, deleted once it is read.
+
+    It takes a few seconds, so one process is enough.
+    """
+    with TemporaryDirectory() as folder:
+        sweep = Sweep(radius, force, samples=SAMPLES)
+        return read_dataset(run_sweep(Path(folder) / "presses", sensor, probes, sweep))

@@ -20,10 +20,8 @@ from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.network.address import Address, check_exposure
 from isocharge.serve.port import recording
-from isocharge.serve.viewer.description import describe_film, find_field
 from isocharge.serve.viewer.link import ReaderEnd, make_link
-from isocharge.serve.viewer.messages import LiveRequest, Marker, Record, Tare
-from isocharge.serve.viewer.samples import SampleFormat
+from isocharge.serve.viewer.messages import LiveRequest, Marker, Record, SampleFormat, Tare, describe_film, find_field
 
 RATE_RECORDS = 400
 """Records, the latest, over which the rate is taken."""

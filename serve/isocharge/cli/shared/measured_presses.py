@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.terminal import say
-from isocharge.serve.prediction.csv_numbers import ignored_words
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, read_presses
+from isocharge.serve.prediction.table import ignored_words
 
 PositionStdOption = Annotated[
     float,
@@ -23,11 +23,6 @@ ForceStdOption = Annotated[
         metavar="SHARE",
         help="Standard deviation of known forces, a share of the force in N, where the file has none.",
     ),
-]
-
-ModelsOption = Annotated[
-    Path | None,
-    typer.Option("--models", metavar="DIR", help="Folder of models to search first. (default: the usual folders)"),
 ]
 
 

@@ -2,15 +2,12 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from isocharge.common.errors import InputError
 from isocharge.common.number_text import number_of
-
-if TYPE_CHECKING:
-    from isocharge.serve import Device
 
 PROBE_HELP = (
     "Footprint, mm: circle:RADIUS, rectangle:WIDTHxHEIGHT, triangle:SIDE or polygon:X,Y;X,Y;...; @DEGREES at the end "
@@ -82,6 +79,15 @@ NewFolderOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to make for the results; it must not exist yet.")
 ]
 
+ModelsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--models",
+        metavar="DIR",
+        help="Folder in which a model's name is looked up before the usual places. (default: none)",
+    ),
+]
+
 DeviceOption = Annotated[
     Path | None,
     typer.Option(
@@ -104,14 +110,6 @@ def refuse(mistakes: Mapping[str, object]) -> None:
     for message, holds in mistakes.items():
         if holds:
             raise InputError(message)
-
-
-def board_of(path: Path | None) -> "Device":
-    """The board that a device file describes; without one, any board."""
-    from isocharge.serve import load_device
-    from isocharge.serve.live.device import ANY_BOARD
-
-    return load_device(path) if path else ANY_BOARD
 
 
 def most_workers(workers: int | None) -> int:

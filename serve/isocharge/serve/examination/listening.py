@@ -1,14 +1,20 @@
-"""Bytes of a port for a while, at the speed at which they are frames."""
+"""Bytes of a port for a while, at the speed at which they are frames; and their frames, as a device file says."""
 
 import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
+from isocharge.common.arrays import Array
 from isocharge.common.errors import PortLost
-from isocharge.serve.port.request import Request
-from isocharge.serve.port.serial_port import Chunk, Port
-from isocharge.serve.port.udp import SCHEME
+from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
+from isocharge.serve.live.device import Device
+from isocharge.serve.live.reading_stream import channel_names
+from isocharge.serve.port.device_clock import DeviceClock
+from isocharge.serve.port.serial_line import SCHEME, Request
+from isocharge.serve.port.source import Chunk, Port
 
 BAUDS = (115200, 921600, 1000000, 2000000, 460800, 230400, 57600, 38400, 19200, 9600)
 """Baud rates to try, in this order, bit/s."""
@@ -110,3 +116,57 @@ def _listen(url: str, baud: int, seconds: float, request: Request | None) -> Hea
             pass
     heard.seconds, heard.echo_share = time.monotonic() - began, port.echo_share
     return heard
+
+
+@dataclass
+class Capture:
+    """What came through a port in a while.
+
+    Attributes:
+        parser: The parser, with its counters.
+        frames: Good frames.
+        times_s: Time of each frame, by the device's clock if it sends one, s.
+        gaps: Counters of the frame numbers.
+        bytes_seen: Number of bytes that came.
+    """
+
+    parser: Parser
+    frames: list[Frame] = field(default_factory=list)
+    times_s: list[float] = field(default_factory=list)
+    gaps: SequenceGaps = field(default_factory=SequenceGaps)
+    bytes_seen: int = 0
+
+    @property
+    def share(self) -> float:
+        """Share of bytes that were part of a good frame, dimensionless."""
+        return 1.0 - self.parser.counts.bytes_dropped / self.bytes_seen if self.frames else 0.0
+
+    @property
+    def rate_Hz(self) -> float:
+        """Frames per second, Hz; 0 for fewer than two frames."""
+        span_s = self.times_s[-1] - self.times_s[0] if self.times_s else 0.0
+        return (len(self.frames) - 1) / span_s if span_s > 0.0 else 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the channels; empty without frames."""
+        return channel_names(self.frames[-1]) if self.frames else ()
+
+    def values(self) -> tuple[Array, Array]:
+        """Values (n, channels) of the frames that have as many as the last one, and their times (n,), s."""
+        width = len(self.frames[-1].values)
+        alike = [k for k, frame in enumerate(self.frames) if len(frame.values) == width]
+        times_s = np.array([self.times_s[k] for k in alike])
+        return np.array([self.frames[k].values for k in alike], dtype=float), times_s - times_s[0]
+
+
+def read_frames(heard: Heard, device: Device) -> Capture:
+    """The frames of what was heard."""
+    capture, clock = Capture(device.parser(), bytes_seen=heard.bytes_seen), DeviceClock()
+    for chunk in heard.chunks:
+        for frame in capture.parser.feed(chunk.data):
+            when = clock.read(frame.t_us, capture.parser.t_us_modulus, chunk.timestamp)
+            capture.frames.append(frame)
+            capture.times_s.append(when.clock_s)
+            capture.gaps.update(frame.seq, capture.parser.seq_modulus)
+    return capture

@@ -8,16 +8,81 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.serve.examination.capture import Capture, read_frames
-from isocharge.serve.examination.channel_health import MAINS_HZ, ChannelHealth, channel_health
-from isocharge.serve.examination.listening import BAUDS, Heard, listen
+from isocharge.common.arrays import Array
+from isocharge.common.toml_text import to_toml
+from isocharge.serve.examination.listening import BAUDS, Capture, Heard, listen, read_frames
 from isocharge.serve.examination.proposal import Proposal, propose, unit_of
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.live.channels import position_of
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
-from isocharge.serve.port.request import Request
+from isocharge.serve.live.reading_stream import position_of
+from isocharge.serve.port.serial_line import Request
 from isocharge.serve.recognition.recognise import recognise
+from isocharge.serve.signal_chain.chain import LARGEST_PC
 from isocharge.serve.signal_chain.tare import TareRule
+
+MAINS_HZ = (50.0, 60.0)
+"""Frequencies at which hum is looked for, Hz."""
+
+SAMPLES_PER_PERIOD = 2.2
+"""Smallest rate for a hum, in samples per period, dimensionless: 10 % above the Nyquist rate."""
+
+SHORTEST_S = 0.5
+"""Shortest time from which hum is estimated, s: 5 Hz resolution separates 50 from 60 Hz."""
+
+
+@dataclass(frozen=True)
+class ChannelHealth:
+    """One channel at rest, in pC after the gain; None where no value is a charge.
+
+    Attributes:
+        name: As the device calls it, or its number from 1.
+        offset_pC: Mean.
+        noise_pC: Standard deviation without drift and hum.
+        drift_pC_per_s: Slope.
+        hum_pC: Amplitude at 50 and at 60 Hz; None where the rate is too low, or the time too short, to tell.
+        span_pC: Difference of the largest and the smallest value.
+        unusable: Number of values that are no charges: not finite, or larger than any film's.
+    """
+
+    name: str
+    offset_pC: float | None = None
+    noise_pC: float | None = None
+    drift_pC_per_s: float | None = None
+    hum_pC: tuple[float | None, float | None] = (None, None)
+    span_pC: float | None = None
+    unusable: int = 0
+
+
+def channel_health(name: str, charge_pC: Array, t_s: Array, rate_Hz: float) -> ChannelHealth:
+    """Fit a constant, a slope and the hum to a channel.
+
+    Args:
+        name: The channel's name.
+        charge_pC: Its values, shape (n,), pC.
+        t_s: Their times from the first frame on, shape (n,), s.
+        rate_Hz: Frames per second, Hz.
+    """
+    usable = np.abs(charge_pC) <= LARGEST_PC
+    unusable = int(np.count_nonzero(~usable))
+    if unusable == usable.size:
+        return ChannelHealth(name, unusable=unusable)
+    charge_pC, t_s = charge_pC[usable], t_s[usable]
+    mains_Hz = [hum for hum in MAINS_HZ if rate_Hz > SAMPLES_PER_PERIOD * hum and t_s[-1] > SHORTEST_S]
+    phases = [2.0 * np.pi * hum * t_s for hum in mains_Hz]
+    columns = [np.ones_like(t_s), t_s, *(wave(phase) for phase in phases for wave in (np.cos, np.sin))]
+    design = np.column_stack(columns)
+    fit = np.linalg.lstsq(design, charge_pC, rcond=None)[0]
+    amplitudes = {hum: float(np.hypot(*fit[2 + 2 * k : 4 + 2 * k])) for k, hum in enumerate(mains_Hz)}
+    return ChannelHealth(
+        name,
+        offset_pC=float(charge_pC.mean()),
+        noise_pC=float((charge_pC - design @ fit).std()),
+        drift_pC_per_s=float(fit[1]),
+        hum_pC=(amplitudes.get(50.0), amplitudes.get(60.0)),
+        span_pC=float(np.ptp(charge_pC)),
+        unusable=unusable,
+    )
+
 
 RIGHT_BAUD_SHARE = 0.5
 """Share of bytes in good frames, dimensionless, from which a baud rate is taken for right."""
@@ -32,10 +97,10 @@ DRIFT_LIMIT_PC_PER_S = 2.0
 """Largest harmless drift, pC/s."""
 
 TO_ASK_FOR = {
-    "counts": "the charge of one count, pC: --pC-per-unit NUMBER, negative where the amplifier inverts (1 if these are "
+    "counts": "the charge of one count, pC: --pc-per-unit NUMBER, negative where the amplifier inverts (1 if these are "
     "pC)",
-    "V": "the amplifier's feedback capacitance, if these are volts: --V-per-unit 1 --feedback-pF NUMBER; or the charge "
-    "of one unit, pC: --pC-per-unit NUMBER (1 if these are pC)",
+    "V": "the amplifier's feedback capacitance, if these are volts: --v-per-unit 1 --feedback-pf NUMBER; or the charge "
+    "of one unit, pC: --pc-per-unit NUMBER (1 if these are pC)",
 }
 """What is missing of the gain, by the unit of the channels."""
 
@@ -243,3 +308,36 @@ def _missing_in(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
     for frequency, hum in zip(MAINS_HZ, channel.hum_pC, strict=True):
         if hum is not None and hum > HUM_LIMIT_PC:
             yield f"[hum] frequency_Hz = {frequency:g} (device file): channel {channel.name} hums by {hum:.2g} pC"
+
+
+HEAD = (
+    "Written by `isocharge serve doctor` from what came through a port; the keys are in serve/docs/device_file.md.",
+)
+
+TO_FILL_IN = {
+    "counts": ("# pC_per_unit = ?    # the charge of one count, pC; with a minus where the amplifier inverts",),
+    "V": (
+        "# V_per_unit = 1.0    # with a minus where the amplifier inverts",
+        "# feedback_pF = ?     # the feedback capacitance of the amplifiers, pF",
+    ),
+}
+"""Lines for the section `[gain]` by the unit of the channels."""
+
+
+def device_text(examination: Examination) -> str:
+    """The content of a device file, TOML; what is not known of the gain is a comment to fill in."""
+    table = {key: value for key, value in examination.device.items() if key != "gain"}
+    text = to_toml(table, (*HEAD, *_words(examination)))
+    gain = examination.device.get("gain")
+    lines = TO_FILL_IN.get(examination.unit, ())
+    if gain is not None:
+        text += "\n" + to_toml({"gain": gain})
+    elif lines:
+        text += "\n[gain]\n"
+    return text + "".join(f"{line}\n" for line in lines)
+
+
+def _words(examination: Examination) -> Iterator[str]:
+    yield f"{examination.format}; {examination.rate_Hz:.4g} frames per second"
+    if examination.unused:
+        yield f"channels that no electrode uses: {', '.join(examination.unused)}"

@@ -9,13 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.examination.capture import Capture, read_frames
-from isocharge.serve.examination.listening import Heard
+from isocharge.serve.examination.listening import Capture, Heard, read_frames
 from isocharge.serve.frames.binary import FORMAT as BINARY
-from isocharge.serve.live.channels import electrode_of
 from isocharge.serve.live.device import device_from_table
+from isocharge.serve.live.reading_stream import electrode_of
+from isocharge.serve.recognition.fields import noise_of, rest_of
 from isocharge.serve.recognition.recognise import recognise
-from isocharge.serve.recognition.series import noise_of, rest_of
 from isocharge.serve.signal_chain.tare import TareRule
 
 QUIET_SHARE = 0.1

@@ -13,27 +13,27 @@ second.
 
 import json
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable
-from enum import StrEnum
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from isocharge.common.errors import InputError, OutputError
+from isocharge.common.errors import InputError
 from isocharge.common.extras import require
-from isocharge.common.files import refuse_existing
-from isocharge.serve.export.record_schema import NAME, record_schema
-from isocharge.serve.export.ros_messages import (
+from isocharge.common.files import WholeWrites
+from isocharge.serve.export.record_messages import (
+    NAME,
     POSE,
     POSE_DEFINITION,
     STRING,
     STRING_DEFINITION,
     WRENCH,
     WRENCH_DEFINITION,
+    RecordEncoding,
     pose_stamped,
+    record_schema,
     string_message,
     time_of,
     wrench_stamped,
@@ -51,13 +51,6 @@ LARGEST_COUNT = (1 << 32) - 1
 """Largest sequence number of a message, after which it begins again at 0."""
 
 log = logging.getLogger(__name__)
-
-
-class RecordEncoding(StrEnum):
-    """How `/isocharge/record` is written."""
-
-    json = "json"
-    ros2 = "ros2"
 
 
 class McapFile:
@@ -97,13 +90,9 @@ class McapFile:
             OutputExists: If it is already there.
             OutputError: If it cannot be created.
         """
-        refuse_existing(self.path)
-        try:
-            self._file = _WholeWrites(self.path)
-            self._writer = Writer(self._file)  # type: ignore[arg-type]  # all it uses is write, tell and flush
-            self._writer.start(profile="ros2", library="isocharge")
-        except OSError as error:
-            raise OutputError(f"{self.path} cannot be written: {error.strerror}; choose another file") from error
+        self._file = WholeWrites(self.path)
+        self._writer = Writer(self._file)  # type: ignore[arg-type]  # all it uses is write, tell and flush
+        self._writer.start(profile="ros2", library="isocharge")
         self._flushed = self._now()
         self._channels = {
             RECORD_TOPIC: self._record_channel(),
@@ -185,31 +174,3 @@ class McapFile:
     def _ros_channel(self, topic: str, kind: str, definition: str) -> int:
         schema = self._writer.register_schema(kind, "ros2msg", definition.encode())
         return self._writer.register_channel(topic, "cdr", schema)
-
-
-class _WholeWrites:
-    """A new file that takes data whole or not at all."""
-
-    def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-        self._size = 0
-
-    def write(self, data: bytes) -> int:
-        unwritten = memoryview(data)
-        try:
-            while unwritten:
-                unwritten = unwritten[os.write(self._descriptor, unwritten) :]
-        except OSError:
-            os.ftruncate(self._descriptor, self._size)
-            raise
-        self._size += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        return self._size
-
-    def flush(self) -> None:
-        """Nothing waits here."""
-
-    def close(self) -> None:
-        os.close(self._descriptor)

@@ -13,8 +13,16 @@ Where number or clock wrap is learned when they do.
 
 from collections.abc import Mapping, Sequence
 
-from isocharge.serve.frames.frame import SEQ, T_US_MODULUS, TIMES_US, Columns, DelimitedParser, Frame
-from isocharge.serve.frames.sequence import SEQ_MODULUS, CounterWrap
+from isocharge.serve.frames.frame import (
+    SEQ,
+    SEQ_MODULUS,
+    T_US_MODULUS,
+    TIMES_US,
+    Columns,
+    CounterWrap,
+    DelimitedParser,
+    Frame,
+)
 from isocharge.serve.frames.text_lines import Line, Notation, parse_line
 
 LONGEST_LINE = 4096

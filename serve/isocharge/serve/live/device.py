@@ -40,7 +40,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.common.structs import Finite, Positive, Settings, WrongKey, convert, read_toml
 from isocharge.serve.frames.formats import AutoFrames, Frames
 from isocharge.serve.frames.frame import Parser
-from isocharge.serve.port.request import Request
+from isocharge.serve.port.serial_line import Request
 from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.signal_chain.contact import TouchRule
 from isocharge.serve.signal_chain.hum import HumRule
@@ -138,10 +138,9 @@ class Device(DeviceSections, frozen=True):
     @property
     def request(self) -> Request | None:
         """What the board has to be asked; None if it sends unasked."""
-        frames = self.frames
-        return (
-            None if frames.request is None else Request(bytes.fromhex(frames.request), frames.request_Hz, frames.echo)
-        )
+        if self.frames.request is None:
+            return None
+        return Request(bytes.fromhex(self.frames.request), self.frames.request_Hz, self.frames.echo)
 
     def parser(self) -> Parser:
         """A new parser for its frames."""
@@ -202,12 +201,14 @@ ANY_BOARD = Device(name="any board")
 """The board of which nothing is known."""
 
 
-def load_device(path: Path) -> Device:
-    """Read a device file.
+def load_device(path: Path | None) -> Device:
+    """Read a device file; without one, it is any board.
 
     Raises:
         DeviceError: If it cannot be read, or a key is unknown, missing or wrong.
     """
+    if path is None:
+        return ANY_BOARD
     return device_from_table(read_toml(path, "a device file", DeviceError, dict[str, Any]), str(path))
 
 

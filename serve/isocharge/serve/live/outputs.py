@@ -1,13 +1,21 @@
-"""Where records go: CSV, and datagrams for PlotJuggler; lines of JSON are `PredictionRecord.to_json`.
+"""Where records go: CSV, datagrams for PlotJuggler, and lines on their way to a consumer that may be slow.
 
 PlotJuggler's UDP server with the JSON protocol takes one object per datagram, uses its number `timestamp`, makes a
 series of every number by the path to it, as in `charge_pC/A`, and passes over nulls: a prediction record as it stands.
+
+Who has lines to give never waits. A thread writes what waits, oldest first. When the consumer is so slow that too much
+waits, the oldest lines are dropped and counted: what it gets next is as new as can be, and chain and recording never
+stop for it.
 """
 
 import csv
 import io
 import socket
-from collections.abc import Iterable
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import partial
 from types import TracebackType
 from typing import Any, Self
 
@@ -60,7 +68,7 @@ class UdpSink:
     """Sends lines as datagrams, whether anybody listens or not."""
 
     def __init__(self, address: str) -> None:
-        """Look up where to send.
+        """Look up where to send, and open the socket.
 
         Args:
             address: `HOST:PORT`.
@@ -75,26 +83,120 @@ class UdpSink:
             family, _, _, _, socket_address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except (OSError, ValueError) as error:  # ValueError: a part of the name is too long
             raise InputError(f"UDP address {address!r}: expected HOST:PORT, as in 127.0.0.1:9870 ({error})") from error
-        self._family, self._address = family, socket_address
-        self._socket: socket.socket | None = None
+        self._socket, self._address = socket.socket(family, socket.SOCK_DGRAM), socket_address
+        self._socket.setblocking(False)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def send(self, line: str) -> None:
+        """Send one datagram, or drop it where the network is not ready: the live path never waits."""
+        with suppress(OSError):  # unreachable, or the buffer is full
+            self._socket.sendto(line.encode(), self._address)
+
+
+MOST_LINES = 10_000
+"""Lines that may wait: ten seconds at 1 kHz, some 10 MB."""
+
+PATIENCE_S = 1.0
+"""Time at the end for which a consumer may take no line before the rest is counted as lost, s."""
+
+
+class LineQueue:
+    """A bounded queue of lines and the thread that writes them; a context manager.
+
+    Attributes:
+        lost: Lines that were never written, the oldest of those that waited.
+    """
+
+    def __init__(
+        self, write: Callable[[str], object], is_ready: Callable[[], bool] = lambda: True, most: int = MOST_LINES
+    ) -> None:
+        """Set up the queue.
+
+        Args:
+            write: Called in the thread with each line.
+            is_ready: Called before that; waits a little while, and says whether the consumer would take a line now.
+            most: Lines that may wait.
+        """
+        self.lost = 0
+        self._write, self._is_ready, self._most = write, is_ready, most
+        self._lines: deque[str] = deque()
+        self._change = threading.Condition()
+        self._taken, self._is_closed = 0, False  # taken: lines that went to `write`
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="lines", daemon=True)  # it may hang in a write for ever
 
     def __enter__(self) -> Self:
-        """Open the socket."""
-        self._socket = socket.socket(self._family, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
+        """Start the thread."""
+        self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the socket."""
-        if self._socket is not None:
-            self._socket.close()
+        """As `close`."""
+        self.close()
 
-    def send(self, line: str) -> None:
-        """Send one datagram, or drop it where the network is not ready: the live path never waits."""
-        assert self._socket is not None
+    def put(self, line: str) -> None:
+        """Let a line wait for its turn; the oldest one is dropped if too many wait.
+
+        Raises:
+            Whatever `write` has raised in the thread.
+        """
+        with self._change:
+            self._raise_error()
+            if len(self._lines) >= self._most:
+                self._lines.popleft()
+                self.lost += 1
+            self._lines.append(line)
+            self._change.notify_all()
+
+    def close(self) -> None:
+        """Write what waits for as long as the consumer goes on taking it; count the rest as lost.
+
+        Raises:
+            As `put`, once.
+        """
+        with self._change:
+            while self._lines and self._thread.is_alive():
+                if not self._change.wait_for(partial(self._goes_on, self._taken), PATIENCE_S):
+                    break
+            self.lost += len(self._lines)
+            self._lines.clear()
+            self._is_closed = True
+            self._change.notify_all()
+        self._thread.join(PATIENCE_S)  # the last line may be on its way
+        self._raise_error()
+
+    def _goes_on(self, taken: int) -> bool:
+        """Whether a line was taken since, or none will be any more."""
+        return self._taken > taken or self._error is not None
+
+    def _raise_error(self) -> None:
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def _run(self) -> None:
         try:
-            self._socket.sendto(line.encode(), self._address)
-        except OSError:  # unreachable, or the buffer is full
-            return
+            while (line := self._next()) is not None:
+                self._write(line)
+        except Exception as error:  # raised again where lines are put in
+            with self._change:
+                self._error = error
+                self._change.notify_all()
+
+    def _next(self) -> str | None:
+        """The next line, once the consumer would take it; None at the end."""
+        while True:
+            with self._change:
+                self._change.wait_for(lambda: self._lines or self._is_closed)
+            if self._is_ready() or self._is_closed:
+                with self._change:
+                    if not self._lines:
+                        return None
+                    self._taken += 1
+                    self._change.notify_all()
+                    return self._lines.popleft()

@@ -13,7 +13,7 @@ from functools import partial
 
 from isocharge.serve.live.stream import TouchStream
 from isocharge.serve.port.recording import Marker, NewModel, RecordedClock, Recorder, Recording
-from isocharge.serve.port.serial_port import Chunk
+from isocharge.serve.port.source import Chunk
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
 
@@ -26,6 +26,9 @@ class RecordedStream:
     """Records of a touch stream, which go into a recording if there is one; belongs to one thread.
 
     What is requested, from any thread, is done before the next chunk.
+
+    Attributes:
+        recorder: The recording that is under way.
     """
 
     def __init__(self, stream: TouchStream, recorder: Recorder | None = None) -> None:
@@ -35,7 +38,7 @@ class RecordedStream:
             stream: From chunks to records.
             recorder: Open while `follow` runs; None for no recording.
         """
-        self._stream, self._recorder = stream, recorder
+        self._stream, self.recorder = stream, recorder
         self._borrowed = recorder  # whoever opened it closes it
         self._under_way: tuple[Chunk, list[str]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
@@ -46,11 +49,6 @@ class RecordedStream:
     def predictor(self) -> Predictor:
         """The model of the next record."""
         return self._stream.predictor
-
-    @property
-    def recorder(self) -> Recorder | None:
-        """The recording that is under way."""
-        return self._recorder
 
     def request_tare(self) -> None:
         """Tare again; may be called from a signal handler."""
@@ -104,26 +102,26 @@ class RecordedStream:
             self._end_recording()
 
     def _record_chunk(self) -> None:
-        if self._recorder is not None and self._under_way is not None:
-            self._recorder.chunk(*self._under_way)
+        if self.recorder is not None and self._under_way is not None:
+            self.recorder.chunk(*self._under_way)
         self._under_way = None
 
     def _record(self, recorder: Recorder | None) -> None:
         self._end_recording()
-        self._recorder = recorder
+        self.recorder = recorder
         if recorder is not None:
             self._stream.restart()
             if recorder.model_label != self.predictor.metadata.label:  # it was taken since the request
                 recorder.model(self.predictor.metadata.label)
 
     def _end_recording(self) -> None:
-        recorder, self._recorder = self._recorder, None
+        recorder, self.recorder = self.recorder, None
         if recorder is not None and recorder is not self._borrowed:
             recorder.close()
 
     def _mark(self, marker: Marker) -> None:
-        if self._recorder is not None:
-            self._recorder.mark(marker)
+        if self.recorder is not None:
+            self.recorder.mark(marker)
 
     def _take_model(self) -> None:
         """Use the model whose loading is done; begin to load the next one."""
@@ -144,14 +142,14 @@ class RecordedStream:
         except Exception as error:  # whatever is wrong with a new model, the old one serves
             log.error("%s serves on, because the new model is refused: %s: %s", before, type(error).__name__, error)
             return
-        if self._recorder is not None:
-            self._recorder.model(predictor.metadata.label)
+        if self.recorder is not None:
+            self.recorder.model(predictor.metadata.label)
         log.warning("%s serves from now on, after %s", predictor.metadata.label, before)
 
     def _tare(self) -> None:
         self._stream.tare()
-        if self._recorder is not None:
-            self._recorder.tare()
+        if self.recorder is not None:
+            self.recorder.tare()
 
 
 def replay(

@@ -10,11 +10,10 @@ from typing import Any, NamedTuple
 from isocharge.common.arrays import Array, Reals
 from isocharge.common.errors import ModelError
 from isocharge.serve.flags import GAP, INVALID, RECONNECTED, REPEAT, RESTART
-from isocharge.serve.frames.frame import Frame, Parser
-from isocharge.serve.frames.sequence import SequenceGaps
+from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.live.reading_stream import ReadingStream, TimedReading
-from isocharge.serve.port.serial_port import Chunk
+from isocharge.serve.port.source import Chunk
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import OUT_OF_CONTACT, UNKNOWN, Charges, PredictionRecord
 from isocharge.serve.signal_chain.chain import Chain, Reading
@@ -93,6 +92,8 @@ class TouchStream:
     Attributes:
         parser, gaps, clock: The parts that read the frames, with their counters.
         counts: Records, skipped frames and outages.
+        predictor: The model of the next record.
+        frame_id: The film's name in the records.
     """
 
     def __init__(
@@ -134,23 +135,13 @@ class TouchStream:
         self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
         self.counts = StreamCounts()
         self._before_restart = StreamTotals()
-        self._policy, self._now_ns, self._frame_id = policy, now_ns, frame_id
+        self._policy, self._now_ns, self._given_name = policy, now_ns, frame_id
         self._use(predictor)
 
     def _use(self, predictor: Predictor) -> None:
-        self._predictor, self._validity = predictor, predictor.validity
+        self.predictor, self._validity = predictor, predictor.validity
         self._electrodes, self._label = predictor.metadata.electrodes, predictor.metadata.label
-        self._name = self.frame_id
-
-    @property
-    def predictor(self) -> Predictor:
-        """The model of the next record."""
-        return self._predictor
-
-    @property
-    def frame_id(self) -> str:
-        """The film's name in the records."""
-        return self._frame_id or self._predictor.metadata.frame_id
+        self.frame_id = self._given_name or predictor.metadata.frame_id
 
     def use(self, predictor: Predictor) -> None:
         """Go on with another model of the same electrodes; tare and chain stay as they are.
@@ -158,7 +149,7 @@ class TouchStream:
         Raises:
             ModelError: If its electrodes are others, or in another order; nothing changes then.
         """
-        before, after = self._predictor.metadata, predictor.metadata
+        before, after = self.predictor.metadata, predictor.metadata
         if after.electrodes != before.electrodes:
             raise ModelError(
                 f"model {after.label}: expected the electrodes {before.electrodes} of {before.label}, got "
@@ -236,7 +227,7 @@ class TouchStream:
             flags=flags,
             latency_us=(self._now_ns() - chunk.clock_ns) / 1e3,
             model=self._label,
-            frame_id=self._name,
+            frame_id=self.frame_id,
         )
 
     def _contact(self, reading: Reading) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -246,7 +237,7 @@ class TouchStream:
             return UNKNOWN, flags
         if not reading.contact or reading.charge_pC is None:
             return OUT_OF_CONTACT, flags
-        contact = self._predictor.predict(reading.charge_pC)
+        contact = self.predictor.predict(reading.charge_pC)
         return contact._asdict(), flags + self._validity.flags(contact)
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
@@ -258,7 +249,7 @@ class TouchStream:
 
     def _misfit(self, charge_pC: Array) -> Reals:
         """The model's misfit, shape (n,), for charges of shape (n, electrodes), pC."""
-        return self._predictor.predict_batch(charge_pC).misfit
+        return self.predictor.predict_batch(charge_pC).misfit
 
 
 def _after(skipped: set[str], reading: Reading) -> Reading:

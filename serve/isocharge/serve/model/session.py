@@ -1,15 +1,24 @@
-"""ONNX sessions as this package runs them: one thread, in order, no spinning, with a checked interface.
+"""What charges a model takes, and how it is run: ONNX sessions of one thread, no spinning, a checked interface.
 
 A network of this size takes microseconds. A second thread costs more than it saves, and onnxruntime's default, to spin
-between runs, burns most of a core at 100 Hz.
+between runs, burns most of a core at 100 Hz. `BoundPress` is the fast way for one press: memory bound once.
+
+Charges are finite numbers, in the order of the electrodes. The hot paths ask `write_finite` for plain numbers and
+`as_singles` for arrays; what these do not take is examined number by number, so that the error names the electrode.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any
 
+import numpy as np
 import onnxruntime as ort
+from numpy.typing import ArrayLike, NDArray
 
 from isocharge.common.arrays import Singles
-from isocharge.common.errors import ModelError, cut
+from isocharge.common.errors import ChargeError, ModelError, cut
 
 INPUT = "charge_pC"
 """Name of the input."""
@@ -101,3 +110,134 @@ def _row_width(shape: list[int | str | None]) -> object:
 
 def _show(tensors: Mapping[str, tuple[str, object]]) -> str:
     return ", ".join(f"{name} {kind} [n, {width}]" for name, (kind, width) in tensors.items())
+
+
+class BoundPress:
+    """Input and output memory of one press, bound to a session.
+
+    `write(q1, q2, ...)` puts the charges in, `run()` computes, `read()` gives the seven numbers of a Contact.
+    """
+
+    def __init__(self, session: ort.InferenceSession, electrodes: int) -> None:
+        charges = np.zeros((1, electrodes), dtype=np.float32)
+        answers = np.zeros(sum(OUTPUTS.values()), dtype=np.float32)
+        # The session sees only addresses: the views in `write` and `read` keep the arrays alive.
+        self.run: Callable[[], None] = partial(session.run_with_iobinding, _bind(session, charges, answers))
+        self.write = partial(struct.Struct(f"={electrodes}f").pack_into, charges.data.cast("B"), 0)
+        self.read = partial(struct.Struct(f"={answers.size}f").unpack, answers.data.cast("B"))
+        self._charges: Any = charges[0].data  # Any: typing knows a memoryview as bytes only
+        self._answers: Any = answers.data
+
+    def run_into(self, charge_pC: Singles, out: Singles) -> None:
+        """Compute from an array into an array; the copies through memoryviews check number type and shape at no cost.
+
+        Raises:
+            AttributeError, NotImplementedError, TypeError, ValueError: If an array has not the number type and shape of
+                the bound memory; nothing is written into `out` then.
+        """
+        self._charges[:] = charge_pC
+        self.run()
+        target: Any = out.data
+        target[:] = self._answers
+
+
+def _bind(session: ort.InferenceSession, charges: Singles, answers: Singles) -> ort.IOBinding:
+    """Bind the input (1, electrodes) and the outputs, one after the other in `answers`, by address."""
+    binding = session.io_binding()
+    binding.bind_input(INPUT, "cpu", 0, np.float32, charges.shape, charges.ctypes.data)
+    start = 0
+    for name, width in OUTPUTS.items():
+        binding.bind_output(name, "cpu", 0, np.float32, (1, width), answers[start:].ctypes.data)
+        start += width
+    return binding
+
+
+LARGEST_SQUARE_SUM = 1e38
+"""Sum of squared charges, pC^2, up to which each charge is certainly finite and fits into float32."""
+
+
+def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
+    """Write numbers as float32 if they are finite and fit; the fast way for the few numbers of one press.
+
+    Args:
+        write: Takes the numbers one by one, as `struct.Struct("=3f").pack_into` does, and raises what that raises.
+        values: The numbers, as many as `write` takes.
+
+    Returns:
+        Whether they were written and are finite; if not, what was written is not to be used.
+    """
+    try:
+        numbers = tuple(values)
+        write(*numbers)
+        return math.isfinite(sum(numbers))  # float32 numbers cannot overflow a sum of float64
+    except (struct.error, TypeError, ValueError, OverflowError):
+        return False
+
+
+def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
+    """The charges of one press as an array of shape (electrodes,), float32, pC.
+
+    Raises:
+        ChargeError: If the number of charges is another, or one is not finite; the electrode is named.
+    """
+    charges = _as_numbers(charge_pC, electrodes)
+    if charges.shape != (len(electrodes),):
+        raise ChargeError(f"expected {_charges(electrodes)}, got an array of shape {charges.shape}")
+    press: Singles = as_singles(charges[np.newaxis], electrodes, one_press=True)[0]
+    return press
+
+
+def as_batch(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
+    """The charges of n presses as a contiguous array of shape (n, electrodes), float32, pC.
+
+    Raises:
+        ChargeError: If the shape is another, or a charge is not finite; the electrode and the row are named.
+    """
+    charges = _as_numbers(charge_pC, electrodes)
+    if charges.ndim != 2 or charges.shape[1] != len(electrodes):
+        raise ChargeError(
+            f"expected rows of {_charges(electrodes)}, shape (n, {len(electrodes)}), "
+            f"got an array of shape {charges.shape}"
+        )
+    return as_singles(charges, electrodes)
+
+
+def _charges(electrodes: tuple[str, ...]) -> str:
+    return f"{len(electrodes)} charges {electrodes}"
+
+
+def _as_numbers(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> NDArray[np.number]:
+    try:
+        charges = np.asarray(charge_pC)
+    except ValueError as error:  # rows of different lengths
+        raise ChargeError(f"expected {_charges(electrodes)} in each row, got {charge_pC!r:.200} ({error})") from error
+    if charges.dtype.kind not in "fiu":
+        raise ChargeError(f"expected {_charges(electrodes)} as numbers (pC), got {charge_pC!r:.200}")
+    return charges
+
+
+def as_singles(charges: NDArray[Any], electrodes: tuple[str, ...], *, one_press: bool = False) -> Singles:
+    """Charges of shape (n, electrodes), pC, of any number type as a contiguous float32 array.
+
+    Raises:
+        ChargeError: If a charge is not finite; its electrode is named, and its row unless there is only `one_press`.
+    """
+    flat = charges.ravel()
+    if (
+        charges.dtype.kind == "f" and np.vdot(flat, flat) <= LARGEST_SQUARE_SUM
+    ):  # one call instead of three and an errstate
+        return np.ascontiguousarray(charges, dtype=np.float32)
+    return _examined(charges, electrodes, one_press)
+
+
+def _examined(charges: NDArray[np.number], electrodes: tuple[str, ...], one_press: bool) -> Singles:
+    """Charges one by one; the first row with a bad one is named."""
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused below
+        singles = np.ascontiguousarray(charges, dtype=np.float32)
+    rows, columns = np.nonzero(~np.isfinite(singles))
+    if rows.size:
+        row = rows[0]
+        bad = [f"{electrodes[column]!r} ({charges[row, column]})" for column in columns[rows == row]]
+        where = "" if one_press else f" in row {row} (rows count from 0)"
+        raise ChargeError(f"expected finite charges (pC), got{where} for electrode {', '.join(bad)}")
+    return singles

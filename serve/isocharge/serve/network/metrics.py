@@ -19,8 +19,7 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 from isocharge.serve.network.model_store import ModelStore
-from isocharge.serve.network.statistics import LATENCY_NS, STAGES, Statistics
-from isocharge.serve.network.traffic import Traffic
+from isocharge.serve.network.traffic import LATENCY_NS, STAGES, Statistics, Traffic
 
 CONTENT_TYPE = b"text/plain; version=0.0.4; charset=utf-8"
 """The format that every Prometheus reads, whatever it asks for."""

@@ -16,11 +16,17 @@ from types import MappingProxyType
 
 from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.model_folder import Model, check_golden, load_model
-from isocharge.serve.model.repository import model_names, repositories, version_folders
-from isocharge.serve.network.statistics import Statistics
-from isocharge.serve.prediction.bound_press import BoundPress
-from isocharge.serve.prediction.validity import Validity
+from isocharge.serve.model.model_folder import (
+    Model,
+    check_golden,
+    load_model,
+    model_names,
+    repositories,
+    version_folders,
+)
+from isocharge.serve.model.session import BoundPress
+from isocharge.serve.network.traffic import Statistics
+from isocharge.serve.prediction.contact import Validity
 
 log = logging.getLogger(__name__)
 
@@ -110,19 +116,18 @@ class ModelStore:
         """Why files were refused, a sentence for each version."""
         return [reason for _, reason in sorted(self._refused.items())]
 
-    def unready(self, *, full: bool) -> str:
-        """Why the server is not ready, in a sentence; empty if it is.
+    def check_ready(self) -> None:
+        """Check that a model serves; the message is for everybody, and names no file.
 
-        Args:
-            full: With the reason for each version, which names files; without, only how many there are.
+        Raises:
+            ModelError: If none does.
         """
-        if self._serving:
-            return ""
-        reasons = [f"; {name}/{version}: {reason}" for (name, version), reason in sorted(self._refused.items())]
-        if full:
-            return "no model is loaded" + "".join(reasons)
-        unloaded = list(self._refused.values()).count(UNLOADED)
-        return f"no model is loaded (versions refused: {len(reasons) - unloaded}, unloaded: {unloaded})"
+        if not self._serving:
+            unloaded = list(self._refused.values()).count(UNLOADED)
+            raise ModelError(
+                f"not ready: no model is loaded (versions refused: {len(self._refused) - unloaded}, unloaded: "
+                f"{unloaded}); the repository's index has the reasons"
+            )
 
     def known(self) -> list[dict[str, str]]:
         """Name, version, state and reason of every version that serves or was refused."""

@@ -15,7 +15,6 @@ disk or a power cut left unfinished is ignored.
 import base64
 import json
 import logging
-import os
 from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -24,11 +23,11 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
 from msgspec import Meta, Struct
 
-from isocharge.common.errors import OutputError, RecordingError, cut
-from isocharge.common.files import bounded_lines, refuse_existing
+from isocharge.common.errors import RecordingError, cut
+from isocharge.common.files import WholeWrites, bounded_lines
 from isocharge.common.progress import report
 from isocharge.common.structs import Text, WrongKey, parse_json
-from isocharge.serve.port.serial_port import Chunk
+from isocharge.serve.port.source import Chunk
 
 VERSION = 1
 """Version of the file's format."""
@@ -42,9 +41,6 @@ LONGEST_ENTRY = 1 << 20
 Latency = Annotated[float, Meta(ge=-1e12, le=1e12, description="a latency of some days at most, us")]
 Moment = Annotated[float, Meta(ge=-1e11, le=1e11, description="a time before the year 5138, unix seconds")]
 Nanoseconds = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
-
-WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
-"""To open a new file, without changing line ends on Windows."""
 
 log = logging.getLogger(__name__)
 
@@ -88,9 +84,8 @@ class Recorder:
         self._header = {KIND: VERSION, "model": model, "policy": policy, "device": dict(device)}
         if name:
             self._header["name"] = name
-        self._descriptor = -1
-        self._good = 0
-        self._last: Chunk | None = None
+        self._last: Chunk | None = None  # the chunk that was given last, and the size of the file before it
+        self._begin = 0
 
     def __enter__(self) -> Self:
         """Create the file.
@@ -99,11 +94,7 @@ class Recorder:
             OutputExists: If it is already there.
             OutputError: If it cannot be created.
         """
-        refuse_existing(self.path)
-        try:
-            self._descriptor = os.open(self.path, WRITE_FLAGS, 0o666)
-        except OSError as error:
-            raise OutputError(f"{self.path} cannot be written: {error.strerror}; choose another file") from error
+        self._file = WholeWrites(self.path)
         self._write(json.dumps(self._header))
         return self
 
@@ -115,15 +106,16 @@ class Recorder:
 
     def close(self) -> None:
         """Close the file."""
-        os.close(self._descriptor)
+        self._file.close()
 
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
         """Write a chunk and the lines of its records, once: after an interruption it may be given again."""
-        if chunk is self._last:
+        if chunk is self._last and self._file.tell() > self._begin:
             return
         data = base64.b64encode(chunk.data).decode()
         head = json.dumps({"chunk": [chunk.timestamp, chunk.clock_ns, chunk.outage_s, data]})
-        self._write("\n".join([head, *records]), chunk)
+        self._last, self._begin = chunk, self._file.tell()
+        self._write("\n".join([head, *records]))
 
     def tare(self) -> None:
         """Write a request for a new tare."""
@@ -137,23 +129,15 @@ class Recorder:
         """Write a marker."""
         self._write(json.dumps({"marker": list(marker)}))
 
-    def _write(self, lines: str, chunk: Chunk | None = None) -> None:
+    def _write(self, lines: str) -> None:
         """Write whole lines or none, over what an interruption left of them."""
         if self.failed:
             return
-        data = f"{lines}\n".encode()
         try:
-            os.lseek(self._descriptor, self._good, os.SEEK_SET)
-            unwritten = memoryview(data)
-            while unwritten:
-                unwritten = unwritten[os.write(self._descriptor, unwritten) :]
+            self._file.write(f"{lines}\n".encode())
         except OSError as error:
             self.failed = True
-            os.ftruncate(self._descriptor, self._good)
             log.error("%s: recording stopped (%s); what was written until now is whole", self.path, error.strerror)
-            return
-        self._good += len(data)
-        self._last = chunk
 
 
 class Event(NamedTuple):

@@ -1,16 +1,207 @@
-"""Where bytes come from: a port, a file, or stdin."""
+"""Where bytes come from: a port, a file, or stdin, as a context manager and an iterator of chunks with their arrival.
+
+A port is any URL that pyserial knows: `/dev/ttyACM0`, a pseudo-terminal, `socket://host:port`, `rfc2217://host:port`,
+`loop://`; and `tcp://host:port`, the same as `socket://`, and `udp://host:port`, where datagrams are received. On
+request, a port that goes away or falls silent is opened again until it is back; the first chunk after an outage says
+how long it was. A board that has to be asked is asked.
+"""
 
 import contextlib
+import logging
 import os
 import stat
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, Self
 
-from isocharge.common.errors import InputError
-from isocharge.serve.port.request import Request
-from isocharge.serve.port.serial_port import Chunk, Port
+from isocharge.common.errors import InputError, PortError, PortLost
+from isocharge.serve.port.serial_line import OPEN_ERRORS, READ_ERRORS, SCHEME, Asker, Request, SerialLine, UdpSocket
+
+RETRY_S = 0.1
+"""First pause before a lost port is opened again, s; each pause is twice as long as the one before."""
+
+LONGEST_RETRY_S = 2.0
+"""Longest pause, s."""
+
+log = logging.getLogger(__name__)
+
+
+class Chunk(NamedTuple):
+    """Bytes as they came.
+
+    Attributes:
+        data: At least one byte.
+        timestamp: Host time of arrival, unix seconds.
+        clock_ns: The same moment on `time.perf_counter_ns`, for latencies.
+        outage_s: Length of the outage just before, s; 0 if there was none.
+    """
+
+    data: bytes
+    timestamp: float
+    clock_ns: int
+    outage_s: float = 0.0
+
+
+class Port:
+    """A port; iterate over it to get `Chunk`s without end.
+
+    Attributes:
+        url: Device path or pyserial URL.
+        outages: Times that it came back.
+        is_live: Bytes come whether they are read or not, and are lost if they are not.
+
+    Example:
+        >>> with Port("/dev/ttyACM0") as port:  # doctest: +SKIP
+        ...     for chunk in port:
+        ...         print(chunk.data)
+    """
+
+    is_live = True
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        baud: int = 115200,
+        silence_s: float = 5.0,
+        reconnect: bool = False,
+        request: Request | None = None,
+    ) -> None:
+        """Describe a port; it is opened on entering the context.
+
+        Args:
+            url: Device path or pyserial URL.
+            baud: Bits per second; ignored by USB and pseudo-terminals.
+            silence_s: Time without a byte after which the port counts as lost, s.
+            reconnect: Whether to open a lost port again until it is back, instead of raising.
+            request: What the board has to be asked; None for a board that sends unasked.
+        """
+        self.url = url
+        self.outages = 0
+        self._baud, self._silence_s, self._reconnect = baud, silence_s, reconnect
+        self._asker = Asker(request) if request else None
+        self._line: SerialLine | UdpSocket | None = None
+
+    def __enter__(self) -> Self:
+        """Open the port and drop the bytes that it has buffered.
+
+        Raises:
+            PortError: If it cannot be opened.
+        """
+        try:
+            is_udp = self.url.startswith(SCHEME)
+            self._line = UdpSocket(self.url) if is_udp else SerialLine(self.url, self._baud)
+            self._line.reset_input_buffer()  # a tty drops them by itself, a socket does not
+        except OPEN_ERRORS as error:
+            self._close()
+            raise PortError(
+                f"{self.url}: cannot be opened at {self._baud} baud ({error}); check the cable and the name, that no "
+                "other program has it open, and that you may read it (on Linux, the group 'dialout')"
+            ) from error
+        if self._asker:
+            self._asker.forget()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the port."""
+        self._close()
+
+    def _close(self) -> None:
+        if self._line is not None:
+            self._line.close()
+        self._line = None
+
+    @property
+    def echo_share(self) -> float:
+        """Share of the requests that the line brought back, dimensionless; 0 for a board that sends unasked."""
+        return self._asker.echo_share if self._asker else 0.0
+
+    def __iter__(self) -> Iterator[Chunk]:
+        """Chunks as they arrive.
+
+        Raises:
+            PortLost: If the port goes away or stays silent for `silence_s`, and is not to be opened again.
+            PortError: If the port is not open.
+        """
+        while True:
+            outage_s, lost_s = 0.0, time.monotonic()
+            try:
+                data = self._read()
+            except PortLost as error:
+                data = self._come_back(error)
+                outage_s = time.monotonic() - lost_s
+                self.outages += 1
+            yield Chunk(data, time.time(), time.perf_counter_ns(), outage_s)
+
+    def read(self, timeout_s: float) -> Chunk | None:
+        """The bytes that come within a time, s; None if none do.
+
+        Raises:
+            PortLost: If the port goes away.
+            PortError: If the port is not open.
+        """
+        data = self._receive(timeout_s)
+        return Chunk(data, time.time(), time.perf_counter_ns()) if data else None
+
+    def _come_back(self, reason: PortLost) -> bytes:
+        """Open the port again and again until bytes come: these bytes."""
+        if not self._reconnect:
+            raise reason
+        log.warning("%s; trying again until it is back", reason)
+        pause_s = RETRY_S
+        while True:
+            self._close()
+            time.sleep(pause_s)
+            pause_s = min(2.0 * pause_s, LONGEST_RETRY_S)
+            try:
+                self.__enter__()
+                return self._read()
+            except PortError:
+                continue
+
+    def _read(self) -> bytes:
+        """Wait for a byte, and read all bytes that came with it.
+
+        Raises:
+            PortLost: If the port went away, or nothing came in time.
+        """
+        data = self._receive(self._silence_s)
+        if not data:
+            raise PortLost(
+                f"{self.url}: no data for {self._silence_s:g} s; check that the board is powered and sends, "
+                f"and that {self._baud} baud is its speed"
+            )
+        return data
+
+    def _receive(self, timeout_s: float) -> bytes:
+        """The bytes that come within a time, s; nothing if none come."""
+        if self._line is None:
+            raise PortError(f"{self.url}: not open; use `with Port(...) as port`")
+        try:
+            if self._asker is None:
+                return self._line.receive(timeout_s)
+            return self._ask(self._line, self._asker, timeout_s)
+        except READ_ERRORS as error:
+            raise PortLost(
+                f"{self.url}: went away while it was read ({error}); check the plug and the cable"
+            ) from error
+
+    def _ask(self, line: SerialLine | UdpSocket, asker: Asker, timeout_s: float) -> bytes:
+        """Ask whenever it is time, until an answer comes."""
+        end_s = time.monotonic() + timeout_s
+        while (left_s := end_s - time.monotonic()) > 0.0:
+            if not (wait_s := asker.wait_s()):
+                line.write(asker.asked())
+                wait_s = asker.wait_s()
+            if answer := asker.heard(line.receive(min(wait_s, left_s))):
+                return answer
+        return b""
+
 
 STDIN = "-"
 """Name of the standard input."""

@@ -1,10 +1,20 @@
-"""What a model says about presses, one or many: seven numbers each, in an order that other programs rely on."""
+"""What a model says about presses, one or many, and whether to trust it.
+
+A contact is seven numbers in an order that other programs rely on. `Validity` checks contacts against the domain that a
+model was trained for: the flags `outside`, `misfit` and `beyond`.
+"""
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
-from isocharge.common.arrays import Singles
+import numpy as np
+
+from isocharge.common.arrays import Array, Booleans, Reals, Singles
+from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE
+from isocharge.serve.model.metadata import ModelMetadata
 
 MOST_DECIMALS = 6
 """Decimals that are shown at most: 1 nm and 1 uN."""
@@ -51,3 +61,93 @@ class Contacts(NamedTuple):
     y_std_mm: Singles
     force_std_N: Singles
     misfit: Singles
+
+
+MISFIT_LIMIT = 5.0
+"""Smallest limit of the misfit, in standard deviations; a model may state a larger one, that of 0.1 % of presses."""
+
+FAR = 3.0
+"""Multiple of the largest force, and of the working area's reach, beyond which an answer is no measurement."""
+
+
+@dataclass(frozen=True)
+class Validity:
+    """Where a model may be trusted: the area, the forces and the misfit that it was trained for.
+
+    Attributes:
+        corners_mm: Corners of the working area, a polygon, shape (n, 2), mm.
+        force_range_N: Smallest and largest force, N.
+        misfit_limit: Largest misfit of a single contact, in standard deviations.
+    """
+
+    corners_mm: Array
+    force_range_N: tuple[float, float]
+    misfit_limit: float = MISFIT_LIMIT
+
+    @classmethod
+    def of(cls, metadata: ModelMetadata) -> "Validity":
+        """What a model's metadata state."""
+        limit = max(MISFIT_LIMIT, metadata.errors.get("misfit_p999", MISFIT_LIMIT))
+        return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit)
+
+    @cached_property
+    def reach_mm(self) -> float:
+        """Distance of the working area's farthest corner from the origin, mm."""
+        return float(np.linalg.norm(self.corners_mm, axis=1).max())
+
+    @cached_property
+    def far(self) -> tuple[float, float]:
+        """Squared distance from the origin, mm^2, and force, N, beyond which an answer is no measurement."""
+        return (FAR * self.reach_mm) ** 2, FAR * self.force_range_N[1]
+
+    @cached_property
+    def safe_mm2(self) -> float:
+        """Squared radius of the largest disk about the origin inside the area, mm^2; 0 if the origin is outside."""
+        zero = np.zeros(1)
+        start, end = self.corners_mm, np.roll(self.corners_mm, -1, axis=0)
+        along = end - start
+        share = np.clip(-(start * along).sum(axis=1) / np.maximum((along * along).sum(axis=1), 1e-30), 0.0, 1.0)
+        nearest = ((start + share[:, np.newaxis] * along) ** 2).sum(axis=1).min()
+        return float(nearest) if inside_polygon(zero, zero, self.corners_mm)[0] else 0.0
+
+    def flags(self, contact: Contact) -> tuple[str, ...]:
+        """The flags of one contact, a quarter of a microsecond where there are none."""
+        low, high = self.force_range_N
+        inside = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm < self.safe_mm2
+        if inside and low <= contact.force_N <= high and contact.misfit <= self.misfit_limit:
+            return ()  # nearly all contacts, without allocating an array
+        return self.batch_flags(Contacts(*np.array(contact, dtype=np.float32)[:, np.newaxis]))[0]
+
+    def batch_flags(self, contacts: Contacts) -> list[tuple[str, ...]]:
+        """The flags of each of n contacts."""
+        low, high = self.force_range_N
+        outside = ~inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm)
+        outside |= (contacts.force_N < low) | (contacts.force_N > high)
+        misfit = contacts.misfit > self.misfit_limit
+        far_mm2, far_N = self.far
+        with np.errstate(over="ignore"):  # infinity is far, too
+            beyond = (contacts.x_mm**2 + contacts.y_mm**2 > far_mm2) | (contacts.force_N > far_N)
+        if not (outside | misfit).any():
+            return [()] * len(outside)
+        return [
+            (OUTSIDE,) * is_outside + (BEYOND,) * is_beyond + (MISFIT,) * is_misfit
+            for is_outside, is_beyond, is_misfit in zip(outside.tolist(), beyond.tolist(), misfit.tolist(), strict=True)
+        ]
+
+
+def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
+    """Whether points lie inside a polygon, by counting the edges to their right.
+
+    Args:
+        x, y: Points, shape (n,), in the unit of the corners.
+        corners: Shape (m, 2), in order; the last one may repeat the first.
+
+    Returns:
+        Shape (n,). Points on the edge itself may be counted either way.
+    """
+    (x0, y0), (x1, y1) = corners.T[..., np.newaxis], np.roll(corners, -1, axis=0).T[..., np.newaxis]
+    crosses = (y0 > y) != (y1 > y)
+    with np.errstate(divide="ignore", invalid="ignore"):  # horizontal edges never cross
+        edge_x = x0 + (y - y0) * (x1 - x0) / (y1 - y0)
+    inside: Booleans = np.count_nonzero(crosses & (x < edge_x), axis=0) % 2 == 1
+    return inside

@@ -12,15 +12,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError, shown
 from isocharge.common.files import bounded_lines, write_whole
-from isocharge.serve.prediction.csv_numbers import CsvNumbers
-from isocharge.serve.prediction.table import CHARGE
+from isocharge.serve.prediction.table import CHARGE, LARGEST, CsvNumbers
 
 POSITION_STD_MM = 0.1
 """Uncertainty of a position where nothing else is said, mm: that of a hand-set stage."""
@@ -155,6 +153,9 @@ def read_presses(
     Raises:
         PressError: Names file, line and column, what was expected, what was got and what to do.
     """
+    for name, std, most in (("position_std_mm", position_std_mm, LARGEST), ("force_std", force_std, 1.0)):
+        if not 0.0 < std <= most:
+            raise PressError(f"{name}: expected {KINDS[name]}, got {std:g}")
     named = f"the electrodes {tuple(electrodes)}" if electrodes is not None else "the electrodes' names"
     with _open_table(path, (*(electrodes or ()), *KINDS), f"{', '.join(CONTACT)} and {named} (charges in pC)") as table:
         if electrodes is None:
@@ -200,12 +201,9 @@ def read_press_list(path: Path) -> Array:
         raise PressError(f"{path}, {error}") from error
 
 
-def write_presses(out: Path | TextIO, presses: MeasuredPresses) -> None:
-    """Write presses as `read_presses` reads them, to the last bit; a file appears whole and replaces an older one."""
-    if isinstance(out, Path):
-        write_whole(out, presses_text(presses).encode())
-    else:
-        out.write(presses_text(presses))
+def write_presses(path: Path, presses: MeasuredPresses) -> None:
+    """Write presses as `read_presses` reads them, to the last bit; the file appears whole and replaces an older one."""
+    write_whole(path, presses_text(presses).encode())
 
 
 def presses_text(presses: MeasuredPresses) -> str:

@@ -16,14 +16,9 @@ from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError, ModelError, shown
-from isocharge.serve.model.charges import as_batch, as_press, write_finite
-from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.model_folder import Model, load_model
-from isocharge.serve.model.repository import find_model
-from isocharge.serve.model.session import OUTPUTS, run
-from isocharge.serve.prediction.bound_press import BoundPress
-from isocharge.serve.prediction.contact import Contact, Contacts
-from isocharge.serve.prediction.validity import Validity
+from isocharge.serve.model.model_folder import Model, find_model, load_model
+from isocharge.serve.model.session import OUTPUTS, BoundPress, as_batch, as_press, run, write_finite
+from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +27,10 @@ class Predictor:
     """A loaded model. Its buffers serve one press at a time: use one Predictor per thread.
 
     `predict` and `predict_into` use the buffers; `predict_batch` does not and may be called from any thread.
+
+    Attributes:
+        metadata: What the model says about itself: sensor, electrodes, working area, measured errors.
+        validity: Where the model may be trusted; its `batch_flags` are those of `predict_batch`.
 
     Example:
         >>> from isocharge.serve import Predictor
@@ -54,23 +53,13 @@ class Predictor:
             ModelError: If it is missing, damaged or of another format.
         """
         loaded = load_model(find_model(model, models))
-        self._metadata = loaded.metadata
+        self.metadata = loaded.metadata
         self._session = loaded.session
-        self._validity = Validity.of(loaded.metadata)
+        self.validity = Validity.of(loaded.metadata)
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
-        self._far_mm2, self._far_N = self._validity.far
+        self._far_mm2, self._far_N = self.validity.far
         self._warned = False
         _check_shared(self._press, loaded)
-
-    @property
-    def metadata(self) -> ModelMetadata:
-        """What the model says about itself: sensor, electrodes, working area, measured errors."""
-        return self._metadata
-
-    @property
-    def validity(self) -> Validity:
-        """Where the model may be trusted; its `batch_flags` are those of `predict_batch`."""
-        return self._validity
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
         """The contact of one press; `flags` says whether to trust it.
@@ -85,7 +74,7 @@ class Predictor:
         """
         values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
         if not write_finite(self._press.write, values):  # raises what is wrong, or converts
-            self._press.write(*as_press(charge_pC, self._metadata.electrodes))
+            self._press.write(*as_press(charge_pC, self.metadata.electrodes))
         self._press.run()
         contact = Contact(*self._press.read())
         x_mm, y_mm, force_N, _, _, _, _ = contact
@@ -99,7 +88,7 @@ class Predictor:
         Three charges and three unknowns: with three electrodes, a wrong charge mostly looks like another press, and
         only one that leads out of the working area or the forces is seen.
         """
-        return self._validity.flags(contact)
+        return self.validity.flags(contact)
 
     def predict_into(self, charge_pC: Singles, out: Singles) -> None:
         """The contact of one press, for the hot loop: from an array into an array, and nothing else.
@@ -120,7 +109,7 @@ class Predictor:
             self._press.run_into(charge_pC, out)
         except (AttributeError, NotImplementedError, TypeError, ValueError) as error:
             raise ChargeError(
-                f"expected charges {self._metadata.electrodes} and a writable `out` of the {len(Contact._fields)} "
+                f"expected charges {self.metadata.electrodes} and a writable `out` of the {len(Contact._fields)} "
                 f"numbers of a Contact, both float32 arrays, got {_kind(charge_pC)} and {_kind(out)} ({error})"
             ) from error
 
@@ -133,15 +122,15 @@ class Predictor:
         Raises:
             ChargeError: If the shape is another, or a charge is not finite; its electrode and row are named.
         """
-        outputs = run(self._session, as_batch(charge_pC, self._metadata.electrodes))
+        outputs = run(self._session, as_batch(charge_pC, self.metadata.electrodes))
         return Contacts(*np.concatenate([outputs[name] for name in OUTPUTS], axis=1).T)
 
     def __repr__(self) -> str:
         """Model, electrodes and domain."""
-        metadata, (low, high) = self._metadata, self._validity.force_range_N
+        metadata, (low, high) = self.metadata, self.validity.force_range_N
         return (
             f"Predictor({metadata.label}: sensor {metadata.frame_id}, charges {' '.join(metadata.electrodes)} (pC), "
-            f"positions up to {self._validity.reach_mm:.3g} mm, forces {low:.3g} to {high:.3g} N)"
+            f"positions up to {self.validity.reach_mm:.3g} mm, forces {low:.3g} to {high:.3g} N)"
         )
 
     def _warn(self, charge_pC: object, contact: Contact) -> None:
@@ -151,7 +140,7 @@ class Predictor:
             log.warning(
                 "%s: %s pC are far from any press that the model knows, and (%.2f, %.2f) mm, %.6g N is no measurement; "
                 "check unit, gain and tare. Predictor.flags says so of each contact, this line only once",
-                self._metadata.label,
+                self.metadata.label,
                 shown(charge_pC),
                 *contact[:3],
             )

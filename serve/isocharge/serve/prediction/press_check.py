@@ -15,11 +15,17 @@ from isocharge.common.arrays import Booleans
 from isocharge.common.json_values import plain_values
 from isocharge.serve.flags import MISFIT
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.prediction.agreement import Agreement, ErrorSummary
-from isocharge.serve.prediction.chi_squared import chi_squared_survival
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.serve.prediction.predictor import Predictor
-from isocharge.serve.prediction.press_errors import NOT_TRAINED, PressErrors, misfit_limit, press_errors
+from isocharge.serve.prediction.press_errors import (
+    NOT_TRAINED,
+    Agreement,
+    ErrorSummary,
+    PressErrors,
+    chi_squared_survival,
+    misfit_limit,
+    press_errors,
+)
 
 FEWEST = 3
 """Presses below which nothing is said: one bad press among two cannot be told from a bad film."""

@@ -1,5 +1,9 @@
-"""Errors of a model on measured presses, one by one, beside the deviations that noise and rig explain."""
+"""Errors of a model on measured presses, one by one, beside the deviations that noise and rig explain.
 
+Whether these explain them: a summary, the part that all presses share, and the sum of squares.
+"""
+
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,10 +12,9 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.flags import MISFIT, OUTSIDE
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.prediction.contact import Contacts
+from isocharge.serve.prediction.contact import MISFIT_LIMIT, Contacts, Validity, inside_polygon
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.serve.prediction.predictor import Predictor
-from isocharge.serve.prediction.validity import MISFIT_LIMIT, Validity, inside_polygon
 
 NO_CHARGE, NOTHING_KNOWN, NOT_TRAINED = "a charge is unknown", "neither place nor force is known", "not trained for"
 """Reasons why a press does not count."""
@@ -127,3 +130,133 @@ def _reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tuple[str, ..
     partial = np.isnan(presses.charge_pC).any(axis=1)
     chosen = np.select([partial, nothing, off], [NO_CHARGE, NOTHING_KNOWN, NOT_TRAINED], "")
     return tuple(chosen.tolist())
+
+
+SIGNIFICANCE = 0.01
+"""Probability with which a film that fits is said not to; half each for the sum of squares and the common part."""
+
+SLACK = 1.1
+"""Chi-squared per degree of freedom that is always accepted: standard deviations are known to 5 %, not better."""
+
+COMMON_SHARE = 0.2
+"""Share of its deviation by which a rig may be off in all presses alike: a stage has an offset, a load cell a scale."""
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """Errors of one kind, mm or %.
+
+    Attributes:
+        presses: Number of presses.
+        rms, median, max: Of the errors' sizes.
+        noise, rig: Root mean square that noise of the charges explains, and that the rig's uncertainty explains.
+        explained: Both together.
+        beyond: Root of the difference of rms^2 and explained^2, 0 if that is negative.
+    """
+
+    presses: int
+    rms: float
+    median: float
+    max: float
+    noise: float
+    rig: float
+    explained: float
+    beyond: float
+
+    @classmethod
+    def of(cls, size: Array, noise_variance: Array, rig_variance: Array) -> "ErrorSummary | None":
+        """Of the sizes of errors and their expected squares, each of shape (n,); None without presses."""
+        if not size.size:
+            return None
+        square, noise, rig = (float(np.mean(values)) for values in (size**2, noise_variance, rig_variance))
+        roots = np.sqrt([noise, rig, noise + rig, max(square - noise - rig, 0.0)]).tolist()
+        return cls(size.size, square**0.5, float(np.median(size)), float(size.max()), *roots)
+
+
+@dataclass(frozen=True)
+class Common:
+    """The part of an error that all presses share: its weighted mean.
+
+    Attributes:
+        mean: mm, or a share of the force; NaN if nothing is known.
+        std: Standard error, from noise and rig, widened where the presses scatter more than these explain.
+        significance: Mean over the standard error that includes what a rig may be off in all presses alike.
+    """
+
+    mean: float
+    std: float
+    significance: float
+
+    @classmethod
+    def of(cls, error: Array, variance: Array) -> "Common":
+        """Of errors and their expected squares, shape (n,), NaN where unknown."""
+        known = ~np.isnan(error)
+        if not known.any():
+            return cls(np.nan, np.nan, 0.0)
+        error, weight = error[known], 1.0 / variance[known]
+        mean, square = float(weight @ error / weight.sum()), 1.0 / float(weight.sum())
+        scatter = float(weight @ (error - mean) ** 2) / max(len(error) - 1, 1)
+        wide = square * (1.0 + COMMON_SHARE**2 * len(error))
+        return cls(mean, (square * max(scatter, 1.0)) ** 0.5, mean / wide**0.5)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Whether noise and rig explain the errors of some presses.
+
+    Attributes:
+        chi_squared, degrees: Sum of squared errors over expected squares, and their number.
+        p_value: Probability of a larger sum from noise and rig alone; NaN without presses.
+        shift_x, shift_y: Common part of the position errors, mm.
+        force: Common part of the force errors, a share.
+        common_p_value: Probability of larger common parts from noise and rig alone; NaN without presses.
+    """
+
+    chi_squared: float
+    degrees: int
+    p_value: float
+    shift_x: Common
+    shift_y: Common
+    force: Common
+    common_p_value: float
+
+    @classmethod
+    def of(cls, errors: PressErrors, rows: Booleans) -> "Agreement":
+        """Of some rows, shape (n,)."""
+        error, variance = errors.error[rows], errors.variance[rows]
+        chi_squared, degrees = float(np.nansum(error**2 / variance)), int(np.count_nonzero(~np.isnan(error)))
+        x, y, force = (Common.of(error[:, kind], variance[:, kind]) for kind in range(3))
+        known = [part.significance for part in (x, y, force) if not np.isnan(part.mean)]
+        common_p_value = _p_value(sum(value**2 for value in known), len(known))
+        return cls(chi_squared, degrees, _p_value(chi_squared, degrees), x, y, force, common_p_value)
+
+    @property
+    def acceptable(self) -> bool:
+        """Whether noise and rig explain the errors."""
+        scatters = self.p_value < 0.5 * SIGNIFICANCE and self.chi_squared > SLACK * self.degrees
+        return not scatters and not self.common_p_value < 0.5 * SIGNIFICANCE
+
+
+def _p_value(chi_squared: float, degrees: int) -> float:
+    return chi_squared_survival(chi_squared, degrees) if degrees else np.nan
+
+
+def chi_squared_survival(statistic: float, degrees: int) -> float:
+    """Probability that a chi-squared variable exceeds a value.
+
+    The tail is a finite sum (Abramowitz and Stegun 1964, 26.4.4 and 26.4.5): with x = statistic / 2, and erfc(sqrt(x))
+    added for odd degrees,
+
+        sum of x^s exp(-x) / Gamma(s + 1) over s = degrees / 2 - 1, degrees / 2 - 2, ... down to 0 or 1/2.
+
+    Args:
+        statistic: Sum of squares, not negative; infinity gives 0.
+        degrees: Degrees of freedom, 1 or more.
+    """
+    x, odd = 0.5 * statistic, degrees % 2
+    if x == 0.0 or math.isinf(x):
+        return 0.0 if x else 1.0
+    first = 0.5 * odd * math.log(4.0 * x / math.pi) - x  # the term of s = 0 or 1/2, of which the others are multiples
+    ratios = np.log(x / (np.arange(1, degrees // 2) + 0.5 * odd))
+    logarithms = first + np.concatenate([[0.0], np.cumsum(ratios)])[: degrees // 2]
+    return min(1.0, odd * math.erfc(math.sqrt(x)) + float(np.exp(logarithms).sum()))

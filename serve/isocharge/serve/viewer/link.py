@@ -29,19 +29,33 @@ REQUESTS: msgspec.json.Decoder[LiveRequest] = msgspec.json.Decoder(LiveRequest)
 
 
 @dataclass
-class ReaderEnd:
-    """The end in the process that reads the port.
+class LinkEnd:
+    """One end.
 
     Attributes:
-        dropped: Samples for which there was no room.
-        is_open: Whether the page's process was there at the last attempt.
-        waits: Whether to wait for room.
+        is_open: Whether the other process was there at the last attempt.
     """
 
     samples: Connection
     messages: socket.socket
-    dropped: int = 0
     is_open: bool = True
+
+    def close_here(self) -> None:
+        """Close this process's copy of the end, which another process may have."""
+        self.messages.close()
+        self.samples.close()
+
+
+@dataclass
+class ReaderEnd(LinkEnd):
+    """The end in the process that reads the port.
+
+    Attributes:
+        dropped: Samples for which there was no room.
+        waits: Whether to wait for room.
+    """
+
+    dropped: int = 0
     waits: bool = False
 
     def put(self, sample: bytes) -> None:
@@ -74,31 +88,18 @@ class ReaderEnd:
             return None
         return REQUESTS.decode(data) if data else None
 
-    def close_here(self) -> None:
-        """Close this process's copy of an end that another process has."""
-        self.messages.close()
-        self.samples.close()
-
     def close(self) -> None:
         """Close this end, and wake who waits in `request`."""
         self.is_open = False
         with suppress(OSError):
             self.messages.shutdown(socket.SHUT_RDWR)
-        self.messages.close()
-        self.samples.close()
+        self.close_here()
 
 
 @dataclass
-class PageEnd:
-    """The end in the page's process.
+class PageEnd(LinkEnd):
+    """The end in the page's process."""
 
-    Attributes:
-        is_open: Whether the reader may still send.
-    """
-
-    samples: Connection
-    messages: socket.socket
-    is_open: bool = True
     _partial: bytes = b""
 
     def take(self, size: int) -> bytes:
@@ -131,11 +132,6 @@ class PageEnd:
         except OSError:
             return False
         return True
-
-    def close_here(self) -> None:
-        """Close this process's copy of an end that another process has."""
-        self.messages.close()
-        self.samples.close()
 
 
 def make_link() -> tuple[ReaderEnd, PageEnd]:

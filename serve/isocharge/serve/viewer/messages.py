@@ -1,21 +1,126 @@
-"""What goes over the WebSocket: samples to the page in binary, states as JSON, and what the page asks for.
+"""What goes to the page and comes from it: the description of the film, samples in binary, requests.
+
+The description is what the page has to know before the first sample: geometry, electrodes, model, deflection field. A
+model carries its sensor whole, as the simulator wrote it; what is missing there is not drawn. The field lies beside the
+model, or is shipped for the films of the released ones.
 
 A binary message to the page, little-endian: kind (u8, 1), zero (u8), number of samples (u16), number of the message
 (u32), time of sending (unix seconds, f64), records that this page has missed for good (u32), options (u32, bit 0:
-forget what was shown before); then the samples, see `isocharge.serve.viewer.samples`. The page confirms what it has
-drawn: the number of the message (u32), as a binary message of its own.
+forget what was shown before); then the samples. The page confirms what it has drawn: the number of the message (u32),
+as a binary message of its own.
+
+A sample is a prediction record of fixed size; many are coalesced to as few as a browser can show:
+
+    offset 0   timestamp, unix seconds, f64
+           8   x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_std_N, misfit, latency_us, f32 each
+          40   flags, u32: a bit for each word of `isocharge.serve.flags`, the highest one for contact
+          44   number of records that the sample stands for, u32
+          48   touch charges, pC, f32 for each electrode; zeros up to a multiple of eight bytes
+
+All little-endian; what is unknown is NaN.
 
 A request of the page is JSON, as {"do": "marker", "text": "here"}: the classes below by their names in lower case.
 """
 
+import math
 import struct
-from typing import Annotated
+from collections.abc import Mapping
+from importlib.resources import as_file, files
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any
 
+import numpy as np
 from msgspec import Meta, Struct
 
-from isocharge.common.errors import RequestError
-from isocharge.common.structs import WrongKey
-from isocharge.serve.viewer.samples import Samples
+from isocharge.common.deflection_field import DeflectionField, read_deflection_field
+from isocharge.common.errors import InputError, RequestError
+from isocharge.common.structs import Finite, Positive, WrongKey, convert
+from isocharge.serve.flags import MEANINGS
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.prediction.record import PredictionRecord
+
+NUMBERS = ("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit", "latency_us")
+"""Fields of a record that a sample has as numbers."""
+
+FLAG_BITS = {word: 1 << position for position, word in enumerate(MEANINGS)}
+"""The bit of each word."""
+
+CONTACT_BIT = 1 << 31
+
+LARGEST = float(np.finfo(np.float32).max)
+
+Samples = np.ndarray[Any, np.dtype[np.void]]
+"""Samples in their order, shape (n,), of a `SampleFormat`."""
+
+
+class SampleFormat:
+    """Samples of a sensor with these electrodes.
+
+    Attributes:
+        electrodes: Their names, in the order of the charges.
+        dtype: A sample as a NumPy record.
+    """
+
+    def __init__(self, electrodes: tuple[str, ...]) -> None:
+        """Lay the sample out."""
+        self.electrodes = electrodes
+        count = len(electrodes)
+        padding = -4 * count % 8
+        self._struct = struct.Struct(f"<d{len(NUMBERS)}fII{count}f{padding}x")
+        numbers = [(name, "<f4") for name in NUMBERS]
+        counts = [("flags", "<u4"), ("records", "<u4")]
+        fields: list[Any] = [("timestamp", "<f8"), *numbers, *counts, ("charge_pC", "<f4", (count,))]
+        self.dtype = np.dtype([*fields, ("padding", f"V{padding}")] if padding else fields)
+
+    def pack(self, record: PredictionRecord) -> bytes:
+        """A record as a sample."""
+        bits = CONTACT_BIT if record.contact else 0
+        for word in record.flags:
+            bits |= FLAG_BITS[word]
+        charges = record.charge_pC or {}
+        values = [getattr(record, name) for name in NUMBERS]
+        numbers = [math.nan if value is None else value for value in values]
+        charge_pC = [math.nan if (q := charges.get(name)) is None else q for name in self.electrodes]
+        timestamp = math.nan if record.timestamp is None else record.timestamp
+        try:
+            return self._struct.pack(timestamp, *numbers, bits, 1, *charge_pC)
+        except OverflowError:  # a number that no float32 can hold
+            clipped = [[min(max(value, -LARGEST), LARGEST) for value in part] for part in (numbers, charge_pC)]
+            return self._struct.pack(timestamp, *clipped[0], bits, 1, *clipped[1])
+
+
+def coalesce(samples: Samples, most: int) -> Samples:
+    """At most `most` samples that stand for all: each for a run of neighbours.
+
+    Of a run, the newest sample counts if it is a contact, else the hardest press: a tap between two pictures is shown.
+    Flags are those of the whole run, the latency its largest, and `records` add up.
+
+    Args:
+        samples: Shape (n,).
+        most: At least 1.
+    """
+    if len(samples) <= most:
+        return samples
+    edges = np.linspace(0, len(samples), most + 1).astype(int)
+    shown: Samples = samples[_shown_of_runs(samples, edges)]
+    starts = edges[:-1]
+    contact = shown["flags"] & CONTACT_BIT
+    shown["flags"] = np.bitwise_or.reduceat(samples["flags"], starts) & ~np.uint32(CONTACT_BIT) | contact
+    shown["records"] = np.add.reduceat(samples["records"], starts)
+    shown["latency_us"] = np.fmax.reduceat(samples["latency_us"], starts)
+    return shown
+
+
+def _shown_of_runs(samples: Samples, edges: np.ndarray) -> np.ndarray:
+    """The position of the sample that is shown of each run, shape (runs,)."""
+    touching = (samples["flags"] & CONTACT_BIT) != 0
+    force = np.where(touching, np.nan_to_num(samples["force_N"], nan=0.0), -1.0)
+    last = edges[1:] - 1
+    hardest = np.array([start + int(force[start:stop].argmax()) for start, stop in pairwise(edges)])
+    missed_tap = ~touching[last] & touching[hardest]
+    return np.where(missed_tap, hardest, last)
+
 
 HEADER = struct.Struct("<BBHIdII")
 
@@ -92,3 +197,80 @@ def confirmed_number(data: bytes) -> int:
     if len(data) != 4:
         raise RequestError(f"expected the number of a message in four bytes, got {len(data)} bytes")
     return int.from_bytes(data, "little")
+
+
+FILE = "deflection.json"
+"""Name of the field in a model's version folder."""
+
+
+def find_field(model: Path, metadata: ModelMetadata) -> DeflectionField | None:
+    """The field of the film for which a model was trained; None if there is none.
+
+    Args:
+        model: Version folder.
+        metadata: Of the model.
+
+    Raises:
+        InputError: If the file in the model's folder is damaged.
+    """
+    if (model / FILE).is_file():
+        return read_deflection_field(model / FILE)
+    film = metadata.sensor.get("film")
+    with as_file(files("isocharge.serve.viewer") / "fields") as folder:
+        fields = map(read_deflection_field, sorted(folder.glob("*.json")))
+        return next((field for field in fields if field.fits(film)), None)
+
+
+def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | None) -> dict[str, Any]:
+    """A film for the page, as JSON.
+
+    Args:
+        name: Of the stream, for people.
+        metadata: Of the model that answers.
+        field: How the film deflects; None if nobody computed it.
+    """
+    sensor = metadata.sensor
+    film = sensor.get("film")
+    return {
+        "name": name,
+        "model": metadata.label,
+        "sensor": metadata.frame_id,
+        "electrodes": list(metadata.electrodes),
+        "outlines_mm": _outlines_mm(sensor, metadata.electrodes),
+        "radius_mm": film.get("radius_mm") if isinstance(film, dict) else None,
+        "working_area_mm": [[float(x), float(y)] for x, y in metadata.working_area_mm],
+        "force_range_N": list(metadata.force_range_N),
+        "probes": list(metadata.probes),
+        "deflection": None if field is None else field.to_json(),
+    }
+
+
+def _outlines_mm(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[float]]]:
+    """Corners of each electrode where it lies on the real film; none for a sensor of another form."""
+    try:
+        parts = convert(sensor["electrodes"], dict[str, Point | Positive | _Polygon], "sensor", InputError)
+        return {name: _placed(_corners(parts, name), sensor.get("calibration") or {}) for name in electrodes}
+    except (InputError, TypeError, ValueError, KeyError):
+        return {}
+
+
+Point = tuple[Finite, Finite]
+
+
+class _Polygon(Struct):
+    polygon_mm: list[Point]
+
+
+def _corners(parts: Mapping[str, Any], name: str) -> list[Point]:
+    if isinstance(part := parts[name], _Polygon):
+        return part.polygon_mm
+    (x, y), half = part, 0.5 * parts["side_mm"]
+    return [(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]
+
+
+def _placed(corners: list[tuple[float, float]], calibration: Any) -> list[list[float]]:
+    """Corners after the calibration's turn and shift."""
+    shift_x, shift_y = calibration.get("shift_mm", (0.0, 0.0))
+    angle = math.radians(calibration.get("rotation_deg", 0.0))
+    c, s = math.cos(angle), math.sin(angle)
+    return [[c * x - s * y + shift_x, s * x + c * y + shift_y] for x, y in corners]

@@ -14,12 +14,10 @@ from typing import Any
 import uvloop
 
 from isocharge.common.errors import IsochargeError, ListenError
-from isocharge.serve.network.address import Address
-from isocharge.serve.network.credentials import Token
-from isocharge.serve.viewer.access import Access
+from isocharge.serve.network.address import Address, Token
 from isocharge.serve.viewer.hub import Hub
 from isocharge.serve.viewer.link import PageEnd
-from isocharge.serve.viewer.server import PageServer
+from isocharge.serve.viewer.server import Access, PageServer
 
 NICE = 10
 """How much later than the reader the page's process gets its turn where both want the same core."""

@@ -1,20 +1,30 @@
-"""The page's server: its files and the description of the film over HTTP, samples by WebSocket.
+"""The page's server: its files and the description of the film over HTTP, samples by WebSocket, to those who may.
 
 The server is that of the package `websockets`, one request of HTTP for each connection. It bounds the head of a request
 (8 KiB a line, 128 lines), the time for it, the size of a message, and asks each viewer for a sign of life. The rest is
 bounded here: how many viewers there are, how much they send, and how long they take nothing.
+
+A browser sends no Authorization header with a WebSocket, so the page sends its token as a subprotocol, `bearer.TOKEN`
+in base64url; other clients send the header. Any page in the world may try to open a WebSocket to this machine; the
+browser says from which page. A page of a name that somebody else has made point here (DNS rebinding) is of the same
+name as the server it asks: without a token, only names that nobody else can give count: addresses, localhost, and the
+host that this server was told to listen on.
 """
 
 import asyncio
+import base64
+import binascii
 import contextlib
 import json
 import logging
 import secrets
 import socket
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -23,16 +33,77 @@ from websockets.http11 import Request
 from websockets.http11 import Response as WebResponse
 from websockets.typing import Subprotocol
 
-from isocharge.common.errors import RequestError, TooMany, UnknownPath
+from isocharge.common.errors import OriginError, RequestError, TooMany, UnknownPath
 from isocharge.common.structs import parse_json
 from isocharge.serve.flags import MEANINGS
+from isocharge.serve.network.address import Token, ip_address
 from isocharge.serve.network.protocol import Response
-from isocharge.serve.network.protocol.page import PAGE_HEADERS
+from isocharge.serve.network.protocol.describe import PAGE_HEADERS
 from isocharge.serve.network.protocol.response import error_response, json_response, response_of
-from isocharge.serve.viewer.access import PROTOCOL, Access
 from isocharge.serve.viewer.hub import Hub, Viewer
-from isocharge.serve.viewer.messages import confirmed_number
-from isocharge.serve.viewer.samples import FLAG_BITS
+from isocharge.serve.viewer.messages import FLAG_BITS, confirmed_number
+
+PROTOCOL = "isocharge.live.1"
+"""The subprotocol of the page."""
+
+BEARER = "bearer."
+
+
+@dataclass(frozen=True)
+class Access:
+    """What a request must show.
+
+    Attributes:
+        token: The secret; None for no secret.
+        host: Where the server listens.
+    """
+
+    token: Token | None = None
+    host: str = "127.0.0.1"
+
+    def check(self, headers: Mapping[bytes, bytes], subprotocols: Iterable[str] = ()) -> None:
+        """Check a request for data.
+
+        Args:
+            headers: Names in lower case.
+            subprotocols: That a WebSocket offers.
+
+        Raises:
+            OriginError: If it comes from a page of another site.
+            TokenError: If it does not carry the token.
+        """
+        self._check_origin(headers)
+        if self.token is not None:
+            self.token.check(headers.get(b"authorization", b"") or _bearer(subprotocols))
+
+    def _check_origin(self, headers: Mapping[bytes, bytes]) -> None:
+        host = headers.get(b"host", b"").decode("latin-1").lower()
+        name = _name(f"//{host}")
+        if self.token is None and not (ip_address(name) or name in ("localhost", self.host.lower(), "")):
+            raise OriginError(f"expected a request to this machine's address, got one to {host!r}; open the address")
+        origin = headers.get(b"origin")
+        if origin is not None and origin.decode("latin-1").lower().partition("://")[2] != host:
+            raise OriginError(f"expected a page of this server, got one of {origin.decode('latin-1')!r}; open {host}")
+
+
+def _name(url: str) -> str:
+    try:
+        return urlsplit(url).hostname or ""
+    except ValueError:
+        return "?"
+
+
+def _bearer(subprotocols: Iterable[str]) -> bytes:
+    """The Authorization header that a subprotocol stands for."""
+    for offered in subprotocols:
+        if offered.startswith(BEARER):
+            text = offered.removeprefix(BEARER)
+            try:
+                return b"Bearer " + base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True)
+            except (binascii.Error, ValueError):
+                return b"Bearer"
+    return b""
+
 
 SESSION, LIVE = "/session.json", "/live"
 """Paths of the description and of the WebSocket."""

@@ -6,24 +6,78 @@ reader: a frame that does not fit into the port's buffer is withheld whole and c
 frame numbers.
 """
 
+import array
+import contextlib
+import importlib
 import itertools
+import os
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import PortError, SceneError
+from isocharge.common.errors import InputError, PortError, SceneError
 from isocharge.serve.frames.binary import encode_frame
-from isocharge.serve.frames.frame import T_US_MODULUS, Frame
-from isocharge.serve.frames.sequence import SEQ_MODULUS
-from isocharge.serve.virtual_sensor.pseudo_port import PseudoPort
+from isocharge.serve.frames.frame import SEQ_MODULUS, T_US_MODULUS, Frame
 from isocharge.serve.virtual_sensor.script import Faults, Script, corrupt
+
+PORT_BUFFER = 3840
+"""Largest number of bytes that wait for the reader. Linux holds 4095: beyond, a write could be cut within a frame."""
+
+
+class PseudoPort:
+    """An open pseudo-terminal in raw mode; `url` is the device path. Close it to make the port vanish."""
+
+    def __init__(self) -> None:
+        """Open one.
+
+        Raises:
+            PortError: If the system has none: Windows.
+        """
+        tty, self._fcntl, self._termios = posix_modules()
+        # The reader's end stays open here, so the port does not hang up when a reader closes it.
+        self._writer, self._reader = os.openpty()
+        tty.setraw(self._reader)
+        os.set_blocking(self._writer, False)
+        self.url = os.ttyname(self._reader)
+
+    def write_whole(self, data: bytes) -> bool:
+        """Write all of `data`, or nothing if the reader is too far behind, without waiting; whether it was written."""
+        waiting = array.array("i", [0])
+        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, waiting)
+        if waiting[0] + len(data) > PORT_BUFFER:
+            return False
+        with contextlib.suppress(BlockingIOError):
+            return os.write(self._writer, data) == len(data)
+        return False
+
+    def close(self) -> None:
+        """Make the port vanish, as when a cable is pulled."""
+        os.close(self._writer)
+        os.close(self._reader)
+
+
+def posix_modules() -> tuple[Any, Any, Any]:
+    """The modules `tty`, `fcntl` and `termios`, which handle pseudo-terminals.
+
+    Raises:
+        PortError: If this system has no pseudo-terminals.
+    """
+    try:
+        tty, fcntl, termios = map(importlib.import_module, ("tty", "fcntl", "termios"))
+    except ImportError as error:
+        raise PortError(
+            f"a virtual sensor needs a pseudo-terminal, and this system has none ({error}); run it on Linux or macOS, "
+            "or on Windows in WSL"
+        ) from error
+    return tty, fcntl, termios
+
 
 Charges = Callable[[Array], Array]
 """Contacts (x, y, F), shape (n, 3), mm and N, to touch charges, shape (n, electrodes), pC: `charges` of a ChargeMap."""
@@ -171,7 +225,11 @@ class VirtualSensor:
         return Truth(x_mm, y_mm, force_N, self._clean_pC[at], float(self._sent_s[seq]))
 
     def __enter__(self) -> Self:
-        """Open the port and start to play."""
+        """Open the port and start to play.
+
+        Raises:
+            InputError: If the link cannot be made.
+        """
         self._frames = self.withheld = self.unplugged = 0
         if self._link is None and self._faults.unplug_every_s > 0.0:
             self._folder = tempfile.TemporaryDirectory(prefix="isocharge-")
@@ -216,9 +274,11 @@ class VirtualSensor:
         try:
             if self._link:
                 self._link.symlink_to(port.url)
-        except OSError:
+        except OSError as error:
             port.close()
-            raise
+            raise InputError(
+                f"{self._link}: the link cannot be made ({error.strerror}); choose another path"
+            ) from error
         self._port = port
         return port
 

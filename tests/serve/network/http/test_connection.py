@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.http.connection import Connection
-from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol.response import response_of
 
 INNER = b"POST /one HTTP/1.1\r\nHost: x\r\nContent-Length: 3\r\n\r\nabc"

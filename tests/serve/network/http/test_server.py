@@ -15,10 +15,8 @@ import numpy as np
 import pytest
 import trustme
 
-from isocharge.serve.network.address import Address
-from isocharge.serve.network.credentials import Tls, Token
+from isocharge.serve.network.address import Address, ServerLimits, Tls, Token
 from isocharge.serve.network.http import HttpServer
-from isocharge.serve.network.limits import ServerLimits
 from isocharge.serve.network.protocol import Handler
 
 pytestmark = pytest.mark.xdist_group("clock")

@@ -7,8 +7,16 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
-from isocharge.cli.shared.options import DeviceOption, FreshOption, JsonOption, ProbeOption, StressLimitOption, refuse
+from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
+from isocharge.cli.shared.options import (
+    DeviceOption,
+    FreshOption,
+    JsonOption,
+    ModelsOption,
+    ProbeOption,
+    StressLimitOption,
+    refuse,
+)
 from isocharge.cli.shared.terminal import say, this_command
 from isocharge.cli.train.press_session import PressPort, calibrate_at_port
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT

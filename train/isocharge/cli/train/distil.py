@@ -4,9 +4,8 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.measured_presses import ModelsOption
-from isocharge.cli.shared.options import ConfigOption, FreshOption, JsonOption, ModelArgument
-from isocharge.cli.shared.simulated_presses import simulated_presses
+from isocharge.cli.shared.forward_maps import simulated_presses
+from isocharge.cli.shared.options import ConfigOption, FreshOption, JsonOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.terminal import shown_progress, this_command
 from isocharge.cli.shared.training_run import ModelFolderOption, VersionOption, release_resumably
 from isocharge.common.errors import InputError

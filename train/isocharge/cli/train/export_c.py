@@ -1,9 +1,9 @@
 """`isocharge train export-c`: a model, and the signal chain beside it, as C99."""
 
-from isocharge.cli.shared.options import DeviceOption, ModelArgument, NewFolderOption, board_of
+from isocharge.cli.shared.options import DeviceOption, ModelArgument, NewFolderOption
 from isocharge.cli.shared.terminal import say, this_command
 from isocharge.common.files import refuse_existing
-from isocharge.serve import find_model
+from isocharge.serve import find_model, load_device
 from isocharge.train.export_c.folder import export_c
 
 
@@ -17,5 +17,5 @@ def export_c_command(model: ModelArgument, output: NewFolderOption, device: Devi
     Example: isocharge train export-c four-25um-biaxial -o c
     """
     refuse_existing(output)
-    folder = export_c(find_model(model), output, board_of(device), command=this_command())
+    folder = export_c(find_model(model), output, load_device(device), command=this_command())
     say(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")

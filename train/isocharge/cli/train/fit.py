@@ -5,19 +5,19 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import caution_of_stress, sweep_radius
-from isocharge.cli.shared.measured_presses import ForceStdOption, ModelsOption, PositionStdOption, read_presses_of
+from isocharge.cli.shared.forward_maps import caution_of_stress, simulated_presses, sweep_radius
+from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
 from isocharge.cli.shared.options import (
     PROBE_HELP,
     ConfigOption,
     FreshOption,
     JsonOption,
+    ModelsOption,
     RadiusOption,
     most_workers,
     radius_mm_of,
     refuse,
 )
-from isocharge.cli.shared.simulated_presses import simulated_presses
 from isocharge.cli.shared.terminal import shown_progress, this_command
 from isocharge.cli.shared.training_run import ModelFolderOption, VersionOption, release_resumably
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS

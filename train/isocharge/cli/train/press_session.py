@@ -10,12 +10,11 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from isocharge.cli.shared.options import board_of
 from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, Screen
 from isocharge.common.errors import InputError, PressError
 from isocharge.common.json_values import plain_values
-from isocharge.serve import ReadingStream, open_source
+from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress
 from isocharge.serve.prediction.measured_presses import read_press_list, read_presses
 from isocharge.train import CalibrationProblem, CalibrationResult
@@ -105,7 +104,7 @@ def _session(port: PressPort, problem: CalibrationProblem, folder: Path) -> Pres
 
 @contextmanager
 def _events(port: PressPort, problem: CalibrationProblem) -> Iterator[PressEvents]:
-    board, machine = board_of(port.device), port.press_list is not None
+    board, machine = load_device(port.device), port.press_list is not None
     if board.common_mode is not None:  # to follow warming needs a model that is right about the film
         say(f"{port.device}: [common_mode] is left out while calibrating: it needs the model that is being made")
         board = replace(board, common_mode=None)

@@ -27,7 +27,7 @@ from isocharge.common.files import write_whole
 from isocharge.common.json_values import plain_values
 from isocharge.common.structs import read_json
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.repository import version_folders
+from isocharge.serve.model.model_folder import version_folders
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text, write_presses
 from isocharge.simulate.plots.figure import picture_bytes
 from isocharge.simulate.sensor.film_prior import FilmPrior

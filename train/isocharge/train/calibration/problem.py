@@ -9,7 +9,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import ModelError, SceneError, SensorError
-from isocharge.serve.model.repository import find_model, model_names, repositories
+from isocharge.serve.model.model_folder import find_model, model_names, repositories
 from isocharge.simulate import Circle, Domain, FilmPrior, NoiseModel, Probe, Sensor
 from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.film_charges import FilmCharges

@@ -1,29 +1,108 @@
-"""The methods of `inference.GRPCInferenceService`, on the models of the HTTP handler.
+"""The gRPC server: `inference.GRPCInferenceService` on the models, limits, token and certificate of the HTTP server.
 
-What a client sends is a stream to grpcio also where it is one message: so the token is checked, and the bounds hold,
-before a message comes, and whether one comes at all. A client may open calls and say nothing: when all places are
-taken, the call that has waited longest for its client gives its place to the new one.
+It has an event loop of its own. An open call costs no thread, so that no number of clients that open calls and wait can
+hold up the others. What a client sends is a stream to grpcio also where it is one message: so the token is checked, and
+the bounds hold, before a message comes, and whether one comes at all. A client may open calls and say nothing: when all
+places are taken, the call that has waited longest for its client gives its place to the new one.
+
+The messages are built from the compiled `inference.proto`. They live in a separate pool, so that a program may use this
+server and another implementation of the same protocol, whose messages have the same names, side by side.
 """
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from importlib.resources import files
+from threading import Thread
 from typing import Any
 
 import grpc
 import grpc.aio
+import numpy as np
+import uvloop
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.json_format import ParseDict
 from google.protobuf.message import DecodeError, Message
+from google.protobuf.message_factory import GetMessageClass
 
-from isocharge.common.errors import RequestError, TooMany
-from isocharge.serve.network.grpc.messages import METHODS, SERVICE, read_infer, write_answer
+from isocharge.common.errors import ListenError, RequestError, TooMany
+from isocharge.serve.network.address import ServerLimits, Tls
 from isocharge.serve.network.protocol import Handler, describe
-from isocharge.serve.network.protocol.infer import answer_inference
+from isocharge.serve.network.protocol.inference import InferAnswer, InferRequest, answer_inference, request_of
 from isocharge.serve.network.protocol.response import client_message, statuses
 from isocharge.serve.network.traffic import Exchange
+
+SERVICE = "inference.GRPCInferenceService"
+
+
+def _load() -> Any:
+    """The service's descriptor."""
+    compiled = files("isocharge.serve.network.grpc").joinpath("inference.binpb").read_bytes()
+    pool = DescriptorPool()
+    for file in FileDescriptorSet.FromString(compiled).file:
+        pool.Add(file)
+    return pool.FindServiceByName(SERVICE)
+
+
+METHODS: dict[str, tuple[type[Any], type[Any]]] = {
+    method.name: (GetMessageClass(method.input_type), GetMessageClass(method.output_type)) for method in _load().methods
+}
+"""Method name to the classes of its request and its answer."""
+
+
+CONTENTS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
+"""Which field of a tensor's contents has its numbers."""
+
+
+def read_infer(message: Any, electrodes: tuple[str, ...], batch: int) -> InferRequest:
+    """The request in a ModelInferRequest. Raw numbers are answered with raw numbers, typed ones with typed ones.
+
+    Raises:
+        RequestError, ChargeError, TooLarge: If it is not one for a model with these electrodes.
+    """
+    raw = message.raw_input_contents
+    if len(raw) > 1:
+        raise RequestError(f"expected one input tensor, got {len(raw)} raw contents")
+    content = {
+        "id": message.id,
+        "inputs": [_input(tensor, raw) for tensor in message.inputs],
+        "outputs": [{"name": output.name, "parameters": _unsupported(output)} for output in message.outputs],
+        "parameters": {"binary_data_output": bool(raw)},
+    }
+    return request_of(content, raw[0] if raw else b"", electrodes, batch)
+
+
+def _input(tensor: Any, raw: Any) -> dict[str, Any]:
+    """A tensor as JSON would have it."""
+    parameters: dict[str, Any] = _unsupported(tensor)
+    content = {"name": tensor.name, "datatype": tensor.datatype, "shape": list(tensor.shape), "parameters": parameters}
+    if raw:
+        parameters["binary_data_size"] = len(raw[0])
+    if tensor.HasField("contents") or not raw:
+        content["data"] = list(getattr(tensor.contents, CONTENTS.get(tensor.datatype, "fp32_contents")))
+    return content
+
+
+def _unsupported(tensor: Any) -> dict[str, bool]:
+    """The parameters of a tensor that change what a request means and that this server does not know."""
+    return {name: True for name in ("shared_memory_region", "classification") if name in tensor.parameters}
+
+
+def write_answer(answer: InferAnswer, message: Any) -> Any:
+    """Fill a ModelInferResponse."""
+    message.model_name, message.model_version, message.id = answer.name, answer.version, answer.id
+    for name, rows in answer.outputs.items():
+        tensor = message.outputs.add(name=name, datatype="FP32", shape=rows.shape)
+        if name in answer.binary:
+            message.raw_output_contents.append(np.asarray(rows, dtype="<f4").tobytes())
+        else:
+            tensor.contents.fp32_contents.extend(rows.ravel().tolist())
+    return message
+
 
 OPEN = ("ServerLive", "ServerReady")
 """Methods that need no token."""
@@ -190,3 +269,90 @@ def _authorization(context: grpc.aio.ServicerContext) -> bytes:
     """The value of the metadata `authorization`, empty if there is none."""
     sent = dict(context.invocation_metadata() or ()).get("authorization", "")
     return sent.encode() if isinstance(sent, str) else bytes(sent)
+
+
+GRACE_SECONDS = 10
+"""Time that requests which have begun get when the server stops, s."""
+
+STREAMS = 100
+"""Calls of one connection at a time, as HTTP/2 advises at least; a client's further calls wait on its side."""
+
+
+@contextmanager
+def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> Iterator[str]:
+    """Serve for as long as the block lasts.
+
+    Args:
+        handler: Handler of the HTTP server; its models, limits and token are used. Clients send the token as metadata
+            `authorization`.
+        host, port: Where to listen; port 0 takes a free one.
+        tls: Certificate and key; without them the connection is plain.
+
+    Yields:
+        The address, `grpc://host:port` or `grpcs://host:port`.
+
+    Raises:
+        ListenError: If the address is taken or impossible.
+        InputError: If a TLS file cannot be used.
+    """
+    with _event_loop() as loop:
+
+        def run(coroutine: Coroutine[Any, Any, Any]) -> Any:
+            return asyncio.run_coroutine_threadsafe(coroutine, loop).result()
+
+        place = f"[{host}]" if ":" in host else host
+        server, listening = run(_start(handler, f"{place}:{port}", tls))
+        try:
+            yield f"{'grpcs' if tls else 'grpc'}://{place}:{listening}"
+        finally:
+            run(server.stop(GRACE_SECONDS))
+
+
+@contextmanager
+def _event_loop() -> Iterator[asyncio.AbstractEventLoop]:
+    """An event loop that runs in its own thread."""
+    loop = uvloop.new_event_loop()
+    thread = Thread(target=loop.run_forever, name="grpc")
+    thread.start()
+    try:
+        yield loop
+    finally:
+        asyncio.run_coroutine_threadsafe(loop.shutdown_default_executor(), loop).result()
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+
+
+async def _start(handler: Handler, place: str, tls: Tls | None) -> tuple[grpc.aio.Server, int]:
+    """A server that answers, and the port that it listens on."""
+    limits = handler.limits
+    server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=2 * limits.connections)
+    server.add_generic_rpc_handlers((Service(handler).handlers(),))
+    listening = _listen(server, place, tls)
+    await server.start()
+    return server, listening
+
+
+def _options(limits: ServerLimits) -> list[tuple[str, int]]:
+    return [
+        ("grpc.max_receive_message_length", limits.body_bytes),
+        ("grpc.max_metadata_size", limits.header_bytes),
+        ("grpc.absolute_max_metadata_size", limits.header_bytes),
+        ("grpc.max_concurrent_streams", STREAMS),
+        ("grpc.max_allowed_incoming_connections", limits.connections),
+        ("grpc.server_handshake_timeout_ms", round(1e3 * limits.header_seconds)),
+        ("grpc.max_connection_idle_ms", round(1e3 * limits.idle_seconds)),
+        ("grpc.so_reuseport", 0),
+    ]
+
+
+def _listen(server: grpc.aio.Server, place: str, tls: Tls | None) -> int:
+    """The port that the server listens on."""
+    try:
+        if tls is None:
+            return int(server.add_insecure_port(place))
+        return int(server.add_secure_port(place, grpc.ssl_server_credentials([tls.pair()])))
+    except RuntimeError as error:
+        raise ListenError(
+            f"cannot listen on {place} for gRPC: {error}; choose another --grpc-port or --host"
+        ) from error

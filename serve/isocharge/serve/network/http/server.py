@@ -8,8 +8,7 @@ from functools import partial
 
 import uvloop
 
-from isocharge.serve.network.address import Address
-from isocharge.serve.network.credentials import Tls
+from isocharge.serve.network.address import Address, Tls
 from isocharge.serve.network.http.connection import Connection, close_overdue
 from isocharge.serve.network.protocol import Handler
 
@@ -47,7 +46,6 @@ class HttpServer:
         self._is_stopped = False
         handler.traffic.open["http"] = lambda: len(self._connections)
         self._socket = address.listen(BACKLOG)
-        self._file = address.file()
         self.url = address.url(self._socket, secure=tls is not None)
 
     def run(self) -> None:
@@ -62,7 +60,7 @@ class HttpServer:
     def close(self) -> None:
         """Listen no more."""
         self._socket.close()
-        self._address.release(self._file)
+        self._address.release()
 
     async def _serve(self) -> None:
         loop = asyncio.get_running_loop()

@@ -10,18 +10,21 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
 from typing import NamedTuple
 
-from isocharge.common.errors import ModelError, RequestError, UnknownPath, WrongMethod
-from isocharge.serve.network.credentials import Token
-from isocharge.serve.network.limits import ServerLimits
+from isocharge.common.errors import RequestError, UnknownPath, WrongMethod
+from isocharge.serve.network.address import ServerLimits, Token
 from isocharge.serve.network.metrics import CONTENT_TYPE, Metrics
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol import describe
-from isocharge.serve.network.protocol.encoding import compress, decompress
-from isocharge.serve.network.protocol.infer import answer_inference
-from isocharge.serve.network.protocol.openapi import openapi
-from isocharge.serve.network.protocol.page import PAGE_HEADERS, page
-from isocharge.serve.network.protocol.request import read_infer, read_object, write_answer
-from isocharge.serve.network.protocol.response import Response, error_response, json_response, response_of
+from isocharge.serve.network.protocol.describe import PAGE_HEADERS, openapi, page
+from isocharge.serve.network.protocol.inference import answer_inference, read_infer, read_object, write_answer
+from isocharge.serve.network.protocol.response import (
+    Response,
+    compress,
+    decompress,
+    error_response,
+    json_response,
+    response_of,
+)
 from isocharge.serve.network.traffic import Client, Exchange, Traffic
 
 Headers = Iterable[tuple[bytes, bytes]]
@@ -39,13 +42,12 @@ OPEN = ("/v2/health/live", "/v2/health/ready")
 
 
 class Request(NamedTuple):
-    """A request with its body unpacked, the model that its path names, and whether all may be said to the client."""
+    """A request with its body unpacked, and the model that its path names."""
 
     headers: Mapping[bytes, bytes]
     body: bytes
     name: str
     version: str
-    trusted: bool
 
 
 Route = tuple[str, Callable[[Request], Response]]
@@ -93,7 +95,10 @@ class Handler:
             "": ("GET", lambda request: json_response(describe.model_metadata(self._loaded(request), store))),
             "ready": ("GET", lambda request: json_response({"ready": bool(self._loaded(request))})),
             "config": ("GET", lambda request: json_response(describe.model_config(self._loaded(request), self.limits))),
-            "stats": ("GET", self._stats),
+            "stats": (
+                "GET",
+                lambda request: json_response(describe.statistics_of(store, request.name, request.version)),
+            ),
             "infer": ("POST", self._infer),
         }
         self._of_repository: dict[str, Route] = {"load": ("POST", self._load), "unload": ("POST", self._unload)}
@@ -135,11 +140,8 @@ class Handler:
         self.traffic.note(Exchange("http", "none", response.status, None, response.error, 0, 0, size, client))
 
     def _answer(self, method: str, path: str, fields: dict[bytes, bytes], body: bytes) -> Response:
-        trusted, authorization = True, fields.get(b"authorization", b"")
-        if self.token is not None and path in OPEN:
-            trusted = self.token.fits(authorization)
-        elif self.token is not None:
-            self.token.check(authorization)
+        if self.token is not None and path not in OPEN:
+            self.token.check(fields.get(b"authorization", b""))
         route, _, name, version = self._find(path)
         if route is None:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
@@ -149,7 +151,7 @@ class Handler:
         self.limits.check_body(len(body))
         if b"content-encoding" in fields:
             body = decompress(body, fields[b"content-encoding"].lower(), self.limits.body_bytes)
-        return respond(Request(fields, body, name, version, trusted))
+        return respond(Request(fields, body, name, version))
 
     def _find_path(self, path: str) -> Found:
         """What is served under a path."""
@@ -168,9 +170,6 @@ class Handler:
     def _loaded(self, request: Request) -> LoadedVersion:
         return self.store.get(request.name, request.version)
 
-    def _stats(self, request: Request) -> Response:
-        return json_response(describe.statistics_of(self.store, request.name, request.version))
-
     def _infer(self, request: Request) -> Response:
         """The answer to an inference, the only one that is compressed: Triton's asyncio client unpacks no other."""
         loaded, headers = self.store.get(request.name, request.version), request.headers
@@ -185,9 +184,8 @@ class Handler:
             response.headers.append((b"content-encoding", encoding))
         return response
 
-    def _ready(self, request: Request) -> Response:
-        if why := self.store.unready(full=request.trusted):
-            raise ModelError(f"not ready: {why}")
+    def _ready(self, _: Request) -> Response:
+        self.store.check_ready()
         return json_response({"ready": True})
 
     def _index(self, request: Request) -> Response:

@@ -1,17 +1,23 @@
-"""A prediction record as ROS 2 messages: the wrench of the press and its pose, in CDR.
+"""A prediction record as messages: JSON with its schema, and the wrench of the press and its pose for ROS 2, in CDR.
+
+Foxglove and Lichtblick take the fields of a topic from `properties` of the schema and read one `type` for each, so that
+a number that may be null has to be a plain "number" there. Validators of draft 7 pass over everything beside a `$ref`
+and check `definitions/record`, which allows null wherever a record has it. So viewers list all fields, and all records
+are valid.
 
 The frame is `frame_id`, the name of the sensor: origin at the film's centre in the plane of the unloaded film, x along
 the drawn direction, y transverse, z towards the probe, right-handed. The wrench is what the probe does to the film, so
 that a press of F at (x, y) has the force (0, 0, -F) and, about the origin, the torque (-y F, x F, 0). The pose is the
 point of contact in the plane, unturned, with the model's standard deviations.
 
-Both messages are a header and doubles. They are packed here because `mcap-ros2-support` offers its encoder only inside
-a writer of its own, which writes no JSON, and takes 15 times as long; tests read them with it and with rosbags.
+ROS messages are a header and doubles. They are packed here because `mcap-ros2-support` offers its encoder only inside a
+writer of its own, which writes no JSON, and takes 15 times as long; tests read them with it and with rosbags.
 """
 
 import math
 import struct
 from collections.abc import Mapping
+from enum import StrEnum
 from typing import Any
 
 from isocharge.common.errors import InputError
@@ -124,3 +130,81 @@ def _stamped(frame_id: str, time_ns: int, values: tuple[float, ...]) -> bytes:
 def _string(text: str) -> bytes:
     data = text.encode() + b"\0"
     return struct.pack("<I", len(data)) + data
+
+
+NAME = "isocharge.PredictionRecord"
+"""Name of the schema."""
+
+NUMBERS = {
+    "timestamp": "Time of the reading, unix seconds.",
+    "x_mm": "Position x in the frame frame_id, mm; null out of contact.",
+    "y_mm": "Position y, mm; null out of contact.",
+    "force_N": "Force, N; 0 out of contact.",
+    "x_std_mm": "Standard deviation of x, mm.",
+    "y_std_mm": "Standard deviation of y, mm.",
+    "force_std_N": "Standard deviation of the force, N.",
+    "misfit": "Distance from the nearest single contact, in standard deviations.",
+    "latency_us": "From the last byte of the reading to this record, us.",
+}
+"""Fields that are a number or null, with what they mean."""
+
+WHOLES = {
+    "t_device_us": "Clock of the device, us, without its wraps.",
+    "seq": "Sequence number, as the device sent it.",
+}
+"""Fields that are a whole number or null."""
+
+CHARGES = {
+    "charge_pC": "Touch charges by electrode, the model's input, pC.",
+    "charge_raw_pC": "Charges by electrode as the device sent them, pC.",
+    "tare_pC": "Charges at rest that were subtracted, by electrode, pC.",
+}
+"""Fields that are an object of charges or null."""
+
+OTHERS: dict[str, dict[str, Any]] = {
+    "contact": {"type": "boolean", "description": "Whether something touches."},
+    "flags": {"type": "array", "items": {"type": "string"}, "description": "Words, each one a reason for care."},
+    "model": {"type": "string", "description": "The model, name/version."},
+    "frame_id": {"type": "string", "description": "Name of the sensor, the frame of x and y."},
+}
+"""Fields that always have a value."""
+
+
+class RecordEncoding(StrEnum):
+    """How an MCAP file holds the records themselves: JSON with this schema, or the same text in ROS 2 messages."""
+
+    json = "json"
+    ros2 = "ros2"
+
+
+def record_schema(electrodes: tuple[str, ...]) -> dict[str, Any]:
+    """The schema of the records of a sensor with these electrodes.
+
+    Further fields are allowed: a later version may add some.
+    """
+    return {
+        "$schema": "http://json-schema.org/draft-07/schema#",
+        "title": NAME,
+        "$ref": "#/definitions/record",
+        "definitions": {"record": _object(electrodes, or_null=True)},
+        **_object(electrodes, or_null=False),
+    }
+
+
+def _object(electrodes: tuple[str, ...], *, or_null: bool) -> dict[str, Any]:
+    """A record whose fields have one type each, or may be null where a record's may."""
+
+    def kind(name: str) -> Any:
+        return [name, "null"] if or_null else name
+
+    charge = {"type": kind("number")}
+    properties: dict[str, dict[str, Any]] = {
+        **{name: {"type": kind("number"), "description": text} for name, text in NUMBERS.items()},
+        **{name: {"type": kind("integer"), "description": text} for name, text in WHOLES.items()},
+        **{
+            name: {"type": kind("object"), "properties": dict.fromkeys(electrodes, charge), "description": text}
+            for name, text in CHARGES.items()
+        },
+        **OTHERS,
+    }
+    return {"type": "object", "properties": properties, "required": sorted(properties)}

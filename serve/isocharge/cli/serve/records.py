@@ -1,26 +1,91 @@
-"""Where the records of `serve stream` and `serve replay` go, and the summary at the end."""
+"""Where the records of `serve stream` and `serve replay` go: options, writers, and the summary at the end."""
 
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
+from enum import StrEnum
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import Annotated, Self
 
-from isocharge.cli.serve.options import McapRecords, Output
+import numpy as np
+import typer
+
 from isocharge.cli.shared.terminal import say
+from isocharge.serve import PredictionRecord, TouchStream
+from isocharge.serve.export.record_messages import RecordEncoding
+from isocharge.serve.live.outputs import LineQueue, UdpSink, csv_header, csv_line
 
-if TYPE_CHECKING:
-    from isocharge.serve import PredictionRecord, TouchStream
+WaitOption = Annotated[
+    float, typer.Option("--wait", min=0.0, max=3600.0, help="Time to wait until the port exists, s.")
+]
+
+
+class Output(StrEnum):
+    """Format of the records on stdout."""
+
+    json = "json"
+    csv = "csv"
+    none = "none"
+
+
+class LogFormat(StrEnum):
+    """What a server writes on stderr."""
+
+    text = "text"
+    json = "json"
+
+
+OutputOption = Annotated[
+    Output, typer.Option("--output", help="Records on stdout: a line of JSON each, CSV with a header, or none.")
+]
+
+UdpOption = Annotated[
+    str | None,
+    typer.Option(
+        "--udp",
+        metavar="HOST:PORT",
+        help="Also send each record as JSON in a UDP packet, as to PlotJuggler. (default: no)",
+    ),
+]
+
+McapOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--mcap",
+        metavar="FILE",
+        help="Also write the records into a new MCAP file, with wrench and pose as ROS 2 messages. (default: no)",
+    ),
+]
+
+
+McapRecordsOption = Annotated[
+    RecordEncoding,
+    typer.Option(
+        "--mcap-records",
+        help="Records in the MCAP file: JSON with its schema, as Foxglove, Lichtblick and PlotJuggler read it; or the "
+        "same text in ROS 2 messages, for `ros2 bag` and rosbags, which refuse a file with anything else.",
+    ),
+]
+
+
+def awaited(port: str, wait: float) -> str:
+    """The port, as soon as there is something under its path, or when the time, s, is over."""
+    end = time.monotonic() + wait
+    while "://" not in port and port != "-" and not Path(port).exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    return port
+
 
 LATENCIES = 100_000
 """Number of records, the latest ones, over which the summary's percentiles are taken."""
 
-Lines = Callable[["PredictionRecord", str], None]
+Lines = Callable[[PredictionRecord, str], None]
 """Called with each record and its line of JSON."""
 
 
-def write_records(records: "Iterable[tuple[PredictionRecord, str]]", write: Lines, latencies: deque[float]) -> None:
+def write_records(records: Iterable[tuple[PredictionRecord, str]], write: Lines, latencies: deque[float]) -> None:
     """Write records as they come, announce each new tare, and remember the latencies."""
     tare = None
     for record, line in records:
@@ -37,13 +102,11 @@ def record_writer(
     stack: ExitStack, output: Output, udp: str | None, electrodes: tuple[str, ...], put: Callable[[str], object]
 ) -> Lines:
     """The function that gives each record to `put` as a line, and sends it to the network."""
-    from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
-
-    sink = stack.enter_context(UdpSink(udp)) if udp else None
+    sink = stack.enter_context(closing(UdpSink(udp))) if udp else None
     if output is Output.csv:
         put(csv_header(electrodes) + "\n")
 
-    def write(record: "PredictionRecord", line: str) -> None:
+    def write(record: PredictionRecord, line: str) -> None:
         if sink:
             sink.send(line)
         if output is not Output.none:
@@ -59,7 +122,7 @@ class McapOutput:
         put: Takes a record's line of JSON.
     """
 
-    def __init__(self, path: Path, electrodes: tuple[str, ...], records: McapRecords, is_live: bool) -> None:
+    def __init__(self, path: Path, electrodes: tuple[str, ...], records: RecordEncoding, is_live: bool) -> None:
         """Describe the file; it is created on entering the context.
 
         Args:
@@ -71,10 +134,9 @@ class McapOutput:
         Raises:
             MissingExtra: If the extra `record` is not installed.
         """
-        from isocharge.serve.export.mcap_file import McapFile, RecordEncoding
-        from isocharge.serve.live.line_queue import LineQueue
+        from isocharge.serve.export.mcap_file import McapFile
 
-        self._file = McapFile(path, electrodes, RecordEncoding(records.value))
+        self._file = McapFile(path, electrodes, records)
         self._queue = LineQueue(self._file.write_live)
         self.put = self._queue.put if is_live else self._file.write_live
         self._stack = ExitStack()
@@ -110,14 +172,14 @@ class McapOutput:
 def in_turn(*writers: Lines) -> Lines:
     """What hands each record, with its line of JSON, to one writer after the other."""
 
-    def write_all(record: "PredictionRecord", line: str) -> None:
+    def write_all(record: PredictionRecord, line: str) -> None:
         for write in writers:
             write(record, line)
 
     return write_all
 
 
-def summary(touch: "TouchStream", latencies: deque[float], unwritten: int = 0) -> str:
+def summary(touch: TouchStream, latencies: deque[float], unwritten: int = 0) -> str:
     """Counts of frames and faults, of records that stdout did not take in time, and percentiles of the latency."""
     totals, stream = touch.totals(), touch.counts
     text = (
@@ -129,7 +191,5 @@ def summary(touch: "TouchStream", latencies: deque[float], unwritten: int = 0) -
         text += f"; {unwritten} records not written, the oldest: the reader of stdout was too slow"
     if not latencies:
         return text
-    import numpy as np
-
     p50, p99 = np.percentile(latencies, (50, 99))
     return f"{text}; last byte to record p50 {p50:.0f} us, p99 {p99:.0f} us"

@@ -7,6 +7,8 @@ import pytest
 
 from isocharge.serve import Predictor, find_model, load_model
 from isocharge.serve.benchmark import (
+    LEAST_CALLS,
+    ROUNDS,
     Contender,
     Timing,
     in_process_contenders,
@@ -14,7 +16,6 @@ from isocharge.serve.benchmark import (
     press_charges,
     take_turns,
 )
-from isocharge.serve.benchmark.timing import LEAST_CALLS, ROUNDS
 
 
 class Clock:
