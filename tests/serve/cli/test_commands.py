@@ -394,7 +394,7 @@ def test_a_slow_reader_stops_neither_chain_nor_recording(models, film, tmp_path,
 
 
 def test_a_reader_who_never_reads_does_not_keep_the_stream(models, board, start):
-    process = start("stream", "linear", "--port", board.url, "--models", models, "--seconds", 2)
+    process = start("stream", "linear", "--port", board.url, "--models", models, "--seconds", 1)
     assert process.wait(60) == 0
     assert "records not written, the oldest" in process.stderr.read()
 

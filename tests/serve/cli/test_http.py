@@ -32,14 +32,6 @@ def ask(url, method="POST", path="/v2/models/linear/infer", body=BODY):
     return answer.status, content
 
 
-def ended(process):
-    """Exit code and the one line of why."""
-    out, err = process.communicate(timeout=30)
-    assert out == ""
-    assert "Traceback" not in err
-    return process.returncode, err.strip()
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_serves_until_told_to_stop(start, number):
     process = start("--port", 0, "--grpc-port", 0)
@@ -68,7 +60,7 @@ def test_killed_and_started_again(start):
     assert ask(url)[0] == 200
 
 
-def test_bad_starts(start, models, tmp_path):
+def test_bad_starts(command, models, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "damaged").mkdir()
     shutil.copytree(models / "linear", tmp_path / "damaged/linear")
@@ -79,21 +71,21 @@ def test_bad_starts(start, models, tmp_path):
         taken.listen()
         port = taken.getsockname()[1]
         cases = [
-            (start("--port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port}: another program listens"),
-            (start("--port", 0, "--grpc-port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port} for gRPC"),
-            (start("--host", "0.0.0.0"), 2, "InputError: 0.0.0.0 lets other machines in: give --token TOKEN"),
-            (start("--uds", "x", "--host", "0.0.0.0", "--grpc-port", 0), 2, "InputError: 0.0.0.0 lets other"),
-            (start("--token", ""), 2, "InputError: token: expected printable ASCII"),
-            (start("--tls-key", "x"), 2, "InputError: --tls-key: expected --tls-cert too"),
-            (start("--tls-cert", tmp_path / "cert.pem"), 2, f"InputError: {tmp_path}/cert.pem: not a certificate"),
-            (start("--tls-cert", tmp_path / "none.pem"), 2, f"InputError: {tmp_path}/none.pem: not a certificate"),
-            (start(folder=tmp_path / "empty"), 2, f"ModelError: {tmp_path}/empty: expected models"),
-            (start(folder=tmp_path / "none"), 2, f"ModelError: {tmp_path}/none: expected a folder of models"),
-            (start(folder=tmp_path / "damaged"), 2, "ModelError: no model can be served: "),
+            (models, ("--port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port}: another program listens"),
+            (models, ("--port", 0, "--grpc-port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port} for gRPC"),
+            (models, ("--host", "0.0.0.0"), 2, "InputError: 0.0.0.0 lets other machines in: give --token TOKEN"),
+            (models, ("--uds", "x", "--host", "0.0.0.0", "--grpc-port", 0), 2, "InputError: 0.0.0.0 lets other"),
+            (models, ("--token", ""), 2, "InputError: token: expected printable ASCII"),
+            (models, ("--tls-key", "x"), 2, "InputError: --tls-key: expected --tls-cert too"),
+            (models, ("--tls-cert", tmp_path / "cert.pem"), 2, f"InputError: {tmp_path}/cert.pem: not a certificate"),
+            (models, ("--tls-cert", tmp_path / "none.pem"), 2, f"InputError: {tmp_path}/none.pem: not a certificate"),
+            (tmp_path / "empty", (), 2, f"ModelError: {tmp_path}/empty: expected models"),
+            (tmp_path / "none", (), 2, f"ModelError: {tmp_path}/none: expected a folder of models"),
+            (tmp_path / "damaged", (), 2, "ModelError: no model can be served: "),
         ]
-        for process, code, said in cases:
-            got, error = ended(process)
-            assert (got, error[: len(said)]) == (code, said)
+        for folder, words, code, said in cases:
+            got, out, error = command("serve", "http", "--models", folder, *words)
+            assert (got, out, error[: len(said)]) == (code, "", said)
 
 
 def test_the_log_in_json_is_json_line_by_line(film, start, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Records as CSV that the csv module reads back, and as datagrams that PlotJuggler reads."""
+"""Records as CSV that the csv module reads back, and as datagrams that nobody waits for."""
 
 import csv
 import io

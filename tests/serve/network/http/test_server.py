@@ -163,15 +163,6 @@ def test_long_bodies(limited):
         assert refused(exchange(server, head))[0] in (400, 408, 413)
 
 
-@pytest.mark.parametrize("token", [None, Token("open sesame")])
-def test_trailers_without_end(store, start_http, token):
-    """They are refused as headers are, before any token is looked at, and cost no memory."""
-    server = start_http(Handler(store, token=token))
-    head = b"POST / HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\n"
-    for endless in (b"a: b\r\n", b"a: " + b"b" * 1000):
-        assert set(statuses(exchange(server, head + endless * (10_000_000 // len(endless))))) <= {431}
-
-
 @pytest.mark.parametrize(
     ("sent", "limits", "status"),
     [
