@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.json_values import finite_or_none
 from isocharge.simulate.mechanics.theory import bending_length, modelling_error
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
@@ -45,9 +46,6 @@ PATCH = 1.0 / 15.0
 
 PER_SIDE = 6
 """Gauss points along a patch's side."""
-
-LINEAR_STRESS = 40.0
-"""Largest stress, MPa, at which PVDF counts as linear."""
 
 WRINKLE_SHARE = 1e-3
 """Compression over the largest stress, dimensionless, above which a warning is given."""
@@ -131,8 +129,8 @@ def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
     """Effects in a real film that the theory does not model, one sentence each."""
     smallest, largest = principal_stress(equilibrium)
     sentences = []
-    if largest > LINEAR_STRESS:
-        sentences.append(f"the film is stressed to {largest:.3g} MPa; PVDF is linear up to {LINEAR_STRESS:g} MPa")
+    if largest > DEFAULT_STRESS_LIMIT:
+        sentences.append(f"the film is stressed to {largest:.3g} MPa; PVDF yields from {DEFAULT_STRESS_LIMIT:g} MPa on")
     if smallest < -WRINKLE_SHARE * largest:
         sentences.append(f"the film is compressed to {smallest:.3g} MPa somewhere; a thin film may wrinkle there")
     return tuple(sentences)
