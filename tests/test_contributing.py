@@ -3,7 +3,6 @@
 import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -57,29 +56,13 @@ def follow(recipe, project):
         (project / name).write_text(content, "utf-8")
 
 
-def run(commands, project):
-    """The commands of a recipe on the copy: the packages of the copy come first, then this environment's."""
-    folders = [str(project / name) for name in ("simulate", "train", "serve")]
-    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    environment = os.environ | {"PYTHONPATH": ":".join(folders), "PATH": path}
-    return subprocess.run(
-        ["bash", "-ec", commands.replace("isocharge ", "python -m isocharge.cli ")],
-        cwd=project,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=250,
-        check=False,
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RECIPES)
-def test_a_recipe_works(name, project):
+def test_a_recipe_works(name, project, run_commands):
+    """On a copy of the project: its packages come first, then this environment's."""
     follow(RECIPES[name], project)
     (commands,) = re.findall(r"^```sh\n(.*?)^```", RECIPES[name], re.DOTALL | re.MULTILINE)
-    done = run(commands, project)
-    assert done.returncode == 0, done.stdout + done.stderr
-    tests = re.search(r"(\d+) passed", done.stdout)
-    assert tests
-    assert int(tests[1]) > 0
+    folders = ":".join(str(project / name) for name in ("simulate", "train", "serve"))
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    printed = run_commands(commands, project, os.environ | {"PYTHONPATH": folders, "PATH": path})
+    assert int(re.search(r"(\d+) passed", printed)[1]) > 0

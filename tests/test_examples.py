@@ -35,6 +35,7 @@ def test_a_layout_s_limit_is_largest_at_its_rim():
     assert "up to 8 mm" in area
 
 
+@pytest.mark.slow  # tests of executors compare the same in every run
 def test_any_executor_gives_the_same_dataset(tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:

@@ -1,6 +1,6 @@
-"""One press: the exported C against `session.run` of the same model in the same process, in interleaved rounds.
+"""One press: the exported C against `session.run` of the same model in the same process, in turns.
 
-    python tests/benchmarks/bench_c.py [--model NAME|PATH] [--rounds 30] [--calls 2000] [--compiler gcc] [--json]
+    python tests/benchmarks/bench_c.py [--model NAME|PATH] [--seconds 10] [--calls 2000] [--compiler gcc] [--json]
 
 The C is compiled as a library, once for each set of options, and loaded with ctypes; the loop over presses is in C, as
 in a host program without Python. The session has one thread and gets its input arrays ready-made. Beside the times
@@ -12,15 +12,15 @@ import ctypes
 import json
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_predictor import machine
 
 from isocharge.serve import find_model, load_model
+from isocharge.serve.benchmark import Contender, machine, take_turns
 from isocharge.train.export_c.folder import export_c
 
 OPTIONS = ("-O2", "-O3 -march=native", "-O3 -march=native -ffp-contract=fast")
@@ -62,8 +62,8 @@ def compiled(export: Path, compiler: str, options: str) -> Callable[[np.ndarray,
     return loop
 
 
-def measure(model: Any, loops: dict[str, Any], rounds: int, calls: int, seed: int) -> list[dict[str, Any]]:
-    """A row for each contender; the first round only warms up."""
+def measure(model: Any, loops: dict[str, Any], seconds: float, calls: int, seed: int) -> list[dict[str, Any]]:
+    """A row for each contender."""
     charge_pC = np.random.default_rng(seed).uniform(300.0, 1500.0, (PRESSES, len(model.metadata.electrodes)))
     charge_pC = np.ascontiguousarray(charge_pC, dtype=np.float32)
     feeds = [{"charge_pC": row[np.newaxis]} for row in charge_pC]
@@ -74,37 +74,29 @@ def measure(model: Any, loops: dict[str, Any], rounds: int, calls: int, seed: in
         for k in range(calls):
             model.session.run(None, feeds[k % PRESSES])
 
-    contenders: dict[str, Callable[[], None]] = {"session.run": sessions}
-    contenders |= {name: lambda loop=loop: loop(charge_pC, calls, contact) for name, loop in loops.items()}
-    durations: dict[str, list[float]] = {name: [] for name in contenders}
-    apart = {"session.run": 0.0}
+    contenders, apart = [Contender("session.run", calls, sessions)], {"session.run": 0.0}
     for name, loop in loops.items():
         loop(charge_pC, PRESSES, contact)
         apart[name] = float(np.max(np.abs(contact - expected) / np.maximum(np.abs(expected), FLOORS)))
-    for _ in range(rounds + 1):
-        for name, call in contenders.items():
-            begin = time.perf_counter()
-            call()
-            durations[name].append(1e6 * (time.perf_counter() - begin) / calls)
-    bare = np.array(durations["session.run"][1:])
+        contenders.append(Contender(name, calls, partial(loop, charge_pC, calls, contact)))
+    bare, *others = take_turns(contenders, seconds)
     return [
         {
-            "call": name,
-            "least_us": round(float(np.min(times[1:])), 3),
-            "p50_us": round(float(np.median(times[1:])), 3),
-            "p99_us": round(float(np.percentile(times[1:], 99)), 3),
-            "ratio_p50": round(float(np.median(np.array(times[1:]) / bare)), 3),
-            "largest_difference": apart[name],
+            "call": timing.name,
+            "p50_us": round(timing.p50_us / calls, 3),
+            "p99_us": round(timing.p99_us / calls, 3),
+            "ratio_p50": round(timing.p50_us / bare.p50_us, 3),
+            "largest_difference": apart[timing.name],
         }
-        for name, times in durations.items()
+        for timing in (bare, *others)
     ]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", default="four-25um-biaxial", help="model name or path")
-    parser.add_argument("--rounds", type=int, default=30)
-    parser.add_argument("--calls", type=int, default=2000, help="calls of each contender in a round")
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--calls", type=int, default=2000, help="calls that are timed at once")
     parser.add_argument("--compiler", default="gcc")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true", help="one JSON object")
@@ -113,16 +105,16 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         export = export_c(model.folder, Path(folder) / "c")
         loops = {f"C {options}": compiled(export, asked.compiler, options) for options in OPTIONS}
-        table = measure(model, loops, asked.rounds, asked.calls, asked.seed)
+        table = measure(model, loops, asked.seconds, asked.calls, asked.seed)
     error_mm = model.metadata.errors.get("position_rms_mm")
     if asked.json:
         about = {"machine": place(asked.compiler), "position_rms_mm": error_mm, "results": table}
         print(json.dumps({"benchmark": "c", **vars(asked), **about}))
         return
     print(", ".join(f"{name} {value}" for name, value in place(asked.compiler).items()))
-    print(f"{asked.model}, error {error_mm} mm rms: {asked.rounds} rounds of {asked.calls} calls after one to warm up")
+    print(f"{asked.model}, error {error_mm} mm rms: {asked.calls} calls at once, in turns for {asked.seconds:g} s")
     for row in table:
-        times = "   ".join(f"{name} {row[f'{name}_us']:6.2f} us" for name in ("least", "p50", "p99"))
+        times = "   ".join(f"{name} {row[f'{name}_us']:6.2f} us" for name in ("p50", "p99"))
         times += f"   ratio of p50 {row['ratio_p50']:.3f}"
         print(f"{row['call']:38s} {times}   largest difference {row['largest_difference']:.1e}")
 

@@ -1,6 +1,6 @@
 """One network for all films: against networks trained on single films, and its time beside today's released model.
 
-    python tests/benchmarks/bench_films.py [--model NAME] [--films 4] [--seed 1] [--rounds 30] [--json]
+    python tests/benchmarks/bench_films.py [--model NAME] [--films 4] [--seed 1] [--seconds 2] [--json]
 
 Each film is drawn from the prior, swept with solves of its own (no family of films in it) and trained on alone, as
 `train fit` does, half a minute each. Both networks answer the same noisy charges of presses that neither was trained
@@ -11,15 +11,15 @@ released model of the same sensor, folding under 1 s. `--train FOLDER` times the
 import argparse
 import json
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from bench_predictor import machine, microseconds
 
 from isocharge.serve import Predictor, find_model
+from isocharge.serve.benchmark import Contender, machine, take_turns
 from isocharge.simulate import Sweep, read_dataset, run_sweep
 from isocharge.simulate.execution.workers import cores, local_workers
 from isocharge.simulate.numerics.statistics import rms
@@ -27,7 +27,6 @@ from isocharge.train import FilmsConfig, FilmsModel, fit, fit_films, read_films,
 from isocharge.train.data.presses import position_error
 
 SAMPLES = 24_000
-CALLS = 2000
 
 
 def one_film(films: FilmsModel, parameters: np.ndarray, seed: int) -> dict[str, Any]:
@@ -52,18 +51,14 @@ def one_film(films: FilmsModel, parameters: np.ndarray, seed: int) -> dict[str, 
     }
 
 
-def prediction_times(model: str, rival: str, rounds: int) -> dict[str, float]:
-    """Median time of one prediction, us, in interleaved rounds."""
-    calls: dict[str, Callable[[], object]] = {}
+def prediction_times(model: str, rival: str, seconds: float) -> dict[str, float]:
+    """Median time of one prediction, us, in turns."""
+    contenders = []
     for name in (model, rival):
         predictor = Predictor(find_model(name))
         charges = [300.0 + 10.0 * k for k in range(len(predictor.metadata.electrodes))]
-        calls[name] = lambda predictor=predictor, charges=charges: predictor.predict(charges)
-    durations: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(rounds):
-        for name, call in calls.items():
-            durations[name].append(float(np.median(microseconds(call, CALLS))))
-    medians = {name: float(np.median(values)) for name, values in durations.items()}
+        contenders.append(Contender(name, 1, partial(predictor.predict, charges)))
+    medians = {timing.name: timing.p50_us for timing in take_turns(contenders, seconds)}
     return {**medians, "ratio": medians[model] / medians[rival]}
 
 
@@ -92,7 +87,7 @@ def main() -> None:
     parser.add_argument("--model", default="four-25um-biaxial-films")
     parser.add_argument("--films", type=int, default=4)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--rounds", type=int, default=30)
+    parser.add_argument("--seconds", type=float, default=2.0, help="for the times of predictions")
     parser.add_argument("--train", type=Path, metavar="FOLDER")
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
@@ -102,7 +97,7 @@ def main() -> None:
         "machine": machine(),
         "model": chosen.model,
         "seed": chosen.seed,
-        "prediction_us": prediction_times(chosen.model, films.prior.sensor.name, chosen.rounds),
+        "prediction_us": prediction_times(chosen.model, films.prior.sensor.name, chosen.seconds),
         "folding_s": folding_time(films, drawn[0]),
         "films": [one_film(films, parameters, chosen.seed) for parameters in drawn],
     }

@@ -113,14 +113,6 @@ def test_its_intervals_hold_on_known_films(films, drawn):
     assert np.median([error["misfit_p99"] for error in errors]) < 5.0
 
 
-def test_factors_widen_the_deviations_alone(films, drawn):
-    charge = films.film(drawn[0]).test.charge[:20]
-    plain, wide = (films.film(drawn[0], widen=widen).predict(charge) for widen in ((1.0, 1.0), (2.0, 3.0)))
-    np.testing.assert_allclose(wide[1], plain[1] * [2.0, 2.0, 3.0], rtol=1e-12)
-    np.testing.assert_array_equal(wide[0], plain[0])
-    np.testing.assert_array_equal(wide[2], plain[2])
-
-
 @pytest.mark.parametrize(
     "parameters", [np.zeros(3), np.full(13, np.nan), np.zeros((2, 13))], ids=["few", "not finite", "two films"]
 )

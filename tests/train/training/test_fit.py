@@ -161,15 +161,6 @@ def test_the_loss_of_a_student_is_the_divergence_of_gaussians():
     torch.testing.assert_close(teaching_loss(mean, log_std, taught_mean, taught_log_std), expected)
 
 
-def test_a_teachers_posterior_is_that_of_its_answers(trained):
-    """Contacts drawn from the answer scatter in unit coordinates as the posterior says."""
-    contact, std, domain = np.array([[3.0, -2.0, 0.7]]), np.array([[0.06, 0.04, 0.002]]), trained.split.domain
-    mean, log_std = Teacher("it/1", "", lambda _: (contact, std)).posterior(torch.ones(1, 4), domain)
-    unit = domain.to_unit(contact + std * np.random.default_rng(1).standard_normal((200_000, 3)))
-    np.testing.assert_allclose(mean[0].numpy(), unit.mean(axis=0), atol=2e-5)
-    np.testing.assert_allclose(np.exp(log_std[0].numpy()), unit.std(axis=0), rtol=0.01)
-
-
 @pytest.mark.usefixtures("split_once")
 def test_a_student_learns_the_answers_and_not_the_presses(dataset, fitted):
     """A teacher that is wrong by 2 mm has a student that is wrong by 2 mm."""
