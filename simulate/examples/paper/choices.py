@@ -90,8 +90,8 @@ class Choices:
 
 
 QUICK = Choices(
-    degree=2,
-    length=12.0,
+    degree=3,
+    length=16.0,
     printed_length=8.0,
     spacing=0.6,
     presses=30,
