@@ -18,8 +18,6 @@ from isocharge.serve.signal_chain.chain import ChainState, advance
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.simulate import load_amplifier
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 RATE_HZ = 200.0
 
 

@@ -25,8 +25,6 @@ from isocharge.serve.network.grpc.service import METHODS, SERVICE
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 NAME = "three-25um-biaxial"
 MODELS = Path(__file__).parents[2] / "models"
 PATH = f"/v2/models/{NAME}/infer"

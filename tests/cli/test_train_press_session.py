@@ -185,7 +185,6 @@ def board(film, places, seed=0) -> Iterator[bytes]:
 def desk(film, places, tmp_path, monkeypatch):
     """A folder with the bytes of a board, in two parts, and the list of the presses that it makes."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("ISOCHARGE_CACHE", str(tmp_path / "cache"))
     (tmp_path / "some.bin").write_bytes(b"".join(board(film, places[:2])))
     (tmp_path / "rest.bin").write_bytes(b"".join(board(film, places[2:], seed=1)))
     np.savetxt(tmp_path / "list.csv", places, fmt="%.17g", delimiter=",", header="x_mm,y_mm,force_N", comments="")

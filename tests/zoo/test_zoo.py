@@ -237,7 +237,6 @@ def test_what_cannot_be_seen_is_asked_for(name, asked, written):
         load_device(written(examination))
 
 
-@pytest.mark.xdist_group("clock")
 def test_a_board_that_is_plugged_in(command, tmp_path):
     """By the commands, over a pseudo-terminal; at first for a model of four electrodes, which does not fit."""
     kind, port, stop = Kind(answer, model=THREE), PseudoPort(), threading.Event()

@@ -23,8 +23,6 @@ from isocharge.common.errors import ChargeError, InputError, ModelError, PortErr
 from isocharge.serve import Recording, Script, VirtualSensor
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 
 def records_of(text):
     return [json.loads(line) for line in text.splitlines()]

@@ -19,8 +19,6 @@ from rosbags.typesys import Stores, get_typestore
 from isocharge.cli.serve import plot
 from isocharge.serve import Chunk, Recorder
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 
 def messages(path):
     with path.open("rb") as file:

@@ -15,8 +15,6 @@ import pytest
 
 from boards import TcpBoard, interrupt, taps, until
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 
 @pytest.fixture
 def repository(film, tmp_path):

@@ -14,8 +14,6 @@ from isocharge.serve import Port, device_from_table, load_device
 from isocharge.simulate import Circle, ForwardMap, load_sensor, virtual_film
 from kept import kept
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 SENSOR = "three-25um-biaxial"
 DESCRIBED = load_sensor(SENSOR), Circle(1.0)
 FILM_9 = virtual_film(*DESCRIBED, 9)

@@ -15,8 +15,6 @@ from isocharge.serve.examination.listening import Heard, listen
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.port.source import Chunk
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 
 @pytest.fixture
 def pty():

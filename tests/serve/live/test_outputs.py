@@ -10,8 +10,6 @@ import pytest
 from isocharge.common.errors import InputError
 from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 ELECTRODES = ("A", "B")
 
 

@@ -27,8 +27,6 @@ from isocharge.serve import (
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.port.recording import Marker
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 DEVICE = {"tare": {"frames": 10}, "leak": {"tau_s": 10.0}, "hum": {"frequency_Hz": 50.0}}
 
 

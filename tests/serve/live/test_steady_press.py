@@ -15,8 +15,6 @@ from isocharge.serve.port.device_clock import ReadingTime
 from isocharge.serve.signal_chain.chain import Reading
 from isocharge.serve.signal_chain.tare import Tare
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 RATE_HZ = 200.0
 PRESS = np.array([800.0, 400.0, 300.0, 500.0])
 NAMES = ("A", "B", "C", "D")

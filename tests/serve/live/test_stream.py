@@ -21,8 +21,6 @@ from isocharge.serve import (
 from isocharge.serve.frames.frame import SequenceGaps
 from isocharge.serve.signal_chain.tare import TareRule
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 OFFSET = np.array([12.0, -7.0, 3.0])
 CHAIN = Chain(tare=TareRule(frames=10))
 

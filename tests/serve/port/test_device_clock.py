@@ -5,8 +5,6 @@ import pytest
 
 from isocharge.serve.port.device_clock import DeviceClock
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 MODULUS, START_S = 2**32, 1_700_000_000.0
 
 

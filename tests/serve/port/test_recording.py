@@ -6,8 +6,6 @@ from isocharge.common.errors import OutputError, OutputExists, RecordingError
 from isocharge.serve import Chunk, RecordedClock, Recorder, Recording
 from isocharge.serve.port.recording import Event, Marker, NewModel
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 CHUNKS = [Chunk(bytes([k, 255 - k]), 1e9 + 0.1 * k, 1000 * k, 1.5 if k == 3 else 0.0) for k in range(5)]
 
 

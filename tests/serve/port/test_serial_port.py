@@ -26,8 +26,6 @@ from isocharge.serve import Port, open_source
 from isocharge.serve.port.serial_line import QUIET_S, UNANSWERED_S, Asker, Request
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 
 @pytest.fixture
 def board():
@@ -379,7 +377,6 @@ def test_an_echo_is_counted_and_stays_where_it_is_not_expected():
     assert asker.echo_share == 1.0
 
 
-@pytest.mark.xdist_group("clock")
 def test_a_port_asks():
     """A pseudo-terminal that answers each request with a line of its own, echo first."""
     board, reader = os.openpty()

@@ -16,7 +16,6 @@ ARGUMENTS = [
     *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"),
     *("--disable-component-update", "--disable-gpu", "--enable-unsafe-swiftshader"),
 ]
-pytestmark = pytest.mark.xdist_group("clock")
 
 RATE_HZ, PRESS_S, PAUSE_S = 200.0, 1.5, 0.9
 PRESSES = [(0.0, 0.0, 1.0), (6.0, 2.0, 0.5), (-5.0, 3.0, 2.0), (2.0, -6.0, 0.2), (5.0, -3.5, 0.1)]

@@ -20,8 +20,6 @@ from isocharge.serve import Frame, Recording, encode_frame
 from isocharge.serve.port.recording import Marker
 from isocharge.serve.viewer.messages import CONTACT_BIT, HEADER, SampleFormat
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 FORM = SampleFormat(("A", "B", "C"))
 
 

@@ -23,8 +23,6 @@ from isocharge.serve.network.address import Token
 from isocharge.serve.viewer import server
 from isocharge.serve.viewer.server import BYTES_AT_ONCE, VIEWERS, Access, Budget
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 
 def put(page, record, count, **changes):
     """Records 5 ms apart, ending now."""

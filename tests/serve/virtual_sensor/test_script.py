@@ -9,8 +9,6 @@ from isocharge.common.errors import SceneError
 from isocharge.serve import Faults, Script, wander
 from isocharge.serve.virtual_sensor.script import load_script
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 
 @pytest.fixture(scope="module")
 def script():

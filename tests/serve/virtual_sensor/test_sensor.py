@@ -16,8 +16,6 @@ from isocharge.serve import BinaryParser, Faults, Port, Script, VirtualSensor, e
 from isocharge.serve.frames.frame import SequenceGaps
 from isocharge.serve.virtual_sensor.script import corrupt
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 
 def reference_noise(charge_pC, rng):
     return charge_pC + np.hypot(1.0, 0.002 * charge_pC) * rng.standard_normal(charge_pC.shape)
@@ -145,7 +143,6 @@ def read(url, count):
     return frames, parser.counts
 
 
-@pytest.mark.xdist_group("clock")
 def test_frames_come_on_time_and_their_truth_is_known(film):
     script = wander(seed=3, seconds=2.0, rate_Hz=1000.0)
     with VirtualSensor(film.charges, script) as sensor:
@@ -161,7 +158,6 @@ def test_frames_come_on_time_and_their_truth_is_known(film):
     assert late_s[-300:].min() - late_s[:300].min() < 0.02  # 0.05 if it slept between frames, not until deadlines
 
 
-@pytest.mark.xdist_group("clock")
 def test_frames_are_withheld_until_somebody_reads(film):
     """What does not fit is withheld whole: a late reader sees a gap at most, and no damaged frame."""
     with VirtualSensor(film.charges, steady(rate_Hz=2000.0)) as sensor:
@@ -180,7 +176,6 @@ def test_frames_are_withheld_until_somebody_reads(film):
         sensor.url  # noqa: B018
 
 
-@pytest.mark.xdist_group("clock")
 def test_a_port_that_vanishes_comes_back_under_the_same_name(film):
     encode = lambda frame: encode_text(frame, "pairs")  # noqa: E731
     faults = Faults(unplug_every_s=0.8, unplug_s=0.3)

@@ -15,8 +15,6 @@ from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, Theory,
 from isocharge.simulate.execution import workers as module
 from isocharge.simulate.execution.workers import dask_workers, in_order, local_workers
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 SENSOR = load_sensor("three-25um-biaxial")
 QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
 SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, orientation="random")

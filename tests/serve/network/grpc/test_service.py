@@ -24,9 +24,6 @@ from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.grpc.service import METHODS, SERVICE
 from isocharge.serve.network.protocol import Handler
 
-pytestmark = pytest.mark.xdist_group("clock")
-
-
 PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inference.proto"
 
 

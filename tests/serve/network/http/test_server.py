@@ -19,8 +19,6 @@ from isocharge.serve.network.address import Address, ServerLimits, Tls, Token
 from isocharge.serve.network.http import HttpServer
 from isocharge.serve.network.protocol import Handler
 
-pytestmark = pytest.mark.xdist_group("clock")
-
 INFER = "/v2/models/linear/infer"
 TENSOR = {"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}
 BODY = json.dumps({"inputs": [TENSOR]}).encode()
