@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from isocharge.common.deflection_field import points_mm, read_deflection_field
 from isocharge.common.errors import RequestError
 from isocharge.common.structs import parse_json
-from isocharge.serve import flags
+from isocharge.serve import find_model, flags, load_model
 from isocharge.serve.viewer.messages import (
     CONTACT_BIT,
     FLAG_BITS,
@@ -34,6 +34,7 @@ from isocharge.serve.viewer.messages import (
     Tare,
     coalesce,
     confirmed_number,
+    describe_film,
     samples_message,
 )
 
@@ -105,6 +106,19 @@ def test_what_no_float32_holds_is_clipped(record):
     sample = np.frombuffer(form.pack(record(charge_pC={"A": -1e300}, misfit=1e200)), form.dtype)[0]
     assert sample["charge_pC"][0] == -np.finfo(np.float32).max
     assert sample["misfit"] == np.finfo(np.float32).max
+
+
+def test_electrodes_are_drawn_where_they_lie(film):
+    """Squares of a released model; a polygon, turned by a right angle and shifted."""
+    described = describe_film("left", load_model(find_model("three-25um-biaxial")).metadata, None)
+    squares = np.array([described["outlines_mm"][name] for name in "ABC"])
+    angle = np.radians([-90.0, 30.0, 150.0])
+    np.testing.assert_allclose(squares.mean(axis=1), 10.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=1e-6)
+    np.testing.assert_allclose(np.ptp(squares, axis=1), 3.0)
+    electrodes = {name: {"polygon_mm": [[2, 0], [3, 0], [2, 1]]} for name in "ABC"}
+    turned = {"name": "mine", "electrodes": electrodes, "calibration": {"rotation_deg": 90.0, "shift_mm": [0.5, 0.0]}}
+    outlines = describe_film("left", film.metadata(sensor=turned), None)["outlines_mm"]
+    np.testing.assert_allclose(outlines["C"], [[0.5, 2.0], [0.5, 3.0], [-0.5, 2.0]], atol=1e-12)
 
 
 def test_every_flag_has_a_bit_of_its_own():

@@ -35,7 +35,7 @@ from msgspec import Meta, Struct
 
 from isocharge.common.deflection_field import DeflectionField, read_deflection_field
 from isocharge.common.errors import InputError, RequestError
-from isocharge.common.structs import Finite, Positive, WrongKey, convert
+from isocharge.common.structs import Finite, WrongKey, convert
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.record import PredictionRecord
@@ -248,7 +248,8 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
 def _outlines_mm(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[float]]]:
     """Corners of each electrode where it lies on the real film; none for a sensor of another form."""
     try:
-        parts = convert(sensor["electrodes"], dict[str, Point | Positive | _Polygon], "sensor", InputError)
+        # not `Positive`: msgspec 0.22 crashes on a tuple of fixed length beside a number with bounds
+        parts = convert(sensor["electrodes"], dict[str, Point | float | _Polygon], "sensor", InputError)
         return {name: _placed(_corners(parts, name), sensor.get("calibration") or {}) for name in electrodes}
     except (InputError, TypeError, ValueError, KeyError):
         return {}
