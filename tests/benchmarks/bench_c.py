@@ -7,9 +7,7 @@ in a host program without Python. The session has one thread and gets its input 
 stand how far the answers are from those of session.run, relative to max(|b|, 1 mm or 0.1 N), and the model's own error.
 """
 
-import argparse
 import ctypes
-import json
 import subprocess
 import tempfile
 from collections.abc import Callable
@@ -18,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from shared import options, print_results
 
 from isocharge.serve import find_model, load_model
-from isocharge.serve.benchmark import Contender, machine, take_turns
+from isocharge.serve.benchmark import Contender, take_turns
 from isocharge.train.export_c.folder import export_c
 
 OPTIONS = ("-O2", "-O3 -march=native", "-O3 -march=native -ffp-contract=fast")
@@ -40,12 +39,6 @@ void loop(const float *charge_pC, int presses, int calls, float *contact)
         isocharge_predict(charge_pC + (k % presses) * ISOCHARGE_ELECTRODES, contact + 7 * (k % presses));
 }
 """
-
-
-def place(compiler: str) -> dict[str, str]:
-    """Where a figure was measured, and with which compiler."""
-    version = subprocess.check_output([compiler, "--version"], text=True).splitlines()[0]
-    return machine() | {"compiler": version}
 
 
 def compiled(export: Path, compiler: str, options: str) -> Callable[[np.ndarray, int, np.ndarray], None]:
@@ -93,30 +86,19 @@ def measure(model: Any, loops: dict[str, Any], seconds: float, calls: int, seed:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", default="four-25um-biaxial", help="model name or path")
+    parser = options(__doc__, "four-25um-biaxial")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--calls", type=int, default=2000, help="calls that are timed at once")
     parser.add_argument("--compiler", default="gcc")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="one JSON object")
     asked = parser.parse_args()
     model = load_model(find_model(asked.model))
+    compiler = subprocess.check_output([asked.compiler, "--version"], text=True).splitlines()[0]
     with tempfile.TemporaryDirectory() as folder:
         export = export_c(model.folder, Path(folder) / "c")
-        loops = {f"C {options}": compiled(export, asked.compiler, options) for options in OPTIONS}
+        loops = {f"C {flags}": compiled(export, asked.compiler, flags) for flags in OPTIONS}
         table = measure(model, loops, asked.seconds, asked.calls, asked.seed)
     error_mm = model.metadata.errors.get("position_rms_mm")
-    if asked.json:
-        about = {"machine": place(asked.compiler), "position_rms_mm": error_mm, "results": table}
-        print(json.dumps({"benchmark": "c", **vars(asked), **about}))
-        return
-    print(", ".join(f"{name} {value}" for name, value in place(asked.compiler).items()))
-    print(f"{asked.model}, error {error_mm} mm rms: {asked.calls} calls at once, in turns for {asked.seconds:g} s")
-    for row in table:
-        times = "   ".join(f"{name} {row[f'{name}_us']:6.2f} us" for name in ("p50", "p99"))
-        times += f"   ratio of p50 {row['ratio_p50']:.3f}"
-        print(f"{row['call']:38s} {times}   largest difference {row['largest_difference']:.1e}")
+    print_results("c", asked, {"compiler": compiler, "position_rms_mm": error_mm, "one press": table})
 
 
 if __name__ == "__main__":

@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from bench_predictor import machine
 from matplotlib.ticker import FormatStrFormatter, NullFormatter, ScalarFormatter
 
 from isocharge.serve import MeasuredPresses
+from isocharge.serve.benchmark import machine
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from isocharge.simulate.plots.figure import new_figure
 from isocharge.train import CalibrationProblem, calibrate

@@ -20,15 +20,15 @@ import sys
 import tempfile
 import time
 import venv
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import tritonclient.http
-from bench_predictor import machine
+from shared import options, print_results, rows, take_turns
 
 from isocharge.serve import find_model, load_model
 from isocharge.serve.model.session import OUTPUTS
@@ -111,6 +111,9 @@ def binary_request(path: str, charge_pC: np.ndarray) -> bytes:
     tensor["parameters"] = {"binary_data_size": charge_pC.nbytes}
     text = json.dumps({"inputs": [tensor], "parameters": {"binary_data_output": True}}).encode()
     return http_request(path, text + charge_pC.tobytes(), f"Inference-Header-Content-Length: {len(text)}\r\n")
+
+
+CODINGS = {"JSON": json_request, "binary": binary_request}
 
 
 def free_port() -> int:
@@ -217,18 +220,6 @@ RIVALS = {
 }
 
 
-def latencies(address: Address, request: bytes, count: int) -> np.ndarray:
-    """Durations of requests one after another on a new connection, us; the first one is thrown away."""
-    connection, clock, durations = Connection(address), time.perf_counter_ns, np.empty(count)
-    connection.ask(request)
-    for i in range(count):
-        begin = clock()
-        connection.ask(request)
-        durations[i] = clock() - begin
-    connection.close()
-    return durations / 1e3
-
-
 def throughput(address: Address, request: bytes, seconds: float) -> float:
     """Answers per second over 32 connections, each with one request under way.
 
@@ -267,46 +258,19 @@ def _answer_size(address: Address, request: bytes) -> int:
     return len(data)
 
 
-def take_turns(contenders: dict[str, tuple[Address, bytes]], rounds: int, number: int) -> dict[str, np.ndarray]:
-    """Durations of each contender, shape (rounds, number), us; the first round only warms up."""
-    durations: dict[str, list[np.ndarray]] = {name: [] for name in contenders}
-    for _ in range(rounds + 1):
-        for name, (address, request) in contenders.items():
-            durations[name].append(latencies(address, request, number))
-    return {name: np.array(of_name[1:]) for name, of_name in durations.items()}
+def asking(stack: ExitStack, address: Address, request: bytes) -> Callable[[], bytes]:
+    """A call that sends a request over an open connection and waits for its answer."""
+    return partial(stack.enter_context(closing(Connection(address))).ask, request)
 
 
-def rows(durations: dict[str, np.ndarray], against: str) -> Iterator[dict[str, Any]]:
-    """A line for each contender: percentiles, and its p50 over the p50 of `against`, median over rounds."""
-    base = np.median(durations[against], axis=1)
-    for name, of in durations.items():
-        p50, p99 = np.percentile(of, (50, 99))
-        ratio = np.median(of, axis=1) / base
-        yield {
-            "contender": name,
-            "p50_us": round(float(p50), 1),
-            "p99_us": round(float(p99), 1),
-            "ratio_p50": round(float(np.median(ratio)), 3),
-            "ratio_range": [round(float(ratio.min()), 3), round(float(ratio.max()), 3)],
-        }
-
-
-def stock_client(address: tuple[str, int], name: str, charges: np.ndarray, count: int) -> dict[str, np.ndarray]:
-    """Arrays in, arrays out through Triton's HTTP client, shape (1, count), us: its own coding included."""
-    client = tritonclient.http.InferenceServerClient(f"{address[0]}:{address[1]}")
-    durations = {"JSON": np.empty((1, count)), "binary": np.empty((1, count))}
-    for i in range(-2, count):  # two to warm up
-        for kind, of in durations.items():
-            begin = time.perf_counter_ns()
-            tensor = tritonclient.http.InferInput("charge_pC", list(charges.shape), "FP32")
-            tensor.set_data_from_numpy(charges, binary_data=kind == "binary")
-            outputs = [tritonclient.http.InferRequestedOutput(o, binary_data=kind == "binary") for o in OUTPUTS]
-            answer = client.infer(name, [tensor], outputs=outputs)
-            for output in OUTPUTS:
-                answer.as_numpy(output)
-            of[0, max(i, 0)] = (time.perf_counter_ns() - begin) / 1e3
-    client.close()
-    return durations
+def stock_infer(client: Any, name: str, charges: np.ndarray, *, binary: bool) -> None:
+    """Arrays in, arrays out through Triton's HTTP client: its own coding included."""
+    tensor = tritonclient.http.InferInput("charge_pC", list(charges.shape), "FP32")
+    tensor.set_data_from_numpy(charges, binary_data=binary)
+    outputs = [tritonclient.http.InferRequestedOutput(output, binary_data=binary) for output in OUTPUTS]
+    answer = client.infer(name, [tensor], outputs=outputs)
+    for output in OUTPUTS:
+        answer.as_numpy(output)
 
 
 def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
@@ -316,47 +280,37 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
         servers = start(stack, asked.model, None if asked.without_rivals else asked.environments)
         one = {name: (address, json_request(path, charges[:1])) for name, (address, path) in servers.items()}
         address, path = servers["isocharge"]
-        batch = {"JSON": (address, json_request(path, charges)), "binary": (address, binary_request(path, charges))}
+        client = stack.enter_context(tritonclient.http.InferenceServerClient("{}:{}".format(*address)))
+        stock = partial(stock_infer, client, path.split("/")[3], charges)
+        single = {name: asking(stack, *target) for name, target in one.items()}
+        batch = {name: asking(stack, address, make(path, charges)) for name, make in CODINGS.items()}
+        arrays = {name: partial(stock, binary=name == "binary") for name in CODINGS}
         tables = {
-            "one press, one request at a time": list(rows(take_turns(one, asked.rounds, asked.requests), "isocharge")),
-            "1024 presses, plain socket": list(rows(take_turns(batch, asked.rounds, asked.requests // 10), "JSON")),
-            "1024 presses, arrays in and out of the stock client": list(
-                rows(stock_client(address, path.split("/")[3], charges, asked.requests // 4), "JSON")
-            ),
+            "one press, one request at a time": (single, asked.requests, "isocharge"),
+            "1024 presses, plain socket": (batch, asked.requests // 10, "JSON"),
+            "1024 presses, arrays in and out of the stock client": (arrays, asked.requests // 40, "JSON"),
         }
-        counts = {name: [throughput(*target, asked.seconds) for _ in range(2)] for name, target in one.items()}
-    ours = np.mean(counts["isocharge"])
-    tables["32 connections"] = [
-        {
-            "contender": name,
-            "per_second": round(float(np.mean(of))),
-            "ours_over_it": round(float(ours / np.mean(of)), 2),
+        results = {
+            title: list(rows(take_turns(calls, asked.rounds, number), against))
+            for title, (calls, number, against) in tables.items()
         }
-        for name, of in counts.items()
+        counts = {name: np.mean([throughput(*target, asked.seconds) for _ in range(2)]) for name, target in one.items()}
+    results["32 connections"] = [
+        {"call": name, "per_second": round(count), "ours_over_it": round(float(counts["isocharge"] / count), 2)}
+        for name, count in counts.items()
     ]
-    return tables
+    return results
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", default="three-25um-biaxial", help="model name or path, three electrodes")
+    parser = options(__doc__)
     parser.add_argument("--environments", type=Path, default=Path("build/bench-environments"), metavar="DIR")
     parser.add_argument("--without-rivals", action="store_true", help="only ours")
     parser.add_argument("--rounds", type=int, default=12)
     parser.add_argument("--requests", type=int, default=400, help="of each contender in a round")
     parser.add_argument("--seconds", type=float, default=4.0, help="of each throughput measurement")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="one JSON object")
     asked = parser.parse_args()
-    tables = measure(asked)
-    if asked.json:
-        print(json.dumps({"benchmark": "http", **vars(asked), "machine": machine(), "results": tables}, default=str))
-        return
-    print(", ".join(f"{name} {value}" for name, value in machine().items()))
-    for title, table in tables.items():
-        print(f"\n{title}")
-        for row in table:
-            print("  ".join(f"{name} {value}" for name, value in row.items()))
+    print_results("http", asked, measure(asked))
 
 
 if __name__ == "__main__":

@@ -23,12 +23,15 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+import bench_stream
 import numpy as np
+from shared import percentiles
 from websockets.asyncio.client import connect
 
-from isocharge.serve import Predictor, Recording, Script, VirtualSensor, wander
+from isocharge.serve import Predictor, Recording, Script, wander
 from isocharge.serve.viewer.messages import HEADER, SampleFormat
 
+SHARES = (50, 95, 99)
 MODEL = "three-25um-biaxial"
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = [
@@ -37,27 +40,11 @@ ARGUMENTS = [
 ]
 
 
-def charges(contact):
-    """A film of no great likeness: what matters here is that it is pressed."""
-    x_mm, y_mm, force_N = contact.T
-    electrodes = np.array([[0.0, -10.0], [8.660254, 5.0], [-8.660254, 5.0]])
-    distance = np.hypot(x_mm[:, None] - electrodes[:, 0], y_mm[:, None] - electrodes[:, 1])
-    return 850.0 * force_N[:, None] ** (2 / 3) * 10.0 / (2.0 + 0.8 * distance)
-
-
 def presses(rate_Hz):
     """A second of rest before every short press: a stream that begins at any time finds its tare in 2,000 frames."""
     scripts = [wander(seed=seed, seconds=1.0 + min(1.5, 1500 / rate_Hz), rate_Hz=rate_Hz) for seed in range(12)]
     columns = [np.concatenate([getattr(script, name) for script in scripts]) for name in ("x_mm", "y_mm", "force_N")]
     return Script(*columns, rate_Hz)
-
-
-def play(rate_Hz, url, stop, counts):
-    """The board, in a process of its own."""
-    with VirtualSensor(charges, presses(rate_Hz)) as sensor:
-        url.send(sensor.url)
-        stop.wait()
-        counts.send((sensor.sent, sensor.withheld))
 
 
 def watch(url, electrodes, stalls, seconds, results):
@@ -151,14 +138,6 @@ def one_round(port, viewers, seconds, folder, name, in_browser):
     return latencies, int(((np.diff(seq) - 1) % 65536).sum()), ages, browsed
 
 
-def percentiles(values, scale=1.0):
-    return (
-        ", ".join(f"p{share} {scale * np.percentile(values, share):.1f}" for share in (50, 95, 99))
-        if len(values)
-        else "none"
-    )
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=4)
@@ -167,11 +146,10 @@ def main():
     parser.add_argument("--browser", action="store_true")
     options = parser.parse_args()
     context = multiprocessing.get_context("spawn")
-    (url, their_url), (counts, their_counts) = context.Pipe(duplex=False), context.Pipe(duplex=False)
-    stop = context.Event()
-    board = context.Process(target=play, args=(options.rate_Hz, their_url, stop, their_counts), daemon=True)
+    pipe, far = context.Pipe()
+    board = context.Process(target=bench_stream.board, args=(far, 3, presses(options.rate_Hz), 0), daemon=True)
     board.start()
-    port, p99 = url.recv(), {0: [], 3: []}
+    port, p99 = pipe.recv(), {0: [], 3: []}
     print(
         f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {options.rate_Hz:g} Hz, {options.seconds:g} s a round"
     )
@@ -184,17 +162,19 @@ def main():
                 )
                 p99[viewers].append(float(np.percentile(latencies, 99)))
                 print(
-                    f"round {number}, {viewers} viewers: latency us {percentiles(latencies)}; "
-                    f"{len(latencies)} records, {lost} lost; age ms {percentiles(ages, 1e3)}"
+                    f"round {number}, {viewers} viewers: latency us {percentiles(latencies, SHARES)}; "
+                    f"{len(latencies)} records, {lost} lost; age ms {percentiles(1e3 * np.array(ages), SHARES)}"
                 )
                 if browsed is not None:
-                    print(f"  Chromium: age of a picture ms {percentiles(browsed[0])}; pictures/s {browsed[1]:.1f}")
+                    print(
+                        f"  Chromium: age of a picture ms {percentiles(browsed[0], SHARES)}, {browsed[1]:.1f} a second"
+                    )
     ratios = np.array(p99[3]) / np.array(p99[0])
     spread = f"median {np.median(ratios):.2f}, {ratios.min():.2f} to {ratios.max():.2f}"
     print(f"p99 with three viewers over without: {spread}")
-    stop.set()
-    sent, withheld = counts.recv()
-    print(f"board: {sent} frames sent, {withheld} withheld while nobody followed")
+    pipe.send("enough")
+    played = pipe.recv()
+    print(f"board: {played['sent']} frames sent, {played['withheld']} withheld while nobody followed")
     board.join()
 
 

@@ -10,7 +10,6 @@ the requests) to the end.
 
 import argparse
 import itertools
-import json
 import os
 import selectors
 import sys
@@ -24,7 +23,7 @@ import grpc
 import numpy as np
 import orjson
 from bench_http import Connection, binary_request, free_port, http_request, json_request, running
-from bench_predictor import machine
+from shared import options, print_results
 
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.network.grpc.service import METHODS, SERVICE
@@ -165,18 +164,10 @@ def measure(asked: argparse.Namespace) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", default="three-25um-biaxial", help="model name or path")
+    parser = options(__doc__)
     parser.add_argument("--requests", type=int, default=1_000_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="one JSON object")
     asked = parser.parse_args()
-    result = measure(asked)
-    if asked.json:
-        print(json.dumps({"benchmark": "soak", **vars(asked), "machine": machine(), "results": result}))
-        return
-    print(", ".join(f"{name} {value}" for name, value in machine().items()))
-    print("\n".join(f"{name:18s} {value}" for name, value in result.items()))
+    print_results("soak", asked, measure(asked))
 
 
 if __name__ == "__main__":

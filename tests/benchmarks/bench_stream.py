@@ -7,17 +7,15 @@ chain on, each record turned into a line of JSON. The latency is that of the rec
 byte. The charges are those of a made-up linear film: nothing here depends on what the model answers.
 """
 
-import argparse
-import json
 import multiprocessing
 import time
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
+from shared import options, percentiles, print_results
 
-from isocharge.serve import Port, Predictor, TouchStream, VirtualSensor, device_from_table, wander
-from isocharge.serve.benchmark import machine
+from isocharge.serve import Port, Predictor, Script, TouchStream, VirtualSensor, device_from_table, wander
 
 BOARD = {
     "gain": {"pC_per_unit": 1.0},
@@ -25,6 +23,7 @@ BOARD = {
     "hum": {"frequency_Hz": 50.0},
     "leak": {"tau_s": 1e6},
 }
+SHARES = (50, 99, 99.9)
 
 
 def reference_noise(charge_pC: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -43,9 +42,8 @@ def linear_film(electrodes: int) -> Any:
     return charges
 
 
-def board(pipe: Connection, electrodes: int, rate_Hz: float, seed: int) -> None:
+def board(pipe: Connection, electrodes: int, script: Script, seed: int) -> None:
     """Play until the other end says so; then tell what was played."""
-    script = wander(seed=seed, seconds=60.0, rate_Hz=rate_Hz)
     with VirtualSensor(linear_film(electrodes), script, noise=reference_noise, seed=seed) as sensor:
         pipe.send(sensor.url)
         pipe.recv()
@@ -55,8 +53,9 @@ def board(pipe: Connection, electrodes: int, rate_Hz: float, seed: int) -> None:
 def play(predictor: Predictor, seconds: float, rate_Hz: float, seed: int) -> dict[str, Any]:
     """Follow a virtual sensor for a while."""
     pipe, far = multiprocessing.Pipe()
+    script = wander(seed=seed, seconds=60.0, rate_Hz=rate_Hz)
     process = multiprocessing.get_context("spawn").Process(
-        target=board, args=(far, len(predictor.metadata.electrodes), rate_Hz, seed)
+        target=board, args=(far, len(predictor.metadata.electrodes), script, seed)
     )
     process.start()
     path, latencies = TouchStream(predictor, device_from_table(BOARD, "bench")), []
@@ -81,31 +80,17 @@ def summary(latencies: np.ndarray, path: TouchStream, played: dict[str, int]) ->
     return path.totals()._asdict() | {
         "board": played,
         "in_contact": len(touched),
-        "last_byte_to_record_us": percentiles(latencies[:, 0]),
-        "in_contact_us": percentiles(touched[:, 0]),
+        "last_byte_to_record_us": percentiles(latencies[:, 0], SHARES),
+        "in_contact_us": percentiles(touched[:, 0], SHARES),
     }
 
 
-def percentiles(values: np.ndarray) -> dict[str, float]:
-    return {f"p{p:g}": round(float(np.percentile(values, p)), 1) for p in (50, 99, 99.9)}
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", default="three-25um-biaxial", help="model name or path")
+    parser = options(__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate-hz", dest="rate_Hz", type=float, default=1000.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="one JSON object")
     asked = parser.parse_args()
-    result = play(Predictor(asked.model), asked.seconds, asked.rate_Hz, asked.seed)
-    if asked.json:
-        print(json.dumps({"benchmark": "stream", **vars(asked), "machine": machine(), "results": result}))
-        return
-    print(", ".join(f"{name} {value}" for name, value in machine().items()))
-    print(f"{asked.model}: {asked.seconds:g} s at {asked.rate_Hz:g} Hz, seed {asked.seed}")
-    for name, value in result.items():
-        print(f"{name:24s} {value}")
+    print_results("stream", asked, play(Predictor(asked.model), asked.seconds, asked.rate_Hz, asked.seed))
 
 
 if __name__ == "__main__":

@@ -8,12 +8,11 @@ the gains to 0.2 % (and once not at all). `--warm` adds a temperature step of 0.
 model of four electrodes, and says where temperature can be told from force; `--unplug N` pulls a terminal N times.
 """
 
-import argparse
-import json
 import time
 from dataclasses import replace
 
 import numpy as np
+from shared import options, percentiles, print_results
 
 from isocharge.serve import (
     Chunk,
@@ -27,10 +26,10 @@ from isocharge.serve import (
     device_from_table,
     encode_frame,
 )
-from isocharge.serve.benchmark import machine
 from isocharge.simulate import Circle, ForwardMap, load_amplifier
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
+SHARES = (50, 95, 100)
 RATE_HZ, REST_S, PRESS_S, PAUSE_S, RAMP_S = 200.0, 4.0, 1.5, 1.5, 0.1
 
 
@@ -92,7 +91,7 @@ def held_presses(predictor, part, seed):
                     ends = np.mean([list(r.charge_pC.values()) for r in records[end - 20 : end]], axis=0)
                     worst.append(np.abs(ends - height).max())
                 assert not records[-1].contact
-            out[f"tau {tau:g} s, {name}, pC"] = percentiles(worst)
+            out[f"tau {tau:g} s, {name}, pC"] = percentiles(worst, SHARES, 3)
     return out
 
 
@@ -109,12 +108,12 @@ def accuracy(predictor, film, part, presses, gain_error, seed):
     starts = np.flatnonzero(np.diff(script.touching.astype(int)) == 1) + 1
     clipped = np.array(["saturated" in records[k].flags for k in felt])
     return {
-        "position_mm": percentiles(error),
-        "position_not_saturated_mm": percentiles(error[~clipped]),
-        "force_percent": percentiles([100 * abs(records[k].force_N - 1.0) for k in felt]),
+        "position_mm": percentiles(error, SHARES, 3),
+        "position_not_saturated_mm": percentiles(error[~clipped], SHARES, 3),
+        "force_percent": percentiles([100 * abs(records[k].force_N - 1.0) for k in felt], SHARES, 3),
         "felt_share": round(len(felt) / len(plateau), 4),
         "saturated_share": round(float(clipped.mean()), 4),
-        "first_reading_ms": percentiles([1e3 / RATE_HZ * int(contact[start:].argmax()) for start in starts]),
+        "first_reading_ms": percentiles([1e3 / RATE_HZ * int(contact[start:].argmax()) for start in starts], SHARES, 3),
     }
 
 
@@ -160,21 +159,18 @@ def unplugging(predictor, times):
                 back.append(since_s)
             if len(back) > len(tared) and record.tare_pC is not None:
                 tared.append(since_s)
-    return {"outages": path.counts.outages, "back_s": percentiles(back), "tared_s": percentiles(tared)}
-
-
-def percentiles(values):
-    return {f"p{p:g}": round(float(np.percentile(values, p)), 3) for p in (50, 95, 100)} if len(values) else {}
+    return {
+        "outages": path.counts.outages,
+        "back_s": percentiles(back, SHARES, 3),
+        "tared_s": percentiles(tared, SHARES, 3),
+    }
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", default="three-25um-biaxial", help="model name or path")
+    parser = options(__doc__)
     parser.add_argument("--presses", type=int, default=100)
     parser.add_argument("--warm", action="store_true")
     parser.add_argument("--unplug", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="one JSON object")
     asked = parser.parse_args()
     predictor, part = Predictor(asked.model), load_amplifier("bench")
     corners = np.array(predictor.metadata.working_area_mm) @ [1.0, 1j]
@@ -190,14 +186,7 @@ def main():
         result["warming"] = warming(predictor, film, part, asked.seed)
     if asked.unplug:
         result["unplugging"] = unplugging(predictor, asked.unplug)
-    if asked.json:
-        print(json.dumps({"benchmark": "touch", **vars(asked), "machine": machine(), "results": result}))
-        return
-    print(", ".join(f"{name} {value}" for name, value in machine().items()))
-    for name, value in result.items():
-        print(name)
-        for key, item in value.items():
-            print(f"    {key:22s} {item}")
+    print_results("touch", asked, result)
 
 
 if __name__ == "__main__":
