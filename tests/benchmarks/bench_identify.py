@@ -11,8 +11,8 @@ from pathlib import Path
 
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 from isocharge.simulate.identifiability.identification import Identification, search_radius
+from isocharge.simulate.plots.error_maps import TICKS, draw_limit_map
 from isocharge.simulate.plots.figure import new_figure
-from isocharge.simulate.plots.limit_map import TICKS, draw_limit_map
 
 SENSORS = ("three-25um-biaxial", "three-25um-uniaxial", "four-25um-biaxial", "four-25um-uniaxial")
 

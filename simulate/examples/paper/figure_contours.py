@@ -1,5 +1,6 @@
 """Fig. 9 to 11: triangulation and contours."""
 
+from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
@@ -15,7 +16,6 @@ from isocharge.simulate import ChargeSpline, Sensor
 from isocharge.simulate.contours.field_contours import ContourField
 from isocharge.simulate.contours.fix import Meeting
 from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTriangulation
-from isocharge.simulate.plots.contours import draw_contours
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, finish_axes, new_axes
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 
@@ -204,3 +204,9 @@ def _label_end(axes: Any, points: Array, text: str) -> None:
     end = points[-1 if points[-1, 1] > points[0, 1] else 0]
     beyond = tuple(9.0 * end / np.linalg.norm(end))
     axes.annotate(text, end, xytext=beyond, textcoords="offset points", fontsize=7, ha="center", va="center")
+
+
+def draw_contours(axes: Any, contours: Sequence[Array], colour: str, label: str = "", width: float = 1.2) -> None:
+    """Pieces of contours, shape (n, 2) each, mm; the first one labelled for the legend."""
+    for number, points in enumerate(contours):
+        axes.plot(*points.T, color=colour, lw=width, label=label if number == 0 else None)

@@ -14,8 +14,7 @@ from isocharge.common.arrays import Array
 from isocharge.simulate import Piezo, Sensor
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from isocharge.simulate.contours.graphical_method import draw_contour
-from isocharge.simulate.plots.contours import draw_curves
-from isocharge.simulate.plots.figure import COLOURS, PRESSED, finish_axes, new_axes
+from isocharge.simulate.plots.figure import COLOURS, PRESSED, finish_axes, new_axes, shades
 
 FROM_A_DEG = {"three": (35.0, 90.0), "four": (110.0, 250.0)}
 """First and last line from A, by layout."""
@@ -227,3 +226,15 @@ def fig_12(solves: Solves) -> Entry:
         numbers[layout] = {**curve_numbers(uniaxial), "spread": 0.01 * apart[1], "spread_biaxial": 0.01 * apart[0]}
     caption = "Charge of A on a uniaxial film under a triangle of 4 mm, with three and with four electrodes."
     return Entry("Fig. 12", caption, figure, rows, numbers)
+
+
+def draw_curves(axes: Any, points: Curves, lines: Curves) -> None:
+    """Charge against distance on each line of a mapping: marks where the scheme presses, lines between them."""
+    colours = shades(points.mapping.angle.size)
+    for angle, colour, marks, line in zip(points.mapping.angle, colours, points.own, lines.own, strict=True):
+        axes.plot(points.mapping.distance, marks, "o", color=colour, ms=3.5)
+        axes.plot(lines.mapping.distance, line, "-", color=colour, lw=1.1, label=f"{np.rad2deg(angle):.0f}°")
+    name = points.mapping.electrode
+    axes.set(xlabel=f"distance from the centre of {name}, mm", ylabel=f"charge of {name}, pC")
+    axes.grid(alpha=0.3)
+    axes.legend(title="line from x", fontsize=8, ncols=2)

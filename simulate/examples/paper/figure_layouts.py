@@ -14,8 +14,7 @@ from isocharge.simulate import Equilibrium, Sensor
 from isocharge.simulate.contours.charge_curves import Mapping
 from isocharge.simulate.forward.readout import contact_charge
 from isocharge.simulate.numerics.interpolation import tensor_values
-from isocharge.simulate.plots.contours import draw_mapping
-from isocharge.simulate.plots.figure import COLOURS, FELT, INK, finish_axes, new_axes
+from isocharge.simulate.plots.figure import COLOURS, FELT, INK, PRESSED, finish_axes, new_axes
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 
 FIG_4_DEG = (35.0, 145.0)
@@ -219,3 +218,19 @@ def _draw_mesh(axes: Any, shown: Equilibrium) -> None:
     z = shown.mesh.points @ tensor_values(shown.mesh.resolution.order, xi, eta).T * turned
     axes.add_collection(LineCollection(list(np.stack([z.real, z.imag], axis=-1)), colors=INK, linewidths=0.5))
     draw_probe(axes, shown.probe, shown.at)
+
+
+def draw_mapping(axes: Any, mapping: Mapping) -> None:
+    """Lines and circles of a mapping scheme, and its presses."""
+    points = np.concatenate([np.broadcast_to(mapping.origin, (mapping.angle.size, 1, 2)), mapping.points], axis=1)
+    for angle, line in zip(mapping.angle, points, strict=True):
+        axes.plot(*line.T, color=PRESSED, lw=0.8)
+        axes.annotate(
+            f"{np.rad2deg(angle):.0f}°", line[-1], fontsize=7, color=INK, ha="center", va="center",
+            xytext=(9 * np.cos(angle), 9 * np.sin(angle)), textcoords="offset points",
+        )  # fmt: skip
+    for number, distance in enumerate(mapping.distance):
+        arc = np.linspace(mapping.angle[0], mapping.angle[-1], 90)
+        circle = np.array(mapping.origin) + distance * np.stack([np.cos(arc), np.sin(arc)], axis=1)
+        axes.plot(*circle.T, color=PRESSED, lw=0.6, ls="--", label="circles, every step" if number == 0 else None)
+    axes.plot(*points[:, 1:].reshape(-1, 2).T, ".", color=FELT, ms=4, label="presses")
