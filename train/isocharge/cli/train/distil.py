@@ -7,7 +7,7 @@ import typer
 from isocharge.cli.shared.forward_maps import simulated_presses
 from isocharge.cli.shared.options import ConfigOption, FreshOption, JsonOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.terminal import shown_progress, this_command
-from isocharge.cli.shared.training_run import ModelFolderOption, VersionOption, release_resumably
+from isocharge.cli.train.fit import ModelFolderOption, VersionOption, release_resumably
 from isocharge.common.errors import InputError
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve import find_model, load_model

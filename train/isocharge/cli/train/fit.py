@@ -1,11 +1,13 @@
 """`isocharge train fit`: a dataset, measured presses, or a sensor, to a model."""
 
+import json as json_module
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from isocharge.cli.shared.forward_maps import caution_of_stress, simulated_presses, sweep_radius
+from isocharge.cli.shared.forward_maps import caution_of_stress, shown_run, simulated_presses, sweep_radius
 from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
 from isocharge.cli.shared.options import (
     PROBE_HELP,
@@ -18,11 +20,10 @@ from isocharge.cli.shared.options import (
     radius_mm_of,
     refuse,
 )
-from isocharge.cli.shared.terminal import shown_progress, this_command
-from isocharge.cli.shared.training_run import ModelFolderOption, VersionOption, release_resumably
+from isocharge.cli.shared.terminal import say, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
-from isocharge.common.resumable_run import ResumableRun
+from isocharge.common.resumable_run import ResumableRun, resume_parts
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import Circle, FilmPrior, load_sensor, local_workers, parse_probe, read_dataset
 from isocharge.train import (
@@ -40,6 +41,13 @@ from isocharge.train import (
 )
 from isocharge.train.films.fit import films_identity
 from isocharge.train.training.fit import fit_identity
+
+ModelFolderOption = Annotated[
+    Path,
+    typer.Option("--output", "-o", metavar="models/NAME", help="Model folder; its name becomes the model's name."),
+]
+
+VersionOption = Annotated[int, typer.Option("--version", min=1, help="Version of the model: the folder in NAME.")]
 
 
 def fit_command(
@@ -177,3 +185,34 @@ def _films(
     if len(probes) != 1 or not isinstance(probe, Circle):
         raise InputError(f"--films: expected one round probe (circle:RADIUS), got {', '.join(probes)}")
     return FilmPrior(load_sensor(str(sensor)), probe), FilmsConfig(radius=radius_mm_of(radius))
+
+
+def release_resumably(
+    fit_and_release: Callable[[ResumableRun], Release],
+    identity: Mapping[str, Any],
+    target: Path,
+    *,
+    fresh: bool,
+    json: bool,
+) -> None:
+    """Fit into a version folder and print the errors; stopped, say how to go on.
+
+    Args:
+        fit_and_release: The work; it keeps its state in the run.
+        identity: All that decides about the weights.
+        target: The version folder.
+        fresh: Throw away what an earlier run left.
+        json: Print the folder and the errors as one JSON object.
+    """
+    with shown_run(target), resume_parts(target, identity, fresh=fresh) as run:
+        release = fit_and_release(run)
+    errors = release.metadata.errors
+    if json:
+        typer.echo(json_module.dumps({"folder": str(release.folder), "errors": dict(errors)}))
+    measured = errors.get("measured_presses")
+    presses = f"on {measured:.0f} measured presses that training never saw, " if measured else ""
+    say(
+        f"{release.folder}: {presses}position error {errors['position_median_mm']:g} mm median, "
+        f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "
+        f"force {errors['force_rms_percent']:g} % rms"
+    )
