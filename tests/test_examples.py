@@ -43,6 +43,7 @@ def test_any_executor_gives_the_same_dataset(tmp_path):
     assert "the same charges: True" in said
 
 
+@pytest.mark.slow
 def test_a_network_is_fitted_inspected_and_released(tmp_path):
     (tmp_path / "quick.toml").write_text("[training]\nsteps = 400\nmisfit_steps = 100\nmisfit_charges = 2000\n")
     said = run("train/examples/fit_inspect_release.py", tmp_path, tmp_path / "quick.toml")
@@ -57,6 +58,7 @@ def test_a_film_is_calibrated(tmp_path):
     assert (tmp_path / "film/sensor.toml").is_file()
 
 
+@pytest.mark.slow
 def test_a_control_loop_follows_touches(start_command, tmp_path):
     port = tmp_path / "film"
     start_command("serve", "virtual", "three-25um-biaxial", "--link", port, "--seconds", "60")
