@@ -71,10 +71,11 @@ def test_percentiles_are_numpy_s():
 def test_ways_predict_what_the_model_does():
     folder = find_model("three-25um-biaxial")
     model, predictor = load_model(folder), Predictor(folder)
-    charges = press_charges(model.golden.charge_pC, seed=3)
+    charges = press_charges(predictor, model.golden.charge_pC, seed=3)
     assert (charges.shape, charges.dtype) == ((4096, 3), np.float32)
-    assert np.array_equal(charges, press_charges(model.golden.charge_pC, seed=3))
-    assert set(map(tuple, charges.tolist())) == set(map(tuple, model.golden.charge_pC.tolist()))
+    assert np.array_equal(charges, press_charges(predictor, model.golden.charge_pC, seed=3))
+    presses = [row for row in model.golden.charge_pC.tolist() if not predictor.flags(predictor.predict(row))]
+    assert set(map(tuple, charges.tolist())) == set(map(tuple, presses))
     contenders = in_process_contenders(predictor, charges[:300])
     assert [contender.presses for contender in contenders] == [1, 1, 16, 256]
     one, batch = contenders[1].call(), contenders[2].call()

@@ -107,10 +107,14 @@ def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
     return durations
 
 
-def press_charges(golden_pC: Singles, seed: int = 0, presses: int = CHARGES) -> Singles:
-    """Presses drawn from the golden vectors of a model, shapes (presses, electrodes) from (n, electrodes), pC."""
-    charges: Singles = golden_pC[np.random.default_rng(seed).integers(0, len(golden_pC), presses)]
-    return charges
+def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0, presses: int = CHARGES) -> Singles:
+    """Presses drawn from the golden vectors of a model, pC: from those that it takes for presses, without a flag.
+
+    Shape (presses, electrodes) from (n, electrodes).
+    """
+    flags = predictor.validity.batch_flags(predictor.predict_batch(golden_pC))
+    sound: Singles = golden_pC[[not words for words in flags]]
+    return sound[np.random.default_rng(seed).integers(0, len(sound), presses)]
 
 
 def in_process_contenders(

@@ -182,8 +182,9 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], fold
 
     force_error = 100.0 * (tested[:, 5] / tested[:, 2] - 1.0)
     model = load_model(find_model(str(folder / "models" / SENSOR)))
-    charges = press_charges(model.golden.charge_pC)
-    (latency,) = take_turns(in_process_contenders(Predictor(model.folder), charges)[1:2], LATENCY_S)
+    predictor = Predictor(model.folder)
+    charges = press_charges(predictor, model.golden.charge_pC)
+    (latency,) = take_turns(in_process_contenders(predictor, charges)[1:2], LATENCY_S)
     rows = [
         ("position error, with noise", position(tested)),
         ("position error, live", position(followed)),

@@ -1,7 +1,6 @@
 """`isocharge serve bench`: how fast a model is on this machine, and how accurate."""
 
 import json as json_module
-import logging
 from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Annotated
@@ -37,13 +36,10 @@ def bench_command(
     """
     loaded = load_model(find_model(model))
     check_golden(loaded)
-    contenders = in_process_contenders(Predictor(loaded.folder), press_charges(loaded.golden.charge_pC))
-    logging.disable(logging.WARNING)  # some golden vectors are no presses, and are timed as all others
-    try:
-        with shown_progress():
-            timings = take_turns(contenders, seconds)
-    finally:
-        logging.disable(logging.NOTSET)
+    predictor = Predictor(loaded.folder)
+    contenders = in_process_contenders(predictor, press_charges(predictor, loaded.golden.charge_pC))
+    with shown_progress():
+        timings = take_turns(contenders, seconds)
     known = loaded.metadata.errors
     errors = {name: known[name] for names in ERRORS.values() for name in names if name in known}
     if json:
