@@ -34,7 +34,7 @@ def test_everything_public_exists():
 def test_sensor_file_can_be_read():
     (text,) = (block for block in TABLES if "[film]" in block)
     sensor = sensor_from_dict(tomllib.loads(text))
-    assert sensor.electrode_names == ("A", "B")
+    assert sensor.electrode_names == ("A", "B", "C")
     assert sensor.calibration.gain == {"A": 1.02}
     keys = {"name", "readout", "surface", "radius_mm", "pretension_MPa", "d33", "pyro_uC_per_m2_K", "rotation_deg"}
     assert keys <= set(re.findall(r"^(\w+) =", text, re.MULTILINE))

@@ -109,16 +109,19 @@ def test_what_no_float32_holds_is_clipped(record):
 
 
 def test_electrodes_are_drawn_where_they_lie(film):
-    """Squares of a released model; a polygon, turned by a right angle and shifted."""
+    """Squares of a released model; a polygon and its trace, turned by a right angle and shifted."""
     described = describe_film("left", load_model(find_model("three-25um-biaxial")).metadata, None)
     squares = np.array([described["outlines_mm"][name] for name in "ABC"])
     angle = np.radians([-90.0, 30.0, 150.0])
     np.testing.assert_allclose(squares.mean(axis=1), 10.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=1e-6)
     np.testing.assert_allclose(np.ptp(squares, axis=1), 3.0)
-    electrodes = {name: {"polygon_mm": [[2, 0], [3, 0], [2, 1]]} for name in "ABC"}
+    assert "more_mm" not in described
+    trace = {"more_mm": [[[2, 0], [2, -9], [3, -9]]], "back_mm": [[[2, 0], [3, 0], [2, 1]]]}
+    electrodes = {name: {"polygon_mm": [[2, 0], [3, 0], [2, 1]]} | trace for name in "ABC"}
     turned = {"name": "mine", "electrodes": electrodes, "calibration": {"rotation_deg": 90.0, "shift_mm": [0.5, 0.0]}}
-    outlines = describe_film("left", film.metadata(sensor=turned), None)["outlines_mm"]
-    np.testing.assert_allclose(outlines["C"], [[0.5, 2.0], [0.5, 3.0], [-0.5, 2.0]], atol=1e-12)
+    described = describe_film("left", film.metadata(sensor=turned), None)
+    np.testing.assert_allclose(described["outlines_mm"]["C"], [[0.5, 2.0], [0.5, 3.0], [-0.5, 2.0]], atol=1e-12)
+    np.testing.assert_allclose(described["more_mm"]["C"], [[[0.5, 2.0], [9.5, 2.0], [9.5, 3.0]]], atol=1e-12)
 
 
 def test_every_flag_has_a_bit_of_its_own():

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from svgelements import SVG, Path
 
+from isocharge.common.errors import SensorError
 from isocharge.simulate import Electrode, load_sensor
 from isocharge.simulate.artwork.drawing import RULER, draw_layout, to_dxf, to_svg
 from isocharge.simulate.artwork.leads import straight_leads
+from isocharge.simulate.artwork.reading import read_artwork
 
 MICROMETRE = 1e-3
 """In mm."""
@@ -49,6 +51,75 @@ def test_dxf_has_the_places_and_sizes_of_the_sensor(sensor, drawing, tmp_path):
     names = [text.dxf.text.replace("\ufffd", "") for text in space.query('TEXT[layer=="NAMES"]')]
     assert names == ["".join(filter(str.isprintable, name)) for name in sensor.electrode_names]
     assert {line.dxf.const_width for line in space.query('LWPOLYLINE[layer=="LEADS"]')} == {0.3}
+
+
+@pytest.fixture
+def with_traces(sensor):
+    """Traces, and a back that two electrodes share."""
+    back = (((-30.0, -30.0), (30.0, -30.0), (30.0, 30.0), (1.0, 29.0), (-30.0, 30.0)),)
+    bent = [((x, y), (1.5 * x, 1.5 * y), (1.6 * x, 1.5 * y + 3.0)) for x, y in (e.centre for e in sensor.electrodes)]
+    traced = (e.with_trace(path, 0.5) for e, path in zip(sensor.electrodes[:2], bent, strict=False))
+    named = [replace(e, name=name, back=back) for e, name in zip(traced, ("Z", "left one"), strict=True)]
+    return replace(sensor, electrodes=tuple(named))
+
+
+@pytest.mark.parametrize("scale", [1.0, 25.4])
+def test_a_drawing_is_read_as_the_electrodes_that_it_shows(with_traces, scale, tmp_path):
+    """Also in inches, where every length is another number."""
+    drawing = draw_layout(with_traces, straight_leads(with_traces))
+    if scale != 1.0:
+        drawing.units = ezdxf.units.IN
+        for entity in drawing.modelspace():
+            entity.transform(ezdxf.math.Matrix44.scale(1.0 / scale))
+    (tmp_path / "layout.dxf").write_text(to_dxf(drawing), "utf-8")
+    again = read_artwork(tmp_path / "layout.dxf", back="BACK")
+    assert [electrode.name for electrode in again] == ["Z", "left one"]
+    for electrode, drawn in zip(again, with_traces.electrodes, strict=True):
+        for polygons, others in ((electrode.front, drawn.front), (electrode.back, drawn.back)):
+            for one, other in zip(polygons, others, strict=True):
+                np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def drawn(path, *lines):
+    document = ezdxf.new("R2010", units=0)
+    for points, width in lines:
+        attributes = {"layer": "metal", "const_width": width}
+        document.modelspace().add_lwpolyline(points, "xyb", close=len(points) == 4, dxfattribs=attributes)
+    document.saveas(path)
+    return path
+
+
+def test_lines_of_a_foreign_drawing(tmp_path):
+    """A clockwise square, its trace in two lines that cross, and a disk of four arcs: no names, no unit."""
+    bulge = np.tan(np.pi / 8)
+    disk = [(22.0, 0.0, bulge), (20.0, 2.0, bulge), (18.0, 0.0, bulge), (20.0, -2.0, bulge)]
+    lines = [[(2.0, 2.0), (2.0, 12.0)], [(0.0, 11.0), (8.0, 11.0)], [(0.0, 0.0), (0.0, 4.0), (4.0, 4.0), (4.0, 0.0)]]
+    one, other = read_artwork(drawn(tmp_path / "mine.dxf", *((line, 0.5) for line in (*lines, disk))), "METAL")
+    assert (one.name, other.name) == ("A", "B")
+    assert one.area == pytest.approx(16.0 + 0.5 * 8.0 + 0.5 * 8.0 - 0.25)
+    assert other.area == pytest.approx(4.0 * np.pi, rel=0.01)
+
+
+SQUARE = [(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)]
+
+
+@pytest.mark.parametrize(
+    ("lines", "layers", "message"),
+    [
+        ([([(0.0, 0.0), (9.0, 0.0)], 0.0)], ("metal",), r"layer 'metal': line #\w+ is open and has no width"),
+        ([([SQUARE[k] for k in (0, 1, 3, 2)], 0.0)], ("metal",), "line #.* does not cross itself"),
+        ([(SQUARE, 0.0)], ("copper",), "layer 'copper' has no polylines; those that have are metal"),
+    ],
+)
+def test_drawings_that_show_no_electrodes(tmp_path, lines, layers, message):
+    with pytest.raises(SensorError, match=rf"mine\.dxf: .*{message}|{message}"):
+        read_artwork(drawn(tmp_path / "mine.dxf", *lines), *layers)
+
+
+def test_a_file_that_is_no_drawing(tmp_path):
+    (tmp_path / "mine.dxf").write_text("film")
+    with pytest.raises(SensorError, match=r"mine\.dxf: expected a DXF file"):
+        read_artwork(tmp_path / "mine.dxf")
 
 
 def test_svg_is_the_same_drawing_to_scale(sensor, drawing, tmp_path):

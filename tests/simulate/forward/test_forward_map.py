@@ -9,6 +9,7 @@ from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
     Circle,
     Domain,
+    Electrode,
     ForwardMap,
     Polygon,
     Resolution,
@@ -26,6 +27,8 @@ MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
 QUICK_SETTINGS = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
 QUICK = {"radius": 4.0, "force_range": (0.7, 1.0), "settings": QUICK_SETTINGS}
 """A small family without bending: few and cheap solves."""
+TRACED = Electrode.of_square("A", (5.0, 0.0), 3.0).with_trace(((5.0, 0.0), (-2.0, -1.0), (-9.0, -30.0)), 0.5)
+"""Its trace runs through the presses."""
 
 
 @pytest.fixture(scope="module")
@@ -100,12 +103,13 @@ def test_ends_of_the_domain_and_the_error_that_the_map_states(near_map):
         {"readout": "edge"},
         {"piezo": load_sensor("four-25um-biaxial").piezo},
         {"calibration": replace(load_sensor("four-25um-biaxial").calibration, shift=(0.5, -0.3), rotation=0.1)},
+        {"electrodes": (TRACED, Electrode.of_square("B", (0.0, 5.0), 3.0))},
     ],
-    ids=["edge", "biaxial", "calibrated"],
+    ids=["edge", "biaxial", "calibrated", "traces"],
 )
 def test_one_family_of_solves_serves_every_readout(near_map, changes):
     other = replace(near_map, sensor=replace(near_map.sensor, **changes))
-    assert errors(other, draw(near_map, 4, seed=4)[0]).max() < 1e-3
+    assert errors(other, draw(near_map, 8, seed=4)[0]).max() < 1e-3
 
 
 def test_contact_pressure(near_map, oriented_map):

@@ -126,6 +126,63 @@ def test_charge_is_that_of_each_electrode_and_of_each_coefficient(solved):
     np.testing.assert_allclose(touch_charge(sensor, solved), 20.0 * first + 2.0 * second, rtol=1e-12)
 
 
+# Traces, dents, front and back
+
+
+def midpoints(low, high, step=0.02):
+    """Centres of small cells of a rectangle, shape (n, 2), and their area, mm^2."""
+    counts = np.round(np.subtract(high, low) / step).astype(int)
+    x, y = (a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, counts, strict=True))
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), np.prod(np.subtract(high, low)) / counts.prod()
+
+
+@pytest.mark.parametrize("at", [(4.0, 3.0), (10.5, 2.0), (14.0, 0.2)])  # away, beside the square, on the trace
+def test_a_trace_collects_the_stress_under_it(film, at):
+    """A square with a trace that bends, against sums over small cells of its three rectangles."""
+    path = ((10.0, 0.0), (18.0, 0.0), (18.0, 20.0))
+    traced = Electrode.of_square("A", (10.0, 0.0), 3.0).with_trace(path, 0.5)
+    solved = press(film, Circle(1.0), at, 1.0)
+    expected = 0.0
+    for low, high in (((8.5, -1.5), (11.5, 1.5)), ((11.5, -0.25), (18.25, 0.25)), ((17.75, 0.25), (18.25, 20.0))):
+        points, cell = midpoints(low, high)
+        expected += cell * float((touch_stress(solved, points)[:, :2] @ [D31, D32]).sum())
+    charge = touch_charge(replace(load_sensor("four-25um-uniaxial"), electrodes=(traced,)), solved)
+    assert charge[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_an_electrode_with_a_dent_is_its_two_rectangles(solved):
+    dented = Electrode("A", ((8.0, 0.0), (12.0, 0.0), (12.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0)))
+    lying = Electrode("A", ((8.0, 0.0), (12.0, 0.0), (12.0, 1.0), (8.0, 1.0)))
+    standing = Electrode("B", ((8.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0)))
+    sensor = with_d33()
+    whole, parts, union = (
+        touch_charge(replace(sensor, electrodes=electrodes), solved)
+        for electrodes in ((dented,), (lying, standing), (replace(lying, more=(standing.corners,)),))
+    )
+    np.testing.assert_allclose([whole[0], union[0]], parts.sum(), rtol=1e-6)
+    stress = (lambda x, y: (x**2 - y, x * y, 0 * x)), COARSE
+    whole, parts = (charge_of(replace(sensor, electrodes=e), *stress) for e in ((dented,), (lying, standing)))
+    assert whole[0] == pytest.approx(parts.sum(), rel=1e-12)
+    whole, parts = (
+        contact_charge(replace(sensor, electrodes=e), Circle(1.5), (9.2, 1.1), 1.0)
+        for e in ((dented,), (lying, standing))
+    )
+    assert whole[0] == pytest.approx(parts.sum(), rel=1e-12)
+
+
+def test_only_what_lies_over_the_back_is_pressed_and_warmed():
+    """A back that is the square: its trace collects nothing."""
+    square = Electrode.of_square("A", (10.0, 0.0), 3.0)
+    traced = replace(square.with_trace(((10.0, 0.0), (20.0, 0.0)), 0.5), back=(square.corners,))
+    for charge in (
+        lambda sensor: charge_of(sensor, lambda x, y: (x**2, y, 0 * x)),
+        lambda sensor: contact_charge(sensor, Circle(1.0), (11.5, 0.0), 1.0),
+        lambda sensor: thermal_charge(replace(sensor, piezo=Piezo(1.0, 1.0, 0.0, -30.0)), 0.1),
+    ):
+        there, alone = (charge(with_d33(electrodes=(electrode,))) for electrode in (traced, square))
+        np.testing.assert_allclose(there, alone, rtol=1e-12)
+
+
 def test_pretension_cancels_in_the_touch_charge(film):
     """A feather's touch on a film under 1 MPa: the tension's own 400 pC do not show."""
     taut = replace(load_sensor("four-25um-biaxial"), film=replace(film, pretension=1.0))

@@ -18,6 +18,9 @@ def test_rules_are_distances(sensor):
     by_rim, by_stay = 44.0 - np.hypot([15.0, 8.0, 8.0], [2.0, 44.0, 41.0]), [4.0 - 2.5 - 0.5, 40.0, 37.0]
     assert case.room(places) == pytest.approx(np.minimum(by_rim, by_stay))
     assert case.apart(places[1:2], places)[0] == pytest.approx([42.0 - 2.5, -2.5, 3.0 - 2.5])
+    traced = sensor.electrodes[0].with_trace(((10.0, 0.0), (30.0, 0.0)), 0.5)
+    case_of_trace = replace(case, sensor=replace(sensor, electrodes=(traced, *sensor.electrodes[1:])))
+    assert case_of_trace.room(np.array([[20.0, 3.0], [14.0, -9.0]])) == pytest.approx([3.0 - 1.75, 9.0 - 3.0])
     assert case.spare(places) == pytest.approx([*case.room(places), 39.5, 36.5, 0.5])
 
 

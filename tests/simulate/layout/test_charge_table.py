@@ -9,7 +9,7 @@ from isocharge.simulate import Circle, Electrode, SolveSettings, load_sensor, pr
 from isocharge.simulate.mechanics.theory import theory_for
 
 CENTRES = np.array([[2.0, 1.0], [-7.0, 4.0], [0.5, -12.0]])
-TRIANGLE = Electrode("D", ((8.0, -6.0), (12.0, -5.0), (9.0, -2.0)))
+TRIANGLE = Electrode("D", ((8.0, -6.0), (12.0, -5.0), (9.0, -2.0))).with_trace(((10.0, -5.0), (12.0, -20.0)), 0.5)
 TOLERANCE = (3e-4, 0.01, 0.01, 1e-3, 0.03, 1e-3)
 """For each column, of its largest value; the differences by place and probe radius cross the kink under the probe."""
 

@@ -9,6 +9,7 @@ from isocharge.common.errors import SensorError
 from isocharge.simulate import Calibration, Circle, Electrode, Film, Piezo, Sensor, load_sensor, press, touch_charge
 
 SQUARE = Electrode.of_square("D", (0.0, 0.0), 3.0)
+TRACED = SQUARE.with_trace(((0.0, 0.0), (9.0, 0.0), (9.0, 5.0)), 0.5)
 
 
 @pytest.fixture
@@ -59,19 +60,18 @@ def test_area_and_centre():
     assert Electrode("T", ((0.0, 0.0), (4.0, 0.0), (0.0, 3.0))).area == pytest.approx(6.0)
 
 
-CONVEX = r"electrode 'A': expected a convex polygon with its corners anticlockwise, got \[\["
+SIMPLE = r"electrode 'A': expected a polygon that does not cross itself, .* anticlockwise, got \[\["
 THREE = "electrode 'A': expected 3 to 256 corners"
 
 
 @pytest.mark.parametrize(
     ("corners", "message"),
     [
-        (((0, 0), (0, 3), (3, 3), (3, 0)), CONVEX),  # clockwise
-        (((0, 0), (3, 0), (1, 1), (0, 3)), CONVEX),  # a dent
-        (((0, 0), (1, 0), (2, 0), (0, 2)), CONVEX),  # three in a row
-        (tuple((3 * np.cos(0.8 * np.pi * i), 3 * np.sin(0.8 * np.pi * i)) for i in range(5)), CONVEX),  # a star
+        (((0, 0), (0, 3), (3, 3), (3, 0)), SIMPLE),  # clockwise
+        (((0, 0), (3, 0), (0, 3), (3, 3)), SIMPLE),  # an hourglass
+        (tuple((3 * np.cos(0.8 * np.pi * i), 3 * np.sin(0.8 * np.pi * i)) for i in range(5)), SIMPLE),  # a star
         (((0.0, 0.0), (1.0, 0.0)), THREE),
-        (((0.0, 0.0), (1.0, 0.0), (0.0, np.nan)), CONVEX),
+        (((0.0, 0.0), (1.0, 0.0), (0.0, np.nan)), SIMPLE),
         ((), THREE),
         (((44.0, 0.0), (48.0, 0.0), (46.0, 3.0)), r"'A' .* centre \(46\.0, 1\.0\) mm, corners up to 2\.23607 mm from"),
         (((0, 0), (3e-3, 0), (0, 3e-3)), r"electrode 'A': expected at least 0\.02 mm, .* 0\.003 m are 3 mm"),
@@ -104,6 +104,17 @@ def test_square_that_is_none_is_refused(three):
         ({"electrodes": (SQUARE, SQUARE)}, "expected 1 to 64 different names .*, not 'side_mm', got 2: .*'D'"),
         ({"electrodes": (replace(SQUARE, name="side_mm"),)}, "expected 1 to 64 different names .* got 1: .*'side_mm'"),
         ({"electrodes": (Electrode("T", SQUARE.corners),), "readout": "edge"}, "'edge' needs square .* 'T' is a polyg"),
+        ({"electrodes": (TRACED,), "readout": "edge"}, "'edge' needs square .* 'D' is a polygon"),
+        (
+            {"electrodes": (SQUARE.with_trace(((0, 0), (46, 0)), 0.5),)},
+            r"'D' lies outside the film: .* film radius 45\.0 mm; end its traces before the rim",
+        ),
+        ({"electrodes": (replace(SQUARE, more=TRACED.more),)}, "'D': expected the corners of a square"),
+        (
+            {"electrodes": (replace(TRACED, back=(((9, 9), (10, 9), (9, 10)),)),)},
+            "'D': its front and its back have no area in common",
+        ),
+        ({"electrodes": (TRACED, Electrode.of_square("E", (9.0, 4.0), 3.0))}, "'D' and 'E' overlap"),
         ({"readout": "mean"}, r"expected one of \(.*\), got 'mean'"),
         ({"surface": "inside"}, r"expected one of \(.*\), got 'inside'"),
     ],
@@ -122,6 +133,41 @@ def test_only_electrodes_that_share_area_overlap(three):
     aslant = Electrode("D", ((1.5, -8.0), (2.0, -9.0), (2.5, -6.0)))  # apart along a slanted line only
     for other in (touching, aslant):
         assert len(replace(three, electrodes=(first, other)).electrodes) == 2
+
+
+@pytest.mark.parametrize(
+    ("path", "width", "message"),
+    [
+        (((0, 0),), 0.5, "trace of electrode 'D': expected 3 to 256 corners"),
+        (((0, 0), (0, 0)), 0.5, "trace of electrode 'D': expected a polygon that does not cross itself"),
+        (((0, 0), (9, 0)), 0.0, "does not cross itself"),
+        (((0, 0), (9, 0), (5, 0)), 0.5, "does not cross itself"),
+        (((0, 0), (9, 0), (9, 5), (5, -5)), 0.5, "does not cross itself"),
+    ],
+)
+def test_impossible_traces(path, width, message):
+    with pytest.raises(SensorError, match=message):
+        SQUARE.with_trace(path, width)
+
+
+def test_area_of_a_union_counts_overlaps_once():
+    """A mitred trace is as large as its middle line is long; what lies on the square or on another trace is there."""
+    assert TRACED.area == pytest.approx(9.0 + 0.5 * (14.0 - 1.5), rel=1e-12)
+    twice = TRACED.with_trace(((9.0, 0.0), (4.0, 0.0)), 0.5)
+    assert twice.area == pytest.approx(TRACED.area, rel=1e-12)
+    assert twice.centre == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("back", "area"),
+    [
+        (((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)), 9.0 + 0.5 * 0.5),  # a larger square
+        (((0.0, 0.0), (20.0, 0.0), (20.0, 20.0), (0.0, 20.0)), 2.25 + 0.25 * 7.75 + 0.5 * 4.75),  # a quarter
+        (((-3.0, 0.0), (0.0, -3.0), (3.0, 0.0), (0.0, 3.0)), 9.0 + 0.5 * 1.5 - 0.25**2),  # a diamond
+    ],
+)
+def test_what_front_and_back_have_in_common_collects(back, area):
+    assert replace(TRACED, back=(back,)).area == pytest.approx(area, rel=1e-12)
 
 
 # Calibration

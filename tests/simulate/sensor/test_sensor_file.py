@@ -131,6 +131,15 @@ def test_polygons_need_no_side():
     assert sensor_from_dict(table).electrodes == (Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0))),)
 
 
+def test_traces_and_metal_of_the_back_arrive():
+    """A trace is written as the polygon that it is."""
+    pad, back = ((8.0, 0.0), (12.0, 0.0), (10.0, 4.0)), (((0.0, -9.0), (9.0, -9.0), (9.0, 9.0), (0.0, 9.0)),)
+    table = {"polygon_mm": pad, "trace_mm": [[10, 0], [10, -5]], "width_mm": 0.5, "back_mm": back}
+    (electrode,) = sensor_from_dict(whole() | {"readout": "area", "electrodes": {"A": table}}).electrodes
+    trace = ((9.75, 0.0), (9.75, -5.0), (10.25, -5.0), (10.25, 0.0))
+    assert electrode == Electrode("A", pad, more=(trace,), back=back)
+
+
 # Errors
 
 
@@ -192,6 +201,16 @@ def test_wrong_type_is_named(path):
             r"electrodes\.A\.polygon_mm\[1\]: expected \[x, y\] in mm",
         ),
         (("electrodes", "A"), {"polygon_mm": []}, "electrode 'A': expected 3 to 256 corners"),
+        (
+            ("electrodes", "A"),
+            {"polygon_mm": [[0, 0], [1, 0], [0, 1]], "trace_mm": [[0, 0], [9, 0]]},
+            r"electrodes\.A\.width_mm: expected trace_mm and a width_mm above 0 together",
+        ),
+        (
+            ("electrodes", "A"),
+            {"polygon_mm": [[0, 0], [1, 0], [0, 1]], "back_mm": [[0, 0]]},
+            r"electrodes\.A\.back_mm\[1\]\[1\]: expected \[x, y\] in mm",
+        ),
         (
             ("electrodes", "B"),
             [25.0, 25.0],
@@ -295,9 +314,12 @@ NAMES = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6) | st.sampl
 )
 
 
+L_SHAPE = ((-1.0, -1.0), (2.0, -1.0), (2.0, 0.0), (0.5, 0.0), (0.5, 2.0), (-1.0, 2.0))
+
+
 @st.composite
 def electrodes(draw: st.DrawFn) -> tuple[Electrode, ...]:
-    """Squares, of one side or of several, and convex polygons, none of which overlap; any names."""
+    """Squares, of one side or of several, and polygons with traces and a back, none of which overlap; any names."""
     names = draw(st.lists(NAMES.filter(lambda name: name != "side_mm"), min_size=1, max_size=5, unique=True))
     places = draw(st.permutations([(x, y) for x in (-6.0, 0.0, 6.0) for y in (-6.0, 0.0, 6.0)]))
     shapes = []
@@ -310,6 +332,10 @@ def electrodes(draw: st.DrawFn) -> tuple[Electrode, ...]:
             angles = draw(st.floats(0.0, 6.0)) + 2.0 * np.pi * np.arange(corners) / corners
             points = zip(x + size * np.cos(angles), y + size * np.sin(angles), strict=True)
             shapes.append(Electrode(name, tuple((float(a), float(b)) for a, b in points)))
+        if draw(st.booleans()):
+            shapes[-1] = shapes[-1].with_trace(((x, y), (x, y + 2.0), (x + draw(st.floats(-1.0, 1.0)), y + 2.8)), 0.3)
+        if draw(st.booleans()):
+            shapes[-1] = replace(shapes[-1], square=False, back=(tuple((x + a, y + b) for a, b in L_SHAPE),))
     return tuple(shapes)
 
 
@@ -349,6 +375,6 @@ def test_what_is_written_is_loaded(name, shapes, film, piezo, gains, rotation, s
     again, table = load_sensor(path), sensor_to_dict(sensor)
     assert tomllib.loads(path.read_text("utf-8")) == table
     assert (again.name, again.surface, again.electrode_names) == (name, surface, sensor.electrode_names)
-    corners = [[shape.corners for shape in each.electrodes] for each in (again, sensor)]
+    corners = [[(shape.front, shape.back) for shape in each.electrodes] for each in (again, sensor)]
     np.testing.assert_allclose(numbers(corners[0]), numbers(corners[1]), rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(numbers(sensor_to_dict(again)), numbers(table), rtol=1e-11)

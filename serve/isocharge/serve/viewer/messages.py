@@ -230,27 +230,30 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
         field: How the film deflects; None if nobody computed it.
     """
     sensor = metadata.sensor
-    film = sensor.get("film")
+    film, shapes = sensor.get("film"), _shapes_mm(sensor, metadata.electrodes)
+    more = {electrode: polygons[1:] for electrode, polygons in shapes.items() if polygons[1:]}
     return {
         "name": name,
         "model": metadata.label,
         "sensor": metadata.frame_id,
         "electrodes": list(metadata.electrodes),
-        "outlines_mm": _outlines_mm(sensor, metadata.electrodes),
+        "outlines_mm": {electrode: polygons[0] for electrode, polygons in shapes.items()},
         "radius_mm": film.get("radius_mm") if isinstance(film, dict) else None,
         "working_area_mm": [[float(x), float(y)] for x, y in metadata.working_area_mm],
         "force_range_N": list(metadata.force_range_N),
         "probes": list(metadata.probes),
         "deflection": None if field is None else field.to_json(),
+        **({"more_mm": more} if more else {}),
     }
 
 
-def _outlines_mm(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[float]]]:
-    """Corners of each electrode where it lies on the real film; none for a sensor of another form."""
+def _shapes_mm(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[list[float]]]]:
+    """Corners of each electrode's pad and of its further metal, on the real film; none for a sensor of another form."""
     try:
         # not `Positive`: msgspec 0.22 crashes on a tuple of fixed length beside a number with bounds
         parts = convert(sensor["electrodes"], dict[str, Point | float | _Polygon], "sensor", InputError)
-        return {name: _placed(_corners(parts, name), sensor.get("calibration") or {}) for name in electrodes}
+        calibration = sensor.get("calibration") or {}
+        return {name: [_placed(polygon, calibration) for polygon in _polygons(parts, name)] for name in electrodes}
     except (InputError, TypeError, ValueError, KeyError):
         return {}
 
@@ -260,13 +263,14 @@ Point = tuple[Finite, Finite]
 
 class _Polygon(Struct):
     polygon_mm: list[Point]
+    more_mm: list[list[Point]] = []
 
 
-def _corners(parts: Mapping[str, Any], name: str) -> list[Point]:
+def _polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]:
     if isinstance(part := parts[name], _Polygon):
-        return part.polygon_mm
+        return [part.polygon_mm, *part.more_mm]
     (x, y), half = part, 0.5 * parts["side_mm"]
-    return [(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]
+    return [[(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]]
 
 
 def _placed(corners: list[tuple[float, float]], calibration: Any) -> list[list[float]]:

@@ -20,7 +20,7 @@ with require("design"):
     from ezdxf.document import Drawing
 
 LAYERS = {"FILM": 7, "ELECTRODES": 1, "LEADS": 30, "RULER": 8, "NAMES": 8}
-"""Layers and their colours, numbers of the AutoCAD colour index."""
+"""Layers and their colours, numbers of the AutoCAD colour index; BACK is there if a back is described."""
 
 RULER, TICK = 50.0, 10.0
 """Length of the ruler and distance of its ticks, mm: with it a print shows whether its scale is right."""
@@ -43,8 +43,14 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
     space.add_circle((0.0, 0.0), radius, dxfattribs={"layer": "FILM"})
     for path in leads.paths.values():
         space.add_lwpolyline(path.tolist(), dxfattribs={"layer": "LEADS", "const_width": leads.width})
+    behind = dict.fromkeys(polygon for electrode in sensor.electrodes for polygon in electrode.back)
+    if behind:
+        document.layers.add("BACK", color=5)
+    for polygon in behind:
+        space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "BACK"})
     for electrode in sensor.electrodes:
-        space.add_lwpolyline(electrode.corners, close=True, dxfattribs={"layer": "ELECTRODES"})
+        for polygon in electrode.front:
+            space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "ELECTRODES"})
         name = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in electrode.name)
         space.add_text(name, height=HEIGHT, dxfattribs={"layer": "NAMES"}).set_placement(max(electrode.corners))
     y, left = -radius - BELOW, -0.5 * RULER

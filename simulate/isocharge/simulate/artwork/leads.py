@@ -70,9 +70,9 @@ def _ways(centre: Array, radius: float) -> Array:
 
 
 def _from_box(points: Array, electrode: Electrode) -> float:
-    """Smallest distance of points from the box round an electrode, mm."""
-    low, high = np.min(electrode.corners, axis=0), np.max(electrode.corners, axis=0)
-    return float(np.hypot(*np.maximum(np.maximum(low - points, points - high), 0.0).T).min())
+    """Smallest distance of points from the boxes round the parts of an electrode, mm."""
+    low, high = (corners[:, None] for corners in electrode.boxes)
+    return float(np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=2).min())
 
 
 def _from_lead(points: Array, lead: Array) -> float:

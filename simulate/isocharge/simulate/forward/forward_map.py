@@ -28,7 +28,7 @@ from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.probe import Probe
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor import Electrode, Sensor
 from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
 
@@ -209,10 +209,14 @@ class ForwardMap:
 
     def _near(self, at: Complexes) -> np.ndarray:
         """Which electrodes need the fine rule for which presses, shape (n, n_electrode)."""
-        corners = [self.sensor.calibration.place(np.array(e.corners)) for e in self.sensor.electrodes]
+        return np.stack([self._near_one(at, electrode) for electrode in self.sensor.electrodes], axis=1)
+
+    def _near_one(self, at: Complexes, electrode: Electrode) -> np.ndarray:
+        """Which presses are near a part of an electrode, shape (n,)."""
+        corners = [self.sensor.calibration.place(part) for part in electrode.parts]
         centre = np.array([c.mean(axis=0) @ [1.0, 1j] for c in corners])
         reach = np.array([np.linalg.norm(c - c.mean(axis=0), axis=1).max() for c in corners])
-        return np.asarray(np.abs(at[:, None] - centre) < reach + self.probe.reach + NEAR)
+        return np.asarray((np.abs(at[:, None] - centre) < reach + self.probe.reach + NEAR).any(axis=1))
 
     def _read(
         self,

@@ -17,9 +17,15 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SensorError
 from isocharge.simulate.numerics.interpolation import gauss_line, gauss_square
-from isocharge.simulate.numerics.polygon import area_in_disk, gauss_polygon, shared_area
+from isocharge.simulate.numerics.polygon import (
+    area_in_disk,
+    gauss_polygon,
+    gauss_quadrilateral,
+    shared_area,
+    to_complex,
+)
 from isocharge.simulate.sensor.probe import Circle, Probe
-from isocharge.simulate.sensor.sensor import Electrode, Readout, Sensor
+from isocharge.simulate.sensor.sensor import LONGEST_PART, Electrode, Readout, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
 
 DIRECT, FINE, COARSE = 20, 12, 4
@@ -99,17 +105,19 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     """
     if sensor.piezo.d33 == 0.0:
         return np.zeros(len(sensor.electrodes))
-    covered = [_covered(sensor.calibration.place(np.array(e.corners)), probe, complex(*at)) for e in sensor.electrodes]
+    covered = [
+        sum(_covered(sensor.calibration.place(part), probe, complex(*at)) for part in electrode.parts)
+        for electrode in sensor.electrodes
+    ]
     charge: Array = -0.5 * sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered)
     return charge
 
 
 def _covered(corners: Array, probe: Probe, at: complex) -> float:
-    """Area of an electrode under a footprint, mm^2."""
-    electrode = corners @ np.array([1.0, 1j])
+    """Area of a part of an electrode under a footprint, mm^2."""
     if isinstance(probe, Circle):
-        return area_in_disk(electrode, at, probe.radius)
-    return shared_area(electrode, at + probe.outline)
+        return area_in_disk(to_complex(corners), at, probe.radius)
+    return shared_area(to_complex(corners), at + probe.outline)
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:
@@ -134,8 +142,12 @@ def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
         unit, share = gauss_square(per_side)
         low, high = np.array(electrode.corners[0]), np.array(electrode.corners[2])
         points = low + unit * (high - low)
+    elif len(electrode.parts) == 1:
+        points, share = gauss_polygon(electrode.parts[0], per_side)
     else:
-        points, share = gauss_polygon(np.array(electrode.corners), per_side)
+        rules = [gauss_quadrilateral(part, per_side, LONGEST_PART) for part in electrode.parts]
+        points, weights = (np.concatenate(values) for values in zip(*rules, strict=True))
+        share = weights / weights.sum()
     return points, np.repeat(share[:, None], 3, axis=1)
 
 

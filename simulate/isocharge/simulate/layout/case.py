@@ -178,7 +178,7 @@ class DesignCase:
             raise InputError(f"keep: {len(self.keep)} of {self.electrodes} electrodes stay: there is nothing to place")
         if self.stay and self.sensor.calibration != Calibration():
             raise InputError(f"keep: {self.sensor.name} is calibrated; start from its layout without [calibration]")
-        sides = {e.corners[1][0] - e.corners[0][0] for e in self.stay}
+        sides = {e.corners[1][0] - e.corners[0][0] for e in self.stay if e.square}
         if self.sensor.readout == "edge" and any(abs(side - self.square_side) > 1e-6 for side in sides):
             raise InputError(f"side: with the readout 'edge' all squares have one side, got {self.square_side:g} mm")
 
@@ -223,8 +223,8 @@ class DesignCase:
         half = 0.5 * self.square_side
         spare = [self.sensor.film.radius - self.rim - np.hypot(*(np.abs(places) + half).T)]
         for electrode in self.stay:
-            low, high = np.min(electrode.corners, axis=0), np.max(electrode.corners, axis=0)
-            spare.append((np.maximum(low - places, places - high) - half).max(axis=1) - self.gap)
+            for low, high in zip(*electrode.boxes, strict=True):
+                spare.append((np.maximum(low - places, places - high) - half).max(axis=1) - self.gap)
         return np.asarray(np.min(spare, axis=0))
 
     def apart(self, places: Array, others: Array) -> Array:

@@ -1,11 +1,11 @@
-"""Convex polygons and disks in the plane: area, centroid, convexity, how much of one lies in another, and integrals."""
+"""Polygons and disks in the plane: area, centroid, how much of one lies in another, convex parts, and integrals."""
 
 from itertools import pairwise
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
-from isocharge.simulate.numerics.interpolation import gauss_square
+from isocharge.simulate.numerics.interpolation import gauss_line, gauss_square
 
 
 def area_of(corners: Array) -> float:
@@ -31,14 +31,25 @@ def is_convex(corners: Array) -> bool:
     return bool(np.all(turn > 0.0) and left.min() >= -1e-9 * left.max())
 
 
-def overlap(first: Array, second: Array) -> bool:
-    """Whether two convex polygons share area: no edge normal separates them (separating axis theorem)."""
+def overlap(first: Array, second: Array, within: float = 0.0) -> bool:
+    """Whether two convex polygons share area, or are apart by less than `within`: no edge normal separates them."""
     for polygon in (first, second):
         edge = np.roll(polygon, -1, axis=0) - polygon
         for normal in np.stack([edge[:, 1], -edge[:, 0]], axis=1):
-            if (first @ normal).max() <= (second @ normal).min() or (second @ normal).max() <= (first @ normal).min():
+            one, other, gap = first @ normal, second @ normal, within * float(np.hypot(*normal))
+            if one.max() + gap <= other.min() or other.max() + gap <= one.min():
                 return False
     return True
+
+
+def to_complex(corners: Array) -> Complexes:
+    """Corners of shape (n, 2) as x + iy."""
+    return np.asarray(corners @ np.array([1.0, 1j]))
+
+
+def to_corners(z: Complexes) -> Array:
+    """Corners x + iy as (x, y), shape (n, 2)."""
+    return np.stack([z.real, z.imag], axis=1)
 
 
 def shared_area(first: Complexes, second: Complexes) -> float:
@@ -49,7 +60,7 @@ def shared_area(first: Complexes, second: Complexes) -> float:
         clipped = _left_of(clipped, side)
         if clipped.size < 3:
             return 0.0
-    return area_of(np.stack([clipped.real, clipped.imag], axis=1))
+    return area_of(to_corners(clipped))
 
 
 def _left_of(corners: Complexes, side: Array) -> Complexes:
@@ -101,3 +112,23 @@ def gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
         shares.append(share * s[:, 0] * (one[0] * two[1] - one[1] * two[0]))
     total = np.concatenate(shares)
     return np.concatenate(points), total / total.sum()
+
+
+def bilinear(z: Complexes, s: Array, t: Array) -> Complexes:
+    """Points of a quadrilateral, or a triangle, whose corners x + iy are those of the unit square (s, t)."""
+    a, b, c, d = z[[0, 1, 2, -1]]
+    return np.asarray(a + (b - a) * s + (d - a) * t + (a - b + c - d) * s * t)
+
+
+def gauss_quadrilateral(corners: Array, count: int, length: float) -> tuple[Array, Array]:
+    """Gauss points of a quadrilateral or triangle, shape (n, 2), and weights, which add up to its area.
+
+    A square mapped bilinearly; `count` points along a side of `length`, fewer, but two, along a shorter one.
+    """
+    z = to_complex(corners)
+    a, b, c, d = z[[0, 1, 2, -1]]
+    sides = max(abs(b - a), abs(c - d)), max(abs(d - a), abs(c - b))
+    (s, share_s), (t, share_t) = (gauss_line(min(count, max(2, int(np.ceil(count * side / length))))) for side in sides)
+    s = s[:, None]
+    turn = np.conj((b - a) * (1.0 - t) + (c - d) * t) * ((d - a) * (1.0 - s) + (c - b) * s)
+    return to_corners(bilinear(z, s, t).ravel()), (np.outer(share_s, share_t) * turn.imag).ravel()

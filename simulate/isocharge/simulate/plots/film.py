@@ -20,11 +20,14 @@ INNER = 0.999999
 def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool = True, ink: str = INK) -> None:
     """Outlines of the electrodes at their calibrated positions, with their names."""
     for electrode in sensor.electrodes:
-        corners = sensor.calibration.place(np.array(electrode.corners))
         colour = FELT if electrode.name == highlight else ink
-        axes.add_patch(Patch(corners, fill=False, ec=colour, lw=1.6, zorder=3))
+        for polygons, style in ((electrode.front, "-"), (electrode.back, "--")):
+            for polygon in polygons:
+                corners = sensor.calibration.place(np.array(polygon))
+                axes.add_patch(Patch(corners, fill=False, ec=colour, lw=1.6, ls=style, zorder=3))
         if names:
-            axes.annotate(electrode.name, corners.mean(axis=0), ha="center", va="center", color=colour, fontsize=9)
+            centre = sensor.calibration.place(np.array(electrode.centre))
+            axes.annotate(electrode.name, centre, ha="center", va="center", color=colour, fontsize=9)
 
 
 def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "", colour: str = FELT) -> None:

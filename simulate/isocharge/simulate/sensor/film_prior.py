@@ -200,8 +200,8 @@ class FilmPrior:
 
 
 def _shapes(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
-    """Corners of the electrodes as described, mm, rounded to a nanometre."""
-    return {e.name: [(round(x, 6), round(y, 6)) for x, y in e.corners] for e in sensor.electrodes}
+    """Corners of what collects as described, mm, rounded to a nanometre."""
+    return {e.name: [(round(x, 6), round(y, 6)) for part in e.parts for x, y in part] for e in sensor.electrodes}
 
 
 def _centres(sensor: Sensor) -> str:

@@ -3,7 +3,8 @@
 Frame: origin at the film's centre, x along the drawn direction (1), y transverse (2), z the way the probe pushes.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
 from typing import Literal, get_args
 
@@ -11,7 +12,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SensorError, cut, shown
-from isocharge.simulate.numerics.polygon import area_of, is_convex, overlap
+from isocharge.simulate.numerics.polygon import area_of, is_convex, overlap, to_complex, to_corners
+from isocharge.simulate.numerics.polygon_union import is_simple, pieces, trace_outline, union_parts
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.size_check import check_length
 
@@ -23,6 +25,9 @@ MOST_CORNERS = 256
 LEAST_EXTENT = 0.02
 """Smallest extent of an electrode along x or y, the larger of both, mm: smaller numbers are in metres."""
 
+LONGEST_PART = 3.0
+"""Longest side of the parts into which what is no convex polygon is cut, mm."""
+
 LONGEST_NAME = 100
 """Longest name of an electrode, characters."""
 
@@ -30,19 +35,27 @@ MOST_ELECTRODES = 64
 """Largest number of electrodes on a film; each is checked against all others."""
 
 
+Corners = tuple[tuple[float, float], ...]
+"""Corners (x, y) of a polygon, anticlockwise, mm; it may have dents, but not cross itself."""
+
+
 @dataclass(frozen=True)
 class Electrode:
-    """One sensing element.
+    """One sensing element: what its metal on the front and that on the back have in common collects.
 
     Attributes:
         name: As in the sensor file.
-        corners: Corners of a convex polygon, anticlockwise, mm.
+        corners: The pad.
         square: Whether it comes from `of_square`; only squares have the edges that the edge readout averages over.
+        more: Further metal of the front, such as traces; where polygons overlap, their area counts once.
+        back: Metal of the back; none stands for a back that is metal all over.
     """
 
     name: str
-    corners: tuple[tuple[float, float], ...]
+    corners: Corners
     square: bool = False
+    more: tuple[Corners, ...] = ()
+    back: tuple[Corners, ...] = ()
 
     @classmethod
     def of_square(cls, name: str, centre: tuple[float, float], side: float) -> "Electrode":
@@ -51,14 +64,57 @@ class Electrode:
         corners = ((x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half))
         return cls(name, corners, square=True)
 
+    def with_trace(self, path: Corners, width: float) -> "Electrode":
+        """The electrode with a trace on its front, a line through the points of `path` with a width, mm.
+
+        Raises:
+            SensorError: If the path has fewer than two points or the same twice, or the trace crosses itself.
+        """
+        outline = to_corners(trace_outline(to_complex(np.array(path)), width))
+        polygon = tuple((float(x), float(y)) for x, y in outline)
+        check_polygon(f"trace of electrode {self.name!r}", polygon)
+        return replace(self, square=False, more=(*self.more, polygon))
+
+    @property
+    def front(self) -> tuple[Corners, ...]:
+        """The pad and the further metal of the front."""
+        return (self.corners, *self.more)
+
+    @cached_property
+    def parts(self) -> tuple[Array, ...]:
+        """What collects, without common area: a convex polygon, or quadrilaterals and triangles; (n, 2) each, mm.
+
+        Raises:
+            SensorError: If a polygon crosses itself or has too few or too many corners.
+        """
+        for polygon in (*self.front, *self.back):
+            check_polygon(f"electrode {self.name!r}", polygon)
+        pad = np.array(self.corners)
+        if not (self.more or self.back) and is_convex(pad):
+            return (pad,)
+        front, back = ([to_complex(np.array(polygon)) for polygon in side] for side in (self.front, self.back))
+        return tuple(to_corners(piece) for part in union_parts(front, back) for piece in pieces(part, LONGEST_PART))
+
     @property
     def area(self) -> float:
-        """Area, mm^2."""
-        return area_of(np.array(self.corners))
+        """Area that collects, mm^2."""
+        return sum(area_of(part) for part in self.parts)
+
+    @cached_property
+    def boxes(self) -> tuple[Array, Array]:
+        """Lower left and upper right corners of the boxes round the parts, each of shape (n_part, 2), mm."""
+        low, high = (np.array([end(part, axis=0) for part in self.parts]) for end in (np.min, np.max))
+        return low, high
+
+    def overlaps(self, other: "Electrode", within: float = 0.0) -> bool:
+        """Whether the two collect from the same area, or are apart by less than `within`, mm."""
+        (low, high), (other_low, other_high) = self.boxes, other.boxes
+        near = (low[:, None] <= other_high + within) & (other_low - within <= high[:, None])
+        return any(overlap(self.parts[i], other.parts[j], within) for i, j in np.argwhere(near.all(axis=2)))
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Mean of the corners, mm."""
+        """Mean of the pad's corners, mm."""
         x, y = np.mean(self.corners, axis=0)
         return float(x), float(y)
 
@@ -116,7 +172,7 @@ class Sensor:
             if self.readout == "edge" and not electrode.square:
                 raise SensorError(f"readout 'edge' needs square electrodes, but {electrode.name!r} is a polygon")
         for first, second in combinations(self.electrodes, 2):
-            if overlap(np.array(first.corners), np.array(second.corners)):
+            if first.overlaps(second):
                 raise SensorError(f"electrodes {first.name!r} and {second.name!r} overlap; move one of them")
 
     @property
@@ -145,31 +201,46 @@ def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration)
     """Refuse an electrode that cannot exist on a film.
 
     Raises:
-        SensorError: If it is no convex polygon, tiny, a square that is none, or not wholly on the film.
+        SensorError: If a polygon crosses itself, nothing collects, it is tiny, a square that is none, or not wholly on
+            the film.
     """
-    corners, name = np.array(electrode.corners), f"electrode {electrode.name!r}"
-    if corners.ndim != 2 or not 3 <= len(corners) <= MOST_CORNERS or corners.shape[1] != 2:
-        raise SensorError(f"{name}: expected 3 to {MOST_CORNERS} corners (x, y), got {shown(corners.tolist())}")
-    if not (np.isfinite(corners).all() and is_convex(corners)):
-        raise SensorError(
-            f"{name}: expected a convex polygon with its corners anticlockwise, got {shown(corners.tolist())} mm"
-        )
+    name, parts = f"electrode {electrode.name!r}", electrode.parts
+    if not parts:
+        raise SensorError(f"{name}: its front and its back have no area in common, so nothing collects; move one")
+    corners = np.array(electrode.corners)
     check_length(name, float(np.ptp(corners, axis=0).max()), LEAST_EXTENT, SensorError)
     side = float(corners[1, 0] - corners[0, 0])
     square = Electrode.of_square(electrode.name, electrode.centre, side).corners
-    if electrode.square and not (len(corners) == 4 and np.allclose(corners, square, rtol=0.0, atol=1e-9 * side)):
+    alone = len(corners) == 4 and not (electrode.more or electrode.back)
+    if electrode.square and not (alone and np.allclose(corners, square, rtol=0.0, atol=1e-9 * side)):
         raise SensorError(
             f"{name}: expected the corners of a square along the axes, got {corners.tolist()} mm; make squares with "
             "Electrode.of_square"
         )
-    placed = calibration.place(corners)
+    placed = calibration.place(np.concatenate(parts))
     if not np.linalg.norm(placed, axis=1).max() < film.radius:
         x, y = placed.mean(axis=0)
         reach = np.linalg.norm(placed - placed.mean(axis=0), axis=1).max()
         size = f"half side {_short(0.5 * side)} mm" if electrode.square else f"corners up to {_short(reach)} mm from it"
         raise SensorError(
             f"{name} lies outside the film: centre ({_short(x)}, {_short(y)}) mm, {size}, "
-            f"film radius {_short(film.radius)} mm"
+            f"film radius {_short(film.radius)} mm" + "; end its traces before the rim" * bool(electrode.more)
+        )
+
+
+def check_polygon(where: str, polygon: Corners) -> None:
+    """Refuse what is no simple polygon.
+
+    Raises:
+        SensorError: If it crosses itself, runs clockwise, or has too few or too many corners.
+    """
+    corners = np.array(polygon)
+    if corners.ndim != 2 or not 3 <= len(corners) <= MOST_CORNERS or corners.shape[1] != 2:
+        raise SensorError(f"{where}: expected 3 to {MOST_CORNERS} corners (x, y), got {shown(corners.tolist())}")
+    if not (np.isfinite(corners).all() and (is_convex(corners) or is_simple(to_complex(corners)))):
+        raise SensorError(
+            f"{where}: expected a polygon that does not cross itself, with its corners anticlockwise, got "
+            f"{shown(corners.tolist())} mm"
         )
 
 

@@ -24,7 +24,7 @@ from isocharge.common.structs import (
 )
 from isocharge.common.toml_text import to_toml
 from isocharge.simulate.sensor.film import Film, Piezo, Surface
-from isocharge.simulate.sensor.sensor import Calibration, Electrode, Readout, Sensor
+from isocharge.simulate.sensor.sensor import Calibration, Corners, Electrode, Readout, Sensor
 from isocharge.simulate.sensor.size_check import tidy
 
 FARTHEST_MM = 1e6
@@ -59,9 +59,13 @@ class PiezoTable(Settings, frozen=True):
 
 
 class PolygonTable(Settings, frozen=True):
-    """An electrode that is no square."""
+    """An electrode that is no square: its pad, further polygons and a trace on the front, polygons on the back."""
 
     polygon_mm: tuple[Point, ...]
+    more_mm: tuple[tuple[Point, ...], ...] = ()
+    trace_mm: tuple[Point, ...] = ()
+    width_mm: NotNegative = 0.0
+    back_mm: tuple[tuple[Point, ...], ...] = ()
 
 
 class CalibrationTable(Settings, frozen=True):
@@ -87,6 +91,9 @@ class SensorTable(Settings, frozen=True):
         for name, value in self.electrodes.items():
             if name != SIDE and isinstance(value, float):
                 raise WrongKey(f"electrodes.{name}", "[x, y] in mm or a table", value)
+            if isinstance(value, PolygonTable) and bool(value.trace_mm) != (value.width_mm > 0.0):
+                missing = "width_mm" if value.trace_mm else "trace_mm"
+                raise WrongKey(f"electrodes.{name}.{missing}", "trace_mm and a width_mm above 0 together")
         side = self.electrodes.get(SIDE)
         if side is not None and not (isinstance(side, float) and 0.0 < side <= FARTHEST_MM):
             raise WrongKey(f"electrodes.{SIDE}", f"a number above 0 and at most {FARTHEST_MM:g}", side)
@@ -213,9 +220,15 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
         if sides.get(electrode.name) == shared is not None:
             tables[electrode.name] = [tidy(value) for value in electrode.centre]
         else:
-            corners = [[tidy(value) for value in corner] for corner in electrode.corners]
-            tables[electrode.name] = {"polygon_mm": corners}
+            tables[electrode.name] = {"polygon_mm": _corners(electrode.corners)}
+            for key, polygons in (("more_mm", electrode.more), ("back_mm", electrode.back)):
+                if polygons:
+                    tables[electrode.name][key] = [_corners(polygon) for polygon in polygons]
     return tables
+
+
+def _corners(polygon: Corners) -> list[list[float]]:
+    return [[tidy(value) for value in corner] for corner in polygon]
 
 
 def _build(file: SensorTable) -> Sensor:
@@ -235,6 +248,7 @@ def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[E
     side = table.get(SIDE)
     for name, value in table.items():
         if isinstance(value, PolygonTable):
-            yield Electrode(name, value.polygon_mm)
+            electrode = Electrode(name, value.polygon_mm, more=value.more_mm, back=value.back_mm)
+            yield electrode.with_trace(value.trace_mm, value.width_mm) if value.trace_mm else electrode
         elif isinstance(value, tuple) and isinstance(side, float):
             yield Electrode.of_square(name, value, side)

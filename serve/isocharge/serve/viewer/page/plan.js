@@ -58,6 +58,7 @@ export class Plan {
     const outline = this.film.outlines_mm[name];
     if (!outline) return;
     g.fillStyle = theme[`c${k % 6}`] + "30"; g.strokeStyle = theme[`c${k % 6}`]; g.lineWidth = 2 * px;
+    for (const polygon of this.film.more_mm?.[name] ?? []) { path(g, polygon); g.fill(); }
     path(g, outline); g.fill(); g.setLineDash(DASHES[k % 6].map((d) => d * px)); g.stroke(); g.setLineDash([]);
     const x = mean(outline, 0), y = mean(outline, 1);
     this.text(g, name, x, y, 15 * px, theme.ink, "center", "600");

@@ -142,7 +142,7 @@ export class Relief {
     this.line(closed(this.film.working_area_mm), theme.accent);
     this.film.electrodes.forEach((name, k) => {
       const outline = this.film.outlines_mm[name];
-      if (outline) this.line(closed(outline), theme[`c${k % 6}`]);
+      for (const polygon of outline ? [outline, ...this.film.more_mm?.[name] ?? []] : []) this.line(closed(polygon), theme[`c${k % 6}`]);
     });
   }
 
