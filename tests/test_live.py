@@ -61,13 +61,9 @@ def test_two_held_presses(tau):
 
 def test_ten_minutes_of_rest_give_no_touch():
     """The whole of `bench`, film temperature wandering included."""
-    measurement = load_amplifier("bench").start(3, RATE_HZ, np.random.default_rng(0))
-    output = measurement(np.zeros((120_000, 3)))
-    chain = Chain(gain_pC=1 / measurement.gain, tau_s=np.full(3, 10.0), hum=HumRule())
-    state = ChainState.start(3)
-    for k, row in enumerate(output):
-        state, reading = advance(chain, state, row, k / RATE_HZ, 1 / RATE_HZ)
-        assert not reading.contact
+    part = load_amplifier("bench").start(3, RATE_HZ, np.random.default_rng(0))
+    _, contact = undo(part, np.zeros((120_000, 3)), 0)
+    assert not contact.any()
 
 
 def test_first_reading_comes_within_50_ms_of_a_touch():

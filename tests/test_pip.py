@@ -145,34 +145,18 @@ def test_a_missing_extra_says_so_in_python_too(base, tmp_path, stage):
 
 
 @pytest.mark.parametrize(
-    ("words", "extra"), [("simulate point three-25um-biaxial", "simulate"), ("serve http --port 0", "http")]
+    ("words", "extra"),
+    [
+        ("simulate point three-25um-biaxial", "simulate"),
+        ("serve http --port 0", "http"),
+        ("serve stream three-25um-biaxial --port - --mcap touch.mcap", "record"),
+    ],
 )
 def test_a_missing_extra_says_how_to_get_it(base, tmp_path, words, extra):
     done = run(base, "isocharge", *words.split(), cwd=tmp_path)
     assert done.returncode == 1
     assert f"pip install 'isocharge[{extra}]'" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("extras", "present", "absent"),
-    [
-        (("base",), ("onnxruntime", "serial", "typer"), ("scipy", "matplotlib", "torch", "uvloop", "grpc", "dask")),
-        (("simulate",), ("scipy", "matplotlib"), ("torch", "sklearn", "onnx", "uvloop", "dask")),
-        (("train",), ("scipy", "torch", "onnx"), ("uvloop", "grpc", "dask")),
-        (("http",), ("uvloop",), ("scipy", "grpc")),
-        (("grpc",), ("uvloop", "grpc"), ("scipy", "torch")),
-        (("all",), ("scipy", "torch", "grpc", "dask"), ()),
-    ],
-)
-def test_the_examples_of_a_page_find_the_packages_of_its_install_only(installed, extras, present, absent):
-    code = (
-        "import sys\nfrom importlib.util import find_spec\nfor name in sys.argv[1:]:\n"
-        "    try:\n        assert find_spec(name)\n    except ModuleNotFoundError as error:\n        print(error.name)"
-    )
-    words = [sys.executable, "-c", code, *present, *absent]
-    done = subprocess.run(words, env=installed(*extras), capture_output=True, text=True, check=True)
-    assert done.stdout.split() == [*absent]
 
 
 @pytest.mark.slow

@@ -26,11 +26,12 @@ from matplotlib.ticker import FormatStrFormatter, NullFormatter, ScalarFormatter
 from isocharge.serve import MeasuredPresses
 from isocharge.serve.benchmark import machine
 from isocharge.simulate import Circle, ForwardMap, load_sensor
+from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.plots.figure import new_figure
 from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.baselines.gauss_newton import GaussNewton
 from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
-from isocharge.train.data.presses import draw_contacts
+from isocharge.train.data.presses import draw_contacts, position_error
 
 SENSORS = ("four-25um-biaxial", "three-25um-biaxial", "four-25um-uniaxial")
 COUNTS = (1, 3, 5, 8, 15, 30)
@@ -46,8 +47,7 @@ def problem_of(sensor: str) -> CalibrationProblem:
 
 def errors(answer: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     """Root-mean-square errors of the position, mm, and of the force, %."""
-    squares = ((answer[:, :2] - truth[:, :2]) ** 2).sum(axis=1)
-    return float(np.sqrt(squares.mean())), float(100.0 * np.sqrt(np.mean((answer[:, 2] / truth[:, 2] - 1.0) ** 2)))
+    return rms(position_error(answer, truth)), 100.0 * rms(answer[:, 2] / truth[:, 2] - 1.0)
 
 
 def as_read(problem: CalibrationProblem, contact: np.ndarray, charge: np.ndarray, rng: Any) -> MeasuredPresses:
@@ -138,35 +138,31 @@ def summary(records: list[dict[str, Any]]) -> dict[str, Any]:
     """Medians over films, and the largest ratio to the limit."""
     table: dict[str, Any] = {
         "films": len(records),
-        "noise_mm": _rms(record["noise"][0] for record in records),
-        "uncalibrated": [_rms(record["uncalibrated"][axis] for record in records) for axis in (0, 1)],
+        "noise_mm": rms([record["noise"][0] for record in records]),
+        "uncalibrated": [rms([record["uncalibrated"][axis] for record in records]) for axis in (0, 1)],
     }
     for count in COUNTS:
         rows = [record["by_count"][count] for record in records]
         ratio, force = np.array([row["left"] for row in rows]).T / np.array([row["limit"] for row in rows]).T
         entry = {
-            "left_mm": _rms(row["left"][0] for row in rows),
-            "left_percent": _rms(row["left"][1] for row in rows),
-            "limit_mm": _rms(row["limit"][0] for row in rows),
-            "limit_percent": _rms(row["limit"][1] for row in rows),
+            "left_mm": rms([row["left"][0] for row in rows]),
+            "left_percent": rms([row["left"][1] for row in rows]),
+            "limit_mm": rms([row["limit"][0] for row in rows]),
+            "limit_percent": rms([row["limit"][1] for row in rows]),
             "ratio_median": float(np.median(ratio)),
             "ratio_max": float(ratio.max()),
             "force_ratio_median": float(np.median(force)),
             "force_ratio_max": float(force.max()),
-            "error_mm": _rms(row["error"][0] for row in rows),
-            "error_percent": _rms(row["error"][1] for row in rows),
+            "error_mm": rms([row["error"][0] for row in rows]),
+            "error_percent": rms([row["error"][1] for row in rows]),
             "bad": sum(row["bad"] for row in rows),
             "seconds_median": float(np.median([row["seconds"] for row in rows])),
         }
         for method in ("gains_only", "gauss_newton"):
             values = [row[method] for row in rows if method in row]
-            entry[method] = [_rms(value[axis] for value in values) for axis in (0, 1)] if values else None
+            entry[method] = [rms([value[axis] for value in values]) for axis in (0, 1)] if values else None
         table[str(count)] = entry
     return table
-
-
-def _rms(values: Any) -> float:
-    return float(np.sqrt(np.mean(np.square(list(values)))))
 
 
 def picture(tables: dict[str, dict[str, Any]], path: Path) -> None:

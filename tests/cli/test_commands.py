@@ -237,19 +237,6 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(command, tmp_path, monke
     assert list(Path().iterdir()) == []
 
 
-def test_an_unknown_option_is_usage(command):
-    assert command("simulate", "point", SENSOR, "--no-such-option")[0] == 2
-
-
-def test_an_existing_output_is_kept(command, tmp_path):
-    (tmp_path / "presses").mkdir()
-    (tmp_path / "presses" / "mine.txt").write_text("keep me")
-    code, _, err = command("simulate", "sweep", SENSOR, "--samples", 100, "-o", tmp_path / "presses")
-    assert code == 1
-    assert "OutputExists" in err
-    assert (tmp_path / "presses" / "mine.txt").read_text() == "keep me"
-
-
 def quick(folder):
     path = folder / "quick.toml"
     path.write_text("[training]\nsteps = 200\nmisfit_steps = 50\nmisfit_charges = 1000\n")

@@ -1,15 +1,17 @@
 """Calibrating at a port: the dialogue against a list of events, and the command against a board that presses."""
 
 import json
+import os
+import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from isocharge.cli.train.press_dialogue import Dialogue, Screen, Stopped
+from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, Screen, Stopped
 from isocharge.common.errors import PortLost
-from isocharge.serve import Frame, encode_frame, read_presses
+from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_frame, read_presses
 from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, Watched
 from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
@@ -189,6 +191,30 @@ def desk(film, places, tmp_path, monkeypatch):
     (tmp_path / "rest.bin").write_bytes(b"".join(board(film, places[2:], seed=1)))
     np.savetxt(tmp_path / "list.csv", places, fmt="%.17g", delimiter=",", header="x_mm,y_mm,force_N", comments="")
     return tmp_path
+
+
+def test_a_press_that_had_begun_is_left_out_and_a_line_is_not(film, places):
+    """The board waits in the middle of its first press until the dialogue wants the next."""
+    (reader, keyboard), armed = os.pipe(), threading.Event()
+
+    def chunks():
+        for number, data in enumerate(board(film, places[:2])):
+            if number == 440:
+                armed.wait(60)
+            yield Chunk(data, number / RATE_HZ, 0)
+
+    with PressEvents(chunks(), ReadingStream(NAMES), PressWatch(NAMES), reader) as events:
+        coming = iter(events.next, None)
+        assert any(event.phase is Phase.settling for event in coming)
+        os.write(keyboard, b"u 1\n")
+        assert "u 1\n" in coming
+        events.arm()
+        armed.set()
+        press = next(event.press for event in coming if event.press)
+        with pytest.raises(Stopped):
+            list(coming)
+    np.testing.assert_allclose(press.charge_pC, film.charges(places[1:2])[0], rtol=0.01, atol=2.0)
+    os.close(keyboard)
 
 
 CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial", "-o", "film")

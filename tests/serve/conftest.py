@@ -5,6 +5,8 @@ charges then gives the force and their weighted mean the position, exactly, and 
 perfect model: what the serving path answers can be compared with what was pressed.
 """
 
+import errno
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from boards import TcpBoard, taps
 from isocharge.serve import ModelMetadata, PredictionRecord, Predictor, write_model
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import HttpServer
@@ -183,6 +186,32 @@ def start_http(stopping):
     for server, _ in started:
         server.stop()
     stopping.extend(started)
+
+
+@pytest.fixture
+def board(film):
+    """A board that is pressed at (3, -2) mm with 1 N for 0.1 s, each 0.25 s."""
+    with TcpBoard(taps(film)) as board:
+        yield board
+
+
+@pytest.fixture
+def fill_disk(monkeypatch):
+    """Let files take so many bytes until the disk is full."""
+
+    def fill(room):
+        write, left = os.write, [room]
+
+        def write_until_full(descriptor, data):
+            if not left[0]:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            taken = write(descriptor, bytes(data)[: left[0]])
+            left[0] -= taken
+            return taken
+
+        monkeypatch.setattr("os.write", write_until_full)
+
+    return fill
 
 
 @pytest.fixture

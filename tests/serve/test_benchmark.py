@@ -10,9 +10,7 @@ from isocharge.serve.benchmark import (
     LEAST_CALLS,
     ROUNDS,
     Contender,
-    Timing,
     in_process_contenders,
-    machine,
     press_charges,
     take_turns,
 )
@@ -60,14 +58,6 @@ def test_a_turn_lasts_as_long_as_it_should():
     assert clock.now == pytest.approx(1e7, rel=0.02)
 
 
-def test_percentiles_are_numpy_s():
-    durations = np.random.default_rng(0).exponential(1e5, 5000)
-    timing = Timing.of("x", 3, durations)
-    assert timing.p50_us == pytest.approx(np.quantile(durations, 0.5) / 1e3)
-    assert timing.p99_us == pytest.approx(np.quantile(durations, 0.99) / 1e3)
-    assert timing.presses_per_s == pytest.approx(3 / durations.mean() * 1e9)
-
-
 def test_ways_predict_what_the_model_does():
     folder = find_model("three-25um-biaxial")
     model, predictor = load_model(folder), Predictor(folder)
@@ -81,11 +71,6 @@ def test_ways_predict_what_the_model_does():
     one, batch = contenders[1].call(), contenders[2].call()
     assert tuple(one) == tuple(predictor.predict(charges[0]))
     assert len(batch.x_mm) == 16
-
-
-def test_the_machine_names_its_versions():
-    assert machine()["numpy"] == np.__version__
-    assert set(machine()) == {"cpu", "cores", "system", "python", "numpy", "onnxruntime"}
 
 
 def test_the_command_prints_a_table_and_json(command):

@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Predictor, TouchStream, load_device
 from isocharge.serve.examination.listening import Heard
 from isocharge.serve.examination.port_check import device_text, findings
@@ -220,23 +219,6 @@ def test_a_board_gets_to_a_right_touch(name, written):
     check_touch([json.loads(record.to_json()) for chunk in chunks for record in stream.feed(chunk)], kind.model)
 
 
-@pytest.mark.parametrize(
-    ("name", "asked"),
-    [
-        ("offset binary", "--pc-per-unit NUMBER, negative"),
-        ("CSV counts, dead inputs", "--pc-per-unit NUMBER, negative"),
-        ("volts", "--feedback-pf"),
-    ],
-)
-def test_what_cannot_be_seen_is_asked_for(name, asked, written):
-    """Raw counts are never called pC, and a file without their charge is refused, not guessed."""
-    examination = examined(Board(ZOO[name]), ZOO[name], {})
-    assert asked in " ".join(examination.missing)
-    assert examination.unit != "pC"
-    with pytest.raises(DeviceError, match=r"gain\.pC_per_unit"):
-        load_device(written(examination))
-
-
 def test_a_board_that_is_plugged_in(command, tmp_path):
     """By the commands, over a pseudo-terminal; at first for a model of four electrodes, which does not fit."""
     kind, port, stop = Kind(answer, model=THREE), PseudoPort(), threading.Event()
@@ -257,6 +239,8 @@ def test_a_board_that_is_plugged_in(command, tmp_path):
         assert "3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')" in out
         assert f"models of 3 electrodes: {THREE}" in err
         assert command(*doctor, "--model", THREE, "--write", path)[0] == 0
+        code, _, err = command(*doctor, "--model", THREE, "--write", path)
+        assert (code, "not overwritten" in err) == (1, True)
         rest = sent + 600  # of which the port may hold two hundred that nobody reads
         code, out, err = command("serve", "stream", THREE, "--port", port.url, "--device", path, "--count", "750")
         assert code == 0, err

@@ -57,13 +57,6 @@ def start(start_command):
 
 
 @pytest.fixture
-def board(film):
-    """A board that is tapped again and again."""
-    with TcpBoard(taps(film)) as board:
-        yield board
-
-
-@pytest.fixture
 def board_until(film):
     """A board that is tapped, and does something after so many frames; by default it ends the command with Ctrl-C."""
 

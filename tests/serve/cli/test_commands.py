@@ -250,23 +250,6 @@ def resting(film):
     return play
 
 
-def noise(charge_pC, rng):
-    return charge_pC + rng.normal(0.0, 0.3, charge_pC.shape)
-
-
-def test_doctor_in_words(resting, models, run):
-    with resting(noise=noise, offset_pC=[5.0, -6.0, 150.0]) as sensor:
-        result = run("doctor", "--port", sensor.url, "--seconds", 0.8, "--model", "linear", "--models", models)
-    for said in (
-        "at 115200 baud: binary frames of isocharge",
-        "0 bad pieces",
-        "0 lost, 0 repeated; a device clock",
-        "rest near zero on channel 3: 150 pC",
-        "the amplifier's time constants",
-    ):
-        assert said in result.stdout
-
-
 def test_doctor_as_json_waits_for_its_port(resting, run, tmp_path):
     link = tmp_path / "film"
     with resting(offset_pC=[5.0, -6.0, 7.0]) as sensor:
@@ -283,20 +266,6 @@ def test_doctor_fails_where_nothing_is_recognised(command):
     code, out, _ = command("serve", "doctor", "--port", silent.url, "--seconds", 0.5)
     silent.close()
     assert (code, "not one byte came" in out) == (1, True)
-
-
-def test_doctor_writes_a_file_that_works(resting, models, command, tmp_path, run):
-    path = tmp_path / "board.toml"
-    encode = lambda frame: b"%d;" % frame.seq + b";".join(b"%.3f" % q for q in frame.values) + b"\n"  # noqa: E731
-    with resting(noise=noise, encode=encode) as sensor:
-        words = ["--port", sensor.url, "--seconds", 0.5, "--model", "linear", "--models", models]
-        code, _, err = command("serve", "doctor", *words, "--write", path)
-        assert (code, f"{path} written" in err) == (0, True)
-        again, _, err = command("serve", "doctor", *words, "--write", path)
-        assert (again, "not overwritten" in err) == (1, True)
-        streamed = run("stream", "linear", "--port", sensor.url, "--device", path, "--count", 150, "--models", models)
-    assert 'columns = ["seq", "ch1", "ch2", "ch3"]' in path.read_text()
-    assert records_of(streamed.stdout)[-1]["tare_pC"] is not None
 
 
 @pytest.mark.parametrize(

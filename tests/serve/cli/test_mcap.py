@@ -7,7 +7,6 @@ import errno
 import json
 import os
 import re
-import sys
 
 import numpy as np
 import pytest
@@ -92,16 +91,6 @@ def test_a_full_disk_costs_the_file_and_an_exit_code(command, frames, models, tm
     assert code == 1
     assert f"{path}: stopped (No space left on device); what was written until now is whole" in err
     assert " frames, 0 lost" in err
-
-
-def test_without_the_extra(command, frames, models, tmp_path, monkeypatch):
-    for name in [name for name in sys.modules if name.startswith(("mcap", "isocharge.serve.export.mcap"))]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "mcap", None)
-    path = tmp_path / "touch.mcap"
-    code, _, err = command("serve", "stream", "linear", "--port", frames, "--models", models, "--mcap", path)
-    assert (code, path.exists()) == (1, False)
-    assert "'mcap', which is not installed; pip install 'isocharge[record]'" in err
 
 
 @pytest.fixture

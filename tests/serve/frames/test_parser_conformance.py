@@ -240,21 +240,17 @@ def test_fuzz_of_ten_million_bytes(name):
     check_fuzzed(name, 10_000_000, seed=1)
 
 
-def follow(*numbers):
+@pytest.mark.parametrize(
+    ("numbers", "counts", "flags"),
+    [
+        ((65534, 65535, 0, 1), (0, 0, 0), [()] * 4),
+        ((65530, 65533, 2, 2, 3, 0, 1), (2 + 4, 1, 1), [(), ("gap",), ("gap",), ("repeat",), (), ("restart",), ()]),
+    ],
+)
+def test_sequence_gaps_repeats_and_restarts(numbers, counts, flags):
     gaps = SequenceGaps()
-    flags = [gaps.update(seq) for seq in numbers]
-    return (gaps.lost, gaps.repeated, gaps.restarts), flags
-
-
-def test_sequence_without_gaps_wraps():
-    counts, flags = follow(65534, 65535, 0, 1)
-    assert (counts, flags) == ((0, 0, 0), [()] * 4)
-
-
-def test_sequence_gaps_repeats_and_restarts():
-    counts, flags = follow(65530, 65533, 2, 2, 3, 0, 1)
-    assert counts == (2 + 4, 1, 1)
-    assert flags == [(), ("gap",), ("gap",), ("repeat",), (), ("restart",), ()]
+    assert [gaps.update(seq) for seq in numbers] == flags
+    assert (gaps.lost, gaps.repeated, gaps.restarts) == counts
 
 
 def test_numbers_of_one_byte_wrap_at_256():

@@ -1,7 +1,6 @@
 """A recording gives the same records again, whatever happened meanwhile."""
 
 import base64
-import errno
 import json
 import os
 import time
@@ -124,18 +123,10 @@ def test_replay_ends_with_the_last_record_wherever_the_recorder_was_interrupted(
     assert played(path, predictor) == lines
 
 
-def test_recording_on_a_full_disk_stays_readable(tmp_path, film, predictor, monkeypatch, caplog):
+def test_recording_on_a_full_disk_stays_readable(tmp_path, film, predictor, fill_disk, caplog):
     """The disk takes half a line and then no more; the live path goes on."""
-    path, write, room = tmp_path / "touch.rec", os.write, [9000]
-
-    def write_until_full(descriptor, data):
-        if not room[0]:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        taken = write(descriptor, bytes(data)[: room[0]])
-        room[0] -= taken
-        return taken
-
-    monkeypatch.setattr("os.write", write_until_full)
+    path = tmp_path / "touch.rec"
+    fill_disk(9000)
     lines = record(path, film, predictor)
     assert len(lines) > 60
     assert path.stat().st_size < 9000

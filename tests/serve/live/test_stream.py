@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from isocharge.common.errors import ChargeError, ModelError, PortError, TareError
+from isocharge.common.errors import ChargeError, ModelError, PortError
 from isocharge.serve import (
     Chain,
     Chunk,
@@ -166,48 +166,9 @@ def test_other_number_of_charges_is_refused(play):
         play(Frame(10, 0, (1.0, 2.0, 3.0, 4.0)))
 
 
-def test_film_that_is_touched_cannot_be_tared(predictor):
-    rows = np.cumsum(np.ones((60, 3)), axis=0) * 20.0
-    with pytest.raises(TareError):
-        list(stream([chunk(f) for f in frames(rows)], predictor, Chain(tare=TareRule(frames=10, patience=50))))
-
-
 def test_bytes_that_are_no_frames_are_refused(predictor):
     noise = [Chunk(bytes(range(128, 256)) * 4, 0.0, 0)] * 50
     with pytest.raises(
         PortError, match=r"no intact frame among the first \d+ bytes .*nothing recognised yet: check baud"
     ):
         list(stream(noise, predictor))
-
-
-@pytest.fixture
-def four(make_film, tmp_path):
-    """The linear film with four electrodes, and its model."""
-    film = make_film(4)
-    film.write(tmp_path)
-    return film, Predictor("linear", models=tmp_path)
-
-
-def test_warming_is_estimated_in_contact_only(four):
-    """This model's misfit says nothing about a common charge: the record says that it is blind."""
-    film, predictor = four
-    board = device_from_table({"tare": {"frames": 10}, "common_mode": {"every_s": 0.01}}, "test")
-    press = film.charge_pC(np.array([2.0]), np.array([1.0]), np.array([0.5]))[0]
-    path = TouchStream(predictor, board)
-    records = [r for f in frames([np.zeros(4)] * 15 + [press] * 15 + [np.zeros(4)] * 5) for r in path.feed(chunk(f))]
-    assert ["blind" in record.flags for record in records] == [False] * 16 + [True] * 14 + [False] * 5
-
-
-def test_warming_is_subtracted_where_the_misfit_shows_it(four, monkeypatch):
-    """A misfit that knows the press: the common charge goes into the tare, and the record says so."""
-    film, predictor = four
-    press = film.charge_pC(np.array([2.0]), np.array([1.0]), np.array([0.5]))[0]
-    path = TouchStream(predictor, device_from_table({"tare": {"frames": 10}, "common_mode": {}}, "test"))
-    monkeypatch.setattr(path._readings, "_misfit", lambda q: np.abs(q - press).max(axis=1))
-    rows = [np.zeros(4)] * 15 + [press + 40.0 * k / 200 for k in range(400)] + [np.full(4, 80.0)] * 5
-    records = [record for frame in frames(rows) for record in path.feed(chunk(frame))]
-    assert "thermal" not in records[20].flags
-    assert "thermal" in records[400].flags
-    assert records[414].force_N == pytest.approx(0.5, rel=0.02)
-    assert records[414].tare_pC["A"] == pytest.approx(80.0, abs=8.0)
-    assert not records[-1].contact

@@ -293,10 +293,6 @@ def test_foreign_props_are_left_alone(film):
     assert ModelMetadata.from_props(props, WHERE) == film.metadata()
 
 
-def test_label_and_frame(film):
-    assert (film.metadata().label, film.metadata().frame_id) == ("linear/1", "linear-film")
-
-
 def test_other_format_version(film):
     props = film.metadata().to_props() | {"format_version": "2"}
     with pytest.raises(ModelError) as caught:

@@ -5,20 +5,10 @@ import socket
 import stat
 
 import pytest
-import trustme
 
 from isocharge.common.errors import InputError, ListenError, TokenError
 from isocharge.serve.network.address import Address, Tls, Token, check_exposure
 from isocharge.serve.network.http import HttpServer
-
-
-@pytest.fixture(scope="module")
-def pem_files(tmp_path_factory):
-    """A folder with a certificate and its key."""
-    folder, issued = tmp_path_factory.mktemp("tls"), trustme.CA().issue_cert("127.0.0.1")
-    issued.cert_chain_pems[0].write_to_path(folder / "cert.pem")
-    issued.private_key_pem.write_to_path(folder / "key.pem")
-    return folder
 
 
 @pytest.mark.parametrize("token", ["", " a", "a\n", "a\r\nb: c", "schlüssel"])
@@ -30,9 +20,8 @@ def test_tokens_that_no_header_carries(token):
 @pytest.mark.parametrize(
     ("certificate", "key"), [("none.pem", None), ("cert.pem", None), ("key.pem", "cert.pem"), (".", None)]
 )
-def test_tls_files_that_cannot_be_used(handler, pem_files, certificate, key):
-    folder = pem_files
-    tls = Tls(folder / certificate, key and folder / key)
+def test_tls_files_that_cannot_be_used(handler, tls_files, certificate, key):
+    tls = Tls(tls_files / certificate, key and tls_files / key)
     with pytest.raises(InputError, match=r"pem.*|tls.*: not a certificate and its unencrypted private key"):
         HttpServer(handler, Address(), tls=tls)
 

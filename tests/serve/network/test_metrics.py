@@ -120,15 +120,11 @@ def test_misfit_alarms_are_the_flags_of_records():
 
 def test_counts_are_exact_with_many_clients(handler, start_http):
     """Eight clients over HTTP and four over gRPC at once, good requests and bad."""
-    url = start_http(handler).url.removeprefix("http://")
+    url = start_http(handler).url
 
-    def over_http(number):
-        with tritonclient.http.InferenceServerClient(url) as client:
-            return [infer(client, tritonclient.http, number + i) for i in range(60)]
-
-    def over_grpc(number):
-        with tritonclient.grpc.InferenceServerClient(grpc_url.removeprefix("grpc://")) as client:
-            return [infer(client, tritonclient.grpc, number + i) for i in range(30)]
+    def ask(module, address, first, count):
+        with module.InferenceServerClient(address.rpartition("/")[2]) as client:
+            return [infer(client, module, first + number) for number in range(count)]
 
     def infer(client, module, number):
         charges = np.ones((1 + number % 3, 3 if number % 5 else 2), np.float32)
@@ -141,7 +137,8 @@ def test_counts_are_exact_with_many_clients(handler, start_http):
         return len(charges)
 
     with grpc_server(handler, "127.0.0.1", 0) as grpc_url, ThreadPoolExecutor(12) as pool:
-        jobs = [pool.submit(over_http, n) for n in range(8)] + [pool.submit(over_grpc, n) for n in range(4)]
+        jobs = [pool.submit(ask, tritonclient.http, url, n, 60) for n in range(8)]
+        jobs += [pool.submit(ask, tritonclient.grpc, grpc_url, n, 30) for n in range(4)]
         presses = [n for job in jobs for n in job.result()]
     samples, of = scrape(handler), {"model": "linear", "version": "2"}
     good, bad = sum(n > 0 for n in presses), presses.count(0)

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-from inspect import isawaitable
 
 import numpy as np
 import pytest
@@ -14,45 +13,18 @@ from tritonclient.utils import InferenceServerException
 from isocharge.serve import Predictor
 from isocharge.serve.network.grpc import grpc_server
 
-CLIENTS = ("http", "aio", "grpc")
 
-
-class AsyncClient:
-    """The asyncio client with the manners of the other one."""
-
-    def __init__(self, loop, address):
-        self._loop, self._client = loop, None
-        self._client = self(tritonclient.http.aio.InferenceServerClient, address)
-
-    def __call__(self, method, *arguments, **named):
-        async def call():
-            value = method(*arguments, **named)
-            return await value if isawaitable(value) else value
-
-        return self._loop.run_until_complete(call())
-
-    def __getattr__(self, name):
-        return lambda *arguments, **named: self(getattr(self._client, name), *arguments, **named)
-
-
-@pytest.fixture(params=CLIENTS)
+@pytest.fixture(params=("http", "grpc"))
 def client(request, handler, start_http):
     if request.param == "grpc":
-        with grpc_server(handler, "127.0.0.1", 0) as url:
-            stock = tritonclient.grpc.InferenceServerClient(url.removeprefix("grpc://"))
+        with (
+            grpc_server(handler, "127.0.0.1", 0) as url,
+            tritonclient.grpc.InferenceServerClient(url.removeprefix("grpc://")) as stock,
+        ):
             yield stock
-            stock.close()
-        return
-    address = start_http(handler).url.removeprefix("http://")
-    if request.param == "http":
-        stock = tritonclient.http.InferenceServerClient(address)
-        yield stock
-        stock.close()
-        return
-    with asyncio.Runner() as runner:
-        stock = AsyncClient(runner.get_loop(), address)
-        yield stock
-        stock.close()
+    else:
+        with tritonclient.http.InferenceServerClient(start_http(handler).url.removeprefix("http://")) as stock:
+            yield stock
 
 
 @pytest.fixture
@@ -127,6 +99,24 @@ def test_compressed_both_ways(client, module, film, tmp_path, way, n):
             request_compression_algorithm=way,
             response_compression_algorithm=way,
         )
+    for name, rows in expected(tmp_path, values).items():
+        np.testing.assert_array_equal(answer.as_numpy(name), rows)
+
+
+@pytest.mark.parametrize("way", [None, "gzip"])
+def test_the_client_for_asyncio(handler, start_http, film, tmp_path, way):
+    values = charges(film, 200)
+
+    async def ask():
+        async with tritonclient.http.aio.InferenceServerClient(
+            start_http(handler).url.removeprefix("http://")
+        ) as stock:
+            inputs = [tensor(tritonclient.http, values)]
+            return await stock.infer(
+                "linear", inputs, request_compression_algorithm=way, response_compression_algorithm=way
+            )
+
+    answer = asyncio.run(ask())
     for name, rows in expected(tmp_path, values).items():
         np.testing.assert_array_equal(answer.as_numpy(name), rows)
 

@@ -6,6 +6,7 @@ import struct
 import urllib.request
 from threading import Event, Thread
 
+import numpy as np
 import pytest
 from websockets.asyncio.client import connect
 
@@ -78,12 +79,9 @@ class Client:
 
     def __init__(self, socket, form):
         self.socket, self.form = socket, form
-        self.states, self.errors, self.plays = [], [], []
 
     async def samples(self, confirm=True):
-        """The next message of samples: (header, rows); others are kept on the way."""
-        import numpy as np
-
+        """The next message of samples: (header, rows); texts are passed over."""
         while True:
             data = await asyncio.wait_for(self.socket.recv(), 20)
             if isinstance(data, bytes):
@@ -91,7 +89,6 @@ class Client:
                 if confirm:
                     await self.confirm(header[3])
                 return header, np.frombuffer(data, self.form.dtype, offset=HEADER.size)
-            self._note(json.loads(data))
 
     async def text(self, key):
         """Wait for a text message with a key."""
@@ -101,7 +98,6 @@ class Client:
                 await self.confirm(HEADER.unpack_from(data)[3])
                 continue
             content = json.loads(data)
-            self._note(content)
             if key in content:
                 return content[key]
 
@@ -110,11 +106,6 @@ class Client:
 
     async def ask(self, **content):
         await self.socket.send(json.dumps(content))
-
-    def _note(self, content):
-        for key, notes in (("state", self.states), ("error", self.errors), ("play", self.plays)):
-            if key in content:
-                notes.append(content[key])
 
 
 @pytest.fixture

@@ -15,19 +15,12 @@ import pytest
 from mcap.reader import make_reader
 from websockets.asyncio.client import connect
 
-from boards import TcpBoard, taps
+from boards import taps
 from isocharge.serve import Frame, Recording, encode_frame
 from isocharge.serve.port.recording import Marker
 from isocharge.serve.viewer.messages import CONTACT_BIT, HEADER, SampleFormat
 
 FORM = SampleFormat(("A", "B", "C"))
-
-
-@pytest.fixture
-def board(film):
-    """A press at (3, -2) mm of 1 N for 0.1 s, each 0.25 s."""
-    with TcpBoard(taps(film)) as board:
-        yield board
 
 
 @pytest.fixture

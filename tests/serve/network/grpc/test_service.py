@@ -4,21 +4,20 @@ Clients that open calls and say nothing: refused or bounded by what their metada
 """
 
 import itertools
-import socket
 import subprocess
 import sys
 import time
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from threading import Event
 
 import grpc
 import numpy as np
 import pytest
-import trustme
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
-from isocharge.common.errors import InputError, ListenError
+from isocharge.common.errors import InputError
 from isocharge.serve.network.address import ServerLimits, Tls, Token
 from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.grpc.service import METHODS, SERVICE
@@ -28,14 +27,15 @@ PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inferenc
 
 
 @pytest.fixture
-def start(handler):
-    """Start servers; a function that calls a method by name."""
+def serve(store):
+    """Start servers with limits of the test's; a function that makes channels to them."""
     with ExitStack() as stack:
 
-        def start(**named):
-            url = stack.enter_context(grpc_server(named.pop("handler", handler), "127.0.0.1", 0, **named))
-            channel = stack.enter_context(grpc.insecure_channel(url.removeprefix("grpc://")))
-            return lambda name, **fields: call(channel, name, **fields)
+        def start(token=None, **limits):
+            handler = Handler(store, ServerLimits(**limits), token=token)
+            url = stack.enter_context(grpc_server(handler, "127.0.0.1", 0)).removeprefix("grpc://")
+            # a separate connection for each channel
+            return lambda: stack.enter_context(grpc.insecure_channel(url, [("grpc.use_local_subchannel_pool", 1)]))
 
         yield start
 
@@ -57,8 +57,8 @@ def tensor(charges, datatype="FP32", **fields):
 
 
 @pytest.mark.parametrize("datatype", ["FP32", "FP64"])
-def test_numbers_that_are_not_raw(start, film, predictor, datatype):
-    answer = start()("ModelInfer", model_name="linear", id="7", inputs=[tensor(film.golden_pC(), datatype)])
+def test_numbers_that_are_not_raw(serve, film, predictor, datatype):
+    answer = call(serve()(), "ModelInfer", model_name="linear", id="7", inputs=[tensor(film.golden_pC(), datatype)])
     contact, std, misfit = answer.outputs
     assert (answer.id, list(answer.raw_output_contents)) == ("7", [])
     assert [output.name for output in answer.outputs] == ["contact", "contact_std", "misfit"]
@@ -95,21 +95,20 @@ def test_numbers_that_are_not_raw(start, film, predictor, datatype):
         ({"model_version": "9"}, "NOT_FOUND", "'linear/9' is not found"),
     ],
 )
-def test_bad_requests_are_refused_with_the_reason(start, fields, status, said):
+def test_bad_requests_are_refused_with_the_reason(serve, fields, status, said):
     with pytest.raises(grpc.RpcError, match=said) as caught:
-        start()("ModelInfer", **{"model_name": "linear", **fields})
+        call(serve()(), "ModelInfer", **{"model_name": "linear", **fields})
     assert caught.value.code() is grpc.StatusCode[status]
 
 
-def test_a_message_beyond_the_limit(start, store):
-    ask = start(handler=Handler(store, ServerLimits(body_bytes=1000)))
+def test_a_message_beyond_the_limit(serve):
     with pytest.raises(grpc.RpcError) as caught:
-        ask("ModelInfer", model_name="linear", raw_input_contents=[bytes(2000)])
+        call(serve(body_bytes=1000)(), "ModelInfer", model_name="linear", raw_input_contents=[bytes(2000)])
     assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
 
 
-def test_a_token(start, store):
-    ask = start(handler=Handler(store, token=Token("open sesame")))
+def test_a_token(serve):
+    ask = partial(call, serve(token=Token("open sesame"))())
     assert ask("ServerLive").live
     assert ask("ServerReady").ready
     assert ask("ServerMetadata", metadata=[("authorization", "Bearer open sesame")]).name == "isocharge"
@@ -119,42 +118,27 @@ def test_a_token(start, store):
         assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
 
 
-def test_tls(handler, tmp_path):
-    authority = trustme.CA()
-    issued = authority.issue_cert("127.0.0.1")
-    issued.private_key_and_cert_chain_pem.write_to_path(tmp_path / "both.pem")
+def test_tls(handler, authority, tls_files):
     trusted = grpc.ssl_channel_credentials(authority.cert_pem.bytes())
     with (
-        grpc_server(handler, "127.0.0.1", 0, tls=Tls(tmp_path / "both.pem")) as url,
+        grpc_server(handler, "127.0.0.1", 0, tls=Tls(tls_files / "both.pem")) as url,
         grpc.secure_channel(url.removeprefix("grpcs://"), trusted) as channel,
     ):
         assert call(channel, "ServerLive").live
     with (
         pytest.raises(InputError, match="not a certificate"),
-        grpc_server(handler, "127.0.0.1", 0, tls=Tls(tmp_path / "none.pem")),
+        grpc_server(handler, "127.0.0.1", 0, tls=Tls(tls_files / "none.pem")),
     ):
         pass
 
 
-def test_a_port_that_is_taken(handler):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with (
-            pytest.raises(ListenError, match=f"cannot listen on 127.0.0.1:{port} for gRPC"),
-            grpc_server(handler, "127.0.0.1", port),
-        ):
-            pass
-
-
-def test_errors_that_are_ours_are_not_told(start, store, monkeypatch, caplog):
+def test_errors_that_are_ours_are_not_told(serve, store, monkeypatch, caplog):
     def fail(*_):
         raise ZeroDivisionError("a secret")
 
     monkeypatch.setattr(store, "all", fail)
     with pytest.raises(grpc.RpcError, match="internal error") as caught:
-        start()("ServerReady")
+        call(serve()(), "ServerReady")
     assert caught.value.code() is grpc.StatusCode.INTERNAL
     assert "a secret" in caplog.text
 
@@ -166,20 +150,6 @@ def test_compiled_messages_are_those_of_the_source(tmp_path):
     subprocess.run(words, check=True)
     kept, new = (FileDescriptorSet.FromString(path.read_bytes()) for path in (PROTO.with_suffix(".binpb"), made))
     assert kept == new
-
-
-@pytest.fixture
-def serve(store):
-    """Start servers with limits of the test's; a function that makes channels to them."""
-    with ExitStack() as stack:
-
-        def start(token=None, **limits):
-            handler = Handler(store, ServerLimits(**limits), token=token)
-            url = stack.enter_context(grpc_server(handler, "127.0.0.1", 0)).removeprefix("grpc://")
-            # a separate connection for each channel
-            return lambda: stack.enter_context(grpc.insecure_channel(url, [("grpc.use_local_subchannel_pool", 1)]))
-
-        yield start
 
 
 @pytest.fixture

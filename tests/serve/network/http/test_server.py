@@ -7,16 +7,14 @@ import socket
 import ssl
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event
 
 import numpy as np
 import pytest
-import trustme
 
-from isocharge.serve.network.address import Address, ServerLimits, Tls, Token
-from isocharge.serve.network.http import HttpServer
+from isocharge.serve.network.address import ServerLimits, Tls, Token
 from isocharge.serve.network.protocol import Handler
 
 INFER = "/v2/models/linear/infer"
@@ -77,8 +75,21 @@ def refused(data):
     return int(head.split(b" ")[1]), json.loads(body)["error"]
 
 
-def is_well(server):
-    return statuses(exchange(server, infer(LAST))) == [200]
+def is_well(server, headers=b""):
+    return statuses(exchange(server, infer(LAST + headers))) == [200]
+
+
+def is_refused(server):
+    with suppress(ConnectionRefusedError), connect(server):
+        return False
+    return True
+
+
+def wait_until(condition):
+    end = time.monotonic() + 30
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.02)
+    assert condition()
 
 
 @pytest.fixture
@@ -90,21 +101,6 @@ def limited(store, start_http):
 @pytest.fixture
 def server(limited):
     return limited()
-
-
-@contextmanager
-def running(handler):
-    """A server that the block stops, and that has stopped after it."""
-    server = HttpServer(handler, Address())
-    thread = Thread(target=server.run)
-    thread.start()
-    try:
-        yield server
-    finally:
-        server.stop()
-        thread.join(30)
-        server.close()
-        assert not thread.is_alive()
 
 
 def test_a_stock_client(server, predictor):
@@ -190,10 +186,7 @@ def test_too_many_connections(limited):
             held.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
             held.recv(1000)
         assert refused(exchange(server, b"")) == (503, "all 3 connections are taken; try again later")
-    end = time.monotonic() + 30
-    while not is_well(server) and time.monotonic() < end:
-        time.sleep(0.02)
-    assert is_well(server)
+    wait_until(lambda: is_well(server))
 
 
 def test_slow_clients_hold_nobody_up(limited):
@@ -297,10 +290,10 @@ def test_a_load_holds_nobody_up(server, slow_load):
         assert statuses(connection.recv(1000)) == [200]
 
 
-def test_stopping_finishes_what_has_begun(handler, slow_load):
+def test_stopping_finishes_what_has_begun(server, slow_load):
     """A load, and a request that is still coming; idle connections end, and no request comes after."""
     began, go_on = slow_load
-    with running(handler) as server, connect(server) as loads, connect(server) as begun, connect(server) as idle:
+    with connect(server) as loads, connect(server) as begun, connect(server) as idle:
         loads.sendall(LOAD)
         begun.sendall(infer()[:-5])
         idle.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
@@ -314,45 +307,17 @@ def test_stopping_finishes_what_has_begun(handler, slow_load):
             data = everything(connection)
             assert statuses(data) == [200]
             assert b"connection: close" in data
-    with pytest.raises(ConnectionRefusedError):
-        connect(server)
+    wait_until(lambda: is_refused(server))
 
 
 def test_a_token(store, start_http):
     server = start_http(Handler(store, token=Token("open sesame")))
-    assert is_open(server, b"Authorization: Bearer open sesame\r\n")
+    assert is_well(server, b"Authorization: Bearer open sesame\r\n")
     for wrong in (b"", b"Authorization: Bearer open\r\n", b"Authorization: open sesame\r\n"):
         data = exchange(server, infer(LAST + wrong))
         assert (statuses(data), b"www-authenticate: Bearer" in data) == ([401], True)
         assert "`Authorization: Bearer TOKEN`" in refused(data)[1]
     assert statuses(exchange(server, b"GET /v2/health/ready HTTP/1.1\r\n" + LAST + b"\r\n")) == [200]
-
-
-def is_open(server, header):
-    return statuses(exchange(server, infer(LAST + header))) == [200]
-
-
-@pytest.fixture(scope="module")
-def authority():
-    return trustme.CA()
-
-
-@pytest.fixture
-def tls_files(authority, tmp_path):
-    """A folder with a certificate for 127.0.0.1, its key, and both in one file."""
-    issued = authority.issue_cert("127.0.0.1")
-    issued.cert_chain_pems[0].write_to_path(tmp_path / "cert.pem")
-    issued.private_key_pem.write_to_path(tmp_path / "key.pem")
-    issued.private_key_and_cert_chain_pem.write_to_path(tmp_path / "both.pem")
-    return tmp_path
-
-
-@pytest.fixture
-def trusted(authority):
-    """The TLS of a client that trusts our authority."""
-    context = ssl.create_default_context()
-    authority.configure_trust(context)
-    return context
 
 
 @pytest.mark.parametrize(("certificate", "key"), [("cert.pem", "key.pem"), ("both.pem", None)])
@@ -368,13 +333,6 @@ def test_tls(handler, start_http, tls_files, trusted, certificate, key):
 
 def open_files():
     return len(list(Path("/proc/self/fd").iterdir()))
-
-
-def wait_until(condition):
-    end = time.monotonic() + 30
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.02)
-    assert condition()
 
 
 def test_half_handshakes_are_bounded(store, start_http, tls_files, trusted):

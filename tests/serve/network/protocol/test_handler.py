@@ -25,10 +25,10 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from isocharge.common.errors import InputError, ModelNotFound, TokenError
+from isocharge.common.errors import InputError
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.protocol.response import compress, decompress, statuses
+from isocharge.serve.network.protocol.response import compress, decompress
 
 INFER = "/v2/models/linear/infer"
 
@@ -393,16 +393,6 @@ def test_the_page_s_example_runs(ask):
     page = ask("GET", "/")[2].decode()
     body = page.split("-d &#x27;")[1].split("&#x27;")[0].replace("&quot;", '"')
     assert ask("POST", INFER, body.encode())[0] == 200
-
-
-def test_status_of_errors():
-    for error, status, name in [
-        (ModelNotFound(""), 404, "NOT_FOUND"),
-        (InputError(""), 400, "INVALID_ARGUMENT"),
-        (TokenError(""), 401, "UNAUTHENTICATED"),
-        (OSError(""), 500, "INTERNAL"),
-    ]:
-        assert statuses(error) == (status, name)
 
 
 def test_the_page_may_run_and_load_nothing(ask):
