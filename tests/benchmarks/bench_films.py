@@ -1,6 +1,6 @@
 """One network for all films: against networks trained on single films, and its time beside today's released model.
 
-    python tests/benchmarks/bench_films.py [--model NAME] [--films 4] [--seed 1] [--seconds 2] [--json]
+    python tests/benchmarks/bench_films.py [--model NAME] [--films 4] [--seed 0] [--seconds 2] [--json]
 
 Each film is drawn from the prior, swept with solves of its own (no family of films in it) and trained on alone, as
 `train fit` does, half a minute each. Both networks answer the same noisy charges of presses that neither was trained
@@ -8,7 +8,6 @@ on. Asked: an rms of at most 1.06 times that of the single network, a prediction
 released model of the same sensor, folding under 1 s. `--train FOLDER` times the training, too, from nothing.
 """
 
-import argparse
 import json
 import time
 from functools import partial
@@ -17,6 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from shared import options
 
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.benchmark import Contender, machine, take_turns
@@ -83,13 +83,10 @@ def training_time(films: FilmsModel, folder: Path) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("--model", default="four-25um-biaxial-films")
+    parser = options(__doc__, "four-25um-biaxial-films")
     parser.add_argument("--films", type=int, default=4)
-    parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=2.0, help="for the times of predictions")
     parser.add_argument("--train", type=Path, metavar="FOLDER")
-    parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
     films = read_films(find_model(chosen.model))
     drawn = films.prior.draw(np.random.default_rng(chosen.seed), chosen.films)
