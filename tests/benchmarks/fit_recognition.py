@@ -3,6 +3,8 @@
 Each weight in turn is made smaller and larger, and its best value is kept; the score is the number of boards whose
 charges, number and clock are read from a short and damaged capture. Boards that the fit has not seen come last.
 
+FITNOTE
+
     python tests/benchmarks/fit_recognition.py [--boards 200]
 """
 

@@ -13,7 +13,6 @@ from isocharge.serve.examination.listening import Capture, Heard, read_frames
 from isocharge.serve.frames.binary import FORMAT as BINARY
 from isocharge.serve.live.device import device_from_table
 from isocharge.serve.live.reading_stream import electrode_of
-from isocharge.serve.recognition.fields import noise_of, rest_of
 from isocharge.serve.recognition.recognise import recognise
 from isocharge.serve.signal_chain.tare import TareRule
 
@@ -37,6 +36,23 @@ LARGEST_V, LARGEST_NOISE_V = 12.0, 0.02
 
 ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Names of electrodes where no model says them."""
+
+
+def rest_of(values: Array) -> float:
+    """The level at which a channel rests: the median of its values; 0 without a finite one."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else 0.0
+
+
+def noise_of(values: Array) -> float:
+    """Standard deviation of a channel, from the median size of its steps, which presses hardly change.
+
+    Coarse counts that stand still most of the time have a median step of 0; their mean step decides.
+    """
+    step = np.abs(np.diff(values[np.isfinite(values)].astype(float)))
+    if not len(step):
+        return 0.0
+    return float(np.median(step) / (0.6745 * np.sqrt(2.0)) or step.mean() * np.sqrt(np.pi) / 2.0)
 
 
 class Proposal(NamedTuple):

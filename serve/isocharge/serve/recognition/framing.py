@@ -4,22 +4,22 @@ A stuffed stream is parted by its delimiter. Otherwise some bytes of every frame
 length of a frame: of all pairs of bytes the one is taken whose most frequent distance to its next occurrence covers
 most of the stream. Where within a frame that pair stands is not known yet.
 
-The cyclic checks of two frames of one length differ by the check of their difference: start, final value and whatever
-is the same in all frames cancel. So only polynomials have to be tried; which name and first byte give the constant part
-is looked up afterwards. A check that has no name is described by its parameters.
+Named checksums are tried from every first byte. Of cyclic checks without a name only the polynomials have to be tried:
+in frames of one length, start and final value and whatever is the same in all frames add up to a constant.
 """
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
-from typing import Any
+from itertools import chain
+from math import gcd
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isocharge.serve.frames.checksums import CHECKSUMS, CRCS, Crc
+from isocharge.serve.frames.checksums import CHECKSUMS, Crc
 from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC, ByteOrder
 from isocharge.serve.frames.stuffing import STUFFINGS, Stuffing
 
@@ -40,8 +40,14 @@ STUFFED_SHARE = 0.9
 COVERED_SHARE = 0.4
 """Share of a stream that frames of one length cover, dimensionless."""
 
+SINGLE_SHARE = 0.05
+"""Share of a stream that a single byte has to cover more than a pair, which seldom occurs by chance, dimensionless."""
+
 MOST_LENGTHS = 3
 """Number of lengths that are tried."""
+
+CONSTANT_SHARE = 0.98
+"""Share of frames in which a constant byte has its value, dimensionless: some may be damaged."""
 
 
 @dataclass(frozen=True)
@@ -60,44 +66,46 @@ class Windows:
     starts: NDArray[np.int64]
     length: int
 
-    def rows(self, turn: int = 0) -> Bytes:
-        """The bytes of the windows from `turn` on, shape (frames, length)."""
-        starts = self.starts[self.starts + turn + self.length <= len(self.stream)] + turn
-        rows: Bytes = self.stream[starts[:, None] + np.arange(self.length)]
+    def rows(self) -> Bytes:
+        """The bytes of each window and as many after it, shape (frames, 2 * length): frames begin anywhere in it."""
+        starts = self.starts[self.starts + 2 * self.length <= len(self.stream)]
+        rows: Bytes = self.stream[starts[:, None] + np.arange(2 * self.length)]
         return rows
+
+
+def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
+    """The most frequent byte at each place of a frame, and whether nearly all frames have it, shape (length,)."""
+    usual = np.array([np.bincount(column).argmax() for column in rows.T], np.uint8)
+    return usual, (rows == usual).mean(axis=0) >= CONSTANT_SHARE
 
 
 def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Windows]:
     """Every way to cut a stream into frames, the most certain first."""
-    if are_datagrams:
-        yield from _datagrams(chunks)
     data = b"".join(chunks)[:MOST_BYTES]
+    if are_datagrams:
+        common = gcd(*map(len, chunks))
+        lengths = [length for length in range(SHORTEST, min(common, LONGEST) + 1) if common % length == 0]
+        yield from (_side_by_side(DATAGRAM, data, length) for length in lengths)
     for name, stuffing in STUFFINGS.items():
-        if (windows := _stuffed(name, stuffing, data)) is not None:
-            yield windows
-    yield from _synchronised(data)
+        yield from _stuffed(name, stuffing, data)
+    yield from _synchronised(np.frombuffer(data, np.uint8))
 
 
-def _windows(framing: str, pieces: Sequence[bytes]) -> Windows:
-    """Windows of pieces of one length."""
-    stream = np.frombuffer(b"".join(pieces), np.uint8)
-    return Windows(framing, stream, np.arange(len(pieces)) * len(pieces[0]), len(pieces[0]))
+def _side_by_side(framing: str, data: bytes, length: int) -> Windows:
+    return Windows(framing, np.frombuffer(data, np.uint8), np.arange(0, len(data), length), length)
 
 
-def _stuffed(name: str, stuffing: Stuffing, data: bytes) -> Windows | None:
+def _stuffed(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
     pieces = [piece for piece in data.split(stuffing.delimiter)[1:-1] if piece]
-    if len(pieces) < FEWEST or sum(map(len, pieces)) < COVERED_SHARE * len(data):
-        return None
     decoded = []
     for piece in pieces:
         with suppress(ValueError):
             decoded.append(stuffing.decode(piece))
     length, count = _most_common_length(decoded)
     if count < STUFFED_SHARE * len(pieces) or not SHORTEST <= length <= LONGEST:
-        return None
-    if name != "cobs" and count <= _most_common_length(pieces)[1]:
-        return None  # without the stuffing they fit better: a byte with which every frame happens to begin or end
-    return _windows(name, [piece for piece in decoded if len(piece) == length])
+        return
+    if name == "cobs" or count > _most_common_length(pieces)[1]:  # else every frame happens to begin with that byte
+        yield _side_by_side(name, b"".join(piece for piece in decoded if len(piece) == length), length)
 
 
 def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
@@ -105,150 +113,102 @@ def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
     return Counter(map(len, pieces)).most_common(1)[0] if pieces else (0, 0)
 
 
-def _synchronised(data: bytes) -> Iterator[Windows]:
-    stream = np.frombuffer(data, np.uint8)
-    if len(stream) < FEWEST * SHORTEST:
-        return
-    pairs = (stream[:-1].astype(np.int64) << 8) | stream[1:]
-    best: dict[int, tuple[float, int, bool]] = {}
-    for codes, is_pair in ((pairs, True), (stream.astype(np.int64), False)):
-        for code, gap, coverage in _coverages(codes):
-            if coverage > best.get(gap, (0.0,))[0] + (0.0 if is_pair else 0.05):
-                best[gap] = (coverage, code, is_pair)
-    ranked = sorted(best, key=lambda gap: (-round(best[gap][0], 1), gap))
+def _synchronised(stream: Bytes) -> Iterator[Windows]:
+    single = stream.astype(np.int64)
+    best: dict[int, tuple[float, NDArray[np.int64]]] = {}
+    for codes, less in ((256 * single[:-1] + single[1:], 0.0), (single, SINGLE_SHARE)):
+        for length, starts in _repeats(codes):
+            coverage = len(starts) * length / len(stream) - less
+            if coverage > best.get(length, (COVERED_SHARE - less,))[0]:
+                best[length] = coverage, starts
+    ranked = sorted(best, key=lambda length: (-round(best[length][0], 1), length))
     for length in ranked[:MOST_LENGTHS]:
-        _, code, is_pair = best[length]
-        positions = np.flatnonzero((pairs if is_pair else stream) == code)
-        follows = np.flatnonzero(np.diff(positions) == length)
-        if len(follows) >= FEWEST - 1:
-            yield Windows(SYNC, stream, positions[follows].astype(np.int64), length)
+        yield Windows(SYNC, stream, best[length][1], length)
 
 
-def _coverages(codes: NDArray[np.int64]) -> Iterator[tuple[int, int, float]]:
-    """(code, gap, share of the stream that this gap covers between two of this code), those that cover much."""
+def _repeats(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Distances to the next occurrence of a code that are frequent, and where these codes stand."""
     order = np.argsort(codes, kind="stable")
-    same = codes[order][1:] == codes[order][:-1]
-    gaps, of = np.diff(order)[same], codes[order][1:][same]
-    fitting = (gaps >= SHORTEST) & (gaps <= LONGEST)
-    keys, counts = np.unique(of[fitting] * (LONGEST + 1) + gaps[fitting], return_counts=True)
-    for key, count in zip(keys.tolist(), counts.tolist(), strict=True):
-        code, gap = divmod(key, LONGEST + 1)
-        coverage = count * gap / len(codes)
-        if coverage >= COVERED_SHARE and count >= FEWEST - 1:
-            yield code, gap, coverage
+    gaps, firsts = np.diff(order), order[:-1]
+    repeats = (np.diff(codes[order]) == 0) & (gaps >= SHORTEST) & (gaps <= LONGEST)
+    gaps, firsts = gaps[repeats], firsts[repeats]
+    keys = codes[firsts] * (LONGEST + 1) + gaps
+    for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
+        length = int(key) % (LONGEST + 1)
+        if count * length >= COVERED_SHARE * len(codes):
+            yield length, firsts[keys == key]
 
 
-def _datagrams(chunks: Sequence[bytes]) -> Iterator[Windows]:
-    """Datagrams that hold frames of one length: what divides the lengths of all."""
-    lengths = [len(chunk) for chunk in chunks if chunk]
-    if len(lengths) < FEWEST:
-        return
-    common, data = int(np.gcd.reduce(lengths)), b"".join(chunks)[:MOST_BYTES]
-    for length in range(SHORTEST, min(common, LONGEST) + 1):
-        if common % length == 0:
-            size = len(data) // length * length
-            yield _windows(DATAGRAM, [data[at : at + length] for at in range(0, size, length)])
-
-
-POLYNOMIALS = {
-    8: (0x07, 0x31, 0x1D, 0x2F, 0x9B, 0x39, 0xD5),
-    16: (0x1021, 0x8005, 0x3D65, 0x8BB7),
-    24: (0x864CFB,),
-    32: (0x04C11DB7, 0x1EDC6F41),
+CYCLIC = {
+    size: [Crc(8 * size, polynomial, 0, reflected, 0) for polynomial in polynomials for reflected in (False, True)]
+    for size, polynomials in {
+        4: (0x04C11DB7, 0x1EDC6F41),
+        3: (0x864CFB,),
+        2: (0x1021, 0x8005, 0x3D65, 0x8BB7),
+        1: (0x07, 0x31, 0x1D, 0x2F, 0x9B, 0x39, 0xD5),
+    }.items()
 }
-"""Of the cyclic checks that are looked for, by their bits."""
+"""Cyclic checks that are looked for without a name, by their bytes, without start and final value."""
 
-FEWEST_ROWS, MOST_ROWS = 6, 48
+FEWEST_ROWS, MOST_ROWS = 6, 24
 """Smallest number of different frames for a checksum, and how many are looked at."""
 
-FITTING_SHARE = 0.9
+FITTING_SHARE = 0.75
 """Share of frames whose checksum fits, dimensionless: some may be damaged."""
 
 MOST_SKIPPED = 16
 """Largest first byte that a checksum covers."""
 
 
-@dataclass(frozen=True)
-class FoundCheck:
-    """A checksum that fits.
-
-    Attributes:
-        size: Bytes.
-        checksum: Its name, or the parameters of a device file.
-        begin: First byte that it covers.
-        order: Its byte order.
-    """
-
-    size: int = 0
-    checksum: str | dict[str, Any] = "none"
-    begin: int = 0
-    order: ByteOrder = "little"
+ORDERS: tuple[ByteOrder, ...] = ("little", "big")
 
 
-@cache
-def _kinds(width: int) -> tuple[Crc, ...]:
-    """The cyclic checks of a width, without start and final value."""
-    return tuple(Crc(width, polynomial, 0, way, 0) for polynomial in POLYNOMIALS[width] for way in (False, True))
+class Check(NamedTuple):
+    """A checksum that fits: its bytes, 0 for none, their order, and its keys in a device file."""
+
+    size: int
+    order: ByteOrder
+    keys: dict[str, Any]
 
 
-def find_checks(rows: Bytes) -> Iterator[FoundCheck]:
+def find_checks(rows: Bytes) -> Iterator[Check]:
     """Checksums that fit frames, shape (n, length), the widest first."""
     rows = np.unique(rows, axis=0)
     rows = rows[np.random.default_rng(0).permutation(len(rows))[:MOST_ROWS]]  # neighbours differ in few bits only
     if len(rows) < FEWEST_ROWS:
         return
-    constant = (rows == rows[0]).mean(axis=0) >= FITTING_SHARE
-    prefix = len(constant) if constant.all() else int(np.argmin(constant))
-    frames = [row.tobytes() for row in rows]
-    for size in (4, 3, 2, 1):
+    constant, frames = usual_bytes(rows)[1], [row.tobytes() for row in rows]
+    skipped = int(np.argmin([*constant[:MOST_SKIPPED], False]))
+    for size in CYCLIC:
         if size + 2 > len(constant) or constant[-size:].all():
             continue
-        orders: tuple[ByteOrder, ...] = ("little", "big") if size > 1 else ("little",)
-        begins = range(min(prefix, MOST_SKIPPED, len(constant) - size - 1) + 1)
-        for order in orders:
-            sums = [name for name in set(CHECKSUMS) - set(CRCS) if CHECKSUMS[name].size == size]
-            found = _cyclic(frames, size, order, begins) or _named(sums, frames, size, order, begins)
-            if found is not None:
-                yield found
+        for order in ORDERS[:size]:
+            named = _named(frames, size, order, range(min(skipped, len(constant) - size - 1) + 1))
+            yield from list(chain(named, _unnamed(frames, size, order)))[:1]
 
 
-def _cyclic(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> FoundCheck | None:
-    for base in frames[:2]:
-        differences = [bytes(a ^ b for a, b in zip(base, other, strict=True)) for other in frames if other is not base]
-        for crc in _kinds(8 * size):
-            if _fits(crc, differences, 0, size, order):
-                alike = [name for name, other in CRCS.items() if _kind(other) == _kind(crc)]
-                return _named(alike, frames, size, order, begins) or _parameters(crc, frames, size, order)
-    return None
-
-
-def _kind(crc: Crc) -> tuple[int, int, bool]:
-    return crc.width, crc.polynomial, crc.reflected
-
-
-def _named(names: list[str], frames: list[bytes], size: int, order: ByteOrder, begins: range) -> FoundCheck | None:
-    fitting = (
-        FoundCheck(size, name, begin, order)
-        for begin in begins
-        for name in sorted(names)
-        if _fits(CHECKSUMS[name].compute, frames, begin, size, order)
-    )
-    return next(fitting, None)
-
-
-def _parameters(crc: Crc, frames: list[bytes], size: int, order: ByteOrder) -> FoundCheck:
-    """A check without a name, in which the constant part is the final value."""
-    finals = [crc(frame[:-size]) ^ int.from_bytes(frame[-size:], order) for frame in frames]
-    final, digits = max(set(finals), key=finals.count), 2 * size
-    numbers = {"polynomial": f"{crc.polynomial:0{digits}X}", "final": f"{final:0{digits}X}"}
-    return FoundCheck(size, {"width": crc.width, "reflected": crc.reflected} | numbers, 0, order)
+def _named(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> Iterator[Check]:
+    names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
+    for begin in begins:
+        for name in names:
+            if _fits(CHECKSUMS[name].compute, frames, begin, size, order):
+                yield Check(size, order, {"checksum": name} | ({"checksum_from": begin} if begin else {}))
 
 
 def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size: int, order: ByteOrder) -> bool:
     """Whether nearly all frames end with their checksum; four decide whether the others are looked at."""
 
-    def share(part: list[bytes]) -> float:
-        fits = [compute(frame[begin:-size]) == int.from_bytes(frame[-size:], order) for frame in part]
-        return sum(fits) / len(fits)
+    def fitting(part: list[bytes]) -> int:
+        return sum(compute(frame[begin:-size]) == int.from_bytes(frame[-size:], order) for frame in part)
 
-    return share(frames[:4]) >= 0.5 and share(frames) >= FITTING_SHARE
+    return fitting(frames[:4]) >= 2 and fitting(frames) >= FITTING_SHARE * len(frames)
+
+
+def _unnamed(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check]:
+    """Cyclic checks by their parameters, in which the constant part is the final value."""
+    for crc in CYCLIC[size]:
+        finals = Counter(crc(frame[:-size]) ^ int.from_bytes(frame[-size:], order) for frame in frames)
+        final, count = finals.most_common(1)[0]
+        if count >= FITTING_SHARE * len(frames):
+            numbers = {"polynomial": f"{crc.polynomial:0{2 * size}X}", "final": f"{final:0{2 * size}X}"}
+            yield Check(size, order, {"checksum": {"width": crc.width, "reflected": crc.reflected} | numbers})

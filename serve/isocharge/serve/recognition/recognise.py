@@ -1,58 +1,39 @@
 """What a board sends: our binary frames, lines of text, or frames of fixed length that are described."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import groupby
+from itertools import count, groupby
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from isocharge.serve.frames.binary import BinaryParser
-from isocharge.serve.frames.frame import SEQ, Frame
-from isocharge.serve.frames.frame_layout import DATAGRAM, PADDING, SYNC
+from isocharge.serve.frames.frame import SEQ, Frame, Parser
+from isocharge.serve.frames.frame_layout import PADDING, SYNC, ByteOrder
 from isocharge.serve.frames.text import Layout, TextParser
 from isocharge.serve.frames.text_lines import Notation
-from isocharge.serve.recognition.fields import (
-    CONSTANT_SHARE,
-    Part,
-    Series,
-    Split,
-    Weights,
-    clock_of,
-    is_counter,
-    number_values,
-    split_frame,
+from isocharge.serve.recognition.fields import Part, Weights, clock_of, parts_of, split_frame, steady_step
+from isocharge.serve.recognition.framing import (
+    FEWEST,
+    MOST_BYTES,
+    ORDERS,
+    Check,
+    Windows,
+    find_checks,
+    framings,
+    usual_bytes,
 )
-from isocharge.serve.recognition.framing import FEWEST, MOST_BYTES, Bytes, FoundCheck, Windows, find_checks, framings
 
 MOST_FRAMES = 300
 """Frames that are examined."""
 
 MOST_BEGINS = 6
-"""Bytes at each end of a run of constant bytes at which a frame may begin."""
+"""Bytes of a run of constant bytes at which a frame may begin: those of its sync, after a CR and LF of the last."""
+
+LONGEST_SYNC = 6
+"""Longest sync, bytes: what follows may be constant for a while only."""
 
 WEIGHTS = Weights()
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """One description that windows allow.
-
-    Attributes:
-        windows: The frames.
-        rows: Those that are examined, each from its begin on, shape (n, length).
-        check: The checksum.
-        split: The parts before it.
-        rate_Hz: Frames per second.
-        score: Bits for each byte of the stream, those too that are in no frame: frames of other lengths are compared.
-    """
-
-    windows: Windows
-    rows: Bytes
-    check: FoundCheck
-    split: Split
-    rate_Hz: float
-    score: float
 
 
 def described_frames(
@@ -66,117 +47,70 @@ def described_frames(
         are_datagrams: Whether each chunk is a datagram.
         weights: Of the score.
     """
+    seconds *= min(1.0, MOST_BYTES / max(1, sum(map(len, chunks))))
     for _, group in groupby(framings(chunks, are_datagrams=are_datagrams), key=lambda windows: windows.framing):
-        candidates = [
-            candidate
-            for windows in group
-            for candidate in _candidates(windows, _rate_Hz(windows, chunks, seconds), weights)
-            if any(part.role == "channel" for part in candidate.split.parts)
-        ]
-        if candidates:
-            return _table(min(candidates, key=lambda candidate: candidate.score))
+        tables = [scored for windows in group for scored in _scored_tables(windows, seconds, weights)]
+        if tables:
+            return min(tables, key=lambda scored: scored[0])[1]
     return None
 
 
-def _rate_Hz(windows: Windows, chunks: Sequence[bytes], seconds: float) -> float:
-    """Frames per second of a whole stream, of which the windows may be the first part."""
-    size = sum(map(len, chunks))
-    if windows.framing in (SYNC, DATAGRAM):
-        return size / windows.length / seconds
-    return len(windows.starts) / (seconds * min(1.0, MOST_BYTES / size))
+def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterator[tuple[float, dict[str, Any]]]:
+    """Every description of frames: of each begin, checksum and byte order; without a checksum only if none fits.
 
-
-def _candidates(windows: Windows, rate_Hz: float, weights: Weights) -> Iterator[Candidate]:
-    """Every begin and checksum that the frames may have; without a checksum only if none fits."""
-    needs_sync = windows.framing == SYNC
-    covered = min(1.0, len(windows.starts) * windows.length / len(windows.stream))
-    all_rows = [windows.rows(turn)[:MOST_FRAMES] for turn in (_turns(windows) if needs_sync else (0,))]
-    checks = [(rows, check) for rows in all_rows for check in find_checks(rows)]
-    for rows, check in checks or [(rows, FoundCheck()) for rows in all_rows]:
-        order = check.order if check.size > 1 else None
-        split = split_frame(rows, windows.length - check.size, rate_Hz, weights, needs_sync=needs_sync, order=order)
-        if split is not None:
-            score = split.score + (-weights.check_byte * check.size if check.size else weights.no_check)
-            score = covered * score / windows.length + (1.0 - covered) * weights.noise
-            yield Candidate(windows, rows, check, split, rate_Hz, score)
-
-
-def _turns(windows: Windows) -> list[int]:
-    """Where a frame may begin: at a constant byte, near the begin or the end of its run of such bytes."""
-    rows = windows.rows()
-    constant = [float(np.bincount(column).max()) >= CONSTANT_SHARE * len(column) for column in rows.T]
-    if all(constant):
-        return []
-    length, first = len(constant), constant.index(False)
-    turns: list[int] = []
-    for is_constant, run in groupby((*range(first, length), *range(first)), key=lambda at: constant[at]):
-        if is_constant:  # once round, from a byte that varies
-            ats = list(run)
-            turns += ats[:MOST_BEGINS] + ats[MOST_BEGINS:][-MOST_BEGINS:]
-    return turns
-
-
-def _table(best: Candidate) -> dict[str, Any]:
-    windows, check, split = best.windows, best.check, best.split
-    table: dict[str, Any] = {"format": "described"}
-    if windows.framing != SYNC:
-        table["framing"] = windows.framing
-    if sync := sum(part.size for part in split.parts if part.role == "sync"):
-        usual = [int(np.bincount(column).argmax()) for column in best.rows[:, :sync].T]
-        table["sync"] = bytes(usual).hex(" ").upper()
-    table |= {"length": windows.length, "byte_order": split.order}
-    if check.size:
-        table["checksum"] = check.checksum
-    if check.begin:
-        table["checksum_from"] = check.begin
-    if check.size > 1 and check.order != split.order:
-        table["checksum_order"] = check.order
-    return table | {"fields": _fields(best)}
-
-
-def _fields(best: Candidate) -> list[dict[str, Any]]:
-    """The fields of a device file; neighbouring bytes without meaning are one padding."""
-    fields: list[dict[str, Any]] = []
-    roles = [part.role for part in best.split.parts]
-    channels = 0
-    for position, part in enumerate(best.split.parts):
-        kind, is_first = f"{'f' if part.is_float else 'u'}{8 * part.size}", part.role not in roles[:position]
-        if part.role == "channel":
-            channels += 1
-            fields.append({"name": f"ch{channels}", "type": _type(best, part)})
-        elif part.role == "seq" and is_first:
-            fields.append({"name": "seq", "type": kind})
-        elif part.role == "clock" and is_first:
-            name, scale = part.clock
-            fields.append({"name": name, "type": kind} | ({"scale": scale} if scale != 1.0 else {}))
-        elif part.role != "sync":
-            size = part.size
-            if fields and fields[-1]["type"] == PADDING:
-                size += fields.pop().get("count", 1)
-            fields.append({"type": PADDING} | ({"count": size} if size > 1 else {}))
-    return fields
-
-
-def _type(best: Candidate, part: Part) -> str:
-    """The type of a channel; whether it has a sign is decided with all channels of its size."""
-    if part.is_float:
-        return f"f{8 * part.size}"
-    alike = [other for other in best.split.parts if other.row == part.row]
-    counts = [number_values(best.rows, other.at, other.size, best.split.order) for other in alike]
-    return f"{'i' if sum(_sign_vote(values, 8 * part.size) for values in counts) > 0 else 'u'}{8 * part.size}"
-
-
-def _sign_vote(counts: Series, bits: int) -> int:
-    """1 for a signed channel, -1 for an unsigned one, 0 for one that does not say.
-
-    The wrong reading jumps where the right one passes zero or the middle of its range. Without a jump, the one is right
-    whose rest is farther from both its limits.
+    The score is in bits for each byte of the stream, those too that are in no frame: frames of other lengths are
+    compared.
     """
-    middle = 1 << (bits - 1)
-    signed, unsigned = int(np.ptp(np.where(counts >= middle, counts - 2 * middle, counts))), int(np.ptp(counts))
-    if signed != unsigned:
-        return 1 if signed < unsigned else -1
-    return 0 if not unsigned else -1 if middle / 2 < float(np.median(counts)) < 3 * middle / 2 else 1
+    length, rows = windows.length, windows.rows()[:MOST_FRAMES]
+    if len(rows) < FEWEST - 1:
+        return
+    usual, constant = usual_bytes(rows[:, :length])
+    turns = _turns(constant) if windows.framing == SYNC else [0]
+    checks = [(turn, check) for turn in turns for check in find_checks(rows[:, turn : turn + length])]
+    covered = min(1.0, len(windows.starts) * length / len(windows.stream))
+    for order in ORDERS:
+        parts_at = parts_of(rows, order, len(windows.stream) / length / seconds, weights)
+        for turn, check in checks or [(turn, Check(0, order, {})) for turn in turns]:
+            turned = (parts_at[turn:] + parts_at[:turn])[: length - check.size]
+            longest = int(np.argmin([*np.roll(constant, -turn)[:LONGEST_SYNC], False]))
+            syncs = range(1, longest + 1) if windows.framing == SYNC else [0]
+            score, sync, parts = split_frame(turned, syncs, weights)
+            if any(part.role == "channel" for part in parts):
+                begin = np.roll(usual, -turn)[:sync].tobytes()
+                bits = covered * score / length + (1.0 - covered) * weights.noise
+                yield bits, _table(windows, begin, check, order, parts)
+
+
+def _turns(constant: NDArray[np.bool_]) -> list[int]:
+    """Where a frame may begin: at one of the first bytes of a run of constant ones, going round."""
+    begins = constant & ~np.roll(constant, 1)
+    near = np.any([np.roll(begins, shift) for shift in range(MOST_BEGINS)], axis=0)
+    return [int(turn) for turn in np.flatnonzero(near & constant)]
+
+
+def _table(windows: Windows, sync: bytes, check: Check, order: ByteOrder, parts: Sequence[Part]) -> dict[str, Any]:
+    table = {"sync": sync.hex(" ").upper()} if windows.framing == SYNC else {"framing": windows.framing}
+    orders = {"checksum_order": check.order} if check.size > 1 and check.order != order else {}
+    layout = {"length": windows.length, "byte_order": order} | check.keys | orders
+    return {"format": "described"} | table | layout | {"fields": _fields(parts)}
+
+
+def _fields(parts: Sequence[Part]) -> list[dict[str, Any]]:
+    """The fields of a device file; a second number or clock is padding, and neighbouring paddings are one."""
+    fields: list[dict[str, Any]] = []
+    roles: list[str] = []
+    for part in parts:
+        roles.append(part.role)
+        number = roles.count(part.role)
+        if part.role == "channel":
+            fields.append({"name": f"ch{number}", "type": part.kind})
+        elif part.role != "pad" and number == 1:
+            fields.append({"name": part.name, "type": part.kind} | ({"scale": part.scale} if part.scale != 1.0 else {}))
+        elif fields and fields[-1]["type"] == PADDING:
+            fields[-1]["count"] = fields[-1].get("count", 1) + part.size
+        else:
+            fields.append({"type": PADDING} | ({"count": part.size} if part.size > 1 else {}))
+    return fields
 
 
 CLEAR_SHARE = 0.4
@@ -191,60 +125,52 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
         seconds: Time in which they came, s.
         are_datagrams: Whether each chunk is a datagram.
     """
-    size = sum(map(len, chunks))
-    binary = BinaryParser()
-    frames = [frame for chunk in chunks for frame in binary.feed(chunk)]
-    if len(frames) >= FEWEST and binary.counts.bytes_dropped < (1.0 - CLEAR_SHARE) * size:
+    frames, share = _read(BinaryParser(), chunks)
+    if len(frames) >= FEWEST and share > CLEAR_SHARE:
         return {"format": "binary"}
-    table, share = _text_frames(chunks, seconds)
-    if share >= CLEAR_SHARE:
-        return table
-    return described_frames(chunks, seconds, are_datagrams=are_datagrams) or table
-
-
-def _text_frames(chunks: Sequence[bytes], seconds: float) -> tuple[dict[str, Any] | None, float]:
-    """The section for lines of text, None if the bytes are none, and the share of bytes that it explains."""
-    parser = TextParser()
-    frames = [frame for chunk in chunks for frame in parser.feed(chunk)]
+    text, parser = None, TextParser()
+    frames, share = _read(parser, chunks)
     frames = [frame for frame in frames if len(frame.values) == len(frames[-1].values)]
-    if parser.layout is None or len(frames) < FEWEST:
-        return None, 0.0
-    share = 1.0 - parser.counts.bytes_dropped / max(1, sum(map(len, chunks)))
-    names = _names_of_meanings(frames, len(frames) / seconds)
-    return {"format": "text"} | _text_keys(parser.layout, frames[-1], names), share
+    if parser.layout is not None and len(frames) >= FEWEST:
+        text = {"format": "text"} | _text_keys(parser.layout, frames, len(frames) / seconds)
+        if share >= CLEAR_SHARE:
+            return text
+    return described_frames(chunks, seconds, are_datagrams=are_datagrams) or text
 
 
-def _names_of_meanings(frames: Sequence[Frame], rate_Hz: float) -> dict[int, str]:
-    """`seq`, `t_us`, `t_ms` or `t_s` by position among the values, of columns that count frames or time."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        step = np.diff(np.array([frame.values for frame in frames]), axis=0)
-    names: dict[int, str] = {}
-    has_clock, has_number = frames[-1].t_us is not None, frames[-1].seq is not None
-    for position, column in enumerate(step.T):
-        if not np.isfinite(column).all():
-            continue
-        clock = None if has_clock else clock_of(column, rate_Hz)
-        is_clock = clock is not None and clock[1] == 1.0  # text has no scale
-        if not has_number and is_counter(column) and not (is_clock and SEQ in names.values()):
-            names[position], has_number = SEQ, True
-        elif clock is not None and is_clock:
-            names[position], has_clock = clock[0], True
-    return names
+def _read(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], float]:
+    """The frames that a parser finds, and the share of bytes that they explain."""
+    frames = [frame for chunk in chunks for frame in parser.feed(chunk)]
+    return frames, 1.0 - parser.counts.bytes_dropped / max(1, sum(map(len, chunks)))
 
 
-def _text_keys(layout: Layout, frame: Frame, names: dict[int, str]) -> dict[str, Any]:
+def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[str, Any]:
     """The keys of a device file; columns without names get names, once one of them has a meaning.
 
     The header of a CSV is written down: who comes later will not see it.
     """
+    last = frames[-1]
+    meanings = _meanings(frames, rate_Hz)
     if layout.notation is Notation.csv and layout.names:
         columns = list(layout.names)
-        for position, name in names.items():
-            columns[layout.columns.channels[position][0]] = name
+        for position, meaning in meanings.items():
+            columns[layout.columns.channels[position][0]] = meaning
         return {"columns": columns}
-    if frame.names:
-        return {name: frame.names[position] for position, name in names.items()}
-    if not names:
-        return {}
-    channels = iter(f"ch{number}" for number in range(1, len(frame.values) + 1))
-    return {"columns": [names.get(position) or next(channels) for position in range(len(frame.values))]}
+    if last.names or not meanings:
+        return {meaning: last.names[position] for position, meaning in meanings.items()}
+    channels = map("ch{}".format, count(1))
+    return {"columns": [meanings.get(position) or next(channels) for position in range(len(last.values))]}
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _meanings(frames: Sequence[Frame], rate_Hz: float) -> dict[int, str]:
+    """`seq`, `t_us`, `t_ms` or `t_s` by position among the values, of columns that count frames or time."""
+    meanings: dict[int, str] = {}
+    has_number, has_clock = frames[-1].seq is not None, frames[-1].t_us is not None
+    for position, step in enumerate(np.diff([frame.values for frame in frames], axis=0).T):
+        name, scale = clock_of(step, rate_Hz) or ("", 0.0)
+        if not has_number and steady_step(step) == 1.0:
+            meanings[position], has_number = SEQ, True
+        elif not has_clock and scale == 1.0:  # text has no scale
+            meanings[position], has_clock = name, True
+    return meanings
