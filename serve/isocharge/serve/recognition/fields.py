@@ -36,6 +36,9 @@ TOLERANCE = 0.06
 PLAUSIBLE = (1e-7, 1e8)
 """Smallest and largest typical magnitude of a floating-point channel."""
 
+USUAL_SYNC = 2
+"""Usual sync, bytes: each byte more or less costs as much as a constant one."""
+
 TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "f32", "f64")
 """Types of numbers, as device files write them."""
 
@@ -112,38 +115,50 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
         rate_Hz: Frames per second, Hz; a clock ticks at a usual rate.
         weights: Of the score.
     """
-    constant, length = usual_bytes(rows)[1], rows.shape[1] // 2
+    (usual, constant), length = usual_bytes(rows), rows.shape[1] // 2
+    is_zero, way = constant & (usual == 0), 1 if order == "little" else -1
     parts_at: list[list[Part]] = []
     for at in range(length):
         parts_at.append([Part("pad", "pad", 1, weights.constant if constant[at] else weights.noise)])
         for kind in TYPES:
             there = slice(at, at + int(kind[1:]) // 8)
             if there.stop <= 2 * length:
-                parts_at[at] += _numbers(rows[:, there], constant[there], kind, order, rate_Hz, weights)
+                parts_at[at] += _numbers(
+                    rows[:, there][:, ::way], constant[there][::way], is_zero[there][::way], kind, rate_Hz, weights
+                )
     return parts_at
 
 
 def _numbers(
-    cut: Bytes, constant: NDArray[np.bool_], kind: str, order: ByteOrder, rate_Hz: float, weights: Weights
+    cut: Bytes, constant: NDArray[np.bool_], is_zero: NDArray[np.bool_], kind: str, rate_Hz: float, weights: Weights
 ) -> Iterator[Part]:
-    """What bytes, shape (n, size), may be as a number of a type: a frame's number or a clock, and a channel."""
+    """What bytes, lowest first, may be as a number of a type: a frame's number or a clock, and a channel.
+
+    Args:
+        cut: The bytes, shape (n, size).
+        constant, is_zero: Which of them are always the same, and always 0, shape (size,).
+        kind: The type.
+        rate_Hz: Frames per second, Hz.
+        weights: Of the score.
+    """
     size = len(constant)
     if constant.all():
         yield Part("channel", kind, size, weights.constant, is_constant=True, row=kind)
         return
-    values, half = _values(cut, kind, order), 1 << (8 * size - 1)
+    values, half = _values(cut, kind), 1 << (8 * size - 1)
     step = going = np.diff(values)
     rest = float(np.median(np.abs(values)))
-    unit = rest * 2.0 ** (-8 * weights.fraction * np.sum(~constant)) if kind[0] == "f" else 1.0
+    unit = rest * 256.0 ** (np.argmin(is_zero) - weights.fraction * size) if kind[0] == "f" else 1.0
     if kind[0] == "f" and not PLAUSIBLE[0] < rest < PLAUSIBLE[1]:
         return
     if kind[0] == "u":
         going = (step + half) % (2 * half) - half  # a counter begins anew
         rest = float(np.median(np.abs(values - half)))
+    standing = weights.constant * np.sum(constant & ~is_zero)
     if kind[0] == "u" and size != 3 and steady_step(going) == 1.0:
-        yield Part("seq", kind, size, 0.0, name="seq")
+        yield Part("seq", kind, size, standing, name="seq")
     elif kind[0] != "i" and size not in (1, 3) and (clock := clock_of(going, rate_Hz)) is not None:
-        yield Part("clock", kind, size, _bits(going - np.median(going), unit, size), False, *clock)
+        yield Part("clock", kind, size, standing + _bits(going - np.median(going), unit, size), False, *clock)
     yield Part("channel", kind, size, weights.channel + _bits(np.append(step, rest), unit, size), row=kind)
 
 
@@ -172,18 +187,17 @@ def split_frame(
                 best = (score, (part, *parts))
         return best
 
-    sync = min(syncs, key=lambda sync: lowest(sync, "")[0])
-    score, parts = lowest(sync, "")
-    return score, sync, parts
+    unusual = [(sync, weights.constant * abs(sync - USUAL_SYNC) if sync else 0.0) for sync in syncs]
+    score, sync = min(((lowest(sync, "")[0] + extra, sync) for sync, extra in unusual), key=lambda scored: scored[0])
+    return score, sync, lowest(sync, "")[1]
 
 
-def _values(cut: Bytes, kind: str, order: ByteOrder) -> Array:
-    """The bytes of a number in all frames, shape (n, size), as values of a type, shape (n,)."""
-    lowest_first = np.ascontiguousarray(cut if order == "little" else cut[:, ::-1])
+def _values(cut: Bytes, kind: str) -> Array:
+    """The bytes of a number in all frames, lowest first, shape (n, size), as values of a type, shape (n,)."""
     size = cut.shape[1]
     if kind[0] == "f":
-        return lowest_first.view(f"<f{size}")[:, 0].astype(float)
-    values: Array = lowest_first @ 256.0 ** np.arange(size)
+        return np.ascontiguousarray(cut).view(f"<f{size}")[:, 0].astype(float)
+    values: Array = cut @ 256.0 ** np.arange(size)
     return values - 256.0**size * (values >= 256.0**size / 2) if kind[0] == "i" else values
 
 

@@ -5,7 +5,6 @@ from itertools import count, groupby
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import SEQ, Frame, Parser
@@ -27,8 +26,8 @@ from isocharge.serve.recognition.framing import (
 MOST_FRAMES = 300
 """Frames that are examined."""
 
-MOST_BEGINS = 6
-"""Bytes of a run of constant bytes at which a frame may begin: those of its sync, after a CR and LF of the last."""
+MOST_TURNS = 24
+"""Bytes at which a frame may begin: those that are always the same, and not 0."""
 
 LONGEST_SYNC = 6
 """Longest sync, bytes: what follows may be constant for a while only."""
@@ -65,27 +64,21 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
     if len(rows) < FEWEST - 1:
         return
     usual, constant = usual_bytes(rows[:, :length])
-    turns = _turns(constant) if windows.framing == SYNC else [0]
+    fixed = constant & (usual != 0)
+    turns = np.flatnonzero(fixed)[:MOST_TURNS].tolist() if windows.framing == SYNC else [0]
     checks = [(turn, check) for turn in turns for check in find_checks(rows[:, turn : turn + length])]
     covered = min(1.0, len(windows.starts) * length / len(windows.stream))
     for order in ORDERS:
         parts_at = parts_of(rows, order, len(windows.stream) / length / seconds, weights)
         for turn, check in checks or [(turn, Check(0, order, {})) for turn in turns]:
             turned = (parts_at[turn:] + parts_at[:turn])[: length - check.size]
-            longest = int(np.argmin([*np.roll(constant, -turn)[:LONGEST_SYNC], False]))
-            syncs = range(1, longest + 1) if windows.framing == SYNC else [0]
+            longest = int(np.argmin([*np.roll(fixed, -turn)[:LONGEST_SYNC], False]))
+            syncs = range(longest, 0, -1) if windows.framing == SYNC else [0]
             score, sync, parts = split_frame(turned, syncs, weights)
             if any(part.role == "channel" for part in parts):
                 begin = np.roll(usual, -turn)[:sync].tobytes()
                 bits = covered * score / length + (1.0 - covered) * weights.noise
                 yield bits, _table(windows, begin, check, order, parts)
-
-
-def _turns(constant: NDArray[np.bool_]) -> list[int]:
-    """Where a frame may begin: at one of the first bytes of a run of constant ones, going round."""
-    begins = constant & ~np.roll(constant, 1)
-    near = np.any([np.roll(begins, shift) for shift in range(MOST_BEGINS)], axis=0)
-    return [int(turn) for turn in np.flatnonzero(near & constant)]
 
 
 def _table(windows: Windows, sync: bytes, check: Check, order: ByteOrder, parts: Sequence[Part]) -> dict[str, Any]:
