@@ -26,8 +26,11 @@ from isocharge.serve.recognition.framing import (
 MOST_FRAMES = 300
 """Frames that are examined."""
 
+NEVER_SYNC = (0x00, 0x0A, 0x0D)
+"""Bytes that no sync has: often the high ones of a number, and the end of the frame before."""
+
 MOST_TURNS = 24
-"""Bytes at which a frame may begin: those that are always the same, and not 0."""
+"""Bytes at which a frame is tried to begin, of those that may be a sync."""
 
 LONGEST_SYNC = 6
 """Longest sync, bytes: what follows may be constant for a while only."""
@@ -64,7 +67,7 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
     if len(rows) < FEWEST - 1:
         return
     usual, constant = usual_bytes(rows[:, :length])
-    fixed = constant & (usual != 0)
+    fixed = constant & ~np.isin(usual, NEVER_SYNC)
     turns = np.flatnonzero(fixed)[:MOST_TURNS].tolist() if windows.framing == SYNC else [0]
     checks = [(turn, check) for turn in turns for check in find_checks(rows[:, turn : turn + length])]
     covered = min(1.0, len(windows.starts) * length / len(windows.stream))
