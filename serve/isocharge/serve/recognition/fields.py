@@ -36,9 +36,6 @@ TOLERANCE = 0.06
 PLAUSIBLE = (1e-7, 1e8)
 """Smallest and largest typical magnitude of a floating-point channel."""
 
-USUAL_SYNC = 2
-"""Usual sync, bytes: each byte more or less costs as much as a constant one."""
-
 TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "f32", "f64")
 """Types of numbers, as device files write them."""
 
@@ -154,11 +151,10 @@ def _numbers(
     if kind[0] == "u":
         going = (step + half) % (2 * half) - half  # a counter begins anew
         rest = float(np.median(np.abs(values - half)))
-    standing = weights.constant * np.sum(constant & ~is_zero)
     if kind[0] == "u" and size != 3 and steady_step(going) == 1.0:
-        yield Part("seq", kind, size, standing, name="seq")
+        yield Part("seq", kind, size, 0.0, name="seq")
     elif kind[0] != "i" and size not in (1, 3) and (clock := clock_of(going, rate_Hz)) is not None:
-        yield Part("clock", kind, size, standing + _bits(going - np.median(going), unit, size), False, *clock)
+        yield Part("clock", kind, size, _bits(going - np.median(going), unit, size), False, *clock)
     yield Part("channel", kind, size, weights.channel + _bits(np.append(step, rest), unit, size), row=kind)
 
 
@@ -169,7 +165,7 @@ def split_frame(
 
     Args:
         parts_at: The parts that may begin at each byte before the checksum.
-        syncs: Bytes that the sync may have; the first of equal ones is taken.
+        syncs: Bytes that the sync may have; the shortest of equal ones is taken.
         weights: Of the score.
     """
 
@@ -187,8 +183,8 @@ def split_frame(
                 best = (score, (part, *parts))
         return best
 
-    unusual = [(sync, weights.constant * abs(sync - USUAL_SYNC) if sync else 0.0) for sync in syncs]
-    score, sync = min(((lowest(sync, "")[0] + extra, sync) for sync, extra in unusual), key=lambda scored: scored[0])
+    scored = [(lowest(sync, "")[0] + weights.constant * (sync == 1), sync) for sync in syncs]  # one byte is seldom all
+    score, sync = min(scored)
     return score, sync, lowest(sync, "")[1]
 
 

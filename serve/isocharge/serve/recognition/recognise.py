@@ -26,9 +26,6 @@ from isocharge.serve.recognition.framing import (
 MOST_FRAMES = 300
 """Frames that are examined."""
 
-NEVER_SYNC = (0x00, 0x0A, 0x0D)
-"""Bytes that no sync has: often the high ones of a number, and the end of the frame before."""
-
 MOST_TURNS = 24
 """Bytes at which a frame is tried to begin, of those that may be a sync."""
 
@@ -67,7 +64,7 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
     if len(rows) < FEWEST - 1:
         return
     usual, constant = usual_bytes(rows[:, :length])
-    fixed = constant & ~np.isin(usual, NEVER_SYNC)
+    fixed = constant & (usual != 0)  # zeros are the high bytes of numbers
     turns = np.flatnonzero(fixed)[:MOST_TURNS].tolist() if windows.framing == SYNC else [0]
     checks = [(turn, check) for turn in turns for check in find_checks(rows[:, turn : turn + length])]
     covered = min(1.0, len(windows.starts) * length / len(windows.stream))
@@ -76,7 +73,7 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
         for turn, check in checks or [(turn, Check(0, order, {})) for turn in turns]:
             turned = (parts_at[turn:] + parts_at[:turn])[: length - check.size]
             longest = int(np.argmin([*np.roll(fixed, -turn)[:LONGEST_SYNC], False]))
-            syncs = range(longest, 0, -1) if windows.framing == SYNC else [0]
+            syncs = range(1, longest + 1) if windows.framing == SYNC else [0]
             score, sync, parts = split_frame(turned, syncs, weights)
             if any(part.role == "channel" for part in parts):
                 begin = np.roll(usual, -turn)[:sync].tobytes()
