@@ -189,13 +189,16 @@ class Statistics:
             unchecked: Rows whose misfit was not computed.
             alarms: Rows whose misfit is above the limit.
         """
+        (read, ran, written), spent = stages_ns, self.stages_ns  # one by one: half a microsecond less than a loop
         with self._lock:
             self.presses += presses
             self.unchecked += unchecked
             self.alarms += alarms
             self.answered += 1
-            self.latency[bisect_left(LATENCY_NS, sum(stages_ns))] += 1
-            self.stages_ns = [before + ns for before, ns in zip(self.stages_ns, stages_ns, strict=True)]
+            self.latency[bisect_left(LATENCY_NS, read + ran + written)] += 1
+            spent[0] += read
+            spent[1] += ran
+            spent[2] += written
             self.last_ms = time.time_ns() // 1_000_000
 
     def failed(self, ns: int) -> None:
@@ -212,7 +215,7 @@ class Statistics:
     def snapshot(self) -> "Statistics":
         """A copy, all of whose counters belong to the same moment."""
         with self._lock:
-            return replace(self, latency=[*self.latency], _lock=threading.Lock())
+            return replace(self, latency=[*self.latency], stages_ns=[*self.stages_ns], _lock=threading.Lock())
 
     def to_json(self) -> dict[str, Any]:
         """The counters under Triton's names; no request waits in a queue."""

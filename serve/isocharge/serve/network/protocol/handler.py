@@ -121,12 +121,12 @@ class Handler:
         Returns:
             The answer; an error is one, with the body {"error": "..."}. Nothing is raised.
         """
-        began = time.perf_counter_ns()
+        began, found, log = time.perf_counter_ns(), self._find(path), self.traffic.log
         try:
-            response = self._answer(method, path, dict(headers), body)
+            response = self._answer(method, path, found, dict(headers), body)
         except Exception as error:  # the one place where an error becomes an answer
             response = error_response(error)
-        found, status, log = self._find(path), response.status, self.traffic.log
+        status = response.status
         self.traffic.count("http", found.label, status)
         if log is not None:
             model, ns = self.store.label(found.name, found.version), time.perf_counter_ns() - began
@@ -139,10 +139,10 @@ class Handler:
         size = len(response.body)
         self.traffic.note(Exchange("http", "none", response.status, None, response.error, 0, 0, size, client))
 
-    def _answer(self, method: str, path: str, fields: dict[bytes, bytes], body: bytes) -> Response:
+    def _answer(self, method: str, path: str, found: Found, fields: dict[bytes, bytes], body: bytes) -> Response:
         if self.token is not None and path not in OPEN:
             self.token.check(fields.get(b"authorization", b""))
-        route, _, name, version = self._find(path)
+        route, _, name, version = found
         if route is None:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
         expected, respond = route
@@ -176,7 +176,8 @@ class Handler:
         length = headers.get(b"inference-header-content-length")
         read = partial(read_infer, request.body, length, loaded.metadata.electrodes, self.limits.batch)
         body, json_length = answer_inference(loaded, read, write_answer)
-        body, encoding = compress(body, headers.get(b"accept-encoding", b""))
+        accepted = headers.get(b"accept-encoding")
+        body, encoding = compress(body, accepted) if accepted else (body, b"")
         response = response_of(200, b"application/json" if json_length is None else b"application/octet-stream", body)
         if json_length is not None:
             response.headers.append((b"inference-header-content-length", b"%d" % json_length))

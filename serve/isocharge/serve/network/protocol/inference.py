@@ -235,8 +235,10 @@ def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
 
 def _tensor(name: str, rows: Singles, in_binary: bool) -> dict[str, Any]:
     """One tensor, its numbers flat and row by row, or only their number of bytes."""
-    tensor: dict[str, Any] = {"name": name, "datatype": "FP32", "shape": rows.shape}
-    return tensor | ({"parameters": {"binary_data_size": rows.nbytes}} if in_binary else {"data": rows.ravel()})
+    if in_binary:
+        size = {"binary_data_size": rows.nbytes}
+        return {"name": name, "datatype": "FP32", "shape": rows.shape, "parameters": size}
+    return {"name": name, "datatype": "FP32", "shape": rows.shape, "data": rows.ravel()}
 
 
 Written = TypeVar("Written")
