@@ -24,6 +24,9 @@ from isocharge.serve.network.model_store import LoadedVersion
 DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
 """Number types of charges, little-endian as the protocol has them."""
 
+EVERY: tuple[str, ...] = tuple(OUTPUTS)
+"""All outputs: what a request gets that names none."""
+
 Unsupported = Annotated[None, Meta(description="nothing, as this server does not support it")]
 
 
@@ -150,13 +153,15 @@ def request_of(
         TooLarge: If there are more presses than `batch`.
     """
     body = convert(content, InferBody, "", RequestError)
-    wanted: dict[str, bool | None] = {output.name: output.parameters.binary_data for output in body.outputs}
-    if len(wanted) < len(body.outputs):
-        raise RequestError("outputs: expected each name once")
-    by_default = body.parameters.binary_data_output
-    wanted = wanted or dict.fromkeys(OUTPUTS)
-    in_binary = frozenset(name for name, flag in wanted.items() if (by_default if flag is None else flag))
-    return InferRequest(body.id, _charges(body.inputs[0], binary, electrodes, batch), tuple(wanted), in_binary)
+    by_default, names = body.parameters.binary_data_output, EVERY
+    in_binary = frozenset(EVERY if by_default else ())
+    if body.outputs:
+        wanted = {output.name: output.parameters.binary_data for output in body.outputs}
+        if len(wanted) < len(body.outputs):
+            raise RequestError("outputs: expected each name once")
+        names = tuple(wanted)
+        in_binary = frozenset(name for name, flag in wanted.items() if (by_default if flag is None else flag))
+    return InferRequest(body.id, _charges(body.inputs[0], binary, electrodes, batch), names, in_binary)
 
 
 def _charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[str, ...], batch: int) -> Singles:
