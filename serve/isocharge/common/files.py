@@ -23,6 +23,9 @@ LONGEST_LINE = 1 << 20
 READ_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
 """To open a file without waiting for a pipe's writer, and without changing line ends; each system has its part."""
 
+WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+"""To open a new file, without changing line ends."""
+
 
 def sha256_of(data: bytes) -> str:
     """Hexadecimal SHA-256."""
@@ -94,7 +97,7 @@ class WholeWrites:
         """
         refuse_existing(path)
         with refusals_explained(path):
-            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+            self._descriptor = os.open(path, WRITE_FLAGS, 0o666)
         self._size = 0
 
     def write(self, data: bytes) -> int:

@@ -14,7 +14,7 @@ from isocharge.serve import device_from_table
 from isocharge.serve.recognition.recognise import described_frames, recognise
 
 FRAMES, RATE_HZ = 300, 200.0
-TYPES = ("i16", "u16", "i24", "u24", "i32", "f32")
+TYPES = ("i16", "u16", "i24", "u24", "i32", "f32", "f32 of counts", "f64 of counts")
 SYNCS = ("AA 55", "A5 5A", "EB 90", "7E", "FF FE", "24 50 5A")
 HEADS = ("seq8", "seq16", "seq32", "t16", "t32ms", "t32us", "status", "kind")
 CYCLIC = {name: crcmod.predefined.Crc(name) for name in ("crc-8-maxim", "modbus", "x-25", "crc-ccitt-false", "crc-32")}
@@ -23,8 +23,8 @@ CHECKS = ("none", "sum-8", "negative", "xor", "sum-16", *CYCLIC)
 
 def number(value, kind, order):
     """A value in the bytes of a type; integers wrap."""
-    if kind == "f32":
-        return struct.pack("<f" if order == "little" else ">f", value)
+    if kind[0] == "f":
+        return struct.pack(("<" if order == "little" else ">") + {"3": "f", "6": "d"}[kind[1]], value)
     size = int(kind[1:]) // 8
     return (int(value) % (1 << 8 * size)).to_bytes(size, order)
 
@@ -52,13 +52,14 @@ class RandomBoard:
         self.head = list({name[:1] if name[0] == "t" else name[:3]: name for name in head}.values())
         self.skips_sync, self.end = bool(rng.integers(2)), pick((b"", b"", b"\r\n"))
         self.check_order = pick((self.order, "little"))
-        bits = 0 if self.kind == "f32" else int(self.kind[1:])
-        noise = rng.uniform(0.1, 1.0) if not bits else 10 ** rng.uniform(0.8, {16: 2.0}.get(bits, 3.8))
+        bits = 0 if self.kind[0] == "f" else int(self.kind[1:])
+        is_count = self.kind != "f32"
+        noise = 10 ** rng.uniform(0.8, {0: 2.5, 16: 2.0}.get(bits, 3.8)) if is_count else rng.uniform(0.1, 1.0)
         zero = 1 << (bits - 1) if self.kind[0] == "u" else 0
         self.values = (
             zero + rng.uniform(-40, 40, self.electrodes) * noise + rng.normal(0, noise, (FRAMES, self.electrodes))
         )
-        self.values = np.round(self.values) if bits else self.values.astype(np.float32)
+        self.values = np.round(self.values) if is_count else self.values.astype(np.float32)
         self.first, self.uptime = int(rng.integers(60_000)), int(rng.integers(1 << 32))
         self.data = b"".join(map(self.frame, range(FRAMES)))[int(rng.integers(9)) :]
 

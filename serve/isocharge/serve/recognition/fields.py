@@ -71,7 +71,7 @@ class Weights:
             dimensionless.
     """
 
-    row: float = 1.5
+    row: float = 4.0
     channel: float = 1.65
     constant: float = 0.8
     noise: float = 8.0
