@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import OutputError, OutputExists
-from isocharge.common.files import bounded_lines, new_file, read_whole
+from isocharge.common.files import WholeWrites, bounded_lines, new_file, read_whole
 from isocharge.common.number_text import number_of
 from isocharge.common.resumable_run import resume_folder
 from isocharge.simulate.execution.workers import in_order
@@ -30,6 +30,18 @@ def test_what_is_no_file_is_not_read(tmp_path):
     for path in (tmp_path / "pipe", tmp_path, "/dev/zero"):
         with pytest.raises(OSError, match="not a regular file"):
             read_whole(path)
+
+
+def test_nothing_of_an_interrupted_write_stays(tmp_path, monkeypatch):
+    """Ctrl-C just after the bytes went out."""
+    file, write = WholeWrites(tmp_path / "file"), os.write
+    monkeypatch.setattr("os.write", lambda *words: write(*words) and signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        file.write(b"long enough")
+    monkeypatch.undo()
+    file.write(b"short")
+    file.close()
+    assert (tmp_path / "file").read_bytes() == b"short"
 
 
 def fill(path, text, then=lambda: None):

@@ -16,7 +16,8 @@ FAST_SHARE = 0.01
 """Share of the inputs in `make test`."""
 
 LONGEST_S, MOST_BYTES = 3.0, 200e6
-"""What no input may take: time, and how much it may raise the peak of memory."""
+"""What no input may take: processor time, s, of which a busy machine counts up to twice as much, and how much it may
+raise the peak of memory, bytes."""
 
 WAITS = 5
 """How much longer an input may take by the clock, with other programs on the same cores."""

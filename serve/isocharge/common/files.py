@@ -121,7 +121,8 @@ class WholeWrites:
         """Nothing waits here."""
 
     def close(self) -> None:
-        """Close it."""
+        """Close it, without what an interruption left of a write."""
+        os.ftruncate(self._descriptor, self._size)
         os.close(self._descriptor)
 
 

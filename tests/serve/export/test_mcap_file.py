@@ -263,6 +263,12 @@ with McapFile(Path({str(path)!r}), ("A", "B", "C"), now=lambda: clock[0]) as fil
     assert len(recovered) >= 69  # of 120 in 2.4 s, written every second
 
 
+def test_a_disk_that_is_full_from_the_start_is_an_error(tmp_path, fill_disk):
+    fill_disk(0)
+    with pytest.raises(OutputError, match=r"a\.mcap cannot be written: No space left on device; choose another"):
+        McapFile(tmp_path / "a.mcap", ("A",)).__enter__()
+
+
 def test_a_full_disk_ends_the_file_and_not_the_stream(tmp_path, fill_disk, caplog):
     path = tmp_path / "touch.mcap"
     fill_disk(12000)

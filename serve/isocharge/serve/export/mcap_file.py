@@ -22,7 +22,7 @@ from typing import Self
 
 from isocharge.common.errors import InputError
 from isocharge.common.extras import require
-from isocharge.common.files import WholeWrites
+from isocharge.common.files import WholeWrites, refusals_explained
 from isocharge.serve.export.record_messages import (
     NAME,
     POSE,
@@ -92,13 +92,14 @@ class McapFile:
         """
         self._file = WholeWrites(self.path)
         self._writer = Writer(self._file)  # type: ignore[arg-type]  # all it uses is write, tell and flush
-        self._writer.start(profile="ros2", library="isocharge")
         self._flushed = self._now()
-        self._channels = {
-            RECORD_TOPIC: self._record_channel(),
-            WRENCH_TOPIC: self._ros_channel(WRENCH_TOPIC, WRENCH, WRENCH_DEFINITION),
-            POSE_TOPIC: self._ros_channel(POSE_TOPIC, POSE, POSE_DEFINITION),
-        }
+        with refusals_explained(self.path):
+            self._writer.start(profile="ros2", library="isocharge")
+            self._channels = {
+                RECORD_TOPIC: self._record_channel(),
+                WRENCH_TOPIC: self._ros_channel(WRENCH_TOPIC, WRENCH, WRENCH_DEFINITION),
+                POSE_TOPIC: self._ros_channel(POSE_TOPIC, POSE, POSE_DEFINITION),
+            }
         return self
 
     def __exit__(

@@ -28,13 +28,15 @@ def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
     """What may fade a press that is held with the same force, and what to do: the end of a sentence.
 
     Args:
-        sizes: Times since the touch, s, and mean magnitudes of the charges then, positive and falling, pC.
+        sizes: Times since the touch, s, and mean magnitudes of the charges then, positive, pC.
     """
     if len(sizes) < FEWEST:
         return UNTOLD
     held_s, size_pC = np.array(sizes).T
     of_leak, left_by_leak = _line(held_s, np.log(size_pC))
     of_creep, left_by_creep = _line(np.log(held_s), np.log(size_pC))
+    if max(of_leak, of_creep) >= 0.0:
+        return UNTOLD
     if left_by_creep > CLEARER * left_by_leak:
         return f"or the amplifier leaks: then put [leak] tau_s = {-1.0 / of_leak:.2g} into a device file"
     if left_by_leak > CLEARER * left_by_creep:

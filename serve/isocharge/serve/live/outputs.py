@@ -168,6 +168,7 @@ class LineQueue:
             self._is_closed = True
             self._change.notify_all()
         self._thread.join(PATIENCE_S)  # the last line may be on its way
+        self.lost += self._thread.is_alive()
         self._raise_error()
 
     def _goes_on(self, taken: int) -> bool:

@@ -65,7 +65,7 @@ class Address:
             raise ListenError(f"cannot listen on {self.uds or f'{self.host}:{self.port}'}: {why}") from error
 
     def release(self) -> None:
-        """Remove what a Unix socket leaves behind when it is closed; what others have put in its place stays."""
+        """Remove what a Unix socket leaves behind when it is closed; what listens in its place stays."""
         if self.uds:
             with contextlib.suppress(ListenError):
                 _remove_stale(self.uds)

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, islice
 from math import gcd
 from typing import Any, NamedTuple
 
@@ -184,7 +184,7 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
             continue
         for order in ORDERS[:size]:
             named = _named(frames, size, order, range(min(skipped, len(constant) - size - 1) + 1))
-            yield from list(chain(named, _unnamed(frames, size, order)))[:1]
+            yield from islice(chain(named, _unnamed(frames, size, order)), 1)
 
 
 def _named(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> Iterator[Check]:

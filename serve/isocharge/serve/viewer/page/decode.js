@@ -1,4 +1,4 @@
-// Binary messages of samples; serve/isocharge/serve/viewer/messages.py and samples.py describe them.
+// Binary messages of samples; serve/isocharge/serve/viewer/messages.py describes them.
 
 export const HEADER_BYTES = 24;
 export const CONTACT = 0x80000000;
