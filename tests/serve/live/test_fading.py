@@ -45,4 +45,4 @@ def test_what_cannot_be_told_is_not(law, seconds, noise_share):
 
 
 def test_a_press_that_rises_first_has_no_time_constant():
-    assert cause_of_fading([(1.0, 500.0), (2.0, 530.0), (3.0, 560.0), (4.0, 590.0), (5.0, 585.0)]) == UNTOLD
+    assert UNTOLD in cause_of_fading([(1.0, 500.0), (2.0, 530.0), (3.0, 560.0), (4.0, 590.0), (5.0, 585.0)])
