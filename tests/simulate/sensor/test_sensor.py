@@ -114,7 +114,14 @@ def test_square_that_is_none_is_refused(three):
             {"electrodes": (replace(TRACED, back=(((9, 9), (10, 9), (9, 10)),)),)},
             "'D': its front and its back have no area in common",
         ),
-        ({"electrodes": (TRACED, Electrode.of_square("E", (9.0, 4.0), 3.0))}, "'D' and 'E' overlap"),
+        (
+            {"electrodes": (replace(TRACED, back=(SQUARE.corners,)), Electrode.of_square("E", (9.0, 4.0), 3.0))},
+            "'D' and 'E' overlap",  # a short circuit, though the trace collects nothing there
+        ),
+        (
+            {"electrodes": (replace(TRACED, more=600 * (SQUARE.corners,)),)},
+            "'D': expected at most 2048 corners of all polygons, got 2404",
+        ),
         ({"readout": "mean"}, r"expected one of \(.*\), got 'mean'"),
         ({"surface": "inside"}, r"expected one of \(.*\), got 'inside'"),
     ],
@@ -139,6 +146,7 @@ def test_only_electrodes_that_share_area_overlap(three):
     ("path", "width", "message"),
     [
         (((0, 0),), 0.5, "trace of electrode 'D': expected 3 to 256 corners"),
+        (((0, 0), (9, 0), (0, 1)), 0.5, "trace of electrode 'D': expected a polygon that does not cross itself"),
         (((0, 0), (0, 0)), 0.5, "trace of electrode 'D': expected a polygon that does not cross itself"),
         (((0, 0), (9, 0)), 0.0, "does not cross itself"),
         (((0, 0), (9, 0), (5, 0)), 0.5, "does not cross itself"),

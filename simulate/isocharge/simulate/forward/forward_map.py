@@ -28,7 +28,7 @@ from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.probe import Probe
-from isocharge.simulate.sensor.sensor import Electrode, Sensor
+from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
 
@@ -190,10 +190,11 @@ class ForwardMap:
         charge = np.empty((at.size, len(self.sensor.electrodes)))
         near, (fine, coarse) = self._near(at), self._readouts
         for readout, chosen in ((fine, near), (coarse, ~near)):
-            press_index, electrode = np.nonzero(chosen)
-            charge[press_index, electrode] = self._read(
-                readout, field, placement, at, rotation + self.probe.angle, press_index, electrode
-            )
+            for count in np.unique(readout.count):
+                press_index, electrode = np.nonzero(chosen & (readout.count == count))
+                charge[press_index, electrode] = self._read(
+                    readout, field, placement, at, rotation + self.probe.angle, press_index, electrode, count
+                )
         scale = self.sensor.film.young * amplitude_squared(self.sensor.film, force)
         scaled: Array = charge * scale[:, None]
         if self.sensor.piezo.d33 != 0.0:
@@ -209,14 +210,8 @@ class ForwardMap:
 
     def _near(self, at: Complexes) -> np.ndarray:
         """Which electrodes need the fine rule for which presses, shape (n, n_electrode)."""
-        return np.stack([self._near_one(at, electrode) for electrode in self.sensor.electrodes], axis=1)
-
-    def _near_one(self, at: Complexes, electrode: Electrode) -> np.ndarray:
-        """Which presses are near a part of an electrode, shape (n,)."""
-        corners = [self.sensor.calibration.place(part) for part in electrode.parts]
-        centre = np.array([c.mean(axis=0) @ [1.0, 1j] for c in corners])
-        reach = np.array([np.linalg.norm(c - c.mean(axis=0), axis=1).max() for c in corners])
-        return np.asarray((np.abs(at[:, None] - centre) < reach + self.probe.reach + NEAR).any(axis=1))
+        away = [(np.abs(at[:, None] - centre) - reach).min(axis=1) for centre, reach in self.sensor.discs]
+        return np.stack(away, axis=1) < self.probe.reach + NEAR
 
     def _read(
         self,
@@ -227,13 +222,14 @@ class ForwardMap:
         frame: Array,
         press_index: Integers,
         electrode: Integers,
+        count: int,
     ) -> Array:
-        """Scaled charges of pairs of press and electrode, shape (n_pair,).
+        """Scaled charges of pairs of press and electrode, whose readout has `count` points, shape (n_pair,).
 
         `frame` is the angle of the probe, and of the field's stress, from the direction of the press, shape (n,).
         """
         mesh, angle = template_for(self.probe, self.resolution), np.angle(at[press_index])
-        points = readout.points[electrode] @ np.array([1.0, 1j]) / self.sensor.film.radius
+        points = readout.points[electrode, :count] @ np.array([1.0, 1j]) / self.sensor.film.radius
         position, mirrored = mesh.into_meshed_half(points * np.exp(-1j * angle)[:, None])
         element, xi, eta = placement[press_index].locate(mesh, position)
         values = tensor_values(self.resolution.order, xi.ravel(), eta.ravel())
@@ -241,7 +237,7 @@ class ForwardMap:
         local = np.matmul(values[:, None, :], nodal.reshape(*values.shape, 3)).reshape(*position.shape, 3)
         local[mirrored, 2] *= -1.0
         stress = rotate_stress(local, (angle if mesh.half else angle + frame[press_index])[:, None])
-        return np.asarray(np.einsum("kpc,kpc->k", stress, readout.weights[electrode]))
+        return np.asarray(np.einsum("kpc,kpc->k", stress, readout.weights[electrode, :count]))
 
 
 def relative_error(

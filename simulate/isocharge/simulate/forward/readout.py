@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import SensorError
 from isocharge.simulate.numerics.interpolation import gauss_line, gauss_square
 from isocharge.simulate.numerics.polygon import (
@@ -45,22 +45,25 @@ class ReadoutPoints:
     Attributes:
         points: (x, y), shape (n_electrode, n_point, 2), mm.
         weights: Charge per stress (s11, s22, s12), shape (n_electrode, n_point, 3), pC/MPa.
+        count: Points of each electrode, shape (n_electrode,); those beyond have no weight.
     """
 
     points: Array
     weights: Array
+    count: Integers
 
     @classmethod
     def of(cls, sensor: Sensor, per_side: int) -> "ReadoutPoints":
         """Integration points for a sensor's electrodes and readout."""
         parts = [electrode_rule(electrode, sensor.readout, per_side) for electrode in sensor.electrodes]
-        most = max(share.shape[0] for _, share in parts)
+        count = np.array([len(share) for _, share in parts])
+        most = count.max()
         points = np.stack([np.pad(at, ((0, most - len(at)), (0, 0)), mode="edge") for at, _ in parts])
         shares = np.stack([np.pad(share, ((0, most - len(share)), (0, 0))) for _, share in parts])
         areas = np.array([electrode.area for electrode in sensor.electrodes])
         per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 0.0])
         weights = (sensor.gains * areas)[:, None, None] * shares * per_stress
-        return cls(sensor.calibration.place(points), weights)
+        return cls(sensor.calibration.place(points), weights, count)
 
     def charge(self, stress: Array) -> Array:
         """Charges (..., n_electrode), pC, from stress at the points, shape (..., n_electrode, n_point, 3), MPa."""
@@ -105,10 +108,10 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     """
     if sensor.piezo.d33 == 0.0:
         return np.zeros(len(sensor.electrodes))
-    covered = [
-        sum(_covered(sensor.calibration.place(part), probe, complex(*at)) for part in electrode.parts)
-        for electrode in sensor.electrodes
-    ]
+    covered = []
+    for electrode, (centre, reach) in zip(sensor.electrodes, sensor.discs, strict=True):
+        near = np.flatnonzero(np.abs(complex(*at) - centre) < reach + probe.reach)
+        covered.append(sum(_covered(sensor.calibration.place(electrode.parts[i]), probe, complex(*at)) for i in near))
     charge: Array = -0.5 * sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered)
     return charge
 

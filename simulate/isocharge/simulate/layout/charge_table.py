@@ -116,8 +116,10 @@ class ChargeTable:
         yield pressed.squares(centres, side)
         for electrode in stay:
             points, shares = electrode_rule(electrode, "area", RULES[0][1])
-            every = np.broadcast_to(points, (len(presses), *points.shape))
-            yield electrode.area * pressed.means(np.arange(len(presses)), every, shares[:, 0])[:, None]
+            chunks = np.array_split(np.arange(len(presses)), -(-len(presses) * len(points) // POINTS))
+            every = [np.broadcast_to(points, (len(chunk), *points.shape)) for chunk in chunks]
+            means = [pressed.means(chunk, at, shares[:, 0]) for chunk, at in zip(chunks, every, strict=True)]
+            yield electrode.area * np.concatenate(means)[:, None]
 
 
 @dataclass(frozen=True)

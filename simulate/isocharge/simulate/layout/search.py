@@ -57,6 +57,9 @@ ENOUGH = 1e-3
 DIFFERENCE = 1e-2
 """Step of the optimiser's differences, mm."""
 
+ALL = slice(None)
+"""Every press of the fine grid."""
+
 
 def random_layouts(case: DesignCase) -> tuple[Array, list[Integers]]:
     """The grid of places, shape (n, 2), mm, and the numbers of `STARTS` random layouts that keep to the rules.
@@ -110,9 +113,15 @@ class Search:
         """What the presses of the fine grid count in the goal, shape (n,)."""
         return self.case.weights(self.fine)
 
-    def squared(self, places: Array, presses: Array) -> Array:
-        """Squared errors of a layout under presses, shape (n_press,), mm^2."""
-        return self.model.squared(self.table.rows(presses, places, self.case.square_side, self.case.stay))
+    @cached_property
+    def staying(self) -> Array:
+        """Rows of the electrodes that stay under the presses of the fine grid."""
+        return self.table.rows(self.fine, np.empty((0, 2)), self.case.square_side, self.case.stay)
+
+    def squared(self, places: Array, which: Integers | slice) -> Array:
+        """Squared errors of a layout under some presses of the fine grid, shape (n_press,), mm^2."""
+        rows = self.table.rows(self.fine[which], places, self.case.square_side)
+        return self.model.squared(np.concatenate([rows, self.staying[which]], axis=1))
 
     def optima(self, places: Array, layouts: list[Integers]) -> list[Array]:
         """The best different layouts that exchange reaches, each of shape (n_new, 2), mm, the best first."""
@@ -152,11 +161,11 @@ class Search:
 
     def value(self, places: Array) -> float:
         """What is made small, mm: the worst error on the fine grid, or the weighted root mean square."""
-        return float(np.exp(self._logs(places, self.fine).max()))
+        return float(np.exp(self._logs(places, ALL).max()))
 
-    def _logs(self, places: Array, presses: Array) -> Array:
+    def _logs(self, places: Array, which: Integers | slice) -> Array:
         """Logarithms of the errors that count: of each press, or one of their mean over the fine grid."""
-        squared = self.squared(places, presses)
+        squared = self.squared(places, which)
         if self.case.goal != "worst":
             squared = np.average(squared, weights=self.weights, keepdims=True)
         return np.asarray(0.5 * np.log(squared))
@@ -177,11 +186,11 @@ class Search:
 
     def _round(self, places: Array, reach: float) -> Array:
         """One sequence of quadratic programs, within `reach` (mm), for the presses that are worst now."""
-        active = self.fine
+        active: Integers | slice = ALL
         if self.case.goal == "worst":
-            squared = self.squared(places, active)
+            squared = self.squared(places, ALL)
             worst = np.argsort(-squared)[:ACTIVE]
-            active = active[worst[squared[worst] >= NEARLY**2 * squared.max()]]
+            active = worst[squared[worst] >= NEARLY**2 * squared.max()]
 
         def spare(variables: Array) -> Array:
             moved = variables[:-1].reshape(-1, 2)

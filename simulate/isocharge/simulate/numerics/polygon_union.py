@@ -9,13 +9,17 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.numerics.polygon import area_of, bilinear, to_corners
 
 NARROW = 1e-9
-"""Distance below which corners, and heights of corners, are one, mm or relative to an area."""
+"""Distance below which corners, and heights of corners, are one, mm."""
+
+SHARPEST = 0.1
+"""Smallest 1 + cos of the angle by which a trace may turn, which is 154 degrees: a mitre grows with 1 / (1 + cos)."""
 
 
 def is_simple(z: Complexes) -> bool:
     """Whether a polygon is anticlockwise and does not cross itself: it then covers its signed area, nothing twice."""
-    area = area_of(to_corners(z))
-    return area > 0.0 and abs(sum(area_of(to_corners(part)) for part in union_parts([z])) - area) < NARROW * area
+    area, around = area_of(to_corners(z)), np.abs(z - np.roll(z, 1)).sum()
+    covered = sum(area_of(to_corners(part)) for part in union_parts([z]))
+    return area > 0.0 and bool(abs(covered - area) < NARROW * around)
 
 
 def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> list[Complexes]:
@@ -65,9 +69,10 @@ def pieces(part: Complexes, longest: float) -> list[Complexes]:
 
 
 def trace_outline(path: Complexes, width: float) -> Complexes:
-    """Corners of a line of a width along a path: its ends are straight, its bends mitred; NaN where it turns back."""
+    """Corners of a line of a width along a path: straight ends, mitred bends; NaN where it turns back sharply."""
     with np.errstate(divide="ignore", invalid="ignore"):
         normal = 1j * np.diff(path) / np.abs(np.diff(path))
         first, last = np.append(normal[:1], normal), np.append(normal, normal[-1:])
-        mitre = 0.5 * width * (first + last) / (1.0 + (first * np.conj(last)).real)
+        turn = 1.0 + (first * np.conj(last)).real
+        mitre = 0.5 * width * (first + last) / np.where(turn < SHARPEST, np.nan, turn)
     return np.append(path - mitre, (path + mitre)[::-1])

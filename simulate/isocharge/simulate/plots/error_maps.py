@@ -90,7 +90,8 @@ def error_maps_picture(design: Design) -> Figure:
     figure = new_figure(6.4 * len(layouts) + 1.0, 6.0)
     smallest = min(float(errors.unknown.min()) for _, errors in layouts)
     norm = LogNorm(smallest, MOST_TIMES * smallest)
-    corners = np.concatenate([electrode.corners for sensor, _ in layouts for electrode in sensor.electrodes])
+    electrodes = [electrode for sensor, _ in layouts for electrode in sensor.electrodes]
+    corners = np.concatenate([polygon for electrode in electrodes for polygon in electrode.front])
     reach = float(max(case.radius, np.abs(corners).max())) + MARGIN
     every = figure.subplots(1, len(layouts), squeeze=False)[0]
     for axes, (sensor, errors) in zip(every, layouts, strict=True):

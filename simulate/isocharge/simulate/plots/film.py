@@ -54,8 +54,8 @@ def draw_working_area(axes: Any, radius: float, label: str = "") -> None:
 
 def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> None:
     """Axes in mm, to scale, that show all electrodes and a circle of `radius` (mm) about the centre."""
-    corners = [corner for e in sensor.electrodes for corner in sensor.calibration.place(np.array(e.corners))]
-    reach = max(radius, *(float(np.hypot(*corner)) for corner in corners)) + 0.7
+    corners = np.concatenate([polygon for electrode in sensor.electrodes for polygon in electrode.front])
+    reach = max(radius, float(np.hypot(*sensor.calibration.place(corners).T).max())) + 0.7
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x, mm", ylabel="y, mm", aspect="equal")
     if title:
         axes.set_title(title)

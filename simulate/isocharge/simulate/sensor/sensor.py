@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SensorError, cut, shown
 from isocharge.simulate.numerics.polygon import area_of, is_convex, overlap, to_complex, to_corners
 from isocharge.simulate.numerics.polygon_union import is_simple, pieces, trace_outline, union_parts
@@ -20,7 +20,10 @@ from isocharge.simulate.sensor.size_check import check_length
 Readout = Literal["area", "edge"]
 
 MOST_CORNERS = 256
-"""Largest number of corners of an electrode."""
+"""Largest number of corners of a polygon."""
+
+MOST_OF_ALL = 2048
+"""Largest number of corners of all polygons of an electrode: where their edges cross is looked for pair by pair."""
 
 LEAST_EXTENT = 0.02
 """Smallest extent of an electrode along x or y, the larger of both, mm: smaller numbers are in metres."""
@@ -81,19 +84,33 @@ class Electrode:
         return (self.corners, *self.more)
 
     @cached_property
-    def parts(self) -> tuple[Array, ...]:
-        """What collects, without common area: a convex polygon, or quadrilaterals and triangles; (n, 2) each, mm.
+    def uncut(self) -> tuple[Array, ...]:
+        """What collects, without common area: a convex polygon, or trapezoids; (n, 2) each, mm.
 
         Raises:
-            SensorError: If a polygon crosses itself or has too few or too many corners.
+            SensorError: If a polygon crosses itself, or there are too few or too many corners.
         """
         for polygon in (*self.front, *self.back):
             check_polygon(f"electrode {self.name!r}", polygon)
-        pad = np.array(self.corners)
-        if not (self.more or self.back) and is_convex(pad):
-            return (pad,)
+        if (count := sum(map(len, (*self.front, *self.back)))) > MOST_OF_ALL:
+            raise SensorError(
+                f"electrode {self.name!r}: expected at most {MOST_OF_ALL} corners of all polygons, got {count}"
+            )
+        if self._is_convex:
+            return (np.array(self.corners),)
         front, back = ([to_complex(np.array(polygon)) for polygon in side] for side in (self.front, self.back))
-        return tuple(to_corners(piece) for part in union_parts(front, back) for piece in pieces(part, LONGEST_PART))
+        return tuple(to_corners(part) for part in union_parts(front, back))
+
+    @cached_property
+    def parts(self) -> tuple[Array, ...]:
+        """What collects, as `uncut`, but trapezoids are cut into quadrilaterals and triangles of `LONGEST_PART`."""
+        if self._is_convex:
+            return self.uncut
+        return tuple(to_corners(piece) for part in self.uncut for piece in pieces(to_complex(part), LONGEST_PART))
+
+    @property
+    def _is_convex(self) -> bool:
+        return not (self.more or self.back) and is_convex(np.array(self.corners))
 
     @property
     def area(self) -> float:
@@ -101,16 +118,21 @@ class Electrode:
         return sum(area_of(part) for part in self.parts)
 
     @cached_property
+    def metal(self) -> tuple[Array, ...]:
+        """What is metal on the front, whether it collects or not, as `parts`."""
+        return replace(self, back=()).parts if self.back else self.parts
+
+    @cached_property
     def boxes(self) -> tuple[Array, Array]:
-        """Lower left and upper right corners of the boxes round the parts, each of shape (n_part, 2), mm."""
-        low, high = (np.array([end(part, axis=0) for part in self.parts]) for end in (np.min, np.max))
+        """Lower left and upper right corners of the boxes round `metal`, each of shape (n_part, 2), mm."""
+        low, high = (np.array([end(part, axis=0) for part in self.metal]) for end in (np.min, np.max))
         return low, high
 
     def overlaps(self, other: "Electrode", within: float = 0.0) -> bool:
-        """Whether the two collect from the same area, or are apart by less than `within`, mm."""
+        """Whether the metal of the two touches on the front, or is apart by less than `within`, mm."""
         (low, high), (other_low, other_high) = self.boxes, other.boxes
         near = (low[:, None] <= other_high + within) & (other_low - within <= high[:, None])
-        return any(overlap(self.parts[i], other.parts[j], within) for i, j in np.argwhere(near.all(axis=2)))
+        return any(overlap(self.metal[i], other.metal[j], within) for i, j in np.argwhere(near.all(axis=2)))
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -180,6 +202,17 @@ class Sensor:
         """Names in the order of the charges."""
         return tuple(electrode.name for electrode in self.electrodes)
 
+    @cached_property
+    def discs(self) -> tuple[tuple[Complexes, Array], ...]:
+        """Centres x + iy and radii of discs round the parts of each electrode, on the real film, (n_part,) each, mm."""
+        discs = []
+        for electrode in self.electrodes:
+            parts = [self.calibration.place(part) for part in electrode.parts]
+            centre = np.array([part.mean(axis=0) for part in parts])
+            reach = [np.linalg.norm(part - at, axis=1).max() for part, at in zip(parts, centre, strict=True)]
+            discs.append((to_complex(centre), np.array(reach)))
+        return tuple(discs)
+
     @property
     def gains(self) -> Array:
         """Calibrated gain of each electrode, shape (n_electrode,)."""
@@ -204,7 +237,7 @@ def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration)
         SensorError: If a polygon crosses itself, nothing collects, it is tiny, a square that is none, or not wholly on
             the film.
     """
-    name, parts = f"electrode {electrode.name!r}", electrode.parts
+    name, parts = f"electrode {electrode.name!r}", electrode.uncut
     if not parts:
         raise SensorError(f"{name}: its front and its back have no area in common, so nothing collects; move one")
     corners = np.array(electrode.corners)

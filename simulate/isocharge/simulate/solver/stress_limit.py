@@ -1,7 +1,8 @@
 """The stress of a film under its hardest press, and the force that keeps it below a limit.
 
 The largest principal stress lies under the probe, at the surface of the film, and hardly depends on where on the film
-that is: one press at the centre tells it. Under a tip it grows a little slower than F^(2/3), as in a membrane.
+that is up to 0.7 of its radius: one press at the centre tells it. Nearer the rim it is larger, 1.4 times at 0.8 and 3.7
+times at 0.93 of the radius. Under a tip it grows a little slower than F^(2/3), as in a membrane.
 """
 
 from functools import lru_cache
@@ -33,7 +34,7 @@ def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAUL
     if stress <= limit:
         return ""
     return (
-        f"{force:.3g} N under {probe.notation} stress the film to {stress:.2g} MPa, the limit is {limit:.3g} MPa; PVDF "
+        f"{force:.3g} N under {probe.notation} stress the film to {stress:.3g} MPa, the limit is {limit:.3g} MPa; PVDF "
         "yields at 45 to 55 MPa, and a dent stays"
     )
 
