@@ -11,8 +11,8 @@ from isocharge.serve.network.address import Address, Tls, Token, check_exposure
 from isocharge.serve.network.http import HttpServer
 
 
-@pytest.mark.parametrize("token", ["", " a", "a\n", "a\r\nb: c", "schlüssel"])
-def test_tokens_that_no_header_carries(token):
+@pytest.mark.parametrize("token", ["", " a", "a\n", "a\r\nb: c", "schlüssel", "100%"])
+def test_tokens_that_no_header_or_address_carries(token):
     with pytest.raises(InputError, match="printable ASCII"):
         Token(token)
 

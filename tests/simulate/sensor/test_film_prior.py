@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import truncnorm
 
 from isocharge.common.errors import SceneError, SensorError
-from isocharge.simulate import Circle, FilmPrior, load_sensor, virtual_film
+from isocharge.simulate import Circle, Electrode, FilmPrior, load_sensor, virtual_film
 from isocharge.simulate.sensor.film_prior import FilmSpread
 
 PRIOR = FilmPrior(load_sensor("four-25um-uniaxial"), Circle(1.0))
@@ -44,6 +44,12 @@ def test_a_parameter_changes_what_its_name_says():
 def test_a_virtual_film_is_drawn_by_its_seed():
     first, again, other = (virtual_film(PRIOR.sensor, PRIOR.probe, seed) for seed in (5, 5, 6))
     assert first == again != other
+
+
+def test_an_electrode_that_some_films_have_over_the_rim_is_refused():
+    at_the_rim = Electrode.of_square("A", (43.0, 0.0), 3.0)
+    with pytest.raises(SensorError, match=r"'A' reaches 44.53 mm .* expected 43.94 mm at most"):
+        FilmPrior(replace(PRIOR.sensor, electrodes=(at_the_rim,)), Circle(1.0))
 
 
 @pytest.mark.parametrize(

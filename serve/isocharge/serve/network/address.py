@@ -169,11 +169,12 @@ class Token:
         """Keep the token.
 
         Raises:
-            InputError: If it is empty, or has characters that no header can carry.
+            InputError: If it is empty, or has characters that no header, or no page's address, can carry.
         """
-        if not token or not token.isascii() or not token.isprintable() or token != token.strip():
+        if not token or not token.isascii() or not token.isprintable() or token != token.strip() or "%" in token:
             raise InputError(
-                "token: expected printable ASCII characters without blanks at the ends; choose another one"
+                "token: expected printable ASCII characters without blanks at the ends, and no %, which means "
+                "something else in the address of a page; choose another one"
             )
         self._expected = b"Bearer " + token.encode()
 

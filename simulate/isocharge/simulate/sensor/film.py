@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from isocharge.common.errors import SensorError
 from isocharge.simulate.sensor.size_check import check_length, check_stress
 
@@ -13,6 +11,9 @@ Surface = Literal["middle", "top", "bottom"]
 
 LEAST_RADIUS, LEAST_THICKNESS = 1.0, 1e-4
 """Smallest radius and thickness of a film, mm: smaller numbers are in metres."""
+
+MOST_PIEZO = 1e5
+"""Largest coefficient, pC/N or pC/(mm^2 K): thirty times that of the strongest crystals."""
 
 LEAST_PIEZO = 1e-3
 """Smallest coefficient d31, d32 or d33 other than 0, pC/N: smaller numbers are in C/N; PVDF has 1 to 30 pC/N."""
@@ -75,8 +76,8 @@ class Piezo:
 
     def __post_init__(self) -> None:
         for name, d in vars(self).items():
-            if not np.isfinite(d):
-                raise SensorError(f"piezo {name}: expected a finite number, got {d}")
+            if not abs(d) <= MOST_PIEZO:
+                raise SensorError(f"piezo {name}: expected a number up to {MOST_PIEZO:g} in size, got {d}")
             if name != "pyro" and 0.0 < abs(d) < LEAST_PIEZO:
                 raise SensorError(f"piezo {name}: expected pC/N, got {d:.6g} pC/N; {d:.6g} C/N are {1e12 * d:.6g} pC/N")
         if self.d31 == 0.0 and self.d32 == 0.0:

@@ -84,6 +84,17 @@ class FilmPrior:
     probe: Circle
     spread: FilmSpread = FilmSpread()
 
+    def __post_init__(self) -> None:
+        sensor, most = self.sensor, float(np.hypot(REACH, REACH)) * self.spread.shift
+        for electrode in sensor.electrodes:
+            reach = np.linalg.norm(sensor.calibration.place(np.concatenate(electrode.parts)), axis=1).max()
+            if not reach + most < sensor.film.radius:
+                raise SensorError(
+                    f"electrode {electrode.name!r} reaches {reach:.4g} mm from the centre, and electrodes may be "
+                    f"{most:.3g} mm off their place: expected {sensor.film.radius - most:.4g} mm at most, or it lies "
+                    "over the rim of some films; move it inwards"
+                )
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, in their order."""

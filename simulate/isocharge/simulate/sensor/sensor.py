@@ -34,6 +34,12 @@ LONGEST_PART = 3.0
 LONGEST_NAME = 100
 """Longest name of an electrode, characters."""
 
+OTHER_COLUMNS = (
+    *("side_mm", "x_mm", "y_mm", "force_N", "position_std_mm", "force_std", "temperature_C"),
+    *("probe", "orientation_deg", "t_us", "t_ms", "t_s", "seq"),
+)
+"""What else stands among the names of electrodes: keys of the sensor file, columns of presses, fields of a frame."""
+
 MOST_ELECTRODES = 64
 """Largest number of electrodes on a film; each is checked against all others."""
 
@@ -178,12 +184,12 @@ class Sensor:
             if value not in options:
                 raise SensorError(f"expected one of {options}, got {value!r}")
         names, gains = self.electrode_names, self.calibration.gain
-        valid = all(0 < len(name) <= LONGEST_NAME and name != "side_mm" for name in names)
-        if not (valid and 1 <= len(names) <= MOST_ELECTRODES and len(set(names)) == len(names)):
+        if not (1 <= len(names) <= MOST_ELECTRODES and len(set(names)) == len(names)):
             raise SensorError(
-                f"electrodes: expected 1 to {MOST_ELECTRODES} different names of 1 to {LONGEST_NAME} characters, not "
-                f"'side_mm', got {len(names)}: {cut(str(names))}"
+                f"electrodes: expected 1 to {MOST_ELECTRODES} different names, got {len(names)}: {cut(str(names))}"
             )
+        for name in names:
+            _check_name(name)
         if not all(np.isfinite(gain) and gain > 0.0 for gain in gains.values()):
             raise SensorError(f"calibration gain: expected positive numbers, got {shown(gains)}")
         if not set(gains) <= set(names):
@@ -228,6 +234,21 @@ def electrode_index(sensor: Sensor, name: str) -> int:
     if name not in sensor.electrode_names:
         raise SensorError(f"no electrode {name!r} on {sensor.name}: it has {', '.join(sensor.electrode_names)}")
     return sensor.electrode_names.index(name)
+
+
+def _check_name(name: str) -> None:
+    """Refuse a name that cannot head a column of charges.
+
+    Raises:
+        SensorError: If it is empty or too long, has a comma or what cannot be printed, or means something else there.
+    """
+    if not (0 < len(name) <= LONGEST_NAME and name.isprintable() and name == name.strip() and "," not in name):
+        raise SensorError(
+            f"electrode {shown(name)}: expected a name of 1 to {LONGEST_NAME} printable characters, without commas and "
+            "without blanks at its ends: it heads a column of CSV files"
+        )
+    if name in OTHER_COLUMNS:
+        raise SensorError(f"electrode {name!r}: this name means something else in files of charges; choose another one")
 
 
 def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration) -> None:
