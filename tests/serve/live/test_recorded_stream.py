@@ -160,7 +160,8 @@ def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, t
     def asking():
         for number, chunk in enumerate(pieces):
             if number == 20:
-                live.request_recording(Recorder(path, predictor.metadata.label, "every", DEVICE).__enter__())
+                for name in ("never.rec", "later.rec"):  # what is asked for anew takes the place of what waits
+                    live.request_recording(Recorder(tmp_path / name, predictor.metadata.label, "every", DEVICE))
             if number == 30:
                 live.request_marker(Marker(1e9, "now"))
             if number == 60:
@@ -177,6 +178,7 @@ def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, t
     replayed = [line for _, line in replay(Recording(path), again, clock, on_marker=markers.append)]
     assert replayed == lines
     assert markers == [Marker(1e9, "now")]
+    assert [*tmp_path.iterdir()] == [path]
 
 
 @pytest.mark.parametrize("marker", ['["x", "y"]', "[1.0]", "[1.0, 2]", '[1e300, "y"]', "1", f'[1.0, "{"x" * 2000}"]'])

@@ -5,10 +5,13 @@ import json
 import os
 import re
 import signal
+import socket
 import struct
+import time
 import urllib.request
 from itertools import islice
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -99,6 +102,27 @@ def test_a_recording_begun_on_the_page_is_repeated_bit_for_bit(board, start, mod
     assert (code, replayed.splitlines()) == (0, written)
     assert any(json.loads(line)["contact"] for line in written)
     assert [event.text for event in Recording(path).events() if isinstance(event, Marker)] == ["here"]
+
+
+def listens(place):
+    with socket.socket() as client:
+        return not client.connect_ex((place.hostname, place.port))
+
+
+def test_a_silent_port(start, tmp_path, monkeypatch):
+    """Its recording waits, once; and a killed reader takes its page along."""
+    monkeypatch.chdir(tmp_path)
+    ends = os.openpty()
+    process, url = start("stream", "linear", "--port", os.ttyname(ends[1]))
+    asked = [{"do": "record", "on": True}] * 6
+    follow(url, lambda _, state: "waits for data" in (state.get("recording") or ""), *asked)
+    assert list(tmp_path.glob("*.rec")) == []
+    process.kill()
+    process.wait(60)
+    while listens(urlsplit(url)):
+        time.sleep(0.1)
+    for end in ends:
+        os.close(end)
 
 
 def test_a_replay_is_sought_and_played_fast(film, models, start, command, tmp_path):

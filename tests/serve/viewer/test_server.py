@@ -173,18 +173,33 @@ FLOODS = {
 """Frames by their bytes; their first byte is kind and end, the second the length and that they are masked."""
 
 
+def followed(place):
+    """A socket on which a stream is followed, by hand."""
+    client = socket.create_connection((place.hostname, place.port), timeout=20)
+    client.sendall(
+        b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+    )
+    assert b" 101 " in client.recv(100)
+    return client
+
+
+def test_who_reads_no_answers_is_not_read_either(start_page, monkeypatch):
+    """Pongs that nobody takes would fill the memory."""
+    monkeypatch.setattr(server, "BYTES_AT_ONCE", 1 << 40)
+    with followed(urlsplit(start_page().url)) as hostile:
+        hostile.settimeout(1.0)
+        with pytest.raises(TimeoutError):
+            hostile.sendall(FLOODS["long pings"] * 200_000)  # 26 MB, more than the system's buffers
+
+
 @pytest.mark.parametrize("kind", FLOODS)
 def test_a_flood_of_any_frame_ends_the_connection(page, record, viewer, kind):
     """Also of one that is no message, and a good viewer gets its samples beside."""
     place = urlsplit(page.url)
 
     def flood():
-        with socket.create_connection((place.hostname, place.port), timeout=20) as hostile:
-            hostile.sendall(
-                b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-                b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-            )
-            assert b" 101 " in hostile.recv(100)
+        with followed(place) as hostile:
             first = b"\x01\x80" + MASK if kind == "empty continuations" else b""
             sent = 0
             with suppress(OSError):

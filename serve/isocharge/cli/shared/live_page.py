@@ -175,7 +175,8 @@ def _do(request: LiveRequest, link: ReaderEnd, live: RecordedStream, header: tup
                 raise InputError("the command that runs the stream records it already (--record)")
             label = live.predictor.metadata.label
             path = Path(f"{label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
-            live.request_recording(Recorder(path, label, *header).__enter__() if is_on else None)
+            live.request_recording(Recorder(path, label, *header) if is_on else None)
+            link.tell(recording=f"{path.name}, which waits for data" if is_on else None)
         case Tare():
             live.request_tare()
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 
+from isocharge.common.errors import IsochargeError
 from isocharge.serve.live.stream import TouchStream
 from isocharge.serve.port.recording import Marker, NewModel, RecordedClock, Recorder, Recording
 from isocharge.serve.port.source import Chunk
@@ -42,6 +43,7 @@ class RecordedStream:
         self._borrowed = recorder  # whoever opened it closes it
         self._under_way: tuple[Chunk, list[str]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
+        self._recording_requested: deque[Recorder | None] = deque(maxlen=1)
         self._load_requested: Load | None = None
         self._loading: Future[Predictor] | None = None
 
@@ -55,14 +57,15 @@ class RecordedStream:
         self._requests.append(self._tare)
 
     def request_recording(self, recorder: Recorder | None) -> None:
-        """End the recording that is under way; begin another one.
+        """End the recording that is under way; begin another one, in the place of one that still waits for data.
 
         A recording begins with a new stream, tare included: its replay has nothing but its bytes to go by.
 
         Args:
-            recorder: Open; it is closed at the end. None for no recording.
+            recorder: It is opened then, and closed at the end. None for no recording.
         """
-        self._requests.append(partial(self._record, recorder))
+        self._recording_requested.append(recorder)
+        self._requests.append(self._record)
 
     def request_marker(self, marker: Marker) -> None:
         """Note a moment in the recording, if there is one."""
@@ -106,10 +109,17 @@ class RecordedStream:
             self.recorder.chunk(*self._under_way)
         self._under_way = None
 
-    def _record(self, recorder: Recorder | None) -> None:
+    def _record(self) -> None:
+        if not self._recording_requested:  # a later request was done in the place of this one
+            return
         self._end_recording()
-        self.recorder = recorder
+        recorder = self._recording_requested.pop()
         if recorder is not None:
+            try:
+                self.recorder = recorder.__enter__()
+            except IsochargeError as error:
+                log.error("no recording: %s", error)
+                return
             self._stream.restart()
             if recorder.model_label != self.predictor.metadata.label:  # it was taken since the request
                 recorder.model(self.predictor.metadata.label)

@@ -163,11 +163,18 @@ class PageConnection(ServerConnection):
         super().connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        """Count, and take."""
-        if self._budget.spend(len(data), time.monotonic()):
-            super().data_received(data)
-        else:
+        """Count, and take; no more from a client that does not read what it is sent, which would fill the memory."""
+        if not self._budget.spend(len(data), time.monotonic()):
             self.transport.abort()
+            return
+        super().data_received(data)
+        if self.paused:
+            self.transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        """The client reads again."""
+        super().resume_writing()
+        self.transport.resume_reading()
 
 
 class PageServer:
