@@ -3,13 +3,14 @@
 import sys
 import time
 
-from isocharge.serve import Port, Predictor, stream
+from isocharge.serve import Port, Predictor, load_device, stream
 
-url, model, seconds = sys.argv[1], sys.argv[2], float(sys.argv[3])  # /dev/ttyACM0 three-25um-biaxial 10
-predictor, end = Predictor(model), time.monotonic() + seconds
+url, model, seconds = sys.argv[1], sys.argv[2], float(sys.argv[3])  # /dev/ttyACM0 three-25um-biaxial 10 [board.toml]
+predictor, device = Predictor(model), load_device(sys.argv[4] if len(sys.argv) > 4 else None)
 touches, in_contact = 0, False
-with Port(url) as port:  # the first half second is the tare: leave the film alone
-    for record in stream(port, predictor):
+with Port(url, wait=60.0, request=device.request) as port:  # the first half second is the tare: leave the film alone
+    end = time.monotonic() + seconds
+    for record in stream(port, predictor, device):
         touches += record.contact and not in_contact
         in_contact = record.contact
         if record.contact and not record.flags:  # flags say when not to trust an answer

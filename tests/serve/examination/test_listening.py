@@ -52,7 +52,7 @@ class PortOfOneSpeed:
     echo_share, opened = 0.0, []
     now_s = 0.0
 
-    def __init__(self, url, *, baud, request):
+    def __init__(self, url, *, baud, request, wait):  # noqa: ARG002
         self.baud, self.lines = baud, 0
         self.opened.append((url, baud, request))
 
@@ -94,14 +94,6 @@ def test_no_speed_is_right(opened):
 def test_one_speed_is_not_tried(opened):
     assert examine("/dev/ttyUSB9", bauds=(57600,), seconds=1.0).good > 190
     assert len(opened) == 1
-
-
-@pytest.mark.parametrize(
-    ("url", "has"),
-    [("/dev/ttyUSB9", True), ("udp://127.0.0.1:9", False), ("socket://x:1", False), ("/dev/pts/1", False)],
-)
-def test_what_has_a_speed(url, has):
-    assert listening.has_speed(url) == has
 
 
 def test_what_is_sent_is_heard_as_long_as_asked(run, pty):

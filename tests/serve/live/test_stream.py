@@ -39,13 +39,20 @@ def play(predictor):
 
     def play(*later, **options):
         rest = frames(np.tile(OFFSET, (10, 1)))
-        return list(stream([chunk(*rest), *(chunk(f) for f in later)], predictor, CHAIN, **options))[10:]
+        return list(stream([chunk(*rest), *(chunk(f) for f in later)], predictor, chain=CHAIN, **options))[10:]
 
     return play
 
 
 def pressed(film, x_mm=2.0, y_mm=-3.0, force_N=0.5):
     return film.charge_pC(np.array([x_mm]), np.array([y_mm]), np.array([force_N]))[0]
+
+
+def test_the_board_of_a_device_file_is_followed(predictor):
+    """Numbers of another unit, whose tare is two frames."""
+    device = device_from_table({"gain": {"pC_per_unit": 2.0}, "tare": {"frames": 2}}, "test")
+    *_, record = stream([chunk(*frames(np.tile(OFFSET, (3, 1))))], predictor, device)
+    assert record.tare_pC == {"A": 24.0, "B": -14.0, "C": 6.0}
 
 
 def test_record_of_a_press(film, play):
@@ -97,7 +104,7 @@ def test_record_out_of_contact(play):
 
 
 def test_record_before_the_tare(predictor):
-    records = list(stream([chunk(*frames(np.tile(OFFSET, (10, 1))))], predictor, CHAIN))
+    records = list(stream([chunk(*frames(np.tile(OFFSET, (10, 1))))], predictor, chain=CHAIN))
     assert {(r.flags, r.contact, r.force_N, r.charge_pC, r.tare_pC) for r in records} == {
         (("tare",), False, 0.0, None, None)
     }

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from isocharge.cli.serve.records import WaitOption, awaited
+from isocharge.cli.serve.records import WaitOption
 from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption
 from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError, IsochargeError
@@ -20,6 +20,7 @@ from isocharge.serve.examination.listening import BAUDS
 from isocharge.serve.examination.port_check import device_text
 from isocharge.serve.model.model_folder import model_names, repositories
 from isocharge.serve.port.serial_line import Request
+from isocharge.serve.port.source import has_speed
 
 GAIN_METAVAR = "NUMBER|A=..,B=.."
 
@@ -98,13 +99,14 @@ def doctor_command(
     electrodes = Predictor(model, models=models).metadata.electrodes if model else ()
     settings = {"pC_per_unit": pC_per_unit, "V_per_unit": V_per_unit, "feedback_pF": feedback_pF}
     examination = examine(
-        awaited(port, wait),
+        port,
         bauds=(baud,) if baud else BAUDS,
         seconds=seconds,
         device=load_device(device),
         electrodes=electrodes,
         gain={key: _setting(key, text) for key, text in settings.items() if text is not None},
         request=_request(request, request_Hz),
+        wait=wait,
     )
     print(dumps(asdict(examination)) if json else "\n".join(report_lines(examination)))
     alive = len(examination.channels)
@@ -159,7 +161,8 @@ def _write(path: Path, examination: Examination) -> None:
 
 def report_lines(examination: Examination) -> Iterator[str]:
     """An examination as text for people."""
-    yield f"{examination.url} at {examination.baud} baud: {examination.format}"
+    speed = f" at {examination.baud} baud" if has_speed(examination.url) else ""
+    yield f"{examination.url}{speed}: {examination.format}"
     yield f"{examination.bytes_seen} bytes in {examination.seconds:.1f} s, {examination.rate_Hz:.1f} frames/s"
     yield f"{examination.good} good frames, {examination.bad} bad pieces"
     numbers = (

@@ -1,6 +1,5 @@
 """Where the records of `serve stream` and `serve replay` go: options, writers, and the summary at the end."""
 
-import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing
@@ -18,7 +17,7 @@ from isocharge.serve.export.record_messages import RecordEncoding
 from isocharge.serve.live.outputs import LineQueue, UdpSink, csv_header, csv_line
 
 WaitOption = Annotated[
-    float, typer.Option("--wait", min=0.0, max=3600.0, help="Time to wait until the port exists, s.")
+    float, typer.Option("--wait", min=0.0, max=3600.0, help="Time to wait until the port can be opened, s.")
 ]
 
 
@@ -68,14 +67,6 @@ McapRecordsOption = Annotated[
         "same text in ROS 2 messages, for `ros2 bag` and rosbags, which refuse a file with anything else.",
     ),
 ]
-
-
-def awaited(port: str, wait: float) -> str:
-    """The port, as soon as there is something under its path, or when the time, s, is over."""
-    end = time.monotonic() + wait
-    while "://" not in port and port != "-" and not Path(port).exists() and time.monotonic() < end:
-        time.sleep(0.05)
-    return port
 
 
 LATENCIES = 100_000

@@ -20,7 +20,6 @@ from isocharge.cli.serve.records import (
     OutputOption,
     UdpOption,
     WaitOption,
-    awaited,
     in_turn,
     record_writer,
     summary,
@@ -150,8 +149,8 @@ def stream_command(
         if address is not None:
             shown = live_page(address, token, path.frame_id, predictor.metadata, find_model(model, models))
             page, _ = stack.enter_context(shown)
-        request = board.request
-        source = stack.enter_context(open_source(awaited(port, wait), baud=baud, reconnect=reconnect, request=request))
+        opened = open_source(port, baud=baud, reconnect=reconnect, request=board.request, wait=wait)
+        source = stack.enter_context(opened)
         stack.enter_context(on_signal(signal.SIGUSR1, recorded.request_tare))
         renew = partial(recorded.request_model, partial(_load, model, models))
         stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(renew)))

@@ -1,6 +1,5 @@
 """Bytes of a port for a while, at the speed at which they are frames; and their frames, as a device file says."""
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +13,7 @@ from isocharge.serve.live.device import Device
 from isocharge.serve.live.reading_stream import channel_names
 from isocharge.serve.port.device_clock import DeviceClock
 from isocharge.serve.port.serial_line import SCHEME, Request
-from isocharge.serve.port.source import Chunk, Port
+from isocharge.serve.port.source import Chunk, Port, has_speed
 
 BAUDS = (115200, 921600, 1000000, 2000000, 460800, 230400, 57600, 38400, 19200, 9600)
 """Baud rates to try, in this order, bit/s."""
@@ -72,17 +71,13 @@ class Heard:
         return self.url.startswith(SCHEME)
 
 
-def has_speed(url: str) -> bool:
-    """Whether a port has a baud rate: sockets and pseudo-terminals have none."""
-    return "://" not in url and not os.path.realpath(url).startswith("/dev/pts/")
-
-
 def listen(
     url: str,
     bauds: Sequence[int],
     seconds: float,
     request: Request | None,
     is_clear: Callable[[Heard], bool],
+    wait: float = 0.0,
 ) -> Heard:
     """Listen to a port, at the first of some speeds at which the bytes make sense; silence is silence at any speed.
 
@@ -92,22 +87,24 @@ def listen(
         seconds: Time of listening at the right one, s.
         request: What the board has to be asked; whether the line brings it back is found out.
         is_clear: Whether bytes make sense.
+        wait: Time to wait until it can be opened, s.
 
     Raises:
         PortError: If the port cannot be opened.
     """
     if request is not None and not request.echo:
-        request = replace(request, echo=_listen(url, bauds[0], ECHO_S, request).echo_share >= ECHO_SHARE)
+        request = replace(request, echo=_listen(url, bauds[0], ECHO_S, request, wait).echo_share >= ECHO_SHARE)
     if has_speed(url) and len(bauds) > 1:
-        tries = (_listen(url, baud, TRY_S, request) for baud in bauds)
+        tries = (_listen(url, baud, TRY_S, request, wait) for baud in bauds)
         bauds = [next((heard.baud for heard in tries if not heard.chunks or is_clear(heard)), bauds[0])]
-    return _listen(url, bauds[0], seconds, request)
+    return _listen(url, bauds[0], seconds, request, wait)
 
 
-def _listen(url: str, baud: int, seconds: float, request: Request | None) -> Heard:
+def _listen(url: str, baud: int, seconds: float, request: Request | None, wait: float) -> Heard:
     """Listen for a while; after the loss of a port, what came before counts."""
-    heard, began = Heard(url, baud, request), time.monotonic()
-    with Port(url, baud=baud, request=request) as port:
+    heard = Heard(url, baud, request)
+    with Port(url, baud=baud, request=request, wait=wait) as port:
+        began = time.monotonic()
         try:
             while (left_s := began + seconds - time.monotonic()) > 0.0:
                 chunk = port.read(left_s)

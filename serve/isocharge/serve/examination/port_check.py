@@ -153,6 +153,7 @@ def examine(
     electrodes: tuple[str, ...] = (),
     gain: Mapping[str, Any] | None = None,
     request: Request | None = None,
+    wait: float = 0.0,
 ) -> Examination:
     """Check a port. The film must not be touched meanwhile.
 
@@ -164,12 +165,13 @@ def examine(
         electrodes: Electrodes of the model that will be used; empty for any model.
         gain: What is known of the amplifier where nothing is known of the board: keys of the section `[gain]`.
         request: What the board has to be asked; by default what the device says.
+        wait: Time to wait until the port can be opened, s.
 
     Raises:
         PortError: If the port cannot be opened.
         DeviceError: If the gain is wrong, or for other electrodes.
     """
-    heard = listen(url, bauds, seconds, request or device.request, lambda part: _is_clear(part, device))
+    heard = listen(url, bauds, seconds, request or device.request, lambda part: _is_clear(part, device), wait)
     return findings(heard, device=device, electrodes=electrodes, gain=gain)
 
 

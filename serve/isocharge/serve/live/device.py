@@ -201,7 +201,7 @@ ANY_BOARD = Device(name="any board")
 """The board of which nothing is known."""
 
 
-def load_device(path: Path | None) -> Device:
+def load_device(path: str | Path | None) -> Device:
     """Read a device file; without one, it is any board.
 
     Raises:
@@ -209,7 +209,7 @@ def load_device(path: Path | None) -> Device:
     """
     if path is None:
         return ANY_BOARD
-    return device_from_table(read_toml(path, "a device file", DeviceError, dict[str, Any]), str(path))
+    return device_from_table(read_toml(Path(path), "a device file", DeviceError, dict[str, Any]), str(path))
 
 
 def device_from_table(table: Mapping[str, Any], where: str) -> Device:

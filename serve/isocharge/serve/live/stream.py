@@ -60,8 +60,9 @@ class StreamTotals(NamedTuple):
 def stream(
     chunks: Iterable[Chunk],
     predictor: Predictor,
-    chain: Chain | None = None,
+    device: Device = ANY_BOARD,
     *,
+    chain: Chain | None = None,
     parser: Parser | None = None,
     gaps: SequenceGaps | None = None,
 ) -> Iterator[PredictionRecord]:
@@ -70,17 +71,19 @@ def stream(
     Args:
         chunks: Bytes with the time of their arrival: an open `Port`, or anything like it.
         predictor: The model of this sensor.
-        chain: Rules of the signal chain.
-        parser: Turns bytes into frames; hand one in to read its counters. By default the format is recognised.
+        device: What is known about the board, of `load_device`.
+        chain: Rules of the signal chain; by default those of the device.
+        parser: Turns bytes into frames; hand one in to read its counters. By default that of the device.
         gaps: Follows the frame numbers; hand one in to read its counters.
 
     Raises:
         ChargeError: If a frame has another number of charges than the model.
+        DeviceError: If the device file has other electrodes than the model.
         TareError: If the film is not left alone to tare.
         PortError: If the bytes are no frames.
         PortLost: If the port goes away.
     """
-    touch = TouchStream(predictor, chain=chain, parser=parser, gaps=gaps)
+    touch = TouchStream(predictor, device, chain=chain, parser=parser, gaps=gaps)
     for chunk in chunks:
         yield from touch.feed(chunk)
     touch.finish()

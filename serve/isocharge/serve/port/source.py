@@ -18,7 +18,16 @@ from types import TracebackType
 from typing import NamedTuple, Self
 
 from isocharge.common.errors import InputError, PortError, PortLost
-from isocharge.serve.port.serial_line import OPEN_ERRORS, READ_ERRORS, SCHEME, Asker, Request, SerialLine, UdpSocket
+from isocharge.serve.port.serial_line import (
+    HAS_POSIX_PORTS,
+    OPEN_ERRORS,
+    READ_ERRORS,
+    SCHEME,
+    Asker,
+    Request,
+    SerialLine,
+    UdpSocket,
+)
 
 RETRY_S = 0.1
 """First pause before a lost port is opened again, s; each pause is twice as long as the one before."""
@@ -69,6 +78,7 @@ class Port:
         silence_s: float = 5.0,
         reconnect: bool = False,
         request: Request | None = None,
+        wait: float = 0.0,
     ) -> None:
         """Describe a port; it is opened on entering the context.
 
@@ -78,8 +88,9 @@ class Port:
             silence_s: Time without a byte after which the port counts as lost, s.
             reconnect: Whether to open a lost port again until it is back, instead of raising.
             request: What the board has to be asked; None for a board that sends unasked.
+            wait: Time to wait until it can be opened, s.
         """
-        self.url = url
+        self.url, self._wait = url, wait
         self.outages = 0
         self._baud, self._silence_s, self._reconnect = baud, silence_s, reconnect
         self._asker = Asker(request) if request else None
@@ -89,21 +100,38 @@ class Port:
         """Open the port and drop the bytes that it has buffered.
 
         Raises:
-            PortError: If it cannot be opened.
+            PortError: If it cannot be opened, or not in time.
         """
+        end_s = time.monotonic() + self._wait
+        while True:
+            try:
+                self._open()
+                return self
+            except PortError as error:
+                if time.monotonic() >= end_s or isinstance(error.__cause__, ValueError):
+                    raise
+                time.sleep(RETRY_S)
+
+    def _open(self) -> None:
+        is_path = "://" not in self.url
+        if is_path and HAS_POSIX_PORTS and not Path(self.url).exists():
+            raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
         try:
             is_udp = self.url.startswith(SCHEME)
             self._line = UdpSocket(self.url) if is_udp else SerialLine(self.url, self._baud)
             self._line.reset_input_buffer()  # a tty drops them by itself, a socket does not
         except OPEN_ERRORS as error:
             self._close()
-            raise PortError(
-                f"{self.url}: cannot be opened at {self._baud} baud ({error}); check the cable and the name, that no "
-                "other program has it open, and that you may read it (on Linux, the group 'dialout')"
-            ) from error
+            speed, hint = "", "check host and number, that the board is on, and that no other program has it"
+            if is_path:
+                speed = f" at {self._baud} baud"
+                hint = (
+                    "check the cable and the name, that no other program has it open, and that you may read it (on "
+                    "Linux, the group 'dialout')"
+                )
+            raise PortError(f"{self.url}: cannot be opened{speed} ({error}); {hint}") from error
         if self._asker:
             self._asker.forget()
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -159,7 +187,7 @@ class Port:
             time.sleep(pause_s)
             pause_s = min(2.0 * pause_s, LONGEST_RETRY_S)
             try:
-                self.__enter__()
+                self._open()
                 return self._read()
             except PortError:
                 continue
@@ -172,9 +200,9 @@ class Port:
         """
         data = self._receive(self._silence_s)
         if not data:
+            speed = f", and that {self._baud} baud is its speed" if has_speed(self.url) else ""
             raise PortLost(
-                f"{self.url}: no data for {self._silence_s:g} s; check that the board is powered and sends, "
-                f"and that {self._baud} baud is its speed"
+                f"{self.url}: no data for {self._silence_s:g} s; check that the board is powered and sends{speed}"
             )
         return data
 
@@ -201,6 +229,11 @@ class Port:
             if answer := asker.heard(line.receive(min(wait_s, left_s))):
                 return answer
         return b""
+
+
+def has_speed(url: str) -> bool:
+    """Whether a port has a baud rate: sockets and pseudo-terminals have none."""
+    return "://" not in url and not os.path.realpath(url).startswith("/dev/pts/")
 
 
 STDIN = "-"
@@ -234,21 +267,26 @@ def open_source(
     silence_s: float = 5.0,
     reconnect: bool = False,
     request: Request | None = None,
+    wait: float = 0.0,
 ) -> Chunks:
     """The source of chunks behind a name, as a context manager.
 
     Args:
         url: A device path or URL, the path of a file or named pipe, or - for stdin.
-        baud, silence_s, reconnect, request: As `Port` takes them; ignored for files.
+        baud, silence_s, reconnect, request, wait: As `Port` takes them; a file is waited for, too, until it exists.
 
     Raises:
         InputError: If the file cannot be read.
     """
     if url == STDIN:
         return contextlib.nullcontext(FileSource(sys.stdin.fileno()))
+    end_s = time.monotonic() + wait
+    while "://" not in url and not Path(url).exists() and time.monotonic() < end_s:
+        time.sleep(RETRY_S)
     if "://" not in url and _is_file(Path(url)):
         return _file(Path(url))
-    return Port(url, baud=baud, silence_s=silence_s, reconnect=reconnect, request=request)
+    left_s = max(0.0, end_s - time.monotonic())
+    return Port(url, baud=baud, silence_s=silence_s, reconnect=reconnect, request=request, wait=left_s)
 
 
 def _is_file(path: Path) -> bool:
