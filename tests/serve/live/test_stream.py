@@ -16,6 +16,7 @@ from isocharge.serve import (
     TouchStream,
     device_from_table,
     encode_frame,
+    open_source,
     stream,
 )
 from isocharge.serve.frames.frame import SequenceGaps
@@ -46,6 +47,14 @@ def play(predictor):
 
 def pressed(film, x_mm=2.0, y_mm=-3.0, force_N=0.5):
     return film.charge_pC(np.array([x_mm]), np.array([y_mm]), np.array([force_N]))[0]
+
+
+def test_times_of_a_file_follow_the_clock_of_the_board(predictor, tmp_path):
+    path = tmp_path / "frames"
+    path.write_bytes(chunk(*frames(np.tile(OFFSET, (600, 1)))).data)
+    with open_source(str(path)) as source:
+        times = [record.timestamp for record in stream(source, predictor)]
+    np.testing.assert_allclose(np.diff(times), 0.005, atol=1e-6)
 
 
 def test_the_board_of_a_device_file_is_followed(predictor):

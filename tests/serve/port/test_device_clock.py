@@ -48,6 +48,18 @@ def test_clock_of_a_device_that_restarts():
     assert np.abs(np.array([time.host_s for time in times]) - arrived_s).max() < 1e-3
 
 
+def test_times_never_fall():
+    """However late chunks of one to eight readings are; and from a restart of the device on neither."""
+    rng, clock, host_s = np.random.default_rng(0), DeviceClock(), []
+    begins = np.cumsum(rng.integers(1, 9, 3000))
+    for first, after, late_s in zip(begins, begins[1:], rng.exponential(0.05, begins.size), strict=False):
+        arrived_s = START_S + 0.004 * after + late_s
+        host_s += [clock.read(4000 * int(k % 7000), MODULUS, arrived_s).host_s for k in range(first, after)]
+        clock.arrived(arrived_s)
+    assert np.diff(host_s).min() >= 0.0
+    assert clock.restarts == 1
+
+
 def test_readings_of_one_chunk_are_spread_by_the_device_clock():
     clock, host_s = DeviceClock(), []
     for chunk in range(200):

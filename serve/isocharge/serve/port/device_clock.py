@@ -24,6 +24,7 @@ class ReadingTime(NamedTuple):
 
     Attributes:
         host_s: Unix seconds: the device's clock fitted to the arrivals, or the arrival if the device sends no clock.
+            It falls only where a new fit begins, because a clock was set.
         device_us: The device's clock without its wraps, us; None if the device sends none.
         step_s: Since the reading before, s; 0 for the first one after a start.
     """
@@ -59,6 +60,8 @@ class DeviceClock:
         self._fitted_us: int | None = None
         self._age_s = 0.0
         self._last_s: float | None = None
+        self._is_first, self._latest_s = True, -math.inf
+        self._arrived_s: float | None = None
 
     def read(self, t_us: int | None, modulus: int, arrived_s: float) -> ReadingTime:
         """The time of the next reading.
@@ -73,16 +76,24 @@ class DeviceClock:
             self._last_s = arrived_s
             return ReadingTime(arrived_s, None, step_s)
         step_us = self._unwrap(t_us, modulus)
-        host_s = arrived_s if self._fitted_us is None else self._predict(self._device_us)
-        return ReadingTime(host_s, self._device_us, step_us * 1e-6)
+        if self._fitted_us is None:
+            self._host_s, self._fitted_us, self._is_first = max(arrived_s, self._latest_s), self._device_us, True
+        self._latest_s = max(self._latest_s, self._predict(self._device_us))
+        return ReadingTime(self._latest_s, self._device_us, step_us * 1e-6)
 
     def arrived(self, at_s: float) -> None:
-        """Fit the clock to the arrival (unix s) of the chunk whose last reading was the latest one."""
-        if self._raw_us is None:
+        """Fit the clock to the arrival (unix s) of the chunk whose last reading was the latest one.
+
+        The chunks of a file arrive all at once, which says nothing; so the first one alone says nothing either.
+        """
+        before_s, self._arrived_s = self._arrived_s, at_s
+        if self._fitted_us is None or before_s in (None, at_s):
             return
-        late_s = 0.0 if self._fitted_us is None else at_s - self._predict(self._device_us)
-        if self._fitted_us is None or abs(late_s) > LOST_S:
+        late_s = at_s - self._predict(self._device_us)
+        is_lost = abs(late_s) > LOST_S
+        if is_lost or self._is_first:
             self._host_s, self._fitted_us, self._age_s, self.rate = at_s, self._device_us, 0.0, 1.0
+            self._latest_s, self._is_first = -math.inf if is_lost else self._latest_s, False
             return
         step_s = (self._device_us - self._fitted_us) * 1e-6
         self._age_s += step_s
