@@ -41,7 +41,10 @@ def asked(monkeypatch):
 
 @pytest.fixture
 def played(run, tmp_path):
-    """Play until so many frames have come: their values, shape (n, electrodes), pC, and the result of the command."""
+    """Play until so many frames have come since charges changed by 30 pC, the film being solved and pressed.
+
+    Gives the values of all frames, shape (n, electrodes), pC, and the result of the command.
+    """
 
     def play(count, *words, board=None):
         link, parser, frames = tmp_path / "film", (board or device_from_table({}, "any")).parser(), []
@@ -50,9 +53,12 @@ def played(run, tmp_path):
             while not link.exists():
                 time.sleep(0.01)
             with Port(str(link), reconnect=True) as port:
+                last = np.inf
                 for chunk in port:
                     frames.extend(parser.feed(chunk.data))
-                    if len(frames) >= count:
+                    if frames and np.abs(np.subtract(frames[-1].values, frames[0].values)).max() > 30.0:
+                        last = min(last, len(frames) + count)
+                    if len(frames) >= last:
                         break
             interrupt()
 
@@ -66,8 +72,20 @@ def played(run, tmp_path):
     return play
 
 
+def test_the_port_is_there_before_the_film_is_solved(played, monkeypatch, tmp_path):
+    build, there = ForwardMap.build, []
+
+    def look(*film, **domain):
+        there.append((tmp_path / "film").exists())
+        return build(*film, **domain)
+
+    monkeypatch.setattr(ForwardMap, "build", look)
+    played(1)
+    assert there == [True]
+
+
 def test_random_presses_come_after_a_second_of_rest(played, asked):
-    values, result = played(1300, "--noise", "clean", "--force-max", 0.5)
+    values, result = played(300, "--noise", "clean", "--force-max", 0.5)
     total = values.sum(axis=1)
     assert values.shape[1] == 3
     assert np.ptp(total[:800]) < 1e-3
@@ -84,7 +102,7 @@ def test_a_film_of_a_seed_plays_its_charges_and_does_not_tell_it(played, tmp_pat
     """A script: half a second without touch, then one press that is held."""
     script = tmp_path / "held.toml"
     script.write_text("presses = [[0, 0, 0, 0], [0.5, 0, 0, 0], [0.501, 1, 2, 0.5], [2, 1, 2, 0.5]]\n")
-    values, result = played(600, "--script", script, "--noise", "clean", "--film", 9, "--frames", frames)
+    values, result = played(100, "--script", script, "--noise", "clean", "--film", 9, "--frames", frames)
     expected_pC = small_map(*FILM_9).charges(np.array([[1.0, 2.0, 0.5]]))[0]
     np.testing.assert_allclose(values[-1, -3:] - values[0, -3:], expected_pC, rtol=1e-3)
     assert f"playing film 9 of {SENSOR} at 1000 Hz" in result.stderr
@@ -116,7 +134,7 @@ def test_the_amplifier_of_a_script(played, tmp_path):
         "limit_pC = 50\ndrift_pC_per_s = 100.0\n"
         "presses = [[0, 0, 0, 0], [0.2, 0, 0, 0], [0.3, 0, 0, 0.5], [2, 0, 0, 0.5]]\n"
     )
-    values, _ = played(500, "--script", script, "--noise", "clean")
+    values, _ = played(400, "--script", script, "--noise", "clean")
     change = values - values[0]
     assert (np.abs(change[150]) > 5.0).all()
     assert 40.0 < np.abs(change).max() <= 100.0

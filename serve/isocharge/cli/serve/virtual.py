@@ -13,11 +13,11 @@ import typer
 from isocharge.cli.shared.forward_maps import SLACK
 from isocharge.cli.shared.options import ProbeOption, SensorArgument
 from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
-from isocharge.cli.shared.virtual_sensor import virtual_sensor
+from isocharge.cli.shared.virtual_sensor import measuring, played
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
-from isocharge.serve import Script, encode_frame, encode_text, load_device
+from isocharge.serve import Script, VirtualSensor, encode_frame, encode_text, load_device
 from isocharge.serve.frames.frame_layout import FrameLayout
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
 from isocharge.serve.virtual_sensor.sensor import Encode, posix_modules
@@ -98,8 +98,8 @@ def virtual_command(
 ) -> None:
     """Play a sensor: simulate presses that wander over the film, and send their charges as frames on a pseudo-terminal.
 
-    Prints the path of the port, then plays until Ctrl-C. The first second of random presses is without touch, for the
-    tare.
+    Prints the path of the port, solves the film, then plays until Ctrl-C. Until it is solved, and in the first second
+    of random presses, nothing touches the film.
 
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
@@ -112,13 +112,22 @@ def virtual_command(
     amplifier = replace(load_amplifier(noise), **{key: value for key, value in changes.items() if value is not None})
     encode, presses = _encoder(frames, device), play.script(rate)
     forces = (DEFAULT_FORCE_RANGE[0], force_max)
-    with shown_progress():
-        forward_map = ForwardMap.build(described, pressing, radius=_farthest(radius, presses), force_range=forces)
-    player = virtual_sensor(
-        forward_map, amplifier, seed, rate, script=presses, encode=encode, faults=play.faults, link=link
+    nowhere, count = np.full(1, np.nan), len(described.electrodes)
+    player = VirtualSensor(
+        lambda _: np.zeros((0, count)),
+        Script(nowhere, nowhere, np.zeros(1), rate),
+        noise=measuring(amplifier, rate),
+        seed=seed,
+        encode=encode,
+        faults=play.faults,
+        link=link,
     )
     with until_stopped(), player:
         print(player.port_path, flush=True)
+        say("solving the film, which is not touched until then")
+        with shown_progress():
+            forward_map = ForwardMap.build(described, pressing, radius=_farthest(radius, presses), force_range=forces)
+        player.use(*played(forward_map, seed, rate, presses))
         say(f"playing {sensor if film is None else f'film {film} of {sensor}'} at {rate:g} Hz; Ctrl-C stops")
         threading.Event().wait(seconds)
     say(

@@ -6,46 +6,37 @@ from typing import Any
 
 from isocharge.common.arrays import Array
 from isocharge.serve import Script, VirtualSensor, wander
+from isocharge.serve.virtual_sensor.sensor import Charges
 from isocharge.simulate import Amplifier, ForwardMap, load_amplifier
 
 SCRIPT_S = 60.0
 """Length of the random script that a virtual sensor repeats, s."""
 
 
-def virtual_sensor(
-    forward_map: ForwardMap,
-    noise: str | Amplifier,
-    seed: int,
-    rate_Hz: float = 200.0,
-    *,
-    script: Script | None = None,
-    **options: Any,
-) -> VirtualSensor:
+def virtual_sensor(forward_map: ForwardMap, noise: str, seed: int, rate_Hz: float = 200.0) -> VirtualSensor:
     """A sensor that plays wandering presses over the whole domain of a forward map.
 
     Args:
         forward_map: Charges of the presses.
-        noise: Level of the noise model, or an amplifier.
+        noise: Level of the noise model.
         seed: Seed of presses, noise and offsets.
         rate_Hz: Frames per second.
-        script: Presses to play instead of random ones.
-        options: Options of `VirtualSensor`: encode, faults, link.
     """
-    amplifier = load_amplifier(noise) if isinstance(noise, str) else noise
+    charges, script = played(forward_map, seed, rate_Hz)
+    return VirtualSensor(charges, script, noise=measuring(load_amplifier(noise), rate_Hz), seed=seed)
+
+
+def played(forward_map: ForwardMap, seed: int, rate_Hz: float, script: Script | None = None) -> tuple[Charges, Script]:
+    """What a virtual sensor plays: a map with its script, by default presses that wander over its whole domain."""
+    domain = forward_map.domain
     presses = script or wander(
         seed=seed,
         seconds=SCRIPT_S,
         rate_Hz=rate_Hz,
-        radius_mm=forward_map.domain.radius,
-        force_range_N=forward_map.domain.force_range,
+        radius_mm=domain.radius,
+        force_range_N=domain.force_range,
     )
-    return VirtualSensor(
-        partial(_charges, forward_map),
-        presses,
-        noise=_measuring(amplifier, rate_Hz),
-        seed=seed,
-        **options,
-    )
+    return partial(_charges, forward_map), presses
 
 
 def _charges(forward_map: ForwardMap, contact: Array) -> Array:
@@ -57,7 +48,7 @@ def _charges(forward_map: ForwardMap, contact: Array) -> Array:
     return forward_map.charges(within) * share[:, None]
 
 
-def _measuring(amplifier: "Amplifier", rate_Hz: float) -> Callable[..., Any]:
+def measuring(amplifier: Amplifier, rate_Hz: float) -> Callable[..., Any]:
     """The amplifier as the virtual sensor calls it, in pC; it is switched on with the first block."""
     states: list[Any] = []
 

@@ -163,10 +163,11 @@ class VirtualSensor:
         self._script, self._noise, self._encode = script, noise, encode
         self._faults, self._link = faults or Faults(), link
         self._clean_pC = _clean_charges(charges, script)
+        self._next: tuple[Script, Array] | None = None
         random_pC = self._rng.uniform(-20.0, 20.0, self._clean_pC.shape[1])
         self._offset_pC = random_pC if offset_pC is None else np.asarray(offset_pC)
         self._sent_s = np.full(SEQ_MODULUS, np.nan)
-        self._frames = self.withheld = self.lost = self.corrupted = self.unplugged = 0
+        self._begin = self._frames = self.withheld = self.lost = self.corrupted = self.unplugged = 0
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
         self._port: PseudoPort | None = None
@@ -189,26 +190,41 @@ class VirtualSensor:
         """Frames that were written."""
         return self._frames - self.withheld - self.lost
 
+    def use(self, charges: Charges, script: Script) -> None:
+        """Go on with another script of the same rate, from its begin, within `BLOCK_S`; the amplifier stays as it is.
+
+        Raises:
+            SceneError: As on construction.
+        """
+        self._next = script, _clean_charges(charges, script)
+
     def frames(self) -> Iterator[bytes]:
         """The bytes of each frame from the first on, by no clock; nothing for a frame that a fault loses."""
-        self.lost = self.corrupted = 0
+        self.lost = self.corrupted = self._begin = 0
         block = max(1, round(BLOCK_S * self._script.rate_Hz))
         for first in itertools.count(step=block):
-            clean_pC = self._clean_pC.take(range(first, first + block), axis=0, mode="wrap")
-            played_pC = clean_pC if self._noise is None else self._noise(clean_pC, self._rng)
-            for number, row in enumerate((played_pC + self._offset_pC).tolist(), first):
+            if self._next is not None:
+                (self._script, self._clean_pC), self._next, self._begin = self._next, None, first
+            rows = range(first - self._begin, first - self._begin + block)
+            clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")
+            output_pC = clean_pC if self._noise is None else self._noise(clean_pC, self._rng)
+            for number, row in enumerate((output_pC + self._offset_pC).tolist(), first):
                 yield self._frame(number, tuple(row))
 
     def _frame(self, number: int, charge_pC: tuple[float, ...]) -> bytes:
-        faults, t_s = self._faults, number / self._script.rate_Hz
+        faults, t_s = self._faults, self._since_begin_s(number)
         if faults.is_silent(t_s) or (faults.lose_share and self._rng.random() < faults.lose_share):
             self.lost += 1
             return b""
-        t_us = round(t_s * (1e6 + faults.clock_ppm)) % T_US_MODULUS
+        t_us = round(number / self._script.rate_Hz * (1e6 + faults.clock_ppm)) % T_US_MODULUS
         whole = self._encode(Frame(number % SEQ_MODULUS, t_us, charge_pC))
         data = corrupt(whole, faults.corrupt_share, self._rng) if faults.corrupt_share else whole
         self.corrupted += data != whole
         return data
+
+    def _since_begin_s(self, number: int) -> float:
+        """Time of a frame since the script began, s."""
+        return (number - self._begin) / self._script.rate_Hz
 
     def truth(self, seq: int) -> Truth:
         """The press in the latest frame with this number.
@@ -220,7 +236,7 @@ class VirtualSensor:
         frame = latest - (latest - seq) % SEQ_MODULUS
         if frame < 0 or not 0 <= seq < SEQ_MODULUS:
             raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest, SEQ_MODULUS - 1)}")
-        at, script = frame % len(self._script), self._script
+        at, script = (frame - self._begin) % len(self._script), self._script
         x_mm, y_mm, force_N = (float(values[at]) for values in (script.x_mm, script.y_mm, script.force_N))
         return Truth(x_mm, y_mm, force_N, self._clean_pC[at], float(self._sent_s[seq]))
 
@@ -256,12 +272,11 @@ class VirtualSensor:
     def _play(self) -> None:
         start = time.perf_counter()
         for number, data in enumerate(self.frames()):
-            t_s = number / self._script.rate_Hz
-            if self._stop.wait(max(0.0, start + t_s - time.perf_counter())):
+            if self._stop.wait(max(0.0, start + number / self._script.rate_Hz - time.perf_counter())):
                 return
             self._sent_s[number % SEQ_MODULUS] = time.perf_counter()
             self._frames = number + 1  # before writing: a quick reader may ask for the truth at once
-            if self._faults.is_unplugged(t_s):
+            if self._faults.is_unplugged(self._since_begin_s(number)):
                 self._unplug()
             elif self._port is None:
                 self._plug()
