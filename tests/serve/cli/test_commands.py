@@ -17,6 +17,8 @@ from itertools import chain, islice, pairwise
 
 import numpy as np
 import pytest
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
 from boards import TcpBoard, interrupt, taps
 from isocharge.common.errors import ChargeError, InputError, ModelError, PortLost
@@ -261,9 +263,18 @@ def test_doctor_as_json_waits_for_its_port(resting, run, tmp_path):
 
 def test_doctor_fails_where_nothing_is_recognised(command):
     silent = PseudoPort()
-    code, out, _ = command("serve", "doctor", "--port", silent.url, "--seconds", 0.5)
+    code, out, err = command("serve", "doctor", "--port", silent.url, "--seconds", 0.5)
     silent.close()
-    assert (code, "not one byte came" in out) == (1, True)
+    assert (code, "not one byte came" in out, "listening for 0.5 s" in err) == (1, True, True)
+
+
+def test_doctor_lists_the_ports_and_what_they_send(resting, run, monkeypatch):
+    with resting() as sensor:
+        ports = [ListPortInfo(sensor.url), ListPortInfo("/dev/ttyNone")]
+        monkeypatch.setattr(list_ports, "comports", lambda: ports)
+        first, none = run("doctor").stdout.splitlines()
+    assert re.fullmatch(r"/dev/\S+ \(n/a\): binary frames of isocharge, \d+ frames/s at 115200 baud", first)
+    assert none.startswith("/dev/ttyNone (n/a): /dev/ttyNone: there is no such port")
 
 
 @pytest.mark.parametrize(

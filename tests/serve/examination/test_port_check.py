@@ -173,6 +173,16 @@ def test_the_rest_is_an_offset_where_a_tare_would_not_take_it(gain, rests, offse
     assert proposed == gain | ({} if offset is None else {"offset": offset})
 
 
+def test_a_board_that_rests_far_from_zero_gets_a_file_that_works():
+    rng = np.random.default_rng(0)
+    board = lambda _: b"%.2f;%.2f;%.2f\n" % tuple(rng.normal((312.0, -128.0, 3.0), 1.0))  # noqa: E731
+    report = findings(heard(board))
+    assert report.device["gain"]["offset"] == pytest.approx({"A": 312.0, "B": -128.0, "C": 3.0}, abs=0.3)
+    assert "rest near zero on channel 1: 311.9 pC" in missing(report)
+    assert report.works
+    assert not findings(heard(row)).works  # counts of which nobody has said what they are
+
+
 def test_a_request_goes_into_the_file():
     frames = findings(heard(row, request=Request(b"?\n", 50.0, echo=True))).device["frames"]
     assert (frames["request"], frames["request_Hz"], frames["echo"]) == ("3F 0A", 50.0, True)

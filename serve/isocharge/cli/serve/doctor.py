@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from serial.tools import list_ports
 
 from isocharge.cli.serve.records import WaitOption
 from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption
@@ -27,13 +28,14 @@ GAIN_METAVAR = "NUMBER|A=..,B=.."
 
 def doctor_command(
     port: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--port",
             metavar="URL",
-            help="Port of the sensor: device path, tcp://HOST:PORT, udp://HOST:PORT, pyserial URL.",
+            help="Port of the sensor: device path, tcp://HOST:PORT, udp://HOST:PORT, pyserial URL. (default: list the "
+            "serial ports and what they seem to send)",
         ),
-    ],
+    ] = None,
     device: DeviceOption = None,
     model: Annotated[
         str | None,
@@ -94,10 +96,14 @@ def doctor_command(
 
     Example: isocharge serve doctor --port /dev/ttyACM0 --write board.toml
     """
+    if port is None:
+        print("\n".join(port_lines()) or "no serial ports; is the board plugged in?")
+        return
     if write is not None:
         refuse_existing(write)
     electrodes = Predictor(model, models=models).metadata.electrodes if model else ()
     settings = {"pC_per_unit": pC_per_unit, "V_per_unit": V_per_unit, "feedback_pF": feedback_pF}
+    say(f"listening for {seconds:g} s")
     examination = examine(
         port,
         bauds=(baud,) if baud else BAUDS,
@@ -116,6 +122,19 @@ def doctor_command(
         _write(write, examination)
     if not examination.good:
         raise typer.Exit(1)
+
+
+def port_lines() -> Iterator[str]:
+    """The serial ports of this machine, what the system says of each, and what came in a second."""
+    for found in sorted(list_ports.comports()):
+        try:
+            heard = examine(found.device, seconds=1.0)
+            sends = (
+                f"{heard.format}, {heard.rate_Hz:.0f} frames/s at {heard.baud} baud" if heard.good else heard.missing[0]
+            )
+        except IsochargeError as error:
+            sends = str(error)
+        yield f"{found.device} ({found.description}): {sends}"
 
 
 def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
@@ -156,7 +175,10 @@ def _write(path: Path, examination: Examination) -> None:
         write_whole(path, device_text(examination).encode())
     except OSError as error:
         raise InputError(f"--write {path}: cannot be written ({error.strerror}); choose another path") from error
-    say(f"{path} written; use it with: isocharge serve stream MODEL --port {examination.url} --device {path}")
+    if examination.works:
+        say(f"{path} written; use it with: isocharge serve stream MODEL --port {examination.url} --device {path}")
+    else:
+        say(f"{path} written; it gives no touches yet: put in what is missing above")
 
 
 def report_lines(examination: Examination) -> Iterator[str]:
@@ -182,6 +204,8 @@ def report_lines(examination: Examination) -> Iterator[str]:
         digits = (5, 6, 5, 5, 5) if examination.unit == "V" else (2, 3, 2, 2, 2)
         columns = zip(figures, (12, 11, 12, 10, 10), digits, strict=True)
         yield f"{channel.name:8.8s}" + "".join(_column(*column) for column in columns)
+    if examination.held:
+        yield examination.held
     yield "missing to get a touch: nothing" if not examination.missing else "missing to get a touch:"
     yield from (f"- {sentence}" for sentence in examination.missing)
 

@@ -2,6 +2,7 @@
 and what is missing to get a touch.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,12 +10,14 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.errors import IsochargeError
 from isocharge.common.toml_text import to_toml
+from isocharge.serve.examination.held_press import HeldPress, held_press
 from isocharge.serve.examination.listening import BAUDS, Capture, Heard, listen, read_frames
 from isocharge.serve.examination.proposal import Proposal, propose, unit_of
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.device import ANY_BOARD, Device, device_from_table
-from isocharge.serve.live.reading_stream import position_of
+from isocharge.serve.live.reading_stream import ReadingStream, position_of
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.recognition.recognise import recognise
 from isocharge.serve.signal_chain.chain import LARGEST_PC
@@ -122,7 +125,9 @@ class Examination:
         unit: Of the channels: "pC", or "counts" or "V" where the charge of one is not known.
         channels: Health of each channel that is used; empty without frames.
         unused: Channels that no electrode uses.
+        held: What a press says that was held meanwhile, a sentence; empty without one.
         missing: One sentence for each thing that is missing to get a touch.
+        works: Whether a film at rest is tared with this device file.
         device: Content of the device file: the one that was given, or else one that fits; empty without frames.
     """
 
@@ -140,7 +145,9 @@ class Examination:
     unit: str
     channels: tuple[ChannelHealth, ...]
     unused: tuple[str, ...]
+    held: str
     missing: tuple[str, ...]
+    works: bool
     device: Mapping[str, Any]
 
 
@@ -204,7 +211,10 @@ def findings(
     capture = read_frames(heard, device)
     unit = "pC" if device.gain is not None else unit_of(capture)
     used = _used(capture, device)
-    channels = tuple(_channels(capture, device, used))
+    held = held_press(*capture.values()) if capture.frames else None
+    if held is not None and held.tau_s is not None:
+        proposal.table.setdefault("leak", {"tau_s": held.tau_s})
+    channels = tuple(_channels(capture, device, used, math.inf if held is None else held.begin_s))
     first = capture.frames[0] if capture.frames else Frame(None, None, ())
     counts, is_numbered = capture.parser.counts, first.seq is not None
     unused = tuple(name for position, name in enumerate(capture.names) if position not in used)
@@ -223,9 +233,26 @@ def findings(
         unit=unit,
         channels=channels,
         unused=unused,
-        missing=tuple(_missing(capture, channels, unused, device, proposal.electrodes, unit)),
+        held="" if held is None else held.says,
+        missing=tuple(_missing(capture, channels, unused, device, proposal.electrodes, unit, held)),
+        works=bool(used) and _works(heard, proposal.table, proposal.electrodes or tuple(used.values())),
         device=proposal.table,
     )
+
+
+def _works(heard: Heard, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
+    """Whether the film is tared with a device file, as far as that can be told: from the frames of two tares."""
+    count = 0
+    try:
+        device = device_from_table(table, "board")
+        stream = ReadingStream(electrodes, device)
+        for timed in (timed for chunk in heard.chunks for timed in stream.feed(chunk)):
+            count += 1
+            if timed.reading.tare is not None or device.tare is None:
+                return True
+    except IsochargeError:
+        return False
+    return device.tare is not None and 0 < count < 2 * device.tare.frames
 
 
 def _used(capture: Capture, device: Device) -> dict[int, str]:
@@ -236,11 +263,12 @@ def _used(capture: Capture, device: Device) -> dict[int, str]:
     return {position: electrode for position, electrode in positions.items() if position is not None}
 
 
-def _channels(capture: Capture, device: Device, used: Mapping[int, str]) -> Iterator[ChannelHealth]:
-    """The health of each channel that is used, from the frames that have as many values as the last one."""
+def _channels(capture: Capture, device: Device, used: Mapping[int, str], until_s: float) -> Iterator[ChannelHealth]:
+    """The health of each channel that is used, from the frames at rest that have as many values as the last one."""
     if not capture.frames:
         return
     values, times_s = capture.values()
+    values, times_s = values[times_s < until_s], times_s[times_s < until_s]
     for position, electrode in used.items():
         charge_pC = values[:, position]
         if device.gain is not None:
@@ -256,6 +284,7 @@ def _missing(
     device: Device,
     electrodes: tuple[str, ...],
     unit: str,
+    held: HeldPress | None,
 ) -> Iterator[str]:
     """One sentence for each thing that is missing to get a touch."""
     if not capture.bytes_seen:
@@ -286,11 +315,13 @@ def _missing(
             yield from _missing_in(channel, device.tare or TareRule())
     if capture.frames[0].t_us is None and device.leak is not None:
         yield "a device clock (t_us, t_ms or t_s): without it the leak is undone by arrival times, which jitter"
-    if device.leak is None:
+    if device.leak is None and held is None:
         yield (
             "the amplifier's time constants ([leak] tau_s in a device file), of its circuit: without them held presses "
-            "fade; what fades by creep of the film, slower and slower, must not go there"
+            "fade. To measure them, listen for 20 s (--seconds 20), and from the third on hold a press with a weight"
         )
+    elif device.leak is None and held is not None and held.tau_s is not None:
+        yield f"[leak] tau_s = {held.tau_s:g} in a device file"
 
 
 def _missing_in(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
@@ -302,8 +333,8 @@ def _missing_in(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
     if abs(channel.offset_pC or 0.0) > rule.offset_limit_pC:
         yield (
             f"rest near zero on channel {channel.name}: {channel.offset_pC:.4g} pC, a tare takes "
-            f"{rule.offset_limit_pC:g} (is something lying on the film? does the amplifier rest there? then [gain] "
-            "offset)"
+            f"{rule.offset_limit_pC:g} (is something lying on the film? or does the amplifier rest there? then "
+            "[gain] offset, as --write has it)"
         )
     if abs(drift := channel.drift_pC_per_s or 0.0) > DRIFT_LIMIT_PC_PER_S:
         yield f"a steady channel {channel.name}: it drifts by {drift:.2g} pC/s"

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.serve.examination.held_press import held_press
 from isocharge.serve.examination.listening import Capture, Heard, read_frames
 from isocharge.serve.frames.binary import FORMAT as BINARY
 from isocharge.serve.live.device import device_from_table
@@ -85,13 +86,17 @@ def propose(heard: Heard, electrodes: tuple[str, ...], gain: Mapping[str, Any]) 
     capture = read_frames(heard, device_from_table(table, "board"))
     if not capture.frames:
         return Proposal({}, electrodes)
-    values, _ = capture.values()
+    values, times_s = capture.values()
     chosen = _chosen(capture, values, electrodes)
     if chosen:
         table["channels"] = {electrode: capture.names[position] for electrode, position in chosen.items()}
-    if gain or unit_of(capture) != "pC":
-        columns = {electrode: values[:, position] for electrode, position in chosen.items()}
-        table["gain"] = _offsets(columns, gain) | dict(gain)
+    held = held_press(values, times_s)
+    at_rest = values if held is None else values[times_s < held.begin_s]
+    columns = {electrode: at_rest[:, position] for electrode, position in chosen.items()}
+    is_far = any(abs(rest_of(column)) > TareRule().offset_limit_pC for column in columns.values())
+    if gain or is_far or unit_of(capture) != "pC":
+        known = gain or ({"pC_per_unit": 1.0} if unit_of(capture) == "pC" else {})
+        table["gain"] = _offsets(columns, known) | dict(known)
     return Proposal(table, electrodes or tuple(chosen))
 
 

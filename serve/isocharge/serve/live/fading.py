@@ -9,6 +9,7 @@ leaves three times its residual. [leak] undoes the first and would make an error
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,26 +25,47 @@ UNTOLD = (
 )
 
 
-def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
-    """What may fade a press that is held with the same force, and what to do: the end of a sentence.
+class Fading(NamedTuple):
+    """The law by which a press fades; nothing where none is clear.
+
+    Attributes:
+        tau_s: Time constant of a leak, s.
+        creep: Share that creep takes in each decade of time, dimensionless.
+    """
+
+    tau_s: float | None = None
+    creep: float | None = None
+
+
+def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
+    """By which law a press fades that is held with the same force.
 
     Args:
         sizes: Times since the touch, s, and mean magnitudes of the charges then, positive, pC.
     """
     if len(sizes) < FEWEST:
-        return UNTOLD
+        return Fading()
     held_s, size_pC = np.array(sizes).T
     of_leak, left_by_leak = _line(held_s, np.log(size_pC))
     of_creep, left_by_creep = _line(np.log(held_s), np.log(size_pC))
     if max(of_leak, of_creep) >= 0.0:
-        return UNTOLD
+        return Fading()
     if left_by_creep > CLEARER * left_by_leak:
-        return f"or the amplifier leaks: then put [leak] tau_s = {-1.0 / of_leak:.2g} into a device file"
+        return Fading(tau_s=-1.0 / of_leak)
     if left_by_leak > CLEARER * left_by_creep:
-        percent = -100.0 * np.expm1(of_creep * np.log(10.0))
+        return Fading(creep=-float(np.expm1(of_creep * np.log(10.0))))
+    return Fading()
+
+
+def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
+    """What may fade such a press, and what to do: the end of a sentence; `sizes` as for `law_of_fading`."""
+    law = law_of_fading(sizes)
+    if law.tau_s is not None:
+        return f"or the amplifier leaks: then put [leak] tau_s = {law.tau_s:.2g} into a device file"
+    if law.creep is not None:
         return (
-            f"or the film creeps, by {percent:.2g} % in each decade of time: wait longer before each reading; this is "
-            "no leak, so set no [leak] for it"
+            f"or the film creeps, by {100.0 * law.creep:.2g} % in each decade of time: wait longer before each "
+            "reading; this is no leak, so set no [leak] for it"
         )
     return UNTOLD
 

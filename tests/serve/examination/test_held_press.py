@@ -1,0 +1,69 @@
+"""A press that was held while somebody listened: what it says, of charges that follow a law by closed form."""
+
+import re
+
+import numpy as np
+import pytest
+
+from isocharge.serve import Chunk, Frame, device_from_table, encode_frame
+from isocharge.serve.examination.held_press import LEARNS_S, held_press
+from isocharge.serve.examination.listening import Heard
+from isocharge.serve.examination.port_check import findings
+
+T_S = np.arange(0.0, 20.0, 0.005)
+HELD_S = T_S - 5.0
+
+
+def board(law, drift=0.0, until_s=18.0, scale=1.0):
+    """Values of three channels, one of them inverted: offsets, noise of 1, a press from 5 s on that fades by a law.
+
+    What changes linearly answers to a release as to the opposite press.
+    """
+    press = sum(
+        sign * np.where(since_s > 0.0, law(np.maximum(since_s, 0.005)), 0.0)
+        for sign, since_s in ((1.0, HELD_S), (-1.0, T_S - max(until_s, 5.0)))
+    )
+    charge = np.outer(press, (500.0, -400.0, 600.0)) + np.outer(drift * T_S, (1.0, -1.0, 1.0))
+    return scale * (charge + 300.0 + np.random.default_rng(0).normal(0.0, 1.0, charge.shape))
+
+
+def still(t):
+    return np.ones_like(t)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 20.0])
+@pytest.mark.parametrize(
+    ("law", "drift", "tau_s", "said"),
+    [
+        (still, 0.0, None, "keeps its charge for 13 s"),
+        (lambda t: np.exp(-t / 10.0), 0.0, 10.0, r"leaks: \[leak\] tau_s"),
+        (lambda t: np.exp(-t / 40.0), 0.0, 40.0, r"leaks: \[leak\] tau_s"),
+        (lambda t: t**-0.03, 0.0, None, "creeps by 6.[5-9] % in each decade .* set no"),  # 1 - 10^-0.03 is 6.7 %
+        (still, -8.0, LEARNS_S, r"the rest drifts, by -1.6 % .*keeps its charge .*\[leak\] tau_s = 100000"),
+        (lambda t: 1.0 + 0.1 * np.sin(t), 0.0, None, "by no law that is clear"),
+    ],
+)
+def test_what_a_held_press_says(law, drift, tau_s, said, scale):
+    held = held_press(board(law, drift, scale=scale), T_S)
+    assert held.begin_s == pytest.approx(5.0, abs=0.2)
+    assert held.tau_s == (None if tau_s is None else pytest.approx(tau_s, rel=0.05))
+    assert re.search(said, held.says)
+
+
+@pytest.mark.parametrize("until_s", [0.0, 7.0])
+def test_no_press_and_a_short_one_say_nothing(until_s):
+    assert held_press(board(still, until_s=until_s), T_S) is None
+    assert held_press(board(still)[:300], T_S[:300]) is None
+
+
+def test_the_file_has_the_time_constant_and_the_rest_before_the_press():
+    values = board(lambda t: np.exp(-t / 10.0)) - 300.0
+    chunks = [
+        Chunk(encode_frame(Frame(k % 65536, 5000 * k, tuple(row.tolist()))), 1e9 + t, 0)
+        for k, (t, row) in enumerate(zip(T_S, values, strict=True))
+    ]
+    report = findings(Heard("/dev/ttyACM0", 115200, chunks=chunks, seconds=20.0))
+    assert device_from_table(report.device, "board").leak.tau_s == pytest.approx(10.0, rel=0.05)
+    assert max(abs(channel.offset_pC) for channel in report.channels) < 1.0
+    assert report.works
+    assert report.missing == ("[leak] tau_s = 10 in a device file",)
