@@ -26,9 +26,9 @@ attack: $(VENV)/installed
 	$(BIN)/python -m pytest tests/attacks -m slow -rP
 	$(ONE_THREAD) $(BIN)/python -m pytest tests/attacks --all-attacks -n 2 --timeout 900
 
-# The reference of all modules, from their docstrings: build/docs/index.html. A warning is an error.
+# The site: pages, gallery and the reference of all modules, in build/docs/index.html. A warning is an error.
 docs: $(VENV)/installed
-	$(BIN)/python -W error .ci/docs.py build/docs
+	$(BIN)/python -m sphinx -q -W --keep-going -j 2 -c .ci/docs . build/docs
 
 bench: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_solve.py

@@ -8,8 +8,8 @@ ROOT = Path(__file__).parents[1]
 
 def test_docstrings_are_ready_for_the_reference():
     """The check with which `make docs` begins; building the pages takes `make test-all`."""
-    path = ROOT / ".ci" / "docs.py"
-    spec = importlib.util.spec_from_file_location("docs_builder", path)
+    path = ROOT / ".ci" / "docs" / "reference.py"
+    spec = importlib.util.spec_from_file_location("reference", path)
     builder = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(builder)
     names = builder.modules()

@@ -1,0 +1,68 @@
+"""The site: the pages as they are, scripts that run with their pictures, and the reference of every module.
+
+    python -m sphinx -W --keep-going -c .ci/docs . build/docs
+
+The folder of the project is the source, so links between pages hold here and where the code is hosted.
+"""
+
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(Path(__file__).parent))
+
+import reference  # noqa: E402
+
+PORTIONS = ("simulate", "train", "serve")
+HOME, REFERENCE, GALLERY = "README", "build/reference", "build/gallery"
+
+project = "isocharge"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
+extensions += ["sphinx_gallery.gen_gallery"]
+root_doc = HOME
+include_patterns = ["*.md", "models/**/card.md", "models/README.md", f"{REFERENCE}/**", f"{GALLERY}/**"]
+include_patterns += [pattern for name in PORTIONS for pattern in (f"{name}/README.md", f"{name}/docs/*.md")]
+exclude_patterns = [f"{GALLERY}/**/{name}" for name in ("*.py", "*.ipynb", "*.zip", "*.json")]
+myst_heading_anchors = 3
+default_role = "code"
+napoleon_use_ivar = napoleon_use_rtype = True
+autodoc_typehints = "none"
+html_theme = "furo"
+html_copy_source = False
+suppress_warnings = ["ref.python"]  # attributes of one name in many classes are not linked
+
+sphinx_gallery_conf = {
+    "examples_dirs": [f"{name}/examples" for name in PORTIONS],
+    "gallery_dirs": [f"{GALLERY}/{name}" for name in PORTIONS],
+    "filename_pattern": r"\.py$",
+    "ignore_pattern": r"/paper/|ros2_node|_on_executors",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_signature": False,
+    "copyfile_regex": r".*\.csv",
+}
+
+
+def add_contents(_app: Any, page: str, source: list[str]) -> None:
+    """Put the contents of the site under the first page."""
+    if page == HOME:
+        source[0] += (ROOT / ".ci" / "docs" / "contents.md").read_text("utf-8")
+
+
+def copy_home(app: Any, error: Exception | None) -> None:
+    """The first page under the name that servers look for."""
+    if error is None:
+        shutil.copy(Path(app.outdir) / f"{HOME}.html", Path(app.outdir) / "index.html")
+
+
+def setup(app: Any) -> None:
+    """Write the pages of the reference, and ask to be called."""
+    names = reference.modules()
+    reference.check_docstrings(names)
+    reference.write_pages(names, ROOT / REFERENCE)
+    app.connect("source-read", add_contents)
+    app.connect("autodoc-skip-member", reference.is_of_scikit_learn)
+    app.connect("autodoc-process-docstring", reference.plain_text, priority=400)
+    app.connect("build-finished", copy_home)

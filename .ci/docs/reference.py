@@ -1,0 +1,73 @@
+"""The reference of every module, from its docstrings."""
+
+import re
+import sys
+from importlib import import_module
+from pathlib import Path
+from pkgutil import walk_packages
+from typing import Any
+
+DOTTED = re.compile(r"`(isocharge(?:\.\w+)+)`")
+
+
+def modules() -> list[str]:
+    """Every module of the namespace packages, private ones left out."""
+    packages = [import_module(name) for name in ("isocharge", "isocharge.cli")]
+    names = {entry.name for package in packages for entry in walk_packages(package.__path__, f"{package.__name__}.")}
+    return sorted(name for name in names if "._" not in name)
+
+
+def check_docstrings(names: list[str]) -> None:
+    """Every dotted name in backticks is a module, or an attribute of one, and an example is indented, so it is code.
+
+    Raises:
+        SystemExit: If one is not.
+    """
+    for name in names:
+        if re.search(r"^(from \w+ import|>>>|\w+ = \w+\()", import_module(name).__doc__ or "", re.MULTILINE):
+            sys.exit(f"{name}: expected the example in the docstring indented, after an empty line")
+        for dotted in DOTTED.findall(Path(str(import_module(name).__file__)).read_text("utf-8")):
+            home, _, attribute = dotted.rpartition(".")
+            if dotted not in names and not (home in names and hasattr(import_module(home), attribute)):
+                sys.exit(f"{name}: expected a module or an attribute of one, got `{dotted}`")
+
+
+def write_pages(names: list[str], folder: Path) -> None:
+    """A page for each module, and a list of all of them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        lines = [name, "=" * len(name), "", f".. automodule:: {name}", "   :members:", "   :show-inheritance:"]
+        if hasattr(import_module(name), "__all__"):  # a package's public names are explained where they are defined
+            lines += ["   :imported-members:", "   :no-index:"]
+        _write(folder / f"{name}.rst", lines)
+    _write(folder / "index.rst", ["Reference", "=========", "", ".. toctree::", "", *(f"   {name}" for name in names)])
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    """Write lines unless they are there: what did not change is not read again."""
+    text = "\n".join(lines) + "\n"
+    if not path.exists() or path.read_text("utf-8") != text:
+        path.write_text(text, "utf-8")
+
+
+def is_of_scikit_learn(_app: Any, _kind: str, name: str, _object: Any, skip: bool, _options: Any) -> bool:
+    """Whether a member is left out: those that scikit-learn makes are explained there."""
+    return skip or (name.startswith("set_") and name.endswith("_request"))
+
+
+def plain_text(_app: Any, _kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
+    """Take a docstring for plain text with names in backticks; what is indented after an empty line is code."""
+    shown, code = [], False
+    for before, line in zip(["", *lines], lines, strict=False):
+        if line.strip():
+            was_code, code = code, line.startswith("    ") and (code or not before.strip())
+            if code and not was_code:
+                shown += ["::", ""]
+        shown.append(line if code else _escaped(line))
+    lines[:] = shown
+
+
+def _escaped(line: str) -> str:
+    parts = line.split("`")
+    parts[::2] = [re.sub(r"([*|\\]|_(?=\W|$))", r"\\\1", part) for part in parts[::2]]
+    return "`".join(parts)

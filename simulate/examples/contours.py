@@ -1,0 +1,32 @@
+"""
+Where do presses give an electrode the same charge?
+===================================================
+
+On an isocharge contour. Each electrode's charge puts a press on one contour, and with the force known the contours of
+three electrodes meet in one point: that is where the film is touched.
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Triangulation, load_sensor
+from isocharge.simulate.contours.field_contours import ContourField
+from isocharge.simulate.plots.film import draw_electrodes, frame_film
+
+sensor, force = load_sensor("three-25um-biaxial"), 0.7
+charge_map = ChargeSpline.of(ForwardMap.build(sensor, Circle(1.0), radius=9.0, force_range=(0.5, 1.0)))
+touch = np.array([[2.0, -3.0, force]])
+charge = charge_map.charges(touch)
+fix = Triangulation(charge_map).locate(charge, force)
+print(f"pressed at {touch[0, :2]}, the contours meet at {fix.contact[0, :2].round(4)} mm")
+
+figure, axes = plt.subplots(figsize=(6.0, 6.0), layout="constrained")
+field = ContourField(charge_map, force)
+for number, name in enumerate(sensor.electrode_names):
+    for contour in field.contours(name, float(charge[0, number])):
+        axes.plot(*contour.T, color=f"C{number}", label=f"{charge[0, number]:.0f} pC on {name}")
+draw_electrodes(axes, sensor)
+axes.plot(*touch[0, :2], "k+", ms=12, label="the press")
+axes.legend()
+frame_film(axes, sensor, 9.0, f"presses of {force:g} N")
+plt.show()

@@ -1,0 +1,29 @@
+"""
+Does a uniaxial film tell more about the direction?
+===================================================
+
+Fig. 12 of the paper (Mirbagheri et al. 2007) says so, and the simulator agrees: on lines in different directions from
+an electrode the charges of a biaxial film are nearly the same, those of a uniaxial film are far apart. All figures of
+the paper are drawn by ``python simulate/examples/paper -o paper``.
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from isocharge.simulate import ForwardMap, Polygon, load_sensor
+from isocharge.simulate.contours.charge_curves import Curves, Mapping
+
+figure, pair = plt.subplots(1, 2, figsize=(11.0, 4.4), layout="constrained", sharey=True)
+for axes, kind in zip(pair, ("biaxial", "uniaxial"), strict=True):
+    sensor = load_sensor(f"three-25um-{kind}")
+    forward_map = ForwardMap.build(sensor, Polygon.triangle(4.0), radius=12.0, force_range=(0.9, 1.1))
+    lines = Mapping.lines(sensor, "A", angles=np.deg2rad((35.0, 90.0)), length=12.0)
+    curves = Curves.of(forward_map, lines, force=1.0)
+    apart = np.ptp(curves.own, axis=0) / curves.own.mean(axis=0)
+    print(f"{kind}: the lines lie {100 * apart.min():.0f} to {100 * apart.max():.0f} % of the charge apart")
+    for angle, charge in zip(lines.angle, curves.own, strict=True):
+        axes.plot(lines.distance, charge, "o-", label=f"{np.rad2deg(angle):.0f}°")
+    axes.set(title=f"{kind} film, triangle, 1 N", xlabel="distance from the centre of A, mm")
+pair[0].set_ylabel("charge of A, pC")
+pair[1].legend(title="direction from x")
+plt.show()
