@@ -37,7 +37,7 @@ sphinx_gallery_conf = {
     "examples_dirs": [f"{name}/examples" for name in PORTIONS],
     "gallery_dirs": [f"{GALLERY}/{name}" for name in PORTIONS],
     "filename_pattern": r"\.py$",
-    "ignore_pattern": r"/paper/|ros2_node|_on_executors",
+    "ignore_pattern": r"/paper/|_on_executors",
     "abort_on_example_error": True,
     "download_all_examples": False,
     "show_signature": False,

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import tritonclient.http as triton
 import yaml
+from prometheus_client.parser import text_string_to_metric_families
 
 from isocharge.serve import find_model
 from isocharge.serve.network.model_store import open_model_store
@@ -140,6 +141,26 @@ def test_the_server_runs_within_what_the_unit_allows(unit, models):
         assert url, process.communicate(timeout=20)[1]
         assert status_of(f"{url}/v2/health/ready") == 200
         assert status_of(f"{url}/metrics") == 200
+
+
+# Prometheus
+
+
+def test_dashboard_and_alerts_ask_for_metrics_that_there_are(start_http):
+    """Every metric that they name is one of a server that has answered a press and refused one."""
+    files = DEPLOY / "monitoring"
+    services = yaml.safe_load((files / "compose.yaml").read_text())["services"]
+    mounts = [mount.split(":")[0] for service in services.values() for mount in service.get("volumes", ())]
+    assert all((files / mount).is_file() for mount in mounts if mount != "./token")
+    rules = [rule["expr"] for rule in yaml.safe_load((files / "alerts.yml").read_text())["groups"][0]["rules"]]
+    panels = json.loads((files / "grafana/isocharge.json").read_text())["panels"]
+    asked = " ".join(rules + [target["expr"] for panel in panels for target in panel["targets"]])
+    url = start_http(Handler(open_model_store(MODELS))).url
+    assert status_of(f"{url}/v2/health/ready") == 200
+    with urllib.request.urlopen(f"{url}/metrics", timeout=20) as answer:
+        families = text_string_to_metric_families(answer.read().decode())
+    there = {sample.name for family in families for sample in family.samples}
+    assert set(re.findall(r"\b(?:isocharge|process)_\w+", asked)) <= there
 
 
 # Kubernetes

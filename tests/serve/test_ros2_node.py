@@ -1,4 +1,4 @@
-"""The example of a ROS 2 node, with a stand-in for rclpy, which cannot be had from a package index.
+"""The ROS 2 node, with a stand-in for rclpy, which cannot be had from a package index.
 
 Messages are made from the definitions of ROS 2 that rosbags ships.
 """
@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from isocharge.serve.export.record_messages import pose_stamped, time_of, wrench_stamped
 
-NODE = Path(__file__).parents[2] / "serve" / "examples" / "ros2_node.py"
+NODE = Path(__file__).parents[2] / "serve/deploy/ros2/isocharge_ros/isocharge_ros/node.py"
 ROS = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -49,6 +49,9 @@ def published(monkeypatch):
             name = f"geometry_msgs/msg/{kind.__name__}"
             return SimpleNamespace(publish=lambda it: published.append((topic, bytes(ROS.serialize_cdr(it, name)))))
 
+        def declare_parameter(self, _, value):
+            return SimpleNamespace(value=value)
+
         def destroy_node(self):
             published.append("destroyed")
 
@@ -73,8 +76,8 @@ def test_the_node_publishes_what_an_mcap_file_holds(published, record):
     press = {"y_mm": -2.5, "force_N": 0.75, "x_std_mm": 0.05, "y_std_mm": 0.0625, "force_std_N": 0.01}
     records = [record(**press), record(**press, contact=False), record(contact=False)]
     module = runpy.run_path(str(NODE))
-    module["main"].__globals__.update(Port=nullcontext, Predictor=str, stream=lambda *_: records)
-    module["main"]("linear", "/dev/null")
+    module["main"].__globals__.update(Port=lambda *_, **__: nullcontext(), Predictor=str, stream=lambda *_: records)
+    module["main"]()
     assert published.pop() == "destroyed"
     expected = []
     for one in records[:2]:

@@ -1,13 +1,11 @@
-"""A ROS 2 node that publishes the contacts of a sensor: `python ros2_node.py MODEL PORT`, where ROS 2 is sourced."""
-
-import sys
+"""A ROS 2 node that publishes the contacts of a film. Its parameters: model, port, device, wait_s."""
 
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 
-from isocharge.serve import Port, Predictor, stream
+from isocharge.serve import Port, Predictor, load_device, stream
 from isocharge.serve.export.record_messages import DEFLECTION_STD, TURN_VARIANCE, time_of
 
 
@@ -38,12 +36,17 @@ class TouchNode(Node):
             self.pose.publish(message)
 
 
-def main(model, url):
+def main():
     rclpy.init()
     node = TouchNode()
+    model, url, file, wait_s = (
+        node.declare_parameter(name, value).value
+        for name, value in (("model", "three-25um-biaxial"), ("port", "/dev/ttyACM0"), ("device", ""), ("wait_s", 60.0))
+    )
     try:
-        with Port(url) as port:
-            for record in stream(port, Predictor(model)):
+        device = load_device(file or None)
+        with Port(url, wait=wait_s, reconnect=True, request=device.request) as port:
+            for record in stream(port, Predictor(model), device):
                 node.publish(record)
                 if not rclpy.ok():  # stopped from outside
                     break
@@ -55,4 +58,4 @@ def main(model, url):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()
