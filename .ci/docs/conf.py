@@ -30,7 +30,8 @@ default_role = "code"
 napoleon_use_ivar = napoleon_use_rtype = True
 autodoc_typehints = "none"
 html_theme = "furo"
-html_copy_source = False
+html_copy_source = html_show_sphinx = html_show_copyright = False
+html_title = project
 suppress_warnings = ["ref.python"]  # attributes of one name in many classes are not linked
 
 sphinx_gallery_conf = {

@@ -55,7 +55,7 @@ def is_of_scikit_learn(_app: Any, _kind: str, name: str, _object: Any, skip: boo
     return skip or (name.startswith("set_") and name.endswith("_request"))
 
 
-def plain_text(_app: Any, _kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
+def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
     """Take a docstring for plain text with names in backticks; what is indented after an empty line is code."""
     shown, code = [], False
     for before, line in zip(["", *lines], lines, strict=False):
@@ -64,10 +64,12 @@ def plain_text(_app: Any, _kind: str, _name: str, _object: Any, _options: Any, l
             if code and not was_code:
                 shown += ["::", ""]
         shown.append(line if code else _escaped(line))
+    if kind in ("attribute", "data"):
+        shown.insert(0, "\\ ")  # what is before a colon in the first line would be taken for a type
     lines[:] = shown
 
 
 def _escaped(line: str) -> str:
     parts = line.split("`")
     parts[::2] = [re.sub(r"([*|\\]|_(?=\W|$))", r"\\\1", part) for part in parts[::2]]
-    return "`".join(parts)
+    return re.sub(r"(`[^`]*`)(?=\w)", r"\1\ ", "`".join(parts))  # what is quoted ends before a letter
