@@ -11,6 +11,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate import ChargeMap, NoiseModel, noise_model
 from isocharge.simulate.identifiability.nearest_contact import CANDIDATES, explain, search
+from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
@@ -53,7 +54,7 @@ def draw_misfit_examples(
     kinds = np.array(list(KINDS))[rng.choice(len(KINDS), size=count, p=list(KINDS.values()))]
     charge = np.empty_like(chosen.charge)
     for kind in KINDS:
-        charge[kinds == kind] = _draw(kind, rng, chosen.charge[kinds == kind], presses.charge, noise)
+        charge[kinds == kind] = draw_charges(kind, rng, chosen.charge[kinds == kind], presses.charge, noise)
     charge = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
     near = np.isin(kinds, ("noisy", "moved"))
     return np.stack([charge, _residuals(charge_map, charge, noise.sigma(charge), chosen, near, candidates)])
@@ -74,7 +75,7 @@ def _residuals(
     return residual
 
 
-def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: NoiseModel) -> Array:
+def draw_charges(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> Array:
     """Charges of one kind made from those of presses, shape (n, n_electrode), pC."""
     each = len(charge), 1
     match kind:

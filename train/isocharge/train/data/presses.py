@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import DatasetError, PressError
 from isocharge.common.files import sha256_of
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
-from isocharge.simulate import Dataset, Domain, NoiseModel, Probe, Samples, Sensor
+from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
+from isocharge.train.data.channel_noise import Noise
 
 LOWEST_CHARGE, HIGHEST_CHARGE = 1.0, 1e6
 """Charges are brought between these, pC, before the logarithm: what is negative or absurd still gives a finite answer.
@@ -60,7 +61,7 @@ class LabelledPresses:
         """Those up to a distance from the centre, mm."""
         return self[np.hypot(self.contact[:, 0], self.contact[:, 1]) <= radius]
 
-    def noisy(self, noise: NoiseModel, seed: int) -> Array:
+    def noisy(self, noise: Noise, seed: int) -> Array:
         """The charges with noise added, shape (n, n_electrode), pC."""
         return noise.add(self.charge, np.random.default_rng(seed))
 
@@ -165,13 +166,23 @@ def held_out(contact: Array) -> Booleans:
     Presses at one position are held out together: neighbours in force would tell too much. The order in which positions
     are taken follows from their coordinates, so that it is the same in every part of the presses.
     """
+    return _before(contact) < max(HELD_SHARE * len(contact), min(FEWEST_HELD, 0.5 * len(contact)))
+
+
+def folds_by_place(contact: Array, count: int) -> Integers:
+    """Numbers from 0 to `count` - 1 of measured presses, shape (n,), in the order of `held_out`: a place has one."""
+    return np.asarray(_before(contact) * count // len(contact), dtype=np.intp)
+
+
+def _before(contact: Array) -> Integers:
+    """Number of presses at positions that are taken before each press's own, shape (n,)."""
     positions, number, counts = np.unique(
         np.round(contact[:, :2], 3) + 0.0, axis=0, return_inverse=True, return_counts=True
     )
     order = np.argsort([sha256_of(position.tobytes()) for position in positions])
-    enough = max(HELD_SHARE * len(contact), min(FEWEST_HELD, 0.5 * len(contact)))
-    before = np.cumsum(counts[order]) - counts[order]
-    return np.asarray(np.isin(number.ravel(), order[before < enough]))
+    before = np.empty_like(counts)
+    before[order] = np.cumsum(counts[order]) - counts[order]
+    return np.asarray(before[number.ravel()])
 
 
 def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Dataset:

@@ -20,6 +20,9 @@ FALSE_ALARMS = 0.01
 ABOUT_1_N = (0.8, 1.25)
 """Smallest and largest force that counts as 1 N where faults are looked for, N."""
 
+FEWEST_FOR_P999 = 5_000
+"""Measured presses from which on five have the misfit that 0.1 % exceed."""
+
 DRAWS = 20
 """Draws of the noise for the misfit's rare values."""
 
@@ -47,12 +50,16 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     if isinstance(presses, Dataset):
         presses = LabelledPresses.of(presses)
     test = fitted.test if presses is None else presses
-    if not test.measured:
+    if not test.measured and isinstance(fitted.noise, NoiseModel):
         return simulated_errors(fitted.predict, test, fitted.noise, seed)
-    errors = contact_errors(*fitted.predict(test.charge)[:2], test.contact)
+    judged = fitted.judged if presses is None else None
+    errors = contact_errors(*(judged or fitted.predict(test.charge)[:2]), test.contact)
     kept = {name: error for name, error in errors.items() if name not in ONLY_SIMULATED}
     if fitted.good.measured:
-        alarm = {"misfit_p99": rounded(alarm_threshold(fitted.predict(fitted.good.charge)[2]))}
+        misfit = fitted.predict(fitted.good.charge)[2]
+        alarm = {"misfit_p99": rounded(alarm_threshold(misfit))}
+        if len(misfit) >= FEWEST_FOR_P999:
+            alarm["misfit_p999"] = rounded(np.percentile(misfit, 99.9))
     else:
         alarm = misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)
     return {**kept, HELD_PRESSES: float(len(test)), **alarm}

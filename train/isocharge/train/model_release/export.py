@@ -15,11 +15,11 @@ from onnx import TensorProto, helper, numpy_helper
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import TrainingError
 from isocharge.serve.model.session import OUTPUTS, open_session, run
-from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 from isocharge.train.model_release.evaluate import Predict
 from isocharge.train.training.folding import FoldedLayers, FoldedNetwork
-from isocharge.train.training.network import MISFIT_UNIT
+from isocharge.train.training.network import LARGEST_RATIO, MISFIT_UNIT
 
 OPSET, IR_VERSION = 17, 8
 """Old enough for runtimes of 2022 on, new enough for every operator used."""
@@ -83,9 +83,14 @@ def export_onnx(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
         `misfit` [n, 1], all float32.
     """
     build, n_electrode = GraphBuilder(), network.typical.size
-    within = build.add("Clip", "charge_pC", build.constant(LOWEST_CHARGE), build.constant(HIGHEST_CHARGE))
-    ratios = build.add("Mul", within, build.constant(1.0 / network.typical))
-    answers = add_layers(build, build.add("Log", ratios), network.layers)
+    if network.signed:
+        ratios = build.add("Mul", "charge_pC", build.constant(1.0 / network.typical))
+        within = build.add("Clip", ratios, build.constant(-LARGEST_RATIO), build.constant(LARGEST_RATIO))
+        logs = build.add("Asinh", within)
+    else:
+        within = build.add("Clip", "charge_pC", build.constant(LOWEST_CHARGE), build.constant(HIGHEST_CHARGE))
+        logs = build.add("Log", build.add("Mul", within, build.constant(1.0 / network.typical)))
+    answers = add_layers(build, logs, network.layers)
     plane, logs, vector = build.split(answers, ("plane", "logs", "misfit_vector"), (2, 4, n_electrode), axis=1)
     force, _ = build.split(build.add("Exp", logs), ("force", "contact_std"), (1, 3), axis=1)
     build.add("Concat", plane, force, to="contact", axis=1)
@@ -120,7 +125,7 @@ def make_model(
     return helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, **attributes)
 
 
-def check_graph(graph: bytes, exact: Predict, presses: LabelledPresses, noise: NoiseModel) -> Singles:
+def check_graph(graph: bytes, exact: Predict, presses: LabelledPresses, noise: Noise) -> Singles:
     """Compare a graph with the network that it was made from.
 
     Args:
@@ -144,7 +149,7 @@ def check_graph(graph: bytes, exact: Predict, presses: LabelledPresses, noise: N
     return np.concatenate([good, absurd])
 
 
-def _golden_charges(exact: Predict, presses: LabelledPresses, noise: NoiseModel) -> tuple[Singles, Singles]:
+def _golden_charges(exact: Predict, presses: LabelledPresses, noise: Noise) -> tuple[Singles, Singles]:
     """Charges for the golden vectors: GOLDEN * 3 / 4 of presses, and absurd ones, shape (n, n_electrode).
 
     They are chosen where charges tell the position better than the median: where 0.2 % is a millimetre, the last digit

@@ -16,7 +16,6 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, write_model
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
-from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.model_release.evaluate import HELD_PRESSES, evaluate
 from isocharge.train.model_release.export import check_graph, export_onnx
 from isocharge.train.training.fit import Fitted
@@ -139,7 +138,7 @@ errors.
 
 
 def _misfit(metadata: ModelMetadata, fitted: Fitted) -> str:
-    errors, unit, shares = metadata.errors, misfit_noise(fitted.noise), ""
+    errors, unit, shares = metadata.errors, fitted.misfit_noise, ""
     simulated = "simulated good presses" if fitted.test.measured else "good presses"
     good = "measured presses" if fitted.good.measured else simulated
     of_unit = f" `{unit.name}` (1 pC and 0.2 %)" if unit != fitted.noise else ""
@@ -208,7 +207,7 @@ def release(
         },
     )
     graph = export_onnx(fitted.network, about.to_props())
-    golden = check_graph(graph, fitted.predict, fitted.good, misfit_noise(fitted.noise))
+    golden = check_graph(graph, fitted.predict, fitted.good, fitted.misfit_noise)
     written = write_model(folder, graph, about, golden, card(about, fitted), fitted.provenance.files)
     return Release(written, about)
 

@@ -23,7 +23,9 @@ from isocharge.common.errors import ConfigError
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.simulate import Dataset, Domain, NoiseModel, Sensor
 from isocharge.simulate.numerics.statistics import rms
+from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.charge_field import ChargeField, invertible_domain
+from isocharge.train.data.measured_sensor import MeasuredSensor
 from isocharge.train.data.misfit_charges import draw_misfit_examples, misfit_noise
 from isocharge.train.data.presses import LabelledPresses, held_out, split_by_position
 from isocharge.train.training.config import FitConfig, TrainingConfig
@@ -54,25 +56,33 @@ class Fitted:
         probes: Notations of the probes.
         domain: The contacts that it knows.
         noise: Noise that it was trained for.
-        test: Presses that it is judged by; it did not learn from them.
+        test: Presses that it is judged by; it did not learn from them, or see `judged`.
         good: Presses of which 1 % may have a misfit above the alarm's.
         sha256: Checksum of what it was fitted to.
         provenance: For the release.
         asked: The domain that was asked for; larger than the network's where the map folds.
         cautions: What users of the network should know, a sentence each.
+        judged: Contacts and standard deviations, mm and N, shapes (n, 3), that networks which did not see the place of
+            a press give for the charges of `test`; None where this one did not see them itself.
     """
 
     network: FoldedNetwork
-    sensor: Sensor
+    sensor: Sensor | MeasuredSensor
     probes: tuple[str, ...]
     domain: Domain
-    noise: NoiseModel
+    noise: Noise
     test: LabelledPresses
     good: LabelledPresses
     sha256: str
     provenance: Provenance
     asked: Domain
     cautions: tuple[str, ...] = ()
+    judged: tuple[Array, Array] | None = None
+
+    @property
+    def misfit_noise(self) -> Noise:
+        """The unit of the misfit."""
+        return misfit_noise(self.noise) if isinstance(self.noise, NoiseModel) else self.noise
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Charges (n, n_electrode), pC, to contact (n, 3), mm and N, standard deviations (n, 3), and misfit (n, 1)."""
@@ -190,8 +200,9 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
             _log.warning("%s", caution)
         features, sizes = Features.fit(split.train.charge), config.network
         network = InverseNetwork(split.domain, features, sizes.hidden, sizes.misfit_hidden)
-        _train(contact_stage(network, split, training, data.teacher), network.contact, config, run)
-        _train(
+        stage = contact_stage(network, split.train, split.watched, training.noise_model, training, data.teacher)
+        train_part(stage, network.contact, config, run)
+        train_part(
             misfit_stage(network, _misfit_examples(split, training, run), training), network.misfit_vector, config, run
         )
     return TrainedNetwork(network.eval(), split)
@@ -214,7 +225,7 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _train(stage: TrainingStage, part: Perceptron, config: FitConfig, run: ResumableRun | None) -> None:
+def train_part(stage: TrainingStage, part: Perceptron, config: FitConfig, run: ResumableRun | None) -> None:
     """Train a perceptron; where weights are to be rounded, round its hidden ones and train the others on."""
     settings = config.training
     Descent(stage, settings.learning_rate, settings.patience, settings.seed).run(run)
@@ -231,13 +242,18 @@ def _train(stage: TrainingStage, part: Perceptron, config: FitConfig, run: Resum
 
 
 def contact_stage(
-    network: InverseNetwork, split: Split, config: TrainingConfig, teacher: Teacher | None
+    network: InverseNetwork,
+    train: LabelledPresses,
+    watched: LabelledPresses,
+    noise: Noise,
+    config: TrainingConfig,
+    teacher: Teacher | None = None,
 ) -> TrainingStage:
     """Contacts and their deviations, of the presses or of a teacher, from charges with fresh noise."""
-    noise, domain, warm_up = config.noise_model, split.domain, round(WARM_UP * config.steps)
-    charge, unit = as_tensor(split.train.charge), as_tensor(domain.to_unit(split.train.contact))
-    watched_charge = as_tensor(split.watched.noisy(noise, config.seed))
-    watched_unit = as_tensor(domain.to_unit(split.watched.contact))
+    domain, warm_up = network.domain, round(WARM_UP * config.steps)
+    charge, unit = as_tensor(train.charge), as_tensor(domain.to_unit(train.contact))
+    watched_charge = as_tensor(watched.charge if watched.measured else watched.noisy(noise, config.seed))
+    watched_unit = as_tensor(domain.to_unit(watched.contact))
 
     def loss(step: int, random: torch.Generator) -> Tensor:
         rows = torch.randint(len(charge), (min(config.batch, len(charge)),), generator=random)
@@ -290,9 +306,10 @@ def contact_score(mean: Tensor, log_std: Tensor, unit: Tensor, domain: Domain, w
     )
 
 
-def with_fresh_noise(charge: Tensor, noise: NoiseModel, random: torch.Generator) -> Tensor:
+def with_fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor:
     """Noisy readings of charges of any shape, pC."""
-    sigma = torch.hypot(torch.tensor(noise.white), noise.gain * charge)
+    white, gain = (torch.as_tensor(number, dtype=torch.float32) for number in (noise.white, noise.gain))
+    sigma = torch.hypot(white, gain * charge)
     return charge + sigma * torch.randn(charge.shape, generator=random)
 
 

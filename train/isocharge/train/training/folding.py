@@ -13,8 +13,7 @@ from torch import nn
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
-from isocharge.train.training.network import MISFIT_UNIT, InverseNetwork, Perceptron
+from isocharge.train.training.network import MISFIT_UNIT, InverseNetwork, Perceptron, bent
 
 Layer = tuple[Array, Array]
 """Weights (inputs, outputs) and bias."""
@@ -88,15 +87,17 @@ class FoldedNetwork:
     Attributes:
         layers: From ln(Q / typical) to: x_mm and y_mm (2), ln F (1), logarithms of the standard deviations in mm and N
             (3), the misfit vector (n_electrode).
-        typical: Powers of two near the charges' geometric means, shape (n_electrode,), pC.
+        typical: Powers of two near the charges' geometric means, shape (n_electrode,), pC; see `Features`.
+        signed: Whether asinh(Q / typical) stands for the logarithm.
     """
 
     layers: FoldedLayers
     typical: Array
+    signed: bool = False
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
-        answers = self.layers.answers(np.log(np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE) / self.typical))
+        answers = self.layers.answers(bent(charge, self.typical, signed=self.signed))
         contact = np.concatenate([answers[:, :2], np.exp(answers[:, 2:3])], axis=1)
         length = np.linalg.norm(answers[:, 6:], axis=1, keepdims=True)
         return contact, np.exp(answers[:, 3:6]), MISFIT_UNIT * np.sinh(length)
@@ -115,7 +116,8 @@ def fold_network(network: InverseNetwork) -> FoldedNetwork:
     perceptrons = [PlainPerceptron.of(part) for part in (network.contact, network.misfit_vector)]
     whitening, mean = network.whitening.double().numpy(), network.logs_mean.double().numpy()
     units = answer_units(network.domain, np.eye(3), np.zeros(3), n_electrode)
-    return FoldedNetwork(FoldedLayers.of(perceptrons, whitening, mean, units), network.features.typical)
+    features = network.features
+    return FoldedNetwork(FoldedLayers.of(perceptrons, whitening, mean, units), features.typical, features.signed)
 
 
 def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer:

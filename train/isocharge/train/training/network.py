@@ -1,7 +1,8 @@
 """The inverse in torch: charges in; contact, standard deviations and misfit out.
 
 Features are whitened logarithms of the charges: a force multiplies all charges nearly alike, so ratios carry the
-position and the common factor the force. One perceptron gives mean and log standard deviation of (x, y, ln F). A second
+position and the common factor the force. Charges of any sign have asinh in the logarithm's place, which is linear where
+noise is larger than the charge. One perceptron gives mean and log standard deviation of (x, y, ln F). A second
 one gives the misfit
 
     min over known contacts c of |(Q - Q(c)) / sigma|
@@ -29,20 +30,28 @@ LARGEST_INT8 = 127
 """A rounded weight is a whole number from minus this to this, times the scale of its output."""
 
 
+LARGEST_RATIO = 1e7
+"""Size of a signed charge over the typical one beyond which it counts as this many: what is absurd still gives a finite
+answer."""
+
+
 @dataclass(frozen=True)
 class Features:
-    """Whitened logarithms of the charges: x = (ln(clip(Q) / typical) - mean) @ matrix.
+    """Whitened logarithms of the charges: x = (ln(clip(Q) / typical) - mean) @ matrix; asinh for signed charges.
 
     Attributes:
         typical: The power of two nearest to each charge's geometric mean, shape (n_electrode,), pC: dividing by it
-            costs a float32 no digit, and the logarithms are small enough to keep theirs.
+            costs a float32 no digit, and the logarithms are small enough to keep theirs. For signed charges the size
+            from which noise grows with the charge.
         mean: Of the logarithms, shape (n_electrode,).
         matrix: Shape (n_electrode, n_electrode).
+        signed: Whether asinh(Q / typical) stands for the logarithm.
     """
 
     typical: Array
     mean: Array
     matrix: Array
+    signed: bool = False
 
     @classmethod
     def fit(cls, charge: Array) -> "Features":
@@ -50,6 +59,18 @@ class Features:
         within = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
         typical = 2.0 ** np.round(np.log2(within).mean(axis=0))
         return cls(typical, *whitening(np.log(within / typical)))
+
+    @classmethod
+    def of_signed(cls, charge: Array, typical: Array) -> "Features":
+        """From charges of any sign, shape (n, n_electrode), and the size from which noise grows with them, pC."""
+        return cls(typical, *whitening(bent(charge, typical, signed=True)), signed=True)
+
+
+def bent(charge: Array, typical: Array, *, signed: bool) -> Array:
+    """What the features are linear in: ln or asinh of Q / typical, within bounds, shape (n, n_electrode)."""
+    if signed:
+        return np.asarray(np.arcsinh(np.clip(charge / typical, -LARGEST_RATIO, LARGEST_RATIO)))
+    return np.asarray(np.log(np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE) / typical))
 
 
 def whitening(values: Array) -> tuple[Array, Array]:
@@ -130,7 +151,10 @@ class InverseNetwork(nn.Module):
 
     def inputs(self, charge: Tensor) -> Tensor:
         """What both perceptrons see, finite for any charges (n, n_electrode), pC."""
-        logs = torch.log(charge.clamp(LOWEST_CHARGE, HIGHEST_CHARGE) / self.typical)
+        if self.features.signed:
+            logs = torch.asinh((charge / self.typical).clamp(-LARGEST_RATIO, LARGEST_RATIO))
+        else:
+            logs = torch.log(charge.clamp(LOWEST_CHARGE, HIGHEST_CHARGE) / self.typical)
         return (logs - self.logs_mean) @ self.whitening
 
     def posterior(self, charge: Tensor) -> tuple[Tensor, Tensor]:

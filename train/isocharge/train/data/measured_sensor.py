@@ -1,0 +1,146 @@
+"""A sensor that is known by measured presses alone: the names of its channels, and the area that was pressed."""
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import Delaunay, QhullError, cKDTree
+
+from isocharge.common.arrays import Array, Integers
+from isocharge.common.errors import PressError
+from isocharge.simulate import Domain
+from isocharge.simulate.numerics.polygon import area_of, to_complex, to_corners
+
+LEAST_HOLE = 3.0
+"""Smallest gap between places that may be outside the area, over the distance between neighbours."""
+
+LONGEST_MITRE = 2.0
+"""Largest distance by which a corner moves out, over that of the sides."""
+
+
+@dataclass(frozen=True)
+class MeasuredSensor:
+    """What a model of measured presses says about its sensor.
+
+    Attributes:
+        name: Of the sensor: the frame of x and y.
+        electrode_names: Of the channels, in the order of their charges.
+    """
+
+    name: str
+    electrode_names: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, object]:
+        """For metadata."""
+        return {"name": self.name, "electrodes": list(self.electrode_names)}
+
+
+@dataclass(frozen=True)
+class PressedArea(Domain):
+    """Contacts that were pressed: an area of any shape, and a range of forces.
+
+    `radius` is the distance of the farthest corner from the middle.
+
+    Attributes:
+        corners: Of the area, in order, mm.
+    """
+
+    corners: tuple[tuple[float, float], ...]
+
+    @classmethod
+    def of(cls, contact: Array) -> "PressedArea":
+        """The area of contacts (x, y, F), shape (n, 3), mm and N.
+
+        Raises:
+            PressError: If they lie on a line.
+        """
+        corners = outline(np.unique(contact[:, :2], axis=0))
+        middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+        radius = float(np.linalg.norm(corners - middle, axis=1).max())
+        forces = float(contact[:, 2].min()), float(contact[:, 2].max())
+        return cls(radius, forces, tuple((x, y) for x, y in np.round(corners, 4).tolist()))
+
+    @cached_property
+    def centre(self) -> Array:
+        """Middle of (x, y, ln F), shape (3,), mm and logarithm of N."""
+        corners = np.array(self.corners)
+        return np.append(0.5 * (corners.min(axis=0) + corners.max(axis=0)), super().centre[2])
+
+    @cached_property
+    def scale(self) -> Array:
+        """Half width of (x, y, ln F), shape (3,), mm and logarithm of N."""
+        return np.append(0.5 * np.ptp(np.array(self.corners), axis=0), super().scale[2])
+
+
+def outline(places: Array) -> Array:
+    """Corners of the area that places cover, shape (n, 2), mm, grown by half the distance between neighbours.
+
+    The triangles between places, without those that are too large for an area that was pressed (Edelsbrunner et al.
+    1983): their limit is the least that leaves one ring with all places inside. Holes are closed.
+
+    Args:
+        places: Different (x, y), shape (m, 2), mm.
+
+    Raises:
+        PressError: If they lie on a line.
+    """
+    try:
+        triangles = Delaunay(places).simplices
+    except QhullError as error:
+        raise PressError(
+            f"expected presses over an area, got {len(places)} places on one line; press beside it, too"
+        ) from error
+    spacing = float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
+    sizes = _circumradii(places[triangles])
+    for limit in LEAST_HOLE * spacing * 2.0 ** np.arange(0.0, 20.0, 0.5):
+        ring = _ring(triangles[sizes <= limit], len(places))
+        if ring is not None:
+            break
+    else:
+        ring = _ring(triangles, len(places))
+        if ring is None:
+            raise PressError(f"expected presses over an area, got {len(places)} places that enclose none")
+    return _grown(places[ring], 0.5 * spacing)
+
+
+def _circumradii(corners: Array) -> Array:
+    """Radii of the circles through triangles, shape (n, 3, 2)."""
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    sides = [np.hypot(*side.T) for side in (a, b, b - a)]
+    doubled = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    return np.asarray(np.prod(sides, axis=0) / np.maximum(2.0 * doubled, 1e-30))
+
+
+def _ring(triangles: Integers, count: int) -> list[int] | None:
+    """The outer edges of triangles as one ring, anticlockwise; None if they are more, or a place is in no triangle."""
+    if len(np.unique(triangles)) < count:
+        return None
+    pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    beside: dict[int, list[int]] = {}
+    for (one, other), times in Counter(map(tuple, pairs.tolist())).items():
+        if times == 1:
+            beside.setdefault(one, []).append(other)
+            beside.setdefault(other, []).append(one)
+    if any(len(others) != 2 for others in beside.values()):
+        return None
+    first = min(beside)
+    ring, at = [first], beside[first][0]
+    while at != first:
+        one, other = beside[at]
+        ring.append(at)
+        at = other if one == ring[-2] else one
+    return ring if len(ring) == len(beside) else None
+
+
+def _grown(corners: Array, by: float) -> Array:
+    """A polygon whose sides have moved out, mm, without its straight corners."""
+    z = to_complex(corners if area_of(corners) > 0.0 else corners[::-1])
+    along = np.roll(z, -1) - z
+    turn = np.angle(along / np.roll(along, 1))
+    z = z[np.abs(turn) > 1e-6]
+    along = np.roll(z, -1) - z
+    after = -1j * along / np.abs(along)
+    before = np.roll(after, 1)
+    mitre = (before + after) / np.maximum(1.0 + (before * np.conj(after)).real, 1e-9)
+    return to_corners(z + by * mitre * np.minimum(1.0, LONGEST_MITRE / np.abs(mitre)))

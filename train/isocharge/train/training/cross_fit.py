@@ -1,0 +1,297 @@
+"""Fit a network to measured presses alone, of a sensor that nobody simulates.
+
+Five networks each leave out a fifth of the places. What they say of the presses there, which they never saw, gives the
+errors, and the factor by which the standard deviations have to grow so that intervals hold what they promise (split
+conformal prediction, Papadopoulos et al. 2002). Their mean errs less than any one of them, and has seen all places; one
+network learns its answers (Hinton et al. 2015) and is as small and fast as those of simulated sensors.
+
+The presses' own noise is learned (`data.channel_noise`). It is added again, at half its size, in every step, against
+learning presses by heart.
+"""
+
+import logging
+from dataclasses import replace
+from functools import partial
+from importlib import metadata
+
+import numpy as np
+import torch
+from msgspec import structs
+from torch import Tensor
+
+from isocharge.common.arrays import Array, Integers
+from isocharge.common.errors import PressError
+from isocharge.common.resumable_run import ResumableRun
+from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text
+from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
+from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
+from isocharge.train.data.misfit_charges import KINDS, draw_charges
+from isocharge.train.data.presses import (
+    FEWEST,
+    FEWEST_POSITIONS,
+    LabelledPresses,
+    complete,
+    folds_by_place,
+    presses_sha256,
+)
+from isocharge.train.training.config import FitConfig, TrainingConfig
+from isocharge.train.training.descent import Descent, TrainingStage
+from isocharge.train.training.fit import (
+    Fitted,
+    contact_stage,
+    misfit_stage,
+    teaching_loss,
+    threads_and_seed,
+    train_part,
+)
+from isocharge.train.training.folding import fold_network
+from isocharge.train.training.network import Features, InverseNetwork, as_tensor
+from isocharge.train.training.source import Provenance
+
+_log = logging.getLogger(__name__)
+
+FOLDS = 5
+"""Networks, and parts of the places of which each leaves out one."""
+
+CHANNELS = (3, 8)
+"""Fewest and most channels."""
+
+FIRST_STEPS = 1_200
+"""Steps that are tried first, then twice as many as long as that helps: noisy presses are learned by heart soon."""
+
+ADDED_NOISE = 0.5
+"""Added to charges in every step, over their own noise: more blurs the map, less is learned by heart."""
+
+TAUGHT_NOISE = (0.0, 0.5, 0.5, 1.0, 1.0, 2.0)
+"""Noise added to the copies of the presses that the last network is taught on, over their own."""
+
+FARTHEST = 2.5
+"""Decades by which charges of no press are moved, in standard deviations of the noise."""
+
+PRESSES = "presses.csv"
+"""File beside the model: what it was fitted to."""
+
+
+def fit_presses(
+    presses: MeasuredPresses,
+    name: str,
+    config: FitConfig | None = None,
+    *,
+    probes: tuple[str, ...] = ("unknown",),
+    run: ResumableRun | None = None,
+) -> Fitted:
+    """Fit a network to measured presses of any sensor with three to eight channels.
+
+    Args:
+        presses: From 500 presses at 50 places on; those of which something is unknown are left out.
+        name: Of the sensor.
+        config: Settings; `steps` are the most that are tried, `noise` and `hold_out` are those of the presses.
+        probes: Notations of the probes that pressed.
+        run: Keeps the state, so that a killed fit goes on.
+
+    Raises:
+        PressError: If there are too few presses or places, or not three to eight channels that vary.
+        ConfigError: If a setting is out of its range.
+        TrainingError: If the loss is not finite.
+
+    Warns the logger of this module of presses that are left out.
+    """
+    settings, usable = (config or FitConfig()).checked(), usable_presses(presses)
+    known = LabelledPresses(usable.contact, usable.charge_pC, measured=True)
+    domain = PressedArea.of(known.contact)
+    noise = ChannelNoise.of(known.charge, domain.to_unit(known.contact))
+    with threads_and_seed(settings.training.threads, settings.training.seed):
+        features = Features.of_signed(known.charge, noise.white / noise.gain)
+        network, *members = (
+            InverseNetwork(domain, features, settings.network.hidden, settings.network.misfit_hidden)
+            for _ in range(1 + FOLDS)
+        )
+        fold = folds_by_place(known.contact, FOLDS)
+        steps = _train_members(members, known, fold, noise, settings.training, run)
+        judged = [_answers(member, known.charge) for member in members]
+        contact, std = (np.choose(fold[:, None], [answer[part] for answer in judged]) for part in range(2))
+        factors = deviation_factors(contact, std, known.contact)
+        train_part(_taught_stage(network, members, known, noise, settings.training), network.contact, settings, run)
+        draw = partial(_misfit_examples, known, domain, noise, settings.training)
+        examples = run.keeping("misfit-charges").submit(draw).result() if run else draw()
+        train_part(misfit_stage(network, examples, settings.training), network.misfit_vector, settings, run)
+    position, force = factors
+    return Fitted(
+        network=fold_network(network.eval()).widened(position, force),
+        sensor=MeasuredSensor(name, usable.electrodes),
+        probes=probes,
+        domain=domain,
+        noise=noise,
+        test=known,
+        good=known,
+        sha256=presses_sha256(usable),
+        provenance=Provenance(
+            made_with={
+                "config": settings.to_dict(),
+                "torch": torch.__version__,
+                "measured": {
+                    "presses": len(usable),
+                    "places": len(np.unique(known.contact[:, :2], axis=0)),
+                    "folds": FOLDS,
+                    "steps": steps,
+                    "std_factors": [float(f"{factor:.4g}") for factor in factors],
+                },
+            },
+            files={PRESSES: presses_text(usable).encode()},
+        ),
+        asked=domain,
+        judged=(contact, std * [position, position, force]),
+    )
+
+
+def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, object]:
+    """All that decides about the weights: the identity of a resumable run."""
+    return {
+        "presses_sha256": presses_sha256(presses),
+        "electrodes": list(presses.electrodes),
+        "config": config.to_dict(),
+        "isocharge": metadata.version("isocharge"),
+        "torch": torch.__version__,
+    }
+
+
+def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
+    """The presses of which everything is known; errors and warnings as `fit_presses`."""
+    names, (fewest, most) = presses.electrodes, CHANNELS
+    if not fewest <= len(names) <= most:
+        raise PressError(
+            f"expected {fewest} to {most} channels, got {len(names)} ({', '.join(names)}): every column without "
+            "another meaning is one; leave other columns out of the file"
+        )
+    usable = presses[complete(presses)]
+    places = len(np.unique(np.round(usable.contact[:, :2], 3), axis=0))
+    if len(usable) < FEWEST or places < FEWEST_POSITIONS:
+        raise PressError(
+            f"expected at least {FEWEST} presses at {FEWEST_POSITIONS} places with known place, force and charges, got "
+            f"{len(usable)} at {places}; measure more, or describe the sensor (--sensor): 50 presses then suffice"
+        )
+    for electrode, charge in zip(names, usable.charge_pC.T, strict=True):
+        if np.ptp(charge) == 0.0:
+            raise PressError(f"channel {electrode!r}: expected charges that vary, got {charge[0]:g} everywhere")
+    if left := len(presses) - len(usable):
+        _log.warning("%d of %d presses are left out: an unknown place, force or charge", left, len(presses))
+    return usable
+
+
+def deviation_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]:
+    """Factors of the standard deviations of position and of force with which intervals hold what they promise.
+
+    Each is the geometric mean of two: that with which intervals of 68 % hold 68 % of the presses, and of 95 % 95 %.
+
+    Args:
+        contact: Of networks that did not see the presses, (x, y, F), shape (n, 3), mm and N.
+        std: Their standard deviations, shape (n, 3).
+        truth: The contacts, shape (n, 3).
+    """
+    off = np.abs(contact - truth) / std
+    return _factor(off[:, :2]), _factor(off[:, 2])
+
+
+def _factor(off: Array) -> float:
+    sixty_eight, ninety_five = np.quantile(off, [0.6827, 0.95])
+    return float(np.sqrt(sixty_eight * ninety_five / 1.96))
+
+
+def _train_members(
+    members: list[InverseNetwork],
+    presses: LabelledPresses,
+    fold: Integers,
+    noise: ChannelNoise,
+    config: TrainingConfig,
+    run: ResumableRun | None,
+) -> int:
+    """Train each on all but its part; the steps that were best for the first are those of all, and are returned."""
+    steps = min(FIRST_STEPS, config.steps)
+
+    def descend(number: int, steps: int) -> Descent:
+        out, settings = fold == number, structs.replace(config, steps=steps)
+        stage = contact_stage(members[number], presses[~out], presses[out], noise.scaled(ADDED_NOISE), settings)
+        stage = replace(stage, name=f"contact-{number + 1}-{steps}")
+        descent = Descent(stage, config.learning_rate, max(steps // 2, 1), config.seed + number)
+        descent.run(run)
+        return descent
+
+    start = {name: weight.clone() for name, weight in members[0].contact.state_dict().items()}
+    best = descend(0, steps)
+    while 2 * steps <= config.steps:
+        members[0].contact.load_state_dict(start)
+        longer = descend(0, 2 * steps)
+        if longer.best >= best.best:
+            members[0].contact.load_state_dict(best.best_weights)
+            break
+        best, steps = longer, 2 * steps
+    for number in range(1, len(members)):
+        descend(number, steps)
+    return steps
+
+
+def _answers(network: InverseNetwork, charge: Array) -> tuple[Array, Array]:
+    """Contacts and standard deviations, mm and N, shapes (n, 3), of charges (n, n_electrode), pC."""
+    with torch.no_grad():
+        contact, std, _ = network(as_tensor(charge))
+    return contact.double().numpy(), std.double().numpy()
+
+
+def _taught_stage(
+    network: InverseNetwork,
+    members: list[InverseNetwork],
+    presses: LabelledPresses,
+    noise: ChannelNoise,
+    config: TrainingConfig,
+) -> TrainingStage:
+    """The mean answers of the members to noisy copies of the presses; the last of them are only watched."""
+    rng = np.random.default_rng(config.seed)
+    copies = [noise.scaled(factor).add(presses.charge, rng) for factor in TAUGHT_NOISE]
+    charge = as_tensor(np.concatenate(copies)[rng.permutation(len(copies) * len(presses))])
+    with torch.no_grad():
+        answers = [torch.stack(member.posterior(charge)) for member in members]
+    mean, log_std = torch.stack(answers).mean(dim=0)
+    trained = len(charge) - len(presses) // 2
+
+    def divergence(rows: Tensor | slice) -> Tensor:
+        return teaching_loss(*network.posterior(charge[rows]), mean[rows], log_std[rows])
+
+    def loss(_: int, random: torch.Generator) -> Tensor:
+        return divergence(torch.randint(trained, (config.batch,), generator=random))
+
+    def score() -> tuple[float, str]:
+        left = divergence(slice(trained, None)).item()
+        return left, f"{left:.4f} from the mean of {len(members)} networks"
+
+    return TrainingStage("contact", network.contact, loss, score, config.steps)
+
+
+def _misfit_examples(
+    presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, config: TrainingConfig
+) -> Array:
+    """Charges of all kinds, pC, and how far they are from those of any press, in standard deviations of the noise.
+
+    Returns:
+        Charges and residuals, shape (2, misfit_charges, n_electrode).
+    """
+    rng, count = np.random.default_rng(config.seed), config.misfit_charges
+    planes = LocalPlanes.through(domain.to_unit(presses.contact), noise.level(presses.charge))
+    chosen = presses.charge[rng.integers(len(presses), size=count)]
+    kinds = np.array(list(KINDS))[rng.choice(len(KINDS), size=count, p=list(KINDS.values()))]
+    charge = np.empty_like(chosen)
+    for kind in KINDS:
+        rows = kinds == kind
+        charge[rows] = _draw(kind, rng, chosen[rows], presses.charge, noise)
+    return np.stack([charge, planes.residuals(noise.level(charge))])
+
+
+def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: ChannelNoise) -> Array:
+    """As `draw_charges`, for charges of any sign."""
+    if kind == "moved":
+        far = 10.0 ** rng.uniform(-1.0, FARTHEST, (len(charge), 1))
+        return noise.charge(noise.level(charge) + far * rng.standard_normal(charge.shape))
+    if kind == "any":
+        level = noise.level(others)
+        low, high = level.min(axis=0), level.max(axis=0)
+        return noise.charge(rng.uniform(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, charge.shape))
+    return draw_charges(kind, rng, charge, others, noise)
