@@ -32,6 +32,7 @@ with require("train"):
     from isocharge.train.model_release.student import StudentCase, student_config, student_data
     from isocharge.train.rig.rig_data import Rig, rig_data
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
+    from isocharge.train.training.cross_fit import fit_presses
     from isocharge.train.training.fit import Fitted, fit
     from isocharge.train.training.source import Provenance, Teacher, TrainingData
 
@@ -62,6 +63,7 @@ __all__ = [
     "evaluate",
     "fit",
     "fit_films",
+    "fit_presses",
     "load_config",
     "next_presses",
     "read_earlier",

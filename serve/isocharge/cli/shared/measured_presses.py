@@ -27,9 +27,9 @@ ForceStdOption = Annotated[
 
 
 def read_presses_of(
-    file: Path, electrodes: tuple[str, ...], position_std_mm: float = 0.1, force_std: float = 0.01
+    file: Path, electrodes: tuple[str, ...] | None, position_std_mm: float = 0.1, force_std: float = 0.01
 ) -> MeasuredPresses:
-    """The presses of a file; columns that nobody reads are named."""
+    """The presses of a file, of all columns without another meaning if `electrodes` are None; others are named."""
     presses = read_presses(file, electrodes, position_std_mm=position_std_mm, force_std=force_std)
     if presses.ignored:
         say(ignored_words(str(file), presses.ignored))

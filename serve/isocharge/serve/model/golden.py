@@ -5,6 +5,7 @@ the same answers: |a - b| <= 1e-5 max(|b|, floor).
 """
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from isocharge.common.arrays import Singles
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.common.structs import Finite, NotNegative, Text, WrongKey, read_json
+from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import INPUT, OUTPUTS, run
 
 RELATIVE = 1e-5
@@ -30,6 +32,17 @@ FLOORS = {
     "misfit": (20.0,),
 }
 """Floor for each column of an output, in the unit of the column."""
+
+USUAL_REACH_MM, USUAL_FORCE_N = 20.0, 2.0
+"""Reach of a working area and largest force up to which these floors hold; beyond, they grow in proportion."""
+
+
+def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
+    """Floors of x and y, mm, and force, N: larger for a wide area, large forces, and where millimetres are noise."""
+    x_mm, y_mm, force_N = FLOORS["contact"]
+    reach_mm = max(math.hypot(x, y) for x, y in metadata.working_area_mm)
+    length = max(1.0, reach_mm / USUAL_REACH_MM, metadata.errors.get("position_rms_mm", 0.0) / x_mm)
+    return x_mm * length, y_mm * length, force_N * max(1.0, metadata.force_range_N[1] / USUAL_FORCE_N)
 
 
 @dataclass(frozen=True)
@@ -65,8 +78,10 @@ class Golden:
         return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
-def make_golden(session: ort.InferenceSession, onnx_model: bytes, charge_pC: Singles) -> Golden:
-    """Run charges of shape (n, electrodes), pC, through a model and keep its answers.
+def make_golden(
+    session: ort.InferenceSession, onnx_model: bytes, charge_pC: Singles, contact: tuple[float, float, float]
+) -> Golden:
+    """Run charges of shape (n, electrodes), pC, through a model and keep its answers; `contact` are `contact_floors`.
 
     Raises:
         ModelError: If an answer is not finite.
@@ -76,7 +91,9 @@ def make_golden(session: ort.InferenceSession, onnx_model: bytes, charge_pC: Sin
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if bad.size:
             raise ModelError(f"the new model answers {name} = {rows[bad[0]]} to the charges {charge_pC[bad[0]]} pC")
-    return Golden(sha256_of(onnx_model), charge_pC, outputs, RELATIVE, FLOORS)
+    return Golden(
+        sha256_of(onnx_model), charge_pC, outputs, RELATIVE, FLOORS | {"contact": contact, "contact_std": contact}
+    )
 
 
 def read_golden(path: Path) -> Golden:

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ModelError, OutputExists
 from isocharge.common.files import new_folder, read_whole, refuse_existing, sha256_of, write_whole
-from isocharge.serve.model.golden import Golden, check_answers, make_golden, read_golden
+from isocharge.serve.model.golden import Golden, check_answers, contact_floors, make_golden, read_golden
 from isocharge.serve.model.metadata import NAME, ModelMetadata
 from isocharge.serve.model.session import INPUT, OUTPUTS, as_batch, check_interface, check_rows, open_session, run
 
@@ -223,7 +223,8 @@ def write_model(
     where = f"the new model {metadata.label}"
     session = open_session(onnx_model, where)
     check_interface(session, len(metadata.electrodes), where)
-    golden = make_golden(session, onnx_model, as_batch(golden_charge_pC, metadata.electrodes))
+    charges = as_batch(golden_charge_pC, metadata.electrodes)
+    golden = make_golden(session, onnx_model, charges, contact_floors(metadata))
     with new_folder(target) as draft:
         write_whole(draft / "model.onnx", onnx_model)
         write_whole(draft / "golden.json", golden.to_json().encode())

@@ -32,6 +32,9 @@ MOST_ROWS = 1_000_000
 CONTACT = ("x_mm", "y_mm", "force_N")
 UNCERTAINTY = ("position_std_mm", "force_std")
 
+NOT_READ = ("temperature_C",)
+"""Columns with a meaning that nothing here needs; they are no electrodes."""
+
 KINDS = {
     "x_mm": "a position in mm, or an empty cell if it is unknown",
     "y_mm": "a position in mm, or an empty cell if it is unknown",
@@ -159,7 +162,7 @@ def read_presses(
     named = f"the electrodes {tuple(electrodes)}" if electrodes is not None else "the electrodes' names"
     with _open_table(path, (*(electrodes or ()), *KINDS), f"{', '.join(CONTACT)} and {named} (charges in pC)") as table:
         if electrodes is None:
-            electrodes = [name for name in table.header if name and name not in KINDS]
+            electrodes = [name for name in table.header if name and name not in KINDS and name not in NOT_READ]
         electrodes = tuple(electrodes)
         _check_electrodes(electrodes)
         columns = table.columns(electrodes, KINDS)

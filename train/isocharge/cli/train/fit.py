@@ -24,6 +24,7 @@ from isocharge.cli.shared.terminal import say, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.resumable_run import ResumableRun, resume_parts
+from isocharge.serve import MeasuredPresses
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import Circle, FilmPrior, load_sensor, local_workers, parse_probe, read_dataset
 from isocharge.train import (
@@ -34,13 +35,18 @@ from isocharge.train import (
     TrainingData,
     fit,
     fit_films,
+    fit_presses,
     load_config,
     release,
     release_films,
     rig_data,
 )
 from isocharge.train.films.fit import films_identity
+from isocharge.train.training.cross_fit import presses_identity, usable_presses
 from isocharge.train.training.fit import fit_identity
+
+DEFAULT_TEXT = f"{DEFAULT_RADIUS}"
+"""Radius of the working area where no other is asked for, mm."""
 
 ModelFolderOption = Annotated[
     Path,
@@ -56,8 +62,9 @@ def fit_command(
         Path | None,
         typer.Argument(
             metavar="DATASET|PRESSES.csv",
-            help="Dataset folder of `isocharge simulate sweep` or of measured presses; or with --sensor a CSV file of "
-            "50 measured presses or more: x_mm, y_mm, force_N and the electrodes' names (pC). (default: --sensor)",
+            help="Dataset folder of `isocharge simulate sweep` or of measured presses; or a CSV file of measured "
+            "presses, 50 with --sensor, 500 without: x_mm, y_mm, force_N and the electrodes' names (pC). "
+            "(default: --sensor)",
         ),
     ] = None,
     sensor: Annotated[
@@ -75,7 +82,7 @@ def fit_command(
             "--probe", metavar="SHAPE", help=f"With --sensor: {PROBE_HELP} May be repeated. (default: circle:1.0)"
         ),
     ] = None,
-    radius: RadiusOption = f"{DEFAULT_RADIUS}",
+    radius: RadiusOption = DEFAULT_TEXT,
     films: Annotated[
         bool,
         typer.Option(
@@ -97,7 +104,8 @@ def fit_command(
     The presses come from DATASET, or are simulated first: --probe and --radius say how, and belong to --sensor.
 
     From measured presses the film is calibrated, what is then still wrong everywhere is corrected, and a fifth is held
-    out: the errors are of those presses as measured.
+    out: the errors are of those presses as measured. Without --sensor the presses alone are learned, of any sensor with
+    three to eight channels: every other column is one. Their errors are of networks that left out the presses' places.
 
     With --films the sensor's film is not taken as described: pretension, stiffness, coefficients, gains and the place
     of the electrodes are drawn as they spread between films, and the folder also gets films.npz, the network for all of
@@ -109,6 +117,8 @@ def fit_command(
     Example: isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
 
     Example: isocharge train fit presses.csv --sensor four-25um-biaxial -o models/rig
+
+    Example: isocharge train fit presses.csv -o models/pad
     """
     probes, target = probe or ["circle:1.0"], output / str(version)
     if films:
@@ -126,6 +136,17 @@ def fit_command(
     if sensor:  # before anything is simulated
         check_target(output, version, load_sensor(sensor).electrode_names)
     settings = load_config(config) if config else FitConfig()
+    if dataset and dataset.is_file() and not sensor:
+        presses = _measured(dataset, radius, (position_std_mm, force_std))
+        check_target(output, version, presses.electrodes)
+
+        def train_alone(run: ResumableRun) -> Release:
+            name = output.resolve().name
+            fitted = fit_presses(presses, name, settings, probes=tuple(probe or ["unknown"]), run=run)
+            return release(fitted, output, version=version, command=this_command())
+
+        release_resumably(train_alone, presses_identity(presses, settings), target, fresh=fresh, json=json)
+        return
     with shown_progress():
         if dataset and not dataset.is_dir():
             rig = _rig(dataset, sensor, probes, radius, (position_std_mm, force_std))
@@ -141,6 +162,10 @@ def fit_command(
     release_resumably(train, fit_identity(data, settings), target, fresh=fresh, json=json)
 
 
+UNSEEN = "that training never saw"
+"""What is said of measured presses that were held out."""
+
+
 def _presses(dataset: Path | None, sensor: str | None, probes: list[str], radius: str) -> TrainingData:
     """A dataset, read or simulated."""
     if dataset and not sensor:
@@ -152,6 +177,14 @@ def _presses(dataset: Path | None, sensor: str | None, probes: list[str], radius
     return TrainingData.of(simulated_presses(film_sensor, pressing, reach, forces))
 
 
+def _measured(file: Path, radius: str, stds: tuple[float, float]) -> MeasuredPresses:
+    """Measured presses of any sensor; the columns that are taken for channels are said."""
+    refuse({"--radius: belongs to --sensor; without it, the area is where the presses are": radius != DEFAULT_TEXT})
+    presses = usable_presses(read_presses_of(file, None, *stds))
+    say(f"{file}: {len(presses)} presses of the channels {', '.join(presses.electrodes)}")
+    return presses
+
+
 def _rig(file: Path, sensor: str | None, probes: list[str], radius: str, stds: tuple[float, float]) -> Rig:
     """Measured presses of a file."""
     refuse(
@@ -159,7 +192,6 @@ def _rig(file: Path, sensor: str | None, probes: list[str], radius: str, stds: t
             f"{file}: expected a dataset folder, or a CSV file of measured presses; there is neither": (
                 not file.exists()
             ),
-            f"{file}: a file of measured presses needs --sensor SENSOR, which says what was pressed": not sensor,
             "--radius: expected a number of mm with measured presses, got auto": radius == "auto",
             f"--probe: expected the one that made the presses, got {', '.join(probes)}": len(probes) != 1,
         }
@@ -210,7 +242,8 @@ def release_resumably(
     if json:
         typer.echo(json_module.dumps({"folder": str(release.folder), "errors": dict(errors)}))
     measured = errors.get("measured_presses")
-    presses = f"on {measured:.0f} measured presses that training never saw, " if measured else ""
+    unseen = "at places that were left out" if "folds" in release.metadata.made_with.get("measured", {}) else UNSEEN
+    presses = f"on {measured:.0f} measured presses {unseen}, " if measured else ""
     say(
         f"{release.folder}: {presses}position error {errors['position_median_mm']:g} mm median, "
         f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "

@@ -12,7 +12,7 @@ from isocharge.common.errors import PressError
 from isocharge.simulate import Domain
 from isocharge.simulate.numerics.polygon import area_of, to_complex, to_corners
 
-LEAST_HOLE = 3.0
+LEAST_HOLE = 6.0
 """Smallest gap between places that may be outside the area, over the distance between neighbours."""
 
 LONGEST_MITRE = 2.0

@@ -55,7 +55,7 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     judged = fitted.judged if presses is None else None
     errors = contact_errors(*(judged or fitted.predict(test.charge)[:2]), test.contact)
     kept = {name: error for name, error in errors.items() if name not in ONLY_SIMULATED}
-    if fitted.good.measured:
+    if fitted.good.measured or not isinstance(fitted.noise, NoiseModel):
         misfit = fitted.predict(fitted.good.charge)[2]
         alarm = {"misfit_p99": rounded(alarm_threshold(misfit))}
         if len(misfit) >= FEWEST_FOR_P999:

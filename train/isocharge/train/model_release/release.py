@@ -12,12 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.serve.model.golden import contact_floors
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, write_model
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
-from isocharge.train.model_release.evaluate import HELD_PRESSES, evaluate
+from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
+from isocharge.train.model_release.evaluate import evaluate
 from isocharge.train.model_release.export import check_graph, export_onnx
+from isocharge.train.model_release.measured_card import measured_card, measured_errors
 from isocharge.train.training.fit import Fitted
 
 CORNERS = 64
@@ -51,6 +54,11 @@ MEASURED_TRUTH = """\
   few presses.
 """
 
+NO_NOISE = """\
+The presses as they were measured: no noise was added, and what the rig does not know of places and forces is in the
+errors.
+"""
+
 LIMITS = """\
 - One press at a time. Outside the working area and forces the answer is finite and wrong; the misfit is then large in
   many cases, not in all.
@@ -60,8 +68,13 @@ LIMITS = """\
 
 def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     """The text of `card.md`."""
+    if isinstance(fitted.sensor, MeasuredSensor):
+        return measured_card(metadata)
     if fitted.test.measured:
-        errors, truth = fitted.provenance.card + _measured_errors(metadata.errors), MEASURED_TRUTH
+        errors, truth = (
+            fitted.provenance.card + measured_errors(metadata.errors, "that training never saw", NO_NOISE),
+            MEASURED_TRUTH,
+        )
     else:
         errors, truth = _errors(metadata.errors, len(fitted.test)), SIMULATED_TRUTH
     cautions = "".join(f"- {caution}.\n" for caution in fitted.cautions)
@@ -119,24 +132,6 @@ Forces log-uniform, positions uniform over the working area.
 """
 
 
-def _measured_errors(errors: Mapping[str, float]) -> str:
-    return f"""## Errors on {errors[HELD_PRESSES]:.0f} measured presses that training never saw
-
-The presses as they were measured: no noise was added, and what the rig does not know of places and forces is in the
-errors.
-
-| error | on measured presses |
-|---|---|
-| position, median | {errors["position_median_mm"]:g} mm |
-| position, rms | {errors["position_rms_mm"]:g} mm |
-| position, 95 % | {errors["position_p95_mm"]:g} mm |
-| force, median | {errors["force_median_percent"]:g} % |
-| force, rms | {errors["force_rms_percent"]:g} % |
-| coverage of the 68 % intervals | {100 * errors["coverage_68"]:.3g} % |
-| coverage of the 95 % intervals | {100 * errors["coverage_95"]:.3g} % |
-"""
-
-
 def _misfit(metadata: ModelMetadata, fitted: Fitted) -> str:
     errors, unit, shares = metadata.errors, fitted.misfit_noise, ""
     simulated = "simulated good presses" if fitted.test.measured else "good presses"
@@ -191,9 +186,11 @@ def release(
     about = ModelMetadata(
         name=folder.resolve().name,
         version=version,
-        sensor=sensor_to_dict(fitted.sensor),
+        sensor=fitted.sensor.to_dict() if isinstance(fitted.sensor, MeasuredSensor) else sensor_to_dict(fitted.sensor),
         electrodes=names,
-        working_area_mm=_disk_polygon(fitted.domain.radius),
+        working_area_mm=fitted.domain.corners
+        if isinstance(fitted.domain, PressedArea)
+        else _disk_polygon(fitted.domain.radius),
         probes=fitted.probes,
         force_range_N=fitted.domain.force_range,
         noise=fitted.noise.to_dict(),
@@ -207,7 +204,7 @@ def release(
         },
     )
     graph = export_onnx(fitted.network, about.to_props())
-    golden = check_graph(graph, fitted.predict, fitted.good, fitted.misfit_noise)
+    golden = check_graph(graph, fitted.predict, fitted.good, fitted.misfit_noise, contact_floors(about))
     written = write_model(folder, graph, about, golden, card(about, fitted), fitted.provenance.files)
     return Release(written, about)
 

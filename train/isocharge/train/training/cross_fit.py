@@ -263,7 +263,7 @@ def _taught_stage(
         left = divergence(slice(trained, None)).item()
         return left, f"{left:.4f} from the mean of {len(members)} networks"
 
-    return TrainingStage("contact", network.contact, loss, score, config.steps)
+    return TrainingStage("contact", network.contact, loss, score, max(config.steps // 2, 1))
 
 
 def _misfit_examples(

@@ -88,16 +88,18 @@ class FoldedNetwork:
         layers: From ln(Q / typical) to: x_mm and y_mm (2), ln F (1), logarithms of the standard deviations in mm and N
             (3), the misfit vector (n_electrode).
         typical: Powers of two near the charges' geometric means, shape (n_electrode,), pC; see `Features`.
-        signed: Whether asinh(Q / typical) stands for the logarithm.
+        shift: Mean of asinh(Q / typical), which less this stands for the logarithm: numbers about 0 keep the digits of
+            a float32. Shape (n_electrode,); None for logarithms.
     """
 
     layers: FoldedLayers
     typical: Array
-    signed: bool = False
+    shift: Array | None = None
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
-        answers = self.layers.answers(bent(charge, self.typical, signed=self.signed))
+        logs = bent(charge, self.typical, signed=self.shift is not None)
+        answers = self.layers.answers(logs if self.shift is None else logs - self.shift)
         contact = np.concatenate([answers[:, :2], np.exp(answers[:, 2:3])], axis=1)
         length = np.linalg.norm(answers[:, 6:], axis=1, keepdims=True)
         return contact, np.exp(answers[:, 3:6]), MISFIT_UNIT * np.sinh(length)
@@ -111,13 +113,15 @@ class FoldedNetwork:
 
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
-    """Both perceptrons, from ln(Q / typical)."""
-    n_electrode = network.features.typical.size
+    """Both perceptrons, from ln(Q / typical), or from asinh(Q / typical) less its mean."""
+    features, n_electrode = network.features, network.features.typical.size
     perceptrons = [PlainPerceptron.of(part) for part in (network.contact, network.misfit_vector)]
     whitening, mean = network.whitening.double().numpy(), network.logs_mean.double().numpy()
     units = answer_units(network.domain, np.eye(3), np.zeros(3), n_electrode)
-    features = network.features
-    return FoldedNetwork(FoldedLayers.of(perceptrons, whitening, mean, units), features.typical, features.signed)
+    if features.signed:
+        layers = FoldedLayers.of(perceptrons, whitening, np.zeros_like(mean), units)
+        return FoldedNetwork(layers, features.typical, mean)
+    return FoldedNetwork(FoldedLayers.of(perceptrons, whitening, mean, units), features.typical)
 
 
 def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer:

@@ -1,0 +1,82 @@
+"""The card of a model of measured presses alone, and the table of errors on measured presses."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.train.model_release.evaluate import HELD_PRESSES
+
+
+def measured_errors(errors: Mapping[str, float], which: str, how: str) -> str:
+    """The section about errors.
+
+    Args:
+        errors: Of the model.
+        which: Words behind "measured presses" in the heading.
+        how: What the figures mean.
+    """
+    return f"""## Errors on {errors[HELD_PRESSES]:.0f} measured presses {which}
+
+{how}
+| error | on measured presses |
+|---|---|
+| position, median | {errors["position_median_mm"]:g} mm |
+| position, rms | {errors["position_rms_mm"]:g} mm |
+| position, 95 % | {errors["position_p95_mm"]:g} mm |
+| force, median | {errors["force_median_percent"]:g} % |
+| force, rms | {errors["force_rms_percent"]:g} % |
+| coverage of the 68 % intervals | {100 * errors["coverage_68"]:.3g} % |
+| coverage of the 95 % intervals | {100 * errors["coverage_95"]:.3g} % |
+"""
+
+
+def measured_card(metadata: ModelMetadata) -> str:
+    """The text of `card.md`."""
+    (low, high), noise, measured = metadata.force_range_N, metadata.noise, metadata.made_with["measured"]
+    width, height = np.ptp(np.array(metadata.working_area_mm), axis=0)
+    channels = ", ".join(metadata.electrodes)
+    levels = "\n".join(
+        f"| noise of {name} | {white:g} and {100 * gain:.3g} % of the charge |"
+        for name, white, gain in zip(metadata.electrodes, noise["white_pC"], noise["gain"], strict=True)
+    )
+    position, force = measured["std_factors"]
+    how = f"""\
+Each press was judged by one of {measured["folds"]} networks, the one that did not learn from its place. The model
+learned the mean answers of all; that mean errs slightly less. The standard deviations were multiplied by {position:g}
+for positions and {force:g} for forces, so that the intervals hold 68 and 95 % of these presses.
+"""
+    return f"""# {metadata.name}, version {metadata.version}
+
+Charges of the sensor `{metadata.sensor["name"]}` in, place and force of one press out. Fitted to measured presses
+alone, without a simulator.
+
+| | |
+|---|---|
+| input | `charge_pC`, float32 [n, {len(metadata.electrodes)}], of {channels}, in the unit in which they were measured |
+| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each), `misfit` |
+| fitted to | {measured["presses"]} presses at {measured["places"]} places, in `presses.csv` |
+| working area | {width:.4g} mm x {height:.4g} mm, the outline of the presses; corners in the metadata |
+| forces | {low:g} to {high:g} N |
+| probes | {", ".join(metadata.probes)} |
+{levels}
+
+{measured_errors(metadata.errors, "at places that were left out", how)}
+The misfit is the distance, in units of that noise, of the charges from those of the nearest press, with planes through
+its neighbours between presses; a network gives it. 1 % of the presses exceed {metadata.errors["misfit_p99"]:g}.
+
+## Limits
+
+- The model knows this sensor on its rig on the day of the measurement; another one, or this one after months, can
+  differ by far more. `isocharge serve check` says so from a few presses.
+- One press at a time. Outside the working area and forces the answer is finite and wrong; the misfit is then large in
+  many cases, not in all.
+- The answer is the mean over presses distributed as those that were measured: where charges say little it shrinks
+  towards their middle.
+
+## Make it again
+
+```bash
+{metadata.made_with["command"] or "(made by a program, see metadata)"}
+```
+"""
