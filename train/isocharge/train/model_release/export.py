@@ -15,11 +15,12 @@ from onnx import TensorProto, helper, numpy_helper
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import TrainingError
 from isocharge.serve.model.session import OUTPUTS, open_session, run
+from isocharge.serve.prediction.table import LARGEST
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 from isocharge.train.model_release.evaluate import Predict
 from isocharge.train.training.folding import FoldedLayers, FoldedNetwork
-from isocharge.train.training.network import LARGEST_RATIO, MISFIT_UNIT
+from isocharge.train.training.network import MISFIT_UNIT
 
 OPSET, IR_VERSION = 17, 8
 """Old enough for runtimes of 2022 on, new enough for every operator used."""
@@ -83,10 +84,11 @@ def export_onnx(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
         `misfit` [n, 1], all float32.
     """
     build, n_electrode = GraphBuilder(), network.typical.size
-    if network.shift is not None:
-        ratios = build.add("Mul", "charge_pC", build.constant(1.0 / network.typical))
-        within = build.add("Clip", ratios, build.constant(-LARGEST_RATIO), build.constant(LARGEST_RATIO))
-        logs = build.add("Sub", build.add("Asinh", within), build.constant(network.shift))
+    if signed := network.signed:
+        above = build.add("Max", "charge_pC", build.constant(signed.low))
+        within = build.add("Min", above, build.constant(signed.high))
+        ratios = build.add("Mul", within, build.constant(1.0 / network.typical))
+        logs = build.add("Sub", build.add("Asinh", ratios), build.constant(signed.mean))
     else:
         within = build.add("Clip", "charge_pC", build.constant(LOWEST_CHARGE), build.constant(HIGHEST_CHARGE))
         logs = build.add("Log", build.add("Mul", within, build.constant(1.0 / network.typical)))
@@ -170,7 +172,9 @@ def _golden_charges(exact: Predict, presses: LabelledPresses, noise: Noise) -> t
 
 def _check_finite(session: ort.InferenceSession, n_electrode: int) -> None:
     """The graph goes on straight in the logarithms beyond its presses: its answers must stay finite up to the ends."""
-    ends = np.random.default_rng(4).choice([LOWEST_CHARGE, HIGHEST_CHARGE], (COMPARED, n_electrode)).astype(np.float32)
+    ends = (
+        np.random.default_rng(4).choice([-LARGEST, LOWEST_CHARGE, LARGEST], (COMPARED, n_electrode)).astype(np.float32)
+    )
     for name, rows in run(session, ends).items():
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if bad.size:

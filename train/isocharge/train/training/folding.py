@@ -13,7 +13,7 @@ from torch import nn
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.train.training.network import MISFIT_UNIT, InverseNetwork, Perceptron, bent
+from isocharge.train.training.network import MISFIT_UNIT, InverseNetwork, Perceptron, SignedCharges, bent
 
 Layer = tuple[Array, Array]
 """Weights (inputs, outputs) and bias."""
@@ -88,18 +88,16 @@ class FoldedNetwork:
         layers: From ln(Q / typical) to: x_mm and y_mm (2), ln F (1), logarithms of the standard deviations in mm and N
             (3), the misfit vector (n_electrode).
         typical: Powers of two near the charges' geometric means, shape (n_electrode,), pC; see `Features`.
-        shift: Mean of asinh(Q / typical), which less this stands for the logarithm: numbers about 0 keep the digits of
-            a float32. Shape (n_electrode,); None for logarithms.
+        signed: What stands for the logarithm if charges may have any sign.
     """
 
     layers: FoldedLayers
     typical: Array
-    shift: Array | None = None
+    signed: SignedCharges | None = None
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
-        logs = bent(charge, self.typical, signed=self.shift is not None)
-        answers = self.layers.answers(logs if self.shift is None else logs - self.shift)
+        answers = self.layers.answers(bent(charge, self.typical, self.signed))
         contact = np.concatenate([answers[:, :2], np.exp(answers[:, 2:3])], axis=1)
         length = np.linalg.norm(answers[:, 6:], axis=1, keepdims=True)
         return contact, np.exp(answers[:, 3:6]), MISFIT_UNIT * np.sinh(length)
@@ -113,15 +111,12 @@ class FoldedNetwork:
 
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
-    """Both perceptrons, from ln(Q / typical), or from asinh(Q / typical) less its mean."""
+    """Both perceptrons, from ln(Q / typical) or what stands for it."""
     features, n_electrode = network.features, network.features.typical.size
     perceptrons = [PlainPerceptron.of(part) for part in (network.contact, network.misfit_vector)]
     whitening, mean = network.whitening.double().numpy(), network.logs_mean.double().numpy()
     units = answer_units(network.domain, np.eye(3), np.zeros(3), n_electrode)
-    if features.signed:
-        layers = FoldedLayers.of(perceptrons, whitening, np.zeros_like(mean), units)
-        return FoldedNetwork(layers, features.typical, mean)
-    return FoldedNetwork(FoldedLayers.of(perceptrons, whitening, mean, units), features.typical)
+    return FoldedNetwork(FoldedLayers.of(perceptrons, whitening, mean, units), features.typical, features.signed)
 
 
 def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer:

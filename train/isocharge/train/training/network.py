@@ -30,14 +30,36 @@ LARGEST_INT8 = 127
 """A rounded weight is a whole number from minus this to this, times the scale of its output."""
 
 
-LARGEST_RATIO = 1e7
-"""Size of a signed charge over the typical one beyond which it counts as this many: what is absurd still gives a finite
-answer."""
+WIDER = 1.0
+"""How far signed charges may lie beyond those of presses, over the width of these, in asinh: farther ones count as just
+so far. What is absurd still gives a finite answer."""
+
+
+@dataclass(frozen=True)
+class SignedCharges:
+    """Charges of any sign: asinh(clip(Q) / typical) - mean stands for the logarithm.
+
+    Attributes:
+        low, high: Charges are brought between these, shape (n_electrode,), pC.
+        mean: Shape (n_electrode,): numbers about 0 keep the digits of a float32.
+    """
+
+    low: Array
+    high: Array
+    mean: Array
+
+    @classmethod
+    def of(cls, charge: Array, typical: Array) -> "SignedCharges":
+        """From charges of presses, shape (n, n_electrode), and the typical ones, pC."""
+        levels = np.arcsinh(charge / typical)
+        low, high = levels.min(axis=0), levels.max(axis=0)
+        beyond = WIDER * (high - low)
+        return cls(np.sinh(low - beyond) * typical, np.sinh(high + beyond) * typical, levels.mean(axis=0))
 
 
 @dataclass(frozen=True)
 class Features:
-    """Whitened logarithms of the charges: x = (ln(clip(Q) / typical) - mean) @ matrix; asinh for signed charges.
+    """Whitened logarithms of the charges: x = (ln(clip(Q) / typical) - mean) @ matrix.
 
     Attributes:
         typical: The power of two nearest to each charge's geometric mean, shape (n_electrode,), pC: dividing by it
@@ -45,13 +67,13 @@ class Features:
             from which noise grows with the charge.
         mean: Of the logarithms, shape (n_electrode,).
         matrix: Shape (n_electrode, n_electrode).
-        signed: Whether asinh(Q / typical) stands for the logarithm.
+        signed: What stands for the logarithm if charges may have any sign.
     """
 
     typical: Array
     mean: Array
     matrix: Array
-    signed: bool = False
+    signed: SignedCharges | None = None
 
     @classmethod
     def fit(cls, charge: Array) -> "Features":
@@ -63,13 +85,14 @@ class Features:
     @classmethod
     def of_signed(cls, charge: Array, typical: Array) -> "Features":
         """From charges of any sign, shape (n, n_electrode), and the size from which noise grows with them, pC."""
-        return cls(typical, *whitening(bent(charge, typical, signed=True)), signed=True)
+        signed = SignedCharges.of(charge, typical)
+        return cls(typical, *whitening(bent(charge, typical, signed)), signed)
 
 
-def bent(charge: Array, typical: Array, *, signed: bool) -> Array:
-    """What the features are linear in: ln or asinh of Q / typical, within bounds, shape (n, n_electrode)."""
+def bent(charge: Array, typical: Array, signed: SignedCharges | None) -> Array:
+    """What features are linear in, shape (n, n_electrode): ln(Q / typical), or what stands for it."""
     if signed:
-        return np.asarray(np.arcsinh(np.clip(charge / typical, -LARGEST_RATIO, LARGEST_RATIO)))
+        return np.asarray(np.arcsinh(np.clip(charge, signed.low, signed.high) / typical) - signed.mean)
     return np.asarray(np.log(np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE) / typical))
 
 
@@ -151,8 +174,9 @@ class InverseNetwork(nn.Module):
 
     def inputs(self, charge: Tensor) -> Tensor:
         """What both perceptrons see, finite for any charges (n, n_electrode), pC."""
-        if self.features.signed:
-            logs = torch.asinh((charge / self.typical).clamp(-LARGEST_RATIO, LARGEST_RATIO))
+        if signed := self.features.signed:
+            low, high, mean = (as_tensor(values) for values in (signed.low, signed.high, signed.mean))
+            logs = torch.asinh(charge.clamp(low, high) / self.typical) - mean
         else:
             logs = torch.log(charge.clamp(LOWEST_CHARGE, HIGHEST_CHARGE) / self.typical)
         return (logs - self.logs_mean) @ self.whitening

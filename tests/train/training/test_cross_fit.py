@@ -1,0 +1,162 @@
+"""Models of measured presses alone, of a sensor whose least error is known in closed form."""
+
+import json
+
+import numpy as np
+import pytest
+
+from isocharge.common.errors import PressError
+from isocharge.serve import MeasuredPresses, Predictor, read_presses
+from isocharge.serve.prediction.press_check import check_presses
+from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit_presses, release
+from isocharge.train.data.measured_sensor import outline
+from isocharge.train.data.presses import folds_by_place, held_out
+from isocharge.train.training.cross_fit import deviation_factors, usable_presses
+from kept import ROOT, kept
+
+QUICK = FitConfig(
+    network=NetworkConfig(hidden=(24, 24), misfit_hidden=(24, 24)),
+    training=TrainingConfig(steps=400, misfit_steps=400, misfit_charges=6_000, batch=256),
+)
+SLOPES = np.array([[0.6, 0.1, 2.0], [-0.5, 0.4, 1.0], [0.1, -0.6, 2.0], [0.2, 0.2, -4.0]])
+"""d(Q)/d(x, y, ln F), pC/mm and pC: half of the charges are negative."""
+
+NOISE = np.array([0.3, 0.2, 0.3, 0.4])
+
+
+def contacts(count, seed):
+    """On an L of 1,200 mm^2, whose middle is not the origin; 0.2 to 5 N."""
+    rng = np.random.default_rng(seed)
+    place = rng.uniform((0.0, -25.0), (40.0, 15.0), (3 * count, 2))
+    place = place[(place[:, 0] < 20.0) | (place[:, 1] < -5.0)][:count]
+    return np.column_stack([place, np.exp(rng.uniform(*np.log([0.2, 5.0]), count))])
+
+
+def charges(contact, seed):
+    """Linear in x, y and ln F, with white noise."""
+    noise = NOISE * np.random.default_rng(seed).standard_normal((len(contact), 4))
+    return np.column_stack([contact[:, :2] - [20.0, -5.0], np.log(contact[:, 2])]) @ SLOPES.T + noise
+
+
+def measured(contact, charge, names=("Q1", "Q2", "Q3", "Q4")):
+    stds = np.full(len(contact), 0.05), np.full(len(contact), 0.005)
+    return MeasuredPresses(contact, charge, *stds, names, tuple(range(2, len(contact) + 2)))
+
+
+def l_shaped():
+    contact = contacts(1_200, 0)
+    return measured(contact, charges(contact, 1))
+
+
+def made():
+    return fit_presses(l_shaped(), "pad", QUICK)
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return kept(made)
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    contact = contacts(4_000, 2)
+    return LabelledPresses(contact, charges(contact, 3), measured=True)
+
+
+def test_the_noise_is_learned(alone):
+    np.testing.assert_allclose(alone.noise.sigma(np.zeros((1, 4)))[0], NOISE, rtol=0.1)
+    assert (alone.noise.gain < 0.03).all()
+
+
+def test_errors_are_those_of_the_least_variance(alone, fresh):
+    """Weighted least squares; edges tell a network where presses cannot be, so it may be a little better."""
+    least = np.linalg.inv(SLOPES.T @ np.diag(NOISE**-2.0) @ SLOPES)
+    errors = evaluate(alone, fresh)
+    assert errors["position_rms_mm"] == pytest.approx(np.sqrt(least[0, 0] + least[1, 1]), rel=0.12)
+    assert errors["force_rms_percent"] == pytest.approx(100.0 * np.sqrt(least[2, 2]), rel=0.12)
+
+
+def test_errors_and_intervals_hold_for_presses_at_other_places(alone, fresh):
+    stated, true = evaluate(alone), evaluate(alone, fresh)
+    assert stated["position_rms_mm"] == pytest.approx(true["position_rms_mm"], rel=0.08)
+    assert true["coverage_68"] == pytest.approx(0.683, abs=0.04)
+    assert true["coverage_95"] == pytest.approx(0.95, abs=0.02)
+
+
+def test_charges_of_no_press_have_a_large_misfit(alone, fresh):
+    limit = evaluate(alone)["misfit_p99"]
+    assert np.mean(alone.predict(fresh.charge)[2] > limit) < 0.03
+    off = fresh.charge + 15.0 * NOISE * np.linalg.svd(SLOPES / NOISE[:, None])[0][:, 3]  # across the map's image
+    assert np.mean(alone.predict(off)[2] > limit) > 0.97
+
+
+def test_the_released_model_is_served_and_checked(alone, fresh, tmp_path):
+    folder = release(alone, tmp_path / "pad", command="make it").folder
+    predictor, presses = Predictor(folder), measured(fresh.contact[:200], fresh.charge[:200])
+    np.testing.assert_allclose(predictor.predict(fresh.charge[0])[:3], alone.predict(fresh.charge[:1])[0][0], rtol=1e-3)
+    assert check_presses(predictor, presses).fits
+    assert predictor.metadata.sensor == {"name": "pad", "electrodes": ["Q1", "Q2", "Q3", "Q4"]}
+    assert read_presses(folder / "presses.csv") == l_shaped()
+    assert "1200 presses at 1200 places" in (folder / "card.md").read_text()
+
+
+def test_tolerances_know_area_and_error(alone, tmp_path):
+    golden = json.loads((release(alone, tmp_path / "pad").folder / "golden.json").read_text())
+    reach = np.hypot(*np.array(alone.domain.corners).T).max()
+    assert golden["tolerance"]["floor"]["contact"] == pytest.approx(
+        [reach / 20.0, reach / 20.0, 0.1 * 5.0 / 2.0], rel=0.01
+    )
+
+
+def test_the_outline_is_that_of_the_area():
+    place = np.stack(np.meshgrid(np.arange(11.0), np.arange(11.0)), axis=-1).reshape(-1, 2)
+    assert sorted(map(tuple, outline(place))) == [(-0.5, -0.5), (-0.5, 10.5), (10.5, -0.5), (10.5, 10.5)]
+    x, y = outline(contacts(2_000, 4)[:, :2]).T
+    area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+    assert area == pytest.approx(1200.0, rel=0.05)
+    with pytest.raises(PressError, match="expected presses over an area"):
+        outline(np.column_stack([np.arange(9.0), np.arange(9.0)]))
+
+
+def test_a_place_is_in_one_fold():
+    place = np.repeat(contacts(100, 5), 7, axis=0)
+    fold = folds_by_place(place, 5)
+    assert (fold.reshape(100, 7) == fold[::7, None]).all()
+    assert np.bincount(fold).tolist() == [140] * 5
+    assert ((fold == 0) == held_out(place)).all()
+
+
+def test_deviations_that_are_too_small_are_multiplied():
+    rng = np.random.default_rng(0)
+    truth = rng.standard_normal((20_000, 3))
+    off = np.array([2.0, 2.0, 0.5]) * rng.standard_normal(truth.shape)
+    assert deviation_factors(truth + off, np.ones_like(truth), truth) == pytest.approx((2.0, 0.5), rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda given: given[:499], "expected at least 500 presses at 50 places with .* got 499 at 499; .*--sensor"),
+        (lambda given: given.of_electrodes(("Q1", "Q2"), "us"), r"expected 3 to 8 channels, got 2 \(Q1, Q2\)"),
+        (
+            lambda given: measured(given.contact, given.charge_pC * [1, 1, 0, 1]),
+            "channel 'Q3': expected charges that vary, got 0 everywhere",
+        ),
+    ],
+)
+def test_what_cannot_train_a_model_is_refused(change, message):
+    with pytest.raises(PressError, match=message):
+        usable_presses(change(l_shaped()))
+
+
+@pytest.mark.slow
+def test_a_real_pad_is_learned_better_than_by_boosted_trees():
+    """TactileFSI (SDU Soft Robotics, CC BY 4.0): errors at a fifth of the places; trees: 6.93 mm and 27.0 %."""
+    presses = read_presses(ROOT / "tests" / "data" / "tactile_fsi.csv")
+    out = held_out(presses.contact)
+    fitted = fit_presses(presses[~out], "pad")
+    errors = evaluate(fitted, LabelledPresses(presses.contact[out], presses.charge_pC[out], measured=True))
+    assert errors["position_rms_mm"] < 6.93
+    assert errors["force_rms_percent"] < 27.0
+    assert 0.63 < errors["coverage_68"] < 0.75
+    assert 0.92 < errors["coverage_95"] < 0.98
