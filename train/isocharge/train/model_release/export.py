@@ -14,6 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import TrainingError
+from isocharge.serve.model.golden import FLOORS
 from isocharge.serve.model.session import OUTPUTS, open_session, run
 from isocharge.serve.prediction.table import LARGEST
 from isocharge.train.data.channel_noise import Noise
@@ -128,7 +129,7 @@ def make_model(
 
 
 def check_graph(
-    graph: bytes, exact: Predict, presses: LabelledPresses, noise: Noise, floors: Sequence[float]
+    graph: bytes, exact: Predict, presses: LabelledPresses, noise: Noise, floors: Sequence[float] = FLOORS["contact"]
 ) -> Singles:
     """Compare a graph with the network that it was made from.
 
