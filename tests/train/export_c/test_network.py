@@ -16,6 +16,7 @@ from isocharge.train.data.presses import draw_contacts
 from isocharge.train.export_c.network import read_network
 from isocharge.train.model_release.export import export_onnx
 from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, PlainPerceptron
+from isocharge.train.training.network import SignedCharges
 
 FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0])
 """mm and N, and the floor that golden vectors have for the misfit."""
@@ -101,6 +102,21 @@ def test_any_width_and_number_of_electrodes(electrodes, contact, misfit, int8, a
     check_agreement(exported.predict(charge_pC), np.concatenate(network.predict(charge_pC.astype(float)), axis=1))
     assert all(f"static const {array}" in exported.source for array in arrays)
     assert ("signed char" in exported.source) == int8
+
+
+def test_signed_charges(build, tmp_path):
+    """asinh within bounds: against the network in double precision, and against onnxruntime beyond the bounds."""
+    draw = np.random.default_rng(3).normal([0.0, -300.0, 900.0, 5.0], [200.0, 100.0, 300.0, 2.0], (1_000, 4))
+    typical = np.array([20.0, 50.0, 10.0, 3.0])
+    network = replace(random_network(4, (24, 24), (16, 16)), typical=typical, signed=SignedCharges.of(draw, typical))
+    folder = written(tmp_path / "signed", network)
+    exported, charge_pC = build(folder), draw.astype(np.float32)
+    check_agreement(exported.predict(charge_pC), np.concatenate(network.predict(charge_pC.astype(float)), axis=1))
+    absurd = np.float32([[np.inf, -np.inf, 0.0, 1e38], [-1e9, 1e9, -np.inf, np.inf]])
+    check_agreement(exported.predict(absurd), answers(folder, absurd))
+    unknown = np.where(np.eye(4, dtype=bool), np.nan, charge_pC[:4]).astype(np.float32)
+    assert np.isnan(exported.predict(unknown)).all()
+    assert np.isnan(answers(folder, unknown)).all()
 
 
 def changed(change):

@@ -15,7 +15,7 @@ On the right the subtraction comes first. The difference of two charges within a
 and the logarithm of 1 + (q_k - q_0) / q_0 has all its digits, where that of a charge has lost some to its size.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, cycle, islice, pairwise
 from typing import Any
@@ -143,8 +143,8 @@ def model_header(metadata: ModelMetadata, network: Network) -> str:
         electrodes=len(metadata.electrodes),
         names=", ".join(map(c_string, metadata.electrodes)),
         fields=", ".join(f'"{name}"' for name in Contact._fields),
-        low=f"{network.low:g}",
-        high=f"{network.high:g}",
+        low=_each(network.low),
+        high=_each(network.high),
     )
 
 
@@ -152,12 +152,13 @@ def model_source(metadata: ModelMetadata, network: Network) -> str:
     """The text of `isocharge_model.c`."""
     (weights, bias), *behind = network.hidden
     *blocks, of_last = blocks_of([*(weights for weights, _ in behind), network.last], PLANE + LOGS)
-    hidden = [Layer("layer_0", _of_differences(weights), bias, activation="tanh_of")]
+    as_inputs = _of_differences if network.mean is None else np.asarray
+    hidden = [Layer("layer_0", as_inputs(weights), bias, activation="tanh_of")]
     hidden += [
         Layer(f"layer_{number}", weights, bias, parts, "tanh_of")
         for number, ((weights, bias), parts) in enumerate(zip(behind, blocks, strict=True), 1)
     ]
-    skip = Layer("skip", _of_differences(network.skip[0]), network.skip[1])
+    skip = Layer("skip", as_inputs(network.skip[0]), network.skip[1])
     rows = ["logs", *islice(cycle(["one", "other"]), len(hidden))]
     calls = [
         *(f"{layer.name}({x}, {layer.name}_bias, {y});" for layer, (x, y) in zip(hidden, pairwise(rows), strict=True)),
@@ -168,13 +169,11 @@ def model_source(metadata: ModelMetadata, network: Network) -> str:
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),
-        factor=c_array("FACTOR", network.factor),
+        features=_features(network),
         layers="\n".join(layer.text() for layer in (*hidden, skip, Layer("last", network.last, None, of_last))),
         rows=", ".join(f"{row}[{width}]" for row in dict.fromkeys(rows[1:])),
         calls="\n    ".join(calls),
         electrodes=network.factor.size,
-        low=c_float(network.low),
-        high=c_float(network.high),
         plane=PLANE,
         known=PLANE + LOGS,
         answers=network.last.shape[1],
@@ -194,6 +193,25 @@ def self_test(golden: Golden) -> str:
         charges=c_array("CHARGE_PC", golden.charge_pC),
         contacts=c_array("CONTACT", answers),
     )
+
+
+def _each(bounds: Singles) -> str:
+    """Bounds of charges for people: one for all, or one for each."""
+    return ", ".join(f"{bound:g}" for bound in np.atleast_1d(bounds))
+
+
+def _features(network: Network) -> str:
+    """The function `features`: from charges to what the first layer takes."""
+    arrays = {"FACTOR": network.factor}
+    if network.mean is not None:
+        arrays |= {"LOW": network.low, "HIGH": network.high, "MEAN": network.mean}
+        return source_text("features_signed.c", arrays=_arrays(arrays), electrodes=network.factor.size)
+    low, high = c_float(network.low.item()), c_float(network.high.item())
+    return source_text("features.c", arrays=_arrays(arrays), electrodes=network.factor.size, low=low, high=high)
+
+
+def _arrays(arrays: Mapping[str, Singles]) -> str:
+    return "\n".join(c_array(name, values) for name, values in arrays.items())
 
 
 def _of_differences(weights: Singles) -> Singles:

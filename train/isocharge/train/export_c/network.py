@@ -31,17 +31,20 @@ class Network:
     """What a model computes from the logarithms of its charges; arrays are float32.
 
     Attributes:
-        low, high: Bounds of the charges, pC.
+        low, high: Bounds of the charges, shape (electrodes,), pC; of shape () if they are the same for all.
         factor: Unit of each charge, shape (electrodes,), 1/pC.
+        mean: What is subtracted from asinh(Q factor), shape (electrodes,), where that stands for the logarithm; else
+            None.
         hidden: Weights (inputs, outputs) and bias of the layers that tanh follows.
         last: Weights from the last of them to the answers.
         skip: Weights and bias from the logarithms to the answers.
         misfit_unit: Factor on the hyperbolic sine of the misfit vector's length.
     """
 
-    low: float
-    high: float
+    low: Singles
+    high: Singles
     factor: Singles
+    mean: Singles | None
     hidden: tuple[tuple[Singles, Singles], ...]
     last: Singles
     skip: tuple[Singles, Singles]
@@ -66,9 +69,17 @@ def read_network(onnx_model: bytes, where: str) -> Network:
     nodes = _Nodes(model.graph, where)
     if (versions := {entry.domain: entry.version for entry in model.opset_import}) != {"": OPSET}:
         nodes.refuse(f"expected ONNX operators of version {OPSET} alone, got {versions}")
-    [clipped], [low, high] = nodes.take("Clip", INPUT, CONSTANT, CONSTANT)
-    [scaled], [factor] = nodes.take("Mul", clipped, CONSTANT)
-    [logs], _ = nodes.take("Log", scaled)
+    mean: Singles | None = None
+    if nodes.coming(1) == ["Max"]:
+        [above], [low] = nodes.take("Max", INPUT, CONSTANT)
+        [within], [high] = nodes.take("Min", above, CONSTANT)
+        [scaled], [factor] = nodes.take("Mul", within, CONSTANT)
+        [bent], _ = nodes.take("Asinh", scaled)
+        [logs], [mean] = nodes.take("Sub", bent, CONSTANT)
+    else:
+        [within], [low, high] = nodes.take("Clip", INPUT, CONSTANT, CONSTANT)
+        [scaled], [factor] = nodes.take("Mul", within, CONSTANT)
+        [logs], _ = nodes.take("Log", scaled)
     value = logs
     hidden: list[tuple[Singles, Singles]] = []
     while not hidden or nodes.coming(2) == ["Gemm", "Tanh"]:
@@ -88,7 +99,7 @@ def read_network(onnx_model: bytes, where: str) -> Network:
     found = [contact, contact_std, misfit, *parts[0].tolist(), *powers[0].tolist(), nodes.coming(1)]
     if found != [*OUTPUTS, PLANE, LOGS, n, 1, LOGS - 1, []]:
         nodes.refuse(f"expected the outputs {', '.join(OUTPUTS)} from {PLANE}, {LOGS} and {n} answers, got {found}")
-    network = Network(low.item(), high.item(), factor, tuple(hidden), last, (skip[0], skip[1]), unit.item())
+    network = Network(low, high, factor, mean, tuple(hidden), last, (skip[0], skip[1]), unit.item())
     nodes.check_shapes(network)
     return network
 
@@ -127,6 +138,9 @@ class _Nodes:
         layers = [*network.hidden, (network.last, network.skip[1]), network.skip]
         expected = [*pairwise(widths), (n, widths[-1])]
         got = [weights.shape for weights, _ in layers]
+        bounds = [] if network.mean is None else [network.low, network.high, network.mean]
+        if any(values.shape != (n,) for values in bounds):
+            self.refuse(f"expected {n} bounds and means, one for each charge, got {[each.shape for each in bounds]}")
         if got != expected or any(bias.shape != shape[1:] for (_, bias), shape in zip(layers, expected, strict=True)):
             self.refuse(f"expected weights of the shapes {expected} and a bias for each column, got {got}")
 

@@ -33,25 +33,13 @@ static float clip(float x, float low, float high)
     return x > high ? high : x;
 }
 
-/* ln(a / b) of two positive numbers; where they are close, their difference is exact, and so it has all its digits. */
-static float log_ratio(float a, float b)
-{
-    const float ratio = a / b;
-
-    return ratio > 0.5f && ratio < 2.0f ? log1pf((a - b) / b) : logf(ratio);
-}
-
-$factor
+$features
 $layers
 void isocharge_predict(const float charge_pC[ISOCHARGE_ELECTRODES], float contact[7])
 {
     float logs[$electrodes], $rows, skipped[$answers], answers[$answers], length = 0.0f;
 
-    for (int i = 0; i < $electrodes; ++i)
-        logs[i] = clip(charge_pC[i], $low, $high) * FACTOR[i];
-    for (int i = 1; i < $electrodes; ++i)
-        logs[i] = log_ratio(logs[i], logs[0]);
-    logs[0] = logf(logs[0]);
+    features(charge_pC, logs);
     $calls
     for (int i = 0; i < $plane; ++i)
         contact[i] = answers[i];
