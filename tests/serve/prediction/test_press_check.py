@@ -7,6 +7,7 @@ The chi-squared distribution beside SciPy's.
 """
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -87,7 +88,8 @@ def test_a_scale_of_the_force_is_recognised(predictor, measure):
     assert check.agreement.force.mean == pytest.approx(0.05, abs=4 * check.agreement.force.std)
     assert check.force_percent.beyond == pytest.approx(5.0, abs=0.5)
     assert check.position_mm.beyond < 0.05
-    assert "forces are 1.0" in check.notes[0]
+    assert check.notes[1] == "this model is of the film as described: calibrate it (isocharge train calibrate)"
+    assert "forces are 1.0" in check.notes[2]
 
 
 def test_a_common_shift_is_recognised_before_the_sum_of_squares_tells(predictor, measure):
@@ -154,6 +156,33 @@ def test_flags_of_the_answers(film, tmp_path, measure):
     assert any(
         note.startswith("3 of 6 presses have a misfit above 2.5, which 1 % of good ones") for note in check.notes
     )
+
+
+def test_a_calibrated_film_that_does_not_fit(film, tmp_path, measure):
+    """Another calibration is not the first remedy; with the rig that is named, the same presses fit."""
+    film.write(tmp_path, sensor={"name": "linear-film", "calibration": {"gain": {"A": 1.02}}})
+    predictor, presses = Predictor("linear", models=tmp_path), measure(30, seed=1)
+    presses.contact[:, :2] += np.random.default_rng(0).normal(0.0, 0.2, (30, 2))
+    check = check_presses(predictor, presses)
+    assert (check.fits, check.verdict.endswith(" beyond noise")) == (False, True)
+    assert "calibrated already" in check.notes[1]
+    assert "from 50 presses on" in check.notes[1]
+    position_std, force_std = map(float, re.findall(r"-std ([\d.e-]+)", check.notes[0]))
+    assert position_std == pytest.approx(np.hypot(0.2, RIG_MM), rel=0.3)
+    known = replace(presses, position_std_mm=np.full(30, position_std), force_std=np.full(30, force_std))
+    assert check_presses(predictor, known).fits
+
+
+@pytest.mark.parametrize(("misfits", "fits"), [(2, True), (4, False)])
+def test_the_verdict_counts_misfits(film, tmp_path, measure, misfits, fits):
+    """Of 30 presses with their forces: two beyond the limit of 1 % are chance, four are not."""
+    film.write(tmp_path, errors={"misfit_p99": 0.5})
+    presses = measure(30)
+    presses.charge_pC[:misfits] = [-1.0, 900.0, 900.0]
+    predictor = Predictor("linear", models=tmp_path)
+    presses.contact[:misfits] = np.nan, np.nan, predictor.predict([-1.0, 900.0, 900.0]).force_N
+    check = check_presses(predictor, presses)
+    assert (check.fits, "4 of 30 presses have a misfit above 0.5" in check.verdict) == (fits, not fits)
 
 
 def test_electrodes_are_taken_by_their_names(predictor, measure):

@@ -5,6 +5,7 @@ and force. If the errors are larger than both together, the film is not the mode
 crept, or it was never calibrated. Such drift shows first as a common scale of the forces and a common shift.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -35,6 +36,12 @@ BAD_PROBABILITY = 1e-3
 
 BAD_SHARE = 0.1
 """Largest share of bad presses, at least one, that a film may have and still fit."""
+
+MISFIT_SHARE, MISFIT_PROBABILITY = 0.01, 2e-3
+"""Share of good presses with a misfit beyond the model's limit; probability below which more of them are too many."""
+
+ENOUGH_TO_FIT = 50
+"""Presses from which `train fit` learns a model from them."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +108,9 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     errors = press_errors(predictor, presses)
     rows, bad = _without_bad(errors)
     agreement, count = Agreement.of(errors, rows), int(rows.sum())
-    fits = agreement.acceptable if count >= FEWEST else None
     position, force = _summaries(errors, rows)
+    misfits = _too_many(errors, rows, predictor.metadata)
+    fits = agreement.acceptable and not misfits if count >= FEWEST else None
     return PressCheck(
         model=predictor.metadata.label,
         presses=len(presses),
@@ -111,8 +119,11 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
         force_percent=force,
         agreement=agreement,
         fits=fits,
-        verdict=_verdict(fits, count, position, force),
-        notes=tuple(_notes(errors, rows, bad, agreement, predictor.metadata)),
+        verdict=_verdict(fits, count, position, force, misfits),
+        notes=(
+            *(_remedies(predictor.metadata, position, force) if fits is False else ()),
+            *_notes(errors, rows, bad, agreement, predictor.metadata),
+        ),
         errors=errors,
     )
 
@@ -149,14 +160,46 @@ def _summaries(errors: PressErrors, rows: Booleans) -> tuple[ErrorSummary | None
     return summaries[0], summaries[1]
 
 
-def _verdict(fits: bool | None, count: int, position: ErrorSummary | None, force: ErrorSummary | None) -> str:
+def _too_many(errors: PressErrors, rows: Booleans, metadata: ModelMetadata) -> str:
+    """How many of some presses have a misfit that few good ones have; empty if chance explains that."""
+    flags = [flags for flags, chosen in zip(errors.flags, rows.tolist(), strict=True) if chosen]
+    count, most = len(flags), sum(MISFIT in words for words in flags)
+    shares = (math.comb(count, k) * MISFIT_SHARE**k * (1.0 - MISFIT_SHARE) ** (count - k) for k in range(most))
+    if 1.0 - sum(shares) >= MISFIT_PROBABILITY:
+        return ""
+    return f"{most} of {count} presses have a misfit above {misfit_limit(metadata):.3g}, which 1 % of good ones have"
+
+
+def _verdict(
+    fits: bool | None, count: int, position: ErrorSummary | None, force: ErrorSummary | None, misfits: str
+) -> str:
     if fits is None:
         return f"too few presses to say: {count} can be compared, {FEWEST} are needed"
     if fits:
         return "fits: noise explains the errors"
     parts = [f"{position.beyond:.2g} mm"] if position else []
     parts += [f"{force.beyond:.2g} %"] if force else []
-    return f"does not fit: {' and '.join(parts)} beyond noise: calibrate the film again"
+    return f"does not fit: {' and '.join(parts)} beyond noise" + (f"; {misfits}" if misfits else "")
+
+
+def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: ErrorSummary | None) -> Iterator[str]:
+    """What would help, by what was done already."""
+    stds = [f"--position-std {_rig(position) / 2**0.5:.2g}"] if position else []
+    stds += [f"--force-std {0.01 * _rig(force):.2g}"] if force else []
+    yield f"the errors would be the rig's if that were as uncertain as {' '.join(stds)}"
+    calibration = metadata.sensor.get("calibration")
+    if not (isinstance(calibration, dict) and any(calibration.get(key) for key in ("gain", "rotation_deg"))):
+        yield "this model is of the film as described: calibrate it (isocharge train calibrate)"
+        return
+    yield (
+        "this film is calibrated already: do so again only if it has changed since (isocharge train calibrate --from); "
+        + f"what no film explains, `isocharge train fit PRESSES.csv` learns from {ENOUGH_TO_FIT} presses on"
+    )
+
+
+def _rig(errors: ErrorSummary) -> float:
+    """What a rig would have to explain, in the unit of the errors."""
+    return float(np.sqrt(max(errors.rms**2 - errors.noise**2, 0.0)))
 
 
 def _notes(
@@ -168,11 +211,9 @@ def _notes(
         yield f"{len(chosen)} of {len(rows)} presses do not count: {_explained(reason, metadata)} ({_lines(chosen)})"
     if bad.any():
         yield f"{_lines(np.array(errors.lines)[bad].tolist())}: nothing like the other presses, left out; look at it"
-    misfits = sum(MISFIT in flags for flags in errors.flags)
-    if misfits > 1.0 + 0.03 * len(rows):
+    if misfits := _too_many(errors, np.ones_like(rows), metadata):
         yield (
-            f"{misfits} of {len(rows)} presses have a misfit above {misfit_limit(metadata):.3g}, which 1 % of good "
-            "ones have: no single press on the model's film gives such charges (gain, tare, swapped or dead electrodes)"
+            f"{misfits}: no single press on the model's film gives such charges (gain, tare, swapped or dead electrode)"
         )
     yield from _common_notes(agreement)
 
