@@ -11,6 +11,7 @@ import time
 import urllib.request
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -19,7 +20,8 @@ from mcap.reader import make_reader
 from websockets.asyncio.client import connect
 
 from boards import taps
-from isocharge.serve import Frame, Recording, encode_frame
+from isocharge.cli.shared import live_page as live_page_module
+from isocharge.serve import Frame, Recording, TouchStream, encode_frame
 from isocharge.serve.port.recording import Marker
 from isocharge.serve.viewer.messages import CONTACT_BIT, HEADER, SampleFormat
 
@@ -123,6 +125,16 @@ def test_a_silent_port(start, tmp_path, monkeypatch):
         time.sleep(0.1)
     for end in ends:
         os.close(end)
+
+
+def test_the_rate_is_that_of_the_board_however_fast_a_recording_is_read(predictor, record, monkeypatch):
+    monkeypatch.setattr(live_page_module, "STATE_S", -1.0)
+    told = []
+    link = SimpleNamespace(put=id, tell=lambda **state: told.append(state), is_open=True, dropped=0)
+    feed = live_page_module.PageFeed(link, TouchStream(predictor))
+    for k in range(50):
+        feed.put(record(timestamp=1e9 + 0.005 * k))
+    assert told[-1]["rate_Hz"] == pytest.approx(200.0, rel=1e-3)
 
 
 def test_a_replay_is_sought_and_played_fast(film, models, start, command, tmp_path):

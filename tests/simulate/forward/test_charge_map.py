@@ -67,6 +67,8 @@ def test_outside_is_refused_with_the_limits(charge_map):
         for ask in (charge_map.charges, charge_map.derivatives):
             with pytest.raises(SceneError, match=rf"^press 1 at .* outside the .* {limits}"):
                 ask(np.array([inside, outside]))
+            with pytest.raises(SceneError, match=r"expected contacts \(x, y, F\), shape \(n, 3\), .* got shape \(3,\)"):
+                ask(inside)
 
 
 def test_differences_are_exact_for_second_order():

@@ -1,6 +1,7 @@
 """The live page in commands: its options, and what a stream and its page tell each other."""
 
 import logging
+import math
 import os
 import threading
 import time
@@ -24,7 +25,7 @@ from isocharge.serve.viewer.link import ReaderEnd, make_link
 from isocharge.serve.viewer.messages import LiveRequest, Marker, Record, SampleFormat, Tare, describe_film, find_field
 
 RATE_RECORDS = 400
-"""Records, the latest, over which the rate is taken."""
+"""Records, the latest, over whose times the rate is taken: that of the board, however fast a recording is read."""
 
 STATE_S = 0.25
 """Time between two messages with the counters, s."""
@@ -115,12 +116,12 @@ class PageFeed:
         """Hand over a record; does not wait."""
         was_open, now_s = self._link.is_open, time.monotonic()
         self._link.put(self._pack(record))
-        self._times.append(now_s)
+        self._times.append(math.nan if record.timestamp is None else record.timestamp)
         if was_open and not self._link.is_open:
             say("the process of the live page has ended; the stream goes on without it")
         if now_s - self._told_s > STATE_S:
             self._told_s = now_s
-            self._tell_state(record, now_s - self._times[0])
+            self._tell_state(record, self._times[-1] - self._times[0])
 
     def _tell_state(self, record: PredictionRecord, elapsed_s: float) -> None:
         rate_Hz = (len(self._times) - 1) / elapsed_s if len(self._times) > 1 and elapsed_s > 0.0 else None

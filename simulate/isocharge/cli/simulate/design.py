@@ -114,11 +114,13 @@ def design_command(
 
 
 def _table(found: Design) -> str:
-    """Places, and errors before and after."""
+    """Places, and errors before and after; an error beyond the disk itself says that charges do not tell the place."""
     rows = ["{:<10} {:9.3f} {:9.3f} mm".format(e.name, *e.centre) for e in found.sensor.electrodes]
     rows.append("least position error, mm     worst      rms")
     for name, errors in (("before", found.before), ("after", found.after)):
         for level, values in errors.to_dict().items() if errors else ():
             title = f"{name}, {level.replace('_', ' ')}"
-            rows.append(f"{title:<26} {values['worst_mm']:7.3f} {values['rms_mm']:8.3f}")
+            sizes = values["worst_mm"], values["rms_mm"]
+            worst, rms = (f"{mm:.3f}" if mm < found.case.radius else "folds" for mm in sizes)
+            rows.append(f"{title:<26} {worst:>7} {rms:>8}")
     return "\n".join(rows)

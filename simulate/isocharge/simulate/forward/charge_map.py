@@ -55,16 +55,17 @@ class Domain:
         """The same forces on a smaller disk."""
         return replace(self, radius=radius)
 
-    def check(self, contact: Array, source: str) -> None:
-        """Refuse contacts outside.
+    def check(self, contact: Array, source: str) -> Array:
+        """The contacts as an array of floats; those outside are refused.
 
         Args:
             contact: (x, y, F), shape (n, 3), mm and N.
             source: The map that is asked, for the message: "forward map".
 
         Raises:
-            SceneError: With the first contact that lies outside.
+            SceneError: If they are of another shape, or with the first contact that lies outside.
         """
+        contact = as_contacts(contact, source)
         inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.radius * SLACK
         inside &= _are_within(contact[:, 2], self.force_range)
         if not inside.all():
@@ -74,6 +75,22 @@ class Domain:
                 f"press {i} at ({x:.4g}, {y:.4g}) mm with {f:.4g} N is outside the {source}: expected at most "
                 f"{self.radius:g} mm from the centre and {low:g} to {high:g} N"
             )
+        return contact
+
+
+def as_contacts(contact: Array, source: str) -> Array:
+    """Contacts (x, y, F) as an array of floats, shape (n, 3).
+
+    Raises:
+        SceneError: If they are of another shape.
+    """
+    contact = np.asarray(contact, dtype=float)
+    if contact.ndim != 2 or contact.shape[1] != 3:
+        raise SceneError(
+            f"{source}: expected contacts (x, y, F), shape (n, 3), mm and N, like [[3.0, -2.0, 1.0]], got shape "
+            f"{contact.shape}"
+        )
+    return contact
 
 
 class ChargeMap(Protocol):

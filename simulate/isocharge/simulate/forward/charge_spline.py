@@ -96,7 +96,7 @@ class ChargeSpline:
         Raises:
             SceneError: If a contact lies outside the domain.
         """
-        self.domain.check(contact, "table")
+        contact = self.domain.check(contact, "table")
         return np.asarray(np.einsum("nk,nke->ne", self.by_force(np.log(contact[:, 2])), self.terms(contact[:, :2])))
 
     def derivatives(self, contact: Array) -> Array:
@@ -109,7 +109,7 @@ class ChargeSpline:
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """See `charges` and `derivatives`."""
-        self.domain.check(contact, "table")
+        contact = self.domain.check(contact, "table")
         charge, slope, by_force = self.first_order(contact[:, :2], contact[:, 2])
         return charge, np.concatenate([slope, by_force[..., None]], axis=2)
 

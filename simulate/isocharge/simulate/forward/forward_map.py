@@ -17,7 +17,7 @@ from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
-from isocharge.simulate.forward.charge_map import Domain, differences
+from isocharge.simulate.forward.charge_map import Domain, as_contacts, differences
 from isocharge.simulate.forward.family import ROTATIONS, Family, check_family
 from isocharge.simulate.forward.readout import COARSE, FINE, NEAR, ReadoutPoints, contact_charge, touch_charge
 from isocharge.simulate.mechanics.scaling import amplitude_squared
@@ -152,7 +152,7 @@ class ForwardMap:
         Raises:
             SceneError: If a press lies outside the domain.
         """
-        contact = np.asarray(contact, dtype=float)
+        contact = as_contacts(contact, "forward map")
         untouched = contact[:, 2] == 0.0
         self.domain.check(np.where(untouched[:, None], (0.0, 0.0, self.domain.force_range[0]), contact), "forward map")
         orientation = np.broadcast_to(orientation, len(contact))
@@ -168,8 +168,7 @@ class ForwardMap:
         Raises:
             SceneError: If a press lies outside the domain.
         """
-        contact = np.asarray(contact, dtype=float)
-        self.domain.check(contact, "forward map")
+        contact = self.domain.check(contact, "forward map")
         return differences(lambda moved: self._at(moved, np.zeros(len(moved))), contact)
 
     def _at(self, contact: Array, orientation: Array) -> Array:
