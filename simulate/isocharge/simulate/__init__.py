@@ -94,3 +94,4 @@ __all__ = [
 __version__: str
 if not TYPE_CHECKING:  # a type checker would take every misspelt name for a text
     __getattr__ = version_attribute(__name__)
+    del TYPE_CHECKING

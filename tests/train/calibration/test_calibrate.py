@@ -118,7 +118,10 @@ def test_what_presses_identify_is_said_and_what_not(problem):
     table = result.quantities
     assert all(table[name].identified for name in ("pretension_MPa", "response_percent", "gain_A_percent"))
     assert not any(table[name].identified for name in ("young_percent", "thickness_percent"))
-    assert "Young's modulus by itself" in " ".join(result.summary).partition("cannot tell")[2]
+    _, known, unknown, together = result.summary[:4]
+    assert "Young's modulus by itself" in unknown.partition("cannot tell")[2]
+    assert len(known.split(", ")) < 8
+    assert not any(table[f"{name}_percent"].identified for name in together.partition(":")[0].split(", "))
     low, high = table["pretension_MPa"].interval_95
     assert low < truth[0] < high
 

@@ -107,8 +107,8 @@ def calibrate_command(
 ) -> None:
     """Calibrate a film: find its parameters from measured presses, and write a model that is right about it.
 
-    Three presses help much, ten are good; of each, the place, the force, or both are known. --next says where to press,
-    also before the first press. What the presses cannot tell is said.
+    Three presses help much, eight are good; of each, the place, the force, or both are known. --next says where to
+    press, also before the first press. What the presses cannot tell is said.
 
     With --port it proposes a press, takes it when it is steady, asks whether it was there, and says how well the film
     is known by now. Every press is on disk at once: the same command goes on with a session that was stopped.

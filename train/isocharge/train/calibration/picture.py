@@ -35,7 +35,7 @@ def calibration_picture(result: CalibrationResult) -> Figure:
     if bad.any():
         after.plot(*contact[bad, :2].T, "X", color=FELT, mec=INK, ms=9, label="left out")
     after.legend(loc="upper right", fontsize=8)
-    label = "position error by not knowing the film (rms), mm"
+    label = "rms error of the position that the film leaves, mm"
     figure.colorbar(shades, ax=[before, after], label=label, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g")
     _draw_quantities(identified, result)
     _draw_residuals(residuals, result)

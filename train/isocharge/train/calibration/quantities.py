@@ -22,6 +22,12 @@ IDENTIFIED = 0.5
 PERCENT = ", over the described one"
 """How quantities are given whose size is described, but not known."""
 
+BY_ITSELF = ("young_percent", "thickness_percent", "d31_percent", "d32_percent", "mean_gain_percent")
+"""Quantities of which presses tell products."""
+
+SHOWN = 5
+"""Quantities in a sentence, the first; the card has a table of all."""
+
 NORMAL_95 = 1.959964
 """Half width of a 95 % interval in standard deviations."""
 
@@ -123,16 +129,19 @@ def _rows(prior: FilmPrior) -> dict[str, tuple[str, float, Array]]:
 def summarise(table: Mapping[str, Quantity]) -> tuple[str, ...]:
     """What the presses identify and what they cannot, a sentence each."""
     known = [f"{name} {q.value:.3g} +- {q.std:.2g}" for name, q in table.items() if q.identified]
-    unknown = [q.meaning.removesuffix(", %").removesuffix(PERCENT) for q in table.values() if not q.identified]
-    sentences = [f"Known now: {', '.join(known)}."] if known else []
+    unknown = [name for name, q in table.items() if not q.identified]
+    words = [table[name].meaning.removesuffix(", %").removesuffix(PERCENT) for name in unknown]
+    more = f" and {len(known) - SHOWN} more, on the card" if len(known) > SHOWN else ""
+    sentences = [f"Known now: {', '.join(known[:SHOWN])}{more}."] if known else []
     if unknown:
         sentences.append(
-            f"These presses cannot tell {', '.join(unknown)}; what is given for them is hardly more than what was "
+            f"These presses cannot tell {', '.join(words)}; what is given for them is hardly more than what was "
             "assumed before."
         )
-    if not table["young_percent"].identified and table["response_percent"].identified:
+    alone = [name.removesuffix("_percent") for name in unknown if name in BY_ITSELF]
+    if len(alone) > 1 and table["response_percent"].identified:
         sentences.append(
-            "Young's modulus, piezoelectric coefficients and gain cannot be told apart; what they give together, the "
+            f"{', '.join(alone)}: only what they give together, the "
             f"charge of a press, is known to {table['response_percent'].std:.2g} %, and that is what contacts need."
         )
     return tuple(sentences)
