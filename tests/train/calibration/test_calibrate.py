@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.stats import chi2
+from scipy.stats import chi2, multivariate_normal
 from tests.train.calibration.conftest import presses_of, rig
 
 from isocharge.common.errors import ModelError, PressError, SceneError
@@ -14,6 +14,7 @@ from isocharge.simulate import Circle, Polygon, load_sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.simulate.solver.stress_limit import largest_stress
 from isocharge.train import CalibrationProblem, calibrate, next_presses
+from isocharge.train.calibration import discrepancy
 from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
 from isocharge.train.calibration.contacts import PressData, with_force
 from isocharge.train.calibration.diagnosis import find_mistakes
@@ -45,8 +46,9 @@ def test_derivatives_are_those_of_the_charges(layout):
     np.testing.assert_allclose(by_contact / size[:, :, None], by_map / size[:, :, None], atol=2e-3)
 
 
-def test_it_is_the_minimum_of_the_joint_problem(problem):
+def test_it_is_the_minimum_of_the_joint_problem(problem, monkeypatch):
     """SciPy over parameters and contacts together, with differences for derivatives, finds the same film."""
+    monkeypatch.setattr(discrepancy, "hypotheses", lambda: [discrepancy.Hypothesis()])
     charges, prior = problem.charges, problem.prior
     truth, presses = rig(problem, 4, seed=11)
     data, ours, n = data_of(problem, presses), fit(problem, presses), len(presses)
@@ -68,6 +70,71 @@ def test_it_is_the_minimum_of_the_joint_problem(problem):
     assert np.abs(apart).max() < 0.1
     joint_covariance = np.linalg.inv(joint.jac.T @ joint.jac)[: truth.size, : truth.size]
     np.testing.assert_allclose(std, np.sqrt(np.diag(joint_covariance)), rtol=0.05)
+
+
+def test_hypotheses_are_weighed_by_their_evidence():
+    """Against SciPy's density of the data, and against Gaussian conditioning in the space of the data."""
+    rng = np.random.default_rng(2)
+    design, data = rng.normal(size=(12, 5)), rng.normal(size=12)
+    before = np.diag([1.0, 0.25, 4.0, 1.0, 0.0])  # the last is excluded
+    evidence, mean, covariance = discrepancy.Linearised.of(design, data, np.zeros(5)).given(before)
+    of_data = np.eye(12) + design @ before @ design.T
+    density = multivariate_normal(np.zeros(12), of_data).logpdf(data) + 6.0 * np.log(2.0 * np.pi)
+    assert evidence == pytest.approx(density, rel=1e-9)
+    gain = before @ design.T @ np.linalg.inv(of_data)
+    np.testing.assert_allclose(mean, -gain @ data, rtol=1e-9)
+    np.testing.assert_allclose(covariance, before - gain @ design @ before, atol=1e-12)
+
+
+def on_a_film(problem, change, count, seed):
+    """Presses on a film whose charges at contacts are changed, and the errors of the calibrated network on it.
+
+    The errors are those by not knowing the film: beside the answers of a network that is told the film, to charges with
+    the same noise that are not changed.
+    """
+    truth, presses = rig(problem, count, seed)
+    spoilt = presses_of(problem, presses.contact, change(presses.contact, presses.charge_pC))
+    result = calibrate(spoilt, problem)
+    at, rng = draw_contacts(np.random.default_rng(8), problem.domain.within(6.0), 400), np.random.default_rng(9)
+    charge = problem.noise.add(problem.charges.charges(truth, at), rng)
+    answer = result.fitted.predict(change(at, charge) if change is bent else charge)[0]
+    expected = problem.films.fold(truth).predict(charge)[0]
+    return result, float(np.sqrt(((answer - expected)[:, :2] ** 2).sum(axis=1).mean()))
+
+
+def bent(contact, charge):
+    """3 % that no parameter describes, another for each electrode."""
+    x, y, _ = contact.T
+    return charge * np.exp(0.03 * np.column_stack([np.sin(x / 4 + k) * np.cos(y / 5) for k in range(4)]))
+
+
+def test_what_no_parameter_describes_is_corrected_and_its_error_is_said(problem):
+    result, error = on_a_film(problem, bent, 20, seed=41)
+    assert 0.5 < result.left.position_mm / error < 2.0
+    plain = replace(result, posterior=replace(result.posterior, coefficients=0.0 * result.posterior.coefficients))
+    at = draw_contacts(np.random.default_rng(3), problem.domain.within(6.0), 200)
+    charge = bent(at, problem.charges.charges(rig(problem, 1, 41)[0], at))
+    errors = [np.hypot(*(each.fitted.predict(charge)[0] - at)[:, :2].T).mean() for each in (result, plain)]
+    assert errors[0] < 0.6 * errors[1]
+    assert re.search(r"charges of this film differ by \d.* 30 more presses would reach 0\.\d+ mm", result.summary[2])
+
+
+@pytest.mark.parametrize(
+    ("change", "caution"),
+    [
+        (lambda _, charge: charge + 30.0, r"the charges are (29|30|31) \+- \S+ pC too large"),
+        (
+            lambda _, charge: charge * np.linspace(1.0, 1.2, len(charge))[:, None],
+            r"the charges are (1[6-9]|20) \+- \S+ % larger at the end",
+        ),
+    ],
+    ids=["offset", "drift"],
+)
+def test_what_a_session_had_is_taken_off_and_said(problem, change, caution):
+    """A bad tare, and an amplifier that drifts: each alone spoils the film else by three times what is said."""
+    result, error = on_a_film(problem, change, 8, seed=42)
+    assert any(re.search(caution, sentence) for sentence in result.cautions)
+    assert error < 2.0 * result.left.position_mm < 0.4
 
 
 @pytest.mark.first_cases(1)
@@ -135,6 +202,7 @@ def test_little_said_is_said(problem):
     far[2, :2] = [12.0, 0.0]
     for few, caution in (
         (presses[:1], "only 1 press"),
+        (presses[:3], "a wrong one among so few cannot be seen"),
         (one_place, "within 0 mm of each other"),
         (replace(presses, contact=np.full((8, 3), np.nan)), "no place is known"),
     ):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
@@ -10,11 +10,12 @@ from scipy.stats import chi2 as chi2_distribution
 from isocharge.common.errors import PressError
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.simulate import Circle, Sensor
-from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity
+from isocharge.simulate.numerics.statistics import rms
+from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
 from isocharge.train.calibration.contacts import PressData
-from isocharge.train.calibration.diagnosis import check_before, explain, find_mistakes, outside
-from isocharge.train.calibration.film_fit import FilmPosterior, fit_film
-from isocharge.train.calibration.problem import CalibrationProblem
+from isocharge.train.calibration.diagnosis import check_before, explain, find_mistakes, misfit, outside
+from isocharge.train.calibration.film_fit import MISTAKEN, FilmPosterior, fit_film
+from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity, quantities, summarise
 from isocharge.train.training.fit import Fitted
 
@@ -33,8 +34,17 @@ STRAINED = 1e-7
 ODD = 1e-3
 """The same, below which presses are tried as what they may be by mistake."""
 
+MISLED = 8.0
+"""Misfit of presses as they are written, as `misfit` gives it, above which mistakes are looked for before a fit."""
+
+PROBABLE = 0.5
+"""Probability of a discrepancy, an offset or a drift above which it is said."""
+
 FEW = 3
-"""Fewer presses than this leave large errors: said, not refused."""
+"""With so few presses a wrong one cannot be seen: said, not refused."""
+
+MORE = 30
+"""Presses of which it is said what they would reach, where a film has what no parameter describes."""
 
 CLOSE_MM = 1.0
 """Presses that all lie within this distance of each other do not identify places: said."""
@@ -69,27 +79,26 @@ class CalibrationResult:
     @cached_property
     def sensitivity(self) -> ContactSensitivity:
         """How contacts answer to noise and to a wrong film, at the calibrated film."""
-        return ContactSensitivity.at(self.problem, self.posterior.parameters)
+        return ContactSensitivity.at(self.problem, self.posterior.unknowns)
 
     @cached_property
     def left(self) -> ContactError:
         """The error of contacts that is left by not knowing the film."""
-        return self.sensitivity.left(self.posterior.covariance)
+        return self.sensitivity.left(self.posterior.joint)
 
     @cached_property
     def left_before(self) -> ContactError:
         """The same before the presses."""
-        return self.sensitivity.left(self.problem.before.covariance)
+        before, covariance = self.problem.before.of_unknowns, np.zeros_like(self.posterior.joint)
+        covariance[: len(before), : len(before)] = before
+        return self.sensitivity.left(covariance)
 
     @property
     def fitted(self) -> Fitted:
         """The network of this film, for `evaluate` and `release`; what the film leaves is in its deviations."""
-        left, noise = self.left, self.sensitivity.of_noise
-        widen = (
-            float(np.hypot(1.0, left.position_mm / noise.position_mm)),
-            float(np.hypot(1.0, left.force_percent / noise.force_percent)),
-        )
-        return self.problem.films.film(self.posterior.parameters, widen=widen)
+        factor = partial(self.problem.charges.factor, self.posterior.coefficients)
+        left = self.sensitivity.contact, np.einsum("nii->ni", self.sensitivity.covariance(self.posterior.joint))
+        return self.problem.films.film(self.posterior.parameters, left=left, factor=factor)
 
     @property
     def reduced_chi2(self) -> float:
@@ -111,8 +120,26 @@ class CalibrationResult:
             f"force (root mean square); before these presses it was {before.position_mm:.2g} mm and "
             f"{before.force_percent:.2g} %. Noise alone leaves {noise.position_mm:.2g} mm and "
             f"{noise.force_percent:.2g} %.",
+            "Forces are as right as the load cell, and places as the origin of the stage: an error of theirs is in "
+            "every answer, beside these.",
+            *self._unexplained,
             *summarise(self.quantities),
             *self.cautions,
+        )
+
+    @property
+    def _unexplained(self) -> Iterator[str]:
+        """What no parameter describes, and what more presses would do about it."""
+        if self.posterior.probability("size") <= PROBABLE:
+            return
+        contact = self.sensitivity.contact
+        share = 100.0 * rms(np.log(self.problem.charges.factor(self.posterior.coefficients, contact)))
+        more = next_presses(self.problem, MORE, self.posterior)
+        places = ", ".join(f"{press.force_N:.2f} N at ({press.x_mm:g}, {press.y_mm:g}) mm" for press in more[:3])
+        yield (
+            f"Beyond what parameters describe, the charges of this film differ by {share:.2g} % (root mean square), "
+            f"smoothly over the film: {self.left.position_mm:.2g} mm are left now. {MORE} more presses would reach "
+            f"{more[-1].position_mm:.2g} mm, the first of them {places}; --next lists more."
         )
 
 
@@ -120,7 +147,9 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
     """The film on which presses were made.
 
     Args:
-        presses: With place and force, or one of them; uncertain as they say.
+        presses: In the order in which they were made. With place and force, or one of them; presses without both tell
+            how a film has changed since an earlier calibration, if it has more than three electrodes. Uncertain as
+            they say.
         problem: The films that it may be.
 
     Raises:
@@ -128,6 +157,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
     """
     presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
     check_before(presses, problem.charges)
+    _check_enough_known(presses, problem)
     far, cautions = outside(presses.contact, problem.charges.domain), []
     if far.any():
         low, high = problem.charges.domain.force_range
@@ -139,16 +169,30 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
             raise explain(presses, problem.charges, np.inf) if len(presses) > 1 else PressError(too_far)
         cautions.append(f"{too_far}; left out")
         presses = presses[~far]
+    if misfit(presses, problem.charges) > MISLED and find_mistakes(presses, problem.charges):
+        raise explain(presses, problem.charges, np.nan)
     posterior = fit_film(problem.charges, PressData.of(presses, problem.noise, problem.charges), problem.before)
     _refuse_unexplained(presses, problem, posterior)
     chi2, freedom = posterior.total
     if freedom and chi2_distribution.sf(chi2, freedom) < UNCERTAIN:  # larger errors, by Birge's ratio (1932)
-        posterior = replace(posterior, covariance=posterior.covariance * (chi2 / freedom))
+        posterior = posterior.scaled(chi2 / freedom)
         cautions.append(
             f"the presses scatter {np.sqrt(chi2 / freedom):.2g} times as much as noise and rig are said to; the errors "
             "are given larger by this factor: are places and forces as certain as assumed?"
         )
+    posterior = _with_unseen_mistakes(posterior, problem.before)
     return CalibrationResult(problem, presses, posterior, (*cautions, *_cautions(presses, posterior)))
+
+
+def _check_enough_known(presses: MeasuredPresses, problem: CalibrationProblem) -> None:
+    """Refuse presses without place and force where charges alone tell nothing of the film."""
+    nothing = np.isnan(presses.contact).all(axis=1)
+    if nothing.all() and len(problem.electrodes) <= 3:
+        raise PressError(
+            f"{len(presses)} presses of unknown place and force: three charges are used up by x, y and force, so they "
+            "tell nothing of the film; give the place or the force of a press (four electrodes would have one charge "
+            "to spare)"
+        )
 
 
 def _lines(presses: MeasuredPresses) -> str:
@@ -162,11 +206,20 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
     strain = float(deviation @ np.linalg.solve(problem.before.covariance, deviation))
     unexplained = freedom > 0.0 and chi2 / freedom > FAR_OFF and chi2_distribution.sf(chi2, freedom) < UNEXPLAINED
     chance = chi2_distribution.sf(strain, deviation.size)
-    suspicious = posterior.bad.any() or chance < ODD  # a few presses written wrongly may still find a strange film
-    odd = suspicious and bool(find_mistakes(presses, problem.charges))
+    strange = posterior.probability("size") > PROBABLE or posterior.bad.any() or chance < ODD
+    odd = strange and bool(find_mistakes(presses, problem.charges))  # a few wrong presses may find a strange film
     if unexplained or chance < STRAINED or odd:
         worst = max(chi2 / max(freedom, 1.0), strain / deviation.size)
         raise explain(presses, problem.charges, float(np.sqrt(worst)))
+
+
+def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> FilmPosterior:
+    """Allow for wrong presses that so few cannot show: with their chance, no more is known than before."""
+    good, left_out = int((~posterior.bad).sum()), int(posterior.bad.sum())
+    chance = MISTAKEN * (good if good <= FEW else 0) + min(left_out / (good * good), 0.5)
+    joint, of_before, count = (1.0 - chance) * posterior.joint, before.of_unknowns, len(before.unknowns)
+    joint[:count, :count] += chance * of_before
+    return replace(posterior, joint=joint, covariance=joint[: len(before.parameters), : len(before.parameters)])
 
 
 def _cautions(presses: MeasuredPresses, posterior: FilmPosterior) -> Iterator[str]:
@@ -174,8 +227,17 @@ def _cautions(presses: MeasuredPresses, posterior: FilmPosterior) -> Iterator[st
         lines = _lines(presses[posterior.bad])
         yield f"{lines}: left out, since no film fits them and all others; look at them again"
     good = presses[~posterior.bad]
-    if len(good) < FEW:
-        yield f"only {len(good)} press{'es' if len(good) > 1 else ''}: three or more tell far more"
+    if len(good) <= FEW:
+        yield (
+            f"only {len(good)} press{'es' if len(good) > 1 else ''}: a wrong one among so few cannot be seen, and the "
+            "errors allow for it; more than three tell far more"
+        )
+    for what, (value, std), unit, meaning in (
+        ("offset", posterior.offset_pC, "pC", "too large in all presses and electrodes: is the tare right"),
+        ("drift", tuple(100.0 * number for number in posterior.drift), "%", "larger at the end than at the beginning"),
+    ):
+        if posterior.probability(what) > PROBABLE:
+            yield f"the charges are {value:.2g} +- {std:.2g} {unit} {meaning}? It is taken off"
     places = good.contact[np.isfinite(good.contact[:, 0]), :2]
     if len(places) > 1 and np.ptp(places, axis=0).max() < CLOSE_MM:
         yield (
@@ -184,5 +246,6 @@ def _cautions(presses: MeasuredPresses, posterior: FilmPosterior) -> Iterator[st
         )
     if not len(places):
         yield (
-            "no place is known: positions will be right only up to the shift and the turn of the electrodes themselves"
+            "no place is known: positions will be right only up to the shift and the turn of the electrodes "
+            "themselves, and if the charges are in the right columns"
         )

@@ -21,6 +21,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.prediction.measured_presses import FORCE_STD, POSITION_STD_MM
 from isocharge.simulate.numerics.disk import sunflower
+from isocharge.train.calibration.contacts import projected
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 
 CONTACTS = 200
@@ -66,8 +67,8 @@ class ContactSensitivity:
 
     Attributes:
         contact: (x, y, F), shape (n, 3), mm and N.
-        by_parameter: -G: (x, y, ln F) by the parameters over their prior standard deviations, shape
-            (n, 3, n_parameter).
+        by_parameter: -G: (x, y, ln F) by the parameters over their prior standard deviations, and by the coefficients
+            of the discrepancy if there is one, shape (n, 3, n_unknown).
         noise: Covariance of (x, y, ln F) by noise alone, shape (n, 3, 3).
     """
 
@@ -88,8 +89,12 @@ class ContactSensitivity:
         return cls(contact, -np.einsum("nij,nkj,nkp->nip", covariance, slopes, by_film), covariance)
 
     def left(self, covariance: Array) -> ContactError:
-        """The error left with a covariance of the parameters over their prior standard deviations."""
-        return ContactError.of(np.einsum("nip,pq,njq->nij", self.by_parameter, covariance, self.by_parameter))
+        """The error left with a covariance of what is unknown of the film."""
+        return ContactError.of(self.covariance(covariance))
+
+    def covariance(self, covariance: Array) -> Array:
+        """The same as covariances of (x, y, ln F), shape (n, 3, 3)."""
+        return np.asarray(self.by_parameter @ covariance @ self.by_parameter.swapaxes(1, 2))
 
     @property
     def of_noise(self) -> ContactError:
@@ -125,20 +130,28 @@ def information_of(
 
     Args:
         problem: The films.
-        parameters: Where the map is linearised, shape (n_parameter,).
+        parameters: Where the map is linearised, as `FilmCharges.film` takes it.
         contact: Presses (x, y, F), shape (n, 3), mm and N.
         position_std_mm: How well a press's place is known, mm; infinite if not at all.
         force_std: How well its force is known, share.
 
     Returns:
-        Fisher information, shape (n, n_parameter, n_parameter).
+        Fisher information, shape (n, n_unknown, n_unknown).
     """
+    rows = _rows_of(problem, parameters, contact, position_std_mm, force_std)
+    return np.asarray(rows.swapaxes(1, 2) @ rows)
+
+
+def _rows_of(
+    problem: CalibrationProblem, parameters: Array, contact: Array, position_std_mm: float, force_std: float
+) -> Array:
+    """Roots of the information: R with R' R, shape (n, n_electrode + 3, n_unknown)."""
     slopes, by_film = _whitened_slopes(problem, parameters, contact)
-    rig = np.diag([position_std_mm**-2.0, position_std_mm**-2.0, force_std**-2.0])
-    normal = np.einsum("nki,nkj->nij", slopes, slopes) + rig
-    across = np.einsum("nki,nkp->nip", slopes, by_film)
-    unknown = np.einsum("nip,nij,njq->npq", across, np.linalg.inv(normal), across)
-    return np.asarray(np.einsum("nkp,nkq->npq", by_film, by_film) - unknown)
+    rig = np.broadcast_to(
+        np.diag([1.0 / position_std_mm, 1.0 / position_std_mm, 1.0 / force_std]), (len(contact), 3, 3)
+    )
+    still = np.zeros((len(contact), 3, by_film.shape[2]))
+    return projected(np.concatenate([by_film, still], axis=1), np.concatenate([slopes, rig], axis=1))
 
 
 @dataclass(frozen=True)
@@ -189,16 +202,18 @@ def next_presses(
         SceneError: If even the smallest force exceeds the stress limit.
     """
     film = film or problem.before
-    sensitivity = ContactSensitivity.at(problem, film.parameters)
+    sensitivity = ContactSensitivity.at(problem, film.unknowns)
     avoid_mm = np.empty((0, 2)) if avoid_mm is None else avoid_mm
     candidates = _candidates(problem.domain.radius, problem.proposed_forces, avoid_mm)
-    offered = information_of(problem, film.parameters, candidates, position_std_mm, force_std)
-    cost, proposed, information = sensitivity.cost(), [], np.linalg.inv(film.covariance)
+    offered = _rows_of(problem, film.unknowns, candidates, position_std_mm, force_std)
+    cost, proposed, covariance = sensitivity.cost(), [], film.of_unknowns
     for _ in range(count):
-        after = np.linalg.inv(information + offered)
-        best = int(np.argmin(np.einsum("pq,nqp->n", cost, after)))
-        information = information + offered[best]
-        left = sensitivity.left(after[best])
+        reached = offered @ covariance  # a press lowers the covariance by reached' (1 + R C R')^-1 reached
+        inner = np.eye(offered.shape[1]) + reached @ offered.swapaxes(1, 2)
+        gain = np.einsum("nij,nji->n", np.linalg.inv(inner), reached @ cost @ reached.swapaxes(1, 2))
+        best = int(np.argmax(gain))
+        covariance = covariance - reached[best].T @ np.linalg.solve(inner[best], reached[best])
+        left = sensitivity.left(covariance)
         x, y, force = candidates[best].tolist()
         proposed.append(ProposedPress(x, y, force, left.position_mm, left.force_percent))
     return proposed

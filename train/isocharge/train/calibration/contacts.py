@@ -4,7 +4,7 @@ A rig knows place and force of a press to its own uncertainty, or one of them no
 is the one that fits charges and rig best; the residuals of both speak about the film.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +34,7 @@ class PressData:
         contact: (x, y, ln F), shape (n, 3); the middle of the domain where unknown.
         contact_weight: One over the standard deviation of each, shape (n, 3); small where unknown.
         known: Which charges and coordinates were measured, shape (n, n_electrode + 3).
+        turn: When each press was made, from -1/2, the first, to 1/2, the last, shape (n,).
     """
 
     charge: Array
@@ -41,6 +42,7 @@ class PressData:
     contact: Array
     contact_weight: Array
     known: Booleans
+    turn: Array
 
     @classmethod
     def of(cls, presses: MeasuredPresses, noise: NoiseModel, charges: FilmCharges) -> "PressData":
@@ -56,6 +58,7 @@ class PressData:
             contact=np.where(known, logs, domain.centre),
             contact_weight=1.0 / np.where(known, rig_std, [domain.radius, domain.radius, VAGUE_FORCE]),
             known=np.column_stack([seen, known]),
+            turn=np.linspace(-0.5, 0.5, len(presses)) if len(presses) > 1 else np.zeros(1),
         )
 
     def __getitem__(self, rows: Integers | Booleans) -> "PressData":
@@ -63,6 +66,16 @@ class PressData:
 
     def __len__(self) -> int:
         return len(self.contact)
+
+    def without(self, nuisances: Array) -> "PressData":
+        """The presses without a common offset of the charges, pC, and without their drift over the session, a share."""
+        offset, drift = nuisances
+        return replace(self, charge=self.charge - offset - drift * self.turn[:, None] * self.charge)
+
+    def by_nuisance(self) -> Array:
+        """Derivatives of the residual by offset and drift, shape (n, n_electrode + 3, 2)."""
+        by_charge = np.stack([np.ones_like(self.charge), self.turn[:, None] * self.charge], axis=2)
+        return np.concatenate([self.weight[:, :, None] * by_charge, np.zeros((len(self), 3, 2))], axis=1)
 
     def residual(self, film: ChargeMap, contact: Array) -> Array:
         """Residuals of charges and rig over their standard deviations at (x, y, ln F): (n, n_electrode + 3)."""
@@ -114,11 +127,11 @@ def adjust_contacts(charges: FilmCharges, parameters: Array, data: PressData, st
 
     Args:
         charges: The films.
-        parameters: The film, shape (n_parameter,).
+        parameters: The film, as `FilmCharges.film` takes it.
         data: The presses.
         start: Contacts (x, y, ln F), shape (n, 3).
     """
-    film, domain = charges.forward_map(parameters), charges.domain
+    film, domain = charges.film(parameters), charges.domain
 
     def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
         contact, presses = unit * domain.scale + domain.centre, data[rows]

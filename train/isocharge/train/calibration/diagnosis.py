@@ -142,9 +142,15 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     if not len(placed):
         return []
     mistakes = [(_misfit(charges, contact, charge), sentence) for sentence, contact, charge in _tried(placed, charges)]
-    clearer = CLEARER * _misfit(charges, placed.contact, placed.charge_pC)
-    least = min(misfit for misfit, _ in mistakes)
-    return [sentence for misfit, sentence in sorted(mistakes) if misfit < clearer and misfit <= AS_GOOD * least]
+    clearer = CLEARER * misfit(presses, charges)
+    least = min(tried for tried, _ in mistakes)
+    return [sentence for tried, sentence in sorted(mistakes) if tried < clearer and tried <= AS_GOOD * least]
+
+
+def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
+    """How far presses of known place and force are from those of any film, dimensionless: 1 is common, 20 is not."""
+    placed = presses[presses.placed]
+    return _misfit(charges, placed.contact, placed.charge_pC) if len(placed) else 0.0
 
 
 def _misfit(charges: FilmCharges, contact: Array, charge: Array) -> float:
@@ -190,11 +196,14 @@ def explain(presses: MeasuredPresses, charges: FilmCharges, times_noise: float) 
     Args:
         presses: As they are written.
         charges: The films.
-        times_noise: Root-mean-square residual of the best film over the noise; infinite if none was tried.
+        times_noise: Root-mean-square residual of the best film over the noise; infinite if most presses lie
+            outside, NaN if none was tried.
     """
     best = f"the best misses them by {times_noise:.2g} times the noise"
     if not np.isfinite(times_noise):
         best = "most of them lie outside the places and forces of a calibration"
+    if np.isnan(times_noise):
+        best = "as they are written, they are nothing like its charges"
     begin = f"no film of {charges.prior.sensor.name!r} explains these {len(presses)} presses: {best}"
     if mistakes := find_mistakes(presses, charges):
         sentences = "; or ".join(mistakes[:3])

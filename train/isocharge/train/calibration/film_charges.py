@@ -1,16 +1,20 @@
-"""Charges of presses on any film of a prior, with their derivatives by the contact and by the film's parameters."""
+"""Charges of presses on any film of a prior, with their derivatives by the contact and by what is unknown of the film.
+
+A film is given by the parameters of `FilmPrior`, after which the coefficients of its discrepancy may stand.
+"""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Circle, Film, ForwardMap
-from isocharge.simulate.forward.charge_map import Domain, differences
+from isocharge.simulate.forward.charge_map import Domain, FunctionMap, differences
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.numerics.disk import onto_disk
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
+from isocharge.train.calibration.discrepancy import term_count, terms
 
 STEP = 0.005
 """Step of the differences by a parameter, in standard deviations of its prior: the map is smooth on that scale."""
@@ -53,8 +57,13 @@ class FilmCharges:
             (float(least * stiff) * (2.0 - EDGE) * 1.01, float(most * soft) * EDGE / 1.01),
         )
 
+    @cached_property
+    def std(self) -> Array:
+        """Scales of parameters and coefficients, shape (n_parameter + n_coefficient,)."""
+        return np.concatenate([self.prior.std, np.ones(term_count() * len(self.prior.sensor.electrodes))])
+
     def forward_map(self, parameters: Array) -> ForwardMap:
-        """The forward map of one film, parameters of shape (n_parameter,).
+        """The forward map of one film without a discrepancy, parameters of shape (n_parameter,).
 
         Films that differ in coefficients, gains and electrodes only share their stresses; the last few are remembered.
         """
@@ -70,35 +79,56 @@ class FilmCharges:
     def _maps(self) -> dict[tuple[Film, Circle], ForwardMap]:
         return {}
 
-    def charges(self, parameters: Array, contact: Array) -> Array:
-        """Charges of contacts (x, y, F), shape (n, 3), mm and N, on one film: (n, n_electrode), pC."""
-        return self.forward_map(parameters).charges(contact)
+    def film(self, unknowns: Array) -> FunctionMap:
+        """The charges of one film with its discrepancy, shape (n_parameter,) or (n_parameter + n_coefficient,)."""
+        parameters, coefficients = np.split(unknowns, [len(self.prior.names)])
+        forward_map = self.forward_map(parameters)
+        if not coefficients.any():
+            return FunctionMap(forward_map.charges, forward_map.electrodes, self.domain)
 
-    def by_contact(self, parameters: Array, contact: Array) -> Array:
+        def charges(contact: Array) -> Array:
+            return forward_map.charges(contact) * self.factor(coefficients, contact)
+
+        return FunctionMap(charges, forward_map.electrodes, self.domain)
+
+    def factor(self, coefficients: Array, contact: Array) -> Array:
+        """Factors of a discrepancy on the charges at contacts (x, y, F), shape (n, 3): (n, n_electrode)."""
+        return np.asarray(np.exp(terms(contact, self.domain) @ coefficients.reshape(term_count(), -1)))
+
+    def charges(self, unknowns: Array, contact: Array) -> Array:
+        """Charges of contacts (x, y, F), shape (n, 3), mm and N, on one film: (n, n_electrode), pC."""
+        return self.film(unknowns).charges(contact)
+
+    def by_contact(self, unknowns: Array, contact: Array) -> Array:
         """Derivatives by (x, y, ln F) on one film, shape (n, n_electrode, 3), pC/mm, pC/mm and pC."""
-        return differences(self.forward_map(parameters).charges, contact, CONTACT_STEPS)
+        return differences(self.film(unknowns).charges, contact, CONTACT_STEPS)
 
     def into_domain(self, contact: Array) -> Array:
         """Contacts moved to the nearest of the domain, shape (n, 3)."""
         place = onto_disk(contact[:, :2], self.domain.radius)
         return np.column_stack([place, np.clip(contact[:, 2], *self.domain.force_range)])
 
-    def by_parameter(self, parameters: Array, contact: Array, by_contact: Array) -> Array:
-        """Derivatives by the parameters over their prior standard deviations.
+    def by_parameter(self, unknowns: Array, contact: Array, by_contact: Array) -> Array:
+        """Derivatives by the parameters over their prior standard deviations, and by coefficients if they are given.
 
         What scales is exact: charges are E q(F / (E h a), T / E, h / a) with T the pretension, and linear in d31 and
         d32. The others are differences of small steps.
 
         Args:
-            parameters: The film, shape (n_parameter,).
+            unknowns: The film, shape (n_parameter,) or (n_parameter + n_coefficient,).
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             by_contact: Derivatives by the contacts, as `by_contact` gives them.
 
         Returns:
-            Shape (n, n_electrode, n_parameter), pC.
+            Shape (n, n_electrode, n_parameter) or (n, n_electrode, n_parameter + n_coefficient), pC.
         """
-        film = self.forward_map(parameters)
-        charge, by_force = film.charges(contact), by_contact[:, :, 2]
+        parameters, coefficients = np.split(unknowns, [len(self.prior.names)])
+        film, by_force = self.forward_map(parameters), by_contact[:, :, 2]
+        charge, factor = film.charges(contact), np.ones((1, 1))
+        if coefficients.size:
+            factor = self.factor(coefficients, contact)
+            steeper = differences(partial(self.factor, coefficients), contact, CONTACT_STEPS)[:, :, 2]
+            by_force = (by_force - charge * steeper) / factor
         columns = {name: self._by_step(name, parameters, contact, charge) for name in STEPPED}
         columns["young"] = charge - by_force - parameters[0] * columns["pretension"]
         columns["thickness"] = columns["thickness"] - by_force
@@ -107,8 +137,13 @@ class FilmCharges:
         columns["d32"] = d32_alone.charges(contact) if piezo.d32 != 0.0 else np.zeros_like(charge)
         columns["d31"] = charge - columns["d32"]
         shared = np.stack([columns[name] for name in SHARED], axis=2)
-        gains = charge[:, :, None] * np.eye(charge.shape[1])
-        return np.asarray(np.concatenate([shared, gains], axis=2) * self.prior.std)
+        own = charge[:, :, None] * np.eye(charge.shape[1])
+        of_film = np.concatenate([shared, own], axis=2) * self.prior.std
+        if not coefficients.size:
+            return np.asarray(of_film)
+        each = own[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
+        both = [of_film, each.reshape(*charge.shape, -1)]
+        return np.asarray(np.concatenate(both, axis=2) * factor[:, :, None])
 
     def _by_step(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
         """Derivative by one parameter; by the thickness at one load F / (E h a), which is bending's part alone."""
@@ -118,4 +153,4 @@ class FilmCharges:
         moved[number] += step if parameters[number] + step <= high[number] else -step
         change = moved[number] - parameters[number]
         at = contact * [1.0, 1.0, np.exp(change)] if name == "thickness" else contact
-        return np.asarray((self.charges(moved, at) - charge) / change)
+        return np.asarray((self.forward_map(moved).charges(at) - charge) / change)

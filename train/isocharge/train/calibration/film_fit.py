@@ -10,13 +10,15 @@ it (Student's t, Lange et al. 1989), so that one bad press does not move the fil
 off is left out and named.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_distribution
 
 from isocharge.common.arrays import Array, Booleans
+from isocharge.simulate.sensor.film_prior import SHARED
 from isocharge.train.calibration.contacts import (
     AdjustedContacts,
     PressData,
@@ -25,6 +27,7 @@ from isocharge.train.calibration.contacts import (
     search_places,
     with_force,
 )
+from isocharge.train.calibration.discrepancy import Hypothesis, Linearised, Mixture, weigh
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.problem import FilmEstimate
 
@@ -52,6 +55,16 @@ TOLERANCE = 1e-4
 MOST_STEPS = 25
 """Steps of a fit at most; from the prior's mean it takes eight."""
 
+ROUNDS = 3
+"""Fits with the most probable hypothesis of the one before, at most."""
+
+MISTAKEN, SURPRISE = 0.02, -3.0
+"""Chance that a press is written wrongly, and the logarithm of the density of each of its charges then, in units of the
+noise: anything up to twenty times as far off."""
+
+LINEAR = 0.2
+"""Largest step of a parameter, in standard deviations of its prior, for which derivatives are not taken again."""
+
 MARGIN = 1e-3
 """Distance of a start from the bounds, in standard deviations: the trust region begins inside."""
 
@@ -65,29 +78,69 @@ class FilmPosterior(FilmEstimate):
         chi2: Sum of squared residuals of each press, shape (n,); about `freedom` for good ones.
         freedom: Measured numbers beyond three for each press, shape (n,).
         bad: Which presses were left out, shape (n,).
+        offset_pC: Common offset of the charges and its standard deviation, pC.
+        drift: Drift of the charges from the first press to the last and its standard deviation, a share.
+        weights: Probability of each hypothesis of what there is besides a film of the prior.
     """
 
-    contact: Array
-    chi2: Array
-    freedom: Array
-    bad: Booleans
+    contact: Array = field(kw_only=True)
+    chi2: Array = field(kw_only=True)
+    freedom: Array = field(kw_only=True)
+    bad: Booleans = field(kw_only=True)
+    offset_pC: tuple[float, float] = field(kw_only=True)
+    drift: tuple[float, float] = field(kw_only=True)
+    weights: dict[Hypothesis, float] = field(kw_only=True)
 
     @property
     def total(self) -> tuple[float, float]:
         """Sum of squared residuals of the good presses, and their degrees of freedom."""
         return float(self.chi2[~self.bad].sum()), float(self.freedom[~self.bad].sum())
 
+    def scaled(self, factor: float) -> "FilmPosterior":
+        """With all variances larger by a factor."""
+        return replace(self, covariance=self.covariance * factor, joint=self.joint * factor)
+
+    def probability(self, what: str) -> float:
+        """Of the hypotheses with a "size", an "offset" or a "drift"."""
+        return sum(weight for hypothesis, weight in self.weights.items() if getattr(hypothesis, what) > 0.0)
+
 
 def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate) -> FilmPosterior:
     """The film that explains presses; `before` is what is known of it without them."""
+    problem = _Fit.of(charges, before)
     keep, freedom = np.ones(len(data), dtype=bool), np.maximum(data.known.sum(axis=1) - 3.0, 0.0)
-    film, adjusted = _solve(charges, before, data, keep, before.parameters)
-    if len(data) >= FEWEST_TO_JUDGE and _suspicious(adjusted.chi2, freedom):
-        keep, start = _good_presses(charges, before, data, film.parameters, adjusted.chi2, freedom)
-        film, _ = _solve(charges, before, data[keep], keep[keep], start)
-        adjusted = adjust_contacts(charges, film.parameters, data, search_places(charges, film.parameters, data))
-    contact = with_force(adjusted.contact)
-    return FilmPosterior(film.parameters, film.covariance, contact, adjusted.chi2, freedom, ~keep)
+    solved = problem.solve(data, keep, problem.mean, Hypothesis())
+    if len(data) >= FEWEST_TO_JUDGE and _suspicious(solved.contacts.chi2, freedom):
+        keep, start = _good_presses(problem, data, solved, freedom)
+        solved = problem.solve(data[keep], keep[keep], start, Hypothesis())
+    known = problem.settle(data, keep, freedom, solved, Hypothesis())
+    if not known.keep.all():  # or is it that the film has what no parameter describes?
+        rest = ~known.keep
+        surprise = SURPRISE * data.known[rest, :-3].sum() + rest.sum() * np.log(MISTAKEN)
+        contacts = problem.adjusted(known.solved.unit, data)
+        everything = problem.weigh(data, _Solved(known.solved.unit, contacts))
+        if everything.evidence > known.mixture.evidence + surprise:
+            known = problem.settle(data, np.ones_like(keep), freedom, known.solved, everything.best)
+    keep, mixture = known.keep, known.mixture
+    unit = np.clip(problem.mean + mixture.mean, *problem.bounds)
+    contacts, n = problem.adjusted(unit, data), len(before.parameters)
+    offset, drift = zip(unit[-2:].tolist(), np.sqrt(np.diag(mixture.covariance)[-2:]).tolist(), strict=True)
+    drifting = np.zeros(charges.std.size)  # nobody knows what the drift was when the film is used
+    drifting[len(SHARED) : n] = np.hypot(*drift) / np.sqrt(12.0) / charges.prior.spread.gain
+    joint = mixture.covariance[:-2, :-2] + np.outer(drifting, drifting)
+    return FilmPosterior(
+        parameters=unit[:n] * charges.prior.std,
+        covariance=joint[:n, :n],
+        coefficients=unit[n:-2],
+        joint=joint,
+        contact=with_force(contacts.contact),
+        chi2=contacts.chi2,
+        freedom=freedom,
+        bad=~keep,
+        offset_pC=offset,
+        drift=drift,
+        weights=mixture.weights,
+    )
 
 
 def _suspicious(chi2: Array, freedom: Array) -> bool:
@@ -97,52 +150,148 @@ def _suspicious(chi2: Array, freedom: Array) -> bool:
     return bool(min(alone, together) < DOUBTFUL)
 
 
-def _good_presses(
-    charges: FilmCharges, before: FilmEstimate, data: PressData, start: Array, chi2: Array, freedom: Array
-) -> tuple[Booleans, Array]:
+class _Solved(NamedTuple):
+    """A film that explains presses best: its unknowns in units of their scales, and the contacts adjusted to it."""
+
+    unit: Array
+    contacts: AdjustedContacts
+
+
+class _Known(NamedTuple):
+    """What is known from the presses that are kept."""
+
+    keep: Booleans
+    solved: _Solved
+    mixture: Mixture
+
+
+def _good_presses(problem: "_Fit", data: PressData, solved: _Solved, freedom: Array) -> tuple[Booleans, Array]:
     """Which presses agree with the film that most of them agree on, and that film."""
-    weight = np.ones(len(data))
+    weight, (start, adjusted) = np.ones(len(data)), solved
     for _ in range(WEIGHTINGS):
-        last, weight = weight, (HEAVY_TAILS + freedom) / (HEAVY_TAILS + chi2)
+        last, weight = weight, (HEAVY_TAILS + freedom) / (HEAVY_TAILS + adjusted.chi2)
         if np.abs(weight / last - 1.0).max() < 0.1:
             break
-        film, adjusted = _solve(charges, before, data, weight, start)
-        start, chi2 = film.parameters, adjusted.chi2
+        start, adjusted = problem.solve(data, weight, start, Hypothesis())
     freedom = np.maximum(freedom, 1.0)
-    scatter = np.median(chi2 / np.maximum(chi2_distribution.median(freedom), 0.1))
-    keep = chi2 <= chi2_distribution.isf(BAD / len(data), freedom) * max(1.0, scatter)
+    scatter = np.median(adjusted.chi2 / np.maximum(chi2_distribution.median(freedom), 0.1))
+    keep = adjusted.chi2 <= chi2_distribution.isf(BAD / len(data), freedom) * max(1.0, scatter)
     return (keep if np.mean(~keep) <= LARGEST_BAD_SHARE else np.ones_like(keep)), start
 
 
-def _solve(
-    charges: FilmCharges, before: FilmEstimate, data: PressData, weight: Array | Booleans, start: Array
-) -> tuple[FilmEstimate, AdjustedContacts]:
-    """The film that explains weighted presses best, from a start, and the contacts adjusted to it."""
-    std, root = charges.prior.std, np.sqrt(weight)
-    low, high = (bound / std for bound in charges.prior.bounds)
-    of_prior, place = np.linalg.inv(np.linalg.cholesky(before.covariance)), search_places(charges, start, data)
-    last: list[tuple[Array, AdjustedContacts]] = []
+@dataclass(frozen=True)
+class _Fit:
+    """Films, and what is known before the presses.
 
-    def adjusted_at(unit: Array) -> AdjustedContacts:
-        if not last or not np.array_equal(last[-1][0], unit):
-            begin = last[-1][1].contact if last else place
-            last[:] = [(unit.copy(), adjust_contacts(charges, unit * std, data, begin))]
-        return last[-1][1]
+    The unknowns are parameters over their prior standard deviations, coefficients, offset and drift.
 
-    def residual(unit: Array) -> Array:
-        of_presses = adjusted_at(unit).residual * root[:, None]
-        return np.concatenate([of_presses.ravel(), of_prior @ (unit - before.parameters / std)])
+    Attributes:
+        charges: The films.
+        mean: Of the unknowns before the presses, shape (n_unknown,).
+        covariance: Of the unknowns before the presses without a hypothesis, shape (n_unknown, n_unknown).
+    """
 
-    def jacobian(unit: Array) -> Array:
-        at = with_force(adjusted_at(unit).contact)
-        by_contact = charges.by_contact(unit * std, at)
-        of_charge = data.weight[:, :, None] * charges.by_parameter(unit * std, at, by_contact)
-        by_parameter = np.concatenate([of_charge, np.zeros((len(data), 3, unit.size))], axis=1)
-        rows = projected(by_parameter, data.slopes(by_contact)) * root[:, None, None]
-        return np.concatenate([rows.reshape(-1, unit.size), of_prior])
+    charges: FilmCharges
+    mean: Array
+    covariance: Array
 
-    start = np.clip(start / std, low + MARGIN, high - MARGIN)
-    bounds, tolerance = (low, high), {"ftol": TOLERANCE, "xtol": TOLERANCE}
-    result = least_squares(residual, start, jacobian, bounds, x_scale=1.0, max_nfev=MOST_STEPS, **tolerance)
-    covariance = np.linalg.inv(result.jac.T @ result.jac).astype(float)
-    return FilmEstimate(result.x * std, covariance), adjusted_at(result.x)
+    @classmethod
+    def of(cls, charges: FilmCharges, before: FilmEstimate) -> "_Fit":
+        """The coefficients are zero, if nothing is known of them."""
+        size = charges.std.size + 2
+        mean, covariance, known = np.zeros(size), np.zeros((size, size)), before.unknowns.size
+        mean[:known] = before.unknowns / charges.std[:known]
+        covariance[:known, :known] = before.of_unknowns
+        return cls(charges, mean, covariance)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Of the unknowns, each of shape (n_unknown,)."""
+        prior, free = self.charges.prior, np.full(self.mean.size - len(self.charges.prior.names), np.inf)
+        low, high = (bound / prior.std for bound in prior.bounds)
+        return np.concatenate([low, -free]), np.concatenate([high, free])
+
+    def _before(self, hypothesis: Hypothesis) -> Array:
+        """Covariance of the unknowns before the presses."""
+        return self.covariance + np.diag(hypothesis.variances(len(self.charges.prior.names), len(self.mean)))
+
+    def _film(self, unit: Array) -> Array:
+        return np.asarray(unit[:-2] * self.charges.std)
+
+    def adjusted(self, unit: Array, data: PressData, start: Array | None = None) -> AdjustedContacts:
+        """The contacts that fit best on a film, searched for from a start."""
+        film, data = self._film(unit), data.without(unit[-2:])
+        begin = search_places(self.charges, film, data) if start is None else start
+        return adjust_contacts(self.charges, film, data, begin)
+
+    def slopes(self, unit: Array, data: PressData, contacts: AdjustedContacts) -> Array:
+        """Derivatives of the residuals by the unknowns once the contacts follow, (n, n_electrode + 3, n_unknown)."""
+        film, at = self._film(unit), with_force(contacts.contact)
+        by_contact = self.charges.by_contact(film, at)
+        of_charge = data.weight[:, :, None] * self.charges.by_parameter(film, at, by_contact)
+        of_film = np.concatenate([of_charge, np.zeros((len(data), 3, film.size))], axis=1)
+        return projected(np.concatenate([of_film, data.by_nuisance()], axis=2), data.slopes(by_contact))
+
+    def solve(self, data: PressData, weight: Array | Booleans, start: Array, hypothesis: Hypothesis) -> _Solved:
+        """The film that explains weighted presses best, from a start; what a hypothesis excludes stays."""
+        covariance, root = self._before(hypothesis), np.sqrt(weight)
+        active = np.diag(covariance) > 0.0
+        of_prior = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(active, active)]))
+        low, high = (bound[active] for bound in self.bounds)
+        last: list[tuple[Array, _Solved]] = []
+
+        def solved_at(some: Array) -> _Solved:
+            if not last or not np.array_equal(last[-1][0], some):
+                unit = self.mean.copy()
+                unit[active] = some
+                contacts = self.adjusted(unit, data, last[-1][1].contacts.contact if last else None)
+                last[:] = [(some.copy(), _Solved(unit, contacts))]
+            return last[-1][1]
+
+        def residual(some: Array) -> Array:
+            of_presses = solved_at(some).contacts.residual * root[:, None]
+            return np.concatenate([of_presses.ravel(), of_prior @ (some - self.mean[active])])
+
+        def jacobian(some: Array) -> Array:
+            unit, contacts = solved_at(some)
+            rows = self.slopes(unit, data, contacts)[:, :, active] * root[:, None, None]
+            return np.concatenate([rows.reshape(-1, some.size), of_prior])
+
+        begin = np.clip(start[active], low + MARGIN, high - MARGIN)
+        tolerance = {"ftol": TOLERANCE, "xtol": TOLERANCE, "max_nfev": MOST_STEPS}
+        return solved_at(least_squares(residual, begin, jacobian, (low, high), x_scale=1.0, **tolerance).x)
+
+    def settle(
+        self, data: PressData, keep: Booleans, freedom: Array, solved: _Solved, hypothesis: Hypothesis
+    ) -> "_Known":
+        """Solve and weigh until neither the film nor the presses that fit it change."""
+        if hypothesis != Hypothesis():
+            solved = self.solve(data[keep], keep[keep], solved.unit, hypothesis)
+        for last in range(ROUNDS)[::-1]:
+            mixture = self.weigh(data[keep], solved)
+            step, readmitted = self.mean + mixture.mean - solved.unit, keep
+            if not keep.all():
+                readmitted = keep | self.fits(data, solved, mixture, freedom)
+            if last == 0 or (
+                np.abs(step[: len(self.charges.prior.names)]).max() < LINEAR and (keep == readmitted).all()
+            ):
+                break
+            keep = readmitted
+            solved = self.solve(data[keep], keep[keep], solved.unit, mixture.best)
+        return _Known(keep, solved, mixture)
+
+    def fits(self, data: PressData, solved: _Solved, mixture: Mixture, freedom: Array) -> Booleans:
+        """Which presses are as a film predicts them, with all that is uncertain of it, shape (n,)."""
+        contacts = self.adjusted(solved.unit, data)
+        rows = self.slopes(solved.unit, data, contacts)
+        residual = contacts.residual + rows @ (self.mean + mixture.mean - solved.unit)
+        expected = np.eye(rows.shape[1]) + rows @ mixture.covariance @ rows.swapaxes(1, 2)
+        chi2 = np.einsum("nk,nk->n", residual, np.linalg.solve(expected, residual[:, :, None])[:, :, 0])
+        return np.asarray(chi2 <= chi2_distribution.isf(BAD / len(data), np.maximum(freedom, 1.0)))
+
+    def weigh(self, data: PressData, solved: _Solved) -> Mixture:
+        """What the presses say of the unknowns, and of the hypotheses."""
+        unit, contacts = solved
+        jacobian = self.slopes(unit, data, contacts).reshape(-1, unit.size)
+        linearised = Linearised.of(jacobian, contacts.residual.ravel(), unit - self.mean)
+        return weigh(linearised, self._before)

@@ -32,8 +32,9 @@ from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses
 from isocharge.simulate.plots.figure import picture_bytes
 from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
-from isocharge.train.calibration.calibrate import CalibrationResult
+from isocharge.train.calibration.calibrate import PROBABLE, CalibrationResult
 from isocharge.train.calibration.contact_error import ContactError
+from isocharge.train.calibration.film_fit import FilmPosterior
 from isocharge.train.calibration.picture import calibration_picture
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.model_release.release import release
@@ -119,7 +120,20 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
         "quantities": {name: quantity.to_dict() for name, quantity in result.quantities.items()},
         "parameters": {name: {"value": float(value), "std": float(error)} for name, value, error in parameters},
         "correlations": np.round(posterior.covariance / np.outer(std, std), 6).tolist(),
+        "discrepancy": _discrepancy(posterior),
         "words": list(result.summary),
+    }
+
+
+def _discrepancy(posterior: FilmPosterior) -> dict[str, Any] | None:
+    """What no parameter describes, if there is anything: coefficients, errors, and correlations, of all unknowns."""
+    if posterior.probability("size") <= PROBABLE:
+        return None
+    std = np.sqrt(np.diag(posterior.joint))
+    return {
+        "coefficients": posterior.coefficients.tolist(),
+        "std": std.tolist(),
+        "correlations": np.round(posterior.joint / np.outer(std, std), 6).tolist(),
     }
 
 
@@ -133,12 +147,19 @@ class _Parameter(Struct, frozen=True):
     std: float
 
 
+class _Discrepancy(Struct, frozen=True):
+    coefficients: list[float]
+    std: list[float]
+    correlations: list[list[float]]
+
+
 class _Earlier(Struct, frozen=True):
     """What `read_earlier` takes from calibration.json."""
 
     sensor: str
     parameters: dict[str, _Parameter]
     correlations: list[list[float]]
+    discrepancy: _Discrepancy | None = None
 
 
 def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
@@ -159,11 +180,21 @@ def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
             f"{path}: a calibration of {table.sensor!r} with the parameters {', '.join(names)}; expected "
             f"{prior.sensor.name!r} with {', '.join(prior.names)}"
         )
-    if [len(row) for row in table.correlations] != [len(names)] * len(names):
-        raise PressError(f"{path}: correlations: expected {len(names)} rows of as many numbers")
     value, std = np.array([[entry.value, entry.std] for entry in table.parameters.values()]).T / _units(prior)
-    unit = std / prior.std
-    return FilmEstimate(value, np.array(table.correlations) * np.outer(unit, unit)).drifted(prior)
+    covariance = _covariance(path, table.correlations, std / prior.std)
+    if (known := table.discrepancy) is None:
+        return FilmEstimate(value, covariance).drifted(prior)
+    size, count = problem.charges.std.size, len(known.coefficients)
+    if len(names) + count != size or len(known.std) != size:
+        raise PressError(f"{path}: discrepancy: expected {size - len(names)} coefficients, got {count}; calibrate anew")
+    joint = _covariance(path, known.correlations, np.array(known.std))
+    return FilmEstimate(value, covariance, np.array(known.coefficients), joint).drifted(prior)
+
+
+def _covariance(path: Path, correlations: list[list[float]], std: Array) -> Array:
+    if [len(row) for row in correlations] != [std.size] * std.size:
+        raise PressError(f"{path}: correlations: expected {std.size} rows of as many numbers")
+    return np.array(correlations) * np.outer(std, std)
 
 
 def _units(prior: FilmPrior) -> Array:

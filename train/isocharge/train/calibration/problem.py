@@ -1,6 +1,6 @@
 """What a calibration is about: the film as it is described, and the network for all films that fits its layout."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -23,6 +23,9 @@ pretension by 0.3 MPa, ageing of the coefficients by 5 %, gains by 1 %; everythi
 REMOUNTED = 0.05
 """See `DRIFT`."""
 
+UNSTEADY = 0.002
+"""Standard deviation by which coefficients of a discrepancy may have changed."""
+
 
 @dataclass(frozen=True)
 class FilmEstimate:
@@ -31,15 +34,33 @@ class FilmEstimate:
     Attributes:
         parameters: As in `FilmPrior`, shape (n_parameter,).
         covariance: Of the parameters over their prior standard deviations, shape (n_parameter, n_parameter).
+        coefficients: Of the discrepancy, shape (n_coefficient,); empty if there is none.
+        joint: Covariance of parameters and coefficients, shape (n_parameter + n_coefficient,) twice; empty if there is
+            no discrepancy.
     """
 
     parameters: Array
     covariance: Array
+    coefficients: Array = field(default_factory=lambda: np.empty(0))
+    joint: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def unknowns(self) -> Array:
+        """Parameters and coefficients, as `FilmCharges.film` takes them."""
+        return np.concatenate([self.parameters, self.coefficients])
+
+    @property
+    def of_unknowns(self) -> Array:
+        """Their covariance."""
+        return self.joint if self.coefficients.size else self.covariance
 
     def drifted(self, prior: FilmPrior) -> "FilmEstimate":
         """What is left of an earlier estimate after the film may have drifted (`DRIFT`)."""
         drift = np.array([DRIFT.get(name.partition(" ")[0], REMOUNTED) for name in prior.names])
-        return FilmEstimate(np.clip(self.parameters, *prior.bounds), self.covariance + np.diag(drift**2))
+        wider, joint = self.covariance + np.diag(drift**2), self.joint
+        if joint.size:
+            joint = joint + np.diag(np.concatenate([drift, np.full(len(joint) - drift.size, UNSTEADY)]) ** 2)
+        return FilmEstimate(np.clip(self.parameters, *prior.bounds), wider, self.coefficients, joint)
 
 
 @dataclass(frozen=True)
@@ -51,7 +72,6 @@ class CalibrationProblem:
         probe: As described.
         films: The network for all films of the layout.
         earlier: An earlier calibration of this film, as `read_earlier` gives it; what the sensor's file says if absent.
-        map_error: Error of the films' charges that is allowed for beside the noise, a share of the charge.
         stress_limit: Largest stress of the film in a press that is proposed, MPa.
 
     Example:
@@ -64,7 +84,6 @@ class CalibrationProblem:
     probe: Circle
     films: FilmsModel
     earlier: FilmEstimate | None = None
-    map_error: float = 0.0
     stress_limit: float = DEFAULT_STRESS_LIMIT
 
     @classmethod
@@ -112,11 +131,10 @@ class CalibrationProblem:
         domain = self.domain.force_range
         return domain[0], force_within_stress(self.sensor.film, self.probe, self.stress_limit, domain)
 
-    @cached_property
+    @property
     def noise(self) -> NoiseModel:
-        """Of the charges, the error of the films' charges included."""
-        noise = self.films.noise
-        return NoiseModel(noise.name, noise.white, float(np.hypot(noise.gain, self.map_error)))
+        """Of the charges."""
+        return self.films.noise
 
     @cached_property
     def before(self) -> FilmEstimate:

@@ -1,6 +1,6 @@
 """A network for all films as it is used: folded to the plain network of one film."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +15,9 @@ from isocharge.train.films.conditional_network import ConditionalWeights, FilmSc
 from isocharge.train.training.fit import Fitted
 from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, answer_units
 from isocharge.train.training.source import Provenance
+
+TAUGHT, COPIES = 1000, 4
+"""Presses by which a last layer is changed, each with noise drawn so often."""
 
 PRESSES, SEED = 1000, 11
 """Fresh presses on which a film's network is judged, and their seed."""
@@ -68,23 +71,39 @@ class FilmsModel:
         self,
         parameters: Array,
         *,
-        widen: tuple[float, float] = (1.0, 1.0),
+        left: tuple[Array, Array] | None = None,
         provenance: Provenance | None = None,
+        factor: Callable[[Array], Array] | None = None,
     ) -> Fitted:
         """The network of one film, as `fit` gives it for one: to predict, to evaluate on fresh presses, to release.
 
         Args:
             parameters: Of the film, as in `FilmPrior`, shape (n_parameter,).
-            widen: Factors on the deviations of position and force, for what is not known of the film.
+            left: Contacts (x, y, F), shape (n, 3), mm and N, and the variances of (x, y, ln F) there by what is not
+                known of the film, shape (n, 3): the deviations are larger by them.
             provenance: For the release, if there is something to say.
+            factor: Contacts (x, y, F), shape (n, 3), mm and N, to factors on the charges, shape (n, n_electrode), if
+                they differ by some percent from those of the parameters: the network's last layer is changed
+                accordingly.
 
         Raises:
             InputError: If there are not as many finite parameters as the prior names.
             SceneError: If the film is outside the family.
         """
-        network, (sensor, probe) = self.fold(parameters).widened(*widen), self.prior.film(parameters)
-        contact = draw_contacts(np.random.default_rng(SEED), self.domain, PRESSES)
-        presses = LabelledPresses(contact, self.forward_map(parameters).charges(contact))
+        network, (sensor, probe) = self.fold(parameters), self.prior.film(parameters)
+        rng, (known, variance) = np.random.default_rng(SEED), left or (np.empty((0, 3)), np.empty((0, 3)))
+        contact = np.concatenate([draw_contacts(rng, self.domain, PRESSES + TAUGHT), known])
+        charge = self.forward_map(parameters).charges(contact)
+        ratio = np.ones_like(charge) if factor is None else factor(contact)
+        presses = LabelledPresses(contact[:PRESSES], (charge * ratio)[:PRESSES])
+        if factor is not None:
+            taught = np.arange(PRESSES, PRESSES + TAUGHT).repeat(COPIES)
+            as_if = self.noise.add(charge[taught], rng)
+            network = network.corrected(as_if * ratio[taught], as_if)
+        if left is not None:
+            taught = np.arange(PRESSES + TAUGHT, len(contact)).repeat(COPIES)
+            noisy = self.noise.add((charge * ratio)[taught], rng)
+            network = network.widened(noisy, variance.repeat(COPIES, axis=0))
         return Fitted(
             network=network,
             sensor=sensor,

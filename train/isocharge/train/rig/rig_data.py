@@ -197,11 +197,11 @@ def _sentences(film: RigFilm, presses: MeasuredPresses, held: Booleans) -> Itera
     correction = film.correction
     low, high = correction.domain.force_range
     if correction.nothing:
-        yield "No correction beyond the film's physics: it would predict presses left out in turn no better."
+        yield "No correction beyond the film's physics: the presses are most probable without."
     else:
         yield (
             f"Beyond the film's physics the charges are corrected by {film.correction_percent(presses.contact):.2g} % "
-            f"(root mean square), by polynomials of degree {correction.degree} in place and logarithm of the force. "
+            "(root mean square), smoothly in place and logarithm of the force. "
             f"Farther than {correction.domain.radius:.3g} mm from the centre, and outside {low:.3g} to {high:.3g} N, "
             "no press was made: the correction stays as at the nearest press."
         )

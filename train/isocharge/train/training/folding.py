@@ -18,6 +18,9 @@ from isocharge.train.training.network import MISFIT_UNIT, InverseNetwork, Percep
 Layer = tuple[Array, Array]
 """Weights (inputs, outputs) and bias."""
 
+RIDGE = 1e-5
+"""Ridge of a last layer that is taught, over the mean square of a feature of size one."""
+
 
 @dataclass(frozen=True)
 class PlainPerceptron:
@@ -74,10 +77,33 @@ class FoldedLayers:
 
     def answers(self, logs: Array) -> Array:
         """Logarithms of the charges (n, n_electrode) to (n, n_answer), in double precision."""
+        return np.asarray(self._features(logs) @ self.last[0] + self.last[1] + logs @ self.skip)
+
+    def _features(self, logs: Array) -> Array:
         value = logs
         for weight, bias in self.hidden:
             value = np.tanh(value @ weight + bias)
-        return np.asarray(value @ self.last[0] + self.last[1] + logs @ self.skip)
+        return value
+
+    def taught(self, logs: Array, answers: Array) -> "FoldedLayers":
+        """The same layers but for the last, which is changed by as little as gives these answers (ridge regression).
+
+        Each answer keeps the features that it was made of.
+
+        Args:
+            logs: Logarithms of charges, shape (n, n_electrode).
+            answers: Shape (n, n_answer).
+        """
+        features, change = self._features(logs), answers - self.answers(logs)
+        design = np.column_stack([features, logs, np.ones(len(logs))])
+        weights = np.vstack([self.last[0], self.skip, self.last[1]])
+        for column in np.flatnonzero(change.any(axis=0)):
+            rows = np.append(weights[: features.shape[1], column] != 0.0, np.ones(logs.shape[1] + 1, dtype=bool))
+            normal = design[:, rows].T @ design[:, rows]
+            normal += RIDGE * len(logs) * np.eye(len(normal))
+            weights[rows, column] += np.linalg.solve(normal, design[:, rows].T @ change[:, column])
+        last, skip, bias = np.split(weights, [features.shape[1], features.shape[1] + logs.shape[1]])
+        return replace(self, last=(last, bias[0]), skip=skip)
 
 
 @dataclass(frozen=True)
@@ -95,19 +121,35 @@ class FoldedNetwork:
     typical: Array
     signed: SignedCharges | None = None
 
+    def _logs(self, charge: Array) -> Array:
+        return bent(charge, self.typical, self.signed)
+
+    def corrected(self, charge: Array, as_if: Array) -> "FoldedNetwork":
+        """The network that answers charges as this one answers others, both (n, n_electrode), pC."""
+        logs = self._logs(charge)
+        answers, before = self.layers.answers(self._logs(as_if)), self.layers.answers(logs)
+        answers[:, 3:6] = before[:, 3:6]  # deviations stay
+        return replace(self, layers=self.layers.taught(logs, answers))
+
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
-        answers = self.layers.answers(bent(charge, self.typical, self.signed))
+        answers = self.layers.answers(self._logs(charge))
         contact = np.concatenate([answers[:, :2], np.exp(answers[:, 2:3])], axis=1)
         length = np.linalg.norm(answers[:, 6:], axis=1, keepdims=True)
         return contact, np.exp(answers[:, 3:6]), MISFIT_UNIT * np.sinh(length)
 
-    def widened(self, position: float, force: float) -> "FoldedNetwork":
-        """The network with larger standard deviations: factors for those of position and force."""
-        weight, bias = self.layers.last
-        added = np.zeros_like(bias)
-        added[3:6] = np.log([position, position, force])
-        return replace(self, layers=replace(self.layers, last=(weight, bias + added)))
+    def widened(self, charge: Array, variance: Array) -> "FoldedNetwork":
+        """The network with larger standard deviations.
+
+        Args:
+            charge: Shape (n, n_electrode), pC.
+            variance: What is added to the variances of (x, y, ln F) at these charges, shape (n, 3).
+        """
+        logs = self._logs(charge)
+        answers = self.layers.answers(logs)
+        relative = answers[:, 3:6] - answers[:, 2:3] * [0.0, 0.0, 1.0]  # of the force: to a deviation of ln F
+        answers[:, 3:6] += 0.5 * np.log1p(variance * np.exp(-2.0 * relative))
+        return replace(self, layers=self.layers.taught(logs, answers))
 
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:

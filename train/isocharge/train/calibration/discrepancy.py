@@ -1,0 +1,165 @@
+"""What a film's parameters leave unexplained of its charges: smooth over the film, as large as the presses say.
+
+No list of parameters has all that a real film has. The rest is a Gaussian process for each electrode (Kennedy and
+O'Hagan 2001), of finite rank: products of Chebyshev polynomials in place and logarithm of the force,
+
+    ln Q_e = ln Q_e(map) + sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= degree, m <= 2,
+
+whose coefficients are independent, with mean zero and the standard deviation s FADING^(i + j + m). The size s is not
+known. Neither is whether the whole session had a common offset of the charges (a bad tare), or charges that drifted.
+Every combination is a hypothesis; the presses weigh them by how well each predicts them (the evidence of a linear
+Gaussian model, MacKay 1992), and what is known is the mixture.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from scipy.linalg import cho_solve
+from scipy.special import logsumexp
+
+from isocharge.common.arrays import Array, Integers
+from isocharge.simulate.forward.charge_map import Domain
+
+DEGREE, FORCE_DEGREE = 4, 2
+"""Largest degree of the polynomials in all, and in ln F."""
+
+FADING = 0.5
+"""Ratio of the standard deviations of terms of successive degrees: what is unexplained is smooth."""
+
+SIZES = {0.0: 0.5, 0.003: 0.1, 0.01: 0.15, 0.03: 0.15, 0.1: 0.1}
+"""Sizes s that are weighed, dimensionless, with what each is believed to beforehand."""
+
+OFFSETS_PC = {0.0: 0.9, 30.0: 0.1}
+"""The same for the standard deviation of a common offset of all charges, pC."""
+
+DRIFTS = {0.0: 0.95, 0.15: 0.05}
+"""The same for the standard deviation of a drift of all charges from the first press to the last, a share."""
+
+
+def terms(contact: Array, domain: Domain) -> Array:
+    """Values of the polynomials with their fading at contacts (x, y, F), shape (n, 3): (n, n_term), dimensionless.
+
+    Beyond the domain they are those of its nearest contact.
+    """
+    unit = domain.to_unit(contact)
+    unit[:, :2] /= np.maximum(np.hypot(unit[:, 0], unit[:, 1]), 1.0)[:, None]
+    unit[:, 2] = np.clip(unit[:, 2], -1.0, 1.0)
+    values = [chebyshev.chebvander(unit[:, axis], DEGREE) for axis in range(3)]
+    of = _degrees()
+    faded = FADING ** of.sum(axis=1)
+    return np.asarray(faded * values[0][:, of[:, 0]] * values[1][:, of[:, 1]] * values[2][:, of[:, 2]])
+
+
+@cache
+def _degrees() -> Integers:
+    """Degrees in x, y and ln F, shape (n_term, 3)."""
+    grid = np.indices((DEGREE + 1, DEGREE + 1, FORCE_DEGREE + 1)).reshape(3, -1).T
+    return np.asarray(grid[grid.sum(axis=1) <= DEGREE])
+
+
+def term_count() -> int:
+    """Number of polynomials of each electrode."""
+    return len(_degrees())
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What a session may have had besides a film of the prior.
+
+    Attributes:
+        size: Of the discrepancy, dimensionless.
+        offset: Standard deviation of a common offset of the charges, pC.
+        drift: Standard deviation of a drift of the charges, a share.
+        belief: Probability before the presses.
+    """
+
+    size: float = 0.0
+    offset: float = 0.0
+    drift: float = 0.0
+    belief: float = 1.0
+
+    def variances(self, n_parameter: int, n_unknown: int) -> Array:
+        """What it adds to the variances of parameters, coefficients, offset and drift, shape (n_unknown,)."""
+        of_coefficients = np.full(n_unknown - n_parameter - 2, self.size**2)
+        return np.concatenate([np.zeros(n_parameter), of_coefficients, [self.offset**2, self.drift**2]])
+
+
+def hypotheses() -> Iterator[Hypothesis]:
+    """All that are weighed."""
+    for (size, a), (offset, b), (drift, c) in product(SIZES.items(), OFFSETS_PC.items(), DRIFTS.items()):
+        yield Hypothesis(size, offset, drift, a * b * c)
+
+
+class Linearised(NamedTuple):
+    """Residuals of presses about a film, linear in the unknowns: |r|^2 = square + 2 moment u + u normal u.
+
+    Attributes:
+        normal: Shape (n_unknown, n_unknown).
+        moment: Shape (n_unknown,).
+        square: At the mean of the unknowns before the presses, u = 0.
+    """
+
+    normal: Array
+    moment: Array
+    square: float
+
+    @classmethod
+    def of(cls, jacobian: Array, residual: Array, at: Array) -> "Linearised":
+        """From a residual and its derivatives at unknowns that differ by `at` from their mean."""
+        at_mean = residual - jacobian @ at
+        return cls(jacobian.T @ jacobian, jacobian.T @ at_mean, float(at_mean @ at_mean))
+
+    def given(self, covariance: Array) -> tuple[float, Array, Array]:
+        """Logarithm of the evidence, mean and covariance of the unknowns, for a covariance before the presses."""
+        active = np.diag(covariance) > 0.0
+        root, wide = np.zeros_like(covariance), np.ix_(active, active)
+        root[wide] = np.linalg.cholesky(covariance[wide])
+        inner = np.eye(len(root)) + root.T @ self.normal @ root
+        factor = np.linalg.cholesky(inner)
+        pull = root.T @ self.moment
+        step = cho_solve((factor, True), pull)
+        evidence = -0.5 * (self.square - pull @ step) - np.log(np.diag(factor)).sum()
+        return float(evidence), -root @ step, root @ cho_solve((factor, True), root.T)
+
+
+class Mixture(NamedTuple):
+    """What is known of the unknowns over all hypotheses.
+
+    Attributes:
+        mean: Over the mean before the presses, shape (n_unknown,).
+        covariance: Shape (n_unknown, n_unknown).
+        weights: Probability of each hypothesis.
+        evidence: Logarithm of the presses' probability density, over that of presses without any residual.
+    """
+
+    mean: Array
+    covariance: Array
+    weights: dict[Hypothesis, float]
+    evidence: float
+
+    @property
+    def best(self) -> Hypothesis:
+        """The most probable hypothesis."""
+        return max(self.weights, key=lambda hypothesis: self.weights[hypothesis])
+
+
+def weigh(
+    linearised: Linearised, before: Callable[[Hypothesis], Array], tried: Iterable[Hypothesis] | None = None
+) -> Mixture:
+    """Weigh hypotheses, all if absent; `before` gives the covariance of the unknowns before the presses by each."""
+    tried = list(tried or hypotheses())
+    answers = [linearised.given(before(each)) for each in tried]
+    logs = np.array([answer[0] + np.log(each.belief) for answer, each in zip(answers, tried, strict=True)])
+    evidence = float(logsumexp(logs))
+    weight = np.exp(logs - evidence)
+    mean = np.einsum("h,hp->p", weight, [answer[1] for answer in answers])
+    covariance = sum(
+        share * (own + np.outer(centre - mean, centre - mean))
+        for share, (_, centre, own) in zip(weight, answers, strict=True)
+    )
+    return Mixture(mean, np.asarray(covariance), dict(zip(tried, weight.tolist(), strict=True)), evidence)
