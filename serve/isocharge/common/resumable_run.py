@@ -13,6 +13,7 @@ import fcntl
 import io
 import json
 import logging
+import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future
@@ -241,7 +242,7 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
     """Hold the draft of this run; create it if necessary."""
     folder = draft.folder
     if fresh and (folder / "run.json").is_file():
-        with _lock(folder):
+        with locked(folder / "lock"):
             draft.remove()
     begins = not folder.exists()
     try:
@@ -249,7 +250,7 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
             with new_folder(folder) as new:
                 (new / "lock").touch()
                 write_whole(new / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
-        with _lock(folder):
+        with locked(folder / "lock"):
             _check_same_run(folder, identity)
             yield
     except KeyboardInterrupt:
@@ -264,16 +265,24 @@ def output_errors(target: Path) -> AbstractContextManager[None]:
 
 
 @contextmanager
-def _lock(folder: Path) -> Iterator[None]:
-    """Keep other processes out; the system lets go if this one is killed."""
-    with (folder / "lock").open("w") as file:
+def locked(path: Path) -> Iterator[None]:
+    """Keep other processes out of a folder, by a file in it or by itself; the system lets go if this one is killed.
+
+    Raises:
+        OutputExists: If another process holds it.
+    """
+    folder = path if path.is_dir() else path.parent
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT)
+    try:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise OutputExists(
                 f"another process is at work in {folder}; wait for it, or choose another output"
             ) from error
         yield
+    finally:
+        os.close(handle)
 
 
 def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:

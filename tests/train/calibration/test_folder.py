@@ -1,6 +1,7 @@
 """The folder of a calibrated film: read back by the predictor, the sensor reader and the next calibration."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from isocharge.common.errors import ModelError, PressError
 from isocharge.serve import Predictor, load_model, read_presses, write_presses
 from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, read_earlier, write_calibration
+from isocharge.train.calibration.folder import calibration_folder, save_session, session_presses
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
 
@@ -116,6 +118,49 @@ def test_the_command_does_it_all(film, tmp_path, command):
     table = json.loads(command(*CALIBRATE, presses, "--json", "--from", folder)[1])
     assert (table["presses"], table["next"]) == (10, [])
     assert Predictor(folder).metadata.electrodes == ("A", "B", "C", "D")
+
+
+def test_only_version_folders_count_and_what_lies_above_is_repaired(film, problem, tmp_path, command):
+    """Killed between the version and the files above it: nothing above, a draft, or the files of an older version."""
+    _, result, folder = film
+    presses, killed = folder.parent / "presses.csv", tmp_path / "mine"
+    shutil.copytree(folder / "1", killed / "1")
+    (killed / ".0a1b2c3d.draft").mkdir()
+    (killed / "calibration.json").write_text("of an older version")
+    assert read_earlier(killed, problem).parameters == pytest.approx(result.posterior.parameters)
+    with calibration_folder(killed, problem):
+        assert (killed / "sensor.toml").read_bytes() == (killed / "1" / "sensor.toml").read_bytes()
+        assert (killed / "calibration.json").read_bytes() == (killed / "1" / "calibration.json").read_bytes()
+        code, _, err = command(*CALIBRATE, presses, "-o", killed)  # another process meanwhile
+        assert (code, "another process is at work" in err) == (1, True)
+    assert not list(killed.glob(".*"))
+    assert command(*CALIBRATE, presses, "-o", killed)[0] == 0
+    assert (killed / "calibration.json").read_bytes() == (killed / "2" / "calibration.json").read_bytes()
+
+
+def test_a_folder_is_checked_before_anything_is_read(film, tmp_path, command):
+    """Presses that are not there are not asked for, if the calibration could not be written."""
+    shutil.copytree(film[-1], tmp_path / "copy")
+    for name, message in (
+        ("my film", "model name 'my film'"),
+        ("copy", "names the model 'mine', its folder is 'copy'"),
+    ):
+        code, _, err = command(*CALIBRATE, tmp_path / "none.csv", "-o", tmp_path / name)
+        assert (code, message in err.replace("\n", " ")) == (2, True)
+
+
+def test_presses_of_a_session_are_of_one_sensor_and_probe(film, problem, tmp_path):
+    folder, presses = tmp_path / "film", film[1].presses
+    with calibration_folder(folder, problem):
+        assert session_presses(folder, problem, fresh=False) is None
+        save_session(folder, presses[:3])
+    assert session_presses(folder, problem, fresh=False) == presses[:3]
+    other = CalibrationProblem.of(problem.sensor, Circle(1.2))
+    with pytest.raises(PressError, match="with another probe"), calibration_folder(folder, other):
+        session_presses(folder, other, fresh=False)
+    with calibration_folder(folder, other):
+        assert session_presses(folder, other, fresh=True) is None
+    assert not folder.exists()
 
 
 def test_presses_are_proposed_before_the_first(command):

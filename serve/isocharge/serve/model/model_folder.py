@@ -255,7 +255,13 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Non
     if not NAME.fullmatch(name):
         raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; rename the folder")
     config, expected = folder / "config.pbtxt", triton_config(name, len(electrodes))
-    if config.exists() and config.read_text(encoding="utf-8") != expected:
+    if config.exists() and (text := config.read_text(encoding="utf-8")) != expected:
+        named = re.match('name: "(.*)"', text)
+        if named and named[1] != name:
+            raise ModelError(
+                f"{config}: names the model {named[1]!r}, its folder is {name!r}: was it copied or renamed? Give it "
+                "its old name, or choose another output"
+            )
         raise ModelError(
             f"{config}: describes a model other than one with the electrodes {electrodes}; use another model name"
         )

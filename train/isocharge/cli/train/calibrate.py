@@ -1,6 +1,7 @@
 """`isocharge train calibrate`: from a few measured presses to a model that is right about one film."""
 
 import json as json_module
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +24,13 @@ from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.json_values import plain_values
 from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, ProposedPress, calibrate, next_presses
-from isocharge.train.calibration.folder import SESSION, read_earlier, result_table, write_calibration
+from isocharge.train.calibration.folder import (
+    SESSION,
+    calibration_folder,
+    read_earlier,
+    result_table,
+    write_calibration,
+)
 
 
 def calibrate_command(
@@ -120,17 +127,18 @@ def calibrate_command(
     if earlier is not None:
         problem = replace(problem, earlier=read_earlier(earlier, problem))
     result = None
-    if port is not None and output is not None:
-        where = PressPort(port, device, baud, yes, press_list, until, fresh, position_std_mm, force_std)
-        result = calibrate_at_port(where, problem, output, json_lines=json)
-    elif file is not None:
-        result = calibrate(read_presses_of(file, problem.electrodes, position_std_mm, force_std), problem)
-    for caution in result.cautions if result else ():
-        say(f"caution: {caution}")
-    if result is not None and output is not None:
-        version = write_calibration(result, output, this_command())
-        (output / SESSION).unlink(missing_ok=True)
-        say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
+    with calibration_folder(output, problem) if output is not None else nullcontext():
+        if port is not None and output is not None:
+            where = PressPort(port, device, baud, yes, press_list, until, fresh, position_std_mm, force_std)
+            result = calibrate_at_port(where, problem, output, json_lines=json)
+        elif file is not None:
+            result = calibrate(read_presses_of(file, problem.electrodes, position_std_mm, force_std), problem)
+        for caution in result.cautions if result else ():
+            say(f"caution: {caution}")
+        if result is not None and output is not None:
+            version = write_calibration(result, output, this_command())
+            (output / SESSION).unlink(missing_ok=True)
+            say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
     known = result.posterior if result else problem.before
     proposed: list[ProposedPress] = []
     if next_count:

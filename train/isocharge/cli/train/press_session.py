@@ -16,9 +16,9 @@ from isocharge.common.errors import InputError, PressError
 from isocharge.common.json_values import plain_values
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress
-from isocharge.serve.prediction.measured_presses import read_press_list, read_presses
+from isocharge.serve.prediction.measured_presses import read_press_list
 from isocharge.train import CalibrationProblem, CalibrationResult
-from isocharge.train.calibration.folder import SESSION, check_calibration_folder, error_table, save_session
+from isocharge.train.calibration.folder import SESSION, error_table, save_session, session_presses
 from isocharge.train.calibration.session import FEWEST_TO_SAY, PressSession
 
 
@@ -57,14 +57,13 @@ def calibrate_at_port(
     Args:
         port: How the presses come.
         problem: The films.
-        folder: Of the calibration; the presses are in it from the first one on.
+        folder: Of the calibration, held by `calibration_folder`; the presses are in it from the first one on.
         json_lines: Whether to print a line of JSON for each press.
 
     Raises:
         PressError: If no film explains the presses; they are on disk.
         IsochargeError: Of port, device file or tare; what was taken is on disk.
     """
-    check_calibration_folder(folder)
     contacts = None if port.press_list is None else read_press_list(port.press_list)
     session = _session(port, problem, folder)
     for number, contact in enumerate(() if contacts is None else contacts, start=1):
@@ -93,12 +92,10 @@ def calibrate_at_port(
 
 def _session(port: PressPort, problem: CalibrationProblem, folder: Path) -> PressSession:
     """A new session, or the one that was stopped."""
-    path, std = folder / SESSION, {"position_std_mm": port.position_std_mm, "force_std": port.force_std}
-    if port.fresh:
-        path.unlink(missing_ok=True)
-    presses = read_presses(path, problem.electrodes, **std) if path.is_file() else None
+    std = {"position_std_mm": port.position_std_mm, "force_std": port.force_std}
+    presses = session_presses(folder, problem, fresh=port.fresh, **std)
     if presses:
-        say(f"going on with {len(presses)} presses of a stopped session, {path}; --fresh begins anew")
+        say(f"going on with {len(presses)} presses of a stopped session, {folder / SESSION}; --fresh begins anew")
     return PressSession(problem, save=partial(save_session, folder), presses=presses, until=port.until, **std)
 
 

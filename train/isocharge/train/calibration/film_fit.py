@@ -58,7 +58,7 @@ MOST_STEPS = 25
 ROUNDS = 3
 """Fits with the most probable hypothesis of the one before, at most."""
 
-MISTAKEN, SURPRISE = 0.02, -3.0
+MISTAKEN, SURPRISE = 0.01, -3.0
 """Chance that a press is written wrongly, and the logarithm of the density of each of its charges then, in units of the
 noise: anything up to twenty times as far off."""
 

@@ -6,15 +6,20 @@
     FOLDER/<version>/calibration.json    parameters, errors, correlations, what cannot be identified
     FOLDER/<version>/presses.csv   the presses
     FOLDER/<version>/calibration.png
-    FOLDER/sensor.toml, calibration.json, card.md, calibration.png    of the last version
-    FOLDER/presses.part.csv        presses of a session that is not over
+    FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the last version's
+    FOLDER/presses.part.csv        presses of a session that is not over; .presses.part.json says on what
 
 A further calibration in the same folder is its next version: a server that watches it takes it with a reload, and
-nothing is lost.
+nothing is lost. Only the version folders count: what lies above them is written anew from the last one, whatever was
+killed when.
 """
 
 import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +28,16 @@ from msgspec import Struct
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, PressError
-from isocharge.common.files import write_whole
+from isocharge.common.files import refusals_explained, remove_empty, write_whole
 from isocharge.common.json_values import plain_values
+from isocharge.common.resumable_run import locked
 from isocharge.common.structs import read_json
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.model_folder import version_folders
-from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text, write_presses
+from isocharge.serve.model.model_folder import check_target, version_folders
+from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text, read_presses, write_presses
 from isocharge.simulate.plots.figure import picture_bytes
 from isocharge.simulate.sensor.film_prior import FilmPrior
-from isocharge.simulate.sensor.sensor_file import sensor_to_toml
+from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
 from isocharge.train.calibration.calibrate import PROBABLE, CalibrationResult
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.film_fit import FilmPosterior
@@ -46,16 +52,83 @@ RESULT, SENSOR, PRESSES, PICTURE, CARD = "calibration.json", "sensor.toml", "pre
 SESSION = "presses.part.csv"
 """Name of the file with the presses of a session that is not over."""
 
+IDENTITY = ".presses.part.json"
+"""Name of the file that says on what these were made."""
+
 FILE_UNITS = {"pretension": 1e6, "shift_x": 1e-3, "shift_y": 1e-3, "probe_radius": 1e-3}
 """Factors to the parameters in calibration.json, which are in Pa and m."""
 
 
-def check_calibration_folder(folder: Path) -> None:
-    """Raise ModelError if a calibration cannot go into this folder, because it holds something else."""
-    if not folder.exists() or (folder / RESULT).is_file():
+def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
+    """Raise ModelError if a calibration cannot go into this folder: for its name, or for what it holds."""
+    versions = version_folders(folder)
+    check_target(folder, max(versions, default=0) + 1, electrodes)
+    if not folder.exists() or any((version / RESULT).is_file() for version in versions.values()):
         return
-    if not folder.is_dir() or {path.name for path in folder.iterdir() if not path.name.startswith(".")} - {SESSION}:
+    if {path.name for path in folder.iterdir() if not path.name.startswith(".")} - {SESSION}:
         raise ModelError(f"{folder}: expected a new folder or one of an earlier calibration; choose another --output")
+
+
+@contextmanager
+def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[None]:
+    """Hold a folder for a calibration, from the first press on, and repair what a kill has left in it.
+
+    Raises:
+        ModelError: As `check_calibration_folder`.
+        OutputExists: If another process calibrates into it.
+        OutputError: If the file system refuses.
+    """
+    check_calibration_folder(folder, problem.electrodes)
+    missing = [folder, *(parent for parent in folder.parents if not parent.exists())]
+    with refusals_explained(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            with locked(folder):
+                for draft in folder.glob(".*.draft"):
+                    shutil.rmtree(draft, ignore_errors=True)
+                    draft.unlink(missing_ok=True)
+                _publish(folder)
+                yield
+        finally:
+            if not (folder / SESSION).exists():
+                (folder / IDENTITY).unlink(missing_ok=True)
+            remove_empty(missing)
+
+
+def _publish(folder: Path) -> None:
+    """Copy the files for people of the last calibration to the top, where they differ."""
+    calibrated = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
+    for version, name in product(calibrated[-1:], (SENSOR, PICTURE, CARD, RESULT)):
+        data = (version / name).read_bytes()
+        if not (folder / name).is_file() or (folder / name).read_bytes() != data:
+            write_whole(folder / name, data)
+
+
+def session_presses(folder: Path, problem: CalibrationProblem, *, fresh: bool, **std: float) -> MeasuredPresses | None:
+    """Presses of a session that was stopped, if there was one; the next are of this sensor and probe.
+
+    Args:
+        folder: Of the calibration.
+        problem: What is calibrated.
+        fresh: Whether to delete them.
+        std: As `read_presses` takes it.
+
+    Raises:
+        PressError: If they were made on another sensor or with another probe.
+    """
+    path, about = folder / SESSION, {"sensor": sensor_to_dict(problem.sensor), "probe": problem.probe.notation}
+    if fresh:
+        path.unlink(missing_ok=True)
+    presses = read_presses(path, problem.electrodes, **std) if path.is_file() else None
+    if presses and (folder / IDENTITY).is_file():  # older versions wrote none
+        of = read_json(folder / IDENTITY, "what the presses of a session were made on", PressError, dict[str, Any])
+        if differing := [key for key, value in about.items() if of.get(key) != json.loads(json.dumps(value))]:
+            raise PressError(
+                f"{path}: the presses of a session with another {' and another '.join(differing)}; go on with the "
+                "same, choose another --output, or begin anew with --fresh, which deletes them"
+            )
+    write_whole(folder / IDENTITY, json.dumps(about).encode())
+    return presses
 
 
 def save_session(folder: Path, presses: MeasuredPresses) -> None:
@@ -82,7 +155,7 @@ def write_calibration(result: CalibrationResult, folder: Path, command: str = ""
         ModelError: If the folder holds something else.
         OutputError: If the file system refuses.
     """
-    check_calibration_folder(folder)
+    check_calibration_folder(folder, result.problem.electrodes)
     files = {
         RESULT: json.dumps(plain_values(result_table(result)), indent=1, allow_nan=False).encode(),
         SENSOR: sensor_to_toml(result.film[0]).encode(),
@@ -96,8 +169,7 @@ def write_calibration(result: CalibrationResult, folder: Path, command: str = ""
         command=command,
         card=lambda about, _: _card(result, about),
     ).folder
-    for name in (SENSOR, PICTURE, CARD, RESULT):
-        write_whole(folder / name, (version / name).read_bytes())
+    _publish(folder)
     return version
 
 
@@ -172,7 +244,8 @@ def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
     Raises:
         PressError: If the folder has no calibration, or one of other parameters.
     """
-    path, prior = folder / RESULT, problem.prior
+    calibrated = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
+    path, prior = [folder, *calibrated][-1] / RESULT, problem.prior
     table = read_json(path, "the calibration.json of `train calibrate`", PressError, _Earlier)
     names = tuple(table.parameters)
     if names != prior.names or table.sensor != prior.sensor.name:
