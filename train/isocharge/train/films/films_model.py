@@ -103,7 +103,7 @@ class FilmsModel:
         if left is not None:
             taught = np.arange(PRESSES + TAUGHT, len(contact)).repeat(COPIES)
             noisy = self.noise.add((charge * ratio)[taught], rng)
-            network = network.widened(noisy, variance.repeat(COPIES, axis=0))
+            network = network.widened_at(noisy, variance.repeat(COPIES, axis=0))
         return Fitted(
             network=network,
             sensor=sensor,

@@ -138,7 +138,14 @@ class FoldedNetwork:
         length = np.linalg.norm(answers[:, 6:], axis=1, keepdims=True)
         return contact, np.exp(answers[:, 3:6]), MISFIT_UNIT * np.sinh(length)
 
-    def widened(self, charge: Array, variance: Array) -> "FoldedNetwork":
+    def widened(self, position: float, force: float) -> "FoldedNetwork":
+        """The network with larger standard deviations: factors for those of position and force."""
+        weight, bias = self.layers.last
+        added = np.zeros_like(bias)
+        added[3:6] = np.log([position, position, force])
+        return replace(self, layers=replace(self.layers, last=(weight, bias + added)))
+
+    def widened_at(self, charge: Array, variance: Array) -> "FoldedNetwork":
         """The network with larger standard deviations.
 
         Args:
