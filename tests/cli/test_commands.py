@@ -157,7 +157,7 @@ def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
     words = ("--sensor", "three-25um-uniaxial", "--config", quick(tmp_path), "--json", "-o", tmp_path / "models" / "u")
     code, out, err = command("train", "fit", *words)
     assert code == 0
-    assert "caution: 2 N under circle:1.0 stress the film to 74 MPa" in err
+    assert "caution: 2 N under circle:1.0 stress the film to 74." in err
     folded = re.search(r"caution: the map from contacts to charges seems to fold about ([0-9.]+) mm", err)
     assert 1.5 < float(folded[1]) < 5.0
     answer = json.loads(out)
