@@ -42,7 +42,7 @@ class HttpServer:
         self._handler, self._address, self._limits = handler, address, handler.limits
         self._tls = tls.context() if tls else None
         self._connections: set[Connection] = set()
-        self._handshakes: set[asyncio.Task[None]] = set()
+        self._handshakes: dict[asyncio.Task[None], None] = {}  # in their order
         self._is_stopped = False
         handler.traffic.open["http"] = lambda: len(self._connections)
         self._socket = address.listen(BACKLOG)
@@ -91,7 +91,7 @@ class HttpServer:
             connection.abort()
 
     async def _accept(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Accept connections; those whose TLS handshake is not done count, too."""
+        """Accept connections; those whose TLS handshake is not done count, too, and the oldest gives its place away."""
         self._socket.setblocking(False)
         while True:
             try:
@@ -100,12 +100,11 @@ class HttpServer:
                 await asyncio.sleep(TICK_SECONDS)
                 continue
             is_full = len(self._connections) + len(self._handshakes) >= self._limits.connections
-            if is_full and self._tls is not None:
-                accepted.close()  # a reason could only be sent after a handshake
-                continue
+            if is_full and self._tls is not None and self._handshakes:
+                next(iter(self._handshakes)).cancel()
             handshake = loop.create_task(self._begin(accepted, loop))
-            self._handshakes.add(handshake)
-            handshake.add_done_callback(self._handshakes.discard)
+            self._handshakes[handshake] = None
+            handshake.add_done_callback(self._handshakes.pop)
 
     async def _begin(self, accepted: socket.socket, loop: asyncio.AbstractEventLoop) -> None:
         """Hand a socket over to its connection, after the TLS handshake if there is one."""
@@ -113,5 +112,5 @@ class HttpServer:
         seconds = self._limits.header_seconds if self._tls else None
         try:
             await loop.connect_accepted_socket(make, accepted, ssl=self._tls, ssl_handshake_timeout=seconds)
-        except OSError:  # ssl.SSLError and TimeoutError are, too: the client did not want to
+        except (OSError, asyncio.CancelledError):  # ssl.SSLError, TimeoutError: the client did not want to, or too long
             accepted.close()
