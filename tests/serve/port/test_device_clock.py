@@ -48,6 +48,15 @@ def test_clock_of_a_device_that_restarts():
     assert np.abs(np.array([time.host_s for time in times]) - arrived_s).max() < 1e-3
 
 
+def test_clock_of_a_device_that_jumps_ahead():
+    """By twelve minutes: the reading is as late as it arrived, and no step is as long."""
+    t_us = np.arange(2000) * 1000
+    t_us[1000:] += 700_000_000
+    clock, times = follow(t_us, START_S + np.arange(2000) * 1e-3)
+    np.testing.assert_allclose(np.diff([time.host_s for time in times]), 1e-3, atol=1e-3)
+    assert (clock.restarts, max(time.step_s for time in times)) == (1, pytest.approx(1e-3))
+
+
 def test_times_never_fall():
     """However late chunks of one to eight readings are; and from a restart of the device on neither."""
     rng, clock, host_s = np.random.default_rng(0), DeviceClock(), []

@@ -44,7 +44,7 @@ class DeviceClock:
 
     Attributes:
         rate: Host seconds per device second.
-        restarts: Times that the device's clock jumped.
+        restarts: Times that the device's clock jumped back, or ahead to what has not come yet.
     """
 
     def __init__(self) -> None:
@@ -76,6 +76,9 @@ class DeviceClock:
             self._last_s = arrived_s
             return ReadingTime(arrived_s, None, step_s)
         step_us = self._unwrap(t_us, modulus)
+        is_later = self._arrived_s not in (None, arrived_s)  # not a chunk of a file
+        if self._fitted_us is not None and is_later and self._predict(self._device_us) - arrived_s > LOST_S:
+            self.restarts, self._fitted_us, step_us = self.restarts + 1, None, 0
         if self._fitted_us is None:
             self._host_s, self._fitted_us, self._is_first = max(arrived_s, self._latest_s), self._device_us, True
         self._latest_s = max(self._latest_s, self._predict(self._device_us))
