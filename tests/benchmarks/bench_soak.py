@@ -50,11 +50,12 @@ def exchanges(predictor: Predictor, path: str, seed: int) -> list[tuple[bytes, b
 
 def _expected(predictor: Predictor, charges: np.ndarray) -> bytes:
     if len(charges) == 1:
-        row = np.empty(7, np.float32)
+        row = np.empty(10, np.float32)
         predictor.predict_into(charges[0], row)
-        return row.tobytes()
-    columns = np.column_stack(predictor.predict_batch(charges))
-    return b"".join(columns[:, part].tobytes() for part in (slice(0, 3), slice(3, 6), slice(6, 7)))
+        columns = row[np.newaxis]
+    else:
+        columns = np.column_stack(predictor.predict_batch(charges))
+    return b"".join(columns[:, part].tobytes() for part in (slice(0, 3), slice(3, 6), slice(7, 10), slice(6, 7)))
 
 
 def numbers_in(body: bytes) -> bytes:

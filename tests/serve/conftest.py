@@ -229,6 +229,9 @@ def contract():
             "y_std_mm",
             "force_std_N",
             "misfit",
+            "xy_correlation",
+            "xF_correlation",
+            "yF_correlation",
         ),
         *("contact", "charge_pC", "charge_raw_pC", "tare_pC", "flags", "latency_us", "model", "frame_id"),
     ]

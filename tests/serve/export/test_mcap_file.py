@@ -36,6 +36,7 @@ from isocharge.serve.export.record_messages import (
     WRENCH_DEFINITION,
     record_schema,
 )
+from isocharge.serve.prediction.contact import NO_CORRELATION
 from isocharge.serve.prediction.record import FIELDS
 
 ELECTRODES = ("A", "B", "C")
@@ -54,10 +55,13 @@ def records(draw):
     """Records as a stream writes them: pressed, at rest, or of a reading that was no number."""
     kind = draw(st.sampled_from(["contact", "rest", "invalid"]))
     contact = dict.fromkeys(("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit"))
+    contact |= dict.fromkeys(NO_CORRELATION)
     if kind == "rest":
         contact["force_N"] = 0.0
     if kind == "contact":
         contact = {name: draw(numbers()) for name in contact}
+        if draw(st.booleans()):
+            contact |= NO_CORRELATION
     charges = st.none() | st.fixed_dictionaries(dict.fromkeys(ELECTRODES, st.none() | numbers()))
     return PredictionRecord(
         timestamp=draw(TIMES),
@@ -146,7 +150,9 @@ def check_messages(topics, lines):
         assert (*vector(turn), turn.w) == (0.0, 0.0, 0.0, 1.0)
         covariance = pose.pose.covariance.reshape(6, 6)
         std = [1e-3 * record["x_std_mm"], 1e-3 * record["y_std_mm"], 5e-3, *[np.pi / np.sqrt(3.0)] * 3]
-        np.testing.assert_allclose(covariance, np.diag(np.square(std)), rtol=1e-14)
+        expected = np.diag(np.square(std))
+        expected[0, 1] = expected[1, 0] = std[0] * std[1] * (record["xy_correlation"] or 0.0)
+        np.testing.assert_allclose(covariance, expected, rtol=1e-14)
 
 
 def check_header(header, time_ns, expected_ns, record):

@@ -38,7 +38,7 @@ def test_csv_takes_any_name(name, record):
 
 def test_csv_has_no_quotes_in_an_ordinary_row(record):
     assert csv_line(record(charge_pC={"A": 1.0, "B": 2.0}), ELECTRODES) == (
-        "1763600000.123457,,,1.234568,,,,,,,true,1.000000,2.000000,,,,,gap,,linear/1,linear-film"
+        "1763600000.123457,,,1.234568,,,,,,,,,,true,1.000000,2.000000,,,,,gap,,linear/1,linear-film"
     )
 
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import ChargeError, ModelError
-from isocharge.serve import Contact, Contacts, Predictor
+from isocharge.serve import Contact, Contacts, Predictor, find_model, load_model
 from isocharge.serve.model.session import BoundPress
 
 PRESSES = st.lists(st.floats(0.0, 5000.0, width=32), min_size=3, max_size=3).filter(lambda q: sum(q) > 1.0)
@@ -39,7 +39,7 @@ def test_predict_gives_back_the_press(film, predictor):
 @settings(derandomize=True)
 @given(PRESSES)
 def test_answers_equal_a_bare_session(bare, predictor, charge_pC):
-    assert predictor.predict(charge_pC) == pytest.approx(bare_answer(bare, charge_pC)[0], rel=1e-6, abs=1e-6)
+    assert predictor.predict(charge_pC)[:7] == pytest.approx(bare_answer(bare, charge_pC)[0], rel=1e-6, abs=1e-6)
 
 
 def test_answers_do_not_change_afterwards(predictor):
@@ -69,8 +69,8 @@ def test_batch_equals_one_by_one(film, predictor):
     charges = film.golden_pC()
     batch = predictor.predict_batch(charges)
     for row, charge_pC in enumerate(charges):
-        assert predictor.predict(charge_pC) == pytest.approx([column[row] for column in batch], rel=1e-6)
-    assert [column.shape for column in predictor.predict_batch(charges[:0])] == [(0,)] * 7
+        assert predictor.predict(charge_pC) == pytest.approx([column[row] for column in batch], rel=1e-6, nan_ok=True)
+    assert [column.shape for column in predictor.predict_batch(charges[:0])] == [(0,)] * 10
 
 
 @pytest.mark.parametrize(
@@ -159,6 +159,7 @@ def test_bound_memory_that_is_not_shared_is_noticed(models, monkeypatch):
 
 def _unshared(press, session, electrodes):  # noqa: ARG001
     press.write, press.run, press.read = lambda *_: None, lambda: None, lambda: (0.0,) * 7
+    press.columns = {"contact": slice(0, 3), "contact_std": slice(3, 6), "misfit": slice(6, 7)}
 
 
 def test_a_predictor_tells_whether_to_trust_a_contact(film, predictor):
@@ -199,13 +200,34 @@ def test_a_contact_is_shown_as_precisely_as_it_is_known(numbers, shown):
     assert repr(Contact(*numbers)) == shown
 
 
-def test_a_contact_stays_seven_numbers_in_their_order():
+def test_the_numbers_of_a_contact_stay_in_their_order():
     """Other programs, exported C code among them, take them by their place."""
     names = ("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit")
-    assert Contact._fields == Contacts._fields == names
-    contact = Contact(*map(float, range(7)))
-    assert tuple(contact) == tuple(map(float, range(7)))
+    assert Contact._fields == Contacts._fields == (*names, "xy_correlation", "xF_correlation", "yF_correlation")
+    contact = Contact(*map(float, range(10)))
+    assert tuple(contact) == tuple(map(float, range(10)))
     assert pickle.loads(pickle.dumps(contact)) == contact
+
+
+def test_a_model_with_correlations_gives_them_behind_the_seven_numbers():
+    """One press as a session gives it by names; a host program's array of seven numbers stays good."""
+    session = load_model(find_model("three-25um-biaxial")).session
+    names = ["contact", "contact_std", "misfit", "contact_correlation"]
+    charges = np.array([[942.9, 910.4, 690.8]], np.float32)
+    expected = np.concatenate(session.run(names, {"charge_pC": charges}), axis=1)[0]
+    touch, ten, seven = Predictor("three-25um-biaxial"), np.zeros(10, np.float32), np.zeros(7, np.float32)
+    touch.predict_into(charges[0], ten)
+    touch.predict_into(charges[0], seven)
+    np.testing.assert_array_equal(ten, expected)
+    np.testing.assert_array_equal(seven, expected[:7])
+    assert touch.predict(charges[0]) == tuple(expected.tolist())
+    assert touch.predict(charges[0]).fields()["xF_correlation"] == expected[8]
+
+
+def test_correlations_that_a_model_does_not_give_are_none_in_a_record(predictor):
+    contact = predictor.predict([100.0, 100.0, 100.0])
+    assert math.isnan(contact.xy_correlation)
+    assert [contact.fields()[name] for name in Contact._fields[7:]] == [None, None, None]
 
 
 def test_a_predictor_is_shown_with_its_domain(predictor):

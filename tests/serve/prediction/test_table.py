@@ -94,10 +94,10 @@ def test_contacts_as_csv_with_flags(film, predictor):
     contacts = predictor.predict_batch(film.charge_pC([1.0, 9.0, 9.0], [0.5, 0.0, 0.0], [1.0, 0.25, 99.0]))
     write_contacts(contacts, out, predictor.validity)
     header, *rows = (line.split(",") for line in out.getvalue().splitlines())
-    assert header == [*Contacts._fields, "flags"]
+    assert header == [*Contacts._fields[:7], "flags"]
     assert [row[-1] for row in rows] == ["", "outside", "outside beyond"]
     assert [float(value) for value in rows[0][:3]] == pytest.approx([1.0, 0.5, 1.0], abs=2e-6)
-    assert [row[:-1] for row in rows] == [[f"{value:.6f}" for value in row] for row in np.column_stack(contacts)]
+    assert [row[:-1] for row in rows] == [[f"{value:.6f}" for value in row] for row in np.column_stack(contacts[:7])]
 
 
 def test_contacts_as_records(film, predictor):
@@ -108,6 +108,7 @@ def test_contacts_as_records(film, predictor):
     assert first["charge_pC"] == pytest.approx(dict(zip("ABC", charges[0], strict=True)), abs=1e-6)
     assert {key for key, value in first.items() if value is None} == {
         "timestamp", "t_device_us", "seq", "charge_raw_pC", "tare_pC", "latency_us",
+        "xy_correlation", "xF_correlation", "yF_correlation",
     }  # fmt: skip
 
 

@@ -6,7 +6,11 @@ void bridge_predict(const float *charge_pC, int count, int times, float *contact
 {
     for (int time = 0; time < times; ++time)
         for (int row = 0; row < count; ++row)
+#if ISOCHARGE_CONTACT_NUMBERS == 10
+            isocharge_predict_all(charge_pC + row * ISOCHARGE_ELECTRODES, contact + 10 * row);
+#else
             isocharge_predict(charge_pC + row * ISOCHARGE_ELECTRODES, contact + 7 * row);
+#endif
 }
 
 void bridge_chain(const double *value, const double *t_s, const double *dt_s, const int *limited, const int *tare,

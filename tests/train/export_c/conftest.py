@@ -33,12 +33,13 @@ class Exported:
 
     library: ctypes.CDLL
     electrodes: int
+    numbers: int
     source: str
 
     def predict(self, charge_pC):
-        """Contacts, shape (n, 7)."""
+        """Contacts, shape (n, 10), or (n, 7) of a model without correlations."""
         charges = np.ascontiguousarray(charge_pC, dtype=np.float32)
-        contacts = np.empty((len(charges), 7), np.float32)
+        contacts = np.empty((len(charges), self.numbers), np.float32)
         self.library.bridge_predict(_of(charges), len(charges), 1, _of(contacts))
         return contacts
 
@@ -95,8 +96,8 @@ def build(tmp_path_factory):
             compiler, folder, folder / "bridge.so", *parts, options=(*options, "-fPIC", "-shared")
         )
         header, source = ((folder / f"isocharge_model.{kind}").read_text() for kind in ("h", "c"))
-        electrodes = int(header.split("ISOCHARGE_ELECTRODES ")[1].split()[0])
-        return Exported(ctypes.CDLL(str(library)), electrodes, source)
+        sizes = (int(header.split(f"ISOCHARGE_{name} ")[1].split()[0]) for name in ("ELECTRODES", "CONTACT_NUMBERS"))
+        return Exported(ctypes.CDLL(str(library)), *sizes, source)
 
     return build
 

@@ -137,7 +137,7 @@ def test_a_tiny_fit_end_to_end(films, tmp_path):
     check_golden(model)
     assert model.metadata.made_with["command"] == "a command"
     assert model.metadata.made_with["config"]["radius_mm"] == 8.0
-    assert len(Predictor(released.folder).predict([100.0, 90.0, 80.0, 70.0])) == 7
+    assert len(Predictor(released.folder).predict([100.0, 90.0, 80.0, 70.0])) == 10
     trained = read_films(released.folder)
     assert evaluate_films(trained, 6, 64).known["position_rms_mm"] < 1.5  # of 4.6 mm by chance
     card = (released.folder / "card.md").read_text()

@@ -11,6 +11,7 @@ import torch
 from isocharge.common.errors import TrainingError
 from isocharge.simulate import noise_model
 from isocharge.train.model_release.export import check_graph, export_onnx
+from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.folding import fold_network
 
 REFERENCE = noise_model("reference")
@@ -37,7 +38,12 @@ def held(trained):
 
 @pytest.fixture(scope="module")
 def graph(trained):
-    return export_onnx(fold_network(trained.network), {"note": "kept"})
+    return export_onnx(turned(trained.network, trained), {"note": "kept"})
+
+
+def turned(network, trained):
+    """The network, folded, with correlations."""
+    return with_correlation(fold_network(network), trained.split.train, REFERENCE, 0)
 
 
 @pytest.fixture(scope="module")
@@ -109,9 +115,9 @@ def test_a_wrong_graph_is_not_released(trained, held, graph, change, exported, m
     network = copy.deepcopy(trained.network)
     with torch.no_grad():
         change(network)
-    exact = fold_network(network)
+    exact = turned(network, trained)
     with pytest.raises(TrainingError, match=message):
-        check_graph(export_onnx(exact, {}) if exported else graph, exact.predict, held, REFERENCE)
+        check_graph(export_onnx(exact, {}) if exported else graph, exact.outputs, held, REFERENCE)
 
 
 def test_the_file_is_plain_onnx_that_another_runtime_computes(held, graph, session):
@@ -123,7 +129,7 @@ def test_the_file_is_plain_onnx_that_another_runtime_computes(held, graph, sessi
     assert {entry.key: entry.value for entry in model.metadata_props} == {"note": "kept"}
     assert {entry.domain for entry in model.opset_import} == {""}
     charge = held.charge[:50].astype(np.float32)
-    reference = ReferenceEvaluator(model).run(None, {"charge_pC": charge})
+    reference = ReferenceEvaluator(model).run(["contact", "contact_std", "misfit"], {"charge_pC": charge})
     contact, std, misfit = answers(session, charge)
     assert max(apart((contact, std), reference[:2])) < CLOSE
     assert np.all(np.abs(misfit - reference[2]) <= CLOSE_MISFIT * np.maximum(misfit, 1.0))

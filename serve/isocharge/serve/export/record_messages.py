@@ -106,10 +106,12 @@ def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
 def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
     """The record as PoseWithCovarianceStamped, m, m^2 and rad^2; None where nothing touches."""
     x, y, x_std, y_std = (record[name] for name in ("x_mm", "y_mm", "x_std_mm", "y_std_mm"))
+    xy_correlation = record.get("xy_correlation") or 0.0  # a record of an earlier version has none
     if None in (x, y, x_std, y_std):
         return None
     covariance = [0.0] * 36  # rows and columns x, y, z, and the rotations about them
     covariance[::7] = (1e-3 * x_std) ** 2, (1e-3 * y_std) ** 2, DEFLECTION_STD**2, *(TURN_VARIANCE,) * 3
+    covariance[1] = covariance[6] = 1e-6 * x_std * y_std * xy_correlation
     pose = (1e-3 * x, 1e-3 * y, 0.0, 0.0, 0.0, 0.0, 1.0)
     return _stamped(record["frame_id"], time_ns, (*pose, *covariance))
 
@@ -144,6 +146,9 @@ NUMBERS = {
     "y_std_mm": "Standard deviation of y, mm.",
     "force_std_N": "Standard deviation of the force, N.",
     "misfit": "Distance from the nearest single contact, in standard deviations.",
+    "xy_correlation": "Correlation of the errors of x and y, -1 to 1; null from a model that gives none.",
+    "xF_correlation": "Correlation of the errors of x and the force.",
+    "yF_correlation": "Correlation of the errors of y and the force.",
     "latency_us": "From the last byte of the reading to this record, us.",
 }
 """Fields that are a number or null, with what they mean."""

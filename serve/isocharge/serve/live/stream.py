@@ -241,7 +241,7 @@ class TouchStream:
         if not reading.contact or reading.charge_pC is None:
             return OUT_OF_CONTACT, flags
         contact = self.predictor.predict(reading.charge_pC)
-        return contact._asdict(), flags + self._validity.flags(contact)
+        return contact.fields(), flags + self._validity.flags(contact)
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
         """Charges by electrode name; None for one that is not a number."""

@@ -1,7 +1,7 @@
 """The model folder: its one writer, its one reader, and the search by name, version or path.
 
     <name>/config.pbtxt            for Triton
-    <name>/<version>/model.onnx    charge_pC -> contact, contact_std, misfit; the metadata is inside
+    <name>/<version>/model.onnx    charge_pC -> contact, its deviations and correlations, misfit; metadata inside
     <name>/<version>/golden.json   charges, answers, tolerances, and the checksum of model.onnx
     <name>/<version>/card.md       for people
 
@@ -27,7 +27,17 @@ from isocharge.common.errors import ModelError, OutputExists
 from isocharge.common.files import new_folder, read_whole, refuse_existing, sha256_of, write_whole
 from isocharge.serve.model.golden import Golden, check_answers, contact_floors, make_golden, read_golden
 from isocharge.serve.model.metadata import NAME, ModelMetadata
-from isocharge.serve.model.session import INPUT, OUTPUTS, as_batch, check_interface, check_rows, open_session, run
+from isocharge.serve.model.session import (
+    CORRELATION,
+    INPUT,
+    OUTPUTS,
+    as_batch,
+    check_interface,
+    check_rows,
+    open_session,
+    outputs_of,
+    run,
+)
 
 VERSION = re.compile("[1-9][0-9]{0,17}")
 """Pattern of version folders: whole numbers of 63 bits."""
@@ -232,7 +242,10 @@ def write_model(
         for name, content in further.items():
             write_whole(draft / name, content)
         _check_draft(draft, metadata)
-    write_whole(folder / "config.pbtxt", triton_config(metadata.name, len(metadata.electrodes)).encode())
+    config, electrodes = folder / "config.pbtxt", len(metadata.electrodes)
+    plain = triton_config(metadata.name, electrodes, correlation=False)
+    every = CORRELATION in outputs_of(session) and not (config.exists() and config.read_text(encoding="utf-8") == plain)
+    write_whole(config, triton_config(metadata.name, electrodes, correlation=every).encode())
     return target
 
 
@@ -254,8 +267,9 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Non
     name = folder.resolve().name
     if not NAME.fullmatch(name):
         raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; rename the folder")
-    config, expected = folder / "config.pbtxt", triton_config(name, len(electrodes))
-    if config.exists() and (text := config.read_text(encoding="utf-8")) != expected:
+    config = folder / "config.pbtxt"
+    expected = [triton_config(name, len(electrodes), correlation=correlation) for correlation in (False, True)]
+    if config.exists() and (text := config.read_text(encoding="utf-8")) not in expected:
         named = re.match('name: "(.*)"', text)
         if named and named[1] != name:
             raise ModelError(
@@ -278,10 +292,14 @@ def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
     check_golden(model)
 
 
-def triton_config(name: str, electrodes: int) -> str:
-    """The text of `config.pbtxt` for a model with this number of electrodes; Triton adds the batch dimension."""
+def triton_config(name: str, electrodes: int, *, correlation: bool = True) -> str:
+    """The text of `config.pbtxt` for a model with this number of electrodes; Triton adds the batch dimension.
+
+    Without `correlation`, which older models do not give, it serves all versions of a model.
+    """
+    outputs = {tensor: width for tensor, width in OUTPUTS.items() if correlation or tensor != CORRELATION}
     head = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
-    return head + _tensors("input", {INPUT: electrodes}) + _tensors("output", OUTPUTS)
+    return head + _tensors("input", {INPUT: electrodes}) + _tensors("output", outputs)
 
 
 def _tensors(kind: str, widths: dict[str, int]) -> str:

@@ -23,8 +23,18 @@ from isocharge.common.errors import ChargeError, ModelError, cut
 INPUT = "charge_pC"
 """Name of the input."""
 
-OUTPUTS = {"contact": 3, "contact_std": 3, "misfit": 1}
-"""Names and widths of the outputs: x_mm, y_mm, force_N; their standard deviations; the misfit."""
+CORRELATION = "contact_correlation"
+"""Name of the output that older models have not."""
+
+OUTPUTS = {"contact": 3, "contact_std": 3, CORRELATION: 3, "misfit": 1}
+"""Names and widths of the outputs: x_mm, y_mm, force_N; their standard deviations; their correlations xy, xF and yF;
+the misfit."""
+
+
+def outputs_of(session: ort.InferenceSession) -> dict[str, int]:
+    """Names and widths of the outputs that a model has, in the order of `OUTPUTS`."""
+    names = {tensor.name for tensor in session.get_outputs()}
+    return {name: width for name, width in OUTPUTS.items() if name in names}
 
 
 def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
@@ -52,12 +62,13 @@ def _options() -> ort.SessionOptions:
     return options
 
 
-def run(session: ort.InferenceSession, charge_pC: Singles, names: Sequence[str] = tuple(OUTPUTS)) -> dict[str, Singles]:
-    """Outputs by name, shape (n, width), from charges of shape (n, electrodes), pC.
+def run(session: ort.InferenceSession, charge_pC: Singles, names: Sequence[str] | None = None) -> dict[str, Singles]:
+    """Outputs by name, all of them by default, shape (n, width), from charges of shape (n, electrodes), pC.
 
     Raises:
         ModelError: If the graph cannot be run on them: it is not the model of these charges.
     """
+    names = tuple(outputs_of(session)) if names is None else names
     try:
         return dict(zip(names, session.run(names, {INPUT: charge_pC}), strict=True))
     except Exception as error:  # onnxruntime's exceptions have no common base of their own
@@ -90,7 +101,8 @@ def check_interface(session: ort.InferenceSession, electrodes: int, where: str) 
         ModelError: If they are not those of a model with this number of electrodes.
     """
     _check_tensors("input", session.get_inputs(), {INPUT: electrodes}, where)
-    _check_tensors("outputs", session.get_outputs(), OUTPUTS, where)
+    known = {name: width for name, width in OUTPUTS.items() if name != CORRELATION}
+    _check_tensors("outputs", session.get_outputs(), known | outputs_of(session), where)
 
 
 def _check_tensors(kind: str, tensors: list[ort.NodeArg], widths: dict[str, int], where: str) -> None:
@@ -115,18 +127,27 @@ def _show(tensors: Mapping[str, tuple[str, object]]) -> str:
 class BoundPress:
     """Input and output memory of one press, bound to a session.
 
-    `write(q1, q2, ...)` puts the charges in, `run()` computes, `read()` gives the seven numbers of a Contact.
+    `write(q1, q2, ...)` puts the charges in, `run()` computes, `read()` gives the numbers of a Contact: ten, or
+    seven from a model without correlations.
+
+    Attributes:
+        size: How many it gives.
+        columns: Where each output lies in the row of these numbers.
     """
 
     def __init__(self, session: ort.InferenceSession, electrodes: int) -> None:
         charges = np.zeros((1, electrodes), dtype=np.float32)
-        answers = np.zeros(sum(OUTPUTS.values()), dtype=np.float32)
+        self.columns = _columns(outputs_of(session))
+        self.size = max(part.stop for part in self.columns.values())
+        answers = np.zeros(self.size, dtype=np.float32)
         # The session sees only addresses: the views in `write` and `read` keep the arrays alive.
-        self.run: Callable[[], None] = partial(session.run_with_iobinding, _bind(session, charges, answers))
+        binding = _bind(session, charges, answers, self.columns)
+        self.run: Callable[[], None] = partial(session.run_with_iobinding, binding)
         self.write = partial(struct.Struct(f"={electrodes}f").pack_into, charges.data.cast("B"), 0)
         self.read = partial(struct.Struct(f"={answers.size}f").unpack, answers.data.cast("B"))
         self._charges: Any = charges[0].data  # Any: typing knows a memoryview as bytes only
         self._answers: Any = answers.data
+        self._first_seven: Any = answers[:SEVEN].data
 
     def run_into(self, charge_pC: Singles, out: Singles) -> None:
         """Compute from an array into an array; the copies through memoryviews check number type and shape at no cost.
@@ -138,17 +159,28 @@ class BoundPress:
         self._charges[:] = charge_pC
         self.run()
         target: Any = out.data
-        target[:] = self._answers
+        target[:] = self._first_seven if len(target) == SEVEN else self._answers
 
 
-def _bind(session: ort.InferenceSession, charges: Singles, answers: Singles) -> ort.IOBinding:
-    """Bind the input (1, electrodes) and the outputs, one after the other in `answers`, by address."""
+SEVEN = 7
+"""Numbers of a Contact without its correlations, which come after them."""
+
+
+def _columns(outputs: Mapping[str, int]) -> dict[str, slice]:
+    """Where outputs lie in the numbers of a Contact: the correlations, if there are any, last."""
+    names, end = sorted(outputs, key=CORRELATION.__eq__), 0
+    return {name: slice(end, end := end + outputs[name]) for name in names}
+
+
+def _bind(
+    session: ort.InferenceSession, charges: Singles, answers: Singles, columns: Mapping[str, slice]
+) -> ort.IOBinding:
+    """Bind the input (1, electrodes) and the outputs, in their columns of `answers`, by address."""
     binding = session.io_binding()
     binding.bind_input(INPUT, "cpu", 0, np.float32, charges.shape, charges.ctypes.data)
-    start = 0
-    for name, width in OUTPUTS.items():
-        binding.bind_output(name, "cpu", 0, np.float32, (1, width), answers[start:].ctypes.data)
-        start += width
+    for name, part in columns.items():
+        width = part.stop - part.start
+        binding.bind_output(name, "cpu", 0, np.float32, (1, width), answers[part].ctypes.data)
     return binding
 
 

@@ -24,7 +24,7 @@ from isocharge.serve.model.model_folder import (
     repositories,
     version_folders,
 )
-from isocharge.serve.model.session import BoundPress
+from isocharge.serve.model.session import BoundPress, outputs_of
 from isocharge.serve.network.traffic import Statistics
 from isocharge.serve.prediction.contact import Validity
 
@@ -48,6 +48,11 @@ class LoadedVersion:
     def misfit_limit(self) -> float:
         """Misfit above which a press has the flag `misfit`, in standard deviations."""
         return Validity.of(self.metadata).misfit_limit
+
+    @cached_property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs that the model has."""
+        return tuple(outputs_of(self.model.session))
 
     def press(self) -> BoundPress:
         """Bound memory for one press; each thread has its own."""

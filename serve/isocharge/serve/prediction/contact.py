@@ -1,6 +1,6 @@
 """What a model says about presses, one or many, and whether to trust it.
 
-A contact is seven numbers in an order that other programs rely on. `Validity` checks contacts against the domain that a
+A contact is ten numbers in an order that other programs rely on. `Validity` checks contacts against the domain that a
 model was trained for: the flags `outside`, `misfit` and `beyond`.
 """
 
@@ -15,6 +15,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Reals, Singles
 from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE
 from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.session import SEVEN
 
 MOST_DECIMALS = 6
 """Decimals that are shown at most: 1 nm and 1 uN."""
@@ -28,6 +29,8 @@ class Contact(NamedTuple):
         force_N: Force, N, positive when pushing.
         x_std_mm, y_std_mm, force_std_N: Standard deviations.
         misfit: Distance of the charges from the nearest single contact the model knows, in standard deviations.
+        xy_correlation, xF_correlation, yF_correlation: Correlations of position and force, -1 to 1; NaN from a model
+            that gives none.
     """
 
     x_mm: float
@@ -37,6 +40,14 @@ class Contact(NamedTuple):
     y_std_mm: float
     force_std_N: float
     misfit: float
+    xy_correlation: float = math.nan
+    xF_correlation: float = math.nan
+    yF_correlation: float = math.nan
+
+    def fields(self) -> dict[str, float | None]:
+        """As fields of a record: correlations that the model does not give are None."""
+        fields = self._asdict()
+        return fields if self.xy_correlation == self.xy_correlation else fields | NO_CORRELATION
 
     def __repr__(self) -> str:
         """Each number with its standard deviation, to two digits of that."""
@@ -51,6 +62,10 @@ class Contact(NamedTuple):
             yield name, f"{value:.{decimals}f}", f"{std:.{decimals}f}"
 
 
+NO_CORRELATION = dict.fromkeys(Contact._fields[SEVEN:])
+"""The fields that a model may not give."""
+
+
 class Contacts(NamedTuple):
     """Contacts of n presses: the fields of `Contact`, each an array of shape (n,), float32."""
 
@@ -61,6 +76,9 @@ class Contacts(NamedTuple):
     y_std_mm: Singles
     force_std_N: Singles
     misfit: Singles
+    xy_correlation: Singles
+    xF_correlation: Singles
+    yF_correlation: Singles
 
 
 MISFIT_LIMIT = 5.0

@@ -1,6 +1,6 @@
 """From charges to contacts in process.
 
-A single press uses buffers that are bound to the session once: to write three numbers, run and read seven back
+A single press uses buffers that are bound to the session once: to write three numbers, run and read the answer back
 allocates no array and is faster than a plain `session.run`. Batches go through `session.run`.
 
 The loop of a host program uses `predict_into` with its two arrays; people use `predict`, which checks and explains.
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError, ModelError, shown
 from isocharge.serve.model.model_folder import Model, find_model, load_model
-from isocharge.serve.model.session import OUTPUTS, BoundPress, as_batch, as_press, run, write_finite
+from isocharge.serve.model.session import SEVEN, BoundPress, as_batch, as_press, run, write_finite
 from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 
 log = logging.getLogger(__name__)
@@ -77,7 +77,7 @@ class Predictor:
             self._press.write(*as_press(charge_pC, self.metadata.electrodes))
         self._press.run()
         contact = Contact(*self._press.read())
-        x_mm, y_mm, force_N, _, _, _, _ = contact
+        x_mm, y_mm, force_N = contact[:3]
         if force_N > self._far_N or x_mm * x_mm + y_mm * y_mm > self._far_mm2:
             self._warn(charge_pC, contact)
         return contact
@@ -96,7 +96,8 @@ class Predictor:
         Args:
             charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. They
                 are not checked: NaN in, NaN out.
-            out: Receives the numbers of a Contact in their order, shape (7,), float32.
+            out: Receives the numbers of a Contact in their order, shape (10,), float32, or the first seven of them,
+                which are all that a model without correlations gives.
 
         Raises:
             ChargeError: If an array is not float32 or of another shape; nothing is written then.
@@ -109,8 +110,9 @@ class Predictor:
             self._press.run_into(charge_pC, out)
         except (AttributeError, NotImplementedError, TypeError, ValueError) as error:
             raise ChargeError(
-                f"expected charges {self.metadata.electrodes} and a writable `out` of the {len(Contact._fields)} "
-                f"numbers of a Contact, both float32 arrays, got {_kind(charge_pC)} and {_kind(out)} ({error})"
+                f"expected charges {self.metadata.electrodes} and a writable `out` of the {self._press.size} numbers "
+                f"of a Contact that the model gives, or of the first {SEVEN}, both float32 arrays, got "
+                f"{_kind(charge_pC)} and {_kind(out)} ({error})"
             ) from error
 
     def predict_batch(self, charge_pC: ArrayLike) -> Contacts:
@@ -122,8 +124,12 @@ class Predictor:
         Raises:
             ChargeError: If the shape is another, or a charge is not finite; its electrode and row are named.
         """
-        outputs = run(self._session, as_batch(charge_pC, self.metadata.electrodes))
-        return Contacts(*np.concatenate([outputs[name] for name in OUTPUTS], axis=1).T)
+        columns = self._press.columns
+        outputs = run(self._session, as_batch(charge_pC, self.metadata.electrodes), tuple(columns))
+        contacts = np.full((len(outputs["misfit"]), len(Contact._fields)), np.nan, np.float32)
+        for name, part in columns.items():
+            contacts[:, part] = outputs[name]
+        return Contacts(*contacts.T)
 
     def __repr__(self) -> str:
         """Model, electrodes and domain."""
@@ -160,7 +166,7 @@ def _check_shared(press: BoundPress, model: Model) -> None:
     charges = model.golden.charge_pC[:1]
     press.write(*charges[0])
     press.run()
-    plain = np.concatenate([rows[0] for rows in run(model.session, charges).values()])
+    plain = np.concatenate([rows[0] for rows in run(model.session, charges, tuple(press.columns)).values()])
     if not np.allclose(press.read(), plain, rtol=1e-4, atol=1e-4):
         raise ModelError(
             f"{model.folder}: onnxruntime {ort.__version__} answers {press.read()} through bound memory and "

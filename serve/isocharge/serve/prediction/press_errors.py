@@ -12,6 +12,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.flags import MISFIT, OUTSIDE
 from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.session import SEVEN
 from isocharge.serve.prediction.contact import MISFIT_LIMIT, Contacts, Validity, inside_polygon
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.serve.prediction.predictor import Predictor
@@ -26,7 +27,7 @@ class PressErrors:
 
     Attributes:
         lines: Line of each press in its file.
-        answer: The numbers of a `Contact`, shape (n, 7); NaN where a charge is unknown.
+        answer: The numbers of a `Contact`, shape (n, 10); NaN where they or a charge are unknown.
         error: Predicted less known x and y, mm, and force, a share of the known one, shape (n, 3); NaN where unknown.
         noise_std: The model's own standard deviations, in the units of `error`, shape (n, 3): noise of the charges.
         rig_std: Those of what is known, in the units of `error`, shape (n, 3).
@@ -63,7 +64,7 @@ class PressErrors:
         error, noise, rig = self.error[press], self.noise_std[press], self.rig_std[press]
         return {
             "line": self.lines[press],
-            **dict(zip(Contacts._fields, self.answer[press].tolist(), strict=True)),
+            **dict(zip(Contacts._fields[:SEVEN], self.answer[press].tolist(), strict=False)),
             "x_error_mm": error[0],
             "y_error_mm": error[1],
             "position_error_mm": self.position_error_mm[press],
@@ -114,7 +115,7 @@ def _answers(predictor: Predictor, charge_pC: Array) -> Array:
 
 def _flags(metadata: ModelMetadata, answer: Array) -> tuple[tuple[str, ...], ...]:
     outside = [OUTSIDE in flags for flags in Validity.of(metadata).batch_flags(Contacts(*answer.astype(np.float32).T))]
-    misfit, whole = answer[:, -1] > misfit_limit(metadata), ~np.isnan(answer[:, 0])
+    misfit, whole = answer[:, SEVEN - 1] > misfit_limit(metadata), ~np.isnan(answer[:, 0])
     return tuple(
         (OUTSIDE,) * (is_outside and is_whole) + (MISFIT,) * is_misfit
         for is_outside, is_misfit, is_whole in zip(outside, misfit.tolist(), whole.tolist(), strict=True)

@@ -41,6 +41,8 @@ class PredictionRecord:
         force_N: Force, N; 0 out of contact.
         x_std_mm, y_std_mm, force_std_N: Standard deviations; None out of contact.
         misfit: Distance from the nearest single contact the model knows, in standard deviations; None out of contact.
+        xy_correlation, xF_correlation, yF_correlation: Correlations of position and force; None out of contact, and
+            from a model that gives none.
         contact: Whether something touches.
         charge_pC: Touch charges, the model's input.
         charge_raw_pC: Charges as the device sent them, after the gain.
@@ -61,6 +63,9 @@ class PredictionRecord:
     y_std_mm: float | None
     force_std_N: float | None
     misfit: float | None
+    xy_correlation: float | None = None
+    xF_correlation: float | None = None
+    yF_correlation: float | None = None
     contact: bool
     charge_pC: Charges | None
     charge_raw_pC: Charges | None

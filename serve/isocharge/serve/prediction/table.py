@@ -19,7 +19,8 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError, InputError, shown
 from isocharge.common.number_text import number_of
-from isocharge.serve.prediction.contact import Contacts, Validity
+from isocharge.serve.model.session import SEVEN
+from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
 
@@ -185,7 +186,7 @@ def read_charges(
 
 
 def write_contacts(contacts: Contacts, out: TextIO, validity: Validity | None = None) -> None:
-    """Write contacts as CSV, a row for each press, columns as in `Contact`, numbers to six decimals.
+    """Write contacts as CSV, a row for each press, columns as in `Contact` up to the misfit, numbers to six decimals.
 
     Args:
         contacts: The contacts.
@@ -193,11 +194,12 @@ def write_contacts(contacts: Contacts, out: TextIO, validity: Validity | None = 
         validity: Where their model may be trusted: adds a column `flags`, words with blanks between.
     """
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(Contacts._fields + ("flags",) * (validity is not None))
+    writer.writerow(Contacts._fields[:SEVEN] + ("flags",) * (validity is not None))
     for block in blocks(np.column_stack(contacts)):
         flags = [] if validity is None else validity.batch_flags(Contacts(*block.T))
         words: list[tuple[str, ...]] = [(" ".join(one),) for one in flags] or [()] * len(block)
-        writer.writerows((*map("{:.6f}".format, row), *flags) for row, flags in zip(block.tolist(), words, strict=True))
+        rows = block[:, :SEVEN].tolist()
+        writer.writerows((*map("{:.6f}".format, row), *flags) for row, flags in zip(rows, words, strict=True))
 
 
 def blocks(rows: Array) -> Iterator[Array]:
@@ -221,7 +223,7 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
                 timestamp=None,
                 t_device_us=None,
                 seq=None,
-                **dict(zip(Contacts._fields, contact, strict=True)),
+                **Contact(*contact).fields(),
                 contact=True,
                 charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
                 charge_raw_pC=None,

@@ -12,10 +12,10 @@ as a binary message of its own.
 A sample is a prediction record of fixed size; many are coalesced to as few as a browser can show:
 
     offset 0   timestamp, unix seconds, f64
-           8   x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_std_N, misfit, latency_us, f32 each
-          40   flags, u32: a bit for each word of `isocharge.serve.flags`, the highest one for contact
-          44   number of records that the sample stands for, u32
-          48   touch charges, pC, f32 for each electrode; zeros up to a multiple of eight bytes
+           8   x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_std_N, misfit, latency_us, xy_correlation, f32 each
+          44   flags, u32: a bit for each word of `isocharge.serve.flags`, the highest one for contact
+          48   number of records that the sample stands for, u32
+          52   touch charges, pC, f32 for each electrode; zeros up to a multiple of eight bytes
 
 All little-endian; what is unknown is NaN.
 
@@ -40,7 +40,17 @@ from isocharge.serve.flags import MEANINGS
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.record import PredictionRecord
 
-NUMBERS = ("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit", "latency_us")
+NUMBERS = (
+    "x_mm",
+    "y_mm",
+    "force_N",
+    "x_std_mm",
+    "y_std_mm",
+    "force_std_N",
+    "misfit",
+    "latency_us",
+    "xy_correlation",
+)
 """Fields of a record that a sample has as numbers."""
 
 FLAG_BITS = {word: 1 << position for position, word in enumerate(MEANINGS)}
@@ -66,7 +76,7 @@ class SampleFormat:
         """Lay the sample out."""
         self.electrodes = electrodes
         count = len(electrodes)
-        padding = -4 * count % 8
+        padding = -4 * (count + 1) % 8
         self._struct = struct.Struct(f"<d{len(NUMBERS)}fII{count}f{padding}x")
         numbers = [(name, "<f4") for name in NUMBERS]
         counts = [("flags", "<u4"), ("records", "<u4")]

@@ -88,7 +88,12 @@ def test_numbers_that_are_not_raw(serve, film, predictor, datatype):
         (
             {"inputs": [tensor([[1.0] * 3])], "outputs": [{"name": "z"}]},
             "INVALID_ARGUMENT",
-            "one of contact, contact_std, misfit",
+            "one of contact, contact_std, contact_correlation, misfit",
+        ),
+        (
+            {"inputs": [tensor([[1.0] * 3])], "outputs": [{"name": "contact_correlation"}]},
+            "INVALID_ARGUMENT",
+            "expected one of contact, contact_std, misfit, got 'contact_correlation', which linear/2 has not",
         ),
         ({"inputs": [tensor([[1.0] * 3], shape=[5000, 3])]}, "RESOURCE_EXHAUSTED", "at most 4096 presses"),
         ({"model_name": "cubic"}, "NOT_FOUND", "'cubic' is not found; serving: linear/1, linear/2"),

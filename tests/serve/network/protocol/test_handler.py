@@ -274,7 +274,11 @@ BAD = {
     "a text": (changed(data="123"), 400, "expected `data`, numbers"),
     "no data": (changed(data=None), 400, "expected `data`, numbers"),
     "id no text": (orjson.dumps(request(PRESS, id=7)), 400, "id: expected a text, got 7"),
-    "other output": (orjson.dumps(request(PRESS, outputs=[{"name": "z"}])), 400, "one of contact, contact_std, misfit"),
+    "other output": (
+        orjson.dumps(request(PRESS, outputs=[{"name": "z"}])),
+        400,
+        "one of contact, contact_std, contact_correl",
+    ),
     "output no object": (orjson.dumps(request(PRESS, outputs=["contact"])), 400, "expected a table, got 'contact'"),
     "output twice": (orjson.dumps(request(PRESS, outputs=[{"name": "misfit"}] * 2)), 400, "each name once"),
     "parameters": (orjson.dumps(request(PRESS, parameters=[])), 400, "parameters: expected a table"),

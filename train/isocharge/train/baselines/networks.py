@@ -110,7 +110,7 @@ class ReleasedModel(GivenMethod):
     def answer(self, charge: Array) -> tuple[Array, Array, Array]:
         """Contact (n, 3), standard deviations (n, 3) and misfit (n, 1)."""
         columns = np.stack(self.predictor.predict_batch(charge), axis=1).astype(float)
-        return columns[:, :3], columns[:, 3:6], columns[:, 6:]
+        return columns[:, :3], columns[:, 3:6], columns[:, 6:7]
 
     def single(self, charge: Array) -> Callable[[], object]:
         """One press, ready to be computed: `Predictor.predict_into`."""

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from isocharge.common.arrays import Singles
 from isocharge.serve import Contact, ModelMetadata
 from isocharge.serve.model.golden import Golden
-from isocharge.serve.model.session import OUTPUTS
+from isocharge.serve.model.session import CORRELATION, SEVEN
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
 from isocharge.train.export_c.network import LOGS, PLANE, Network
 
@@ -142,7 +142,9 @@ def model_header(metadata: ModelMetadata, network: Network) -> str:
         sensor=c_string(metadata.frame_id),
         electrodes=len(metadata.electrodes),
         names=", ".join(map(c_string, metadata.electrodes)),
-        fields=", ".join(f'"{name}"' for name in Contact._fields),
+        fields=", ".join(f'"{name}"' for name in Contact._fields[: _numbers(network)]),
+        numbers=_numbers(network),
+        all=source_text("isocharge_all.h") if len(network.cosines) else "",
         low=_each(network.low),
         high=_each(network.high),
     )
@@ -151,7 +153,7 @@ def model_header(metadata: ModelMetadata, network: Network) -> str:
 def model_source(metadata: ModelMetadata, network: Network) -> str:
     """The text of `isocharge_model.c`."""
     (weights, bias), *behind = network.hidden
-    *blocks, of_last = blocks_of([*(weights for weights, _ in behind), network.last], PLANE + LOGS)
+    *blocks, of_last = blocks_of([*(weights for weights, _ in behind), network.last], network.known)
     as_inputs = _of_differences if network.mean is None else np.asarray
     hidden = [Layer("layer_0", as_inputs(weights), bias, activation="tanh_of")]
     hidden += [
@@ -175,19 +177,36 @@ def model_source(metadata: ModelMetadata, network: Network) -> str:
         calls="\n    ".join(calls),
         electrodes=network.factor.size,
         plane=PLANE,
-        known=PLANE + LOGS,
+        logs=PLANE + LOGS,
+        known=network.known,
         answers=network.last.shape[1],
+        all=_all_source(network) if len(network.cosines) else "",
         misfit_unit=c_float(network.misfit_unit),
     )
 
 
+def _numbers(network: Network) -> int:
+    """Numbers of a Contact that a model gives."""
+    return len(Contact._fields) if len(network.cosines) else SEVEN
+
+
+def _all_source(network: Network) -> str:
+    """The function that gives the correlations, too."""
+    table, (_, answers) = c_array("COSINES", network.cosines), network.last.shape
+    values = {"table": table, "cosines": len(network.cosines), "first": PLANE + LOGS, "answers": answers}
+    return "\n" + source_text("isocharge_all.c", **values)
+
+
 def self_test(golden: Golden) -> str:
     """The text of `self_test.c`: golden vectors, and how far an answer may be from them."""
-    answers = np.concatenate([golden.outputs[name] for name in OUTPUTS], axis=1)
-    floors = np.array([floor for name in OUTPUTS for floor in golden.floors[name]], np.float32)
+    names = sorted(golden.outputs, key=CORRELATION.__eq__)  # the order of a Contact
+    answers = np.concatenate([golden.outputs[name] for name in names], axis=1)
+    floors = np.array([floor for name in names for floor in golden.floors[name]], np.float32)
     return source_text(
         "self_test.c",
         vectors=len(answers),
+        numbers=answers.shape[1],
+        function="isocharge_predict_all" if CORRELATION in names else "isocharge_predict",
         relative=c_float(golden.relative),
         floors=c_array("FLOOR", floors),
         charges=c_array("CHARGE_PC", golden.charge_pC),

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import ModelError, cut
-from isocharge.serve.model.session import INPUT, OUTPUTS
+from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS
 
 OPSET = 17
 """Version of the ONNX operators."""
 
 PLANE, LOGS = 2, 4
-"""Answers of the last layer: x and y; logarithms of force and standard deviations; then comes the misfit vector."""
+"""Answers of the last layer: x and y; logarithms of force and standard deviations; then come the arguments of cosines,
+of which a graph without correlations has none, and the misfit vector."""
 
 CONSTANT = ""
 """Stands for a constant among the inputs of a node."""
@@ -38,6 +39,7 @@ class Network:
         hidden: Weights (inputs, outputs) and bias of the layers that tanh follows.
         last: Weights from the last of them to the answers.
         skip: Weights and bias from the logarithms to the answers.
+        cosines: Weights from the cosines to the correlations, shape (cosines, 3).
         misfit_unit: Factor on the hyperbolic sine of the misfit vector's length.
     """
 
@@ -48,7 +50,13 @@ class Network:
     hidden: tuple[tuple[Singles, Singles], ...]
     last: Singles
     skip: tuple[Singles, Singles]
+    cosines: Singles
     misfit_unit: float
+
+    @property
+    def known(self) -> int:
+        """Answers before the misfit vector."""
+        return PLANE + LOGS + len(self.cosines)
 
 
 def read_network(onnx_model: bytes, where: str) -> Network:
@@ -88,18 +96,27 @@ def read_network(onnx_model: bytes, where: str) -> Network:
         hidden.append((weights, bias))
     [skipped], skip = nodes.take("Gemm", logs, CONSTANT, CONSTANT)
     [answers], [last] = nodes.take("Gemm", value, CONSTANT, skipped)
-    [plane, logarithms, vector], parts = nodes.take("Split", answers, CONSTANT, results=3, axis=1)
+    results = nodes.results()
+    [plane, logarithms, *angles, vector], parts = nodes.take("Split", answers, CONSTANT, results=results, axis=1)
     [exponentials], _ = nodes.take("Exp", logarithms)
     [force, contact_std], powers = nodes.take("Split", exponentials, CONSTANT, results=2, axis=1)
     [contact], _ = nodes.take("Concat", plane, force, axis=1)
+    correlation: list[str] = []
+    cosines: Singles = np.empty((0, 3), np.float32)
+    for arguments in angles:
+        [cosine], _ = nodes.take("Cos", arguments)
+        correlation, [cosines] = nodes.take("MatMul", cosine, CONSTANT)
     [length], _ = nodes.take("ReduceL2", vector, axes=[1], keepdims=1)
     [sinh], _ = nodes.take("Sinh", length)
     [misfit], [unit] = nodes.take("Mul", sinh, CONSTANT)
     n = factor.size
-    found = [contact, contact_std, misfit, *parts[0].tolist(), *powers[0].tolist(), nodes.coming(1)]
-    if found != [*OUTPUTS, PLANE, LOGS, n, 1, LOGS - 1, []]:
-        nodes.refuse(f"expected the outputs {', '.join(OUTPUTS)} from {PLANE}, {LOGS} and {n} answers, got {found}")
-    network = Network(low, high, factor, mean, tuple(hidden), last, (skip[0], skip[1]), unit.item())
+    outputs = [name for name in OUTPUTS if correlation or name != CORRELATION]
+    sizes = [PLANE, LOGS, *([len(cosines)] if correlation else []), n]
+    found = [contact, contact_std, *correlation, misfit, *parts[0].tolist(), *powers[0].tolist(), nodes.coming(1)]
+    if found != [*outputs, *sizes, 1, LOGS - 1, []]:
+        answers_in = " + ".join(map(str, sizes))
+        nodes.refuse(f"expected the outputs {', '.join(outputs)} from {answers_in} answers, got {found}")
+    network = Network(low, high, factor, mean, tuple(hidden), last, (skip[0], skip[1]), cosines, unit.item())
     nodes.check_shapes(network)
     return network
 
@@ -114,6 +131,10 @@ class _Nodes:
     def coming(self, count: int) -> list[str]:
         """Operators of the next nodes."""
         return [node.op_type for node in self._left[:count]]
+
+    def results(self) -> int:
+        """Number of results of the next node: three, or four where there are correlations."""
+        return 4 if self._left and len(self._left[0].output) == 4 else 3
 
     def take(
         self, operator: str, *inputs: str, results: int = 1, **attributes: Any
@@ -134,14 +155,14 @@ class _Nodes:
     def check_shapes(self, network: Network) -> None:
         """The constants must fit each other."""
         n = network.factor.size
-        widths = [n, *(bias.size for _, bias in network.hidden), PLANE + LOGS + n]
+        widths = [n, *(bias.size for _, bias in network.hidden), network.known + n]
         layers = [*network.hidden, (network.last, network.skip[1]), network.skip]
-        expected = [*pairwise(widths), (n, widths[-1])]
-        got = [weights.shape for weights, _ in layers]
+        expected = [*pairwise(widths), (n, widths[-1]), (len(network.cosines), 3)]
+        got = [*(weights.shape for weights, _ in layers), network.cosines.shape]
         bounds = [] if network.mean is None else [network.low, network.high, network.mean]
         if any(values.shape != (n,) for values in bounds):
             self.refuse(f"expected {n} bounds and means, one for each charge, got {[each.shape for each in bounds]}")
-        if got != expected or any(bias.shape != shape[1:] for (_, bias), shape in zip(layers, expected, strict=True)):
+        if got != expected or any(bias.shape != shape[1:] for (_, bias), shape in zip(layers, expected, strict=False)):
             self.refuse(f"expected weights of the shapes {expected} and a bias for each column, got {got}")
 
     def refuse(self, what: str) -> NoReturn:

@@ -12,6 +12,7 @@ from isocharge.simulate import Domain, FilmPrior, ForwardMap, NoiseModel
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.films.conditional_network import ConditionalWeights, FilmScaling
+from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.fit import Fitted
 from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, answer_units
 from isocharge.train.training.source import Provenance
@@ -21,6 +22,9 @@ TAUGHT, COPIES = 1000, 4
 
 PRESSES, SEED = 1000, 11
 """Fresh presses on which a film's network is judged, and their seed."""
+
+HEAD_PRESSES, HEAD_SEED = 5_000, 12
+"""Presses from which the correlations are learned once the film is known, and their seed."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,7 @@ class FilmsModel:
         left: tuple[Array, Array] | None = None,
         provenance: Provenance | None = None,
         factor: Callable[[Array], Array] | None = None,
+        correlation: bool = True,
     ) -> Fitted:
         """The network of one film, as `fit` gives it for one: to predict, to evaluate on fresh presses, to release.
 
@@ -85,6 +90,7 @@ class FilmsModel:
             factor: Contacts (x, y, F), shape (n, 3), mm and N, to factors on the charges, shape (n, n_electrode), if
                 they differ by some percent from those of the parameters: the network's last layer is changed
                 accordingly.
+            correlation: Whether it learns how errors go together; that takes seconds.
 
         Raises:
             InputError: If there are not as many finite parameters as the prior names.
@@ -93,13 +99,18 @@ class FilmsModel:
         network, (sensor, probe) = self.fold(parameters), self.prior.film(parameters)
         rng, (known, variance) = np.random.default_rng(SEED), left or (np.empty((0, 3)), np.empty((0, 3)))
         contact = np.concatenate([draw_contacts(rng, self.domain, PRESSES + TAUGHT), known])
-        charge = self.forward_map(parameters).charges(contact)
+        forward = self.forward_map(parameters)
+        charge = forward.charges(contact)
         ratio = np.ones_like(charge) if factor is None else factor(contact)
         presses = LabelledPresses(contact[:PRESSES], (charge * ratio)[:PRESSES])
         if factor is not None:
             taught = np.arange(PRESSES, PRESSES + TAUGHT).repeat(COPIES)
             as_if = self.noise.add(charge[taught], rng)
             network = network.corrected(as_if * ratio[taught], as_if)
+        if correlation:
+            more = draw_contacts(np.random.default_rng(HEAD_SEED), self.domain, HEAD_PRESSES)
+            clean = forward.charges(more) * (1.0 if factor is None else factor(more))
+            network = with_correlation(network, LabelledPresses(more, clean), self.noise, HEAD_SEED)
         if left is not None:
             taught = np.arange(PRESSES + TAUGHT, len(contact)).repeat(COPIES)
             noisy = self.noise.add((charge * ratio)[taught], rng)

@@ -128,7 +128,7 @@ def films_card(films: FilmsModel, errors: FilmsErrors, about: ModelMetadata, fit
     """The text of `card.md`."""
     (low, high), spread = fitted.domain.force_range, films.prior.spread
     known, unknown, exact = errors.known, errors.unknown, about.errors
-    electrodes = ", ".join(about.electrodes)
+    electrodes, correlated = ", ".join(about.electrodes), ", `contact_correlation` (xy, xF, yF)"
     lines = [f"| {text} | {known[key]:g} {unit} | {unknown[key]:g} {unit} |" for text, key, unit in ROWS]
     lines += [
         f"| coverage of the {level} % intervals | {100 * known[f'coverage_{level}']:.3g} % | "
@@ -146,7 +146,7 @@ It serves before anything is calibrated, and errs as the right column says.
 | | |
 |---|---|
 | input | `charge_pC`, float32 [n, {len(about.electrodes)}], touch charges of {electrodes} in pC |
-| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each), `misfit` |
+| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlated}, `misfit` |
 | working area | within {fitted.domain.radius:g} mm of the centre |
 | forces | {low:g} to {high:g} N |
 | probe | {about.probes[0]} as described |

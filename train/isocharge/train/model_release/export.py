@@ -3,7 +3,7 @@
 The graph is compared with the network that it was made from before anybody gets it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,16 +12,17 @@ import onnx
 import onnxruntime as ort
 from onnx import TensorProto, helper, numpy_helper
 
-from isocharge.common.arrays import Singles
+from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import TrainingError
 from isocharge.serve.model.golden import FLOORS
-from isocharge.serve.model.session import OUTPUTS, open_session, run
+from isocharge.serve.model.session import CORRELATION, OUTPUTS, open_session, run
 from isocharge.serve.prediction.table import LARGEST
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
-from isocharge.train.model_release.evaluate import Predict
-from isocharge.train.training.folding import FoldedLayers, FoldedNetwork
+from isocharge.train.training.folding import COSINES, FoldedLayers, FoldedNetwork
 from isocharge.train.training.network import MISFIT_UNIT
+
+Exact = Callable[[Array], tuple[Array, ...]]
 
 OPSET, IR_VERSION = 17, 8
 """Old enough for runtimes of 2022 on, new enough for every operator used."""
@@ -32,6 +33,7 @@ GOLDEN = 64
 AGREEMENT = {
     "contact": 1e-5,
     "contact_std": 1e-5,
+    CORRELATION: 5e-5,
     "misfit": 2e-4,
 }
 """By output: how far file and network may be apart (float32)."""
@@ -82,7 +84,7 @@ def export_onnx(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
 
     Returns:
         The ONNX file: input `charge_pC` [n, n_electrode]; outputs `contact` [n, 3], `contact_std` [n, 3],
-        `misfit` [n, 1], all float32.
+        `contact_correlation` [n, 3] if the network gives it, `misfit` [n, 1], all float32.
     """
     build, n_electrode = GraphBuilder(), network.typical.size
     if signed := network.signed:
@@ -94,12 +96,17 @@ def export_onnx(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
         within = build.add("Clip", "charge_pC", build.constant(LOWEST_CHARGE), build.constant(HIGHEST_CHARGE))
         logs = build.add("Log", build.add("Mul", within, build.constant(1.0 / network.typical)))
     answers = add_layers(build, logs, network.layers)
-    plane, logs, vector = build.split(answers, ("plane", "logs", "misfit_vector"), (2, 4, n_electrode), axis=1)
+    parts = {"plane": 2, "logs": 4, "angles": network.angles, "misfit_vector": n_electrode}
+    parts = {name: width for name, width in parts.items() if width}
+    plane, logs, *angles, vector = build.split(answers, tuple(parts), tuple(parts.values()), axis=1)
     force, _ = build.split(build.add("Exp", logs), ("force", "contact_std"), (1, 3), axis=1)
     build.add("Concat", plane, force, to="contact", axis=1)
+    for arguments in angles:
+        build.add("MatMul", build.add("Cos", arguments), build.constant(COSINES), to=CORRELATION)
     length = build.add("ReduceL2", vector, axes=[1], keepdims=1)
     build.add("Mul", build.add("Sinh", length), build.constant(MISFIT_UNIT), to="misfit")
-    model = make_model(build, "isocharge", n_electrode, OUTPUTS, producer_name="isocharge")
+    widths = {name: width for name, width in OUTPUTS.items() if angles or name != CORRELATION}
+    model = make_model(build, "isocharge", n_electrode, widths, producer_name="isocharge")
     helper.set_model_props(model, dict(properties))
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())
@@ -129,13 +136,13 @@ def make_model(
 
 
 def check_graph(
-    graph: bytes, exact: Predict, presses: LabelledPresses, noise: Noise, floors: Sequence[float] = FLOORS["contact"]
+    graph: bytes, exact: Exact, presses: LabelledPresses, noise: Noise, floors: Sequence[float] = FLOORS["contact"]
 ) -> Singles:
     """Compare a graph with the network that it was made from.
 
     Args:
         graph: The ONNX file.
-        exact: The network in double precision.
+        exact: The network in double precision: from charges to its outputs in the order of the graph's.
         presses: Presses of the film.
         noise: Noise of good presses.
         floors: Of x and y, mm, and force, N, below which differences count absolutely.
@@ -155,7 +162,7 @@ def check_graph(
     return np.concatenate([good, absurd])
 
 
-def _golden_charges(exact: Predict, presses: LabelledPresses, noise: Noise) -> tuple[Singles, Singles]:
+def _golden_charges(exact: Exact, presses: LabelledPresses, noise: Noise) -> tuple[Singles, Singles]:
     """Charges for the golden vectors: GOLDEN * 3 / 4 of presses, and absurd ones, shape (n, n_electrode).
 
     They are chosen where charges tell the position better than the median: where 0.2 % is a millimetre, the last digit
@@ -186,11 +193,11 @@ def _check_finite(session: ort.InferenceSession, n_electrode: int) -> None:
 
 
 def _compare(
-    session: ort.InferenceSession, exact: Predict, charge: Singles, floors: Sequence[float], slack: float
+    session: ort.InferenceSession, exact: Exact, charge: Singles, floors: Sequence[float], slack: float
 ) -> None:
     """The file must answer as the network does; below `floors` differences of contacts count absolutely."""
     for mine, (name, theirs) in zip(exact(charge.astype(float)), run(session, charge).items(), strict=True):
-        unit, limit = floors if name.startswith("contact") else [1.0], AGREEMENT[name]
+        unit, limit = floors if name in ("contact", "contact_std") else [1.0], AGREEMENT[name]
         apart = np.max(np.abs(mine - theirs) / np.maximum(np.abs(mine), unit), axis=1)
         nearly_all, all_of_them = float(np.quantile(apart, NEARLY_ALL)), float(apart.max())
         if not (nearly_all <= slack * limit and all_of_them <= ABSURD * limit):

@@ -97,6 +97,7 @@ def _interface(metadata: ModelMetadata, fitted: Fitted) -> str:
     electrodes = ", ".join(metadata.electrodes)
     taught = f"\nA small network that learned the answers of `{teacher}`." if teacher else ""
     folded = f" (of {fitted.asked.radius:g} mm asked for: beyond, two contacts give the same charges)"
+    correlated = ", `contact_correlation` (xy, xF, yF)" if fitted.network.angles else ""
     unknown_probe = "; which of them presses is not known to the model" if len(metadata.probes) > 1 else ""
     return f"""# {metadata.name}, version {metadata.version}
 
@@ -105,7 +106,7 @@ Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of o
 | | |
 |---|---|
 | input | `charge_pC`, float32 [n, {len(metadata.electrodes)}], touch charges of {electrodes} in pC |
-| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each), `misfit` |
+| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlated}, `misfit` |
 | working area | within {fitted.domain.radius:g} mm of the centre{folded if fitted.asked != fitted.domain else ""} |
 | forces | {low:g} to {high:g} N |
 | probes | {", ".join(metadata.probes)}{unknown_probe} |
@@ -204,7 +205,7 @@ def release(
         },
     )
     graph = export_onnx(fitted.network, about.to_props())
-    golden = check_graph(graph, fitted.predict, fitted.good, fitted.misfit_noise, contact_floors(about))
+    golden = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, contact_floors(about))
     written = write_model(folder, graph, about, golden, card(about, fitted), fitted.provenance.files)
     return Release(written, about)
 

@@ -29,6 +29,7 @@ from isocharge.train.data.measured_sensor import MeasuredSensor
 from isocharge.train.data.misfit_charges import draw_misfit_examples, misfit_noise
 from isocharge.train.data.presses import LabelledPresses, held_out, split_by_position
 from isocharge.train.training.config import FitConfig, TrainingConfig
+from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.folding import FoldedNetwork, fold_network
 from isocharge.train.training.network import Features, InverseNetwork, Perceptron, as_tensor, compress_length
@@ -108,6 +109,9 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
     settings = (config or FitConfig()).checked()
     trained = train_network(data, settings, run=run)
     split, taught = trained.split, data.teacher
+    with threads_and_seed(settings.training.threads, settings.training.seed):
+        noise = settings.training.noise_model
+        network = with_correlation(fold_network(trained.network), split.train, noise, settings.training.seed)
     made_with = {
         "config": settings.to_dict(),
         "torch": torch.__version__,
@@ -116,7 +120,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
         **data.provenance.made_with,
     }
     return Fitted(
-        network=fold_network(trained.network),
+        network=network,
         sensor=data.sensor,
         probes=data.probes,
         domain=split.domain,

@@ -77,9 +77,10 @@ class FoldedLayers:
 
     def answers(self, logs: Array) -> Array:
         """Logarithms of the charges (n, n_electrode) to (n, n_answer), in double precision."""
-        return np.asarray(self._features(logs) @ self.last[0] + self.last[1] + logs @ self.skip)
+        return np.asarray(self.features(logs) @ self.last[0] + self.last[1] + logs @ self.skip)
 
-    def _features(self, logs: Array) -> Array:
+    def features(self, logs: Array) -> Array:
+        """Logarithms of the charges (n, n_electrode) to what the last hidden layer gives, in double precision."""
         value = logs
         for weight, bias in self.hidden:
             value = np.tanh(value @ weight + bias)
@@ -94,7 +95,7 @@ class FoldedLayers:
             logs: Logarithms of charges, shape (n, n_electrode).
             answers: Shape (n, n_answer).
         """
-        features, change = self._features(logs), answers - self.answers(logs)
+        features, change = self.features(logs), answers - self.answers(logs)
         design = np.column_stack([features, logs, np.ones(len(logs))])
         weights = np.vstack([self.last[0], self.skip, self.last[1]])
         for column in np.flatnonzero(change.any(axis=0)):
@@ -106,13 +107,21 @@ class FoldedLayers:
         return replace(self, last=(last, bias[0]), skip=skip)
 
 
+KNOWN = 6
+"""Answers about the contact: x, y, ln F, and the logarithms of their standard deviations."""
+
+COSINES = np.array([[1, 0, 0, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0, 0], [0, 0, 2, 2, 1, 1, -1, -1]]).T / [1, 1, 4]
+"""From eight cosines to the correlations xy, xF and yF (`training.correlation`)."""
+
+
 @dataclass(frozen=True)
 class FoldedNetwork:
     """A whole model as plain layers: what the exported graph computes, here in double precision.
 
     Attributes:
         layers: From ln(Q / typical) to: x_mm and y_mm (2), ln F (1), logarithms of the standard deviations in mm and N
-            (3), the misfit vector (n_electrode).
+            (3), the arguments of the cosines that make the correlations (8, or 0 without these), the misfit vector
+            (n_electrode).
         typical: Powers of two near the charges' geometric means, shape (n_electrode,), pC; see `Features`.
         signed: What stands for the logarithm if charges may have any sign.
     """
@@ -121,22 +130,35 @@ class FoldedNetwork:
     typical: Array
     signed: SignedCharges | None = None
 
-    def _logs(self, charge: Array) -> Array:
+    def inputs(self, charge: Array) -> Array:
+        """What the layers see of charges, shape (n, n_electrode), pC: their logarithms, or what stands for them."""
         return bent(charge, self.typical, self.signed)
 
     def corrected(self, charge: Array, as_if: Array) -> "FoldedNetwork":
         """The network that answers charges as this one answers others, both (n, n_electrode), pC."""
-        logs = self._logs(charge)
-        answers, before = self.layers.answers(self._logs(as_if)), self.layers.answers(logs)
+        logs = self.inputs(charge)
+        answers, before = self.layers.answers(self.inputs(as_if)), self.layers.answers(logs)
         answers[:, 3:6] = before[:, 3:6]  # deviations stay
         return replace(self, layers=self.layers.taught(logs, answers))
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
-        answers = self.layers.answers(self._logs(charge))
-        contact = np.concatenate([answers[:, :2], np.exp(answers[:, 2:3])], axis=1)
-        length = np.linalg.norm(answers[:, 6:], axis=1, keepdims=True)
-        return contact, np.exp(answers[:, 3:6]), MISFIT_UNIT * np.sinh(length)
+        contact, std, *_, misfit = self.outputs(charge)
+        return contact, std, misfit
+
+    @property
+    def angles(self) -> int:
+        """How many arguments of cosines there are: 8, or 0 without correlations."""
+        return int(self.layers.skip.shape[1]) - KNOWN - self.typical.size
+
+    def outputs(self, charge: Array) -> tuple[Array, ...]:
+        """As `predict`; between deviations and misfit contact_correlation (n, 3), if the network gives it."""
+        answers = self.layers.answers(self.inputs(charge))
+        known, angles, vector = np.split(answers, [KNOWN, KNOWN + self.angles], axis=1)
+        contact = np.concatenate([known[:, :2], np.exp(known[:, 2:3])], axis=1)
+        correlation = (np.cos(angles) @ COSINES,) if self.angles else ()
+        length = np.linalg.norm(vector, axis=1, keepdims=True)
+        return contact, np.exp(known[:, 3:]), *correlation, MISFIT_UNIT * np.sinh(length)
 
     def widened(self, position: float, force: float) -> "FoldedNetwork":
         """The network with larger standard deviations: factors for those of position and force."""
@@ -152,7 +174,7 @@ class FoldedNetwork:
             charge: Shape (n, n_electrode), pC.
             variance: What is added to the variances of (x, y, ln F) at these charges, shape (n, 3).
         """
-        logs = self._logs(charge)
+        logs = self.inputs(charge)
         answers = self.layers.answers(logs)
         relative = answers[:, 3:6] - answers[:, 2:3] * [0.0, 0.0, 1.0]  # of the force: to a deviation of ln F
         answers[:, 3:6] += 0.5 * np.log1p(variance * np.exp(-2.0 * relative))

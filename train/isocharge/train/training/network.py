@@ -96,11 +96,14 @@ def bent(charge: Array, typical: Array, signed: SignedCharges | None) -> Array:
     return np.asarray(np.log(np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE) / typical))
 
 
-def whitening(values: Array) -> tuple[Array, Array]:
-    """Mean and matrix M of values (n, k): (values - mean) @ M has unit covariance along its principal axes."""
+def whitening(values: Array, least: float = 0.0) -> tuple[Array, Array]:
+    """Mean and matrix M of values (n, k): (values - mean) @ M has unit covariance along its principal axes.
+
+    Where the deviation along an axis is less than `least` of the largest, it stays below 1.
+    """
     mean = values.mean(axis=0)
     _, singular, axes = np.linalg.svd(values - mean, full_matrices=False)
-    return mean, axes.T * (np.sqrt(len(values)) / np.maximum(singular, 1e-12))
+    return mean, axes.T * (np.sqrt(len(values)) / np.maximum(singular, max(1e-12, least * singular[0])))
 
 
 class Trainable(nn.Module, ABC):

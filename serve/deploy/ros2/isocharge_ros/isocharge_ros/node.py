@@ -33,6 +33,8 @@ class TouchNode(Node):
             message.pose.pose.position.x, message.pose.pose.position.y = x, y
             variances = (1e-3 * record.x_std_mm) ** 2, (1e-3 * record.y_std_mm) ** 2, DEFLECTION_STD**2
             message.pose.covariance[::7] = [*variances, TURN_VARIANCE, TURN_VARIANCE, TURN_VARIANCE]
+            covariance = 1e-6 * record.x_std_mm * record.y_std_mm * (record.xy_correlation or 0.0)
+            message.pose.covariance[1] = message.pose.covariance[6] = covariance
             self.pose.publish(message)
 
 

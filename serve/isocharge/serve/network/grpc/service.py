@@ -31,6 +31,7 @@ from google.protobuf.message_factory import GetMessageClass
 
 from isocharge.common.errors import ListenError, RequestError, TooMany
 from isocharge.serve.network.address import ServerLimits, Tls
+from isocharge.serve.network.model_store import LoadedVersion
 from isocharge.serve.network.protocol import Handler, describe
 from isocharge.serve.network.protocol.inference import InferAnswer, InferRequest, answer_inference, request_of
 from isocharge.serve.network.protocol.response import client_message, statuses
@@ -58,11 +59,11 @@ CONTENTS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
 """Which field of a tensor's contents has its numbers."""
 
 
-def read_infer(message: Any, electrodes: tuple[str, ...], batch: int) -> InferRequest:
+def read_infer(message: Any, loaded: LoadedVersion, batch: int) -> InferRequest:
     """The request in a ModelInferRequest. Raw numbers are answered with raw numbers, typed ones with typed ones.
 
     Raises:
-        RequestError, ChargeError, TooLarge: If it is not one for a model with these electrodes.
+        RequestError, ChargeError, TooLarge: If it is not one for this model.
     """
     raw = message.raw_input_contents
     if len(raw) > 1:
@@ -73,7 +74,7 @@ def read_infer(message: Any, electrodes: tuple[str, ...], batch: int) -> InferRe
         "outputs": [{"name": output.name, "parameters": _unsupported(output)} for output in message.outputs],
         "parameters": {"binary_data_output": bool(raw)},
     }
-    return request_of(content, raw[0] if raw else b"", electrodes, batch)
+    return request_of(content, raw[0] if raw else b"", loaded, batch)
 
 
 def _input(tensor: Any, raw: Any) -> dict[str, Any]:
@@ -219,7 +220,7 @@ class Service:
 
     def _infer(self, request: Any) -> Any:
         loaded = self._store.get(request.model_name, request.model_version)
-        read = partial(read_infer, request, loaded.metadata.electrodes, self._limits.batch)
+        read = partial(read_infer, request, loaded, self._limits.batch)
         return answer_inference(loaded, read, lambda answer: write_answer(answer, METHODS["ModelInfer"][1]()))
 
     def _infer_in_stream(self, request: Any) -> Any:

@@ -56,7 +56,7 @@ def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:
         "versions": [other.version for other in store.named(metadata.name)],
         "platform": PLATFORM,
         "inputs": [_tensor(name, width) for name, width in widths.items()],
-        "outputs": [_tensor(name, width) for name, width in OUTPUTS.items()],
+        "outputs": [_tensor(name, OUTPUTS[name]) for name in loaded.outputs],
         "properties": metadata.to_props(),
     }
 
@@ -74,7 +74,7 @@ def model_config(loaded: LoadedVersion, limits: ServerLimits) -> dict[str, Any]:
         "version_policy": {"all": {}},
         "max_batch_size": limits.batch,
         "input": [{"name": INPUT, "data_type": "TYPE_FP32", "dims": [len(loaded.metadata.electrodes)]}],
-        "output": [{"name": name, "data_type": "TYPE_FP32", "dims": [width]} for name, width in OUTPUTS.items()],
+        "output": [{"name": name, "data_type": "TYPE_FP32", "dims": [OUTPUTS[name]]} for name in loaded.outputs],
     }
 
 

@@ -174,7 +174,7 @@ class Handler:
         """The answer to an inference, the only one that is compressed: Triton's asyncio client unpacks no other."""
         loaded, headers = self.store.get(request.name, request.version), request.headers
         length = headers.get(b"inference-header-content-length")
-        read = partial(read_infer, request.body, length, loaded.metadata.electrodes, self.limits.batch)
+        read = partial(read_infer, request.body, length, loaded, self.limits.batch)
         body, json_length = answer_inference(loaded, read, write_answer)
         accepted = headers.get(b"accept-encoding")
         body, encoding = compress(body, accepted) if accepted else (body, b"")

@@ -8,7 +8,6 @@ import struct
 import time
 from collections.abc import Callable
 from functools import lru_cache, partial
-from itertools import accumulate
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -18,14 +17,19 @@ from msgspec import Meta, Struct
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import RequestError, TooLarge
 from isocharge.common.structs import convert
-from isocharge.serve.model.session import INPUT, OUTPUTS, as_singles, check_rows, run, run_error, write_finite
+from isocharge.serve.model.session import (
+    CORRELATION,
+    INPUT,
+    as_singles,
+    check_rows,
+    run,
+    run_error,
+    write_finite,
+)
 from isocharge.serve.network.model_store import LoadedVersion
 
 DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
 """Number types of charges, little-endian as the protocol has them."""
-
-EVERY: tuple[str, ...] = tuple(OUTPUTS)
-"""All outputs: what a request gets that names none."""
 
 Unsupported = Annotated[None, Meta(description="nothing, as this server does not support it")]
 
@@ -53,7 +57,7 @@ class InputTensor(Struct, frozen=True):
 class OutputTensor(Struct, frozen=True):
     """An output that is asked for."""
 
-    name: Literal["contact", "contact_std", "misfit"]
+    name: Literal["contact", "contact_std", "contact_correlation", "misfit"]
     parameters: Parameters = Parameters()
 
 
@@ -113,19 +117,19 @@ def read_object(text: bytes) -> dict[str, Any]:
     return content
 
 
-def read_infer(body: bytes, header_length: bytes | None, electrodes: tuple[str, ...], batch: int) -> InferRequest:
+def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, batch: int) -> InferRequest:
     """The request in a body.
 
     Args:
         body: The body, not compressed.
         header_length: Value of Inference-Header-Content-Length, None without binary data.
-        electrodes, batch: As in `request_of`.
+        loaded, batch: As in `request_of`.
 
     Raises:
         RequestError, ChargeError, TooLarge: As `request_of`.
     """
     if header_length is None:
-        return request_of(read_object(body), b"", electrodes, batch)
+        return request_of(read_object(body), b"", loaded, batch)
     # isdigit first: int() accepts signs, blanks and underscores, and takes long for a long text.
     if not header_length.isdigit() or len(header_length) > 12 or int(header_length) > len(body):
         raise RequestError(
@@ -133,35 +137,38 @@ def read_infer(body: bytes, header_length: bytes | None, electrodes: tuple[str, 
             f"got {header_length.decode('latin-1')!r:.50}"
         )
     end = int(header_length)
-    return request_of(read_object(body[:end]), memoryview(body)[end:], electrodes, batch)
+    return request_of(read_object(body[:end]), memoryview(body)[end:], loaded, batch)
 
 
-def request_of(
-    content: dict[str, Any], binary: bytes | memoryview, electrodes: tuple[str, ...], batch: int
-) -> InferRequest:
+def request_of(content: dict[str, Any], binary: bytes | memoryview, loaded: LoadedVersion, batch: int) -> InferRequest:
     """The request that a JSON object makes.
 
     Args:
         content: The object as it came.
         binary: The bytes after the JSON; the numbers of the input, if it announces them.
-        electrodes: Names of the model's electrodes.
+        loaded: The model; a request that names no outputs gets all that it has.
         batch: Presses that one request may have.
 
     Raises:
-        RequestError: If it is not one for a model with these electrodes.
+        RequestError: If it is not one for this model.
         ChargeError: If a charge is not finite.
         TooLarge: If there are more presses than `batch`.
     """
     body = convert(content, InferBody, "", RequestError)
-    by_default, names = body.parameters.binary_data_output, EVERY
-    in_binary = frozenset(EVERY if by_default else ())
+    by_default, names = body.parameters.binary_data_output, loaded.outputs
+    in_binary = frozenset(names if by_default else ())
     if body.outputs:
         wanted = {output.name: output.parameters.binary_data for output in body.outputs}
         if len(wanted) < len(body.outputs):
             raise RequestError("outputs: expected each name once")
+        if CORRELATION in wanted and CORRELATION not in names:
+            label = loaded.metadata.label
+            raise RequestError(
+                f"outputs: expected one of {', '.join(names)}, got {CORRELATION!r}, which {label} has not"
+            )
         names = tuple(wanted)
         in_binary = frozenset(name for name, flag in wanted.items() if (by_default if flag is None else flag))
-    return InferRequest(body.id, _charges(body.inputs[0], binary, electrodes, batch), names, in_binary)
+    return InferRequest(body.id, _charges(body.inputs[0], binary, loaded.metadata.electrodes, batch), names, in_binary)
 
 
 def _charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[str, ...], batch: int) -> Singles:
@@ -248,11 +255,6 @@ def _tensor(name: str, rows: Singles, in_binary: bool) -> dict[str, Any]:
 
 Written = TypeVar("Written")
 
-_ENDS = tuple(accumulate(OUTPUTS.values()))
-
-COLUMNS = {name: slice(end - OUTPUTS[name], end) for name, end in zip(OUTPUTS, _ENDS, strict=True)}
-"""Where each output lies in the row of numbers that is bound for one press."""
-
 
 def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> tuple[dict[str, Singles], int, int]:
     """Run the model; may be called from any thread.
@@ -265,9 +267,9 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
         ModelError: If its graph fails.
     """
     if len(charge_pC) == 1:
-        row = _one_press(loaded, charge_pC[0])
-        misfit = row[:, COLUMNS["misfit"]]
-        return {name: row[:, COLUMNS[name]] for name in names}, 0, int(not misfit.item() <= loaded.misfit_limit)
+        row, columns = _one_press(loaded, charge_pC[0])
+        misfit = row[:, columns["misfit"]]
+        return {name: row[:, columns[name]] for name in names}, 0, int(not misfit.item() <= loaded.misfit_limit)
     outputs = run(loaded.model.session, charge_pC, names)
     check_rows(outputs, len(charge_pC), loaded.metadata.label)
     if "misfit" not in outputs:
@@ -275,14 +277,15 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
     return outputs, 0, len(charge_pC) - int(np.count_nonzero(outputs["misfit"] <= loaded.misfit_limit))
 
 
-def _one_press(loaded: LoadedVersion, charge_pC: Singles) -> Singles:
-    """All outputs in a row, shape (1, 7), from bound memory, which is faster than a plain run."""
-    row = np.empty((1, _ENDS[-1]), np.float32)
+def _one_press(loaded: LoadedVersion, charge_pC: Singles) -> tuple[Singles, dict[str, slice]]:
+    """All outputs in a row, shape (1, n), and where they lie; from bound memory, which is faster than a plain run."""
+    press = loaded.press()
+    row = np.empty((1, press.size), np.float32)
     try:
-        loaded.press().run_into(charge_pC, row[0])
+        press.run_into(charge_pC, row[0])
     except Exception as error:  # onnxruntime's exceptions have no common base of their own
         raise run_error(error) from error
-    return row
+    return row, press.columns
 
 
 def answer_inference(

@@ -121,8 +121,9 @@ export class Plan {
   }
 
   drawEllipse(g, x, y, sample, scale, colour, width) {
+    const { long, short, angle } = axes(sample);
     g.strokeStyle = colour; g.lineWidth = width; g.beginPath();
-    g.ellipse(x, y, SIGMAS_95 * sample.xStd * scale, SIGMAS_95 * sample.yStd * scale, 0, 0, 2 * Math.PI); g.stroke();
+    g.ellipse(x, y, SIGMAS_95 * long * scale, SIGMAS_95 * short * scale, angle, 0, 2 * Math.PI); g.stroke();
   }
 
   /** The millimetre around the touch, enlarged, with the ellipse in which it lies 95 times of 100. */
@@ -163,6 +164,13 @@ export class Plan {
     g.font = `${weight} ${size / this.pixel}px system-ui, sans-serif`; g.fillStyle = colour; g.textAlign = align; g.textBaseline = "middle";
     g.fillText(words, 0, 0); g.restore();
   }
+}
+
+/** Standard deviations along the axes of the ellipse of a covariance, and the angle of the long one from x, rad. */
+export function axes({ xStd, yStd, correlation }) {
+  const xx = xStd ** 2, yy = yStd ** 2, xy = (correlation ?? 0) * xStd * yStd;
+  const half = Math.hypot((xx - yy) / 2, xy), middle = (xx + yy) / 2;
+  return { long: Math.sqrt(middle + half), short: Math.sqrt(Math.max(middle - half, 0)), angle: Math.atan2(2 * xy, xx - yy) / 2 };
 }
 
 function mean(points, axis) { return points.reduce((sum, point) => sum + point[axis], 0) / points.length; }

@@ -35,17 +35,33 @@ static float clip(float x, float low, float high)
 
 $features
 $layers
-void isocharge_predict(const float charge_pC[ISOCHARGE_ELECTRODES], float contact[7])
+/* What the last layer gives, still without the functions of `contact_of`. */
+static void answers_of(const float charge_pC[ISOCHARGE_ELECTRODES], float answers[$answers])
 {
-    float logs[$electrodes], $rows, skipped[$answers], answers[$answers], length = 0.0f;
+    float logs[$electrodes], $rows, skipped[$answers];
 
     features(charge_pC, logs);
     $calls
+}
+
+static void contact_of(const float answers[$answers], float contact[7])
+{
+    float length = 0.0f;
+
     for (int i = 0; i < $plane; ++i)
         contact[i] = answers[i];
-    for (int i = $plane; i < $known; ++i)
+    for (int i = $plane; i < $logs; ++i)
         contact[i] = expf(answers[i]);
     for (int i = $known; i < $answers; ++i)
         length += answers[i] * answers[i];
-    contact[$known] = sinhf(sqrtf(length)) * $misfit_unit;
+    contact[$logs] = sinhf(sqrtf(length)) * $misfit_unit;
 }
+
+void isocharge_predict(const float charge_pC[ISOCHARGE_ELECTRODES], float contact[7])
+{
+    float answers[$answers];
+
+    answers_of(charge_pC, answers);
+    contact_of(answers, contact);
+}
+$all

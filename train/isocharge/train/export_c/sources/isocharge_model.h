@@ -11,6 +11,7 @@ extern "C" {
 #define ISOCHARGE_ELECTRODES $electrodes
 #define ISOCHARGE_ELECTRODE_NAMES {$names}
 #define ISOCHARGE_CONTACT_FIELDS {$fields}
+#define ISOCHARGE_CONTACT_NUMBERS $numbers
 
 /* The contact of one press. It needs no memory but its stack, and may run on several threads at once.
 
@@ -19,7 +20,7 @@ extern "C" {
    contact    x_mm, y_mm, force_N, their standard deviations x_std_mm, y_std_mm, force_std_N, and the misfit: distance
               of the charges from the nearest single contact that the model knows, in standard deviations. */
 void isocharge_predict(const float charge_pC[ISOCHARGE_ELECTRODES], float contact[7]);
-
+$all
 #ifdef __cplusplus
 }
 #endif

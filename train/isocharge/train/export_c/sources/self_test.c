@@ -14,13 +14,13 @@ $contacts
 int main(void)
 {
     static const char *const field[] = ISOCHARGE_CONTACT_FIELDS;
-    float contact[7], worst = 0.0f;
+    float contact[$numbers], worst = 0.0f;
     int row, column, wrong = 0;
 
     for (row = 0; row < VECTORS; ++row) {
-        isocharge_predict(CHARGE_PC + row * ISOCHARGE_ELECTRODES, contact);
-        for (column = 0; column < 7; ++column) {
-            const float expected = CONTACT[row * 7 + column];
+        $function(CHARGE_PC + row * ISOCHARGE_ELECTRODES, contact);
+        for (column = 0; column < $numbers; ++column) {
+            const float expected = CONTACT[row * $numbers + column];
             const float apart = fabsf(contact[column] - expected) / fmaxf(fabsf(expected), FLOOR[column]);
 
             if (!(apart <= RELATIVE)) {
