@@ -20,6 +20,7 @@ from isocharge.common.extras import require
         ("grpc", "uvloop"),
         ("record", "mcap.writer"),
         ("record", "zstandard"),
+        ("parquet", "pyarrow.parquet"),
     ],
 )
 def test_missing_package_of_an_extra(extra, module):

@@ -15,6 +15,7 @@ PACKAGES = {
     "cluster": frozenset({"dask", "distributed"}),
     "design": SIMULATE | {"ezdxf"},
     "record": frozenset({"mcap", "lz4", "zstandard"}),
+    "parquet": frozenset({"pyarrow"}),
 }
 """Import names that come with an extra of pyproject.toml."""
 

@@ -3,9 +3,11 @@
 import csv
 
 import numpy as np
+import pyarrow
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from pyarrow.parquet import read_table, write_table
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, read_presses, write_presses
@@ -62,6 +64,29 @@ def test_without_names_all_other_columns_are_electrodes(read, tmp_path):
     with pytest.raises(PressError, match=r"electrodes \('A', 'B'\) of mine, got \('A', 'C'\); missing: 'B'"):
         presses.of_electrodes(("A", "B"), "mine")
     assert read("day,x_mm,y_mm,note,A,B,C\n1,2,3,a,4,5,6\n").ignored == ("day", "note")
+
+
+def test_parquet_of_another_program_is_read_as_csv_is(tmp_path):
+    """pyarrow's own writer: whole numbers, null, NaN, a column of text."""
+    table = {"x_mm": [1, 2, None], "y_mm": [3, 4, None], "force_N": [0.5, 1.0, 2.0], "A": [100.5, np.nan, 3.0]}
+    table |= {"B": [-1, 2, 3], "C": [1.0, 2.0, 3.0], "note": ["a\n,b", "", None]}
+    write_table(pyarrow.table(table), tmp_path / "p.parquet")
+    rows = ["x_mm,y_mm,force_N,A,B,C", "1,3,0.5,100.5,-1,1", "2,4,1,,2,2", ",,2,3,3,3"]
+    (tmp_path / "p.csv").write_text("\n".join(rows))
+    presses = read_presses(tmp_path / "p.parquet", NAMES)
+    assert presses == read_presses(tmp_path / "p.csv", NAMES)
+    assert presses.ignored == ("note",)
+    write_presses(tmp_path / "again.parquet", presses)
+    assert read_presses(tmp_path / "again.parquet") == presses
+    assert read_table(tmp_path / "again.parquet")["A"].to_pylist() == [100.5, None, 3.0]
+
+
+@pytest.mark.parametrize(("content", "said"), [(None, "cannot be read"), (b"x_mm,y_mm\n1,2\n", "not a Parquet file")])
+def test_parquet_that_is_none(content, said, tmp_path):
+    if content:
+        (tmp_path / "p.parquet").write_bytes(content)
+    with pytest.raises(PressError, match=said):
+        read_presses(tmp_path / "p.parquet", NAMES)
 
 
 def test_a_list_of_presses_for_a_machine(tmp_path):

@@ -14,6 +14,7 @@ from isocharge.cli.shared.terminal import say, until_stopped
 from isocharge.common.errors import InputError
 from isocharge.common.files import bounded_lines
 from isocharge.serve import Predictor, read_charges, table_records, write_contacts
+from isocharge.serve.prediction.parquet import SUFFIX, parquet_lines
 
 
 def predict_command(
@@ -22,8 +23,8 @@ def predict_command(
         str,
         typer.Argument(
             metavar="FILE.csv",
-            help="CSV file with the electrodes' names in the header and a press in each row, charges in pC; further "
-            "columns are ignored. - reads stdin.",
+            help="CSV or Parquet file with the electrodes' names in the header and a press in each row, charges in pC; "
+            "further columns are ignored. - reads CSV from stdin.",
         ),
     ],
     json: Annotated[
@@ -51,6 +52,9 @@ def predict_command(
 
 def _lines(file: str) -> Iterator[str]:
     """Lines of a file, or of stdin for `-`, for the csv module, without a byte order mark."""
+    if file.endswith(SUFFIX):
+        yield from parquet_lines(Path(file))
+        return
     try:
         with nullcontext(sys.stdin.buffer) if file == "-" else Path(file).open("rb") as data:
             text = TextIOWrapper(data, encoding="utf-8-sig", newline="")

@@ -2,7 +2,8 @@
 
 The header has `x_mm, y_mm, force_N` and the electrodes' names (pC), in any order. An empty cell is unknown. Optional
 columns `position_std_mm` and `force_std` (a share: 0.01 is 1 %) say how well the rig knows place and force. Further
-columns are ignored where the electrodes are named. The file `isocharge serve predict` reads it too.
+columns are ignored where the electrodes are named. `isocharge serve predict` reads the file too. Parquet with the same
+columns will do as well.
 """
 
 import csv
@@ -18,6 +19,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError, shown
 from isocharge.common.files import bounded_lines, write_whole
+from isocharge.serve.prediction.parquet import SUFFIX, parquet_bytes, parquet_lines
 from isocharge.serve.prediction.table import CHARGE, LARGEST, CsvNumbers
 
 POSITION_STD_MM = 0.1
@@ -147,7 +149,7 @@ def read_presses(
     """Read a file of measured presses.
 
     Args:
-        path: CSV in UTF-8, with or without byte order mark.
+        path: CSV in UTF-8, with or without byte order mark; or Parquet, if its name ends in `.parquet`.
         electrodes: Names of the electrodes, in the order in which the charges are wanted; all columns without another
             meaning if absent.
         position_std_mm: Standard deviation of x and of y where the file has none, mm.
@@ -205,8 +207,13 @@ def read_press_list(path: Path) -> Array:
 
 
 def write_presses(path: Path, presses: MeasuredPresses) -> None:
-    """Write presses as `read_presses` reads them, to the last bit; the file appears whole and replaces an older one."""
-    write_whole(path, presses_text(presses).encode())
+    """Write presses as `read_presses` reads them, to the last bit; the file appears whole and replaces an older one.
+
+    Its name decides: Parquet if it ends in `.parquet`, else CSV.
+    """
+    names = (*CONTACT, *presses.electrodes, *UNCERTAINTY)
+    columns = dict(zip(names, presses._columns().T, strict=True))
+    write_whole(path, parquet_bytes(columns) if path.suffix == SUFFIX else presses_text(presses).encode())
 
 
 def presses_text(presses: MeasuredPresses) -> str:
@@ -234,9 +241,13 @@ def _check_electrodes(electrodes: tuple[str, ...]) -> None:
 @contextmanager
 def _open_table(path: Path, names: Sequence[str], expected: str) -> Iterator[CsvNumbers]:
     """The table of an open file; `names` have a meaning, and `expected` are those that the header should have."""
+    header = f"a header with {expected}"
+    if Path(path).suffix == SUFFIX:
+        yield CsvNumbers(parquet_lines(Path(path)), names, str(path), PressError, header)
+        return
     try:
         with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            yield CsvNumbers(bounded_lines(file), names, str(path), PressError, f"a header with {expected}")
+            yield CsvNumbers(bounded_lines(file), names, str(path), PressError, header)
     except OSError as error:
         raise PressError(f"{path}: cannot be read ({error.strerror}); expected a CSV file of presses") from error
 
