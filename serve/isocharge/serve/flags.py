@@ -13,6 +13,7 @@ BLIND = "blind"
 RECONNECTED = "reconnected"
 NEGATIVE = "negative"
 INVALID = "invalid"
+STRESS = "stress"
 
 MEANINGS = {
     TARE: "no tare yet, so no contact either",
@@ -28,5 +29,6 @@ MEANINGS = {
     BLIND: "temperature is inseparable from force at this position: nothing was subtracted",
     RECONNECTED: "the first frame after the port was away; the film is tared again",
     INVALID: "the device sent a charge that is not a number; nothing was computed",
+    STRESS: "the press stresses the film beyond 45 MPa, where PVDF yields: a dent stays",
 }
 """Every word, and what it says."""

@@ -1,12 +1,13 @@
 """Stress under the hardest press, and the force that keeps it below a limit."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate import Circle, load_sensor
+from isocharge.simulate import Circle, load_sensor, press
 from isocharge.simulate.solver.stress_limit import force_within_stress, largest_stress, stress_caution
 
 FILM, TIP = load_sensor("four-25um-biaxial").film, Circle(1.0)
@@ -31,6 +32,16 @@ def test_a_tip_of_1_mm_makes_pvdf_yield(force, stress):
     assert largest_stress(FILM, TIP, force) == pytest.approx(stress, rel=0.05)
     assert f"{force:g} N under circle:1.0 stress the film to {stress:.0f}" in stress_caution(FILM, TIP, force)
     assert not stress_caution(FILM, TIP, force, 80.0)
+
+
+def test_a_press_shows_its_stress():
+    hard, soft = (repr(press(FILM, TIP, (3.0, -2.0), force)) for force in (1.0, 0.5))
+    assert re.fullmatch(
+        r"Equilibrium\(1 N under circle:1.0 at \(3, -2\) mm: converged, deflection 2\.8\d* mm, "
+        r"stress up to 4[89]\.?\d* MPa, beyond 45 MPa: PVDF yields\)",
+        hard,
+    )
+    assert re.search(r"stress up to 3[23]\.?\d* MPa\)$", soft)
 
 
 def test_force_within_a_stress():

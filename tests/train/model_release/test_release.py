@@ -12,8 +12,9 @@ from scipy.stats import chi2, halfnorm
 from isocharge.common.errors import DatasetError, ModelError, OutputExists
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.model.model_folder import model_names
-from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor, noise_model
+from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor, noise_model, press
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
+from isocharge.simulate.solver.equilibrium import principal_stress
 from isocharge.train import (
     FitConfig,
     LabelledPresses,
@@ -103,6 +104,8 @@ def test_the_folder_is_complete_and_says_what_it_holds(released, dataset, sensor
     assert metadata.dataset_sha256 == dataset.sha256
     assert metadata.probes == ("circle:1.0",)
     assert metadata.force_range_N == (LOW, HIGH)
+    at_yield = press(sensor.film, Circle(1.0), (0.0, 0.0), metadata.yield_force_N)
+    assert principal_stress(at_yield)[1] == pytest.approx(45.0, rel=0.01)
     assert metadata.noise == {"name": "reference", "white_pC": 1.0, "gain": 0.002}
     assert sensor_from_dict(json.loads(json.dumps(metadata.sensor))) == sensor
     corners = np.array(metadata.working_area_mm)
@@ -110,6 +113,7 @@ def test_the_folder_is_complete_and_says_what_it_holds(released, dataset, sensor
     assert np.hypot(*middle.T).min() == pytest.approx(RADIUS, abs=1e-3)
     card = (released.folder / "card.md").read_text()
     assert f"{metadata.errors['position_median_mm']:g} mm" in card
+    assert f"beyond {metadata.yield_force_N:g} N the film is stressed to more than 45 MPa" in card
     assert "make it" in card
 
 

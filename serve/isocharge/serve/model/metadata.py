@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from msgspec import Meta, Struct
 
 from isocharge.common.errors import ModelError, shown
-from isocharge.common.structs import Finite, Settings, Text, WrongKey, convert, parse_json
+from isocharge.common.structs import Finite, Positive, Settings, Text, WrongKey, convert, parse_json
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 """Pattern of model names: safe in paths, URLs, pages and config.pbtxt."""
@@ -41,6 +41,8 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         errors: Measured errors, by names that carry the unit.
         made_with: The command and the package versions.
         format_version: Version of the metadata.
+        yield_force_N: Force beyond which the film yields under the sharpest of the probes, N; None if that is beyond
+            the range, or not known.
     """
 
     name: Annotated[str, Meta(pattern=f"^{NAME.pattern}$", description="letters, digits, '-', '_' and '.'")]
@@ -55,6 +57,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
     errors: dict[str, Finite]
     made_with: dict[str, Any]
     format_version: int = FORMAT_VERSION
+    yield_force_N: Positive | None = None
 
     def __post_init__(self) -> None:
         if "name" not in self.sensor:
@@ -82,7 +85,8 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         Raises:
             ModelError: If a value is not JSON, NaN included.
         """
-        return {name: _to_json(name, getattr(self, name)) for name in self.__struct_fields__}
+        known = [name for name in self.__struct_fields__ if getattr(self, name) is not None]
+        return {name: _to_json(name, getattr(self, name)) for name in known}
 
     @classmethod
     def from_props(cls, props: Mapping[str, str], where: str) -> "ModelMetadata":

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Reals, Singles
-from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE
+from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import SEVEN
 
@@ -96,17 +96,25 @@ class Validity:
         corners_mm: Corners of the working area, a polygon, shape (n, 2), mm.
         force_range_N: Smallest and largest force, N.
         misfit_limit: Largest misfit of a single contact, in standard deviations.
+        yield_force_N: Force beyond which the film yields, N.
     """
 
     corners_mm: Array
     force_range_N: tuple[float, float]
     misfit_limit: float = MISFIT_LIMIT
+    yield_force_N: float = math.inf
 
     @classmethod
     def of(cls, metadata: ModelMetadata) -> "Validity":
         """What a model's metadata state."""
         limit = max(MISFIT_LIMIT, metadata.errors.get("misfit_p999", MISFIT_LIMIT))
-        return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit)
+        yields_N = math.inf if metadata.yield_force_N is None else metadata.yield_force_N
+        return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit, yields_N)
+
+    @cached_property
+    def safe_N(self) -> float:
+        """Largest force of the range at which the film does not yield, N."""
+        return min(self.force_range_N[1], self.yield_force_N)
 
     @cached_property
     def reach_mm(self) -> float:
@@ -130,9 +138,8 @@ class Validity:
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """The flags of one contact, a quarter of a microsecond where there are none."""
-        low, high = self.force_range_N
         inside = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm < self.safe_mm2
-        if inside and low <= contact.force_N <= high and contact.misfit <= self.misfit_limit:
+        if inside and self.force_range_N[0] <= contact.force_N <= self.safe_N and contact.misfit <= self.misfit_limit:
             return ()  # nearly all contacts, without allocating an array
         return self.batch_flags(Contacts(*np.array(contact, dtype=np.float32)[:, np.newaxis]))[0]
 
@@ -141,15 +148,15 @@ class Validity:
         low, high = self.force_range_N
         outside = ~inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm)
         outside |= (contacts.force_N < low) | (contacts.force_N > high)
-        misfit = contacts.misfit > self.misfit_limit
+        misfit, yields = contacts.misfit > self.misfit_limit, contacts.force_N > self.yield_force_N
         far_mm2, far_N = self.far
         with np.errstate(over="ignore"):  # infinity is far, too
             beyond = (contacts.x_mm**2 + contacts.y_mm**2 > far_mm2) | (contacts.force_N > far_N)
-        if not (outside | misfit).any():
+        if not (outside | misfit | yields).any():
             return [()] * len(outside)
         return [
-            (OUTSIDE,) * is_outside + (BEYOND,) * is_beyond + (MISFIT,) * is_misfit
-            for is_outside, is_beyond, is_misfit in zip(outside.tolist(), beyond.tolist(), misfit.tolist(), strict=True)
+            (OUTSIDE,) * is_outside + (BEYOND,) * is_beyond + (MISFIT,) * is_misfit + (STRESS,) * is_stress
+            for is_outside, is_beyond, is_misfit, is_stress in np.stack([outside, beyond, misfit, yields], 1).tolist()
         ]
 
 

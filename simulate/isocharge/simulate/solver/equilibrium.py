@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mechanics.stress import principal_stresses, rotate_stress, strain, stress
@@ -59,6 +60,16 @@ class Equilibrium:
     residual: float
     seconds: float
     proven_error: float | None = None
+
+    def __repr__(self) -> str:
+        """The press, its deflection and its largest stress, beside that at which PVDF yields."""
+        (depth,), most = deflection(self, np.array([self.at])), principal_stress(self)[1]
+        yields = f", beyond {DEFAULT_STRESS_LIMIT:g} MPa: PVDF yields" * (most > DEFAULT_STRESS_LIMIT)
+        x, y = self.at
+        return (
+            f"Equilibrium({self.force:g} N under {self.probe.notation} at ({x:g}, {y:g}) mm: {self.status}, deflection "
+            f"{depth:.4g} mm, stress up to {most:.3g} MPa{yields})"
+        )
 
 
 def deflection(equilibrium: Equilibrium, points: Array) -> Array:

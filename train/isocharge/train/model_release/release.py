@@ -12,11 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
+from isocharge.common.errors import SceneError, SolveError
 from isocharge.serve.model.golden import contact_floors
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, write_model
+from isocharge.simulate import parse_probe
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
+from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
 from isocharge.train.model_release.evaluate import evaluate
 from isocharge.train.model_release.export import check_graph, export_onnx
@@ -99,6 +103,12 @@ def _interface(metadata: ModelMetadata, fitted: Fitted) -> str:
     folded = f" (of {fitted.asked.radius:g} mm asked for: beyond, two contacts give the same charges)"
     correlated = ", `contact_correlation` (xy, xF, yF)" if fitted.network.angles else ""
     unknown_probe = "; which of them presses is not known to the model" if len(metadata.probes) > 1 else ""
+    yields = (
+        f"; beyond {metadata.yield_force_N:g} N the film is stressed to more than {DEFAULT_STRESS_LIMIT:g} MPa: PVDF "
+        "yields, and a dent stays (flag `stress`)"
+        if metadata.yield_force_N
+        else ""
+    )
     return f"""# {metadata.name}, version {metadata.version}
 
 Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of one press out.{taught}
@@ -108,7 +118,7 @@ Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of o
 | input | `charge_pC`, float32 [n, {len(metadata.electrodes)}], touch charges of {electrodes} in pC |
 | outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlated}, `misfit` |
 | working area | within {fitted.domain.radius:g} mm of the centre{folded if fitted.asked != fitted.domain else ""} |
-| forces | {low:g} to {high:g} N |
+| forces | {low:g} to {high:g} N{yields} |
 | probes | {", ".join(metadata.probes)}{unknown_probe} |
 | trained for the noise | {noise["name"]}: {noise["white_pC"]:g} pC and {100 * float(noise["gain"]):g} % |
 """
@@ -203,11 +213,28 @@ def release(
             "python": platform.python_version(),
             **fitted.provenance.made_with,
         },
+        yield_force_N=_yield_force(fitted),
     )
     graph = export_onnx(fitted.network, about.to_props())
     golden = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, contact_floors(about))
     written = write_model(folder, graph, about, golden, card(about, fitted), fitted.provenance.files)
     return Release(written, about)
+
+
+def _yield_force(fitted: Fitted) -> float | None:
+    """Force beyond which the film yields under the sharpest probe, N; None if no press that the model knows does so."""
+    if isinstance(fitted.sensor, MeasuredSensor):
+        return None
+    low, high = forces = fitted.domain.force_range
+    least = high
+    for probe in map(parse_probe, fitted.probes):
+        try:
+            least = min(least, force_within_stress(fitted.sensor.film, probe, DEFAULT_STRESS_LIMIT, forces))
+        except SceneError:  # the smallest force is beyond it already
+            least = low
+        except SolveError:  # nobody knows
+            continue
+    return round(least, 3) if least < high else None
 
 
 def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
