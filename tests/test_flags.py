@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Predictor
+from isocharge.serve.flags import STRESS
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 from kept import kept
 
@@ -26,7 +27,12 @@ def column(sensor):
 
 
 def shares(name):
-    """Shares of presses with a flag, in %, by fault."""
+    """Shares of presses with a flag, in %, by fault; hard presses that dent the film are no fault."""
+
+    def share_of(charge_pC):
+        flags = predictor.validity.batch_flags(predictor.predict_batch(charge_pC))
+        return 100.0 * np.mean([bool(set(words) - {STRESS}) for words in flags])
+
     predictor, rng = Predictor(name), np.random.default_rng(7)
     reach, names = 0.999 * predictor.validity.reach_mm, predictor.metadata.electrodes
     forward_map = kept(ForwardMap.build, load_sensor(name), Circle(1.0), radius=reach, force_range=(0.4, 2.0))
@@ -36,20 +42,15 @@ def shares(name):
     charge_pC = noise_model("reference").add(clean, rng)
 
     def share(*gains):
-        flags = []
-        for gain in gains:
-            for electrode in range(len(names)):
-                faulty = charge_pC * np.where(np.arange(len(names)) == electrode, gain, 1.0)
-                flags += predictor.validity.batch_flags(predictor.predict_batch(faulty))
-        return 100.0 * sum(map(bool, flags)) / len(flags)
+        one = np.eye(len(names), dtype=bool)
+        return np.mean([share_of(charge_pC * np.where(electrode, gain, 1.0)) for gain in gains for electrode in one])
 
-    swapped = predictor.validity.batch_flags(predictor.predict_batch(charge_pC[:, [1, 0, *range(2, len(names))]]))
     return {
         "none": share(1.0),
         "one gain 5 % off": share(0.95, 1.05),
         "one gain 20 % off": share(0.8, 1.2),
         "one electrode dead": share(0.0),
-        "A and B swapped": 100.0 * sum(map(bool, swapped)) / PRESSES,
+        "A and B swapped": share_of(charge_pC[:, [1, 0, *range(2, len(names))]]),
     }
 
 

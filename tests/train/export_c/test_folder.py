@@ -30,7 +30,7 @@ from isocharge.train.export_c.folder import export_c
 
 HERE = Path(__file__).parent
 EXAMPLE = ("host_example.c", "isocharge_chain.c", "isocharge_frames.c", "isocharge_model.c")
-ONLY_PYTHON = {"gap", "repeat", "restart", "outside", "misfit"}
+ONLY_PYTHON = {"gap", "repeat", "restart", "outside", "misfit", "stress"}
 """Flags of a record that the example does not compute."""
 
 BOARD = """

@@ -35,9 +35,9 @@ class Predictor:
     Example:
         >>> from isocharge.serve import Predictor
         >>> touch = Predictor("three-25um-biaxial")
-        >>> contact = touch.predict([942.9, 910.4, 690.8])
+        >>> contact = touch.predict([593.9, 573.5, 435.2])
         >>> contact
-        Contact(x_mm=2.990 +- 0.045, y_mm=-1.994 +- 0.031, force_N=1.0027 +- 0.0021, misfit=0.025)
+        Contact(x_mm=2.989 +- 0.054, y_mm=-1.991 +- 0.036, force_N=0.5014 +- 0.0012, misfit=0.023)
         >>> touch.flags(contact)  # a reason for each doubt
         ()
     """

@@ -96,6 +96,16 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
 """
 
 
+def yield_words(metadata: ModelMetadata) -> str:
+    """From where on PVDF yields, for the row of the forces; empty where no press of the range makes it."""
+    if metadata.yield_force_N is None:
+        return ""
+    return (
+        f"; beyond {metadata.yield_force_N:g} N the film is stressed to more than {DEFAULT_STRESS_LIMIT:g} MPa: PVDF "
+        "yields, and a dent stays (flag `stress`)"
+    )
+
+
 def _interface(metadata: ModelMetadata, fitted: Fitted) -> str:
     (low, high), noise, teacher = metadata.force_range_N, metadata.noise, metadata.made_with.get("teacher")
     electrodes = ", ".join(metadata.electrodes)
@@ -103,12 +113,6 @@ def _interface(metadata: ModelMetadata, fitted: Fitted) -> str:
     folded = f" (of {fitted.asked.radius:g} mm asked for: beyond, two contacts give the same charges)"
     correlated = ", `contact_correlation` (xy, xF, yF)" if fitted.network.angles else ""
     unknown_probe = "; which of them presses is not known to the model" if len(metadata.probes) > 1 else ""
-    yields = (
-        f"; beyond {metadata.yield_force_N:g} N the film is stressed to more than {DEFAULT_STRESS_LIMIT:g} MPa: PVDF "
-        "yields, and a dent stays (flag `stress`)"
-        if metadata.yield_force_N
-        else ""
-    )
     return f"""# {metadata.name}, version {metadata.version}
 
 Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of one press out.{taught}
@@ -118,7 +122,7 @@ Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of o
 | input | `charge_pC`, float32 [n, {len(metadata.electrodes)}], touch charges of {electrodes} in pC |
 | outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlated}, `misfit` |
 | working area | within {fitted.domain.radius:g} mm of the centre{folded if fitted.asked != fitted.domain else ""} |
-| forces | {low:g} to {high:g} N{yields} |
+| forces | {low:g} to {high:g} N{yield_words(metadata)} |
 | probes | {", ".join(metadata.probes)}{unknown_probe} |
 | trained for the noise | {noise["name"]}: {noise["white_pC"]:g} pC and {100 * float(noise["gain"]):g} % |
 """
