@@ -86,6 +86,24 @@ def test_infer_with_defaults(client, module, film, tmp_path):
     assert said.get("model_version", said.get("modelVersion")) == "2"
 
 
+@pytest.mark.parametrize("n", [1, 5])
+@pytest.mark.parametrize("binary", [True, False])
+def test_flags_on_request(client, module, tmp_path, n, binary):
+    """As in process, beside an output; the charges of a press far outside, and of one that no press gives."""
+    values = np.resize(np.float32([[800.0, 10.0, 10.0], [-3.0, 900.0, 900.0], [800.0, 800.0, 800.0]]), (n, 3))
+    if module is tritonclient.grpc:
+        outputs = [module.InferRequestedOutput(name) for name in ("flags", "contact")]
+    else:
+        outputs = [module.InferRequestedOutput(name, binary_data=binary) for name in ("flags", "contact")]
+    answer = client.infer("linear", [tensor(module, values)], outputs=outputs)
+    touch = Predictor(tmp_path / "models/linear")
+    expected_words = [",".join(words) for words in touch.validity.batch_flags(touch.predict_batch(values))]
+    flags = [text.decode() if isinstance(text, bytes) else text for text in answer.as_numpy("flags")[:, 0]]
+    assert flags == expected_words
+    assert any(flags)
+    np.testing.assert_array_equal(answer.as_numpy("contact"), expected(tmp_path, values)["contact"])
+
+
 @pytest.mark.parametrize("way", ["gzip", "deflate"])
 @pytest.mark.parametrize("n", [1, 200])
 def test_compressed_both_ways(client, module, film, tmp_path, way, n):

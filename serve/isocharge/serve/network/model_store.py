@@ -45,9 +45,14 @@ class LoadedVersion:
     _of_thread: threading.local = field(default_factory=threading.local, repr=False)
 
     @cached_property
+    def validity(self) -> Validity:
+        """Where it may be trusted."""
+        return Validity.of(self.metadata)
+
+    @cached_property
     def misfit_limit(self) -> float:
         """Misfit above which a press has the flag `misfit`, in standard deviations."""
-        return Validity.of(self.metadata).misfit_limit
+        return self.validity.misfit_limit
 
     @cached_property
     def outputs(self) -> tuple[str, ...]:

@@ -21,7 +21,6 @@ from typing import Any
 
 import grpc
 import grpc.aio
-import numpy as np
 import uvloop
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
@@ -33,7 +32,14 @@ from isocharge.common.errors import ListenError, RequestError, TooMany
 from isocharge.serve.network.address import ServerLimits, Tls
 from isocharge.serve.network.model_store import LoadedVersion
 from isocharge.serve.network.protocol import Handler, describe
-from isocharge.serve.network.protocol.inference import InferAnswer, InferRequest, answer_inference, request_of
+from isocharge.serve.network.protocol.inference import (
+    FLAGS,
+    InferAnswer,
+    InferRequest,
+    answer_inference,
+    packed,
+    request_of,
+)
 from isocharge.serve.network.protocol.response import client_message, statuses
 from isocharge.serve.network.traffic import Exchange
 
@@ -97,9 +103,11 @@ def write_answer(answer: InferAnswer, message: Any) -> Any:
     """Fill a ModelInferResponse."""
     message.model_name, message.model_version, message.id = answer.name, answer.version, answer.id
     for name, rows in answer.outputs.items():
-        tensor = message.outputs.add(name=name, datatype="FP32", shape=rows.shape)
+        tensor = message.outputs.add(name=name, datatype="BYTES" if name == FLAGS else "FP32", shape=rows.shape)
         if name in answer.binary:
-            message.raw_output_contents.append(np.asarray(rows, dtype="<f4").tobytes())
+            message.raw_output_contents.append(packed(rows))
+        elif name == FLAGS:
+            tensor.contents.bytes_contents.extend(text.encode() for text in rows[:, 0].tolist())
         else:
             tensor.contents.fp32_contents.extend(rows.ravel().tolist())
     return message

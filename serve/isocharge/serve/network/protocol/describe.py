@@ -19,7 +19,7 @@ from isocharge.serve.model.model_folder import Model
 from isocharge.serve.model.session import INPUT, OUTPUTS
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
-from isocharge.serve.network.protocol.inference import InferBody
+from isocharge.serve.network.protocol.inference import FLAGS, InferBody
 
 EXTENSIONS = (
     "binary_tensor_data",
@@ -203,10 +203,10 @@ _NUMBER = {"type": ["number", "null"], "description": "null: not finite, which J
 
 _OUTPUT = _object(
     {
-        "name": {"enum": list(OUTPUTS)},
-        "datatype": {"const": "FP32"},
+        "name": {"enum": [*OUTPUTS, FLAGS]},
+        "datatype": {"enum": ["FP32", "BYTES"]},
         "shape": _SHAPE,
-        "data": _list_of(_NUMBER),
+        "data": {"anyOf": [_list_of(_NUMBER), _list_of(_TEXT)]},
     },
     ["name", "datatype", "shape"],
 )

@@ -27,9 +27,16 @@ from isocharge.serve.model.session import (
     write_finite,
 )
 from isocharge.serve.network.model_store import LoadedVersion
+from isocharge.serve.prediction.contact import Contacts
 
 DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
 """Number types of charges, little-endian as the protocol has them."""
+
+FLAGS = "flags"
+"""The output that only requests get that name it: the flags of each press, words with commas between them."""
+
+Rows = np.ndarray[Any, Any]
+"""Of an output: numbers, or of `flags` texts, shape (n, width)."""
 
 Unsupported = Annotated[None, Meta(description="nothing, as this server does not support it")]
 
@@ -57,7 +64,7 @@ class InputTensor(Struct, frozen=True):
 class OutputTensor(Struct, frozen=True):
     """An output that is asked for."""
 
-    name: Literal["contact", "contact_std", "contact_correlation", "misfit"]
+    name: Literal["contact", "contact_std", "contact_correlation", "misfit", "flags"]
     parameters: Parameters = Parameters()
 
 
@@ -98,7 +105,7 @@ class InferAnswer(NamedTuple):
     name: str
     version: str
     id: str
-    outputs: dict[str, Singles]
+    outputs: dict[str, Rows]
     binary: frozenset[str]
 
 
@@ -241,12 +248,24 @@ def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
     text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
     if not answer.binary:
         return text, None
-    parts = [rows.astype("<f4", copy=False).tobytes() for name, rows in answer.outputs.items() if name in answer.binary]
+    parts = [packed(rows) for name, rows in answer.outputs.items() if name in answer.binary]
     return b"".join([text, *parts]), len(text)
 
 
-def _tensor(name: str, rows: Singles, in_binary: bool) -> dict[str, Any]:
-    """One tensor, its numbers flat and row by row, or only their number of bytes."""
+def packed(rows: Rows) -> bytes:
+    """Numbers as they lie in memory, texts each behind its length (u32), little-endian."""
+    if not rows.dtype.hasobject:
+        return rows.astype("<f4", copy=False).tobytes()
+    return b"".join(struct.pack("<I", len(text)) + text.encode() for text in rows.ravel().tolist())
+
+
+def _tensor(name: str, rows: Rows, in_binary: bool) -> dict[str, Any]:
+    """One tensor, its numbers or texts flat and row by row, or only their number of bytes."""
+    if name == FLAGS:
+        content = (
+            {"parameters": {"binary_data_size": len(packed(rows))}} if in_binary else {"data": rows[:, 0].tolist()}
+        )
+        return {"name": name, "datatype": "BYTES", "shape": rows.shape, **content}
     if in_binary:
         size = {"binary_data_size": rows.nbytes}
         return {"name": name, "datatype": "FP32", "shape": rows.shape, "parameters": size}
@@ -256,7 +275,7 @@ def _tensor(name: str, rows: Singles, in_binary: bool) -> dict[str, Any]:
 Written = TypeVar("Written")
 
 
-def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> tuple[dict[str, Singles], int, int]:
+def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> tuple[dict[str, Rows], int, int]:
     """Run the model; may be called from any thread.
 
     Returns:
@@ -266,15 +285,27 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
     Raises:
         ModelError: If its graph fails.
     """
+    if FLAGS in names:
+        outputs, unchecked, alarms = infer(loaded, charge_pC, loaded.outputs)
+        outputs[FLAGS] = _flags(loaded, outputs)
+        return {name: outputs[name] for name in names}, unchecked, alarms
     if len(charge_pC) == 1:
         row, columns = _one_press(loaded, charge_pC[0])
         misfit = row[:, columns["misfit"]]
         return {name: row[:, columns[name]] for name in names}, 0, int(not misfit.item() <= loaded.misfit_limit)
-    outputs = run(loaded.model.session, charge_pC, names)
+    outputs = dict[str, Rows](run(loaded.model.session, charge_pC, names))
     check_rows(outputs, len(charge_pC), loaded.metadata.label)
     if "misfit" not in outputs:
         return outputs, len(charge_pC), 0
     return outputs, 0, len(charge_pC) - int(np.count_nonzero(outputs["misfit"] <= loaded.misfit_limit))
+
+
+def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
+    """The flags of presses, shape (n, 1)."""
+    known = [outputs[name] for name in ("contact", "contact_std", "misfit")]
+    columns = np.concatenate([*known, np.zeros_like(outputs["contact"])], axis=1).T  # correlations decide no flag
+    words = [",".join(flags) for flags in loaded.validity.batch_flags(Contacts(*columns))]
+    return np.array(words, dtype=object)[:, np.newaxis]
 
 
 def _one_press(loaded: LoadedVersion, charge_pC: Singles) -> tuple[Singles, dict[str, slice]]:
