@@ -248,6 +248,7 @@ def test_the_allowed_error_bounds_it_earlier():
 def test_where_nothing_ends_it_the_search_does():
     working = working_area(creased(radius=1.0), REFERENCE, error=1000.0)
     assert (working.radius, working.bound) == (1.0, "search")
+    assert working.summary.endswith("The search ended at 1 mm.")
 
 
 def test_pairs_of_a_biaxial_film_are_mirror_images_in_the_electrodes_circle(charges):
