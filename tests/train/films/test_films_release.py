@@ -141,6 +141,7 @@ def test_a_tiny_fit_end_to_end(films, tmp_path):
     trained = read_films(released.folder)
     assert evaluate_films(trained, 6, 64).known["position_rms_mm"] < 1.5  # of 4.6 mm by chance
     card = (released.folder / "card.md").read_text()
+    assert "| d31 and d32, each; gains, each | 20 %; 5 % |" in card
     assert "`model.onnx` is that plain model for the film" in card
     assert f"| position, rms | {model.metadata.made_with['films']['position_rms_mm']:g} mm |" in card
 
