@@ -1,6 +1,6 @@
 """A family of presses of one probe: where it is solved, and how presses between are interpolated."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -156,6 +156,7 @@ class Chain:
         forces: N, in their order.
         surface: Where in the thickness the stress is read.
         settings: Theory, mesh and width of the thin rings.
+        read: What is wanted of each: stresses at the nodes, shape (..., 3).
     """
 
     film: Film
@@ -164,10 +165,11 @@ class Chain:
     forces: Array
     surface: Surface
     settings: SolveSettings
+    read: Callable[[Equilibrium, Surface], Array] = nodal_stress
 
 
 def solve_chains(chains: Sequence[Chain], executor: Executor | None) -> Array:
-    """Scaled stress at the nodes, seen from the probe, shape (n_chain, n_force, n_element * n_local * 3)."""
+    """What each chain reads at the nodes, seen from the probe, shape (n_chain, n_force, its size)."""
     return np.stack(list(track(in_order(executor, _solve_chain, chains), "solving the film", len(chains))))
 
 
@@ -176,5 +178,5 @@ def _solve_chain(chain: Chain) -> Array:
     rows = []
     for force in chain.forces.tolist():
         start = press(chain.film, chain.probe, (chain.distance, 0.0), force, chain.settings, start=start)
-        rows.append(rotate_stress(nodal_stress(start, chain.surface), -chain.probe.angle).ravel())
+        rows.append(rotate_stress(chain.read(start, chain.surface), -chain.probe.angle).ravel())
     return np.stack(rows)

@@ -14,7 +14,7 @@ takes a millisecond.
 In a file, coefficients and modes are integers of 16 bits, each mode with its own scale: 3e-5 of a charge.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
@@ -26,11 +26,11 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, SceneError, SolveError
 from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, FilmLimits, decompose, quantised
+from isocharge.simulate.forward.film_modes import MODES, FilmModes, ModeMap
 from isocharge.simulate.forward.family import Chain, Family, check_family, solve_chains
 from isocharge.simulate.forward.forward_map import ForwardMap, relative_error
-from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.simulate.sensor.probe import Circle
@@ -38,24 +38,14 @@ from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 from isocharge.simulate.solver.press import needed_resolution
 
-AXES = ("distance", "load", "tension", "thickness", "reach")
-"""The numbers that a press of a film is described by, in the order of the grid's axes."""
-
 COUNTS = (5, 12, 8, 2, 5)
 """Nodes along each axis."""
 
-SOFTENING = 4e-4
-"""Added to the tension before its logarithm is taken: about the strain that a press of 0.05 N induces, below which the
-pretension makes no difference."""
+IMPERFECTIONS = "imperfections."
+"""What the names of their arrays begin with."""
 
 MODES_LEFT = 8e-5
 """Share of the stresses that the modes may leave out: root mean square, each node's stress relative to its own size."""
-
-THEORY = Theory(stretching=True, bending=True, pretensioned=True)
-"""All terms: a family holds slack films and taut ones."""
-
-FilmLimits = dict[str, tuple[float, float]]
-"""Smallest and largest value along each of `AXES`, all dimensionless."""
 
 LARGEST_ERROR = 2e-3
 """Largest relative error of any charge against direct solves that a family may have, dimensionless: the lightest
@@ -66,55 +56,6 @@ CHECKS = 24
 
 SLACK = 1e-9
 """Relative tolerance of the limits: rounding of units."""
-
-
-@dataclass(frozen=True)
-class FilmGrid:
-    """Nodes of a family, one array for each of `AXES`, ascending.
-
-    Attributes:
-        distance: Of the press from the film's centre over the film's radius a.
-        load: F / (E h a).
-        tension: Pretension over E.
-        thickness: h / a.
-        reach: Radius of the probe over a.
-    """
-
-    distance: Array
-    load: Array
-    tension: Array
-    thickness: Array
-    reach: Array
-
-    @classmethod
-    def spread(cls, limits: FilmLimits, counts: tuple[int, ...] = COUNTS) -> "FilmGrid":
-        """Chebyshev nodes between the limits: of load, reach and softened tension in the logarithm."""
-        axes = {name: (_stretched(name, low), _stretched(name, high)) for name, (low, high) in limits.items()}
-        nodes = [chebyshev_nodes(count, *axes[name]) for name, count in zip(AXES, counts, strict=True)]
-        return cls(*(_unstretched(name, values) for name, values in zip(AXES, nodes, strict=True)))
-
-    def weights(self, axis: str, at: float) -> Array:
-        """Interpolation weights of an axis at one value, shape (n_node,)."""
-        nodes = _stretched(axis, getattr(self, axis))
-        return np.asarray(lagrange_values(nodes, barycentric_weights(nodes), np.array([_stretched(axis, at)]))[0])
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Number of nodes along each axis."""
-        return tuple(getattr(self, name).size for name in AXES)
-
-
-def _stretched(axis: str, value: Array | float) -> Any:
-    """The coordinate in which an axis is interpolated by polynomials."""
-    if axis in ("load", "reach"):
-        return np.log(value)
-    return np.log(value + SOFTENING) if axis == "tension" else value
-
-
-def _unstretched(axis: str, value: Array) -> Array:
-    if axis in ("load", "reach"):
-        return np.exp(value)
-    return np.maximum(np.exp(value) - SOFTENING, 0.0) if axis == "tension" else value
 
 
 @dataclass(frozen=True)
@@ -132,6 +73,7 @@ class FilmFamily:
             n_mode).
         modes: Scaled stress C : E' at the nodes of every element, shape (n_mode, n_element * n_local * 3).
         error: Largest relative error of a charge against the direct solves that the build compared with.
+        imperfections: The modes of the films' imperfections; None in files of before they were solved.
     """
 
     poisson: float
@@ -143,6 +85,7 @@ class FilmFamily:
     coefficients: Array
     modes: Array
     error: float
+    imperfections: FilmModes | None = None
 
     @classmethod
     def build(
@@ -177,7 +120,7 @@ class FilmFamily:
         smallest = Circle(limits["reach"][0] * a)
         resolution = needed_resolution(film, smallest, (radius, 0.0), middle, settings)
         settings = replace(settings, resolution=resolution)
-        coefficients, modes = _decompose(_solve_films(film, surface, grid, settings, executor))
+        coefficients, modes = decompose(_solve_films(film, surface, grid, settings, executor), MODES_LEFT)
         family = cls(film.poisson, surface, limits, grid, resolution, layer, coefficients, modes, np.nan)
         error = _check_against_solves(family, prior, domain)
         if error > LARGEST_ERROR:
@@ -216,10 +159,21 @@ class FilmFamily:
         table = by_press @ self.modes
         return ForwardMap(sensor, probe, family, THEORY, self.resolution, self.layer, table, self.error)
 
+    def mode_map(self, sensor: Sensor, probe: Circle, names: Sequence[str] = tuple(MODES)) -> ModeMap:
+        """The modes of one film; only what the names need is computed.
+
+        Raises:
+            SceneError: If the film or the probe is not one of the family, or it has no such modes.
+        """
+        if self.imperfections is None:
+            raise SceneError("this family of films has no modes of imperfections; add FilmModes.build")
+        return self.imperfections.mode_map(self.forward_map(sensor, probe), names)
+
     def to_arrays(self) -> dict[str, Any]:
         """The family as arrays, numbers and texts, for a file."""
-        coefficients, scale = _quantised(self.coefficients, axis=(0, 1, 2, 3, 4))
-        modes, size = _quantised(self.modes, axis=1)
+        more = {} if self.imperfections is None else self.imperfections.to_arrays()
+        coefficients, scale = quantised(self.coefficients, axis=(0, 1, 2, 3, 4))
+        modes, size = quantised(self.modes, axis=1)
         return {
             **{name: getattr(self, name) for name in ("poisson", "surface", "layer", "error")},
             "limits": np.array([self.limits[name] for name in AXES]),
@@ -229,6 +183,7 @@ class FilmFamily:
             "coefficients": coefficients,
             "modes": modes,
             "mode_scale": np.float32(scale.ravel()[:, None] * size),
+            **{IMPERFECTIONS + name: value for name, value in more.items()},
         }
 
     @classmethod
@@ -246,6 +201,7 @@ class FilmFamily:
             sizes = len(arrays["limits"]), arrays["grid"].size, arrays["resolution"].size
             if sizes != (len(AXES), sum(shape), len(fields(Resolution))):
                 raise ValueError(f"limits, grid and resolution have {sizes} numbers")
+            more = {name.removeprefix(IMPERFECTIONS): arrays[name] for name in arrays if name.startswith(IMPERFECTIONS)}
             if str(arrays["surface"]) not in get_args(Surface):
                 raise ValueError(f"surface {arrays['surface']!s}")
             return cls(
@@ -260,6 +216,7 @@ class FilmFamily:
                 coefficients=coefficients.astype(float),
                 modes=modes * np.asarray(scale, dtype=float),
                 error=float(arrays["error"]),
+                imperfections=FilmModes.from_arrays(more) if more else None,
             )
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise InputError(f"film family: expected the arrays that to_arrays gives ({error})") from error
@@ -274,12 +231,6 @@ class FilmFamily:
             low, high = self.limits[name]
             if not low * (1.0 - SLACK) - 1e-15 <= value <= high * (1.0 + SLACK):
                 raise SceneError(f"film: {name} {value:.4g} is outside the family: expected {low:.4g} to {high:.4g}")
-
-
-def _quantised(values: Array, axis: int | tuple[int, ...]) -> tuple[np.ndarray, Array]:
-    """Integers of 16 bits, and the scales along an axis that give the values back: values = integers * scale."""
-    scale = np.abs(values).max(axis=axis, keepdims=True) / np.iinfo(np.int16).max
-    return np.round(values / scale).astype(np.int16), scale
 
 
 def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain, seed: int = 0) -> float:
@@ -320,22 +271,3 @@ def _solve_films(
     rows = solve_chains(chains, executor)[:, ::-1]
     by_axis = rows.reshape(*(grid.shape[axis] for axis in (0, 2, 3, 4, 1)), -1)
     return np.moveaxis(by_axis, 4, 1)
-
-
-def _decompose(stress: Array) -> tuple[Array, Array]:
-    """Coefficients and modes of scaled stresses of shape (..., n): the fewest that leave out `MODES_LEFT`.
-
-    Every node counts relative to its own stress: the peak under the probe would else hide the electrodes.
-    """
-    flat = stress.reshape(-1, stress.shape[-1])
-    size = np.repeat(np.sqrt((flat.reshape(len(flat), -1, 3) ** 2).sum(axis=2).mean(axis=0)), 3)
-    relative = flat / size
-    few = len(relative) < relative.shape[1]  # the smaller of both products has the same values
-    values, vectors = np.linalg.eigh(relative @ relative.T if few else relative.T @ relative)
-    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
-    left = np.sqrt(np.maximum(1.0 - np.cumsum(values) / values.sum(), 0.0))
-    count = int(np.argmax(left <= MODES_LEFT)) + 1
-    modes = vectors[:, :count].T
-    if few:
-        modes = modes @ relative / np.sqrt(values[:count, None])
-    return (relative @ modes.T).reshape(*stress.shape[:-1], count), modes * size

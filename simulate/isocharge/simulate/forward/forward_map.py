@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Complexes, Integers
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
@@ -40,6 +40,9 @@ INTERPOLATION_ERROR = 5e-4
 
 SMALL = 0.1
 """Floor for the charge that an error is relative to, as a share of the press's largest charge, dimensionless."""
+
+EVEN = np.zeros(1, dtype=bool)
+"""Parity of the stress under a press on an isotropic round film."""
 
 CHECKS = 10
 """Number of direct solves that a forward map is compared with."""
@@ -180,27 +183,49 @@ class ForwardMap:
                 charge[chunk] = self._charges(at[chunk], contact[chunk, 2], orientation[chunk])
         return charge
 
+    def by_field(self, contact: Array, odd: Booleans) -> Array:
+        """Charges of several fields of stress in one table, each at its nodes in turn, under a round probe.
+
+        Args:
+            contact: Presses of the domain, shape (n, 3), mm and N.
+            odd: Which fields are odd about the direction of the press, shape (n_field,).
+
+        Returns:
+            Shape (n, n_electrode, n_field), pC.
+        """
+        at = contact[:, 0] + 1j * contact[:, 1]
+        with single_threaded_blas():
+            parts = [
+                self._by_field(at[chunk], contact[chunk, 2], np.zeros(1), odd)
+                for chunk in (slice(start, start + CHUNK) for start in range(0, at.size, CHUNK))
+            ]
+        return np.concatenate(parts)
+
     def _charges(self, at: Complexes, force: Array, orientation: Array) -> Array:
         """Charges of one chunk of presses, shape (n, n_electrode)."""
+        charge: Array = self._by_field(at, force, orientation, EVEN)[..., 0]
+        if self.sensor.piezo.d33 != 0.0:
+            for i in np.flatnonzero(self._near(at).any(axis=1)):
+                probe = self.probe.rotated(float(orientation[i]))
+                charge[i] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])
+        return charge
+
+    def _by_field(self, at: Complexes, force: Array, orientation: Array, odd: Booleans) -> Array:
+        """Charges of the fields of one chunk of presses, shape (n, n_electrode, n_field)."""
         rotation = orientation - np.angle(at)
         field = self.family.weights(np.abs(at), force, rotation) @ self.table
         mesh = template_for(self.probe, self.resolution)
         placement = Placement.of(mesh, self.probe, np.abs(at), self.sensor.film.radius, self.layer, rotation)
-        charge = np.empty((at.size, len(self.sensor.electrodes)))
+        charge = np.empty((at.size, len(self.sensor.electrodes), odd.size))
         near, (fine, coarse) = self._near(at), self._readouts
         for readout, chosen in ((fine, near), (coarse, ~near)):
             for count in np.unique(readout.count):
                 press_index, electrode = np.nonzero(chosen & (readout.count == count))
                 charge[press_index, electrode] = self._read(
-                    readout, field, placement, at, rotation + self.probe.angle, press_index, electrode, count
+                    readout, field, placement, at, rotation + self.probe.angle, press_index, electrode, count, odd
                 )
         scale = self.sensor.film.young * amplitude_squared(self.sensor.film, force)
-        scaled: Array = charge * scale[:, None]
-        if self.sensor.piezo.d33 != 0.0:
-            for i in np.flatnonzero(near.any(axis=1)):
-                probe = self.probe.rotated(float(orientation[i]))
-                scaled[i] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])
-        return scaled
+        return np.asarray(charge * scale[:, None, None])
 
     @cached_property
     def _readouts(self) -> tuple[ReadoutPoints, ReadoutPoints]:
@@ -222,8 +247,9 @@ class ForwardMap:
         press_index: Integers,
         electrode: Integers,
         count: int,
+        odd: Booleans,
     ) -> Array:
-        """Scaled charges of pairs of press and electrode, whose readout has `count` points, shape (n_pair,).
+        """Scaled charges of pairs of press and electrode, whose readout has `count` points, shape (n_pair, n_field).
 
         `frame` is the angle of the probe, and of the field's stress, from the direction of the press, shape (n,).
         """
@@ -232,11 +258,15 @@ class ForwardMap:
         position, mirrored = mesh.into_meshed_half(points * np.exp(-1j * angle)[:, None])
         element, xi, eta = placement[press_index].locate(mesh, position)
         values = tensor_values(self.resolution.order, xi.ravel(), eta.ravel())
-        nodal = field.reshape(len(field), mesh.n_element, -1, 3)[press_index[:, None], element]
-        local = np.matmul(values[:, None, :], nodal.reshape(*values.shape, 3)).reshape(*position.shape, 3)
-        local[mirrored, 2] *= -1.0
-        stress = rotate_stress(local, (angle if mesh.half else angle + frame[press_index])[:, None])
-        return np.asarray(np.einsum("kpc,kpc->k", stress, readout.weights[electrode, :count]))
+        width, frames = 3 * odd.size, (angle if mesh.half else angle + frame[press_index])[:, None]
+        nodal = field.reshape(len(field), mesh.n_element, -1, width)[press_index[:, None], element]
+        local = np.matmul(values[:, None, :], nodal.reshape(*values.shape, width)).reshape(*position.shape, width)
+        charge, weights = np.empty((len(local), odd.size)), readout.weights[electrode, :count]
+        for number in range(odd.size):
+            one = local[..., 3 * number : 3 * number + 3]
+            one[mirrored, (slice(0, 2) if odd[number] else 2)] *= -1.0
+            charge[:, number] = np.einsum("kpc,kpc->k", rotate_stress(one, frames), weights)
+        return charge
 
 
 def relative_error(

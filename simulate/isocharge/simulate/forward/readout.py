@@ -61,7 +61,7 @@ class ReadoutPoints:
         points = np.stack([np.pad(at, ((0, most - len(at)), (0, 0)), mode="edge") for at, _ in parts])
         shares = np.stack([np.pad(share, ((0, most - len(share)), (0, 0))) for _, share in parts])
         areas = np.array([electrode.area for electrode in sensor.electrodes])
-        per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 0.0])
+        per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
         weights = (sensor.gains * areas)[:, None, None] * shares * per_stress
         return cls(sensor.calibration.place(points), weights, count)
 

@@ -8,14 +8,16 @@ an amplitude A (see `isocharge.simulate.mechanics.scaling`)
     w = a A W,   u = a A^2 U,   E = A^2 [ sym grad U + grad W (x) grad W / 2 + A^2 (grad U)^T grad U / 2 ],
 
 so that the Green-Lagrange strain is A^2 times a number of order one whatever the force, and so is the stress: St.
-Venant-Kirchhoff, plane stress, S = E_young A^2 (C : E' + tau I). Energies are in units of E_young h a^2 A^4.
+Venant-Kirchhoff, plane stress, S = E_young A^2 (C : E' + tau I). Energies are in units of E_young h a^2 A^4. A film that
+is not the same in all directions adds a matrix to C and a deviator to tau I (`scaling.Anisotropy`); its bending keeps
+the mean stiffness.
 """
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.mechanics.stress import strain, stress
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_stress
+from isocharge.simulate.mechanics.stress import strain
 from isocharge.simulate.mesh.placed_mesh import Geometry
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -82,6 +84,15 @@ class Membrane:
         self.groups = groups
         self._scale = np.array([groups.amplitude2, groups.amplitude2, 1.0])
 
+    @property
+    def _deviator(self) -> Array | None:
+        """What the pretension adds to its mean, over E_young A^2, shape (2, 2)."""
+        return None if self.groups.anisotropy is None else _tensor(self.groups.anisotropy.tension)
+
+    def _stress(self, elastic: Array) -> Array:
+        """C : E' of a strain, shape (..., 3)."""
+        return scaled_stress(elastic, self.groups)
+
     def _slope(self, field: Array) -> Array:
         """d(U1, U2, W)/d(X1, X2) at the quadrature points, shape (n_element, n_point, 2, 3)."""
         slope = self.geometry.stacked @ field[self.geometry.nodes]
@@ -98,15 +109,19 @@ class Membrane:
         """Stretching energy of a nodal field of shape (n_node, 3)."""
         slope = self._slope(field)
         elastic = strain(slope, self.groups.amplitude2)
-        density = 0.5 * np.sum(elastic * stress(elastic, self.groups.poisson), axis=-1)
+        density = 0.5 * np.sum(elastic * self._stress(elastic), axis=-1)
         density += 0.5 * self.groups.tension * np.sum(slope**2 @ self._scale, axis=-1)
+        if self._deviator is not None:
+            density += 0.5 * np.sum(slope * (self._deviator @ slope) @ self._scale, axis=-1)
         return float(np.sum(density * self.geometry.weights))
 
     def forces(self, field: Array) -> Array:
         """Gradient of the energy, element by element: internal forces, shape (n_element, n_local, 3)."""
         geometry, slope = self.geometry, self._slope(field)
-        total = stress(strain(slope, self.groups.amplitude2), self.groups.poisson)
+        total = self._stress(strain(slope, self.groups.amplitude2))
         traction = _tensor(total) @ self._stretch(slope) + self.groups.tension * self._scale * slope
+        if self._deviator is not None:
+            traction += self._scale * (self._deviator @ slope)
         traction *= geometry.weights[..., None, None]
         return np.asarray(geometry.stacked.transpose(0, 2, 1) @ traction.reshape(len(traction), -1, 3))
 
@@ -118,8 +133,10 @@ class Membrane:
         """
         geometry, gradient, slope = self.geometry, self.geometry.gradient, self._slope(field)
         stretch = self._stretch(slope)
-        total = stress(strain(slope, self.groups.amplitude2), self.groups.poisson)
+        total = self._stress(strain(slope, self.groups.amplitude2))
         total[..., :2] += self.groups.tension
+        if self.groups.anisotropy is not None:
+            total += self.groups.anisotropy.tension
         weighted = _tensor(total * geometry.weights[..., None])
         n_element, _, _, n_local = gradient.shape
         left = np.ascontiguousarray(geometry.stacked.transpose(0, 2, 1))
@@ -145,6 +162,12 @@ class Membrane:
         block[..., 1, 1] = plane * b * d + shear * a * c
         block[..., 0, 1] = plane * poisson * a * d + shear * b * c
         block[..., 1, 0] = plane * poisson * b * c + shear * a * d
+        if self.groups.anisotropy is not None:
+            left, right = (np.zeros((*a.shape, 2, 3)) for _ in range(2))  # d(E11, E22, 2 E12) / d(slope)
+            for side, one, two in ((left, a, b), (right, c, d)):
+                side[..., 0, 0] = side[..., 1, 2] = one
+                side[..., 1, 1] = side[..., 0, 2] = two
+            block += left @ self.groups.anisotropy.moduli @ right.swapaxes(-1, -2)
         return block
 
 

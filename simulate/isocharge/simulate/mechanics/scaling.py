@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.simulate.mechanics.stress import rotate_stress, stress, stress_turn
 from isocharge.simulate.sensor.film import Film
 
 MEMBRANE_STIFFNESS = 1.6
@@ -21,6 +22,19 @@ MEMBRANE_STIFFNESS = 1.6
 
 PLATE_STIFFNESS = 16.0 * np.pi
 """Force over deflection of a clamped plate under a central point load, in units of its stiffness over a^2."""
+
+
+@dataclass(frozen=True, eq=False)
+class Anisotropy:
+    """What a film has that is not the same in all directions, seen from the press.
+
+    Attributes:
+        moduli: Added to the isotropic C over E, shape (3, 3); see `mechanics.stress.stress`.
+        tension: Added to the mean pretension over E A^2: (T11, T22, T12), shape (3,).
+    """
+
+    moduli: Array
+    tension: Array
 
 
 @dataclass(frozen=True)
@@ -33,6 +47,7 @@ class DimensionlessGroups:
         tension: Pretension over E A^2.
         bending: Bending stiffness over E h a^2 A^2, that is b / A^2; 0 leaves bending out.
         poisson: Poisson's ratio.
+        anisotropy: What is not the same in all directions, if anything.
     """
 
     amplitude2: float
@@ -40,10 +55,11 @@ class DimensionlessGroups:
     tension: float
     bending: float
     poisson: float
+    anisotropy: Anisotropy | None = None
 
     @classmethod
-    def of(cls, film: Film, force: float, *, bending: bool) -> "DimensionlessGroups":
-        """The groups of a film under a force (N), with or without bending."""
+    def of(cls, film: Film, force: float, *, bending: bool, angle: float = 0.0) -> "DimensionlessGroups":
+        """The groups of a film under a force (N), with or without bending, of a press in the direction `angle` (rad)."""
         amplitude2 = float(amplitude_squared(film, force))
         return cls(
             amplitude2=amplitude2,
@@ -51,12 +67,13 @@ class DimensionlessGroups:
             tension=film.pretension / (film.young * amplitude2),
             bending=slenderness(film) / amplitude2 if bending else 0.0,
             poisson=film.poisson,
+            anisotropy=_anisotropy(film, amplitude2, angle) if film.anisotropic else None,
         )
 
     @property
     def height(self) -> float:
         """Approximate deflection of the middle in units of a A: one for groups from `of`."""
-        linear = MEMBRANE_STIFFNESS * self.tension + PLATE_STIFFNESS * self.bending
+        linear = MEMBRANE_STIFFNESS * max(self.tension, 0.0) + PLATE_STIFFNESS * self.bending
         return float(_root(linear, self.load))
 
     @property
@@ -69,6 +86,21 @@ class DimensionlessGroups:
         return replace(self, tension=self.tension + tension)
 
 
+def scaled_stress(strained: Array, groups: DimensionlessGroups) -> Array:
+    """C : E' of a scaled strain, shape (..., 3), in units of E_young A^2; see `mechanics.stress.stress`."""
+    return stress(strained, groups.poisson, groups.anisotropy and groups.anisotropy.moduli)
+
+
+def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:
+    turn, plane = stress_turn(film.axis - angle), 1.0 / (1.0 - film.poisson**2)
+    ratio = np.sqrt(film.young_ratio)
+    shear = 0.0 if film.shear is None else film.shear / film.young - 0.5 / (1.0 + film.poisson)
+    moduli = turn @ np.diag([plane * (ratio - 1.0), plane * (1.0 / ratio - 1.0), shear]) @ turn.T
+    difference, shear = film.deviator
+    tension = rotate_stress(np.array([difference, -difference, shear]), -angle) / (film.young * amplitude2)
+    return Anisotropy(moduli, tension)
+
+
 def slenderness(film: Film) -> float:
     """b: bending stiffness over E h a^2."""
     return (film.thickness / film.radius) ** 2 / (12.0 * (1.0 - film.poisson**2))
@@ -76,7 +108,7 @@ def slenderness(film: Film) -> float:
 
 def amplitude_squared(film: Film, force: Array | float) -> Any:
     """A^2, of the shape and type of `force` (N)."""
-    linear = MEMBRANE_STIFFNESS * film.pretension / film.young + PLATE_STIFFNESS * slenderness(film)
+    linear = MEMBRANE_STIFFNESS * max(film.pretension, 0.0) / film.young + PLATE_STIFFNESS * slenderness(film)
     return _root(linear, force / (film.young * film.thickness * film.radius)) ** 2
 
 

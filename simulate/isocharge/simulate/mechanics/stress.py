@@ -34,13 +34,22 @@ def strain(slope: Array, amplitude2: float) -> Array:
     )
 
 
-def stress(strain: Array, poisson: float) -> Array:
-    """C : E' in units of E_young A^2, plane stress; (S11, S22, S12), shape (..., 3), without pretension."""
+def stress(strain: Array, poisson: float, more: Array | None = None) -> Array:
+    """C : E' in units of E_young A^2, plane stress; (S11, S22, S12), shape (..., 3), without pretension.
+
+    `more` is added to the isotropic C over E_young, as a symmetric matrix from (E11, E22, 2 E12), shape (3, 3).
+    """
     e11, e22, shear = strain[..., 0], strain[..., 1], strain[..., 2]
     plane = 1.0 / (1.0 - poisson**2)
-    return np.stack(
+    isotropic = np.stack(
         [plane * (e11 + poisson * e22), plane * (e22 + poisson * e11), 0.5 * shear / (1.0 + poisson)], axis=-1
     )
+    return isotropic if more is None else isotropic + strain @ more
+
+
+def stress_turn(angle: float) -> Array:
+    """Matrix of `rotate_stress` for one angle, shape (3, 3); T C T^T turns an elasticity matrix."""
+    return rotate_stress(np.eye(3), angle).T
 
 
 def rotate_stress(local: Array, angle: float | Array) -> Array:

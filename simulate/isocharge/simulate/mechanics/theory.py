@@ -118,6 +118,8 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
 def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
     """The cheapest theory whose error stays within half of the accuracy; the full one if no theory does."""
     tense = film.pretension > 0.0
+    if film.pretension < 0.0 or not film.turns:  # the errors above are those of a film that is alike all round
+        return Theory(stretching=True, bending=True, pretensioned=tense)
     cheap_first = (
         Theory(stretching=False, bending=False, pretensioned=tense),
         Theory(stretching=False, bending=True, pretensioned=tense),

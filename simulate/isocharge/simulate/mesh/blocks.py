@@ -7,7 +7,8 @@ Seen from the probe, the mesh is a footprint's worth of blocks inside a circle a
     rings of 2 n sectors    carry on to the rim, the last ones thin where bending needs it.
 
 A circular footprint is the same with a virtual square as its polygon and the circle as its edge; since it is
-symmetric about the line through the film's centre, only the upper half is meshed. Each block may be subdivided.
+symmetric about the line through the film's centre, only the upper half is meshed if the film is, too. Each block may
+be subdivided.
 `Placement` says where the blocks lie, `Template` numbers their nodes.
 """
 
@@ -75,10 +76,10 @@ class Blocks:
         eta: Local coordinate of an element's nodes, shape ((order + 1)^2,).
     """
 
-    def __init__(self, resolution: Resolution, corners: int) -> None:
+    def __init__(self, resolution: Resolution, corners: int, whole: bool = False) -> None:
         self.resolution = resolution
         self.corners = corners
-        self.half = corners == 0
+        self.half = corners == 0 and not whole
         self.n_corner = corners or SQUARE
         self.split = max(1, round(resolution.around / (2 * self.n_corner)))
         self.n_meshed = self.n_corner // 2 if self.half else self.n_corner
@@ -94,7 +95,7 @@ class Blocks:
     @property
     def footprint(self) -> slice:
         """The elements that fill the footprint."""
-        return slice(0, self.n_inner if self.half else self.n_quad)
+        return slice(0, self.n_quad if self.corners else self.n_inner)
 
     @property
     def copies(self) -> int:

@@ -19,6 +19,13 @@ from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 
 
+ROUND = 0.5
+"""Share of the film's radius within which the mesh of an oval film is that of a round one: probe and electrodes."""
+
+INVERSE_STEPS = 8
+"""Steps of Newton, with a slope that is right at the rim, to undo `to_oval`: to round-off up to e = 0.05."""
+
+
 @dataclass(frozen=True)
 class Geometry:
     """The elements of a template where it lies on the film, ready for integration.
@@ -67,11 +74,13 @@ class PlacedMesh:
         template: The template.
         placement: Where it lies.
         layer: Width of the thin rings at the rim over the film's radius.
+        oval: e exp(2 i alpha) of a rim at 1 + e cos 2 (angle - alpha), in film radii.
     """
 
     template: Template
     placement: Placement
     layer: float
+    oval: complex = 0.0
 
     @property
     def resolution(self) -> Resolution:
@@ -81,7 +90,7 @@ class PlacedMesh:
     @cached_property
     def points(self) -> Complexes:
         """Film points of every element's nodes, shape (n_element, n_local), in film radii."""
-        return self.placement.element_points(self.template)
+        return to_oval(self.placement.element_points(self.template), self.oval)
 
     @property
     def node_points(self) -> Complexes:
@@ -98,7 +107,7 @@ class PlacedMesh:
 
         And which points were mirrored into the half that is meshed.
         """
-        position, mirrored = self.template.into_meshed_half(points)
+        position, mirrored = self.template.into_meshed_half(from_oval(points, self.oval))
         element, xi, eta = self.placement.batch().locate(self.template, position[None])
         return element[0], xi[0], eta[0], mirrored
 
@@ -129,9 +138,33 @@ class PlacedMesh:
 
 def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> PlacedMesh:
     """Place the template of a probe under a press; `layer` is the width of the thin rings over the film's radius."""
-    template = template_for(probe, resolution)
-    rotated = probe.rotated(-float(np.arctan2(at[1], at[0])))
-    return PlacedMesh(template, Placement.of(template, rotated, np.array(np.hypot(*at)), film.radius, layer), layer)
+    template, angle = template_for(probe, resolution, not film.turns), float(np.arctan2(at[1], at[0]))
+    placement = Placement.of(template, probe.rotated(-angle), np.array(np.hypot(*at)), film.radius, layer)
+    return PlacedMesh(template, placement, layer, film.oval * np.exp(2j * (film.oval_axis - angle)))
+
+
+def to_oval(points: Complexes, oval: complex) -> Complexes:
+    """Points of the round film (unit radius) where they lie on an oval one: the inner half of it stays."""
+    if oval == 0.0:
+        return points
+    radius = np.maximum(np.abs(points), ROUND)
+    return np.asarray(points * (1.0 + _swell(radius) * (np.conj(oval) * (points / radius) ** 2).real))
+
+
+def from_oval(points: Complexes, oval: complex) -> Complexes:
+    """The inverse of `to_oval`."""
+    if oval == 0.0:
+        return points
+    radius = start = np.maximum(np.abs(points), ROUND)
+    along = (np.conj(oval) * (points / start) ** 2).real
+    for _ in range(INVERSE_STEPS):
+        radius = radius - (radius * (1.0 + _swell(radius) * along) - start) / (1.0 + 7.0 * along * _swell(radius))
+    return np.asarray(points * (radius / start))
+
+
+def _swell(radius: Array) -> Array:
+    """How much of the rim's displacement a radius takes part in: none up to `ROUND`, all at 1."""
+    return np.asarray(((radius - ROUND) / (1.0 - ROUND)) ** 3)
 
 
 @lru_cache(maxsize=16)

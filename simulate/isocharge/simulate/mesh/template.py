@@ -24,8 +24,8 @@ class Template(Blocks):
         on_axis: Whether a node lies on the line of symmetry of a half template, shape (n_node,).
     """
 
-    def __init__(self, resolution: Resolution, corners: int) -> None:
-        super().__init__(resolution, corners)
+    def __init__(self, resolution: Resolution, corners: int, whole: bool = False) -> None:
+        super().__init__(resolution, corners, whole)
         points = _sample_points(self)
         z = points.ravel()
         _, self.first_seen, number = np.unique(np.round(z, 9), return_index=True, return_inverse=True)
@@ -50,11 +50,14 @@ def corners_of(probe: Probe) -> int:
 
 
 @lru_cache(maxsize=16)
-def template(resolution: Resolution, corners: int) -> Template:
-    """The template of a resolution for a polygon with this number of corners, 0 for a circle; built once."""
-    return Template(resolution, corners)
+def template(resolution: Resolution, corners: int, whole: bool = False) -> Template:
+    """The template of a resolution for a polygon with this number of corners, 0 for a circle; built once.
+
+    `whole` meshes both halves under a circle, too.
+    """
+    return Template(resolution, corners, whole)
 
 
-def template_for(probe: Probe, resolution: Resolution) -> Template:
-    """The template that follows a probe's outline."""
-    return template(resolution, corners_of(probe))
+def template_for(probe: Probe, resolution: Resolution, whole: bool = False) -> Template:
+    """The template that follows a probe's outline; `whole` as above."""
+    return template(resolution, corners_of(probe), whole and corners_of(probe) == 0)

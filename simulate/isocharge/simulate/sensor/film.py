@@ -30,8 +30,14 @@ class Film:
         radius: mm.
         thickness: mm.
         young: Young's modulus, MPa.
-        poisson: Poisson's ratio, 0 <= poisson < 0.5.
-        pretension: Uniform second Piola-Kirchhoff stress without load, MPa, tension positive.
+        poisson: Poisson's ratio, 0 <= poisson < 0.5; of an orthotropic film sqrt(nu12 nu21).
+        pretension: Uniform second Piola-Kirchhoff stress without load, MPa, tension positive: the mean of T11 and T22.
+        deviator: (T11 - T22) / 2 and T12 of a pretension that is not the same in all directions, MPa.
+        young_ratio: E1 / E2 of an orthotropic film; `young` is then sqrt(E1 E2).
+        shear: Its shear modulus G12, MPa; None for young / (2 (1 + poisson)).
+        axis: Angle of its axis 1 from x, rad, anticlockwise.
+        oval: e of a clamp that is no circle: its half axes are radius * (1 + e) and radius * (1 - e).
+        oval_axis: Angle of the longer one from x, rad.
     """
 
     radius: float
@@ -39,12 +45,28 @@ class Film:
     young: float
     poisson: float
     pretension: float = 0.0
+    deviator: tuple[float, float] = (0.0, 0.0)
+    young_ratio: float = 1.0
+    shear: float | None = None
+    axis: float = 0.0
+    oval: float = 0.0
+    oval_axis: float = 0.0
+
+    @property
+    def anisotropic(self) -> bool:
+        """Whether elasticity or pretension differ between directions."""
+        return self.deviator != (0.0, 0.0) or self.young_ratio != 1.0 or self.shear is not None
+
+    @property
+    def turns(self) -> bool:
+        """Whether the film turned about its centre is the same film: a press at (r, theta) is then one at (r, 0)."""
+        return not self.anisotropic and self.oval == 0.0
 
     def __post_init__(self) -> None:
         check_length("film radius", self.radius, LEAST_RADIUS, SensorError)
         check_length("film thickness", self.thickness, LEAST_THICKNESS, SensorError)
         check_stress("film young", self.young, LEAST_YOUNG, MOST_YOUNG, SensorError)
-        check_stress("film pretension", self.pretension, 0.0, MOST_PRETENSION, SensorError)
+        check_stress("film pretension", self.pretension, -MOST_PRETENSION, MOST_PRETENSION, SensorError)
         if not 0.0 <= self.poisson < 0.5:
             raise SensorError(f"film poisson: expected 0 <= poisson < 0.5, got {self.poisson}")
         if self.thickness > 0.1 * self.radius:
@@ -66,6 +88,7 @@ class Piezo:
     Attributes:
         d31, d32: Charge of tension along x and y, pC/N.
         d33: Charge of tension through the thickness, pC/N.
+        d12: Charge of shear, 2 d12 s12, pC/N: of turned axes (d31 - d32) / 2 times sin of twice their angle.
         pyro: Charge of warming a film that is free to expand, pC/(mm^2 K).
     """
 
@@ -73,6 +96,7 @@ class Piezo:
     d32: float
     d33: float = 0.0
     pyro: float = 0.0
+    d12: float = 0.0
 
     def __post_init__(self) -> None:
         for name, d in vars(self).items():
@@ -80,5 +104,5 @@ class Piezo:
                 raise SensorError(f"piezo {name}: expected a number up to {MOST_PIEZO:g} in size, got {d}")
             if name != "pyro" and 0.0 < abs(d) < LEAST_PIEZO:
                 raise SensorError(f"piezo {name}: expected pC/N, got {d:.6g} pC/N; {d:.6g} C/N are {1e12 * d:.6g} pC/N")
-        if self.d31 == 0.0 and self.d32 == 0.0:
+        if self.d31 == self.d32 == self.d12 == 0.0:
             raise SensorError("piezo d31 and d32 are both 0: such a film gives no charge")

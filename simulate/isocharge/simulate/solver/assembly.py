@@ -5,7 +5,8 @@ and only the skeleton is factorised: 2.3 times fewer unknowns at order 4. Everyt
 (numbering, sparsity, where each entry goes) is done once.
 
 Unknowns per node are U1, U2, W and, with bending, the carried Laplacian (see `mechanics.energy`). On the rim
-the first three are fixed; on the line of symmetry of a half template U2 is.
+the first three are fixed; on the line of symmetry of a half template U2 is, or, for fields that are odd about it, all
+but U2.
 """
 
 from functools import lru_cache
@@ -15,8 +16,7 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.template import Template, template
+from isocharge.simulate.mesh.template import Template
 
 
 class Assembly:
@@ -30,12 +30,12 @@ class Assembly:
         skeleton: Numbers of those that are left to factorise.
     """
 
-    def __init__(self, mesh: Template, components: int) -> None:
+    def __init__(self, mesh: Template, components: int, odd: bool = False) -> None:
         line = np.arange(mesh.resolution.order + 1)
         on_edge = (line == line[0]) | (line == line[-1])
         shell = (on_edge[:, None] | on_edge[None, :]).ravel()
         self.components = components
-        self.free = _free(mesh, components)
+        self.free = _free(mesh, components, odd)
         self._outer, self._inner = self._unknowns(np.flatnonzero(shell)), self._unknowns(np.flatnonzero(~shell))
         unknown = self._unknowns(mesh.nodes)
         self.inner_global = unknown[:, self._inner]
@@ -117,15 +117,15 @@ class Factor:
         return solution.reshape(parts.free.shape)[:, :3]
 
 
-def _free(mesh: Template, components: int) -> np.ndarray:
+def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
     """Which unknowns are not fixed by clamping or symmetry, shape (n_node, components)."""
     free = np.ones((mesh.n_node, components), dtype=bool)
     free[mesh.on_rim, :3] = False
-    free[mesh.on_axis, 1] = False
+    free[np.ix_(mesh.on_axis, np.arange(components) != 1 if odd else [1])] = False
     return free
 
 
 @lru_cache(maxsize=16)
-def assembly(resolution: Resolution, corners: int, components: int) -> Assembly:
+def assembly(mesh: Template, components: int, odd: bool = False) -> Assembly:
     """The assembly of a template, built once."""
-    return Assembly(template(resolution, corners), components)
+    return Assembly(mesh, components, odd)

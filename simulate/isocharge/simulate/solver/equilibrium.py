@@ -1,7 +1,7 @@
 """The film at rest under a press, and its deflection and stress at any point.
 
-The film is round and its elasticity isotropic, so every press is solved on the positive x axis and rotated when it is
-read: one equilibrium serves all angles, electrode layouts and piezoelectric coefficients.
+Every press is solved on the positive x axis, the film turned with it, and rotated when it is read. If the film is round
+and its elasticity isotropic, one equilibrium serves all angles, electrode layouts and piezoelectric coefficients.
 """
 
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.mechanics.stress import principal_stresses, rotate_stress, strain, stress
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_stress
+from isocharge.simulate.mechanics.stress import principal_stresses, rotate_stress, strain
 from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import tensor_values
@@ -113,7 +113,7 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     strained = strain(gradient @ equilibrium.field[mesh.template.nodes[element]], groups.amplitude2)
     if surface != "middle":
         strained += _bent_strain(equilibrium, surface, gradient @ node_slope(equilibrium)[element, :, :, 2])
-    local = equilibrium.film.young * groups.amplitude2 * stress(strained, groups.poisson)
+    local = equilibrium.film.young * groups.amplitude2 * scaled_stress(strained, groups)
     local[mirrored, 2] *= -1.0
     return rotate_stress(local, np.arctan2(equilibrium.at[1], equilibrium.at[0]))
 
@@ -127,7 +127,7 @@ def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array
     strained = strain(slope, equilibrium.groups.amplitude2)
     if surface != "middle":
         strained += _bent_strain(equilibrium, surface, equilibrium.mesh.node_derivatives(slope[..., 2]))
-    return stress(strained, equilibrium.groups.poisson)
+    return scaled_stress(strained, equilibrium.groups)
 
 
 def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
@@ -135,11 +135,13 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
 
     At the mid-surface, and where the theory has bending at both surfaces for the largest.
     """
-    smallest, largest = principal_stresses(nodal_stress(equilibrium))
+    groups = equilibrium.groups
+    deviator = np.zeros(3) if groups.anisotropy is None else groups.anisotropy.tension
+    smallest, largest = principal_stresses(nodal_stress(equilibrium) + deviator)
     if equilibrium.theory.bending:
-        outer = (principal_stresses(nodal_stress(equilibrium, surface))[1] for surface in ("top", "bottom"))
+        outer = (principal_stresses(nodal_stress(equilibrium, surface) + deviator)[1] for surface in ("top", "bottom"))
         largest = max(largest, *outer)
-    scale = equilibrium.film.young * equilibrium.groups.amplitude2
+    scale = equilibrium.film.young * groups.amplitude2
     return scale * smallest + equilibrium.film.pretension, scale * largest + equilibrium.film.pretension
 
 
@@ -162,7 +164,9 @@ def _bent_strain(equilibrium: Equilibrium, surface: Surface, hessian: Array) -> 
 def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, Array, Booleans]:
     """Element, xi, eta of each point and whether it was mirrored into a half template; SceneError off the film."""
     points, radius, (x, y) = np.asarray(points, dtype=float), equilibrium.film.radius, equilibrium.at
-    off = ~(np.hypot(points[:, 0], points[:, 1]) <= radius * (1.0 + 1e-9))
+    alpha, oval = equilibrium.film.oval_axis, equilibrium.film.oval
+    rim = radius * (1.0 + oval * np.cos(2.0 * (np.arctan2(points[:, 1], points[:, 0]) - alpha))) if oval else radius
+    off = ~(np.hypot(points[:, 0], points[:, 1]) <= rim * (1.0 + 1e-9))
     if off.any():
         first = points[np.argmax(off)]
         raise SceneError(f"point ({first[0]:.4g}, {first[1]:.4g}) mm is off the film of radius {radius:.4g} mm")

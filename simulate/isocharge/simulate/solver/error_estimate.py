@@ -7,7 +7,6 @@ meshes agree. Each order divides the error by three to ten, so the difference of
 finer one.
 """
 
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -60,7 +59,8 @@ def shape_error(mesh: PlacedMesh) -> float:
     geometry = mesh.geometry
     if geometry.weights.min() <= 0.0 or geometry.mass.min() <= 0.0:
         return np.inf
-    return float(np.sqrt(abs(mesh.template.copies * geometry.weights.sum() / np.pi - 1.0)))
+    area = np.pi * (1.0 + 0.5 * abs(mesh.oval) ** 2)
+    return float(np.sqrt(abs(mesh.template.copies * geometry.weights.sum() / area - 1.0)))
 
 
 def decay(mesh: PlacedMesh, slope: Array) -> float:
@@ -147,7 +147,7 @@ def summary(equilibrium: Equilibrium) -> dict[str, Any]:
         "seconds": equilibrium.seconds,
         "estimated_error": finite_or_none(estimated_error(equilibrium)),
         "groups": {
-            **asdict(equilibrium.groups),
+            **{name: value for name, value in vars(equilibrium.groups).items() if name != "anisotropy"},
             "bending_length": bending_length(equilibrium.film, equilibrium.force),
         },
         "warnings": list(cautions(equilibrium)),

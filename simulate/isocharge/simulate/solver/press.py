@@ -11,7 +11,7 @@ from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.placed_mesh import Geometry, PlacedMesh
+from isocharge.simulate.mesh.placed_mesh import Geometry, PlacedMesh, from_oval
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.film import Film
@@ -129,7 +129,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
     """Solve on one mesh."""
     if np.isinf(shape_error(mesh)):
         raise too_near_the_rim(case, mesh.resolution)
-    solver = assembly(mesh.resolution, mesh.template.corners, 4 if case.theory.bending else 3)
+    solver = assembly(mesh.template, 4 if case.theory.bending else 3)
     elastic = _elastic(case, mesh.geometry, case.force)
     result = _newton(case, elastic, solver, mesh, start) if case.theory.stretching else solve_linear(elastic, solver)
     return Equilibrium(
@@ -150,14 +150,15 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 
 
 def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
-    return ElasticFilm(geometry, DimensionlessGroups.of(case.film, force, bending=case.theory.bending))
+    angle = float(np.arctan2(case.at[1], case.at[0]))
+    return ElasticFilm(geometry, DimensionlessGroups.of(case.film, force, bending=case.theory.bending, angle=angle))
 
 
 def _newton(
     case: LoadCase, elastic: ElasticFilm, solver: Assembly, mesh: PlacedMesh, start: Equilibrium | None
 ) -> NewtonResult:
     """Newton's method from the start if its mesh fits, else from Schwerin's field; by load steps if that fails."""
-    z = mesh.placement.to_template(mesh.node_points)
+    z = mesh.placement.to_template(from_oval(mesh.node_points, mesh.oval))
     cold = schwerin_start(z, float(mesh.placement.rho), elastic.groups)
     result = solve_newton(elastic, solver, _start_field(start, mesh.template, cold), case.tolerance)
     return result if result.converged else _by_load_steps(case, result, mesh.geometry, solver, cold)
@@ -187,7 +188,7 @@ def _by_load_steps(
 
 def _start_field(start: Equilibrium | None, template: Template, cold: Array) -> Array:
     """The field of a neighbour on the same mesh, perhaps of another order; else the cold start."""
-    if start is None or start.mesh.template.corners != template.corners:
+    if start is None or (start.mesh.template.corners, start.mesh.template.half) != (template.corners, template.half):
         return cold
     before, order = start.mesh.template, template.resolution.order
     if replace(before.resolution, order=order) != template.resolution:

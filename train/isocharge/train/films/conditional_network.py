@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.forward.film_family import SOFTENING
+from isocharge.simulate.forward.film_grid import SOFTENING
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 from isocharge.train.films.films_data import FilmPresses
