@@ -1,7 +1,8 @@
-"""Independent second solver of a pressed film with imperfections, with scikit-fem: a test oracle, not of the product.
+"""Independent second solver of a pressed film with imperfections, with scikit-fem: a test oracle.
 
-Green-Lagrange membrane strain, St. Venant-Kirchhoff plane stress of an orthotropic film with a tensor pretension, linear
-plate bending, a clamp that may be oval, electrodes that may be stiffer, dead load spread uniformly over a round tip.
+Green-Lagrange membrane strain, St. Venant-Kirchhoff plane stress of an orthotropic film with a tensor pretension,
+linear plate bending, a clamp that may be oval, electrodes that may be stiffer, dead load spread uniformly over a round
+tip.
 All three displacements are continuous cubic triangles; bending is a C0 interior penalty method, which also clamps the
 slope. Electrodes are not meshed: their charge, that of the film alone, is integrated on a fine mesh of their own.
 Newton, millimetre and MPa throughout.
@@ -19,7 +20,7 @@ from skfem import Basis, BoundaryFacetBasis, ElementTriP1, ElementTriP3, Interio
 Array = NDArray[np.float64]
 
 PENALTY = 10.0
-"""On jumps of slope, times plate stiffness * side length / area of the triangle; too little makes the plate unstable."""
+"""On jumps of slope, times plate stiffness * side / area of the triangle; too little makes the plate unstable."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class SkfemFilm:
         tension: T11, T22, T12 along x and y, MPa.
         oval: e of the clamp, with semi-axes radius * (1 +- e).
         oval_angle: Of its long axis, rad.
-        stiffer: Convex polygons (n, 2) in mm, anticlockwise, within which the membrane is stiffer, each with its factor.
+        stiffer: Convex polygons (n, 2), mm, anticlockwise, within which the membrane is stiffer, with their factors.
         soft: Width of their edges, mm, over which the factor rises.
     """
 
@@ -52,7 +53,7 @@ class SkfemFilm:
 
     @property
     def moduli(self) -> Array:
-        """Plane-stress C, (s11, s22, s12) from (e11, e22, 2 e12) along x and y, shape (3, 3), MPa (Jones 1999, ch. 2)."""
+        """Plane-stress C along x and y, (s11, s22, s12) from (e11, e22, 2 e12), (3, 3), MPa (Jones 1999, ch. 2)."""
         (one, two), nu = self.young, self.poisson
         mean = np.sqrt(one * two)
         shear = self.shear if self.shear is not None else mean / (2 * (1 + nu * np.sqrt(two / one)))
@@ -70,7 +71,9 @@ def stress_turn(angle: float) -> Array:
 # --- mesh -------------------------------------------------------------------------------------------------------------
 
 
-def film_mesh(film: SkfemFilm, at: complex, reach: float, layer: float, around: int) -> tuple[MeshTri, NDArray[np.bool_]]:
+def film_mesh(
+    film: SkfemFilm, at: complex, reach: float, layer: float, around: int
+) -> tuple[MeshTri, NDArray[np.bool_]]:
     """Triangles in mm whose rings follow tip and rim, and which of them the tip presses on.
 
     A Moebius map carries rings about the centre onto the disk, circles staying circles; z + e z^3 makes the rim oval.
@@ -274,7 +277,9 @@ class Discrete:
                 lower = self.energy(unknown + length * step)
             if slope < 0 and length > 0.05:
                 unknown, energy = unknown + length * step, lower
-                for _ in range(12 if extra == 0 and length == 1 else 0):  # more steps with the same tangent while it pays
+                for _ in range(
+                    12 if extra == 0 and length == 1 else 0
+                ):  # more steps with the same tangent while it pays
                     before, step = slope, -solve_linear(force := self.force(unknown))
                     slope = float(force @ step)
                     if abs(slope) > 0.1 * abs(before):

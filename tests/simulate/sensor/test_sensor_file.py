@@ -187,7 +187,7 @@ def test_wrong_type_is_named(path):
         (("film", "thickness_um"), -25.0, r"film\.thickness_um: expected a positive number, got -25\.0"),
         (("film", "radius_mm"), 1e300, r"film\.radius_mm: expected a number above 0 and at most 1e\+06, got 1e\+300"),
         (("film", "radius_mm"), 0.03, r"film radius: expected at least 1 mm, .* 0\.03 m are 30 mm"),
-        (("film", "pretension_MPa"), -1, r"film\.pretension_MPa: expected a number from 0, got -1"),
+        (("film", "pretension_MPa"), -11, r"film pretension: expected -10 to 10000 MPa, got -11 MPa"),
         (("film", "thickness_um"), 3000.3, r"film thickness: .* radius \(30 mm\), got 3\.0003 mm"),
         (("electrodes", "side_mm"), 0.0, "electrodes.side_mm: expected a number above 0"),
         (("electrodes", "A"), [8.0, 5.0], "electrodes 'A' and 'B' overlap"),

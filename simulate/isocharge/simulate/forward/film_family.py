@@ -26,9 +26,9 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, SceneError, SolveError
 from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.forward.family import Chain, Family, check_family, solve_chains
 from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, FilmLimits, decompose, quantised
 from isocharge.simulate.forward.film_modes import MODES, FilmModes, ModeMap
-from isocharge.simulate.forward.family import Chain, Family, check_family, solve_chains
 from isocharge.simulate.forward.forward_map import ForwardMap, relative_error
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.sensor.film import Film, Surface
@@ -227,6 +227,8 @@ class FilmFamily:
                 f"film: expected the family's Poisson's ratio {self.poisson} and surface {self.surface!r}, got "
                 f"{film.poisson} and {surface!r}"
             )
+        if not film.turns:
+            raise SceneError(f"film: expected one that is alike all round, got {film.around}; modes stand for these")
         for name, value in groups.items():
             low, high = self.limits[name]
             if not low * (1.0 - SLACK) - 1e-15 <= value <= high * (1.0 + SLACK):

@@ -25,7 +25,6 @@ from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.sensor.film import Film, Piezo
 from isocharge.simulate.sensor.probe import Circle
-from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.sensitivity import FIELDS, ODD, stress_changes
 
@@ -48,7 +47,7 @@ MODES = {
     tension_difference, tension_shear   (T11 - T22) / 2 and T12
     stiffness_x, stiffness_xy           ln(E1 / E2) times cos and sin of twice the angle of axis 1 from x
     poisson                             added to the family's Poisson's ratio
-    oval_x, oval_xy                     e of a rim at radius * (1 + e cos 2 (angle - alpha)), times cos and sin of 2 alpha
+    oval_x, oval_xy                     e of a rim at radius * (1 + e cos 2 (angle - alpha)), by cos and sin of 2 alpha
     d12                                 charge of shear, 2 d12 s12: (d31 - d32) / 2 times sin of twice the angle of axes
     crosstalk                           share of every other electrode's charge that an electrode reads
 """
@@ -56,12 +55,12 @@ MODES = {
 COUNTS = (5, 8, 7, 1, 1)
 """Nodes along each of `AXES`."""
 
-LEFT_OUT = 1e-3
+LEFT_OUT = 3e-3
 """Share of the fields that their decomposition may leave out."""
 
 
-BITS = 10
-"""Bits of a part's values in a file: they err by a thousandth of the largest, and the file stays small."""
+BITS = 9
+"""Bits of a part's values in a file, relative to the node's own size."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,8 @@ class ModeMap:
         columns: dict[str, Array] = {}
         if self.fields is not None:
             sensor = self.film.sensor
-            charge = dict(zip(self.which, np.moveaxis(self.fields.by_field(contact, ODD[list(self.which)]), 2, 0)))
+            by_field = self.fields.by_field(contact, ODD[list(self.which)])
+            charge = dict(zip(self.which, np.moveaxis(by_field, 2, 0), strict=True))
             scale = sensor.film.young * amplitude_squared(sensor.film, contact[:, 2]) + sensor.film.pretension
             for name, (first, second), (along, across) in _pairs():
                 if first in charge:
@@ -112,7 +112,8 @@ class ModeMap:
             shear = replace(self.film, sensor=replace(self.film.sensor, piezo=Piezo(0.0, 0.0, d12=1.0)))
             columns["d12"] = shear.charges(contact)
         if "crosstalk" in self.names:
-            own = self.film.charges(contact)
+            calibration = replace(self.film.sensor.calibration, crosstalk=0.0)
+            own = replace(self.film, sensor=replace(self.film.sensor, calibration=calibration)).charges(contact)
             columns["crosstalk"] = own.sum(axis=1, keepdims=True) - own
         return np.stack([columns[name] for name in self.names], axis=2)
 
@@ -212,13 +213,16 @@ class FilmModes:
     def to_arrays(self) -> dict[str, Any]:
         """As arrays, for a file."""
         coefficients, scale = quantised(self.coefficients, axis=(0, 1, 2, 3, 4))
-        parts, size = quantised(self.parts, axis=1, bits=BITS)
+        by_node = self.parts.reshape(len(self.parts), -1, 3)
+        node_size = np.float32(np.sqrt((by_node**2).sum(axis=(0, 2), keepdims=True)) + np.finfo(np.float32).tiny)
+        parts, size = quantised((by_node / node_size).reshape(len(self.parts), -1), axis=1, bits=BITS)
         return {
             "grid_shape": np.array(self.grid.shape),
             "grid": np.concatenate([getattr(self.grid, name) for name in AXES]),
             "coefficients": coefficients,
             "parts": parts,
             "part_scale": np.float32(scale.ravel()[:, None] * size),
+            "node_size": node_size.ravel(),
         }
 
     @classmethod
@@ -233,6 +237,7 @@ class FilmModes:
             if arrays["coefficients"].shape != (*shape, len(parts)) or scale.shape != (len(parts), 1):
                 raise ValueError(f"coefficients {arrays['coefficients'].shape} and parts {parts.shape} do not fit")
             grid = FilmGrid(*np.split(np.asarray(arrays["grid"], dtype=float), np.cumsum(shape)[:-1]))
-            return cls(grid, arrays["coefficients"].astype(float), parts * np.asarray(scale, dtype=float))
+            size = np.repeat(np.asarray(arrays["node_size"], dtype=float), 3)
+            return cls(grid, arrays["coefficients"].astype(float), parts * np.asarray(scale, dtype=float) * size)
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise InputError(f"film modes: expected the arrays that to_arrays gives ({error})") from error

@@ -208,7 +208,7 @@ class ForwardMap:
             for i in np.flatnonzero(self._near(at).any(axis=1)):
                 probe = self.probe.rotated(float(orientation[i]))
                 charge[i] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])
-        return charge
+        return self.sensor.calibration.read(charge)
 
     def _by_field(self, at: Complexes, force: Array, orientation: Array, odd: Booleans) -> Array:
         """Charges of the fields of one chunk of presses, shape (n, n_electrode, n_field)."""

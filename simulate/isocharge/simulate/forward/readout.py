@@ -96,7 +96,7 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
     stress = touch_stress(equilibrium, readout.points.reshape(-1, 2), sensor.surface)
     charge = readout.charge(stress.reshape(*readout.points.shape[:2], 3))
     charge += contact_charge(sensor, equilibrium.probe, equilibrium.at, equilibrium.force)
-    return charge
+    return sensor.calibration.read(charge)
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
@@ -131,7 +131,7 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
     """
     areas = np.array([electrode.area for electrode in sensor.electrodes])
     charge: Array = sensor.gains * areas * sensor.piezo.pyro * step
-    return charge
+    return sensor.calibration.read(charge)
 
 
 def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tuple[Array, Array]:

@@ -8,9 +8,9 @@ an amplitude A (see `isocharge.simulate.mechanics.scaling`)
     w = a A W,   u = a A^2 U,   E = A^2 [ sym grad U + grad W (x) grad W / 2 + A^2 (grad U)^T grad U / 2 ],
 
 so that the Green-Lagrange strain is A^2 times a number of order one whatever the force, and so is the stress: St.
-Venant-Kirchhoff, plane stress, S = E_young A^2 (C : E' + tau I). Energies are in units of E_young h a^2 A^4. A film that
-is not the same in all directions adds a matrix to C and a deviator to tau I (`scaling.Anisotropy`); its bending keeps
-the mean stiffness.
+Venant-Kirchhoff, plane stress, S = E_young A^2 (C : E' + tau I). Energies are in units of E_young h a^2 A^4. A film
+that is not the same in all directions adds a matrix to C and a deviator to tau I (`scaling.Anisotropy`); its bending
+keeps the mean stiffness.
 """
 
 import numpy as np

@@ -59,7 +59,7 @@ class DimensionlessGroups:
 
     @classmethod
     def of(cls, film: Film, force: float, *, bending: bool, angle: float = 0.0) -> "DimensionlessGroups":
-        """The groups of a film under a force (N), with or without bending, of a press in the direction `angle` (rad)."""
+        """The groups of a film under a force (N), with or without bending; the press lies at an angle (rad)."""
         amplitude2 = float(amplitude_squared(film, force))
         return cls(
             amplitude2=amplitude2,
@@ -88,7 +88,7 @@ class DimensionlessGroups:
 
 def scaled_stress(strained: Array, groups: DimensionlessGroups) -> Array:
     """C : E' of a scaled strain, shape (..., 3), in units of E_young A^2; see `mechanics.stress.stress`."""
-    return stress(strained, groups.poisson, groups.anisotropy and groups.anisotropy.moduli)
+    return stress(strained, groups.poisson, None if groups.anisotropy is None else groups.anisotropy.moduli)
 
 
 def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:

@@ -70,7 +70,7 @@ class Theory:
 def bending_length(film: Film, force: float) -> float:
     """l / a: length over which a clamped edge bends the film, in units of the film's radius."""
     groups = DimensionlessGroups.of(film, force, bending=True)
-    tension = groups.tension + INDUCED_STRAIN * groups.height**2
+    tension = max(groups.tension, 0.0) + INDUCED_STRAIN * groups.height**2
     return float(np.sqrt(groups.bending / tension))
 
 

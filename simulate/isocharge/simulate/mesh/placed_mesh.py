@@ -18,7 +18,6 @@ from isocharge.simulate.numerics.interpolation import (
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 
-
 ROUND = 0.5
 """Share of the film's radius within which the mesh of an oval film is that of a round one: probe and electrodes."""
 

@@ -1,5 +1,6 @@
 """The film and its piezoelectric coefficients."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,6 +21,14 @@ LEAST_PIEZO = 1e-3
 
 LEAST_YOUNG, MOST_YOUNG, MOST_PRETENSION = 1e-6, 1e7, 1e4
 """Bounds of Young's modulus and of the pretension of a film, MPa: larger numbers are in pascals."""
+
+
+MOST_RATIO, MOST_OVAL = 10.0, 0.1
+"""Largest E1 / E2 and largest e of an oval clamp: beyond, the mesh and the start of a solve are not tried."""
+
+
+MOST_SLACK = 10.0
+"""Largest pretension below 0, MPa: a film that is too long by 0.2 %; light presses wrinkle a slack one."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +67,12 @@ class Film:
         return self.deviator != (0.0, 0.0) or self.young_ratio != 1.0 or self.shear is not None
 
     @property
+    def around(self) -> dict[str, object]:
+        """All that is not alike all round the film, by the names of the attributes."""
+        names = ("deviator", "young_ratio", "shear", "axis", "oval", "oval_axis")
+        return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(Film, name)}
+
+    @property
     def turns(self) -> bool:
         """Whether the film turned about its centre is the same film: a press at (r, theta) is then one at (r, 0)."""
         return not self.anisotropic and self.oval == 0.0
@@ -66,9 +81,21 @@ class Film:
         check_length("film radius", self.radius, LEAST_RADIUS, SensorError)
         check_length("film thickness", self.thickness, LEAST_THICKNESS, SensorError)
         check_stress("film young", self.young, LEAST_YOUNG, MOST_YOUNG, SensorError)
-        check_stress("film pretension", self.pretension, -MOST_PRETENSION, MOST_PRETENSION, SensorError)
+        check_stress("film pretension", self.pretension, -MOST_SLACK, MOST_PRETENSION, SensorError)
         if not 0.0 <= self.poisson < 0.5:
             raise SensorError(f"film poisson: expected 0 <= poisson < 0.5, got {self.poisson}")
+        for name, value in zip(("(T11 - T22) / 2", "T12"), self.deviator, strict=True):
+            check_stress(f"film pretension, {name}", value, -MOST_PRETENSION, MOST_PRETENSION, SensorError)
+        if self.shear is not None:
+            check_stress("film shear", self.shear, LEAST_YOUNG, MOST_YOUNG, SensorError)
+        if not 1.0 / MOST_RATIO <= self.young_ratio <= MOST_RATIO:
+            raise SensorError(
+                f"film young: expected E1 / E2 from 1/{MOST_RATIO:g} to {MOST_RATIO:g}, got {self.young_ratio:g}"
+            )
+        if not abs(self.oval) <= MOST_OVAL:
+            raise SensorError(f"film oval: expected a share up to {MOST_OVAL:g}, got {self.oval}")
+        if not (math.isfinite(self.axis) and math.isfinite(self.oval_axis)):
+            raise SensorError(f"film axis, oval_axis: expected finite angles, got {self.axis}, {self.oval_axis}")
         if self.thickness > 0.1 * self.radius:
             raise SensorError(
                 f"film thickness: expected at most a tenth of the radius ({self.radius:g} mm), "

@@ -22,7 +22,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate.sensor.probe import Circle
-from isocharge.simulate.sensor.sensor import Calibration, Sensor
+from isocharge.simulate.sensor.sensor import Sensor
 
 SHARED = ("pretension", "young", "thickness", "d31", "d32", "shift_x", "shift_y", "rotation", "probe_radius")
 """Parameters that every film has; gains follow, one for each electrode."""
@@ -161,7 +161,7 @@ class FilmPrior:
                 pretension=values["pretension"],
             ),
             piezo=replace(piezo, d31=piezo.d31 * factors["d31"], d32=piezo.d32 * factors["d32"]),
-            calibration=Calibration(gains, shift, before.rotation + values["rotation"]),
+            calibration=replace(before, gain=gains, shift=shift, rotation=before.rotation + values["rotation"]),
         )
         return sensor, Circle(self.probe.radius + values["probe_radius"])
 
@@ -182,6 +182,9 @@ class FilmPrior:
             ("film radius (mm)", round(sensor.film.radius, 6), round(described.film.radius, 6)),
             ("film poisson", round(sensor.film.poisson, 9), round(described.film.poisson, 9)),
             ("d33 (pC/N)", sensor.piezo.d33, described.piezo.d33),
+            ("d12 (pC/N)", sensor.piezo.d12, described.piezo.d12),
+            ("crosstalk", sensor.calibration.crosstalk, described.calibration.crosstalk),
+            ("what is not alike all round the film", sensor.film.around, described.film.around),
         ):
             if value != expected:
                 raise SensorError(f"{sensor.name}: {what}: expected those of {described.name}, {expected}, got {value}")

@@ -31,6 +31,9 @@ LEAST_EXTENT = 0.02
 LONGEST_PART = 3.0
 """Longest side of the parts into which what is no convex polygon is cut, mm."""
 
+MOST_CROSSTALK = 0.2
+"""Largest crosstalk, dimensionless: beyond, the wires are wrong."""
+
 LONGEST_NAME = 100
 """Longest name of an electrode, characters."""
 
@@ -155,11 +158,19 @@ class Calibration:
         gain: Charge read over charge collected, by electrode name; missing names count as 1.
         shift: Displacement of the electrodes from the layout, mm.
         rotation: Angle by which they are rotated about the film's centre before the shift, rad, anticlockwise.
+        crosstalk: Share of every other electrode's charge that an electrode reads, dimensionless.
     """
 
     gain: dict[str, float] = field(default_factory=dict)
     shift: tuple[float, float] = (0.0, 0.0)
     rotation: float = 0.0
+    crosstalk: float = 0.0
+
+    def read(self, charge: Array) -> Array:
+        """What is read of charges (..., n_electrode), pC, with the crosstalk."""
+        if self.crosstalk == 0.0:
+            return charge
+        return np.asarray(charge + self.crosstalk * (charge.sum(axis=-1, keepdims=True) - charge))
 
     def place(self, points: Array) -> Array:
         """Layout positions, shape (..., 2), to positions on the real film."""
@@ -192,6 +203,10 @@ class Sensor:
             _check_name(name)
         if not all(np.isfinite(gain) and gain > 0.0 for gain in gains.values()):
             raise SensorError(f"calibration gain: expected positive numbers, got {shown(gains)}")
+        if not abs(self.calibration.crosstalk) <= MOST_CROSSTALK:
+            raise SensorError(
+                f"calibration crosstalk: expected a share up to {MOST_CROSSTALK:g}, got {self.calibration.crosstalk}"
+            )
         if not set(gains) <= set(names):
             unknown = sorted(set(gains) - set(names))
             raise SensorError(f"calibration gain: no electrode named {shown(unknown)}, have {cut(str(names))}")

@@ -44,9 +44,13 @@ class FilmTable(Settings, frozen=True):
 
     radius_mm: Annotated[float, Meta(gt=0.0, le=FARTHEST_MM)]
     thickness_um: Positive
-    young_GPa: Positive
+    young_GPa: Positive | Annotated[list[Positive], Meta(min_length=2, max_length=2)]
     poisson: Finite
-    pretension_MPa: NotNegative = 0.0
+    pretension_MPa: Finite | Annotated[list[Finite], Meta(min_length=3, max_length=3)] = 0.0
+    shear_GPa: Positive | None = None
+    axis_deg: Finite = 0.0
+    oval: Finite = 0.0
+    oval_axis_deg: Finite = 0.0
 
 
 class PiezoTable(Settings, frozen=True):
@@ -56,6 +60,7 @@ class PiezoTable(Settings, frozen=True):
     d32: Finite
     d33: Finite = 0.0
     pyro_uC_per_m2_K: Finite = 0.0
+    d12: Finite = 0.0
 
 
 class PolygonTable(Settings, frozen=True):
@@ -74,6 +79,7 @@ class CalibrationTable(Settings, frozen=True):
     gain: dict[str, Positive] = field(default_factory=dict)
     shift_mm: Point = (0.0, 0.0)
     rotation_deg: Finite = 0.0
+    crosstalk: Finite = 0.0
 
 
 class SensorTable(Settings, frozen=True):
@@ -155,24 +161,36 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
             "d32": tidy(piezo.d32),
             "d33": tidy(piezo.d33),
             "pyro_uC_per_m2_K": tidy(piezo.pyro),
+            **({"d12": tidy(piezo.d12)} if piezo.d12 else {}),
         },
         "electrodes": _electrode_tables(sensor),
         "calibration": {
             "gain": dict(calibration.gain),
             "shift_mm": [tidy(value) for value in calibration.shift],
             "rotation_deg": tidy(float(np.rad2deg(calibration.rotation))),
+            **({"crosstalk": tidy(calibration.crosstalk)} if calibration.crosstalk else {}),
         },
     }
 
 
-def film_to_dict(film: Film) -> dict[str, float]:
+def film_to_dict(film: Film) -> dict[str, Any]:
     """The table of a film in the sensor file."""
+    (difference, shear), ratio, mean = film.deviator, np.sqrt(film.young_ratio), film.pretension
+    tension = [tidy(value) for value in (mean + difference, mean - difference, shear)]
+    both = [tidy(film.young * 1e-3 * ratio), tidy(film.young * 1e-3 / ratio)]
+    around = {
+        "shear_GPa": None if film.shear is None else tidy(film.shear * 1e-3),
+        "axis_deg": tidy(float(np.rad2deg(film.axis))),
+        "oval": tidy(film.oval),
+        "oval_axis_deg": tidy(float(np.rad2deg(film.oval_axis))),
+    }
     return {
         "radius_mm": tidy(film.radius),
         "thickness_um": tidy(film.thickness * 1e3),
-        "young_GPa": tidy(film.young * 1e-3),
+        "young_GPa": tidy(film.young * 1e-3) if film.young_ratio == 1.0 else both,
         "poisson": film.poisson,
-        "pretension_MPa": tidy(film.pretension),
+        "pretension_MPa": tension if any(film.deviator) else tidy(mean),
+        **{name: value for name, value in around.items() if value},
     }
 
 
@@ -235,12 +253,33 @@ def _build(file: SensorTable) -> Sensor:
     film, piezo, calibration = file.film, file.piezo, file.calibration
     return Sensor(
         name=file.name,
-        film=Film(film.radius_mm, film.thickness_um * 1e-3, film.young_GPa * 1e3, film.poisson, film.pretension_MPa),
-        piezo=Piezo(piezo.d31, piezo.d32, piezo.d33, piezo.pyro_uC_per_m2_K),
+        film=_film(film),
+        piezo=Piezo(piezo.d31, piezo.d32, piezo.d33, piezo.pyro_uC_per_m2_K, piezo.d12),
         electrodes=tuple(_electrodes(file.electrodes)),
         readout=file.readout,
         surface=file.surface,
-        calibration=Calibration(calibration.gain, calibration.shift_mm, float(np.deg2rad(calibration.rotation_deg))),
+        calibration=Calibration(
+            calibration.gain, calibration.shift_mm, float(np.deg2rad(calibration.rotation_deg)), calibration.crosstalk
+        ),
+    )
+
+
+def _film(table: FilmTable) -> Film:
+    young, tension = table.young_GPa, table.pretension_MPa
+    first, second = young if isinstance(young, list) else (young, young)
+    along, across, shear = tension if isinstance(tension, list) else (tension, tension, 0.0)
+    return Film(
+        radius=table.radius_mm,
+        thickness=table.thickness_um * 1e-3,
+        young=first * 1e3 if first == second else float(np.sqrt(first * second)) * 1e3,
+        poisson=table.poisson,
+        pretension=along if along == across else 0.5 * (along + across),
+        deviator=(0.5 * (along - across), shear),
+        young_ratio=first / second,
+        shear=None if table.shear_GPa is None else table.shear_GPa * 1e3,
+        axis=float(np.deg2rad(table.axis_deg)),
+        oval=table.oval,
+        oval_axis=float(np.deg2rad(table.oval_axis_deg)),
     )
 
 

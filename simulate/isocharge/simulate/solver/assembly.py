@@ -121,7 +121,7 @@ def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
     """Which unknowns are not fixed by clamping or symmetry, shape (n_node, components)."""
     free = np.ones((mesh.n_node, components), dtype=bool)
     free[mesh.on_rim, :3] = False
-    free[np.ix_(mesh.on_axis, np.arange(components) != 1 if odd else [1])] = False
+    free[np.ix_(mesh.on_axis, (np.arange(components) == 1) != odd)] = False
     return free
 
 

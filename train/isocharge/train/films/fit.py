@@ -1,7 +1,7 @@
 """Fit one network to all the films that a sensor may be."""
 
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from typing import Any
 
@@ -14,6 +14,7 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.simulate import Domain, NoiseModel, noise_model
 from isocharge.simulate.forward.film_family import FilmFamily
+from isocharge.simulate.forward.film_modes import FilmModes
 from isocharge.simulate.sensor.film_prior import REACH, SHARED, FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.misfit_charges import misfit_noise
@@ -182,7 +183,8 @@ def _family(prior: FilmPrior, config: FilmsConfig, executor: Executor | None) ->
     low, high = config.force_range
     forces = (low * FORCES_BEYOND[0], high * FORCES_BEYOND[1])
     family = FilmFamily.build(prior, config.radius + BEYOND, forces, executor=executor)
-    return FilmFamily.from_arrays(family.to_arrays())
+    modes = FilmModes.build(family, prior.sensor.film, executor)
+    return FilmFamily.from_arrays(replace(family, imperfections=modes).to_arrays())
 
 
 def _network(inputs: FilmInputs, hidden: tuple[int, ...], outputs: int) -> ConditionalPerceptron:

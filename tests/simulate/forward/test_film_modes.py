@@ -1,0 +1,83 @@
+"""Modes of imperfections against differences of direct solves, on a film that the grid does not have."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.common.errors import SceneError
+from isocharge.simulate import press, touch_charge
+from isocharge.simulate.forward import film_modes
+from isocharge.simulate.forward.film_family import FilmFamily
+from isocharge.simulate.forward.film_modes import MODES, FilmModes
+from isocharge.simulate.mechanics.stress import stress_turn
+from kept import kept
+
+CONTACTS = np.array([[2.0, 1.0, 0.9], [-0.5, -1.5, 1.1]])
+STEP = 0.02
+
+
+def narrow_modes(family, film):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(film_modes, "COUNTS", (3, 3, 3, 1, 1))
+        return FilmModes.build(family, film)
+
+
+@pytest.fixture(scope="module")
+def known(film_family):
+    """A family with its modes, and the sensor and probe of one of its films."""
+    prior, family = film_family
+    modes = kept(narrow_modes, family, prior.sensor.film)
+    whole = FilmFamily.from_arrays(replace(family, imperfections=modes).to_arrays())
+    return whole, *prior.film(prior.draw(np.random.default_rng(3), 1)[0])
+
+
+@pytest.mark.parametrize(
+    ("mode", "changes"),
+    [
+        ("tension_difference", lambda step: {"deviator": (0.1 * step, 0.0)}),
+        ("tension_shear", lambda step: {"deviator": (0.0, 0.1 * step)}),
+        ("stiffness_x", lambda step: {"young_ratio": np.exp(step)}),
+        ("stiffness_xy", lambda step: {"young_ratio": np.exp(step), "axis": 0.25 * np.pi}),
+        ("poisson", lambda step: {"poisson": 0.34 + step}),
+        ("oval_x", lambda step: {"oval": step}),
+        ("oval_xy", lambda step: {"oval": step, "oval_axis": 0.25 * np.pi}),
+    ],
+)
+def test_modes_are_the_differences_of_direct_solves(known, mode, changes):
+    family, sensor, probe = known
+
+    def charge(contact, step):
+        film = replace(sensor.film, **changes(step))
+        return touch_charge(replace(sensor, film=film), press(film, probe, tuple(contact[:2]), contact[2]))
+
+    unit = 0.1 if mode.startswith("tension") else 1.0
+    expected = [(charge(contact, STEP) - charge(contact, -STEP)) / (2.0 * STEP * unit) for contact in CONTACTS]
+    by_mode = family.mode_map(sensor, probe, [mode]).by_mode(CONTACTS)[:, :, 0]
+    assert np.abs(by_mode - expected).max() < 0.03 * np.abs(expected).max()
+
+
+def test_modes_of_the_readout(known):
+    """d12 is that of turned axes to first order; crosstalk is what the sensor reads with it."""
+    family, sensor, probe = known
+    sensor = replace(sensor, piezo=replace(sensor.piezo, d31=20.0, d32=2.0))
+    film, by_mode = family.forward_map(sensor, probe), family.mode_map(sensor, probe, ["crosstalk", "d12"])
+    d31, d32, double = np.array([20.0, 2.0, 0.0]) @ np.linalg.inv(stress_turn(0.01))
+    turned = replace(sensor, piezo=replace(sensor.piezo, d31=d31, d32=d32, d12=0.5 * double))
+    wired = replace(sensor, calibration=replace(sensor.calibration, crosstalk=0.01))
+    assert turned.piezo.d12 == pytest.approx(9.0 * np.sin(0.02), rel=1e-3)
+    for column, (other, unit) in enumerate(((wired, 0.01), (turned, turned.piezo.d12))):
+        change = family.forward_map(other, probe).charges(CONTACTS) - film.charges(CONTACTS)
+        np.testing.assert_allclose(
+            by_mode.by_mode(CONTACTS)[..., column], change / unit, atol=0.06 * np.abs(change / unit).max()
+        )
+
+
+def test_what_is_not_asked_for_is_not_computed(known):
+    family, sensor, probe = known
+    assert family.mode_map(sensor, probe, ["crosstalk"]).fields is None
+    assert family.mode_map(sensor, probe).by_mode(CONTACTS).shape == (2, 3, len(MODES))
+    with pytest.raises(SceneError, match="got wrinkles"):
+        family.mode_map(sensor, probe, ["wrinkles"])
+    with pytest.raises(SceneError, match="no modes"):
+        replace(family, imperfections=None).mode_map(sensor, probe)

@@ -1,0 +1,99 @@
+"""Films that are not isotropic, not evenly taut or not round: against scikit-fem and on paper; what refuses them."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from isocharge.common.errors import SceneError
+from isocharge.simulate import (
+    Circle,
+    Film,
+    ForwardMap,
+    SolveSettings,
+    Theory,
+    deflection,
+    load_sensor,
+    press,
+    touch_charge,
+)
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
+from kept import kept
+
+SENSOR = load_sensor("four-25um-biaxial")
+PROBE, AT, FORCE = Circle(1.0), (3.0, -2.0), 0.5
+ALL = Film(45.0, 0.025, 3000.0, 0.34, 1.0, (0.33, 0.2), young_ratio=1.2, axis=0.4, oval=0.02, oval_axis=-0.7)
+SLACK = Film(45.0, 0.025, 3000.0, 0.34, -0.3, shear=1000.0)
+
+
+def by_scikit_fem(film, around):
+    """Charges of the press by the other code, shape (n_electrode,), pC."""
+    spec = importlib.util.spec_from_file_location("film_skfem", Path(__file__).with_name("film_skfem.py"))
+    skfem = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(skfem)
+    (difference, shear), ratio = film.deviator, np.sqrt(film.young_ratio)
+    solved = skfem.solve(
+        skfem.SkfemFilm(
+            young=(film.young * ratio, film.young / ratio),
+            poisson=film.poisson * ratio,
+            shear=film.shear,
+            angle=film.axis,
+            tension=(film.pretension + difference, film.pretension - difference, shear),
+            oval=film.oval,
+            oval_angle=film.oval_axis,
+        ),
+        AT,
+        PROBE.radius,
+        FORCE,
+        around,
+    )
+    return np.array([solved.charge([np.array(electrode.corners)], 8.0, 8.0) for electrode in SENSOR.electrodes])
+
+
+@pytest.mark.parametrize("film", [ALL, SLACK], ids=["all at once", "slack, soft in shear"])
+def test_charges_agree_with_another_code(film):
+    sensor = replace(SENSOR, film=film)
+    expected = kept(by_scikit_fem, film, 30)
+    np.testing.assert_allclose(touch_charge(sensor, press(film, PROBE, AT, FORCE)), expected, rtol=8e-4)
+
+
+def test_an_oval_film_that_is_tauter_along_it_sinks_as_a_round_one_stretched():
+    """With T1 / T2 as the squares of the half axes, Green's function of the disk holds in scaled coordinates."""
+    e, taut, turn = 0.02, 2.0, 0.4
+    half, mean = 2.0 * e * taut, (1.0 + e**2) * taut
+    deviator = (half * np.cos(2.0 * turn), half * np.sin(2.0 * turn))
+    film = replace(SENSOR.film, pretension=mean, deviator=deviator, oval=e, oval_axis=turn)
+    solved = press(film, Circle(0.1), (9.0, -5.0), 1e-6, SolveSettings(theory=Theory(True, False, True)))
+
+    def scaled(points):
+        along = np.asarray(points) @ [1.0, 1j] * np.exp(-1j * turn) / film.radius
+        return along.real / (1.0 + e) + 1j * along.imag / (1.0 - e)
+
+    points = np.array([[-10.0, 3.0], [15.0, 12.0], [0.0, 20.0], [-30.0, -10.0]])
+    z, source = scaled(points), scaled((9.0, -5.0))
+    green = np.log(np.abs((1.0 - z * np.conj(source)) / (z - source)))
+    expected = 1e-6 / (2.0 * np.pi * film.thickness * taut * (1.0 - e**2)) * green
+    np.testing.assert_allclose(deflection(solved, points), expected, rtol=3.0 * e**2)
+
+
+def test_the_sensor_file_holds_all_of_it():
+    sensor = replace(SENSOR, film=replace(ALL, shear=1000.0), piezo=replace(SENSOR.piezo, d12=0.5))
+    sensor = replace(sensor, calibration=replace(sensor.calibration, crosstalk=0.01))
+    table = sensor_to_dict(sensor)
+    assert table["film"]["pretension_MPa"] == [1.33, 0.67, 0.2]
+    assert sensor_to_dict(sensor_from_dict(table)) == table
+
+
+def test_crosstalk_adds_a_share_of_the_others():
+    solved = press(SENSOR.film, PROBE, AT, FORCE)
+    own = touch_charge(SENSOR, solved)
+    wired = replace(SENSOR, calibration=replace(SENSOR.calibration, crosstalk=0.01))
+    np.testing.assert_allclose(touch_charge(wired, solved), 0.99 * own + 0.01 * own.sum(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("changes", [{"oval": 0.01}, {"deviator": (0.1, 0.0)}])
+def test_maps_refuse_what_is_not_alike_all_round(changes):
+    with pytest.raises(SceneError, match=f"alike all round, got .*{next(iter(changes))}"):
+        ForwardMap.build(replace(SENSOR, film=replace(SENSOR.film, **changes)), PROBE)
