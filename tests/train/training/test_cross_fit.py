@@ -9,9 +9,11 @@ from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, Predictor, read_presses
 from isocharge.serve.prediction.press_check import check_presses
 from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit_presses, release
-from isocharge.train.data.measured_sensor import outline
+from isocharge.train.data.channel_noise import ChannelNoise
+from isocharge.train.data.measured_sensor import PressedArea, outline
 from isocharge.train.data.presses import folds_by_place, held_out
 from isocharge.train.training.cross_fit import deviation_factors, usable_presses
+from isocharge.train.training.network import Features
 from kept import ROOT, kept
 
 QUICK = FitConfig(
@@ -116,6 +118,16 @@ def test_the_outline_is_that_of_the_area():
     assert area == pytest.approx(1200.0, rel=0.05)
     with pytest.raises(PressError, match="expected presses over an area"):
         outline(np.column_stack([np.arange(9.0), np.arange(9.0)]))
+
+
+def test_one_force_and_channels_that_are_mostly_zero():
+    contact = contacts(600, 6) * [1.0, 1.0, 0.0] + [0.0, 0.0, 2.0]
+    low, high = PressedArea.of(contact).force_range
+    assert low < 2.0 < high
+    charge = np.where(np.random.default_rng(7).random((600, 4)) < 0.6, 0.0, charges(contact, 8))
+    noise = ChannelNoise.of(charge, PressedArea.of(contact).to_unit(contact))
+    np.testing.assert_allclose(noise.charge(noise.level(charge)), charge, rtol=1e-9, atol=1e-12)
+    assert np.isfinite(Features.of_signed(charge, noise.bend(charge)).matrix).all()
 
 
 def test_a_place_is_in_one_fold():

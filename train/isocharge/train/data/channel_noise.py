@@ -23,8 +23,18 @@ OUTLIER = 3.0
 """Standard deviations beyond which a residual counts as this many: a knock against the rig is no noise."""
 
 LEAST_SHARE = 0.01
-"""Least white noise over gain, relative to the median size of a channel's charges: where no charge is small, the
-presses do not tell the white noise."""
+"""Least white noise over gain, relative to the usual size of a channel's charges: where no charge is small, the presses
+do not tell the white noise."""
+
+BOTH_SIGNS = 0.01
+"""Share of presses from which on the rarer sign of a channel's charges counts, dimensionless."""
+
+LEAST_BEND = 0.5
+"""Least charge of such a channel from which features are logarithmic, relative to the usual size: without noise they
+would have a kink where the charge changes its sign."""
+
+LARGEST_EXPONENT = 50.0
+"""Of charges from levels: 1e21 times the white noise over gain is no charge."""
 
 LEAST_GAIN = 1e-4
 """Least gain, dimensionless: that of a good amplifier. It keeps asinh(gain Q / white) / gain apart from Q / white."""
@@ -53,7 +63,7 @@ class ChannelNoise:
         fits = [_variance(*columns) for columns in zip(planes.value.T, planes.residual.T, strict=True)]
         white, gain = np.sqrt(np.array(fits)).T
         gain = np.maximum(gain, LEAST_GAIN)
-        return cls(np.maximum(white, LEAST_SHARE * gain * np.median(np.abs(charge), axis=0)), gain)
+        return cls(np.maximum(white, LEAST_SHARE * gain * usual_size(charge)), gain)
 
     def sigma(self, charge: Array) -> Array:
         """Standard deviation for charges of shape (n, n_electrode), pC; the same shape."""
@@ -69,7 +79,14 @@ class ChannelNoise:
 
     def charge(self, level: Array) -> Array:
         """The inverse of `level`, pC."""
-        return np.asarray(np.sinh(level * self.gain) * self.white / self.gain)
+        exponent = np.clip(level * self.gain, -LARGEST_EXPONENT, LARGEST_EXPONENT)
+        return np.asarray(np.sinh(exponent) * self.white / self.gain)
+
+    def bend(self, charge: Array) -> Array:
+        """Sizes from which features of charges (n, n_electrode) are logarithmic, shape (n_electrode,), pC."""
+        rarer = np.minimum(np.mean(charge > 0.0, axis=0), np.mean(charge < 0.0, axis=0))
+        least = np.where(rarer > BOTH_SIGNS, LEAST_BEND * usual_size(charge), 0.0)
+        return np.asarray(np.maximum(self.white / self.gain, least))
 
     def scaled(self, factor: float) -> "ChannelNoise":
         """The same noise, larger by a factor."""
@@ -122,6 +139,11 @@ class LocalPlanes:
             nearer = (left**2).sum(axis=1) < (best**2).sum(axis=1)
             best[nearer] = left[nearer]
         return best
+
+
+def usual_size(charge: Array) -> Array:
+    """Median size of the charges that are not 0, shape (n_electrode,), of (n, n_electrode), pC; none may be 0 alone."""
+    return np.array([np.median(np.abs(column[column != 0.0])) for column in charge.T])
 
 
 def _variance(value: Array, residual: Array) -> tuple[float, float]:

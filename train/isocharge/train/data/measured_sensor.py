@@ -15,6 +15,9 @@ from isocharge.simulate.numerics.polygon import area_of, to_complex, to_corners
 LEAST_HOLE = 6.0
 """Smallest gap between places that may be outside the area, over the distance between neighbours."""
 
+LEAST_RANGE = 1.1
+"""Least ratio of the largest to the smallest force: presses of one force are learned, too."""
+
 LONGEST_MITRE = 2.0
 """Largest distance by which a corner moves out, over that of the sides."""
 
@@ -58,8 +61,10 @@ class PressedArea(Domain):
         corners = outline(np.unique(contact[:, :2], axis=0))
         middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
         radius = float(np.linalg.norm(corners - middle, axis=1).max())
-        forces = float(contact[:, 2].min()), float(contact[:, 2].max())
-        return cls(radius, forces, tuple((x, y) for x, y in np.round(corners, 4).tolist()))
+        low, high = float(contact[:, 2].min()), float(contact[:, 2].max())
+        if high < LEAST_RANGE * low:
+            low, high = low / LEAST_RANGE**0.5, high * LEAST_RANGE**0.5
+        return cls(radius, (low, high), tuple((x, y) for x, y in np.round(corners, 4).tolist()))
 
     @cached_property
     def centre(self) -> Array:

@@ -145,8 +145,8 @@ def model_header(metadata: ModelMetadata, network: Network) -> str:
         fields=", ".join(f'"{name}"' for name in Contact._fields[: _numbers(network)]),
         numbers=_numbers(network),
         all=source_text("isocharge_all.h") if len(network.cosines) else "",
-        low=_each(network.low),
-        high=_each(network.high),
+        low=f"{network.low:g}" if network.mean is None else "LOW",
+        high=f"{network.high:g}" if network.mean is None else "HIGH (isocharge_model.c)",
     )
 
 
@@ -212,11 +212,6 @@ def self_test(golden: Golden) -> str:
         charges=c_array("CHARGE_PC", golden.charge_pC),
         contacts=c_array("CONTACT", answers),
     )
-
-
-def _each(bounds: Singles) -> str:
-    """Bounds of charges for people: one for all, or one for each."""
-    return ", ".join(f"{bound:g}" for bound in np.atleast_1d(bounds))
 
 
 def _features(network: Network) -> str:

@@ -20,9 +20,6 @@ FALSE_ALARMS = 0.01
 ABOUT_1_N = (0.8, 1.25)
 """Smallest and largest force that counts as 1 N where faults are looked for, N."""
 
-FEWEST_FOR_P999 = 5_000
-"""Measured presses from which on five have the misfit that 0.1 % exceed."""
-
 DRAWS = 20
 """Draws of the noise for the misfit's rare values."""
 
@@ -58,7 +55,7 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     if fitted.good.measured or not isinstance(fitted.noise, NoiseModel):
         misfit = fitted.predict(fitted.good.charge)[2]
         alarm = {"misfit_p99": rounded(alarm_threshold(misfit))}
-        if len(misfit) >= FEWEST_FOR_P999:
+        if fitted.judged:
             alarm["misfit_p999"] = rounded(np.percentile(misfit, 99.9))
     else:
         alarm = misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)

@@ -101,7 +101,7 @@ def fit_presses(
     domain = PressedArea.of(known.contact)
     noise = ChannelNoise.of(known.charge, domain.to_unit(known.contact))
     with threads_and_seed(settings.training.threads, settings.training.seed):
-        features = Features.of_signed(known.charge, noise.white / noise.gain)
+        features = Features.of_signed(known.charge, noise.bend(known.charge))
         network, *members = (
             InverseNetwork(domain, features, settings.network.hidden, settings.network.misfit_hidden)
             for _ in range(1 + FOLDS)
