@@ -178,6 +178,12 @@ def test_flags_of_a_contact(film, changes, flags):
     assert Validity.of(film.metadata()).flags(GOOD._replace(**changes)) == flags
 
 
+def test_contacts_as_an_array_have_a_press_in_each_row(predictor, film):
+    contacts = predictor.predict_batch(film.golden_pC())
+    np.testing.assert_array_equal(np.asarray(contacts)[:, :3], np.column_stack(contacts[:3]))
+    assert np.asarray(contacts, dtype=float).shape == (8, 10)
+
+
 def test_a_press_that_dents_the_film_is_flagged(film):
     """One by one and in a batch, beside what else is to be said; a model that does not say from where says nothing."""
     yields = Validity.of(film.metadata(yield_force_N=0.8))

@@ -56,6 +56,15 @@ def test_a_missing_file_says_what_it_belongs_to(tmp_path):
         read_films(tmp_path)
 
 
+def test_an_array_that_no_memory_holds_is_damaged():
+    buffer, header = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 50,)})
+    with zipfile.ZipFile(buffer, "w") as file:
+        file.writestr("mean.npy", header.getvalue())
+    with pytest.raises(ModelError, match=r"films\.npz: damaged \(.*MemoryError"):
+        films_from_bytes(buffer.getvalue(), "films.npz")
+
+
 @pytest.mark.parametrize("share", [0.0, 0.9999])
 def test_a_torn_file_is_damaged(data, tmp_path, share):
     (tmp_path / FILE).write_bytes(data[: int(share * len(data))])

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -67,7 +67,7 @@ NO_CORRELATION = dict.fromkeys(Contact._fields[SEVEN:])
 
 
 class Contacts(NamedTuple):
-    """Contacts of n presses: the fields of `Contact`, each an array of shape (n,), float32."""
+    """Contacts of n presses: the fields of `Contact`, each an array of shape (n,), float32; a row each as one array."""
 
     x_mm: Singles
     y_mm: Singles
@@ -79,6 +79,10 @@ class Contacts(NamedTuple):
     xy_correlation: Singles
     xF_correlation: Singles
     yF_correlation: Singles
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray[Any, Any]:
+        """What `np.asarray` gives: shape (n, 10), a press in each row."""
+        return np.stack(tuple(self), axis=1).astype(dtype or np.float32, copy=False)
 
 
 MISFIT_LIMIT = 5.0

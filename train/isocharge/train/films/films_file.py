@@ -59,6 +59,7 @@ DAMAGED = (
     zipfile.BadZipFile,
     lzma.LZMAError,
     zlib.error,
+    MemoryError,
 )
 """What NumPy, zipfile and the model's parts raise over damaged files."""
 
