@@ -132,10 +132,13 @@ def calibrate_command(
             where = PressPort(port, device, baud, yes, press_list, until, fresh, position_std_mm, force_std)
             result = calibrate_at_port(where, problem, output, json_lines=json)
         elif file is not None:
-            result = calibrate(read_presses_of(file, problem.electrodes, position_std_mm, force_std), problem)
+            presses = read_presses_of(file, problem.electrodes, position_std_mm, force_std)
+            say(f"fitting the film to {len(presses)} presses")
+            result = calibrate(presses, problem)
         for caution in result.cautions if result else ():
             say(f"caution: {caution}")
         if result is not None and output is not None:
+            say("folding and measuring the model of this film")
             version = write_calibration(result, output, this_command())
             (output / SESSION).unlink(missing_ok=True)
             say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
