@@ -53,7 +53,7 @@ from isocharge.serve import (
     open_source,
 )
 from isocharge.serve.export.record_messages import RecordEncoding
-from isocharge.serve.live.device import with_offset_limit
+from isocharge.serve.live.device import with_offset_limit, with_tracking
 from isocharge.serve.live.outputs import LineQueue
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.port.recording import Marker
@@ -121,6 +121,13 @@ def stream_command(
             help="Largest charge at rest that the tare accepts, pC. (default: 100, or as --device says)",
         ),
     ] = None,
+    track: Annotated[
+        bool,
+        typer.Option(
+            "--track",
+            help="Follow contacts in time: each record gets `tracked` and `event`, as by [track] in --device.",
+        ),
+    ] = False,
     live: LiveOption = None,
     token: TokenOption = None,
 ) -> None:
@@ -139,6 +146,7 @@ def stream_command(
     predictor, board = Predictor(model, models=models), load_device(device)
     if offset_limit_pC is not None:
         board = with_offset_limit(board, offset_limit_pC)
+    board = with_tracking(board) if track else board
     path = TouchStream(predictor, board, policy=policy, frame_id=name)
     latencies: deque[float] = deque(maxlen=LATENCIES)
     recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name or "") if record else None

@@ -23,8 +23,8 @@
     tau_s = {A = 10.0, B = 10.2, C = 9.9}
 
 `[hum]`, `[tare]`, `[leak]`, `[touch]` and `[common_mode]` take the settings of their rules (see
-`isocharge.serve.signal_chain`), and every stage `on = false`, which switches it off. Tare and touch are on without a
-section. An unknown key is an error.
+`isocharge.serve.signal_chain`), `[track]` those of `isocharge.serve.tracking`, and every stage `on = false`, which
+switches it off. Tare and touch are on without a section. An unknown key is an error.
 """
 
 from collections.abc import Mapping
@@ -48,6 +48,7 @@ from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
+from isocharge.serve.tracking.tracker import TrackRule
 
 LEAST_ELECTRODES_FOR_WARMING = 4
 """Number of electrodes from which warming can be separated from force: a contact alone has three unknowns."""
@@ -122,6 +123,7 @@ class DeviceSections(Settings, frozen=True):
     leak: LeakSection | None = None
     touch: TouchRule | None = TouchRule()
     common_mode: ThermalRule | None = None
+    track: TrackRule | None = None
 
 
 class Device(DeviceSections, frozen=True):
@@ -227,6 +229,14 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     sections = msgspec.structs.asdict(convert(tagged, DeviceSections, where, DeviceError))
     on: dict[str, Any] = {name: None if isinstance(one, Rule) and not one.on else one for name, one in sections.items()}
     return Device(**on, table=table, where=where)
+
+
+def with_tracking(device: Device) -> Device:
+    """A board whose contacts are followed; in its table too, so that a recording keeps it."""
+    if device.track is not None:
+        return device
+    track = {**device.table.get("track", {}), "on": True}
+    return device_from_table({**device.table, "track": track}, device.where)
 
 
 def with_offset_limit(device: Device, offset_limit_pC: float) -> Device:

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from isocharge.common.arrays import Array, Reals
 from isocharge.common.errors import ModelError
@@ -14,9 +14,11 @@ from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.live.reading_stream import ReadingStream, TimedReading
 from isocharge.serve.port.source import Chunk
+from isocharge.serve.prediction.contact import Contact
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import OUT_OF_CONTACT, UNKNOWN, Charges, PredictionRecord
 from isocharge.serve.signal_chain.chain import Chain, Reading
+from isocharge.serve.tracking.tracker import Tracker
 
 LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
 """Flags of a frame without a record that pass to the next record: they say what happened before it."""
@@ -137,6 +139,7 @@ class TouchStream:
         )
         self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
         self.counts = StreamCounts()
+        self._tracker = None if device.track is None else Tracker(device.track)
         self._before_restart = StreamTotals()
         self._policy, self._now_ns, self._given_name = policy, now_ns, frame_id
         self._use(predictor)
@@ -163,11 +166,17 @@ class TouchStream:
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
         self._readings.tare()
+        self._forget_contact()
+
+    def _forget_contact(self) -> None:
+        if self._tracker is not None:
+            self._tracker.forget()
 
     def restart(self) -> None:
         """Begin as a new stream does, so that what follows can be repeated from its bytes alone; `totals` go on."""
         self._before_restart = self.totals()
         self._readings.restart()
+        self._forget_contact()
         self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
 
     def totals(self) -> StreamTotals:
@@ -191,7 +200,9 @@ class TouchStream:
         Raises:
             As `stream`.
         """
-        self.counts.outages += chunk.outage_s > 0.0
+        if chunk.outage_s > 0.0:
+            self.counts.outages += 1
+            self._forget_contact()
         frames = self._readings.frames(chunk)
         last, skipped = len(frames) - 1, set[str]()
         for number, frame in enumerate(frames):
@@ -218,11 +229,14 @@ class TouchStream:
         """The record of a frame; the clock is asked once everything is computed."""
         reading, when = timed
         contact, flags = self._contact(reading)
+        tracked, event = None, None
+        if self._tracker is not None:
+            tracked, event = self._tracker.update(contact, when.clock_s, flags)
         return PredictionRecord(
             timestamp=when.host_s,
             t_device_us=when.device_us,
             seq=frame.seq,
-            **contact,
+            **(contact.fields() if contact else UNKNOWN if INVALID in flags else OUT_OF_CONTACT),
             contact=reading.contact,
             charge_pC=self._by_electrode(reading.charge_pC),
             charge_raw_pC=self._by_electrode(reading.raw_pC),
@@ -231,17 +245,18 @@ class TouchStream:
             latency_us=(self._now_ns() - chunk.clock_ns) / 1e3,
             model=self._label,
             frame_id=self.frame_id,
+            tracked=None if tracked is None else tracked._asdict(),
+            event=event,
+            follows=self._tracker is not None,
         )
 
-    def _contact(self, reading: Reading) -> tuple[dict[str, Any], tuple[str, ...]]:
-        """The fields of the contact, and the reading's flags with those of the contact."""
+    def _contact(self, reading: Reading) -> tuple[Contact | None, tuple[str, ...]]:
+        """The contact, None without one, and the reading's flags with those of the contact."""
         flags = reading.flags
-        if INVALID in flags:
-            return UNKNOWN, flags
-        if not reading.contact or reading.charge_pC is None:
-            return OUT_OF_CONTACT, flags
+        if INVALID in flags or not reading.contact or reading.charge_pC is None:
+            return None, flags
         contact = self.predictor.predict(reading.charge_pC)
-        return contact.fields(), flags + self._validity.flags(contact)
+        return contact, flags + self._validity.flags(contact)
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
         """Charges by electrode name; None for one that is not a number."""

@@ -44,7 +44,7 @@ class Contact(NamedTuple):
     xF_correlation: float = math.nan
     yF_correlation: float = math.nan
 
-    def fields(self) -> dict[str, float | None]:
+    def fields(self) -> dict[str, Any]:
         """As fields of a record: correlations that the model does not give are None."""
         fields = self._asdict()
         return fields if self.xy_correlation == self.xy_correlation else fields | NO_CORRELATION

@@ -51,6 +51,9 @@ class PredictionRecord:
         latency_us: From the arrival of the reading's last byte to this record, us.
         model: `name/version`.
         frame_id: Name of the sensor.
+        tracked: The contact by all frames up to now, where contacts are followed: the fields of a `Tracked`.
+        event: What begins with this record: `press`, `hold`, `slide`, `tap` or `release`.
+        follows: Whether contacts are followed; without it the record is written without the two fields before.
     """
 
     timestamp: float | None
@@ -74,6 +77,9 @@ class PredictionRecord:
     latency_us: float | None
     model: str
     frame_id: str
+    tracked: dict[str, float] | None = None
+    event: str | None = None
+    follows: bool = False
 
     def to_json(self) -> str:
         """One line of strictly valid JSON, keys in the order above, numbers to six decimals.
@@ -81,10 +87,14 @@ class PredictionRecord:
         Raises:
             ValueError: If a number is not finite.
         """
-        return _ENCODE({name: _plain(getattr(self, name)) for name in FIELDS})
+        names = FIELDS + OF_TRACKING if self.follows else FIELDS
+        return _ENCODE({name: _plain(getattr(self, name)) for name in names})
 
 
-FIELDS = tuple(field.name for field in fields(PredictionRecord))
+OF_TRACKING = ("tracked", "event")
+"""Fields that a record has where contacts are followed."""
+
+FIELDS = tuple(field.name for field in fields(PredictionRecord) if field.name not in (*OF_TRACKING, "follows"))
 
 UNKNOWN: dict[str, Any] = dict.fromkeys(Contact._fields)
 """The fields of the contact where nothing was computed."""

@@ -10,6 +10,7 @@ LARGEST = 1_000_000_000
 """Largest setting, in its unit."""
 
 Setting = Annotated[float, Meta(ge=0, le=LARGEST)]
+Share = Annotated[float, Meta(ge=0, lt=1)]
 Count = Annotated[int, Meta(ge=0, le=LARGEST)]
 TimeConstant = Annotated[float, Meta(ge=1e-3, le=LARGEST)]
 """What the chain divides by, s."""

@@ -1,0 +1,183 @@
+"""A contact followed from frame to frame: place, force and velocity, less noisy than a frame, and what the touch does.
+
+Two filters of `modes`, one for the place and one for ln F, take in each frame's answer with its covariance. A part of
+the model's errors is the same in every frame of a held contact (its own errors, gains): it is kept out of the filters
+and added to what they say, so that the deviations stay true. Frames that are saturated, beyond the model or of a large
+misfit count for less, one that is far from this contact not at all; two of these in a row are another contact.
+"""
+
+import math
+from typing import NamedTuple
+
+from isocharge.serve.flags import BEYOND, INVALID, MISFIT, SATURATED
+from isocharge.serve.prediction.contact import Contact
+from isocharge.serve.signal_chain.rule import Rule, Share
+from isocharge.serve.tracking.modes import Modes, Movement, Step, Unit, step
+
+PLACE = Movement(creep=1e-3, speed=40.0**2, change=1e3)
+"""A finger: 0.03 mm in a second while it holds still, speeds of 40 mm/s, 32 mm/s more or less after a second."""
+
+FORCE = Movement(creep=1e-3, speed=10.0**2, change=1e3)
+"""A held force wanders by 3 % in a second; one that changes becomes e times as large in a tenth of a second."""
+
+DOUBTS = {SATURATED: 100.0, BEYOND: 100.0, MISFIT: 10.0}
+"""Flags of frames that count for less, with the factor on their variance."""
+
+FAR_FRAMES = 2
+"""Frames in a row that are none of this contact, after which it is another one."""
+
+LONGEST_STEP_S = 1.0
+"""Time without a frame after which nothing of the contact is known any more, s."""
+
+HOLD_S, TAP_S = 0.2, 0.25
+"""Time at rest that makes a hold; longest time of a tap, s."""
+
+SLIDE_MM, MOVES = 0.3, 0.95
+"""Distance from the place of rest, and probability of the moving mode, that make a slide."""
+
+
+class TrackRule(Rule, frozen=True, kw_only=True):
+    """How contacts are followed; the section `[track]` of a device file.
+
+    Attributes:
+        lasting: Part of the model's deviations that is the same in every frame of a held contact, 0 to 1: 0.12 are the
+            model's own errors (measured); nearly 1 where gains are known to some percent.
+    """
+
+    lasting: Share = 0.12
+
+
+class Tracked(NamedTuple):
+    """A contact by all frames up to now.
+
+    Attributes:
+        x_mm, y_mm, force_N: Estimates.
+        x_std_mm, y_std_mm, force_std_N: Standard deviations; correlations are those of the frame.
+        vx_mm_s, vy_mm_s: Velocity; 0 while the contact is held.
+        moving: Probability that it moves.
+    """
+
+    x_mm: float
+    y_mm: float
+    force_N: float
+    x_std_mm: float
+    y_std_mm: float
+    force_std_N: float
+    vx_mm_s: float
+    vy_mm_s: float
+    moving: float
+
+
+class Tracker:
+    """Follows one contact at a time; belongs to one thread. The same frames give the same answers, bit for bit."""
+
+    def __init__(self, rule: TrackRule | None = None) -> None:
+        """Begin without a contact; by default with the settings of an empty section."""
+        self._lasting = (rule or TrackRule()).lasting ** 2
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the contact, as after an outage or a new tare."""
+        self._modes: tuple[Modes, Modes] | None = None
+        self._last: Tracked | None = None
+        self._far, self._t_s = 0, 0.0
+        self._began_s = self._rest_s = 0.0
+        self._rest, self._state = 0j, ""
+
+    def update(
+        self, contact: Contact | None, t_s: float, flags: tuple[str, ...] = ()
+    ) -> tuple[Tracked | None, str | None]:
+        """Take the next frame in.
+
+        Args:
+            contact: The model's answer; None if nothing touches, or nothing was computed.
+            t_s: Time of the frame, s, on any clock.
+            flags: Of the frame.
+
+        Returns:
+            The contact by now, None if nothing touches; and which of `press`, `hold`, `slide`, `tap` and `release`
+            this frame begins with.
+        """
+        if contact is None:
+            if INVALID in flags or self._last is None:
+                return self._last, None
+            ended = "tap" if self._state == "press" and t_s - self._began_s <= TAP_S else "release"
+            self.forget()
+            return None, ended
+        began = self._last is None
+        if began:
+            self._began_s = t_s
+        tracked = self._advance(contact, t_s, flags)
+        event = self._event(tracked, t_s, began=began)
+        self._last = tracked
+        return tracked, event
+
+    def _advance(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> Tracked:
+        x, y, force, x_std, y_std, force_std, _, correlation, _, _ = contact
+        force = max(force, 1e-6)
+        place, log_force = complex(x, y), complex(math.log(force))
+        relative = force_std / force
+        correlation = correlation if correlation == correlation else 0.0  # a model may give none
+        units = Unit.of_place(x_std, y_std, correlation), Unit.of_force(relative)
+        white = 1.0 - self._lasting
+        for flag in flags:
+            white *= DOUBTS.get(flag, 1.0)
+        dt_s, steps = t_s - self._t_s, None
+        if self._modes is not None and 0.0 < dt_s <= LONGEST_STEP_S:
+            steps = self._steps(self._modes, place, log_force, dt_s, units, white)
+            self._far = 0 if steps else self._far + 1
+            if self._last is not None and 0 < self._far < FAR_FRAMES:
+                return self._last
+        if steps is None:
+            start = Modes.start(place, units[0], white, PLACE), Modes.start(log_force, units[1], white, FORCE)
+            steps = (start[0], place, white), (start[1], log_force, white)
+        self._far, self._t_s = 0, t_s
+        (modes, place, spread), (force_modes, log_force, force_spread) = steps
+        self._modes = modes, force_modes
+        of_place, force = math.sqrt(spread + self._lasting), math.exp(log_force.real)
+        velocity = modes.moving * modes.velocity
+        return Tracked(
+            place.real,
+            place.imag,
+            force,
+            x_std * of_place,
+            y_std * of_place,
+            force * relative * math.sqrt(force_spread + self._lasting),
+            velocity.real,
+            velocity.imag,
+            modes.moving,
+        )
+
+    @staticmethod
+    def _steps(
+        modes: tuple[Modes, Modes],
+        place: complex,
+        log_force: complex,
+        dt_s: float,
+        units: tuple[Unit, Unit],
+        white: float,
+    ) -> tuple[Step, Step] | None:
+        """Both filters by a frame; None if its place is none of this contact. A force that jumps begins anew alone."""
+        by_place = step(modes[0], place, dt_s, units[0], white, PLACE)
+        if by_place is None:
+            return None
+        by_force = step(modes[1], log_force, dt_s, units[1], white, FORCE)
+        return by_place, by_force or (Modes.start(log_force, units[1], white, FORCE), log_force, white)
+
+    def _event(self, tracked: Tracked, t_s: float, *, began: bool) -> str | None:
+        """What begins with this frame."""
+        place = complex(tracked.x_mm, tracked.y_mm)
+        if began:
+            self._rest, self._rest_s, self._state = place, t_s, "press"
+            return "press"
+        if tracked.moving > MOVES:
+            if self._state != "slide" and abs(place - self._rest) > SLIDE_MM:
+                self._state = "slide"
+                return "slide"
+        elif tracked.moving < 0.5:
+            if abs(place - self._rest) > SLIDE_MM:
+                self._rest, self._rest_s = place, t_s
+            elif self._state != "hold" and t_s - self._rest_s >= HOLD_S:
+                self._state = "hold"
+                return "hold"
+        return None
