@@ -164,7 +164,9 @@ def _too_many(errors: PressErrors, rows: Booleans, metadata: ModelMetadata) -> s
     """How many of some presses have a misfit that few good ones have; empty if chance explains that."""
     flags = [flags for flags, chosen in zip(errors.flags, rows.tolist(), strict=True) if chosen]
     count, most = len(flags), sum(MISFIT in words for words in flags)
-    shares = (math.comb(count, k) * MISFIT_SHARE**k * (1.0 - MISFIT_SHARE) ** (count - k) for k in range(most))
+    ways = (math.lgamma(count + 1) - math.lgamma(k + 1) - math.lgamma(count - k + 1) for k in range(most))
+    odds, none = math.log(MISFIT_SHARE / (1.0 - MISFIT_SHARE)), count * math.log1p(-MISFIT_SHARE)
+    shares = (math.exp(way + k * odds + none) for k, way in enumerate(ways))  # the numbers overflow, not the product
     if 1.0 - sum(shares) >= MISFIT_PROBABILITY:
         return ""
     return f"{most} of {count} presses have a misfit above {misfit_limit(metadata):.3g}, which 1 % of good ones have"

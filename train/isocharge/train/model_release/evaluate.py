@@ -50,10 +50,10 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     if not test.measured and isinstance(fitted.noise, NoiseModel):
         return simulated_errors(fitted.predict, test, fitted.noise, seed)
     judged = fitted.judged if presses is None else None
-    errors = contact_errors(*(judged or fitted.predict(test.charge)[:2]), test.contact)
+    errors = contact_errors(*(judged or fitted.predict(test.charge))[:2], test.contact)
     kept = {name: error for name, error in errors.items() if name not in ONLY_SIMULATED}
     if fitted.good.measured or not isinstance(fitted.noise, NoiseModel):
-        misfit = fitted.predict(fitted.good.charge)[2]
+        misfit = fitted.judged[2] if fitted.judged else fitted.predict(fitted.good.charge)[2]
         alarm = {"misfit_p99": rounded(alarm_threshold(misfit))}
         if fitted.judged:
             alarm["misfit_p999"] = rounded(np.percentile(misfit, 99.9))

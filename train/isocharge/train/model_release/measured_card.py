@@ -63,7 +63,8 @@ alone, without a simulator.
 
 {measured_errors(metadata.errors, "at places that were left out", how)}
 The misfit is the distance, in units of that noise, of the charges from those of the nearest press, with planes through
-its neighbours between presses; a network gives it. 1 % of the presses exceed {metadata.errors["misfit_p99"]:g}.
+its neighbours between presses; a network gives it. 1 % of the presses are farther from those at other places than
+{metadata.errors["misfit_p99"]:g}.
 
 ## Limits
 

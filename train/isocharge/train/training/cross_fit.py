@@ -140,7 +140,7 @@ def fit_presses(
             files={PRESSES: presses_text(usable).encode()},
         ),
         asked=domain,
-        judged=(contact, std * [position, position, force]),
+        judged=(contact, std * [position, position, force], _left_out_misfit(known, domain, noise, fold)),
     )
 
 
@@ -283,6 +283,16 @@ def _misfit_examples(
         rows = kinds == kind
         charge[rows] = _draw(kind, rng, chosen[rows], presses.charge, noise)
     return np.stack([charge, planes.residuals(noise.level(charge))])
+
+
+def _left_out_misfit(presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, fold: Integers) -> Array:
+    """Misfit of each press from the presses of the other folds, shape (n, 1)."""
+    unit, level, misfit = domain.to_unit(presses.contact), noise.level(presses.charge), np.empty((len(presses), 1))
+    for number in range(FOLDS):
+        out = fold == number
+        residual = LocalPlanes.through(unit[~out], level[~out]).residuals(level[out])
+        misfit[out] = np.linalg.norm(residual, axis=1, keepdims=True)
+    return misfit
 
 
 def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: ChannelNoise) -> Array:

@@ -63,8 +63,8 @@ class Fitted:
         provenance: For the release.
         asked: The domain that was asked for; larger than the network's where the map folds.
         cautions: What users of the network should know, a sentence each.
-        judged: Contacts and standard deviations, mm and N, shapes (n, 3), that networks which did not see the place of
-            a press give for the charges of `test`; None where this one did not see them itself.
+        judged: Contacts and standard deviations, mm and N, shapes (n, 3), and misfits, shape (n, 1), of `test` without
+            what was learned from a press's own place; None where this network did not see `test`.
     """
 
     network: FoldedNetwork
@@ -78,7 +78,7 @@ class Fitted:
     provenance: Provenance
     asked: Domain
     cautions: tuple[str, ...] = ()
-    judged: tuple[Array, Array] | None = None
+    judged: tuple[Array, Array, Array] | None = None
 
     @property
     def misfit_noise(self) -> Noise:
