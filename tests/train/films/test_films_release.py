@@ -134,6 +134,7 @@ def solved(films, monkeypatch):
             return films.family
 
     monkeypatch.setattr(films_fit, "FilmFamily", Solved)
+    monkeypatch.setattr(films_fit.FilmModes, "build", lambda *_: films.family.imperfections)
     monkeypatch.setattr(films_release, "FILMS", 4)
     monkeypatch.setattr(films_data, "CANDIDATES", 64)
 
