@@ -14,7 +14,7 @@ from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
 from isocharge.train.calibration.contacts import PressData
 from isocharge.train.calibration.diagnosis import check_before, explain, find_mistakes, misfit, outside
-from isocharge.train.calibration.film_fit import MISTAKEN, FilmPosterior, fit_film
+from isocharge.train.calibration.film_fit import MISTAKEN, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity, quantities, summarise
 from isocharge.train.training.fit import Fitted
@@ -36,9 +36,6 @@ ODD = 1e-3
 
 MISLED = 8.0
 """Misfit of presses as they are written, as `misfit` gives it, above which mistakes are looked for before a fit."""
-
-PROBABLE = 0.5
-"""Probability of a discrepancy, an offset or a drift above which it is said."""
 
 FEW = 3
 """With so few presses a wrong one cannot be seen: said, not refused."""
@@ -96,7 +93,7 @@ class CalibrationResult:
     @property
     def fitted(self) -> Fitted:
         """The network of this film, for `evaluate` and `release`; what the film leaves is in its deviations."""
-        factor = partial(self.problem.charges.factor, self.posterior.coefficients)
+        factor = partial(self.problem.charges.factor, self.posterior.unknowns)
         left = self.sensitivity.contact, np.einsum("nii->ni", self.sensitivity.covariance(self.posterior.joint))
         return self.problem.films.film(self.posterior.parameters, left=left, factor=factor)
 
@@ -130,14 +127,14 @@ class CalibrationResult:
     @property
     def _unexplained(self) -> Iterator[str]:
         """What no parameter describes, and what more presses would do about it."""
-        if self.posterior.probability("size") <= PROBABLE:
+        if not self.posterior.imperfect:
             return
         contact = self.sensitivity.contact
-        share = 100.0 * rms(np.log(self.problem.charges.factor(self.posterior.coefficients, contact)))
+        share = 100.0 * rms(np.log(self.problem.charges.factor(self.posterior.unknowns, contact)))
         more = next_presses(self.problem, MORE, self.posterior)
         places = ", ".join(f"{press.force_N:.2f} N at ({press.x_mm:g}, {press.y_mm:g}) mm" for press in more[:3])
         yield (
-            f"Beyond what parameters describe, the charges of this film differ by {share:.2g} % (root mean square), "
+            f"Beyond the parameters below, the charges of this film differ by {share:.2g} % (root mean square), "
             f"smoothly over the film: {self.left.position_mm:.2g} mm are left now. {MORE} more presses would reach "
             f"{more[-1].position_mm:.2g} mm, the first of them {places}; --next lists more."
         )
@@ -206,7 +203,7 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
     strain = float(deviation @ np.linalg.solve(problem.before.covariance, deviation))
     unexplained = freedom > 0.0 and chi2 / freedom > FAR_OFF and chi2_distribution.sf(chi2, freedom) < UNEXPLAINED
     chance = chi2_distribution.sf(strain, deviation.size)
-    strange = posterior.probability("size") > PROBABLE or posterior.bad.any() or chance < ODD
+    strange = posterior.imperfect or posterior.bad.any() or chance < ODD
     odd = strange and bool(find_mistakes(presses, problem.charges))  # a few wrong presses may find a strange film
     if unexplained or chance < STRAINED or odd:
         worst = max(chi2 / max(freedom, 1.0), strain / deviation.size)

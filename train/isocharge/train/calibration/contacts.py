@@ -5,13 +5,14 @@ is the one that fits charges and rig best; the residuals of both speak about the
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
-from isocharge.simulate.forward.charge_map import ChargeMap, differences
+from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.numerics.disk_least_squares import minimise
@@ -77,9 +78,9 @@ class PressData:
         by_charge = np.stack([np.ones_like(self.charge), self.turn[:, None] * self.charge], axis=2)
         return np.concatenate([self.weight[:, :, None] * by_charge, np.zeros((len(self), 3, 2))], axis=1)
 
-    def residual(self, film: ChargeMap, contact: Array) -> Array:
-        """Residuals of charges and rig over their standard deviations at (x, y, ln F): (n, n_electrode + 3)."""
-        of_charge = self.weight * (film.charges(with_force(contact)) - self.charge)
+    def residual(self, charge: Array, contact: Array) -> Array:
+        """Residuals of a film's charges and of the rig over their deviations at (x, y, ln F): (n, n_electrode + 3)."""
+        of_charge = self.weight * (charge - self.charge)
         return np.column_stack([of_charge, self.contact_weight * (contact - self.contact)])
 
     def slopes(self, by_contact: Array) -> Array:
@@ -131,12 +132,20 @@ def adjust_contacts(charges: FilmCharges, parameters: Array, data: PressData, st
         data: The presses.
         start: Contacts (x, y, ln F), shape (n, 3).
     """
-    film, domain = charges.film(parameters), charges.domain
+    forward_map, domain = charges.forward_map(parameters[: len(charges.prior.names)]), charges.domain
+    begin, besides = with_force(start), parameters[len(charges.prior.names) :].any()
+    factor, steeper = np.ones_like(data.charge), np.zeros((*data.charge.shape, 3))
+    if besides:  # what a film has besides its parameters is smooth: linear about the start
+        factor = charges.factor(parameters, begin)
+        steeper = differences(partial(charges.factor, parameters), begin, CONTACT_STEPS)
 
     def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
         contact, presses = unit * domain.scale + domain.centre, data[rows]
-        slopes = presses.slopes(differences(film.charges, with_force(contact), CONTACT_STEPS))
-        return presses.residual(film, contact), (slopes * domain.scale).swapaxes(1, 2)
+        at, change = with_force(contact), (contact - start[rows])[:, None]
+        share = factor[rows] + (steeper[rows] * change).sum(axis=2)
+        charge, by_contact = forward_map.charges(at), differences(forward_map.charges, at, CONTACT_STEPS)
+        slopes = presses.slopes(share[:, :, None] * by_contact + charge[:, :, None] * steeper[rows])
+        return presses.residual(share * charge, contact), (slopes * domain.scale).swapaxes(1, 2)
 
     unit, residual = minimise(residuals, (start - domain.centre) / domain.scale)
     return AdjustedContacts(unit * domain.scale + domain.centre, residual)

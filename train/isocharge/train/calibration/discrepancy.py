@@ -31,6 +31,9 @@ DEGREE, FORCE_DEGREE = 4, 2
 FADING = 0.5
 """Ratio of the standard deviations of terms of successive degrees: what is unexplained is smooth."""
 
+IMPERFECT = {0.0: 0.5, 1.0: 0.5}
+"""Sizes of the modes of imperfections that are weighed, with what each is believed to beforehand."""
+
 SIZES = {0.0: 0.5, 0.003: 0.1, 0.01: 0.15, 0.03: 0.15, 0.1: 0.1}
 """Sizes s that are weighed, dimensionless, with what each is believed to beforehand."""
 
@@ -72,27 +75,32 @@ class Hypothesis:
     """What a session may have had besides a film of the prior.
 
     Attributes:
+        modes: Size of the modes of imperfections over what films have, dimensionless.
         size: Of the discrepancy, dimensionless.
         offset: Standard deviation of a common offset of the charges, pC.
         drift: Standard deviation of a drift of the charges, a share.
         belief: Probability before the presses.
     """
 
+    modes: float = 0.0
     size: float = 0.0
     offset: float = 0.0
     drift: float = 0.0
     belief: float = 1.0
 
-    def variances(self, n_parameter: int, n_unknown: int) -> Array:
+    def variances(self, n_parameter: int, n_mode: int, n_unknown: int) -> Array:
         """What it adds to the variances of parameters, coefficients, offset and drift, shape (n_unknown,)."""
-        of_coefficients = np.full(n_unknown - n_parameter - 2, self.size**2)
-        return np.concatenate([np.zeros(n_parameter), of_coefficients, [self.offset**2, self.drift**2]])
+        counts = n_parameter, n_mode, n_unknown - n_parameter - n_mode - 2, 1, 1
+        return np.repeat(np.array([0.0, self.modes, self.size, self.offset, self.drift]) ** 2, counts)
 
 
 def hypotheses() -> Iterator[Hypothesis]:
     """All that are weighed."""
-    for (size, a), (offset, b), (drift, c) in product(SIZES.items(), OFFSETS_PC.items(), DRIFTS.items()):
-        yield Hypothesis(size, offset, drift, a * b * c)
+    for (modes, a), (size, b), (offset, c), (drift, d) in product(
+        IMPERFECT.items(), SIZES.items(), OFFSETS_PC.items(), DRIFTS.items()
+    ):
+        if modes == 0.0 or size > 0.0:  # to first order modes are never the whole
+            yield Hypothesis(modes, size, offset, drift, a * b * c * d)
 
 
 class Linearised(NamedTuple):

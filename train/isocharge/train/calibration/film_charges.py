@@ -1,17 +1,19 @@
 """Charges of presses on any film of a prior, with their derivatives by the contact and by what is unknown of the film.
 
-A film is given by the parameters of `FilmPrior`, after which the coefficients of its discrepancy may stand.
+A film is given by the parameters of `FilmPrior`, after which the coefficients of what it has besides may stand: of the
+modes of its imperfections, `MODE_STDS` their units, and of its discrepancy.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate import Circle, Film, ForwardMap
+from isocharge.simulate import Circle, Film, ForwardMap, Probe
 from isocharge.simulate.forward.charge_map import Domain, FunctionMap, differences
 from isocharge.simulate.forward.film_family import FilmFamily
+from isocharge.simulate.forward.film_modes import MODES, ModeMap
 from isocharge.simulate.numerics.disk import onto_disk
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 from isocharge.train.calibration.discrepancy import term_count, terms
@@ -27,6 +29,23 @@ CONTACT_STEPS = (5e-3, 5e-3, 1e-3)
 
 REMEMBERED = 8
 """Forward maps that are remembered."""
+
+MODE_STDS = {
+    "tension_difference": 0.25,
+    "tension_shear": 0.15,
+    "stiffness_x": 0.12,
+    "stiffness_xy": 0.06,
+    "poisson": 0.03,
+    "oval_x": 0.006,
+    "oval_xy": 0.006,
+    "d12": 0.3,
+    "crosstalk": 0.01,
+    "stiffening": 0.3,
+}
+"""Standard deviations of the modes over films that have imperfections, in their units."""
+
+LEAST_FACTOR = 0.05
+"""Least factor of the modes: first order ends before charges change their sign."""
 
 EDGE = 1.0 - 1e-6
 """Share of the family's radius and forces within which presses are evaluated: differences stay inside."""
@@ -58,9 +77,14 @@ class FilmCharges:
         )
 
     @cached_property
-    def std(self) -> Array:
-        """Scales of parameters and coefficients, shape (n_parameter + n_coefficient,)."""
-        return np.concatenate([self.prior.std, np.ones(term_count() * len(self.prior.sensor.electrodes))])
+    def modes(self) -> tuple[str, ...]:
+        """Names of the modes that these films have; none in a family of before they were solved."""
+        return tuple(name for name in MODES if name in MODE_STDS) if self.family.imperfections else ()
+
+    @property
+    def n_coefficient(self) -> int:
+        """Number of coefficients after the parameters."""
+        return len(self.modes) + term_count() * len(self.prior.sensor.electrodes)
 
     def forward_map(self, parameters: Array) -> ForwardMap:
         """The forward map of one film without a discrepancy, parameters of shape (n_parameter,).
@@ -80,20 +104,52 @@ class FilmCharges:
         return {}
 
     def film(self, unknowns: Array) -> FunctionMap:
-        """The charges of one film with its discrepancy, shape (n_parameter,) or (n_parameter + n_coefficient,)."""
-        parameters, coefficients = np.split(unknowns, [len(self.prior.names)])
-        forward_map = self.forward_map(parameters)
-        if not coefficients.any():
-            return FunctionMap(forward_map.charges, forward_map.electrodes, self.domain)
+        """The charges of one film, shape (n_parameter,), or (n_parameter + n_coefficient,) with what it has besides."""
+        forward_map = self.forward_map(unknowns[: len(self.prior.names)])
 
         def charges(contact: Array) -> Array:
-            return forward_map.charges(contact) * self.factor(coefficients, contact)
+            charge = forward_map.charges(contact)
+            return charge * self.factor(unknowns, contact, charge)
 
         return FunctionMap(charges, forward_map.electrodes, self.domain)
 
-    def factor(self, coefficients: Array, contact: Array) -> Array:
-        """Factors of a discrepancy on the charges at contacts (x, y, F), shape (n, 3): (n, n_electrode)."""
-        return np.asarray(np.exp(terms(contact, self.domain) @ coefficients.reshape(term_count(), -1)))
+    def factor(self, unknowns: Array, contact: Array, charge: Array | None = None) -> Array:
+        """Factors of modes and discrepancy on a film's charges, shape (n, n_electrode).
+
+        Args:
+            unknowns: As `film` takes them.
+            contact: (x, y, F), shape (n, 3), mm and N.
+            charge: Charges without them, if they are known.
+        """
+        n = len(self.prior.names)
+        of_modes, shares = np.split(unknowns[n:], [len(self.modes)])
+        factor = np.ones((len(contact), len(self.prior.sensor.electrodes)))
+        if of_modes.any():
+            charge = self.forward_map(unknowns[:n]).charges(contact) if charge is None else charge
+            factor += self._by_mode(unknowns[:n], contact) @ of_modes / charge
+        if shares.any():
+            factor = np.maximum(factor, LEAST_FACTOR) * np.exp(
+                terms(contact, self.domain) @ shares.reshape(term_count(), -1)
+            )
+        return factor
+
+    def _by_mode(self, parameters: Array, contact: Array) -> Array:
+        """Derivatives of the charges by the modes over `MODE_STDS`, shape (n, n_electrode, n_mode), pC."""
+        forward_map, family = self.forward_map(parameters), self.family.imperfections
+        if family is None:
+            return np.zeros((len(contact), len(self.prior.sensor.electrodes), 0))
+        key = (forward_map.sensor.film, forward_map.probe)
+        if key not in self._modes:
+            self._modes.clear()
+            self._modes[key] = family.mode_map(forward_map, self.modes)
+        known = self._modes[key]
+        fields = known.fields and replace(known.fields, sensor=forward_map.sensor)
+        by_mode = replace(known, film=forward_map, fields=fields).by_mode(contact)
+        return np.asarray(by_mode * [MODE_STDS[name] for name in self.modes])
+
+    @cached_property
+    def _modes(self) -> dict[tuple[Film, Probe], ModeMap]:
+        return {}
 
     def charges(self, unknowns: Array, contact: Array) -> Array:
         """Charges of contacts (x, y, F), shape (n, 3), mm and N, on one film: (n, n_electrode), pC."""
@@ -120,15 +176,14 @@ class FilmCharges:
             by_contact: Derivatives by the contacts, as `by_contact` gives them.
 
         Returns:
-            Shape (n, n_electrode, n_parameter) or (n, n_electrode, n_parameter + n_coefficient), pC.
+            Shape (n, n_electrode, n_parameter) or (n, n_electrode, n_parameter + n_coefficient), pC. The modes are
+            taken for the same share of the charges on neighbouring films.
         """
         parameters, coefficients = np.split(unknowns, [len(self.prior.names)])
         film, by_force = self.forward_map(parameters), by_contact[:, :, 2]
-        charge, factor = film.charges(contact), np.ones((1, 1))
-        if coefficients.size:
-            factor = self.factor(coefficients, contact)
-            steeper = differences(partial(self.factor, coefficients), contact, CONTACT_STEPS)[:, :, 2]
-            by_force = (by_force - charge * steeper) / factor
+        charge = film.charges(contact)
+        if coefficients.any():
+            by_force = differences(film.charges, contact, CONTACT_STEPS)[:, :, 2]
         columns = {name: self._by_step(name, parameters, contact, charge) for name in STEPPED}
         columns["young"] = charge - by_force - parameters[0] * columns["pretension"]
         columns["thickness"] = columns["thickness"] - by_force
@@ -141,9 +196,10 @@ class FilmCharges:
         of_film = np.concatenate([shared, own], axis=2) * self.prior.std
         if not coefficients.size:
             return np.asarray(of_film)
-        each = own[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
-        both = [of_film, each.reshape(*charge.shape, -1)]
-        return np.asarray(np.concatenate(both, axis=2) * factor[:, :, None])
+        factor = self.factor(unknowns, contact, charge)[:, :, None]
+        of_modes = self._by_mode(parameters, contact)
+        of_terms = (factor * own)[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
+        return np.asarray(np.concatenate([factor * of_film, of_modes, of_terms.reshape(*charge.shape, -1)], axis=2))
 
     def _by_step(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
         """Derivative by one parameter; by the thickness at one load F / (E h a), which is bending's part alone."""

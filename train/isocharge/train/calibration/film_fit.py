@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_distribution
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.simulate.sensor.film_prior import SHARED
+from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 from isocharge.train.calibration.contacts import (
     AdjustedContacts,
     PressData,
@@ -62,6 +62,9 @@ MISTAKEN, SURPRISE = 0.01, -3.0
 """Chance that a press is written wrongly, and the logarithm of the density of each of its charges then, in units of the
 noise: anything up to twenty times as far off."""
 
+PROBABLE = 0.5
+"""Probability above which something is said to be."""
+
 LINEAR = 0.2
 """Largest step of a parameter, in standard deviations of its prior, for which derivatives are not taken again."""
 
@@ -100,6 +103,17 @@ class FilmPosterior(FilmEstimate):
         """With all variances larger by a factor."""
         return replace(self, covariance=self.covariance * factor, joint=self.joint * factor)
 
+    @property
+    def imperfect(self) -> bool:
+        """Whether the film probably has what its parameters do not describe."""
+        return sum(weight for each, weight in self.weights.items() if each.modes or each.size) > PROBABLE
+
+    def drifted(self, prior: FilmPrior) -> FilmEstimate:
+        """See `FilmEstimate`; what the film has besides its parameters is known only if it probably has something."""
+        if self.imperfect:
+            return super().drifted(prior)
+        return FilmEstimate(self.parameters, self.covariance).drifted(prior)
+
     def probability(self, what: str) -> float:
         """Of the hypotheses with a "size", an "offset" or a "drift"."""
         return sum(weight for hypothesis, weight in self.weights.items() if getattr(hypothesis, what) > 0.0)
@@ -123,9 +137,10 @@ def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate) -> Fil
             known = problem.settle(data, np.ones_like(keep), freedom, known.solved, everything.best)
     keep, mixture = known.keep, known.mixture
     unit = np.clip(problem.mean + mixture.mean, *problem.bounds)
-    contacts, n = problem.adjusted(unit, data), len(before.parameters)
+    begin = known.solved.contacts.contact if keep.all() else None
+    contacts, n = problem.adjusted(unit, data, begin), len(before.parameters)
     offset, drift = zip(unit[-2:].tolist(), np.sqrt(np.diag(mixture.covariance)[-2:]).tolist(), strict=True)
-    drifting = np.zeros(charges.std.size)  # nobody knows what the drift was when the film is used
+    drifting = np.zeros(len(unit) - 2)  # nobody knows what the drift was when the film is used
     drifting[len(SHARED) : n] = np.hypot(*drift) / np.sqrt(12.0) / charges.prior.spread.gain
     joint = mixture.covariance[:-2, :-2] + np.outer(drifting, drifting)
     return FilmPosterior(
@@ -198,9 +213,10 @@ class _Fit:
     @classmethod
     def of(cls, charges: FilmCharges, before: FilmEstimate) -> "_Fit":
         """The coefficients are zero, if nothing is known of them."""
-        size = charges.std.size + 2
-        mean, covariance, known = np.zeros(size), np.zeros((size, size)), before.unknowns.size
-        mean[:known] = before.unknowns / charges.std[:known]
+        n, known = len(before.parameters), before.unknowns.size
+        size = n + charges.n_coefficient + 2
+        mean, covariance = np.zeros(size), np.zeros((size, size))
+        mean[:known] = np.concatenate([before.parameters / charges.prior.std, before.coefficients])
         covariance[:known, :known] = before.of_unknowns
         return cls(charges, mean, covariance)
 
@@ -213,10 +229,12 @@ class _Fit:
 
     def _before(self, hypothesis: Hypothesis) -> Array:
         """Covariance of the unknowns before the presses."""
-        return self.covariance + np.diag(hypothesis.variances(len(self.charges.prior.names), len(self.mean)))
+        counts = len(self.charges.prior.names), len(self.charges.modes), len(self.mean)
+        return self.covariance + np.diag(hypothesis.variances(*counts))
 
     def _film(self, unit: Array) -> Array:
-        return np.asarray(unit[:-2] * self.charges.std)
+        n = len(self.charges.prior.names)
+        return np.concatenate([unit[:n] * self.charges.prior.std, unit[n:-2]])
 
     def adjusted(self, unit: Array, data: PressData, start: Array | None = None) -> AdjustedContacts:
         """The contacts that fit best on a film, searched for from a start."""
@@ -224,18 +242,24 @@ class _Fit:
         begin = search_places(self.charges, film, data) if start is None else start
         return adjust_contacts(self.charges, film, data, begin)
 
-    def slopes(self, unit: Array, data: PressData, contacts: AdjustedContacts) -> Array:
-        """Derivatives of the residuals by the unknowns once the contacts follow, (n, n_electrode + 3, n_unknown)."""
-        film, at = self._film(unit), with_force(contacts.contact)
+    def slopes(self, unit: Array, data: PressData, contacts: AdjustedContacts, *, besides: bool = True) -> Array:
+        """Derivatives of the residuals by the unknowns once the contacts follow, (n, n_electrode + 3, n_unknown).
+
+        Those by what a film has besides its parameters take time; they are zero if they are not wanted.
+        """
+        film, at, n = self._film(unit), with_force(contacts.contact), len(self.charges.prior.names)
         by_contact = self.charges.by_contact(film, at)
-        of_charge = data.weight[:, :, None] * self.charges.by_parameter(film, at, by_contact)
-        of_film = np.concatenate([of_charge, np.zeros((len(data), 3, film.size))], axis=1)
-        return projected(np.concatenate([of_film, data.by_nuisance()], axis=2), data.slopes(by_contact))
+        by_film = self.charges.by_parameter(film if besides else film[:n], at, by_contact)
+        by_unknown = np.zeros((*data.known.shape, unit.size))
+        by_unknown[:, :-3, : by_film.shape[2]] = data.weight[:, :, None] * by_film
+        by_unknown[:, :, -2:] = data.by_nuisance()
+        return projected(by_unknown, data.slopes(by_contact))
 
     def solve(self, data: PressData, weight: Array | Booleans, start: Array, hypothesis: Hypothesis) -> _Solved:
         """The film that explains weighted presses best, from a start; what a hypothesis excludes stays."""
         covariance, root = self._before(hypothesis), np.sqrt(weight)
         active = np.diag(covariance) > 0.0
+        besides = bool(active[len(self.charges.prior.names) : -2].any())
         of_prior = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(active, active)]))
         low, high = (bound[active] for bound in self.bounds)
         last: list[tuple[Array, _Solved]] = []
@@ -254,7 +278,7 @@ class _Fit:
 
         def jacobian(some: Array) -> Array:
             unit, contacts = solved_at(some)
-            rows = self.slopes(unit, data, contacts)[:, :, active] * root[:, None, None]
+            rows = self.slopes(unit, data, contacts, besides=besides)[:, :, active] * root[:, None, None]
             return np.concatenate([rows.reshape(-1, some.size), of_prior])
 
         begin = np.clip(start[active], low + MARGIN, high - MARGIN)

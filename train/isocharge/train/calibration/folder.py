@@ -38,7 +38,7 @@ from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses
 from isocharge.simulate.plots.figure import picture_bytes
 from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
-from isocharge.train.calibration.calibrate import PROBABLE, CalibrationResult
+from isocharge.train.calibration.calibrate import CalibrationResult
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.film_fit import FilmPosterior
 from isocharge.train.calibration.picture import calibration_picture
@@ -199,7 +199,7 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
 
 def _discrepancy(posterior: FilmPosterior) -> dict[str, Any] | None:
     """What no parameter describes, if there is anything: coefficients, errors, and correlations, of all unknowns."""
-    if posterior.probability("size") <= PROBABLE:
+    if not posterior.imperfect:
         return None
     std = np.sqrt(np.diag(posterior.joint))
     return {
@@ -257,7 +257,7 @@ def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
     covariance = _covariance(path, table.correlations, std / prior.std)
     if (known := table.discrepancy) is None:
         return FilmEstimate(value, covariance).drifted(prior)
-    size, count = problem.charges.std.size, len(known.coefficients)
+    size, count = len(names) + problem.charges.n_coefficient, len(known.coefficients)
     if len(names) + count != size or len(known.std) != size:
         raise PressError(f"{path}: discrepancy: expected {size - len(names)} coefficients, got {count}; calibrate anew")
     joint = _covariance(path, known.correlations, np.array(known.std))
