@@ -108,6 +108,24 @@ def bent(contact, charge):
     return charge * np.exp(0.03 * np.column_stack([np.sin(x / 4 + k) * np.cos(y / 5) for k in range(4)]))
 
 
+def test_imperfections_of_a_film_are_taken_for_what_they_are(problem):
+    """Pretensions of 1.3 to 0.7, a stiffer axis and an oval clamp, as their modes have it."""
+    modes = np.zeros(problem.charges.n_coefficient)
+    modes[: len(problem.charges.modes)] = [1.2, 0.5, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+
+    def imperfect(contact, charge):
+        truth, _ = rig(problem, 1, 31)
+        return charge * problem.charges.factor(np.concatenate([truth, modes]), problem.charges.into_domain(contact))
+
+    result, _ = on_a_film(problem, imperfect, 20, seed=31)
+    assert result.posterior.probability("modes") > 0.9
+    at = draw_contacts(np.random.default_rng(3), problem.domain.within(6.0), 200)
+    charge = imperfect(at, problem.charges.charges(rig(problem, 1, 31)[0], at))
+    left = np.log(problem.charges.charges(result.posterior.unknowns, at) / charge)
+    imperfection = np.log(imperfect(at, np.ones((200, 4))))
+    assert np.sqrt(np.mean(left**2)) < 0.4 * np.sqrt(np.mean(imperfection**2))
+
+
 def test_what_no_parameter_describes_is_corrected_and_its_error_is_said(problem):
     result, error = on_a_film(problem, bent, 20, seed=41)
     assert 0.5 < result.left.position_mm / error < 2.0
@@ -293,6 +311,43 @@ def test_an_earlier_calibration_is_the_prior_of_the_next(problem):
     assert result.left.position_mm < 0.7 * calibrate(again, problem).left.position_mm
     pretension = result.quantities["pretension_MPa"]
     assert abs(pretension.value - truth[0]) < 4.0 * pretension.std
+
+
+@pytest.fixture(scope="module")
+def warmed(problem):
+    """What an earlier calibration knows of a film, and the film a degree later."""
+    truth, presses = rig(problem, 12, seed=31)
+    earlier = calibrate(presses, problem).posterior.drifted(problem.prior)
+    truth[0] += 0.35
+    return replace(problem, earlier=earlier), truth
+
+
+NOBODY_KNOWS = (np.nan, np.nan, np.nan)
+
+
+@pytest.mark.parametrize(
+    ("count", "known", "within_mpa"),
+    [(30, NOBODY_KNOWS, 0.15), (1, (np.nan, np.nan, 0.1), 0.15), (3, (1.0, 2.0, 0.1), 0.1)],
+)
+def test_a_pretension_is_followed_by_little(warmed, count, known, within_mpa):
+    """By ordinary touches of which nothing is known, by a known weight anywhere, by a few presses that are known."""
+    problem, truth = warmed
+    rng = np.random.default_rng(10)
+    at = draw_contacts(rng, problem.domain.within(6.0), count)
+    at[:, np.isfinite(known)] = np.array(known)[np.isfinite(known)]
+    charge = problem.noise.add(problem.charges.charges(truth, at), rng)
+    at[:, np.isnan(known)] = np.nan
+    before, result = problem.earlier, calibrate(presses_of(problem, at, charge), problem)
+    std = np.sqrt(result.posterior.covariance[0, 0]) * problem.prior.std[0]
+    assert abs(before.parameters[0] - truth[0]) > 0.25
+    assert abs(result.posterior.parameters[0] - truth[0]) < min(within_mpa, 3.0 * std)
+
+
+def test_three_electrodes_follow_no_touches():
+    problem = CalibrationProblem.of(load_sensor("three-25um-biaxial"), Circle(1.0))
+    _, presses = rig(problem, 5, seed=1)
+    with pytest.raises(PressError, match="three charges are used up by x, y and force"):
+        calibrate(replace(presses, contact=np.full((5, 3), np.nan)), problem)
 
 
 def test_a_network_is_chosen_by_layout_and_not_by_name():
