@@ -117,10 +117,10 @@ class CalibrationResult:
             f"force (root mean square); before these presses it was {before.position_mm:.2g} mm and "
             f"{before.force_percent:.2g} %. Noise alone leaves {noise.position_mm:.2g} mm and "
             f"{noise.force_percent:.2g} %.",
+            *summarise(self.quantities),
             "Forces are as right as the load cell, and places as the origin of the stage: an error of theirs is in "
             "every answer, beside these.",
             *self._unexplained,
-            *summarise(self.quantities),
             *self.cautions,
         )
 
@@ -134,7 +134,7 @@ class CalibrationResult:
         more = next_presses(self.problem, MORE, self.posterior)
         places = ", ".join(f"{press.force_N:.2f} N at ({press.x_mm:g}, {press.y_mm:g}) mm" for press in more[:3])
         yield (
-            f"Beyond the parameters below, the charges of this film differ by {share:.2g} % (root mean square), "
+            f"Beyond these parameters, the charges of this film differ by {share:.2g} % (root mean square), "
             f"smoothly over the film: {self.left.position_mm:.2g} mm are left now. {MORE} more presses would reach "
             f"{more[-1].position_mm:.2g} mm, the first of them {places}; --next lists more."
         )
