@@ -11,7 +11,7 @@ stresses have few independent directions, so they are stored as the coefficients
 orthogonal decomposition, Sirovich 1987). The forward map of one film is a contraction over the last three numbers, and
 takes a millisecond.
 
-In a file, coefficients and modes are integers of 16 bits, each mode with its own scale: 3e-5 of a charge.
+In a file, coefficients and modes are integers, of fewer bits where there is little of a mode: some 3e-5 of a charge.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, SceneError, SolveError
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.family import Chain, Family, check_family, solve_chains
-from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, FilmLimits, decompose, quantised
+from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, FilmLimits, bits_of, decompose, quantised
 from isocharge.simulate.forward.film_modes import MODES, FilmModes, ModeMap
 from isocharge.simulate.forward.forward_map import ForwardMap, relative_error
 from isocharge.simulate.mesh.blocks import Resolution
@@ -40,6 +40,9 @@ from isocharge.simulate.solver.press import needed_resolution
 
 COUNTS = (5, 12, 8, 2, 5)
 """Nodes along each axis."""
+
+SPARE_BITS = 4.0
+"""See `bits_of`."""
 
 IMPERFECTIONS = "imperfections."
 """What the names of their arrays begin with."""
@@ -172,8 +175,9 @@ class FilmFamily:
     def to_arrays(self) -> dict[str, Any]:
         """The family as arrays, numbers and texts, for a file."""
         more = {} if self.imperfections is None else self.imperfections.to_arrays()
-        coefficients, scale = quantised(self.coefficients, axis=(0, 1, 2, 3, 4))
-        modes, size = quantised(self.modes, axis=1)
+        bits = bits_of(self.coefficients, self.modes, 16, SPARE_BITS)
+        coefficients, scale = quantised(self.coefficients, (0, 1, 2, 3, 4), bits)
+        modes, size = quantised(self.modes, 1, bits[:, None])
         return {
             **{name: getattr(self, name) for name in ("poisson", "surface", "layer", "error")},
             "limits": np.array([self.limits[name] for name in AXES]),

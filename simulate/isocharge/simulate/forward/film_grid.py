@@ -73,7 +73,20 @@ def _unstretched(axis: str, value: Array) -> Array:
     return np.maximum(np.exp(value) - SOFTENING, 0.0) if axis == "tension" else value
 
 
-def quantised(values: Array, axis: int | tuple[int, ...], bits: int = 16) -> tuple[np.ndarray, Array]:
+def bits_of(coefficients: Array, modes: Array, most: int, spare: float) -> Array:
+    """Bits for each mode, shape (n_mode,): fewer, but for `spare` ones, for those of which there is little.
+
+    Args:
+        coefficients: Shape (..., n_mode).
+        modes: Shape (n_mode, n).
+        most: Bits of the largest mode.
+        spare: As many modes share the error, each is given some bits more than its size asks for.
+    """
+    largest = np.abs(coefficients).reshape(-1, len(modes)).max(axis=0) * np.abs(modes).max(axis=1)
+    return np.asarray(np.clip(most + spare + np.log2(largest / largest.max()), 2.0, most))
+
+
+def quantised(values: Array, axis: int | tuple[int, ...], bits: Array | int) -> tuple[np.ndarray, Array]:
     """Integers of some bits, and the scales along an axis that give the values back: values = integers * scale."""
     scale = np.abs(values).max(axis=axis, keepdims=True) / (2 ** (bits - 1) - 1)
     return np.round(values / scale).astype(np.int16), scale

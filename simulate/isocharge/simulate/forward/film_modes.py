@@ -19,7 +19,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, SceneError
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.family import Chain, Family, solve_chains
-from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, decompose, quantised
+from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, bits_of, decompose, quantised
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mesh.template import template_for
@@ -59,8 +59,8 @@ LEFT_OUT = 3e-3
 """Share of the fields that their decomposition may leave out."""
 
 
-BITS = 9
-"""Bits of a part's values in a file, relative to the node's own size."""
+BITS, SPARE_BITS = 9, 2.0
+"""Bits of a part's values in a file, relative to the node's own size; see `bits_of`."""
 
 
 @dataclass(frozen=True)
@@ -212,10 +212,12 @@ class FilmModes:
 
     def to_arrays(self) -> dict[str, Any]:
         """As arrays, for a file."""
-        coefficients, scale = quantised(self.coefficients, axis=(0, 1, 2, 3, 4))
+        coefficients, scale = quantised(self.coefficients, (0, 1, 2, 3, 4), 16)
         by_node = self.parts.reshape(len(self.parts), -1, 3)
-        node_size = np.float32(np.sqrt((by_node**2).sum(axis=(0, 2), keepdims=True)) + np.finfo(np.float32).tiny)
-        parts, size = quantised((by_node / node_size).reshape(len(self.parts), -1), axis=1, bits=BITS)
+        node_size = np.sqrt((by_node**2).sum(axis=(0, 2), keepdims=True)) + np.finfo(np.float32).tiny
+        node_size = np.float32(np.exp2(np.round(np.log2(node_size))))  # a power of two: little to write
+        relative = (by_node / node_size).reshape(len(self.parts), -1)
+        parts, size = quantised(relative, 1, bits_of(self.coefficients, relative, BITS, SPARE_BITS)[:, None])
         return {
             "grid_shape": np.array(self.grid.shape),
             "grid": np.concatenate([getattr(self.grid, name) for name in AXES]),
