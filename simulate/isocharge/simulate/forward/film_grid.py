@@ -83,7 +83,7 @@ def bits_of(coefficients: Array, modes: Array, most: int, spare: float) -> Array
         spare: As many modes share the error, each is given some bits more than its size asks for.
     """
     largest = np.abs(coefficients).reshape(-1, len(modes)).max(axis=0) * np.abs(modes).max(axis=1)
-    return np.asarray(np.clip(most + spare + np.log2(largest / largest.max()), 2.0, most))
+    return np.asarray(np.clip(np.round(most + spare + np.log2(largest / largest.max())), 2.0, most))
 
 
 def quantised(values: Array, axis: int | tuple[int, ...], bits: Array | int) -> tuple[np.ndarray, Array]:
