@@ -22,7 +22,7 @@ MICROMETRE = 1e-3
 def sensor(request):
     if request.param != "shapes":
         return load_sensor(request.param)
-    triangle = Electrode('<"A\x01&B">\n', ((0.0, 10.0123456), (3.0, 10.0), (1.2345678, 14.0)))
+    triangle = Electrode('<"A&B">', ((0.0, 10.0123456), (3.0, 10.0), (1.2345678, 14.0)))
     square = Electrode.of_square("C", (-12.3456789, 0.1), 2.7182818)
     return replace(load_sensor("three-25um-biaxial"), electrodes=(triangle, square))
 

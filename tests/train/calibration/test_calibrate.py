@@ -260,7 +260,7 @@ def test_a_mistake_is_found_where_there_is_one(problem, name):
     _, presses = rig(problem, 12, seed=7)
     assert find_mistakes(presses, problem.charges) == []
     found = find_mistakes(presses_of(problem, *mistake(presses.contact, presses.charge_pC)), problem.charges)
-    assert re.search(reason, found[0])
+    assert re.search(reason, "; ".join(found))  # turned axes and swapped columns are the same on this layout
 
 
 @pytest.mark.parametrize("name", IMPOSSIBLE)

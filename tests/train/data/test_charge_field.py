@@ -127,7 +127,7 @@ def test_a_fit_across_a_fold_is_in_log_card_and_metadata(film, sensor, tmp_path,
     """One of three electrodes at the centre, where the map folds at once (0.2 mm by `identify`)."""
     central = layout(sensor, (0.0, 0.0), (8.66, 5.0), (-8.66, 5.0))
     model = release(fit(swept(tmp_path, film, 2_000, central), TINY), tmp_path / "models" / "centre")
-    (caution,) = caplog.messages
+    caution, *_ = caplog.messages  # a network that learned so little may say so
     assert "seems to fold about 0." in caution or "seems to fold about 1." in caution
     assert model.metadata.made_with["cautions"] == [caution]
     assert f"- {caution}." in (model.folder / "card.md").read_text("utf-8")
