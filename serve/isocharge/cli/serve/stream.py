@@ -125,7 +125,7 @@ def stream_command(
         bool,
         typer.Option(
             "--track",
-            help="Follow contacts in time: records get `tracked` and `event`, as by [track] in --device. (default: off)",
+            help="Follow contacts in time: records get `tracked` and `event`, as by [track]. (default: off)",
         ),
     ] = False,
     live: LiveOption = None,
