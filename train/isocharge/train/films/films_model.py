@@ -23,7 +23,7 @@ TAUGHT, COPIES = 1000, 4
 PRESSES, SEED = 1000, 11
 """Fresh presses on which a film's network is judged, and their seed."""
 
-HEAD_PRESSES, HEAD_SEED = 5_000, 12
+HEAD_PRESSES, HEAD_SEED = 1_500, 12
 """Presses from which the correlations are learned once the film is known, and their seed."""
 
 

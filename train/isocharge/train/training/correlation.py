@@ -40,10 +40,10 @@ LEAST_SPREAD = 0.02
 """Deviation of a combination of features, over the largest, below which it counts for less: its coefficient would be
 large and be lost in the digits of a float32."""
 
-SMALL_GRADIENT = 3e-4
-"""Largest derivative of the loss at its minimum."""
+SMALL_GRADIENT, LARGE_GRADIENT = 2e-3, 0.02
+"""Largest derivative of the loss at its minimum, and that from which it is said that there is none."""
 
-STARTS, STEPS = 5, 200
+STARTS, STEPS = 2, 200
 """How often the search may begin anew, as a line search may find no step where two unit vectors nearly meet; and the
 steps of each."""
 
@@ -104,7 +104,7 @@ def _fit_angles(features: Array, deviation: Array) -> tuple[Array, Array]:
         found = result.x
         if np.abs(result.jac).max() <= SMALL_GRADIENT:
             break
-    else:
+    if np.abs(result.jac).max() > LARGE_GRADIENT:
         _log.warning("the correlations are not learned to the end: the gradient is %.1g", np.abs(result.jac).max())
     found = found.reshape(start.shape)
     slopes = matrix @ found[1:]
