@@ -40,10 +40,10 @@ LEAST_SPREAD = 0.02
 """Deviation of a combination of features, over the largest, below which it counts for less: its coefficient would be
 large and be lost in the digits of a float32."""
 
-SMALL_GRADIENT, LARGE_GRADIENT = 2e-3, 0.02
-"""Largest derivative of the loss at its minimum, and that from which it is said that there is none."""
+SMALL_GRADIENT, LARGE_GRADIENT = 2e-3, 0.01
+"""Largest derivative of the loss at its minimum, and that from which the search begins anew."""
 
-STARTS, STEPS = 2, 200
+STARTS, STEPS = 5, 200
 """How often the search may begin anew, as a line search may find no step where two unit vectors nearly meet; and the
 steps of each."""
 
@@ -102,9 +102,9 @@ def _fit_angles(features: Array, deviation: Array) -> tuple[Array, Array]:
     for _ in range(STARTS):
         result = minimize(loss, found, jac=True, method="L-BFGS-B", options=options)
         found = result.x
-        if np.abs(result.jac).max() <= SMALL_GRADIENT:
+        if np.abs(result.jac).max() <= LARGE_GRADIENT:
             break
-    if np.abs(result.jac).max() > LARGE_GRADIENT:
+    else:
         _log.warning("the correlations are not learned to the end: the gradient is %.1g", np.abs(result.jac).max())
     found = found.reshape(start.shape)
     slopes = matrix @ found[1:]
