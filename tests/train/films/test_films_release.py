@@ -2,6 +2,7 @@
 
 import io
 import json
+import tracemalloc
 import zipfile
 from dataclasses import replace
 
@@ -18,7 +19,7 @@ from isocharge.train import FilmsConfig, fit_films, read_films, release_films
 from isocharge.train.films import films_data, films_file
 from isocharge.train.films import fit as films_fit
 from isocharge.train.films import release as films_release
-from isocharge.train.films.films_file import FILE, films_bytes, films_from_bytes
+from isocharge.train.films.films_file import FILE, _npz, films_bytes, films_from_bytes
 from isocharge.train.films.fit import films_identity
 from isocharge.train.films.release import evaluate_films
 from isocharge.train.training import descent
@@ -63,6 +64,19 @@ def test_an_array_that_no_memory_holds_is_damaged():
         file.writestr("mean.npy", header.getvalue())
     with pytest.raises(ModelError, match=r"films\.npz: damaged \(.*MemoryError"):
         films_from_bytes(buffer.getvalue(), "films.npz")
+
+
+def test_a_small_file_that_unpacks_to_very_much_is_refused_before_it_is_unpacked():
+    zeros = np.zeros(1 << 26, np.uint8)
+    bomb = _npz({"mean": zeros, "whitening": zeros, "contact": zeros})
+    del zeros
+    tracemalloc.start()
+    with pytest.raises(ModelError, match=r"films\.npz: damaged \(.*unpacks to more than"):
+        films_from_bytes(bomb, "films.npz")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(bomb) < 1 << 16
+    assert peak < 3 << 26
 
 
 @pytest.mark.parametrize("share", [0.0, 0.9999])

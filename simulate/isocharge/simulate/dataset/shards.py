@@ -10,7 +10,6 @@ format; it has no solver and no seed.
 
 import io
 import json
-import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -23,6 +22,7 @@ from msgspec import Struct
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, SensorError, cut, shown
 from isocharge.common.files import new_folder, read_whole, sha256_of, write_whole
+from isocharge.common.npz import npz_arrays
 from isocharge.common.structs import MOST_JSON_BYTES, Text, convert, parse_json
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
@@ -39,10 +39,7 @@ COLUMNS = {
 }
 
 MOST_SHARD_BYTES = 1 << 26
-"""Largest shard, and largest column in it once unpacked, bytes: a sweep's have a twentieth."""
-
-LONGEST_HEAD = 4096
-"""Longest description of an array in a shard, bytes."""
+"""Largest shard, bytes: a sweep's have a twentieth."""
 
 
 @dataclass(frozen=True)
@@ -318,17 +315,7 @@ def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
 def _unpacked(data: bytes, where: str) -> Samples:
     """The columns in the bytes of a shard; nothing in them is executed."""
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as packed:
-            return Samples(**{name: _column(packed, name) for name in COLUMNS})
+        return Samples(**npz_arrays(data, COLUMNS))
     except Exception as error:  # zipfile, zlib and NumPy raise what they like
         said = cut(str(error) or type(error).__name__)
         raise DatasetError(f"{where}: not a shard with the columns {', '.join(COLUMNS)}: {said}") from error
-
-
-def _column(packed: zipfile.ZipFile, name: str) -> np.ndarray:
-    """An array of an npz file, not larger than a shard may be."""
-    with packed.open(f"{name}.npy") as file:
-        data = file.read(MOST_SHARD_BYTES + 1)
-    if len(data) > MOST_SHARD_BYTES:
-        raise ValueError(f"{name} unpacks to more than {MOST_SHARD_BYTES} bytes")
-    return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False, max_header_size=LONGEST_HEAD)

@@ -26,6 +26,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, ModelError
 from isocharge.common.files import read_whole, sha256_of
+from isocharge.common.npz import npz_arrays
 from isocharge.simulate import Circle, Domain, NoiseModel
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread
@@ -129,8 +130,7 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 def _arrays(data: bytes) -> dict[str, np.ndarray]:
     """All arrays but the checksum, which must be theirs."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
+    arrays = npz_arrays(data)
     expected = str(arrays.pop("sha256"))
     if (actual := _checksum(arrays)) != expected:
         raise ValueError(f"expected the checksum {expected:.12}..., got {actual:.12}...")
