@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from msgspec import structs
 from scipy.stats import chi2, halfnorm
 
@@ -115,6 +116,13 @@ def test_the_folder_is_complete_and_says_what_it_holds(released, dataset, sensor
     assert f"{metadata.errors['position_median_mm']:g} mm" in card
     assert f"beyond {metadata.yield_force_N:g} N the film is stressed to more than 45 MPa" in card
     assert "make it" in card
+    _, block, _ = card.split("---\n", 2)
+    [index] = yaml.safe_load(block)["model-index"]
+    [result] = index["results"]
+    assert (index["name"], result["dataset"]["name"]) == (metadata.name, metadata.sensor["name"])
+    listed = {metric["type"]: metric["value"] for metric in result["metrics"]}
+    assert listed == {key: float(f"{metadata.errors[key]:g}") for key in listed}
+    assert "position_rms_mm" in listed
 
 
 def test_what_is_evaluated_is_what_is_served(fitted, released):

@@ -161,6 +161,12 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
     """The README.md of a dataset, from its manifest."""
     ranges, solver = manifest.get("ranges", {}), manifest.get("solver", {})
     lines = [
+        "---",  # what data hubs read: https://huggingface.co/docs/hub/datasets-cards
+        f"pretty_name: {json.dumps(name)}",
+        "task_categories: [tabular-regression]",
+        "tags: [isocharge, tactile-sensing, piezoelectric]",
+        "---",
+        "",
         f"# {name}",
         "",
         f"{manifest['samples']} presses on the sensor `{manifest['sensor']['name']}` and the touch charge of each "

@@ -3,6 +3,7 @@
 The card says what a model is for, what it reaches, what it cannot do, and how to make it again.
 """
 
+import json
 import platform
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -67,6 +68,47 @@ LIMITS = """\
 - One press at a time. Outside the working area and forces the answer is finite and wrong; the misfit is then large in
   many cases, not in all.
 - The deviations hold for the noise named above; gains that are off by 1 % add more than all of it.
+"""
+
+
+HUB_METRICS = {
+    "position_median_mm": "position error, median, mm",
+    "position_rms_mm": "position error, rms, mm",
+    "force_median_percent": "force error, median, %",
+    "force_rms_percent": "force error, rms, %",
+}
+"""Measured errors that model hubs list, and what they are called there."""
+
+
+def hub_block(metadata: ModelMetadata) -> str:
+    """The block of YAML above a card that model hubs read: what kind of model it is, and its measured errors.
+
+    Source: https://huggingface.co/docs/hub/model-cards. No licence is named: whoever publishes a model chooses it.
+    """
+    metrics = "".join(
+        f"""
+    - type: {key}
+      name: {said}
+      value: {metadata.errors[key]:g}"""
+        for key, said in HUB_METRICS.items()
+        if key in metadata.errors
+    )
+    name, sensor = json.dumps(metadata.name), json.dumps(str(metadata.sensor["name"]))
+    return f"""---
+library_name: onnx
+pipeline_tag: tabular-regression
+tags: [isocharge, tactile-sensing, piezoelectric]
+model-index:
+- name: {name}
+  results:
+  - task:
+      type: tabular-regression
+    dataset:
+      name: {sensor}
+      type: presses
+    metrics:{metrics}
+---
+
 """
 
 
@@ -221,7 +263,8 @@ def release(
     )
     graph = export_onnx(fitted.network, about.to_props())
     golden = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, contact_floors(about))
-    written = write_model(folder, graph, about, golden, card(about, fitted), fitted.provenance.files)
+    text = hub_block(about) + card(about, fitted)
+    written = write_model(folder, graph, about, golden, text, fitted.provenance.files)
     return Release(written, about)
 
 
