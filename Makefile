@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test test-all attack docs bench soak release report paper proto clean
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
+COMPILED_ONCE := PYTHONDONTWRITEBYTECODE=
 
 demo: $(VENV)/installed
 	$(BIN)/isocharge demo
@@ -16,7 +17,7 @@ test: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(ONE_THREAD) $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	$(ONE_THREAD) $(COMPILED_ONCE) $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 test-all: docs
 	$(BIN)/python -m pytest -m "slow or not slow"

@@ -17,6 +17,8 @@ from isocharge.common.extras import PACKAGES
 
 ROOT = Path(__file__).parents[1]
 
+LONGEST = ("tests/train", "tests/cli", "tests/test_pages", "tests/test_examples")
+
 settings.register_profile("patient", deadline=None)  # a busy machine is no fault of an example
 settings.load_profile("patient")
 
@@ -27,7 +29,11 @@ signal.signal(
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark the later cases of a test with `first_cases(n)` as slow, before slow tests are left out."""
+    """Mark the later cases of a test with `first_cases(n)` as slow, before slow tests are left out.
+
+    Files that take longest begin first, so that no worker is left with one of them at the end.
+    """
+    items.sort(key=lambda item: not item.path.relative_to(ROOT).as_posix().startswith(LONGEST))
     seen = Counter()
     for item in items:
         if marker := item.get_closest_marker("first_cases"):

@@ -25,6 +25,16 @@ SMALLER = {
 """What of an example would take a test too long, and what it runs with in its place."""
 
 
+QUICK = """
+[network]
+hidden = [24, 24]
+misfit_hidden = [24, 24]
+[training]
+steps = 300
+misfit_steps = 20
+misfit_charges = 2000
+"""
+
 EXAMPLE_PAGES = [page for page in PAGES if not page.startswith(("serve/", "CONTRIBUTING", "CHANGELOG"))]
 """Those of serve use ports (tests/serve), and CONTRIBUTING.md has recipes (tests/test_contributing.py)."""
 
@@ -51,7 +61,7 @@ def desks(tmp_path_factory):
     folders = {page: tmp_path_factory.mktemp("desk") for page in EXAMPLE_PAGES}
     for folder in folders.values():
         (folder / "train").symlink_to(ROOT / "train")
-        (folder / "quick.toml").write_text("[training]\nsteps = 50\nmisfit_steps = 20\nmisfit_charges = 2000\n")
+        (folder / "quick.toml").write_text(QUICK)
     return folders
 
 

@@ -239,7 +239,10 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(command, tmp_path, monke
 
 def quick(folder):
     path = folder / "quick.toml"
-    path.write_text("[training]\nsteps = 200\nmisfit_steps = 50\nmisfit_charges = 1000\n")
+    path.write_text(
+        "[network]\nhidden = [24, 24]\nmisfit_hidden = [24, 24]\n"
+        "[training]\nsteps = 300\nmisfit_steps = 50\nmisfit_charges = 1000\n"
+    )
     return path
 
 
