@@ -20,7 +20,7 @@ from isocharge.common.errors import InputError, SceneError
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.family import Chain, Family, solve_chains
 from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, bits_of, decompose, quantised
-from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.forward.forward_map import EVEN, ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.sensor.film import Film, Piezo
@@ -110,10 +110,9 @@ class ModeMap:
                 columns["poisson"] = charge[POISSON]
         if "d12" in self.names:
             shear = replace(self.film, sensor=replace(self.film.sensor, piezo=Piezo(0.0, 0.0, d12=1.0)))
-            columns["d12"] = shear.charges(contact)
+            columns["d12"] = shear.by_field(contact, EVEN)[..., 0]
         if "crosstalk" in self.names:
-            calibration = replace(self.film.sensor.calibration, crosstalk=0.0)
-            own = replace(self.film, sensor=replace(self.film.sensor, calibration=calibration)).charges(contact)
+            own = self.film.by_field(contact, EVEN)[..., 0]
             columns["crosstalk"] = own.sum(axis=1, keepdims=True) - own
         return np.stack([columns[name] for name in self.names], axis=2)
 

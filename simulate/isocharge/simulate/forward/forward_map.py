@@ -186,6 +186,9 @@ class ForwardMap:
     def by_field(self, contact: Array, odd: Booleans) -> Array:
         """Charges of several fields of stress in one table, each at its nodes in turn, under a round probe.
 
+        These are corrections: the coarse rule is used everywhere, and neither pressure on electrodes nor crosstalk is
+        in them.
+
         Args:
             contact: Presses of the domain, shape (n, 3), mm and N.
             odd: Which fields are odd about the direction of the press, shape (n_field,).
@@ -194,30 +197,32 @@ class ForwardMap:
             Shape (n, n_electrode, n_field), pC.
         """
         at = contact[:, 0] + 1j * contact[:, 1]
+        near = np.zeros((at.size, len(self.electrodes)), dtype=bool)
         with single_threaded_blas():
             parts = [
-                self._by_field(at[chunk], contact[chunk, 2], np.zeros(1), odd)
+                self._by_field(at[chunk], contact[chunk, 2], np.zeros(1), odd, near[chunk])
                 for chunk in (slice(start, start + CHUNK) for start in range(0, at.size, CHUNK))
             ]
         return np.concatenate(parts)
 
     def _charges(self, at: Complexes, force: Array, orientation: Array) -> Array:
         """Charges of one chunk of presses, shape (n, n_electrode)."""
-        charge: Array = self._by_field(at, force, orientation, EVEN)[..., 0]
+        near = self._near(at)
+        charge: Array = self._by_field(at, force, orientation, EVEN, near)[..., 0]
         if self.sensor.piezo.d33 != 0.0:
-            for i in np.flatnonzero(self._near(at).any(axis=1)):
+            for i in np.flatnonzero(near.any(axis=1)):
                 probe = self.probe.rotated(float(orientation[i]))
                 charge[i] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])
         return self.sensor.calibration.read(charge)
 
-    def _by_field(self, at: Complexes, force: Array, orientation: Array, odd: Booleans) -> Array:
-        """Charges of the fields of one chunk of presses, shape (n, n_electrode, n_field)."""
+    def _by_field(self, at: Complexes, force: Array, orientation: Array, odd: Booleans, near: Booleans) -> Array:
+        """Charges of the fields of one chunk of presses, (n, n_electrode, n_field); the fine rule where `near`."""
         rotation = orientation - np.angle(at)
         field = self.family.weights(np.abs(at), force, rotation) @ self.table
         mesh = template_for(self.probe, self.resolution)
         placement = Placement.of(mesh, self.probe, np.abs(at), self.sensor.film.radius, self.layer, rotation)
         charge = np.empty((at.size, len(self.sensor.electrodes), odd.size))
-        near, (fine, coarse) = self._near(at), self._readouts
+        fine, coarse = self._readouts
         for readout, chosen in ((fine, near), (coarse, ~near)):
             for count in np.unique(readout.count):
                 press_index, electrode = np.nonzero(chosen & (readout.count == count))
@@ -232,10 +237,10 @@ class ForwardMap:
         """The fine and the coarse rule for the charges."""
         return ReadoutPoints.of(self.sensor, FINE), ReadoutPoints.of(self.sensor, COARSE)
 
-    def _near(self, at: Complexes) -> np.ndarray:
+    def _near(self, at: Complexes) -> Booleans:
         """Which electrodes need the fine rule for which presses, shape (n, n_electrode)."""
         away = [(np.abs(at[:, None] - centre) - reach).min(axis=1) for centre, reach in self.sensor.discs]
-        return np.stack(away, axis=1) < self.probe.reach + NEAR
+        return np.asarray(np.stack(away, axis=1) < self.probe.reach + NEAR)
 
     def _read(
         self,

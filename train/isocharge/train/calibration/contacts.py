@@ -4,6 +4,7 @@ A rig knows place and force of a press to its own uncertainty, or one of them no
 is the one that fits charges and rig best; the residuals of both speak about the film.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -12,7 +13,6 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
-from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.numerics.disk_least_squares import minimise
@@ -136,19 +136,28 @@ def adjust_contacts(charges: FilmCharges, parameters: Array, data: PressData, st
     begin, besides = with_force(start), parameters[len(charges.prior.names) :].any()
     factor, steeper = np.ones_like(data.charge), np.zeros((*data.charge.shape, 3))
     if besides:  # what a film has besides its parameters is smooth: linear about the start
-        factor = charges.factor(parameters, begin)
-        steeper = differences(partial(charges.factor, parameters), begin, CONTACT_STEPS)
+        factor, steeper = _linearised(partial(charges.factor, parameters), begin)
 
     def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
         contact, presses = unit * domain.scale + domain.centre, data[rows]
         at, change = with_force(contact), (contact - start[rows])[:, None]
         share = factor[rows] + (steeper[rows] * change).sum(axis=2)
-        charge, by_contact = forward_map.charges(at), differences(forward_map.charges, at, CONTACT_STEPS)
+        charge, by_contact = _linearised(forward_map.charges, at)
         slopes = presses.slopes(share[:, :, None] * by_contact + charge[:, :, None] * steeper[rows])
         return presses.residual(share * charge, contact), (slopes * domain.scale).swapaxes(1, 2)
 
     unit, residual = minimise(residuals, (start - domain.centre) / domain.scale)
     return AdjustedContacts(unit * domain.scale + domain.centre, residual)
+
+
+def _linearised(function: Callable[[Array], Array], contact: Array) -> tuple[Array, Array]:
+    """Values at contacts (x, y, F) and derivatives by (x, y, ln F): one-sided differences are enough for a search."""
+    moved = contact + np.zeros((4, 1, 1))
+    moved[1, :, 0] += CONTACT_STEPS[0]
+    moved[2, :, 1] += CONTACT_STEPS[1]
+    moved[3, :, 2] *= np.exp(CONTACT_STEPS[2])
+    values = function(moved.reshape(-1, 3)).reshape(4, len(contact), -1)
+    return values[0], np.stack([(values[i + 1] - values[0]) / CONTACT_STEPS[i] for i in range(3)], axis=2)
 
 
 def search_places(charges: FilmCharges, parameters: Array, data: PressData) -> Array:

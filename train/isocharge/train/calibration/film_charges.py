@@ -6,11 +6,12 @@ modes of its imperfections, `MODE_STDS` their units, and of its discrepancy.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate import Circle, Film, ForwardMap, Probe
+from isocharge.simulate import Circle, Film, ForwardMap, Probe, Sensor
 from isocharge.simulate.forward.charge_map import Domain, FunctionMap, differences
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.forward.film_modes import MODES, ModeMap
@@ -49,6 +50,15 @@ LEAST_FACTOR = 0.05
 
 EDGE = 1.0 - 1e-6
 """Share of the family's radius and forces within which presses are evaluated: differences stay inside."""
+
+
+class _Modes(NamedTuple):
+    """The modes of the last film, and their charges under the last presses."""
+
+    modes: ModeMap
+    sensor: Sensor
+    contact: Array
+    by_mode: Array
 
 
 @dataclass(frozen=True)
@@ -138,17 +148,19 @@ class FilmCharges:
         forward_map, family = self.forward_map(parameters), self.family.imperfections
         if family is None:
             return np.zeros((len(contact), len(self.prior.sensor.electrodes), 0))
-        key = (forward_map.sensor.film, forward_map.probe)
-        if key not in self._modes:
-            self._modes.clear()
-            self._modes[key] = family.mode_map(forward_map, self.modes)
-        known = self._modes[key]
-        fields = known.fields and replace(known.fields, sensor=forward_map.sensor)
-        by_mode = replace(known, film=forward_map, fields=fields).by_mode(contact)
-        return np.asarray(by_mode * [MODE_STDS[name] for name in self.modes])
+        sensor, key = forward_map.sensor, (forward_map.sensor.film, forward_map.probe)
+        last = self._last_modes.get(key)
+        known = last.modes if last else family.mode_map(forward_map, self.modes)
+        if not last or last.sensor != sensor or not np.array_equal(last.contact, contact):
+            fields = known.fields and replace(known.fields, sensor=sensor)
+            by_mode = replace(known, film=forward_map, fields=fields).by_mode(contact)
+            last = _Modes(known, sensor, contact, by_mode * [MODE_STDS[name] for name in self.modes])
+            self._last_modes.clear()
+            self._last_modes[key] = last
+        return last.by_mode
 
     @cached_property
-    def _modes(self) -> dict[tuple[Film, Probe], ModeMap]:
+    def _last_modes(self) -> dict[tuple[Film, Probe], "_Modes"]:
         return {}
 
     def charges(self, unknowns: Array, contact: Array) -> Array:
@@ -183,7 +195,8 @@ class FilmCharges:
         film, by_force = self.forward_map(parameters), by_contact[:, :, 2]
         charge = film.charges(contact)
         if coefficients.any():
-            by_force = differences(film.charges, contact, CONTACT_STEPS)[:, :, 2]
+            more = np.array([1.0, 1.0, np.exp(CONTACT_STEPS[2])])
+            by_force = (film.charges(contact * more) - film.charges(contact / more)) / (2.0 * CONTACT_STEPS[2])
         columns = {name: self._by_step(name, parameters, contact, charge) for name in STEPPED}
         columns["young"] = charge - by_force - parameters[0] * columns["pretension"]
         columns["thickness"] = columns["thickness"] - by_force

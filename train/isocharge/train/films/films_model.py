@@ -17,14 +17,11 @@ from isocharge.train.training.fit import Fitted
 from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, answer_units
 from isocharge.train.training.source import Provenance
 
-TAUGHT, COPIES = 1000, 4
-"""Presses by which a last layer is changed, each with noise drawn so often."""
+TAUGHT, COPIES = 1500, 4
+"""Presses by which a last layer is changed, each with noise drawn so often; from them correlations are learned, too."""
 
 PRESSES, SEED = 1000, 11
 """Fresh presses on which a film's network is judged, and their seed."""
-
-HEAD_PRESSES, HEAD_SEED = 1_500, 12
-"""Presses from which the correlations are learned once the film is known, and their seed."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +96,7 @@ class FilmsModel:
         network, (sensor, probe) = self.fold(parameters), self.prior.film(parameters)
         rng, (known, variance) = np.random.default_rng(SEED), left or (np.empty((0, 3)), np.empty((0, 3)))
         contact = np.concatenate([draw_contacts(rng, self.domain, PRESSES + TAUGHT), known])
-        forward = self.forward_map(parameters)
-        charge = forward.charges(contact)
+        charge = self.forward_map(parameters).charges(contact)
         ratio = np.ones_like(charge) if factor is None else factor(contact)
         presses = LabelledPresses(contact[:PRESSES], (charge * ratio)[:PRESSES])
         if factor is not None:
@@ -108,9 +104,9 @@ class FilmsModel:
             as_if = self.noise.add(charge[taught], rng)
             network = network.corrected(as_if * ratio[taught], as_if)
         if correlation:
-            more = draw_contacts(np.random.default_rng(HEAD_SEED), self.domain, HEAD_PRESSES)
-            clean = forward.charges(more) * (1.0 if factor is None else factor(more))
-            network = with_correlation(network, LabelledPresses(more, clean), self.noise, HEAD_SEED)
+            learned = slice(PRESSES, PRESSES + TAUGHT)
+            examples = LabelledPresses(contact[learned], (charge * ratio)[learned])
+            network = with_correlation(network, examples, self.noise, SEED)
         if left is not None:
             taught = np.arange(PRESSES + TAUGHT, len(contact)).repeat(COPIES)
             noisy = self.noise.add((charge * ratio)[taught], rng)
