@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,9 @@ from isocharge.serve.model.session import OUTPUTS
 
 MODELS = Path(__file__).parents[3] / "models"
 PACKAGE = "onnxruntime-web@1"
+
+WASM = 3e-5
+"""Relative tolerance: the exponential of WebAssembly rounds otherwise where a deviation is 9 mm."""
 
 SCRIPT = """
 import { readFileSync } from "node:fs";
@@ -59,4 +63,4 @@ def test_node_gives_the_golden_answers(project, name):
         for key, tensor in json.loads(done.stdout).items()
     }
     assert set(answers) == set(OUTPUTS)
-    check_answers(model.golden, answers, f"{name} in node")
+    check_answers(replace(model.golden, relative=WASM), answers, f"{name} in node")
