@@ -1,6 +1,6 @@
 """The page: summary, one table, pictures with captions; Markdown from the record alone.
 
-The record is that of `report.json`, but for the methods, which are `MethodRecord`s.
+The record is that of `report.json`, but for the methods, each a `MethodRecord`.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
