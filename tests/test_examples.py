@@ -3,13 +3,15 @@
 import re
 import runpy
 import sys
+from functools import partial
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from isocharge.simulate import ForwardMap
+from kept import ROOT, kept
 
 
 @pytest.fixture
@@ -44,6 +46,7 @@ def test_a_thicker_and_a_tauter_film_give_less_charge(run):
     assert (np.diff(by_thickness, axis=1) < 0.0).all()
 
 
+@pytest.mark.slow  # tests/test_pages.py calibrates the same film by the command
 def test_a_film_is_calibrated(run, tmp_path):
     said = run("train/examples/calibrate.py", tmp_path)
     released, calibrated = (numbers(line)[0] for line in said.splitlines()[-2:])
@@ -51,7 +54,8 @@ def test_a_film_is_calibrated(run, tmp_path):
     assert (tmp_path / "film/sensor.toml").is_file()
 
 
-def test_a_lamp_is_switched_by_each_hard_press(run):
+def test_a_lamp_is_switched_by_each_hard_press(run, monkeypatch):
+    monkeypatch.setattr(ForwardMap, "build", partial(kept, ForwardMap.build))
     lines = run("serve/examples/lamp.py").splitlines()
     assert [line.split()[0] for line in lines] == ["on", "off", "on", "off", "on"]
     assert min(numbers(line)[0] for line in lines) >= 0.5

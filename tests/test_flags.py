@@ -1,6 +1,7 @@
 """What flags can see, and what they cannot: the figures of the pages, on fresh presses of every released sensor."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,8 @@ def shares(name):
 
     predictor, rng = Predictor(name), np.random.default_rng(7)
     reach, names = 0.999 * predictor.validity.reach_mm, predictor.metadata.electrodes
-    forward_map = kept(ForwardMap.build, load_sensor(name), Circle(1.0), radius=reach, force_range=(0.4, 2.0))
+    film = kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0))  # the same film under all of them
+    forward_map = replace(film, sensor=load_sensor(name))
     radius, angle = reach * np.sqrt(rng.random(PRESSES)), 2.0 * np.pi * rng.random(PRESSES)
     force = np.exp(rng.uniform(np.log(0.5), np.log(2.0), PRESSES))
     clean = forward_map.charges(np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force]))

@@ -158,6 +158,7 @@ def test_taut_membrane_under_a_centred_disk(share):
 POLYGONS = [Polygon.rectangle(4.0, 2.0, 0.5), Polygon.triangle(6.0, 1.0)]
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(("probe", "at"), [(POLYGONS[0], PLACES[1]), (POLYGONS[1], PLACES[2])], ids=str)
 def test_taut_membrane_under_a_polygon(probe, at):
     solved = press(TAUT, probe, at, TINY, SolveSettings(accuracy=1e-5, theory=Theory(False, False, True)))
@@ -196,6 +197,7 @@ def test_plate_under_a_centred_disk(share):
     assert deflection(solved, np.zeros((1, 2)))[0] == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(("probe", "at"), [(POLYGONS[0], PLACES[2]), (POLYGONS[1], PLACES[1])], ids=str)
 def test_plate_under_a_polygon(probe, at):
     solved = press(THICK, probe, at, TINY, SolveSettings(accuracy=1e-4, theory=Theory(False, True, False)))

@@ -87,6 +87,7 @@ def test_turning_press_and_layout_turns_nothing(probe):
     np.testing.assert_allclose(second, first, **EXACT)
 
 
+@pytest.mark.first_cases(3)
 @pytest.mark.parametrize("film", FILMS)
 def test_mirror(probe, film):
     """About the y axis."""
@@ -104,6 +105,7 @@ def test_turn_by_the_period_changes_nothing(probe):
     assert np.abs(half / second - 1.0).max() > 1e-4
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("film", FILMS)
 def test_polygon_of_many_corners_is_a_circle(film):
     """24 corners and the same area: what is left is the 24th harmonic and a second moment off by 5e-6.

@@ -52,8 +52,8 @@ def test_modes_are_the_differences_of_direct_solves(known, mode, changes):
         return touch_charge(replace(sensor, film=film), press(film, probe, tuple(contact[:2]), contact[2]))
 
     unit = 0.1 if mode.startswith("tension") else 1.0
-    expected = [(charge(contact, STEP) - charge(contact, -STEP)) / (2.0 * STEP * unit) for contact in CONTACTS]
-    by_mode = family.mode_map(sensor, probe, [mode]).by_mode(CONTACTS)[:, :, 0]
+    expected = [(charge(contact, STEP) - charge(contact, -STEP)) / (2.0 * STEP * unit) for contact in CONTACTS[:1]]
+    by_mode = family.mode_map(sensor, probe, [mode]).by_mode(CONTACTS[:1])[:, :, 0]
     assert np.abs(by_mode - expected).max() < 0.03 * np.abs(expected).max()
 
 

@@ -22,7 +22,7 @@ from isocharge.train.films import release as films_release
 from isocharge.train.films.films_file import FILE, _npz, films_bytes, films_from_bytes
 from isocharge.train.films.fit import films_identity
 from isocharge.train.films.release import evaluate_films
-from isocharge.train.training import descent
+from isocharge.train.training import correlation, descent
 
 
 @pytest.fixture(scope="module")
@@ -151,6 +151,7 @@ def solved(films, monkeypatch):
     monkeypatch.setattr(films_fit.FilmModes, "build", lambda *_: films.family.imperfections)
     monkeypatch.setattr(films_release, "FILMS", 4)
     monkeypatch.setattr(films_data, "CANDIDATES", 64)
+    monkeypatch.setattr(correlation, "EXAMPLES", 1_000)
 
 
 @pytest.mark.usefixtures("solved")

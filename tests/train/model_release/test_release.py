@@ -54,8 +54,8 @@ def released(fitted, tmp_path_factory):
 
 
 def _measured_here(name):
-    """The films of these models are others than that of all tests: they would have to be solved."""
-    return pytest.param(name, marks=pytest.mark.slow) if name.endswith("-films") else name
+    """Other films than that of all tests, and wider areas of it, would have to be solved."""
+    return pytest.param(name, marks=pytest.mark.slow) if name.endswith(("-films", "mm")) else name
 
 
 @pytest.fixture(scope="module", params=map(_measured_here, model_names(MODELS)))
