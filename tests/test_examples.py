@@ -4,7 +4,6 @@ import re
 import runpy
 import sys
 from functools import partial
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np

@@ -20,9 +20,10 @@ PAGES = {
 SMALLER = {
     "--samples 100000": "--samples 500",
     "--samples 6000": "--samples 1500",
+    "--seconds 90": "--seconds 900",
     "train/configs/quick.toml": "quick.toml",
 }
-"""What of an example would take a test too long, and what it runs with in its place."""
+"""What of an example would take a test too long, or be over too early on a busy machine, and what runs in its place."""
 
 
 QUICK = """

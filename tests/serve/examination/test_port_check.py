@@ -161,6 +161,8 @@ def test_the_proposal_is_a_device_that_reads_the_same():
     [
         ({}, (32768 + 400, 32768 - 90), 32768),  # half of 16 bits
         ({"pC_per_unit": 0.01}, (32768 + 400, 32768 - 90), 32768),
+        ({}, (128 + 3, 128 - 2), 128),  # of the fewest bits
+        ({}, ((1 << 30) + 7, (1 << 30) - 2), 1 << 30),  # and of the most
         ({"pC_per_unit": 1.0}, (32768 + 400, 32768 - 90), {"A": 33168, "B": 32678}),  # half is 400 pC away
         ({"pC_per_unit": 1.0}, (10, -10), None),
         ({}, (0, 0), None),

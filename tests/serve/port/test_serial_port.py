@@ -87,6 +87,13 @@ def test_port_that_is_silent(board):
             next(iter(port))
 
 
+def test_a_board_that_answers_no_request_is_silent():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = Port(f"tcp://127.0.0.1:{server.getsockname()[1]}", request=Request(b"?\n", 100.0), silence_s=0.05)
+        with port, pytest.raises(PortLost, match=r"no data for 0.05 s"):
+            next(iter(port))
+
+
 def test_port_that_is_not_open(board):
     with pytest.raises(PortError, match="not open"):
         next(iter(Port(board.url)))

@@ -81,6 +81,13 @@ def test_a_film_that_fits_is_hardly_ever_called_another(predictor, measure):
     assert sum(not check.fits for check in checks) <= 5  # 1 % of 150, and three deviations
 
 
+def test_a_scatter_that_is_hardly_larger_is_accepted_however_sure(predictor, measure):
+    agreement = check_presses(predictor, measure(12)).agreement
+    larger = [replace(agreement, p_value=1e-9, chi_squared=share * agreement.degrees) for share in (1.05, 1.2)]
+    assert [each.acceptable for each in larger] == [True, False]
+    assert replace(larger[1], p_value=0.2).acceptable
+
+
 def test_a_scale_of_the_force_is_recognised(predictor, measure):
     check = check_presses(predictor, measure(20, force_scale=1.05))
     assert check.fits is False

@@ -59,6 +59,14 @@ def test_a_message_stays_short(text, said):
     assert len(str(caught.value)) < 600
 
 
+def test_ten_of_many_missing_columns_are_named():
+    names = [f"Q{number}" for number in range(13)]
+    with pytest.raises(ChargeError, match=r"missing: 'Q1', .*'Q10' and 2 more"):
+        read_charges(io.StringIO("Q0\n1\n"), names, "presses.csv")
+    with pytest.raises(ChargeError, match=r"missing: 'Q3', .*'Q12'$"):
+        read_charges(io.StringIO("Q0,Q1,Q2\n1,2,3\n"), names, "presses.csv")
+
+
 def test_charges_of_a_header_alone():
     assert read("A,B,C\n").shape == (0, 3)
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import InputError, SceneError
-from isocharge.simulate import Circle, FilmPrior, load_sensor, press, touch_charge
+from isocharge.simulate import Circle, Domain, FilmPrior, load_sensor, press, touch_charge
+from isocharge.simulate.forward import film_family
 from isocharge.simulate.forward.film_family import FilmFamily
 
 RELEASED = sorted((Path(__file__).parents[3] / "models").glob("*-films/*/films.npz"))
@@ -34,6 +35,15 @@ def test_maps_agree_with_direct_solves_on_films_that_were_not_solved(prior, fami
         (x, y), force = rng.uniform(-2.0, 2.0, 2), rng.uniform(0.8, 1.2)
         direct = touch_charge(sensor, press(sensor.film, probe, (x, y), force))
         np.testing.assert_allclose(charges(family, sensor, probe, x, y, force), direct, rtol=1.5e-3)
+
+
+def test_a_family_is_checked_over_all_its_forces_and_places(prior, family, monkeypatch):
+    checked = []
+    monkeypatch.setattr(film_family, "relative_error", lambda _, *press: checked.append(press) or 1e-4 * len(checked))
+    assert film_family._check_against_solves(family, prior, Domain(3.0, (0.2, 1.2))) == 1e-4 * film_family.CHECKS
+    distance, _, force = np.array(checked).T
+    assert (0.2 <= force.min() < 0.3, 0.8 < force.max() <= 1.2) == (True, True)
+    assert (distance.min() < 1.0, distance.max()) == (True, 3.0)
 
 
 def test_modulus_and_loads_scale_exactly(prior, family):

@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from matplotlib.figure import Figure
 
-from isocharge.simulate import Calibration, Electrode, load_sensor
-from isocharge.simulate.plots.film import draw_electrodes
+from isocharge.simulate import Calibration, Domain, Electrode, FunctionMap, load_sensor
+from isocharge.simulate.plots.film import draw_charge_map, draw_electrodes
 
 
 def test_all_metal_is_drawn_where_it_lies():
@@ -20,3 +21,11 @@ def test_all_metal_is_drawn_where_it_lies():
         np.testing.assert_allclose(drawn, polygon)
     assert [patch.get_linestyle() for patch in axes.patches] == ["-", "-", "--"]
     assert [(text.get_text(), *text.xy) for text in axes.texts] == [("A", *np.add(electrode.centre, [1.0, 0.0]))]
+
+
+def test_the_whole_film_is_shaded():
+    """By charges that are the place itself: the shades reach to the rim on all sides."""
+    charge_map = FunctionMap(lambda contact: contact[:, :1], ("A",), Domain(8.0, (0.1, 1.0)))
+    axes = Figure().subplots()
+    draw_charge_map(axes, charge_map, 0)
+    assert axes.dataLim.extents == pytest.approx([-8.0, -8.0, 8.0, 8.0], abs=0.02)

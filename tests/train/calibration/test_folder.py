@@ -56,7 +56,9 @@ def test_every_file_is_there_and_reads_back(film, problem):
     parameters = problem.prior.parameters_of(load_sensor(folder / "sensor.toml"), result.film[1])
     np.testing.assert_allclose(parameters, result.posterior.parameters, rtol=1e-9, atol=1e-12)
     assert read_presses(folder / "1" / "presses.csv") == result.presses
-    assert "cannot tell" in (folder / "card.md").read_text("utf-8")
+    card = (folder / "card.md").read_text("utf-8")
+    assert "cannot tell" in card
+    assert "\nisocharge train calibrate ...\n" in card
     assert (folder / "calibration.png").read_bytes()[:4] == b"\x89PNG"
     load_model(folder / "1")
 

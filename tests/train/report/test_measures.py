@@ -1,15 +1,17 @@
 """Figures of merit against scikit-learn, SciPy, brute force and planted errors; sentences on made-up methods."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from sklearn.metrics import root_mean_squared_error
 
 from isocharge.serve.benchmark import Timing
-from isocharge.simulate import Domain
+from isocharge.simulate import Domain, parse_probe
 from isocharge.train.baselines.rivals import GivenMethod, Rival
 from isocharge.train.data.presses import draw_contacts
+from isocharge.train.report.case import EvaluationCase
 from isocharge.train.report.measures import Errors, MethodRecord, coverage, pareto, verdict
 from isocharge.train.report.studies import by_force
 
@@ -105,3 +107,19 @@ def test_errors_fall_into_the_bins_of_their_forces():
     np.testing.assert_allclose(found["position_rms_mm"]["Cramér-Rao"], 0.2, rtol=1e-3)
     np.testing.assert_allclose(found["position_rms_mm"]["method"], [0.1] * 10 + [0.5, 0.1], rtol=1e-3)
     np.testing.assert_allclose(found["force_N"][10] ** 2, edges[10] * edges[11], rtol=1e-3)
+
+
+def test_a_case_has_the_dataset_s_probes_and_as_many_presses_of_each(dataset):
+    """A probe at one angle carries it; one at any angle is turned at random."""
+    samples = dataset.samples
+    rows, third = len(samples.force_N), np.arange(len(samples.force_N)) % 3
+    probe = np.array(["circle:1.0", "rectangle:4x2", "triangle:4.0"])[third]
+    angles = np.choose(third, [np.zeros(rows), np.full(rows, 30.0), np.linspace(0.0, 90.0, rows)])
+    turned, fixed = third < 3, third < 2
+    for chosen, probes, presses in ((turned, 3, 99), (fixed, 2, 100)):
+        some = {name: np.asarray(getattr(samples, name))[chosen] for name in ("x_mm", "y_mm", "force_N", "charge_pC")}
+        mixed = replace(samples, **some, probe=probe[chosen], orientation_deg=angles[chosen])
+        case = EvaluationCase.of(replace(dataset, samples=mixed), 101, 0)
+        assert (len(case.probes), case.presses, case.rotated) == (probes, presses, chosen is turned)
+        assert case.probes[1] == parse_probe("rectangle:4x2").rotated(np.deg2rad(30.0))
+        assert case.probes[2:] == (parse_probe("triangle:4.0"),) * (probes - 2)

@@ -9,6 +9,7 @@ from tests.train.rig.conftest import DOMAIN, measured, systematic
 from isocharge.simulate import noise_model
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.data.presses import draw_contacts
+from isocharge.train.rig import rig_film
 from isocharge.train.rig.rig_film import Residuals, calibrated_film, corrected_film, fit_correction
 
 
@@ -42,6 +43,15 @@ def test_noise_alone_is_not_corrected():
     assert len(real) <= 1
     fresh = contacts(np.random.default_rng(5), 500)
     assert all(np.sqrt(np.mean(each.log_factor(fresh) ** 2)) < 0.004 for each in real)
+
+
+def test_presses_in_pieces_ask_for_the_same_correction(monkeypatch):
+    presses = residuals(0, 200, systematic)
+    whole = fit_correction(presses)
+    monkeypatch.setattr(rig_film, "CHUNK", 64)
+    pieces = fit_correction(presses)
+    np.testing.assert_allclose(pieces.coefficients, whole.coefficients, rtol=1e-6, atol=1e-9)
+    assert pieces.freedom == pytest.approx(whole.freedom)
 
 
 def test_beyond_the_presses_it_stays():
