@@ -51,7 +51,7 @@ def point_command(
     terms = theory_by_name(theory, film_sensor.film) if theory != "auto" else None
     terms = terms or theory_for(film_sensor, pressing, (force, force), accuracy)
     settings = SolveSettings(accuracy=accuracy, theory=terms)
-    equilibrium = press(film_sensor.film, pressing, position_of(at), force, settings)
+    equilibrium = press(film_sensor.coated_film, pressing, position_of(at), force, settings)
     charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
     charge_pC = dict(zip(film_sensor.electrode_names, charge.tolist(), strict=True))
     report = {"charge_pC": charge_pC, **summary(equilibrium)}

@@ -75,7 +75,7 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
     """Touch charge of each electrode.
 
     Args:
-        sensor: Its electrodes, coefficients and readout are used; its film must be the one that was solved.
+        sensor: Its electrodes, coefficients and readout are used; its `coated_film` must be the one that was solved.
         equilibrium: The solved press.
 
     Returns:
@@ -85,8 +85,10 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
     Raises:
         SensorError: If the film is another one, or the sensor reads a surface and bending was left out.
     """
-    if sensor.film != equilibrium.film:
-        raise SensorError(f"the equilibrium belongs to another film: expected {sensor.film}, got {equilibrium.film}")
+    if sensor.coated_film != equilibrium.film:
+        raise SensorError(
+            f"the equilibrium belongs to another film: expected {sensor.coated_film}, got {equilibrium.film}"
+        )
     if sensor.surface != "middle" and not equilibrium.theory.bending:
         raise SensorError(
             f"surface {sensor.surface!r} needs bending, but the film was solved as a {equilibrium.theory.name}; solve "
@@ -119,7 +121,7 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
 def _covered(corners: Array, probe: Probe, at: complex) -> float:
     """Area of a part of an electrode under a footprint, mm^2."""
     if isinstance(probe, Circle):
-        return area_in_disk(to_complex(corners), at, probe.radius)
+        return float(area_in_disk(to_complex(corners), at, probe.radius))
     return shared_area(to_complex(corners), at + probe.outline)
 
 

@@ -13,7 +13,11 @@ that is not the same in all directions adds a matrix to C and a deviator to tau 
 keeps the mean stiffness.
 """
 
+from dataclasses import replace
+
 import numpy as np
+from scipy.sparse import diags_array
+from scipy.sparse.linalg import SuperLU, splu
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_stress
@@ -90,8 +94,12 @@ class Membrane:
         return None if self.groups.anisotropy is None else _tensor(self.groups.anisotropy.tension)
 
     def _stress(self, elastic: Array) -> Array:
-        """C : E' of a strain, shape (..., 3)."""
-        return scaled_stress(elastic, self.groups)
+        """C : E' of a strain at the quadrature points, shape (n_element, n_point, 3), that of a coat included."""
+        borne = scaled_stress(elastic, self.groups)
+        if self.geometry.coat is not None:
+            stiffened, moduli = self.geometry.coat
+            borne[stiffened] += (moduli @ elastic[stiffened][..., None])[..., 0]
+        return borne
 
     def _slope(self, field: Array) -> Array:
         """d(U1, U2, W)/d(X1, X2) at the quadrature points, shape (n_element, n_point, 2, 3)."""
@@ -163,11 +171,11 @@ class Membrane:
         block[..., 0, 1] = plane * poisson * a * d + shear * b * c
         block[..., 1, 0] = plane * poisson * b * c + shear * a * d
         if self.groups.anisotropy is not None:
-            left, right = (np.zeros((*a.shape, 2, 3)) for _ in range(2))  # d(E11, E22, 2 E12) / d(slope)
-            for side, one, two in ((left, a, b), (right, c, d)):
-                side[..., 0, 0] = side[..., 1, 2] = one
-                side[..., 1, 1] = side[..., 0, 2] = two
-            block += left @ self.groups.anisotropy.moduli @ right.swapaxes(-1, -2)
+            block += _by_slope(a, b) @ self.groups.anisotropy.moduli @ _by_slope(c, d).swapaxes(-1, -2)
+        if self.geometry.coat is not None:
+            stiffened, moduli = self.geometry.coat
+            left, right = _by_slope(a[stiffened], b[stiffened]), _by_slope(c[stiffened], d[stiffened])
+            block[stiffened] += left @ moduli @ right.swapaxes(-1, -2)
         return block
 
 
@@ -198,12 +206,19 @@ class Bending:
         self.stiffness = stiffness
         weights = np.repeat(geometry.weights, 2, axis=1)[..., None]
         self._laplace = geometry.stacked.transpose(0, 2, 1) @ (weights * geometry.stacked)
-        self._mass = geometry.gather(geometry.mass)
+        self._mass = replace(geometry, constraint=None).gather(geometry.mass)
+        self._factor: SuperLU | None = None
 
     def laplacian(self, deflection: Array) -> Array:
         """lap W at the nodes, shape (n_node,), from W at the nodes."""
-        weak = self._laplace @ deflection[self.geometry.nodes][..., None]
-        return np.asarray(-self.geometry.gather(weak[..., 0]) / self._mass)
+        weak = self.geometry.gather((self._laplace @ deflection[self.geometry.nodes][..., None])[..., 0])
+        follow = self.geometry.constraint
+        if follow is None:
+            return np.asarray(-weak / self._mass)
+        if self._factor is None:  # the mass of nodes that others follow is not quite diagonal
+            hanging = diags_array((follow.diagonal() == 0.0).astype(float))
+            self._factor = splu((follow.T @ diags_array(self._mass) @ follow + hanging).tocsc())
+        return np.asarray(-(follow @ self._factor.solve(weak)))
 
     def energy(self, deflection: Array) -> float:
         """Bending energy of a nodal deflection, shape (n_node,)."""
@@ -229,6 +244,14 @@ class Bending:
         matrix[:, :, 3, :, 2] = shifted
         matrix[:, :, 3, :, 3] = -mass
         return matrix
+
+
+def _by_slope(one: Array, two: Array) -> Array:
+    """d(E11, E22, 2 E12) / d(slope) of a component with this column of F, shape (..., 2, 3)."""
+    by_slope = np.zeros((*one.shape, 2, 3))
+    by_slope[..., 0, 0] = by_slope[..., 1, 2] = one
+    by_slope[..., 1, 1] = by_slope[..., 0, 2] = two
+    return by_slope
 
 
 def _tensor(total: Array) -> Array:

@@ -93,7 +93,7 @@ class Blocks:
         self.xi, self.eta = xi.ravel(), eta.ravel()
 
     @property
-    def footprint(self) -> slice:
+    def footprint(self) -> slice | Integers:
         """The elements that fill the footprint."""
         return slice(0, self.n_quad if self.corners else self.n_inner)
 

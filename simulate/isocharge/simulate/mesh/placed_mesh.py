@@ -1,11 +1,13 @@
 """The mesh of one press: a template, where it lies on the film, and its elements there, ready for integration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
+from isocharge.simulate.mechanics.coating import Coating
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, template_for
@@ -14,6 +16,7 @@ from isocharge.simulate.numerics.interpolation import (
     lobatto_nodes,
     lobatto_quadrature,
     tensor_basis,
+    tensor_values,
 )
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
@@ -35,6 +38,9 @@ class Geometry:
         weights: Integration weights, shape (n_element, n_point); they add up to the meshed area.
         load: Share of the load on each node's W, shape (n_node,); adds up to one over the number of copies.
         mass: Lumped share of the area of each element's nodes, shape (n_element, n_local).
+        constraint: As `Template.constraint`.
+        coat: Elements that something stiffens, shape (n,), and what it adds there to C over E at the quadrature points,
+            shape (n, n_point, 3, 3).
     """
 
     nodes: Integers
@@ -42,6 +48,8 @@ class Geometry:
     weights: Array
     load: Array
     mass: Array
+    constraint: csr_array | None = None
+    coat: tuple[Integers, Array] | None = None
 
     @classmethod
     def build(cls, template: Template, points: Complexes) -> "Geometry":
@@ -53,7 +61,10 @@ class Geometry:
         share = area[inner] @ values
         load = np.bincount(template.nodes[inner].ravel(), share.ravel(), template.n_node)
         mass = _jacobian(at_nodes[:, None], points)[-1] * node_weights
-        return cls(template.nodes, gradient, area, load / (template.copies * area[inner].sum()), mass)
+        load = load / (template.copies * area[inner].sum())
+        if template.constraint is not None:
+            load = template.constraint.T @ load
+        return cls(template.nodes, gradient, area, load, mass, template.constraint)
 
     @property
     def stacked(self) -> Array:
@@ -61,8 +72,12 @@ class Geometry:
         return self.gradient.reshape(len(self.gradient), -1, self.gradient.shape[-1])
 
     def gather(self, local: Array) -> Array:
-        """Add up element contributions of shape (n_element, n_local) at the nodes, shape (n_node,)."""
-        return np.asarray(np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64))
+        """Add up element contributions of shape (n_element, n_local) at the nodes, shape (n_node,).
+
+        Those of a hanging node go to the nodes that it follows.
+        """
+        total = np.asarray(np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64))
+        return total if self.constraint is None else np.asarray(self.constraint.T @ total)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +89,14 @@ class PlacedMesh:
         placement: Where it lies.
         layer: Width of the thin rings at the rim over the film's radius.
         oval: e exp(2 i alpha) of a rim at 1 + e cos 2 (angle - alpha), in film radii.
+        coat: What stiffens parts of the film, in film radii, the press rotated onto the x axis.
     """
 
     template: Template
     placement: Placement
     layer: float
     oval: complex = 0.0
+    coat: Coating | None = None
 
     @property
     def resolution(self) -> Resolution:
@@ -89,7 +106,8 @@ class PlacedMesh:
     @cached_property
     def points(self) -> Complexes:
         """Film points of every element's nodes, shape (n_element, n_local), in film radii."""
-        return to_oval(self.placement.element_points(self.template), self.oval)
+        points = to_oval(self.placement.element_points(self.template), self.oval)
+        return self.template.from_base(points)
 
     @property
     def node_points(self) -> Complexes:
@@ -99,7 +117,13 @@ class PlacedMesh:
     @cached_property
     def geometry(self) -> Geometry:
         """The elements, ready for integration."""
-        return Geometry.build(self.template, self.points)
+        geometry = Geometry.build(self.template, self.points)
+        if self.coat is None:
+            return geometry
+        xi, eta, _ = gauss_reference_square(self.resolution.order + 1)
+        points = self.points @ tensor_values(self.resolution.order, xi, eta).T
+        stiffened = np.flatnonzero(self.coat.near(points).any(axis=1))
+        return replace(geometry, coat=(stiffened, self.coat.moduli(points[stiffened])))
 
     def locate(self, points: Complexes) -> tuple[Integers, Array, Array, Booleans]:
         """Element, xi and eta of film points, shape (n,), in film radii, the press rotated onto the x axis.
@@ -108,7 +132,7 @@ class PlacedMesh:
         """
         position, mirrored = self.template.into_meshed_half(from_oval(points, self.oval))
         element, xi, eta = self.placement.batch().locate(self.template, position[None])
-        return element[0], xi[0], eta[0], mirrored
+        return *self.template.within(element[0], xi[0], eta[0]), mirrored
 
     def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:
         """d(basis)/d(X1, X2) at points of elements, shape (n, 2, n_local)."""

@@ -74,28 +74,21 @@ def _left_of(corners: Complexes, side: Array) -> Complexes:
     return np.array(clipped, dtype=complex)
 
 
-def area_in_disk(corners: Complexes, centre: complex, radius: float) -> float:
-    """Area of a polygon (anticlockwise corners x + iy) that lies in a disk: edge by edge, the triangle with the centre.
+def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float) -> Array:
+    """Area of a polygon (anticlockwise corners x + iy) that lies in a disk about each centre, of the centres' shape.
 
-    Along an edge the part inside the circle spans a triangle, the parts outside span sectors.
+    Edge by edge, the triangle with the centre: along an edge the part inside the circle spans a triangle, the parts
+    outside span sectors.
     """
-    total = 0.0
-    z = corners - centre
-    for start, end in zip(z, np.roll(z, -1), strict=True):
-        total += _sector_of_edge(complex(start), complex(end), radius)
-    return total
-
-
-def _sector_of_edge(start: complex, end: complex, radius: float) -> float:
-    along = (end - start) / abs(end - start)
-    low, high = (start * along.conjugate()).real, (end * along.conjugate()).real
-    height = (start * along.conjugate()).imag
-    half = np.sqrt(max(radius**2 - height**2, 0.0))
-    inside = np.clip([low, high], -half, half)
-    points = [start, *((inside + 1j * height) * along), end]
-    turns = [np.angle(b * np.conj(a)) if a != 0.0 and b != 0.0 else 0.0 for a, b in pairwise(points)]
-    triangle = -0.5 * height * (inside[1] - inside[0])
-    return float(triangle + 0.5 * radius**2 * (turns[0] + turns[2]))
+    start = corners - np.asarray(centre)[..., None]
+    end = np.roll(start, -1, axis=-1)
+    along = (end - start) / np.abs(end - start)
+    height = (start * np.conj(along)).imag
+    half = np.sqrt(np.maximum(radius**2 - height**2, 0.0))
+    first, last = (np.clip((z * np.conj(along)).real, -half, half) for z in (start, end))
+    points = np.stack([start, (first + 1j * height) * along, (last + 1j * height) * along, end])
+    turns = np.angle(points[1:] * np.conj(points[:-1]))
+    return np.asarray((-0.5 * height * (last - first) + 0.5 * radius**2 * (turns[0] + turns[2])).sum(axis=-1))
 
 
 def gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:

@@ -31,6 +31,28 @@ MOST_SLACK = 10.0
 """Largest pretension below 0, MPa: a film that is too long by 0.2 %; light presses wrinkle a slack one."""
 
 
+MOST_COAT = 5.0
+"""Largest stiffness of a coat over the film's: tested up to this; beyond, the coat's bending counts, too."""
+
+
+@dataclass(frozen=True)
+class Coat:
+    """Metal or ink that stiffens parts of a film: isotropic, of the film's Poisson's ratio, without tension of its own.
+
+    Attributes:
+        stiffness: Young's modulus times thickness, N/mm.
+        layers: What is coated at least once, and what twice, on both sides: convex polygons without common area,
+            anticlockwise corners (x, y) on the real film, mm.
+    """
+
+    stiffness: float
+    layers: tuple[tuple[tuple[tuple[float, float], ...], ...], ...]
+
+    def __repr__(self) -> str:
+        """Without the corners."""
+        return f"Coat({self.stiffness:.4g} N/mm, {len(self.layers[0])} parts)"
+
+
 @dataclass(frozen=True)
 class Film:
     """The clamped circular film.
@@ -47,6 +69,7 @@ class Film:
         axis: Angle of its axis 1 from x, rad, anticlockwise.
         oval: e of a clamp that is no circle: its half axes are radius * (1 + e) and radius * (1 - e).
         oval_axis: Angle of the longer one from x, rad.
+        coat: What stiffens parts of it, if anything.
     """
 
     radius: float
@@ -60,6 +83,7 @@ class Film:
     axis: float = 0.0
     oval: float = 0.0
     oval_axis: float = 0.0
+    coat: Coat | None = None
 
     @property
     def anisotropic(self) -> bool:
@@ -69,13 +93,13 @@ class Film:
     @property
     def around(self) -> dict[str, object]:
         """All that is not alike all round the film, by the names of the attributes."""
-        names = ("deviator", "young_ratio", "shear", "axis", "oval", "oval_axis")
+        names = ("deviator", "young_ratio", "shear", "axis", "oval", "oval_axis", "coat")
         return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(Film, name)}
 
     @property
     def turns(self) -> bool:
         """Whether the film turned about its centre is the same film: a press at (r, theta) is then one at (r, 0)."""
-        return not self.anisotropic and self.oval == 0.0
+        return not self.anisotropic and self.oval == 0.0 and self.coat is None
 
     def __post_init__(self) -> None:
         check_length("film radius", self.radius, LEAST_RADIUS, SensorError)
@@ -84,6 +108,11 @@ class Film:
         check_stress("film pretension", self.pretension, -MOST_SLACK, MOST_PRETENSION, SensorError)
         if not 0.0 <= self.poisson < 0.5:
             raise SensorError(f"film poisson: expected 0 <= poisson < 0.5, got {self.poisson}")
+        if self.coat is not None and not 0.0 < self.coat.stiffness <= MOST_COAT * self.young * self.thickness:
+            raise SensorError(
+                f"film coat: expected Young's modulus times thickness up to {MOST_COAT:g} times the film's, "
+                f"{self.young * self.thickness:.4g} N/mm, got {self.coat.stiffness:.4g} N/mm"
+            )
         for name, value in zip(("(T11 - T22) / 2", "T12"), self.deviator, strict=True):
             check_stress(f"film pretension, {name}", value, -MOST_PRETENSION, MOST_PRETENSION, SensorError)
         if self.shear is not None:

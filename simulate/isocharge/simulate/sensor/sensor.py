@@ -14,7 +14,7 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SensorError, cut, shown
 from isocharge.simulate.numerics.polygon import area_of, is_convex, overlap, to_complex, to_corners
 from isocharge.simulate.numerics.polygon_union import is_simple, pieces, trace_outline, union_parts
-from isocharge.simulate.sensor.film import Film, Piezo, Surface
+from isocharge.simulate.sensor.film import Coat, Film, Piezo, Surface
 from isocharge.simulate.sensor.size_check import check_length
 
 Readout = Literal["area", "edge"]
@@ -38,7 +38,7 @@ LONGEST_NAME = 100
 """Longest name of an electrode, characters."""
 
 OTHER_COLUMNS = (
-    *("side_mm", "x_mm", "y_mm", "force_N", "position_std_mm", "force_std", "temperature_C"),
+    *("side_mm", "coating_N_per_mm", "x_mm", "y_mm", "force_N", "position_std_mm", "force_std", "temperature_C"),
     *("probe", "orientation_deg", "t_us", "t_ms", "t_s", "seq"),
 )
 """What else stands among the names of electrodes: keys of the sensor file, columns of presses, fields of a frame."""
@@ -180,7 +180,19 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A film with electrodes; see `isocharge.simulate.sensor.sensor_file` for its file."""
+    """A film with electrodes; see `isocharge.simulate.sensor.sensor_file` for its file.
+
+    Attributes:
+        name: Its name.
+        film: The bare film.
+        piezo: Its coefficients.
+        electrodes: What collects.
+        readout: Mean over an electrode or over its edges.
+        surface: Where in the thickness the stress is read.
+        calibration: What was measured on a real film.
+        coating: Young's modulus times thickness of the electrodes' metal or ink, N/mm, on the front and on a back that
+            is not metal all over; 0 where it does not stiffen the film.
+    """
 
     name: str
     film: Film
@@ -189,6 +201,7 @@ class Sensor:
     readout: Readout = "area"
     surface: Surface = "middle"
     calibration: Calibration = field(default_factory=Calibration)
+    coating: float = 0.0
 
     def __post_init__(self) -> None:
         for value, options in ((self.readout, get_args(Readout)), (self.surface, get_args(Surface))):
@@ -222,6 +235,17 @@ class Sensor:
     def electrode_names(self) -> tuple[str, ...]:
         """Names in the order of the charges."""
         return tuple(electrode.name for electrode in self.electrodes)
+
+    @cached_property
+    def coated_film(self) -> Film:
+        """The film with the metal of the electrodes, as it is pressed; the bare one if that does not stiffen it."""
+        if self.coating == 0.0:
+            return self.film
+        once = [replace(e, more=(*e.more, *e.back), back=(), square=False) for e in self.electrodes]
+        twice = [electrode for electrode in self.electrodes if electrode.back]
+        layers = [[self.calibration.place(part) for e in layer for part in e.parts] for layer in (once, twice) if layer]
+        corners = tuple(tuple(tuple((float(x), float(y)) for x, y in part) for part in layer) for layer in layers)
+        return replace(self.film, coat=Coat(self.coating, corners))
 
     @cached_property
     def discs(self) -> tuple[tuple[Complexes, Array], ...]:

@@ -32,8 +32,8 @@ FARTHEST_MM = 1e6
 
 log = logging.getLogger(__name__)
 
-SIDE = "side_mm"
-"""Key of the squares' side, among the names of the electrodes."""
+SIDE, COATING = "side_mm", "coating_N_per_mm"
+"""Keys of the squares' side and of the stiffness of metal or ink, among the names of the electrodes."""
 
 Coordinate = Annotated[float, Meta(ge=-FARTHEST_MM, le=FARTHEST_MM)]
 Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm, each at most {FARTHEST_MM:g}")]
@@ -83,7 +83,7 @@ class CalibrationTable(Settings, frozen=True):
 
 
 class SensorTable(Settings, frozen=True):
-    """A sensor file; `electrodes` has places of squares and polygons by name, and the squares' side."""
+    """A sensor file; `electrodes` has places of squares and polygons by name, the squares' side and the coating."""
 
     name: Text
     film: FilmTable
@@ -95,11 +95,14 @@ class SensorTable(Settings, frozen=True):
 
     def __post_init__(self) -> None:
         for name, value in self.electrodes.items():
-            if name != SIDE and isinstance(value, float):
+            if name not in (SIDE, COATING) and isinstance(value, float):
                 raise WrongKey(f"electrodes.{name}", "[x, y] in mm or a table", value)
             if isinstance(value, PolygonTable) and bool(value.trace_mm) != (value.width_mm > 0.0):
                 missing = "width_mm" if value.trace_mm else "trace_mm"
                 raise WrongKey(f"electrodes.{name}.{missing}", "trace_mm and a width_mm above 0 together")
+        coating = self.electrodes.get(COATING, 0.0)
+        if not (isinstance(coating, float) and 0.0 <= coating <= FARTHEST_MM):
+            raise WrongKey(f"electrodes.{COATING}", f"a number from 0 to {FARTHEST_MM:g}", coating)
         side = self.electrodes.get(SIDE)
         if side is not None and not (isinstance(side, float) and 0.0 < side <= FARTHEST_MM):
             raise WrongKey(f"electrodes.{SIDE}", f"a number above 0 and at most {FARTHEST_MM:g}", side)
@@ -233,7 +236,9 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
             f"readout 'edge' needs squares, and in a sensor file all squares have one side: got {sides} mm"
         )
     shared = next(iter(sides.values()), None)
-    tables: dict[str, Any] = {} if shared is None else {"side_mm": shared}
+    tables: dict[str, Any] = {} if shared is None else {SIDE: shared}
+    if sensor.coating:
+        tables[COATING] = tidy(sensor.coating)
     for electrode in sensor.electrodes:
         if sides.get(electrode.name) == shared is not None:
             tables[electrode.name] = [tidy(value) for value in electrode.centre]
@@ -256,6 +261,7 @@ def _build(file: SensorTable) -> Sensor:
         film=_film(film),
         piezo=Piezo(piezo.d31, piezo.d32, piezo.d33, piezo.pyro_uC_per_m2_K, piezo.d12),
         electrodes=tuple(_electrodes(file.electrodes)),
+        coating=_coating(file.electrodes),
         readout=file.readout,
         surface=file.surface,
         calibration=Calibration(
@@ -281,6 +287,11 @@ def _film(table: FilmTable) -> Film:
         oval=table.oval,
         oval_axis=float(np.deg2rad(table.oval_axis_deg)),
     )
+
+
+def _coating(table: Mapping[str, float | Point | PolygonTable]) -> float:
+    value = table.get(COATING)
+    return value if isinstance(value, float) else 0.0
 
 
 def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:

@@ -12,7 +12,7 @@ but U2.
 from functools import lru_cache
 
 import numpy as np
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_matrix, eye_array, kron
 from scipy.sparse.linalg import SuperLU, splu
 
 from isocharge.common.arrays import Array, Integers
@@ -28,6 +28,7 @@ class Assembly:
         inner_global: Numbers of the elements' interior unknowns, shape (n_element, n_inner).
         outer_global: Numbers of those on the elements' edges, shape (n_element, n_outer).
         skeleton: Numbers of those that are left to factorise.
+        follow: Their values from those that do not hang; None if none hangs.
     """
 
     def __init__(self, mesh: Template, components: int, odd: bool = False) -> None:
@@ -46,6 +47,10 @@ class Assembly:
         number = np.full(self.free.size, -1, dtype=np.intp)
         number[self.skeleton] = np.arange(self.skeleton.size)
         self._pattern(number[self.outer_global])
+        self.follow = None
+        if mesh.constraint is not None:
+            each = kron(mesh.constraint, eye_array(components)).tocsr()[self.skeleton][:, self.skeleton]
+            self.follow = each[:, each.diagonal() > 0.0].tocsc()
 
     def _unknowns(self, nodes: Integers) -> Integers:
         """Numbers of the unknowns of nodes: shape (..., n) to (..., components * n), components fast."""
@@ -84,6 +89,8 @@ class Assembly:
     def _factor_skeleton(self, schur: Array) -> SuperLU:
         data = np.bincount(self._place, schur.ravel(), self._indices.size + 1)[:-1]
         skeleton = csc_matrix((data, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
+        if self.follow is not None:
+            skeleton = csc_matrix(self.follow.T @ skeleton @ self.follow)
         return splu(skeleton, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
@@ -111,7 +118,11 @@ class Factor:
         carried = self._coupling.transpose(0, 2, 1) @ inside
         shifted = flat - np.bincount(parts.outer_global.ravel(), carried.ravel(), flat.size)
         solution = np.zeros(flat.size)
-        solution[parts.skeleton] = self._skeleton.solve(shifted[parts.skeleton])
+        skeleton = shifted[parts.skeleton]
+        if parts.follow is not None:
+            skeleton = parts.follow.T @ skeleton
+        found = self._skeleton.solve(skeleton)
+        solution[parts.skeleton] = found if parts.follow is None else parts.follow @ found
         back = self._reduced @ solution[parts.outer_global][..., None]
         solution[parts.inner_global] = (inside - back)[..., 0]
         return solution.reshape(parts.free.shape)[:, :3]

@@ -113,6 +113,9 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     strained = strain(gradient @ equilibrium.field[mesh.template.nodes[element]], groups.amplitude2)
     if surface != "middle":
         strained += _bent_strain(equilibrium, surface, gradient @ node_slope(equilibrium)[element, :, :, 2])
+    if mesh.coat is not None:
+        turned = (points @ [1.0, 1j]) * np.exp(-1j * np.arctan2(equilibrium.at[1], equilibrium.at[0]))
+        strained = mesh.coat.of_film(turned / equilibrium.film.radius, strained)
     local = equilibrium.film.young * groups.amplitude2 * scaled_stress(strained, groups)
     local[mirrored, 2] *= -1.0
     return rotate_stress(local, np.arctan2(equilibrium.at[1], equilibrium.at[0]))

@@ -15,6 +15,7 @@ from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import CLEARANCE
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, place
 from isocharge.simulate.mesh.placement import Placement
+from isocharge.simulate.mesh.refinement import coated
 from isocharge.simulate.mesh.template import corners_of
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Polygon, Probe, farthest
@@ -161,7 +162,7 @@ class LoadCase:
 
     def place(self, resolution: Resolution) -> PlacedMesh:
         """A mesh under this press."""
-        return place(self.film, self.probe, self.at, resolution, self.layer)
+        return coated(place(self.film, self.probe, self.at, resolution, self.layer), self.film, self.at)
 
 
 def _layer(film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None) -> float:
@@ -215,7 +216,7 @@ def _ladder(case: LoadCase) -> Iterator[Resolution]:
     crowded = isinstance(probe, Polygon) and farthest(probe, at) + CLEARANCE * probe.reach > film.radius
     sharper = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.accuracy)))
     base = Resolution(
-        order=(5 if case.theory.bending else 4) + sharper,
+        order=(5 if case.theory.bending and film.coat is None else 4) + sharper,
         around=16 if crowded else 8,
         rings=max(3, math.ceil(-1.3 * math.log(float(placement.rho)) + min(2.0 * math.log(stretch), 4.0)))
         + sharper // 2,

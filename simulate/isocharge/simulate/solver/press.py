@@ -193,6 +193,8 @@ def _start_field(start: Equilibrium | None, template: Template, cold: Array) -> 
     before, order = start.mesh.template, template.resolution.order
     if replace(before.resolution, order=order) != template.resolution:
         return cold
+    if not np.array_equal(before.splits, template.splits):
+        return cold
     return start.field if before.resolution == template.resolution else resampled(start.field, before, template)
 
 
