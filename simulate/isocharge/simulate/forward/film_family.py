@@ -116,7 +116,7 @@ class FilmFamily:
         domain, film, surface = Domain(radius, force_range), prior.sensor.film, prior.sensor.surface
         limits = _limits_of(prior, domain)
         grid, a = FilmGrid.spread(limits, counts), film.radius
-        check_family(film, Circle(limits["reach"][1] * a), domain)
+        check_family(prior.sensor.coated_film, Circle(limits["reach"][1] * a), domain)
         middle = float(np.sqrt(force_range[0] * force_range[1]))
         layer = layer_for(film, middle)
         settings = SolveSettings(theory=THEORY, layer=layer)

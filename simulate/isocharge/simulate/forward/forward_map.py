@@ -100,7 +100,7 @@ class ForwardMap:
             SolveError: If an equilibrium or the interpolation error is not reached.
         """
         film, domain = sensor.film, Domain(radius, force_range)
-        check_family(film, probe, domain)
+        check_family(sensor.coated_film, probe, domain)
         middle = float(np.sqrt(force_range[0] * force_range[1]))
         theory = settings.theory
         if theory == "auto":

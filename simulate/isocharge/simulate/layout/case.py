@@ -159,7 +159,7 @@ class DesignCase:
                 f"electrodes: expected {FEWEST} to {MOST}, got {self.electrodes}; x, y and the force of a press are "
                 "three unknowns"
             )
-        check_family(self.sensor.film, self.probe, Domain(self.radius, (self.force, self.force)))
+        check_family(self.sensor.coated_film, self.probe, Domain(self.radius, (self.force, self.force)))
         for name, value, least in (("gap", self.gap, 0.0), ("rim", self.rim, 0.0), ("side", self.square_side, 1e-2)):
             if not (np.isfinite(value) and value >= least):
                 raise InputError(f"{name}: expected a length from {least:g} mm, got {value} mm")

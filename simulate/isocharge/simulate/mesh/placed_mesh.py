@@ -7,8 +7,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
-from isocharge.simulate.mechanics.coating import Coating
 from isocharge.simulate.mesh.blocks import Resolution
+from isocharge.simulate.mesh.coating import Coating
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.numerics.interpolation import (

@@ -13,13 +13,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from isocharge.common.arrays import Array, Complexes, Integers
-from isocharge.simulate.mechanics.coating import Coating
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups
+from isocharge.simulate.mesh.coating import Coating
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.template import Template, sample_points
 from isocharge.simulate.numerics.interpolation import lagrange_values, lobatto_nodes, lobatto_weights, tensor_values
-from isocharge.simulate.numerics.polygon import area_of, to_complex, to_corners
-from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.numerics.polygon import area_of, to_corners
 
 GRADING = 1.0
 """An element is split if a line lies nearer to its middle than this multiple of its longest side."""
@@ -36,7 +34,7 @@ SAME = 1e-8
 FINEST = 0.35
 """Longest side of an element on the edge of a coat, over the square root of the area of the coat's largest part."""
 
-BAND = 1.0
+BAND = 0.6
 """Width of the band along an edge within which film and coated film are mixed, in units of the longest side above."""
 
 
@@ -171,18 +169,11 @@ def refine(mesh: PlacedMesh, lines: Complexes, finest: float) -> PlacedMesh:
     return replace(mesh, template=RefinedTemplate(base, parent, low, size))
 
 
-def coated(mesh: PlacedMesh, film: Film, at: tuple[float, float]) -> PlacedMesh:
-    """The mesh of a press at `at`, mm, on a film with a coat: finer along the coat's edges, and with its stiffness."""
-    if film.coat is None:
-        return mesh
-    angle = float(np.arctan2(at[1], at[0]))
-    turn = np.exp(-1j * angle) / film.radius
-    layers = tuple(tuple(to_complex(np.array(part)) * turn for part in layer) for layer in film.coat.layers)
-    finest = FINEST * np.sqrt(max(area_of(to_corners(part)) for part in layers[0]))
-    groups = DimensionlessGroups.of(film, 1.0, bending=False, angle=angle)
-    coat = Coating.of(layers, BAND * finest, film.coat.stiffness / (film.young * film.thickness), groups)
+def coated(mesh: PlacedMesh, layers: tuple[tuple[Complexes, ...], ...], bare: Array, added: Array) -> PlacedMesh:
+    """The mesh of a film with a coat: finer along the coat's edges, and with its stiffness; arguments as `Coating`."""
+    finest = FINEST * float(np.sqrt(max(area_of(to_corners(part)) for part in layers[0])))
     lines = np.concatenate([_edges(layer, finest) for layer in layers])
-    return replace(refine(mesh, lines, finest), coat=coat)
+    return replace(refine(mesh, lines, finest), coat=Coating(layers, BAND * finest, bare, added))
 
 
 def _edges(parts: tuple[Complexes, ...], finest: float) -> Complexes:

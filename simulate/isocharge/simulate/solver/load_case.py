@@ -9,7 +9,8 @@ from typing import Literal, Self
 import numpy as np
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.scaling import amplitude_squared
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups, amplitude_squared, scaled_stress
+from isocharge.simulate.mechanics.stress import stress
 from isocharge.simulate.mechanics.theory import ACCURACY, Theory, bending_length, choose_theory
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import CLEARANCE
@@ -17,6 +18,7 @@ from isocharge.simulate.mesh.placed_mesh import PlacedMesh, place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.refinement import coated
 from isocharge.simulate.mesh.template import corners_of
+from isocharge.simulate.numerics.polygon import to_complex
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Polygon, Probe, farthest
 from isocharge.simulate.solver.error_estimate import shape_error
@@ -162,7 +164,19 @@ class LoadCase:
 
     def place(self, resolution: Resolution) -> PlacedMesh:
         """A mesh under this press."""
-        return coated(place(self.film, self.probe, self.at, resolution, self.layer), self.film, self.at)
+        return place_coated(self.film, self.probe, self.at, resolution, self.layer)
+
+
+def place_coated(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> PlacedMesh:
+    """As `place`, with the film's coat if it has one."""
+    mesh, angle = place(film, probe, at, resolution, layer), float(np.arctan2(at[1], at[0]))
+    if film.coat is None:
+        return mesh
+    turn = np.exp(-1j * angle) / film.radius
+    layers = tuple(tuple(to_complex(np.array(part)) * turn for part in layer) for layer in film.coat.layers)
+    bare = scaled_stress(np.eye(3), DimensionlessGroups.of(film, 1.0, bending=False, angle=angle))
+    added = film.coat.stiffness / (film.young * film.thickness) * stress(np.eye(3), film.poisson)
+    return coated(mesh, layers, bare, added)
 
 
 def _layer(film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None) -> float:

@@ -11,13 +11,10 @@ is left is of second order in the band's width over that of the coat, at its cor
 """
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_stress
-from isocharge.simulate.mechanics.stress import stress
 from isocharge.simulate.numerics.polygon import area_in_disk
 
 DIFFERENCE = 0.1
@@ -40,13 +37,6 @@ class Coating:
     band: float
     bare: Array
     added: Array
-
-    @classmethod
-    def of(
-        cls, layers: tuple[tuple[Complexes, ...], ...], band: float, share: float, groups: DimensionlessGroups
-    ) -> Self:
-        """An isotropic coat whose stiffness E h is a share of the film's."""
-        return cls(layers, band, scaled_stress(np.eye(3), groups), share * stress(np.eye(3), groups.poisson))
 
     def near(self, points: Complexes) -> Booleans:
         """Which points a coat may reach, of the shape of `points`."""

@@ -1,0 +1,99 @@
+"""Electrodes whose metal or ink stiffens the film: against a closed form and scikit-fem, and what refuses them."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from isocharge.common.errors import SceneError, SensorError
+from isocharge.simulate import Circle, ForwardMap, Resolution, load_sensor, press, touch_charge
+from isocharge.simulate.mechanics.energy import ElasticFilm
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups
+from isocharge.simulate.numerics.interpolation import gauss_reference_square, tensor_values
+from isocharge.simulate.sensor.film import Coat
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
+from isocharge.simulate.solver.assembly import assembly
+from isocharge.simulate.solver.load_case import place_coated
+from kept import kept
+
+SENSOR = load_sensor("four-25um-biaxial")
+TAUT = replace(SENSOR, film=replace(SENSOR.film, pretension=1.0))
+INK = replace(TAUT, coating=0.3 * TAUT.film.young * TAUT.film.thickness)
+PROBE, AT, FORCE = Circle(1.0), (3.0, -2.0), 0.5
+
+
+def by_scikit_fem(coating):
+    """Charges of the press with stiffer electrodes over those without by the other code, shape (n_electrode,).
+
+    Its triangles are cut by the electrodes' edges, which errs in proportion to their size: two sizes give none.
+    """
+    spec = importlib.util.spec_from_file_location("film_skfem", Path(__file__).with_name("film_skfem.py"))
+    skfem = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(skfem)
+    pads = [np.array(electrode.corners) for electrode in SENSOR.electrodes]
+
+    def charges(edges, **coat):
+        solved = skfem.solve(skfem.SkfemFilm(tension=(1.0, 1.0, 0.0), **coat), AT, PROBE.radius, FORCE, 26, edges)
+        return np.array([solved.charge([pad], 8.0, 8.0) for pad in pads])
+
+    coarse, fine = (charges(edges, stiffer=[(pad, 1.0 + coating) for pad in pads]) for edges in (0.6, 0.3))
+    return (2.0 * fine - coarse) / charges(0.0)
+
+
+def test_charges_of_stiffer_electrodes_agree_with_another_code():
+    stiff, bare = (touch_charge(s, press(s.coated_film, PROBE, AT, FORCE)) for s in (INK, TAUT))
+    np.testing.assert_allclose(stiff / bare, kept(by_scikit_fem, 0.3), rtol=1.5e-3)
+
+
+@pytest.mark.parametrize("stiffening", [0.3, 3.0])
+def test_strain_of_a_film_with_a_round_coat_is_the_closed_form(stiffening):
+    """A pressure 1 - r^2 in the plane: u = r^3 / (4 K) + A r + B / r with K inside the coat and outside (Lame)."""
+    film, b, nu = SENSOR.film, 6.0 / 45.0, SENSOR.film.poisson
+    corner = 6.0 * np.exp(2j * np.pi * np.arange(96) / 96)
+    disk = tuple(zip(corner.real.tolist(), corner.imag.tolist(), strict=True))
+    film = replace(film, coat=Coat(stiffening * film.young * film.thickness, ((disk,),)))
+    mesh = place_coated(film, PROBE, (0.0, 0.0), Resolution(4, 8, 4, 0), 0.02)
+    geometry, (xi, eta, _) = mesh.geometry, gauss_reference_square(5)
+    pressure = geometry.weights * (1.0 - np.abs(mesh.points @ tensor_values(4, xi, eta).T) ** 2)
+    force = np.einsum("ep,epan->ena", pressure, geometry.gradient)
+    pressed = np.stack([*(geometry.gather(force[..., axis]) for axis in (0, 1)), 0.0 * geometry.load], axis=1)
+    flat = DimensionlessGroups(amplitude2=1e-12, load=1.0, tension=1.0, bending=0.0, poisson=nu)
+    tangent = ElasticFilm(geometry, flat).tangent(np.zeros_like(pressed))
+    field = -assembly(mesh.template, 3).factor(tangent).solve(pressed)
+    outer = 1.0 / (1.0 - nu**2)
+    inner = (1.0 + stiffening) * outer
+    system = [[0.0, 1.0, 1.0], [b, -b, -1.0 / b], [inner * (1.0 + nu), -outer * (1.0 + nu), outer * (1.0 - nu) / b**2]]
+    right = [-0.25 / outer, b**3 * (0.25 / outer - 0.25 / inner), 0.0]
+    c, _, _ = np.linalg.solve(system, right)
+    at = np.array([0.0, 0.5 * b])
+    element, xi, eta, _ = mesh.locate(at + 0j)
+    slope = mesh.gradient(element, xi, eta) @ field[mesh.template.nodes[element]]
+    mixed = np.stack([slope[:, 0, 0], slope[:, 1, 1], slope[:, 0, 1] + slope[:, 1, 0]], axis=1)
+    expected = np.stack([c + 0.75 * at**2 / inner, c + 0.25 * at**2 / inner], axis=1)
+    np.testing.assert_allclose(mesh.coat.of_film(at + 0j, mixed)[:, :2], expected, rtol=3e-3 * stiffening)
+
+
+def test_a_coat_on_both_sides_is_one_that_is_twice_as_stiff():
+    both = tuple(replace(e, square=False, back=(e.corners,)) for e in INK.electrodes)
+    two = replace(INK, electrodes=both, coating=0.5 * INK.coating)
+    points = (8.3 + 0.1 * np.arange(20) + 0.7j) / INK.film.radius  # across an edge
+    added = []
+    for film in (two.coated_film, INK.coated_film):
+        mesh = place_coated(film, PROBE, (0.0, 0.0), Resolution(2, 8, 2, 0), 0.02)
+        added.append(mesh.coat.moduli(points))
+    np.testing.assert_allclose(*added, atol=1e-9)
+
+
+def test_the_sensor_file_holds_the_coating():
+    table = sensor_to_dict(INK)
+    assert table["electrodes"]["coating_N_per_mm"] == 22.5
+    assert sensor_to_dict(sensor_from_dict(table)) == table
+
+
+def test_what_is_pressed_and_what_is_read_must_be_the_same_film():
+    with pytest.raises(SensorError, match=r"another film: expected .*Coat"):
+        touch_charge(INK, press(INK.film, PROBE, AT, FORCE))
+    with pytest.raises(SceneError, match=r"alike all round, got .*coat"):
+        ForwardMap.build(INK, PROBE)
