@@ -14,6 +14,7 @@ RECONNECTED = "reconnected"
 NEGATIVE = "negative"
 INVALID = "invalid"
 STRESS = "stress"
+FILM = "film"
 
 MEANINGS = {
     TARE: "no tare yet, so no contact either",
@@ -30,5 +31,6 @@ MEANINGS = {
     RECONNECTED: "the first frame after the port was away; the film is tared again",
     INVALID: "the device sent a charge that is not a number; nothing was computed",
     STRESS: "the press stresses the film beyond 45 MPa, where PVDF yields: a dent stays",
+    FILM: "the last touches fit this film at no pretension (a wrong gain, warmth): it is not followed now",
 }
 """Every word, and what it says."""

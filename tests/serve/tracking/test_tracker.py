@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Chunk, Contact, Device, Frame, TouchStream, encode_frame
-from isocharge.serve.live.device import device_from_table, with_tracking
+from isocharge.serve.live.device import device_from_table, with_section
 from isocharge.serve.tracking.modes import Modes, Movement, Unit, step
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
 
@@ -142,4 +142,4 @@ def test_records_carry_it_beside_the_answer_of_the_frame_and_repeat_bit_for_bit(
 def test_the_device_file_switches_it_on_and_a_recording_keeps_it():
     assert Device().track is None
     assert device_from_table({"track": {"lasting": 0.9}}, "b").track == TrackRule(lasting=0.9)
-    assert with_tracking(device_from_table({}, "b")).table == {"track": {"on": True}}
+    assert with_section(device_from_table({}, "b"), "track").table == {"track": {"on": True}}

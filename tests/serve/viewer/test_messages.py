@@ -24,6 +24,7 @@ from isocharge.serve import find_model, flags, load_model
 from isocharge.serve.viewer.messages import (
     CONTACT_BIT,
     FLAG_BITS,
+    Back,
     LiveRequest,
     Marker,
     Record,
@@ -47,6 +48,7 @@ def parse(text, kind=LiveRequest | ReplayRequest):
     ("text", "request_"),
     [
         ('{"do": "tare"}', Tare()),
+        ('{"do": "back"}', Back()),
         ('{"do": "record", "on": true}', Record(on=True)),
         ('{"do": "marker", "text": "here"}', Marker("here")),
         ('{"do": "seek", "value": 12.5}', Seek(12.5)),
@@ -79,7 +81,7 @@ def test_other_requests_are_refused(content):
 
 
 def test_a_live_page_does_not_seek():
-    with pytest.raises(RequestError, match="one of tare, record, marker"):
+    with pytest.raises(RequestError, match="one of tare, back, record, marker"):
         parse('{"do": "seek", "value": 1}', LiveRequest)
 
 

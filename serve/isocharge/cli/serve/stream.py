@@ -53,7 +53,7 @@ from isocharge.serve import (
     open_source,
 )
 from isocharge.serve.export.record_messages import RecordEncoding
-from isocharge.serve.live.device import with_offset_limit, with_tracking
+from isocharge.serve.live.device import with_offset_limit, with_section
 from isocharge.serve.live.outputs import LineQueue
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.port.recording import Marker
@@ -128,15 +128,23 @@ def stream_command(
             help="Follow contacts in time: records get `tracked` and `event`, as by [track]. (default: off)",
         ),
     ] = False,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--follow",
+            help="Follow the film's pretension by ordinary touches, as by [follow]: records get `film`. Needs four "
+            "electrodes and a model of `train calibrate`. (default: off)",
+        ),
+    ] = False,
     live: LiveOption = None,
     token: TokenOption = None,
 ) -> None:
     """Follow a sensor live: read its port, and print position (mm) and force (N) for every frame of charges.
 
     The first 100 frames (0.5 s at 200 Hz) are the tare, the charges at rest: leave the film alone meanwhile. The signal
-    SIGUSR1 starts a new tare; SIGHUP takes the latest version of MODEL, without losing a frame. Ctrl-C stops. If the
-    reader of stdout is too slow for a sensor, the oldest lines are dropped and counted in the summary; --record gets
-    everything.
+    SIGUSR1 starts a new tare; SIGUSR2 goes back to the film as it was calibrated; SIGHUP takes the latest version of
+    MODEL, without losing a frame. Ctrl-C stops. If the reader of stdout is too slow for a sensor, the oldest lines are
+    dropped and counted in the summary; --record gets everything.
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
@@ -146,7 +154,8 @@ def stream_command(
     predictor, board = Predictor(model, models=models), load_device(device)
     if offset_limit_pC is not None:
         board = with_offset_limit(board, offset_limit_pC)
-    board = with_tracking(board) if track else board
+    board = with_section(board, "track") if track else board
+    board = with_section(board, "follow") if follow else board
     path = TouchStream(predictor, board, policy=policy, frame_id=name)
     latencies: deque[float] = deque(maxlen=LATENCIES)
     recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name or "") if record else None
@@ -160,6 +169,7 @@ def stream_command(
         opened = open_source(port, baud=baud, reconnect=reconnect, request=board.request, wait=wait)
         source = stack.enter_context(opened)
         stack.enter_context(on_signal(signal.SIGUSR1, recorded.request_tare))
+        stack.enter_context(on_signal(signal.SIGUSR2, recorded.request_back))
         renew = partial(recorded.request_model, partial(_load, model, models))
         stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(renew)))
         stack.enter_context(stop_after(seconds))

@@ -22,7 +22,16 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.network.address import Address, check_exposure
 from isocharge.serve.port import recording
 from isocharge.serve.viewer.link import ReaderEnd, make_link
-from isocharge.serve.viewer.messages import LiveRequest, Marker, Record, SampleFormat, Tare, describe_film, find_field
+from isocharge.serve.viewer.messages import (
+    Back,
+    LiveRequest,
+    Marker,
+    Record,
+    SampleFormat,
+    Tare,
+    describe_film,
+    find_field,
+)
 
 RATE_RECORDS = 400
 """Records, the latest, over whose times the rate is taken: that of the board, however fast a recording is read."""
@@ -180,6 +189,8 @@ def _do(request: LiveRequest, link: ReaderEnd, live: RecordedStream, header: tup
             link.tell(recording=f"{path.name}, which waits for data" if is_on else None)
         case Tare():
             live.request_tare()
+        case Back():
+            live.request_back()
 
 
 def _show(link: ReaderEnd, text: str) -> None:

@@ -23,13 +23,13 @@
     tau_s = {A = 10.0, B = 10.2, C = 9.9}
 
 `[hum]`, `[tare]`, `[leak]`, `[touch]` and `[common_mode]` take the settings of their rules (see
-`isocharge.serve.signal_chain`), `[track]` those of `isocharge.serve.tracking`, and every stage `on = false`, which
-switches it off. Tare and touch are on without a section. An unknown key is an error.
+`isocharge.serve.signal_chain`), `[track]` and `[follow]` those of `isocharge.serve.tracking`, and every stage
+`on = false`, which switches it off. Tare and touch are on without a section. An unknown key is an error.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -48,6 +48,7 @@ from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
+from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule
 
 LEAST_ELECTRODES_FOR_WARMING = 4
@@ -124,6 +125,7 @@ class DeviceSections(Settings, frozen=True):
     touch: TouchRule | None = TouchRule()
     common_mode: ThermalRule | None = None
     track: TrackRule | None = None
+    follow: FollowRule | None = None
 
 
 class Device(DeviceSections, frozen=True):
@@ -231,12 +233,12 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     return Device(**on, table=table, where=where)
 
 
-def with_tracking(device: Device) -> Device:
-    """A board whose contacts are followed; in its table too, so that a recording keeps it."""
-    if device.track is not None:
+def with_section(device: Device, name: Literal["track", "follow"]) -> Device:
+    """A board with this section switched on; in its table too, so that a recording keeps it."""
+    if getattr(device, name) is not None:
         return device
-    track = {**device.table.get("track", {}), "on": True}
-    return device_from_table({**device.table, "track": track}, device.where)
+    section = {**device.table.get(name, {}), "on": True}
+    return device_from_table({**device.table, name: section}, device.where)
 
 
 def with_offset_limit(device: Device, offset_limit_pC: float) -> Device:

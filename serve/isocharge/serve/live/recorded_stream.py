@@ -13,7 +13,7 @@ from functools import partial
 
 from isocharge.common.errors import IsochargeError
 from isocharge.serve.live.stream import TouchStream
-from isocharge.serve.port.recording import Marker, NewModel, RecordedClock, Recorder, Recording
+from isocharge.serve.port.recording import Back, Marker, NewModel, RecordedClock, Recorder, Recording
 from isocharge.serve.port.source import Chunk
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
@@ -55,6 +55,10 @@ class RecordedStream:
     def request_tare(self) -> None:
         """Tare again; may be called from a signal handler."""
         self._requests.append(self._tare)
+
+    def request_back(self) -> None:
+        """Go back to the film as it was calibrated; may be called as `request_tare`."""
+        self._requests.append(self._back)
 
     def request_recording(self, recorder: Recorder | None) -> None:
         """End the recording that is under way; begin another one, in the place of one that still waits for data.
@@ -161,6 +165,11 @@ class RecordedStream:
         if self.recorder is not None:
             self.recorder.tare()
 
+    def _back(self) -> None:
+        self._stream.back()
+        if self.recorder is not None:
+            self.recorder.back()
+
 
 def replay(
     recording: Recording,
@@ -193,6 +202,9 @@ def replay(
         if isinstance(event, NewModel):
             if load is not None:
                 stream.use(load(event.label))
+            continue
+        if isinstance(event, Back):
+            stream.back()
             continue
         clock.set(event)
         if event.chunk is None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from isocharge.common.arrays import Array, Reals
 from isocharge.common.errors import ModelError
-from isocharge.serve.flags import GAP, INVALID, RECONNECTED, REPEAT, RESTART
+from isocharge.serve.flags import FILM, GAP, INVALID, RECONNECTED, REPEAT, RESTART
 from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.live.reading_stream import ReadingStream, TimedReading
@@ -18,6 +18,7 @@ from isocharge.serve.prediction.contact import Contact
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import OUT_OF_CONTACT, UNKNOWN, Charges, PredictionRecord
 from isocharge.serve.signal_chain.chain import Chain, Reading
+from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.serve.tracking.tracker import Tracker
 
 LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
@@ -127,6 +128,7 @@ class TouchStream:
 
         Raises:
             DeviceError: If the device file has other electrodes than the model.
+            ModelError: If the film is to be followed, and the model cannot.
         """
         self._readings = ReadingStream(
             predictor.metadata.electrodes,
@@ -141,10 +143,11 @@ class TouchStream:
         self.counts = StreamCounts()
         self._tracker = None if device.track is None else Tracker(device.track)
         self._before_restart = StreamTotals()
-        self._policy, self._now_ns, self._given_name = policy, now_ns, frame_id
+        self._policy, self._now_ns, self._given_name, self._follow = policy, now_ns, frame_id, device.follow
         self._use(predictor)
 
     def _use(self, predictor: Predictor) -> None:
+        self._follower = None if self._follow is None else FilmFollower(predictor, self._follow)
         self.predictor, self._validity = predictor, predictor.validity
         self._electrodes, self._label = predictor.metadata.electrodes, predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
@@ -153,7 +156,8 @@ class TouchStream:
         """Go on with another model of the same electrodes; tare and chain stay as they are.
 
         Raises:
-            ModelError: If its electrodes are others, or in another order; nothing changes then.
+            ModelError: If its electrodes are others, or in another order, or its film cannot be followed as this one
+                is; nothing changes then.
         """
         before, after = self.predictor.metadata, predictor.metadata
         if after.electrodes != before.electrodes:
@@ -168,7 +172,14 @@ class TouchStream:
         self._readings.tare()
         self._forget_contact()
 
+    def back(self) -> None:
+        """Go back to the film as it was calibrated, where it is followed."""
+        if self._follower is not None:
+            self._follower.back()
+
     def _forget_contact(self) -> None:
+        if self._follower is not None:
+            self._follower.forget()
         if self._tracker is not None:
             self._tracker.forget()
 
@@ -177,6 +188,7 @@ class TouchStream:
         self._before_restart = self.totals()
         self._readings.restart()
         self._forget_contact()
+        self.back()
         self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
 
     def totals(self) -> StreamTotals:
@@ -229,6 +241,11 @@ class TouchStream:
         """The record of a frame; the clock is asked once everything is computed."""
         reading, when = timed
         contact, flags = self._contact(reading)
+        film = None
+        if self._follower is not None:
+            film = self._follower.film
+            self._follower.see(reading.charge_pC, contact, flags, when.clock_s)
+            flags += (FILM,) * (contact is not None and self._follower.is_lost)
         tracked, event = None, None
         if self._tracker is not None:
             tracked, event = self._tracker.update(contact, when.clock_s, flags)
@@ -248,6 +265,7 @@ class TouchStream:
             tracked=None if tracked is None else tracked._asdict(),
             event=event,
             follows=self._tracker is not None,
+            film=film,
         )
 
     def _contact(self, reading: Reading) -> tuple[Contact | None, tuple[str, ...]]:
@@ -255,7 +273,8 @@ class TouchStream:
         flags = reading.flags
         if INVALID in flags or not reading.contact or reading.charge_pC is None:
             return None, flags
-        contact = self.predictor.predict(reading.charge_pC)
+        predictor = self.predictor if self._follower is None else self._follower.predictor
+        contact = predictor.predict(reading.charge_pC)
         return contact, flags + self._validity.flags(contact)
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:

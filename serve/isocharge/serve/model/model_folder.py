@@ -132,12 +132,13 @@ def _not_found(model: str | Path, roots: list[Path], is_path: bool) -> str:
 
 @dataclass(frozen=True)
 class Model:
-    """A model that was read and checked: its version folder, metadata, golden vectors, and a session to run it."""
+    """A model that was read and checked: version folder, metadata, golden vectors, its session, and its bytes."""
 
     folder: Path
     metadata: ModelMetadata
     golden: Golden
     session: ort.InferenceSession
+    graph: bytes
 
 
 def load_model(folder: Path) -> Model:
@@ -156,7 +157,7 @@ def load_model(folder: Path) -> Model:
     metadata = ModelMetadata.from_props(session.get_modelmeta().custom_metadata_map, str(path))
     check_interface(session, len(metadata.electrodes), str(path))
     _check_fits(golden, metadata, folder)
-    return Model(folder, metadata, golden, session)
+    return Model(folder, metadata, golden, session, data)
 
 
 def _read(path: Path) -> bytes:

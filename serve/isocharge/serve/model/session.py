@@ -11,6 +11,7 @@ import math
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -37,14 +38,25 @@ def outputs_of(session: ort.InferenceSession) -> dict[str, int]:
     return {name: width for name, width in OUTPUTS.items() if name in names}
 
 
-def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
+def open_session(
+    onnx_model: bytes, where: str, constants: Mapping[str, Singles] = MappingProxyType({})
+) -> ort.InferenceSession:
     """A session for one thread, whose interface is not checked yet.
+
+    Args:
+        onnx_model: The graph.
+        where: The model, for messages.
+        constants: In the place of the graph's constants of these names.
 
     Raises:
         ModelError: If the bytes are not an ONNX graph that onnxruntime can run.
     """
+    options = _options()
     try:
-        return ort.InferenceSession(onnx_model, _options(), providers=["CPUExecutionProvider"])
+        held = {name: ort.OrtValue.ortvalue_from_numpy(values) for name, values in constants.items()}
+        for name, value in held.items():
+            options.add_initializer(name, value)
+        return ort.InferenceSession(onnx_model, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions have no common base of their own
         raise ModelError(
             f"{where}: onnxruntime {ort.__version__} cannot read these {len(onnx_model)} bytes as a model "

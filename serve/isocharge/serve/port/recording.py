@@ -4,6 +4,7 @@
     {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
     {"timestamp": ..., ...}                       the records of that chunk, as they went out
     {"tare": true}                                a request for a new tare
+    {"back": true}                                a request to go back to the film as it was calibrated
     {"use": "three/2"}                            the model of all that follows
     {"marker": [timestamp, "text"]}               a moment that somebody noted
 
@@ -121,6 +122,10 @@ class Recorder:
         """Write a request for a new tare."""
         self._write('{"tare": true}')
 
+    def back(self) -> None:
+        """Write a request to go back to the film as it was calibrated."""
+        self._write('{"back": true}')
+
     def model(self, label: str) -> None:
         """Write the label, `name/version`, of the model of all that follows."""
         self._write(json.dumps({"use": label}))
@@ -145,6 +150,10 @@ class Event(NamedTuple):
 
     chunk: Chunk | None
     latencies_us: tuple[float, ...] = ()
+
+
+class Back(NamedTuple):
+    """A request to go back to the film as it was calibrated."""
 
 
 class NewModel(NamedTuple):
@@ -187,7 +196,7 @@ class Recording:
             )
         self.model, self.policy, self.device, self.name = header.model, header.policy, header.device, header.name
 
-    def events(self) -> Iterator[Event | Marker | NewModel]:
+    def events(self) -> Iterator[Event | Marker | NewModel | Back]:
         """Chunks, requests for a new tare, markers and changes of the model, in their order.
 
         Raises:
@@ -248,6 +257,7 @@ class _Entry(Struct):
     timestamp: float | None = None
     latency_us: Latency | None = None
     tare: bool | None = None
+    back: bool | None = None
     use: Text | None = None
     marker: tuple[Moment, Annotated[str, Meta(max_length=1000)]] | None = None
     chunk: tuple[Moment, Nanoseconds, Annotated[float, Meta(ge=0.0)], bytes] | None = None
@@ -255,7 +265,7 @@ class _Entry(Struct):
     def __post_init__(self) -> None:
         if self.timestamp is not None and self.latency_us is None:
             raise WrongKey("latency_us")
-        if all(key is None for key in (self.timestamp, self.tare, self.use, self.marker, self.chunk)):
+        if all(key is None for key in (self.timestamp, self.tare, self.back, self.use, self.marker, self.chunk)):
             raise WrongKey("chunk")
 
     @property
@@ -267,10 +277,12 @@ class _Entry(Struct):
         return Chunk(data, timestamp, clock_ns, outage_s)
 
     @property
-    def moment(self) -> Event | Marker | NewModel:
+    def moment(self) -> Event | Marker | NewModel | Back:
         """What happened, if it is neither record nor chunk."""
         if self.marker is not None:
             return Marker(*self.marker)
+        if self.back is not None:
+            return Back()
         return Event(None) if self.use is None else NewModel(self.use)
 
 

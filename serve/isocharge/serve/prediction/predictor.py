@@ -7,7 +7,8 @@ The loop of a host program uses `predict_into` with its two arrays; people use `
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError, ModelError, shown
 from isocharge.serve.model.model_folder import Model, find_model, load_model
-from isocharge.serve.model.session import SEVEN, BoundPress, as_batch, as_press, run, write_finite
+from isocharge.serve.model.session import SEVEN, BoundPress, as_batch, as_press, open_session, run, write_finite
 from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 
 log = logging.getLogger(__name__)
@@ -29,6 +30,7 @@ class Predictor:
     `predict` and `predict_into` use the buffers; `predict_batch` does not and may be called from any thread.
 
     Attributes:
+        folder: Its version folder.
         metadata: What the model says about itself: sensor, electrodes, working area, measured errors.
         validity: Where the model may be trusted; its `batch_flags` are those of `predict_batch`.
 
@@ -53,13 +55,26 @@ class Predictor:
             ModelError: If it is missing, damaged or of another format.
         """
         loaded = load_model(find_model(model, models))
-        self.metadata = loaded.metadata
+        self.folder, self.metadata, self._graph = loaded.folder, loaded.metadata, loaded.graph
         self._session = loaded.session
         self.validity = Validity.of(loaded.metadata)
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
         self._far_mm2, self._far_N = self.validity.far
         self._warned = False
+        self._constants: Mapping[str, Singles] = {}
         _check_shared(self._press, loaded)
+
+    def with_constants(self, constants: Mapping[str, Singles]) -> "Predictor":
+        """The same model with other numbers in the place of its graph's constants, by name; takes a millisecond.
+
+        Raises:
+            ModelError: If the graph has not these constants, or not of these shapes.
+        """
+        other = copy(self)
+        other._constants = constants  # onnxruntime computes in their memory
+        other._session = open_session(self._graph, self.metadata.label, constants)
+        other._press = BoundPress(other._session, len(self.metadata.electrodes))
+        return other
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
         """The contact of one press; `flags` says whether to trust it.

@@ -53,6 +53,8 @@ class PredictionRecord:
         frame_id: Name of the sensor.
         tracked: The contact by all frames up to now, where contacts are followed: the fields of a `Tracked`.
         event: What begins with this record: `press`, `hold`, `slide`, `tap` or `release`.
+        film: Where the film is followed: `pretension_MPa` for which the model answered, `pretension_std_MPa`, and how
+            many `touches` have told it; without it the record is written without this field.
         follows: Whether contacts are followed; without it the record is written without the two fields before.
     """
 
@@ -79,6 +81,7 @@ class PredictionRecord:
     frame_id: str
     tracked: dict[str, float] | None = None
     event: str | None = None
+    film: dict[str, float] | None = None
     follows: bool = False
 
     def to_json(self) -> str:
@@ -87,14 +90,14 @@ class PredictionRecord:
         Raises:
             ValueError: If a number is not finite.
         """
-        names = FIELDS + OF_TRACKING if self.follows else FIELDS
+        names = FIELDS + OF_TRACKING * self.follows + ("film",) * (self.film is not None)
         return _ENCODE({name: _plain(getattr(self, name)) for name in names})
 
 
 OF_TRACKING = ("tracked", "event")
 """Fields that a record has where contacts are followed."""
 
-FIELDS = tuple(field.name for field in fields(PredictionRecord) if field.name not in (*OF_TRACKING, "follows"))
+FIELDS = tuple(field.name for field in fields(PredictionRecord) if field.name not in (*OF_TRACKING, "film", "follows"))
 
 UNKNOWN: dict[str, Any] = dict.fromkeys(Contact._fields)
 """The fields of the contact where nothing was computed."""

@@ -149,6 +149,10 @@ class Tare(PageRequest):
     """Take the charges at rest again."""
 
 
+class Back(PageRequest):
+    """Go back to the film as it was calibrated."""
+
+
 class Record(PageRequest):
     """Begin or end a recording."""
 
@@ -186,7 +190,7 @@ class Speed(PageRequest):
     value: Annotated[float, Meta(ge=0.01, le=100.0)]
 
 
-LiveRequest = Tare | Record | Marker
+LiveRequest = Tare | Back | Record | Marker
 
 ReplayRequest = Play | Pause | Seek | Speed
 

@@ -1,12 +1,13 @@
 """From measured presses to the film they were made on, with what it leaves uncertain."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
+from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.simulate import Circle, Sensor
@@ -93,9 +94,25 @@ class CalibrationResult:
     @property
     def fitted(self) -> Fitted:
         """The network of this film, for `evaluate` and `release`; what the film leaves is in its deviations."""
-        factor = partial(self.problem.charges.factor, self.posterior.unknowns)
+        return self.fitted_film(self.posterior.parameters, correlation=True)
+
+    def fitted_film(self, parameters: Array, *, correlation: bool = False) -> Fitted:
+        """The network of a film near it, of these parameters; all else that is known of this film holds for it."""
         left = self.sensitivity.contact, np.einsum("nii->ni", self.sensitivity.covariance(self.posterior.joint))
-        return self.problem.films.film(self.posterior.parameters, left=left, factor=factor)
+        return self.problem.films.film(parameters, left=left, factor=self._factor, correlation=correlation)
+
+    @cached_property
+    def _factor(self) -> Callable[[Array], Array]:
+        """What the film has besides its parameters; the answers are remembered, for its networks ask the same."""
+        known: dict[bytes, Array] = {}
+
+        def factor(contact: Array) -> Array:
+            key = contact.tobytes()
+            if key not in known:
+                known[key] = self.problem.charges.factor(self.posterior.unknowns, contact)
+            return known[key]
+
+        return factor
 
     @property
     def reduced_chi2(self) -> float:

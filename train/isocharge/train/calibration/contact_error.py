@@ -70,11 +70,14 @@ class ContactSensitivity:
         by_parameter: -G: (x, y, ln F) by the parameters over their prior standard deviations, and by the coefficients
             of the discrepancy if there is one, shape (n, 3, n_unknown).
         noise: Covariance of (x, y, ln F) by noise alone, shape (n, 3, 3).
+        misfit: Derivatives of what no contact explains of the charges by the same, shape (n, n_electrode, n_unknown),
+            in units of the noise.
     """
 
     contact: Array
     by_parameter: Array
     noise: Array
+    misfit: Array
 
     @classmethod
     def at(cls, problem: CalibrationProblem, parameters: Array) -> "ContactSensitivity":
@@ -86,7 +89,8 @@ class ContactSensitivity:
         slopes, by_film = _whitened_slopes(problem, parameters, contact)
         spread = np.array([0.5 * domain.radius, 0.5 * domain.radius, max(np.log(high / low), 0.1) / np.sqrt(12.0)])
         covariance = np.linalg.inv(np.einsum("nki,nkj->nij", slopes, slopes) + np.diag(spread**-2))
-        return cls(contact, -np.einsum("nij,nkj,nkp->nip", covariance, slopes, by_film), covariance)
+        by_parameter = -np.einsum("nij,nkj,nkp->nip", covariance, slopes, by_film)
+        return cls(contact, by_parameter, covariance, projected(by_film, slopes))
 
     def left(self, covariance: Array) -> ContactError:
         """The error left with a covariance of what is unknown of the film."""

@@ -5,6 +5,7 @@
     FOLDER/<version>/sensor.toml   the calibrated sensor
     FOLDER/<version>/calibration.json    parameters, errors, correlations, what cannot be identified
     FOLDER/<version>/presses.csv   the presses
+    FOLDER/<version>/pretensions.npz     weights for `serve stream --follow`, with four electrodes or more
     FOLDER/<version>/calibration.png
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the last version's
     FOLDER/presses.part.csv        presses of a session that is not over; .presses.part.json says on what
@@ -34,6 +35,7 @@ from isocharge.common.resumable_run import locked
 from isocharge.common.structs import read_json
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, version_folders
+from isocharge.serve.model.pretensions import FILE as PRETENSIONS
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text, read_presses, write_presses
 from isocharge.simulate.plots.figure import picture_bytes
 from isocharge.simulate.sensor.film_prior import FilmPrior
@@ -41,6 +43,7 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
 from isocharge.train.calibration.calibrate import CalibrationResult
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.film_fit import FilmPosterior
+from isocharge.train.calibration.following import pretensions_of
 from isocharge.train.calibration.picture import calibration_picture
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.model_release.release import release
@@ -162,8 +165,11 @@ def write_calibration(result: CalibrationResult, folder: Path, command: str = ""
         PRESSES: presses_text(result.presses).encode(),
         PICTURE: picture_bytes(calibration_picture(result)),
     }
+    fitted = result.fitted
+    if (pretensions := pretensions_of(result, fitted.network)) is not None:
+        files[PRETENSIONS] = pretensions.to_bytes()
     version = release(
-        replace(result.fitted, provenance=Provenance(files=files)),
+        replace(fitted, provenance=Provenance(files=files)),
         folder,
         version=max(version_folders(folder), default=0) + 1,
         command=command,

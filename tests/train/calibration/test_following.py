@@ -1,0 +1,240 @@
+"""A calibrated film whose pretension drifts, followed live by touches whose place and force nobody tells."""
+
+import json
+import tempfile
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.train.calibration.conftest import presses_of
+
+from isocharge.common.errors import ModelError
+from isocharge.serve import (
+    Chunk,
+    Frame,
+    Predictor,
+    RecordedClock,
+    Recorder,
+    Recording,
+    TouchStream,
+    device_from_table,
+    encode_frame,
+)
+from isocharge.serve.flags import FILM
+from isocharge.serve.live import recorded_stream
+from isocharge.serve.live.recorded_stream import RecordedStream
+from isocharge.serve.model.pretensions import read_pretensions
+from isocharge.serve.tracking.film_follower import FilmFollower
+from isocharge.simulate import Circle, load_sensor
+from isocharge.train import CalibrationProblem, calibrate, write_calibration
+from isocharge.train.data.presses import draw_contacts
+from kept import kept
+
+DEGREE_MPa = 0.35
+"""What a degree of the room does on a ring of aluminium."""
+
+REST, TOUCH = np.zeros(20), np.sqrt(np.sin(np.linspace(0.0, np.pi, 42)[1:-1]))
+"""Force over its peak in the frames between touches and in those of one."""
+
+PERIOD = REST.size + TOUCH.size
+
+FOLLOWING = device_from_table({"follow": {"on": True}}, "test")
+
+
+def film_of(problem):
+    """Parameters of a film that is not as described, at 1 MPa."""
+    parameters = problem.prior.draw(np.random.default_rng(1), 1)[0]
+    return np.append(1.0, parameters[1:])
+
+
+def calibrated_files(sensor: str, seed: int) -> dict[str, bytes]:
+    """The model folder of a film calibrated by twenty presses: its files by their paths."""
+    problem, rng = CalibrationProblem.of(load_sensor(sensor), Circle(1.0)), np.random.default_rng(seed)
+    contact = draw_contacts(rng, problem.domain, 20)
+    charge = problem.noise.add(problem.charges.charges(film_of(problem), contact), rng)
+    contact *= np.exp([0.0, 0.0, 0.01] * rng.standard_normal((20, 3)))
+    contact[:, :2] += 0.1 * rng.standard_normal((20, 2))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mine"
+        write_calibration(calibrate(presses_of(problem, contact, charge), problem), path)
+        return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+@pytest.fixture(scope="module")
+def mine(tmp_path_factory) -> Path:
+    """The folder of the calibrated film."""
+    folder = tmp_path_factory.mktemp("films") / "mine"
+    for name, data in kept(calibrated_files, "four-25um-biaxial", 5).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def film(problem):
+    """Forward maps of the film by its pretension, to 0.01 MPa."""
+    parameters = film_of(problem)
+
+    @cache
+    def at(hundredths):
+        return problem.charges.forward_map(np.append(0.01 * hundredths, parameters[1:]))
+
+    return lambda pretension: at(round(100 * pretension))
+
+
+def follow(mine, problem, film, pretensions, gain=1.0, ask=None):
+    """Records of the hardest frames of touches, one at each pretension (MPa), and errors, mm and of ln F, (n, 2)."""
+    stream, records = TouchStream(Predictor(mine), FOLLOWING), []
+    contact, chunks = touches(problem, film, pretensions, gain)
+    for number, chunk in enumerate(chunks):
+        if ask and (number - 110) % PERIOD == 0:
+            ask(stream, (number - 110) // PERIOD)
+        records += stream.feed(chunk)
+    hardest = records[110 + REST.size + TOUCH.size // 2 :: PERIOD]
+    errors = [
+        (np.hypot(r.x_mm - x, r.y_mm - y), np.log(r.force_N / F)) for r, (x, y, F) in zip(hardest, contact, strict=True)
+    ]
+    return hardest, np.array(errors)
+
+
+def touches(problem, film, pretensions, gain=1.0):
+    """Contacts, shape (n, 3), and the chunks of a board that begins at rest, one for each frame."""
+    rng, low, rows = np.random.default_rng(3), 0.05, []
+    contact = draw_contacts(rng, problem.domain, len(pretensions))
+    for (x, y, peak), pretension in zip(contact, pretensions, strict=True):
+        at = np.column_stack([np.tile([x, y], (TOUCH.size, 1)), np.maximum(peak * TOUCH, low)])
+        charge = film(pretension).charges(at) * (np.minimum(peak * TOUCH / low, 1.0) ** (2 / 3))[:, None]
+        rows += [np.zeros((REST.size, charge.shape[1])), charge * gain]
+    raw = problem.noise.add(np.vstack([np.zeros((110, charge.shape[1])), *rows]), rng)
+    frames = [Frame(number, 5000 * number, tuple(row.tolist())) for number, row in enumerate(raw)]
+    return contact, [Chunk(encode_frame(frame), 1.7e9 + 0.005 * frame.seq, 0) for frame in frames]
+
+
+def rms(errors):
+    """Errors of place, mm, and of force, %."""
+    return np.sqrt(np.mean(errors**2, axis=0)) * [1.0, 100.0]
+
+
+def test_it_follows_a_degree_and_goes_back_when_asked(mine, problem, film):
+    """Issue 29's numbers: 0.19 mm and 3 % after 60 touches, where the calibration is then wrong by 0.3 mm and 14 %."""
+    back = lambda stream, touch: touch == 110 and stream.back()  # noqa: E731
+    records, errors = follow(mine, problem, film, [1.0 + DEGREE_MPa] * 118, ask=back)
+    start, still = rms(errors[:8]), rms(errors[60:110])
+    assert start[1] > 10.0
+    assert still[0] < 0.19
+    assert still[1] < 3.0
+    before, after, last = (records[n].film for n in (0, 109, 111))
+    change = after["pretension_MPa"] - before["pretension_MPa"]
+    assert change == pytest.approx(DEGREE_MPa, abs=2.0 * after["pretension_std_MPa"])
+    assert after["pretension_std_MPa"] < 0.09  # computed limit after 30 touches on this layout
+    assert (after["touches"], before["touches"]) == (pytest.approx(95, abs=15), 0)
+    assert last == before | {"touches": last["touches"]}
+    assert rms(errors[111:])[1] > 10.0
+
+
+def test_it_follows_a_drift_that_lasts(mine, problem, film):
+    _, errors = follow(mine, problem, film, 1.0 + DEGREE_MPa * np.linspace(0.0, 1.0, 100))
+    assert rms(errors[50:])[1] < 4.0
+
+
+def test_a_film_that_stays_is_left_as_it_is(mine, problem, film):
+    _, errors = follow(mine, problem, film, [1.0] * 80)
+    _, alone = follow(mine, problem, film, [1.0] * 80, ask=lambda stream, _: stream.back())
+    followed, alone = rms(errors), rms(alone)
+    np.testing.assert_array_less(followed, 1.05 * alone + [0.0, 0.1])
+
+
+def test_a_replay_follows_and_goes_back_as_the_stream_did(mine, problem, film, tmp_path):
+    _, chunks = touches(problem, film, [1.0 + DEGREE_MPa] * 40)
+    model, path, clock = Predictor(mine), tmp_path / "touches.rec", RecordedClock()
+    with Recorder(path, model.metadata.label, "every", FOLLOWING.table) as recorder:
+        live = RecordedStream(TouchStream(model, FOLLOWING), recorder)
+
+        def asking():
+            for number, chunk in enumerate(chunks):
+                if number == 110 + 36 * PERIOD:
+                    live.request_back()
+                yield chunk
+
+        lines = [line for _, line in live.follow(asking())]
+    pretensions = [json.loads(line)["film"]["pretension_MPa"] for line in lines]
+    assert max(pretensions) > pretensions[0] + 0.2
+    assert pretensions[-1] == pretensions[0]
+    recording = Recording(path)
+    again = TouchStream(Predictor(mine), device_from_table(recording.device, "test"), now_ns=clock)
+    assert [line for _, line in recorded_stream.replay(recording, again, clock)] == lines
+
+
+@pytest.mark.parametrize("electrode", [0, 3])
+def test_a_gain_that_is_wrong_is_not_followed(mine, problem, film, electrode):
+    """The charges could nearly be those of a film 0.3 MPa slacker, and the force wrong by 14 %."""
+    records, _ = follow(mine, problem, film, [1.0] * 80, gain=1.0 - 0.03 * np.eye(4)[electrode])
+    assert records[-1].film["pretension_MPa"] == pytest.approx(records[0].film["pretension_MPa"], abs=0.02)
+    assert FILM in records[-1].flags
+
+
+def test_between_its_pretensions_it_is_the_network_for_all_films(mine, problem):
+    """Interpolated weights against the network that `calibrate` folds for that film."""
+    known, folder = read_pretensions(mine / "1"), mine / "1"
+    table = json.loads((folder / "calibration.json").read_text("utf-8"))
+    values = [entry["value"] for entry in table["parameters"].values()]
+    middle = float(known.node_MPa[3:5].mean())
+    parameters = problem.prior.parameters_of(load_sensor(folder / "sensor.toml"), problem.probe)
+    parameters[problem.prior.names.index("probe_radius")] = 1e3 * values[problem.prior.names.index("probe_radius")]
+    parameters[0] = middle
+    at = draw_contacts(np.random.default_rng(2), problem.domain, 300)
+    charge = problem.noise.add(problem.charges.charges(parameters, at), np.random.default_rng(3))
+    folded = problem.films.fold(parameters).predict(charge)[0]
+    answer = np.asarray(Predictor(mine).with_constants(known.constants(middle)).predict_batch(charge))
+    apart = np.hypot(*(answer[:, :2] - folded[:, :2]).T)
+    assert np.sqrt(np.mean(apart**2)) < 0.06  # what the film has besides its parameters was taught to the one alone
+    nodes = known.at(np.linspace(*known.range_MPa, 29))
+    misfits = [nodes.misfits(row, np.array([middle]))[0] for row in charge[:20]]
+    followed = Predictor(mine).with_constants(known.constants(middle)).predict_batch(charge[:20]).misfit
+    np.testing.assert_allclose(misfits, followed, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("flags", "counted"), [((), 1), (("stress",), 1), (("saturated",), 0), (("misfit",), 0), (("thermal",), 0)]
+)
+def test_touches_that_do_not_count(mine, flags, counted):
+    follower, charge = FilmFollower(Predictor(mine)), np.array([500.0, 480.0, 520.0, 510.0])
+    contact = follower.predictor.predict(charge)
+    for frame in (("outside", "misfit"), (), flags):
+        follower.see(charge, contact, frame, 0.0)
+    follower.see(charge, None, (), 0.1)
+    assert follower.film["touches"] == counted
+
+
+@pytest.mark.parametrize("change", ["gone", "damaged", "another model"])
+def test_a_file_that_cannot_be_used(mine, tmp_path, change):
+    folder = tmp_path / "mine"
+    for name in ("model.onnx", "golden.json", "pretensions.npz"):
+        (folder / "1").mkdir(parents=True, exist_ok=True)
+        (folder / "1" / name).write_bytes((mine / "1" / name).read_bytes())
+    path = folder / "1" / "pretensions.npz"
+    if change == "gone":
+        path.unlink()
+    elif change == "damaged":
+        path.write_bytes(path.read_bytes()[:-100])
+    else:
+        known = read_pretensions(folder / "1")
+        weights = {name: 1.01 * rows for name, rows in known.weights.items()}
+        path.write_bytes(replace(known, weights=weights).to_bytes())
+    with pytest.raises(ModelError, match=r"pretensions\.npz.*calibrate"):
+        FilmFollower(Predictor(folder))
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        ("three-25um-biaxial", "its film cannot be followed: 3 charges"),
+        ("four-25um-biaxial", "a film is followed from a model that `isocharge train calibrate` made"),
+    ],
+)
+def test_models_that_cannot_follow(command, model, words):
+    code, out, err = command("serve", "stream", model, "--port", "-", "--follow")
+    assert (code, out) == (2, "")
+    assert words in " ".join(err.split())

@@ -1,0 +1,119 @@
+"""What a calibrated model needs to follow the pretension of its film live: the file `pretensions.npz`.
+
+The network for all films is folded at some pretensions, all other parameters as the calibration found them; what the
+film has besides its parameters, and what is left of it, are taught to each as to the model itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import onnx
+from onnx import numpy_helper
+
+from isocharge.common.arrays import Array
+from isocharge.serve.model.pretensions import Pretensions
+from isocharge.simulate.numerics.statistics import rms
+from isocharge.train.calibration.calibrate import CalibrationResult
+from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, draw_contacts
+from isocharge.train.model_release.export import export_onnx
+from isocharge.train.training.folding import KNOWN, FoldedNetwork
+from isocharge.train.training.network import MISFIT_UNIT
+
+NODES = 6
+"""Pretensions at which weights are given."""
+
+REACH = 1.4
+"""Farthest pretension from that of the calibration, MPa: three or four degrees."""
+
+TOUCHES, SEED = 300, 21
+"""Simulated touches by which misfits are judged, and their seed."""
+
+ROUGH = 1.5
+"""Root mean square of the misfits of good touches above which misfits tell nothing of a film, in units of the noise."""
+
+
+def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretensions | None:
+    """The network of a calibrated film at other pretensions.
+
+    Args:
+        result: The calibration.
+        network: The model's own network.
+
+    Returns:
+        None if charges have no number to spare (three electrodes), or the network's misfits are too rough on this film.
+    """
+    problem, posterior = result.problem, result.posterior
+    if len(problem.electrodes) <= 3:
+        return None
+    parameters, own = posterior.parameters, posterior.parameters[0]
+    nodes = _nodes(float(own), problem.prior.bounds[0][0], problem.prior.bounds[1][0])
+    networks = [
+        network if node == own else _like(network, result.fitted_film(np.append(node, parameters[1:])).network)
+        for node in nodes
+    ]
+    std = np.sqrt(np.diag(posterior.drifted(problem.prior).covariance))[0] * problem.prior.std[0]
+    known = Pretensions(
+        node_MPa=nodes,
+        calibrated_MPa=float(own),
+        std_MPa=float(std),
+        floor_MPa=_floor(result),
+        misfit_rms=1.0,
+        misfit_unit=MISFIT_UNIT,
+        limits_pC=(LOWEST_CHARGE, HIGHEST_CHARGE),
+        typical_pC=network.typical,
+        weights=dict(zip(_constants(network), map(np.stack, zip(*map(_arrays, networks), strict=True)), strict=True)),
+    )
+    rng = np.random.default_rng(SEED)
+    touches = draw_contacts(rng, problem.domain, TOUCHES)
+    charge = problem.noise.add(problem.charges.charges(posterior.unknowns, touches), rng)
+    typical = rms(np.array([known.misfits(row, np.array([own])) for row in charge]))
+    return None if typical > ROUGH else replace(known, misfit_rms=max(typical, 1.0))
+
+
+def _nodes(own: float, low: float, high: float) -> Array:
+    """Chebyshev's nodes about the calibrated pretension within a range, the nearest of them moved onto it."""
+    low, high = max(low, own - REACH), min(high, own + REACH)
+    angle = np.pi * (np.arange(NODES) + 0.5) / NODES
+    nodes = 0.5 * (low + high) - 0.5 * (high - low) * np.cos(angle) / np.cos(angle[0])
+    nodes[np.abs(nodes - own).argmin()] = own
+    return np.asarray(nodes)
+
+
+def _like(network: FoldedNetwork, other: FoldedNetwork) -> FoldedNetwork:
+    """Another network with the correlations of this one: they hardly change with the pretension."""
+    if not network.angles:
+        return other
+    head = np.s_[..., KNOWN : KNOWN + network.angles]
+
+    def widened(theirs: Array, mine: Array) -> Array:
+        return np.concatenate([theirs[..., :KNOWN], mine[head], theirs[..., KNOWN:]], axis=-1)
+
+    weight, bias = map(widened, other.layers.last, network.layers.last)
+    skip = widened(other.layers.skip, network.layers.skip)
+    return replace(other, layers=replace(other.layers, last=(weight, bias), skip=skip))
+
+
+def _arrays(network: FoldedNetwork) -> list[np.ndarray]:
+    """Weights in the order of `Pretensions`."""
+    layers = network.layers
+    arrays: Sequence[Array] = [*(array for layer in layers.hidden for array in layer), layers.skip, layers.last[1]]
+    return [np.asarray(array, dtype=np.float32) for array in (*arrays, layers.last[0])]
+
+
+def _constants(network: FoldedNetwork) -> list[str]:
+    """Names of the graph's constants that hold them."""
+    graph = onnx.load_from_string(export_onnx(network, {})).graph
+    constants = [(constant.name, numpy_helper.to_array(constant)) for constant in graph.initializer]
+    return [next(name for name, held in constants if np.array_equal(held, array)) for array in _arrays(network)]
+
+
+def _floor(result: CalibrationResult) -> float:
+    """Standard deviation, MPa, of the change that very many touches tell of a film that has not changed.
+
+    Touches give the pretension that goes best with the other parameters, which are not exact, and neither is that of
+    the calibration; their errors go together.
+    """
+    misfit = result.sensitivity.misfit
+    tells = np.einsum("nk,nkp->p", misfit[:, :, 0], misfit) / (misfit[:, :, 0] ** 2).sum()
+    return float(np.sqrt(tells @ result.posterior.joint @ tells) * result.problem.prior.std[0])
