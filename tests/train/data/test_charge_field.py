@@ -167,7 +167,7 @@ def by_scipy(field, charge, start):
     sigma = np.hypot(1.0, 0.002 * charge)
 
     def square(unit):
-        return float((((charge - np.exp(field.log_charge(unit[None])[0, 0])) / sigma) ** 2).sum())
+        return float((((charge - field.charges(field.domain.to_contact(unit[None]))[0]) / sigma) ** 2).sum())
 
     inside = {"type": "ineq", "fun": lambda unit: 1.0 - unit[0] ** 2 - unit[1] ** 2}
     bounds = [(-1, 1), (-1, 1), (-1, 1)]

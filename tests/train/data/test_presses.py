@@ -58,7 +58,11 @@ def few(dataset):
         (few, "expected at least 500 presses at 50 positions, got 100 at 100"),
         (lambda d: with_samples(d, x_mm=0.0 * d.samples.x_mm, y_mm=0.0 * d.samples.y_mm), "got 6000 at 1"),
         (lambda d: with_samples(d, charge_pC=d.samples.charge_pC[:, :2]), "at least three electrodes"),
-        (lambda d: changed(d, -3.0), "sample 17: expected positive force and charges"),
+        (lambda d: with_samples(d, force_N=-d.samples.force_N), "sample 0: expected a positive force, got -"),
+        (
+            lambda d: with_samples(d, charge_pC=d.samples.charge_pC * [1, 0, 1]),
+            "electrode 'B': expected charges that vary",
+        ),
         (lambda d: changed(d, np.nan), r"sample 17: expected finite numbers, .*nan.* pC"),
     ],
 )

@@ -47,6 +47,10 @@ EVEN = np.zeros(1, dtype=bool)
 CHECKS = 10
 """Number of direct solves that a forward map is compared with."""
 
+NODES = (((5, 3), ROTATIONS), ((8, 5), 2 * ROTATIONS), ((13, 8), 3 * ROTATIONS), ((13, 12), 3 * ROTATIONS))
+"""Distances and forces, and least orientations, that are tried in turn: the last for taut films, on which the charges
+pass from a power of the force to another, and through zero."""
+
 
 @dataclass(frozen=True)
 class ForwardMap:
@@ -110,7 +114,7 @@ class ForwardMap:
         resolution = needed_resolution(film, probe, (radius, 0.0), middle, settings)
         settings = replace(settings, resolution=resolution)
         error = np.inf
-        for count, rotations in (((5, 3), ROTATIONS), ((8, 5), 2 * ROTATIONS), ((13, 8), 3 * ROTATIONS)):
+        for count, rotations in NODES:
             family = Family.spread(domain, count, probe.period, rotations)
             table = family.unfold(family.solve(sensor, probe, settings, executor), template_for(probe, resolution))
             forward_map = cls(sensor, probe, family, theory, resolution, layer, table, error)

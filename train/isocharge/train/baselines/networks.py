@@ -19,11 +19,11 @@ from isocharge.serve import Predictor
 from isocharge.serve.model.session import INPUT, open_session
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.baselines.rivals import GivenMethod
-from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
-from isocharge.train.model_release.export import GraphBuilder, add_layers, make_model
+from isocharge.train.data.presses import LabelledPresses
+from isocharge.train.model_release.export import GraphBuilder, add_inputs, add_layers, make_model
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.training.fit import train_network
-from isocharge.train.training.folding import FoldedLayers, contact_alone
+from isocharge.train.training.folding import FoldedNetwork, contact_alone
 from isocharge.train.training.source import TrainingData
 
 RELEASED = "released network"
@@ -132,11 +132,10 @@ class ReleasedModel(GivenMethod):
         return OnnxContact(part.SerializeToString())
 
 
-def contact_graph(layers: FoldedLayers) -> bytes:
+def contact_graph(network: FoldedNetwork) -> bytes:
     """An ONNX graph with the input `charge_pC` [n, n_electrode] and the output `contact` [n, 3], float32."""
     build = GraphBuilder()
-    within = build.add("Clip", INPUT, build.constant(LOWEST_CHARGE), build.constant(HIGHEST_CHARGE))
-    value = add_layers(build, build.add("Log", within), layers)
+    value = add_layers(build, add_inputs(build, network), network.layers)
     plane, log_force = build.split(value, ("plane", "log_force"), (2, 1), axis=1)
     build.add("Concat", plane, build.add("Exp", log_force), to="contact", axis=1)
-    return bytes(make_model(build, "contact", len(layers.skip), {"contact": 3}).SerializeToString())
+    return bytes(make_model(build, "contact", network.typical.size, {"contact": 3}).SerializeToString())

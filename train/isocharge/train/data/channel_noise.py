@@ -65,6 +65,11 @@ class ChannelNoise:
         gain = np.maximum(gain, LEAST_GAIN)
         return cls(np.maximum(white, LEAST_SHARE * gain * usual_size(charge)), gain)
 
+    @classmethod
+    def alike(cls, noise: NoiseModel, electrodes: int) -> "ChannelNoise":
+        """The same noise on every one of so many channels."""
+        return cls(np.full(electrodes, noise.white), np.full(electrodes, max(noise.gain, LEAST_GAIN)), noise.name)
+
     def sigma(self, charge: Array) -> Array:
         """Standard deviation for charges of shape (n, n_electrode), pC; the same shape."""
         return np.asarray(np.hypot(self.white, self.gain * charge))

@@ -4,10 +4,11 @@ Without pretension Q = F^(2/3) g(x, y) nearly, with g smooth, so ln Q is expande
 
     ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
 
-with r the radius of the working area and l the logarithm of the force scaled to [-1, 1]. The coefficients follow from
-linear least squares. Training needs it to find the contact nearest to any charges, and to see folds, by the simulator's
-search for folds and for contacts far apart with the same charges; the model itself does without. A dataset of several
-probes gives their mean.
+with r the radius of the working area and l the logarithm of the force scaled to [-1, 1]. Charges of both signs, as taut
+uniaxial films give, have Q_e / S(l) in the logarithm's place, with S their usual size under that force. The
+coefficients follow from linear least squares. Training needs the series to find the contact nearest to any charges, and
+to see folds, by the simulator's search for folds and for contacts far apart with the same charges; the model itself
+does without. A dataset of several probes gives their mean.
 """
 
 from dataclasses import dataclass, replace
@@ -23,10 +24,20 @@ from isocharge.simulate import NoiseModel, working_area
 from isocharge.simulate.forward.charge_map import Domain, within
 from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
 from isocharge.simulate.numerics.statistics import rms
-from isocharge.train.data.presses import LabelledPresses
+from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 
 CANDIDATES = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
 """Degrees tried in turn, in position and in force."""
+
+SIGNED_CANDIDATES = ((6, 1), (6, 4), (8, 8), (12, 8), (16, 8), (20, 8), (24, 6), (24, 8))
+"""The same for charges of both signs: taut films, on which the force's power changes with the force."""
+
+SIZE_DEGREE = 4
+"""Degree of ln S in l."""
+
+NOISY = 500.0
+"""Charge below which errors of charges of both signs are relative to this, pC: it has as much of either noise of
+`reference`, 1 pC and 0.2 %."""
 
 ROWS_PER_TERM = 40
 """Presses used for each coefficient at most. Near the edge of the disk, where the series is worst, more help most."""
@@ -54,12 +65,15 @@ class ChargeField:
         electrodes: Names, in the order of the charges.
         series: Coefficients of ln Q (Q in pC), shape (degree + 1, degree + 1, force_degree + 1, n_electrode).
         error: Root-mean-square relative error on presses that the fit did not see.
+        log_size: For charges of both signs the coefficients of ln S, shape (SIZE_DEGREE + 1,); `series` is then of
+            Q / S.
     """
 
     domain: Domain
     electrodes: tuple[str, ...]
     series: Array
     error: float
+    log_size: Array | None = None
 
     @classmethod
     def fit(
@@ -70,21 +84,24 @@ class ChargeField:
         Args:
             domain: Where the contacts lie.
             electrodes: Names.
-            presses: Clean, all charges positive.
+            presses: Clean.
             held: Presses to measure the error on.
 
         Raises:
             TrainingError: If there are too few presses for the smallest degree.
         """
         best: ChargeField | None = None
-        unit, target = domain.to_unit(presses.contact), np.log(presses.charge)
-        for degree, force_degree in CANDIDATES:
+        unit, signed = domain.to_unit(presses.contact), presses.signed
+        log_size = _log_size(unit[:, 2], presses.charge) if signed else None
+        target = np.log(presses.charge) if log_size is None else presses.charge / _size(log_size, unit[:, 2])[0]
+        for degree, force_degree in SIGNED_CANDIDATES if signed else CANDIDATES:
             count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
             if FEWEST_PER_TERM * count > len(unit):
                 break
             rows = slice(0, ROWS_PER_TERM * count)
-            field = cls(domain, electrodes, _least_squares(unit[rows], target[rows], degree, force_degree), np.inf)
-            error = rms(field.charges(held.contact) / held.charge - 1.0)
+            series = _least_squares(unit[rows], target[rows], degree, force_degree)
+            field = cls(domain, electrodes, series, np.inf, log_size)
+            error = rms((field.charges(held.contact) - held.charge) / np.hypot(held.charge, NOISY if signed else 0.0))
             if best is None or error < best.error:
                 best = replace(field, error=error)
             if error < GOOD_ENOUGH:
@@ -105,12 +122,18 @@ class ChargeField:
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Charges and derivatives at once, in half the time; see `ChargeMap`."""
-        logs = self.log_charge(self.domain.to_unit(contact))
-        charge = np.exp(logs[:, 0])
-        return charge, charge[:, :, None] * logs[:, 1:].swapaxes(1, 2) / self.domain.scale
+        unit = self.domain.to_unit(contact)
+        values = self.values(unit)
+        if self.log_size is None:
+            charge = np.exp(values[:, 0])
+            return charge, charge[:, :, None] * values[:, 1:].swapaxes(1, 2) / self.domain.scale
+        size, growth = _size(self.log_size, unit[:, 2])
+        slopes = values[:, 1:]
+        slopes[:, 2] += growth * values[:, 0]
+        return size * values[:, 0], size[:, :, None] * slopes.swapaxes(1, 2) / self.domain.scale
 
-    def log_charge(self, unit: Array) -> Array:
-        """ln Q and its derivatives by the unit coordinates: contacts (n, 3) in them to (n, 4, n_electrode)."""
+    def values(self, unit: Array) -> Array:
+        """The series and its derivatives by the unit coordinates: contacts (n, 3) in them to (n, 4, n_electrode)."""
         degree, _, orders, n_electrode = (size - 1 for size in self.series.shape)
         parts = []
         for some in np.array_split(unit, len(unit) // CHUNK + 1):
@@ -125,6 +148,19 @@ class ChargeField:
         all_four = np.stack([self.series, *(_derivative(self.series, axis) for axis in range(3))])
         of_terms = all_four[:, *_plane_terms(self.series.shape[0] - 1)]  # (4, n_term, force_degree + 1, n_electrode)
         return np.asarray(of_terms.transpose(1, 2, 0, 3).reshape(of_terms.shape[1], -1))
+
+
+def _log_size(logs: Array, charge: Array) -> Array:
+    """Coefficients of ln S, from logarithms of forces in [-1, 1], shape (n,), and charges (n, n_electrode)."""
+    total = np.maximum(np.linalg.norm(charge, axis=1), LOWEST_CHARGE)
+    return np.asarray(chebyshev.chebfit(logs, np.log(total), SIZE_DEGREE))
+
+
+def _size(coefficients: Array, logs: Array) -> tuple[Array, Array]:
+    """S and the derivative of ln S by l, each of shape (n, 1)."""
+    inside = np.clip(logs, -1.0, 1.0)[:, None]
+    slope = chebyshev.chebval(inside, chebyshev.chebder(coefficients))
+    return np.exp(chebyshev.chebval(inside, coefficients)), np.asarray(slope)
 
 
 def _plane_terms(degree: int) -> tuple[Integers, Integers]:

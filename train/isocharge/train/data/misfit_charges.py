@@ -6,16 +6,25 @@ off the image of the forward map by any distance, wrong gains, dying electrodes,
 everything. Few electrodes make a space small enough to be covered.
 """
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate import ChargeMap, NoiseModel, noise_model
 from isocharge.simulate.identifiability.nearest_contact import CANDIDATES, explain, search
-from isocharge.train.data.channel_noise import Noise
+from isocharge.train.data.channel_noise import ChannelNoise, Noise
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
 """Kinds of charges, and the share of the examples that each makes up, dimensionless."""
+
+FARTHEST = 2.5
+"""Decades by which charges of any sign are moved, in standard deviations of the noise."""
+
+LARGEST_FACTOR = 2.0
+"""Factor by which a map may be off at a press to be scaled there: a quotient of charges near zero says nothing."""
 
 FAR = 6.0
 """Distance above which a press's own place may not be the nearest: searched as the others are."""
@@ -29,21 +38,23 @@ def misfit_noise(noise: NoiseModel) -> NoiseModel:
 def draw_misfit_examples(
     presses: LabelledPresses,
     charge_map: ChargeMap,
-    noise: NoiseModel,
+    noise: Noise,
     count: int,
     seed: int,
     *,
     candidates: int = CANDIDATES,
+    limits: tuple[Array | float, Array | float] = (LOWEST_CHARGE, HIGHEST_CHARGE),
 ) -> Array:
     """Draw charges of every kind, and find how far from any known contact they are.
 
     Args:
         presses: To start from.
         charge_map: What is known.
-        noise: Noise of good presses, and the unit of distance.
+        noise: Noise of good presses, and the unit of distance; `ChannelNoise` for charges of any sign.
         count: How many.
         seed: Of all that is drawn.
         candidates: Contacts among which searches start.
+        limits: What charges are brought between, pC, as the network brings them.
 
     Returns:
         The charges Q, pC, and their residuals (Q - Q(c)) / sigma at the nearest known contact c, shape (2, count,
@@ -51,11 +62,8 @@ def draw_misfit_examples(
     """
     rng = np.random.default_rng(seed)
     chosen = presses[rng.integers(len(presses), size=count)]
-    kinds = np.array(list(KINDS))[rng.choice(len(KINDS), size=count, p=list(KINDS.values()))]
-    charge = np.empty_like(chosen.charge)
-    for kind in KINDS:
-        charge[kinds == kind] = draw_charges(kind, rng, chosen.charge[kinds == kind], presses.charge, noise)
-    charge = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
+    kinds, charge = draw_charges(rng, chosen.charge, presses.charge, noise)
+    charge = np.clip(charge, *limits)
     near = np.isin(kinds, ("noisy", "moved"))
     return np.stack([charge, _residuals(charge_map, charge, noise.sigma(charge), chosen, near, candidates)])
 
@@ -66,7 +74,7 @@ def _residuals(
     """Those `near` their own press start there, with the map scaled to be right there; the others search."""
     residual, at = np.zeros_like(charge), np.flatnonzero(near)
     start = chosen.contact[at]
-    scale = chosen.charge[at] / charge_map.charges(start)
+    scale = np.clip(chosen.charge[at] / charge_map.charges(start), 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
     residual[at] = explain(charge_map, charge[at] / scale, sigma[at] / scale, start)[1]
     far = np.flatnonzero(~near | (np.linalg.norm(residual, axis=1) > FAR))
     searched = search(charge_map, charge[far], sigma[far], candidates=candidates)[1]
@@ -75,10 +83,27 @@ def _residuals(
     return residual
 
 
-def draw_charges(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> Array:
-    """Charges of one kind made from those of presses, shape (n, n_electrode), pC."""
+def draw_charges(rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> tuple[NDArray[Any], Array]:
+    """Kinds, shape (n,), and charges of them made from those of presses, shape (n, n_electrode), pC."""
+    kinds = np.array(list(KINDS))[rng.choice(len(KINDS), size=len(charge), p=list(KINDS.values()))]
+    drawn = np.empty_like(charge)
+    for kind in KINDS:
+        rows = kinds == kind
+        drawn[rows] = _draw(kind, rng, charge[rows], others, noise)
+    return kinds, drawn
+
+
+def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> Array:
+    """Charges of one kind; those of any sign are moved, and fill a box, in units of their noise."""
     each = len(charge), 1
     match kind:
+        case "moved" if isinstance(noise, ChannelNoise):
+            far = 10.0 ** rng.uniform(-1.0, FARTHEST, each)
+            return noise.charge(noise.level(charge) + far * rng.standard_normal(charge.shape))
+        case "any" if isinstance(noise, ChannelNoise):
+            level = noise.level(others)
+            low, high = level.min(axis=0), level.max(axis=0)
+            return noise.charge(rng.uniform(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, charge.shape))
         case "noisy":
             return noise.add(charge, rng)
         case "moved":  # in any direction, by a thousandth up to a factor of seven

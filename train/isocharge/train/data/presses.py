@@ -57,6 +57,11 @@ class LabelledPresses:
     def __len__(self) -> int:
         return len(self.contact)
 
+    @property
+    def signed(self) -> bool:
+        """Whether some charge is not positive, so that it has no logarithm."""
+        return bool((self.charge <= 0.0).any())
+
     def within(self, radius: float) -> "LabelledPresses":
         """Those up to a distance from the centre, mm."""
         return self[np.hypot(self.contact[:, 0], self.contact[:, 1]) <= radius]
@@ -116,8 +121,8 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
         fewest: Presses that it must have at least.
 
     Raises:
-        DatasetError: If the dataset has too few presses or positions, fewer than three electrodes, or numbers that are
-            not finite or charges that are not positive.
+        DatasetError: If the dataset has too few presses or positions, fewer than three electrodes or one whose charge
+            never varies, or numbers that are not finite or forces that are not positive.
     """
     presses = LabelledPresses.of(dataset)
     finite = np.isfinite(presses.charge).all(axis=1) & np.isfinite(presses.contact).all(axis=1)
@@ -135,13 +140,13 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
         )
     if presses.charge.shape[1] < 3:
         raise DatasetError(f"expected at least three electrodes to find x, y and force, got {presses.charge.shape[1]}")
-    wrong = np.flatnonzero((presses.charge <= 0.0).any(axis=1) | (presses.contact[:, 2] <= 0.0))
+    for name, charge in zip(dataset.sensor.electrode_names, presses.charge.T, strict=True):
+        if np.ptp(charge) == 0.0:
+            raise DatasetError(f"electrode {name!r}: expected charges that vary, got {charge[0]:g} pC everywhere")
+    wrong = np.flatnonzero(presses.contact[:, 2] <= 0.0)
     if wrong.size:
         row = int(wrong[0])
-        raise DatasetError(
-            f"sample {row}: expected positive force and charges (the features are logarithms), got "
-            f"{presses.contact[row, 2]:g} N and {presses.charge[row].tolist()} pC"
-        )
+        raise DatasetError(f"sample {row}: expected a positive force, got {presses.contact[row, 2]:g} N")
     return presses
 
 
@@ -208,7 +213,7 @@ def check_enough(count: int, of: int, sensor: str) -> None:
     """Raise PressError if there are too few measured presses to train on and to measure by."""
     if count < FEWEST_MEASURED:
         raise PressError(
-            f"expected at least {FEWEST_MEASURED} presses with known place, force and charges, positive and within the "
+            f"expected at least {FEWEST_MEASURED} presses with known place, force and charges, within the "
             f"model's forces and radius, got {count} of {of}; fewer calibrate a film: isocharge train calibrate "
             f"PRESSES.csv --sensor {sensor} -o FOLDER"
         )

@@ -87,15 +87,7 @@ def export_onnx(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
         `contact_correlation` [n, 3] if the network gives it, `misfit` [n, 1], all float32.
     """
     build, n_electrode = GraphBuilder(), network.typical.size
-    if signed := network.signed:
-        above = build.add("Max", "charge_pC", build.constant(signed.low))
-        within = build.add("Min", above, build.constant(signed.high))
-        ratios = build.add("Mul", within, build.constant(1.0 / network.typical))
-        logs = build.add("Sub", build.add("Asinh", ratios), build.constant(signed.mean))
-    else:
-        within = build.add("Clip", "charge_pC", build.constant(LOWEST_CHARGE), build.constant(HIGHEST_CHARGE))
-        logs = build.add("Log", build.add("Mul", within, build.constant(1.0 / network.typical)))
-    answers = add_layers(build, logs, network.layers)
+    answers = add_layers(build, add_inputs(build, network), network.layers)
     parts = {"plane": 2, "logs": 4, "angles": network.angles, "misfit_vector": n_electrode}
     parts = {name: width for name, width in parts.items() if width}
     plane, logs, *angles, vector = build.split(answers, tuple(parts), tuple(parts.values()), axis=1)
@@ -110,6 +102,17 @@ def export_onnx(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
     helper.set_model_props(model, dict(properties))
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())
+
+
+def add_inputs(build: GraphBuilder, network: FoldedNetwork) -> str:
+    """Add what the layers see of the input `charge_pC`: logarithms, or what stands for them."""
+    if not (signed := network.signed):
+        within = build.add("Clip", "charge_pC", build.constant(LOWEST_CHARGE), build.constant(HIGHEST_CHARGE))
+        return build.add("Log", build.add("Mul", within, build.constant(1.0 / network.typical)))
+    above = build.add("Max", "charge_pC", build.constant(signed.low))
+    within = build.add("Min", above, build.constant(signed.high))
+    ratios = build.add("Mul", within, build.constant(1.0 / network.typical))
+    return build.add("Sub", build.add("Asinh", ratios), build.constant(signed.mean))
 
 
 def add_layers(build: GraphBuilder, logs: str, layers: FoldedLayers) -> str:

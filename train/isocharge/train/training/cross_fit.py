@@ -25,7 +25,7 @@ from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
 from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
-from isocharge.train.data.misfit_charges import KINDS, draw_charges
+from isocharge.train.data.misfit_charges import draw_charges
 from isocharge.train.data.presses import (
     FEWEST,
     FEWEST_POSITIONS,
@@ -64,9 +64,6 @@ ADDED_NOISE = 0.5
 
 TAUGHT_NOISE = (0.0, 0.5, 0.5, 1.0, 1.0, 2.0)
 """Noise added to the copies of the presses that the last network is taught on, over their own."""
-
-FARTHEST = 2.5
-"""Decades by which charges of no press are moved, in standard deviations of the noise."""
 
 PRESSES = "presses.csv"
 """File beside the model: what it was fitted to."""
@@ -277,11 +274,7 @@ def _misfit_examples(
     rng, count = np.random.default_rng(config.seed), config.misfit_charges
     planes = LocalPlanes.through(domain.to_unit(presses.contact), noise.level(presses.charge))
     chosen = presses.charge[rng.integers(len(presses), size=count)]
-    kinds = np.array(list(KINDS))[rng.choice(len(KINDS), size=count, p=list(KINDS.values()))]
-    charge = np.empty_like(chosen)
-    for kind in KINDS:
-        rows = kinds == kind
-        charge[rows] = _draw(kind, rng, chosen[rows], presses.charge, noise)
+    charge = draw_charges(rng, chosen, presses.charge, noise)[1]
     return np.stack([charge, planes.residuals(noise.level(charge))])
 
 
@@ -293,15 +286,3 @@ def _left_out_misfit(presses: LabelledPresses, domain: PressedArea, noise: Chann
         residual = LocalPlanes.through(unit[~out], level[~out]).residuals(level[out])
         misfit[out] = np.linalg.norm(residual, axis=1, keepdims=True)
     return misfit
-
-
-def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: ChannelNoise) -> Array:
-    """As `draw_charges`, for charges of any sign."""
-    if kind == "moved":
-        far = 10.0 ** rng.uniform(-1.0, FARTHEST, (len(charge), 1))
-        return noise.charge(noise.level(charge) + far * rng.standard_normal(charge.shape))
-    if kind == "any":
-        level = noise.level(others)
-        low, high = level.min(axis=0), level.max(axis=0)
-        return noise.charge(rng.uniform(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, charge.shape))
-    return draw_charges(kind, rng, charge, others, noise)

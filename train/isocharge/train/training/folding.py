@@ -210,12 +210,12 @@ def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: in
     return matrix, shift
 
 
-def contact_alone(network: InverseNetwork) -> FoldedLayers:
-    """The contact network without standard deviations, from ln Q to (x_mm, y_mm, ln F)."""
+def contact_alone(network: InverseNetwork) -> FoldedNetwork:
+    """The contact network without standard deviations: its layers give (x_mm, y_mm, ln F) alone."""
     matrix = np.vstack([np.diag(network.domain.scale), np.zeros((3, 3))])
     features, contact = network.features, PlainPerceptron.of(network.contact)
-    mean = np.log(features.typical) + features.mean
-    return FoldedLayers.of((contact,), features.matrix, mean, (matrix, network.domain.centre))
+    layers = FoldedLayers.of((contact,), features.matrix, features.mean, (matrix, network.domain.centre))
+    return FoldedNetwork(layers, features.typical, features.signed)
 
 
 def _side_by_side(perceptrons: Sequence[PlainPerceptron]) -> tuple[list[Layer], Layer]:

@@ -77,7 +77,7 @@ class Features:
 
     @classmethod
     def fit(cls, charge: Array) -> "Features":
-        """From clean charges, shape (n, n_electrode): zero mean, unit covariance along the principal axes."""
+        """From clean positive charges, shape (n, n_electrode): zero mean, unit covariance along the principal axes."""
         within = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
         typical = 2.0 ** np.round(np.log2(within).mean(axis=0))
         return cls(typical, *whitening(np.log(within / typical)))
