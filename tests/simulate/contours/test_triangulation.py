@@ -21,6 +21,7 @@ from isocharge.simulate import (
     load_sensor,
     noise_model,
 )
+from isocharge.simulate.contours.candidates import NODE_SPACING, SeedGrid
 from isocharge.simulate.contours.fix import Meeting
 from kept import kept
 
@@ -125,6 +126,15 @@ def test_closest_to_meeting_is_scipys_least_squares():
     best = least_squares(away, [2.0, -1.0, np.log(0.8)], xtol=1e-12, ftol=1e-12)
     np.testing.assert_allclose(fix.contact[0, :2], best.x[:2], atol=5e-3)
     assert fix.spread[0] == pytest.approx(np.sqrt(np.mean(best.fun**2)), rel=1e-2)
+
+
+def test_a_search_begins_within_a_cell_of_the_press():
+    charge_map, contact = round_map(CENTRES["four"]), draw(100, seed=11)
+    grid = SeedGrid.of(charge_map)
+    distance = grid.distance(charge_map.charges(contact), contact[:, 2:])
+    off = np.hypot(*(grid.at[np.argmin(distance, axis=1)] - contact[:, :2]).T)
+    assert off.max() < NODE_SPACING
+    assert distance.min(axis=1) == pytest.approx(off, abs=0.5 * NODE_SPACING)
 
 
 @pytest.fixture(scope="module")
