@@ -10,7 +10,7 @@ from scipy.stats import chi2, multivariate_normal
 from tests.train.calibration.conftest import presses_of, rig
 
 from isocharge.common.errors import ModelError, PressError, SceneError
-from isocharge.simulate import Circle, Polygon, load_sensor
+from isocharge.simulate import Circle, Polygon, load_sensor, press, touch_charge
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.simulate.solver.stress_limit import largest_stress
 from isocharge.train import CalibrationProblem, calibrate, next_presses
@@ -363,3 +363,21 @@ def test_a_network_is_chosen_by_layout_and_not_by_name():
         CalibrationProblem.of(sensor_from_dict(table), Circle(1.0))
     with pytest.raises(SceneError, match="expected a round one"):
         CalibrationProblem.of(load_sensor("four-25um-biaxial"), Polygon.triangle(4.0))
+
+
+@pytest.mark.slow
+def test_electrodes_with_traces_are_read_by_the_network_of_their_pads(problem):
+    """On charges of direct solves; a trace collects as much as its pad."""
+    outward = [e.with_trace((e.centre, (4.0 * e.centre[0], 4.0 * e.centre[1])), 0.5) for e in problem.sensor.electrodes]
+    traced = CalibrationProblem.of(replace(problem.sensor, electrodes=tuple(outward)), problem.probe)
+    contact, (sensor, probe) = (
+        draw_contacts(np.random.default_rng(3), traced.domain, 40),
+        traced.prior.film(traced.prior.mean),
+    )
+    charge = [touch_charge(sensor, press(sensor.film, probe, (x, y), force)) for x, y, force in contact[:10]]
+    fitted = traced.fitted(
+        traced.prior.mean, (contact[10:], np.zeros((30, 3))), lambda at: np.ones((len(at), 4)), correlation=False
+    )
+    off = fitted.predict(np.array(charge))[0] - contact[:10]
+    assert fitted.sensor.electrodes == sensor.electrodes
+    assert np.hypot(off[:, 0], off[:, 1]).mean() < 0.1  # of the pads alone 0.9

@@ -145,7 +145,7 @@ class FilmFamily:
             "thickness": film.thickness / a,
             "reach": probe.radius / a,
         }
-        self._check_inside(film, sensor.surface, groups)
+        self._check_inside(sensor.coated_film, sensor.surface, groups)
         tension, thickness, reach = (self.grid.weights(name, value) for name, value in groups.items())
         by_film = np.einsum("t,h,p->thp", tension, thickness, reach).ravel()
         sizes = self.coefficients.shape

@@ -99,7 +99,7 @@ class CalibrationResult:
     def fitted_film(self, parameters: Array, *, correlation: bool = False) -> Fitted:
         """The network of a film near it, of these parameters; all else that is known of this film holds for it."""
         left = self.sensitivity.contact, np.einsum("nii->ni", self.sensitivity.covariance(self.posterior.joint))
-        return self.problem.films.film(parameters, left=left, factor=self._factor, correlation=correlation)
+        return self.problem.fitted(parameters, left, self._factor, correlation=correlation)
 
     @cached_property
     def _factor(self) -> Callable[[Array], Array]:

@@ -1,6 +1,7 @@
 """What a calibration is about: the film as it is described, and the network for all films that fits its layout."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -11,10 +12,12 @@ from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import ModelError, SceneError, SensorError
 from isocharge.serve.model.model_folder import find_model, model_names, repositories
 from isocharge.simulate import Circle, Domain, FilmPrior, NoiseModel, Probe, Sensor
+from isocharge.simulate.sensor.film_prior import SHARED
 from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.films.films_file import FILE, read_films
 from isocharge.train.films.films_model import FilmsModel
+from isocharge.train.training.fit import Fitted
 
 DRIFT = {"pretension": 0.4, "d31": 0.05, "d32": 0.05, "gain": 0.1}
 """Standard deviations of what may have changed since an earlier calibration, over those of the prior: creep of the
@@ -108,15 +111,41 @@ class CalibrationProblem:
         """Names of the electrodes."""
         return self.sensor.electrode_names
 
-    @property
+    @cached_property
     def prior(self) -> FilmPrior:
-        """How films spread."""
-        return self.films.prior
+        """How films spread; their electrodes are as described, traces included."""
+        return _with_electrodes(self.films.prior, self.sensor)
 
     @cached_property
     def charges(self) -> FilmCharges:
         """The films' charges."""
-        return FilmCharges(self.films.prior, self.films.family)
+        return FilmCharges(self.prior, self.films.family)
+
+    def fitted(
+        self,
+        parameters: Array,
+        left: tuple[Array, Array],
+        besides: Callable[[Array], Array],
+        *,
+        correlation: bool = True,
+    ) -> Fitted:
+        """The network of a film, arguments as `FilmsModel.film` takes them, `besides` its factor.
+
+        What the described electrodes have that the network's do not have is one more factor: its mean counts as gains,
+        and the network's last layer is changed for the rest.
+        """
+        if self.prior is self.films.prior:
+            return self.films.film(parameters, left=left, factor=besides, correlation=correlation)
+        described, own = self.charges.forward_map(parameters), self.films.forward_map(parameters)
+        scaled = parameters.copy()
+        scaled[len(SHARED) :] += np.log(described.charges(left[0]) / own.charges(left[0])).mean(axis=0)
+
+        def factor(contact: Array) -> Array:
+            of_network = self.films.forward_map(scaled).charges(contact)
+            return np.asarray(besides(contact) * described.charges(contact) / of_network)
+
+        fitted = self.films.film(scaled, left=left, factor=factor, correlation=correlation)
+        return replace(fitted, sensor=described.sensor)
 
     @property
     def domain(self) -> Domain:
@@ -153,8 +182,8 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
     """The network for all films of a sensor's layout, looked up by the electrodes, not by the name.
 
     Args:
-        sensor: Its electrodes, radius and readout must be those of a network's; everything else may differ within the
-            spread of its films.
+        sensor: Its pads, radius and readout must be those of a network's; everything else may differ within the spread
+            of its films, and electrodes may have traces and patterned backs besides.
         probe: What presses; its radius must be within the spread as well.
         models: Folder of models that is searched first.
 
@@ -165,7 +194,7 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
     for folder in _folders(models, sensor.name):
         films = read_films(folder)
         try:
-            parameters = films.prior.parameters_of(sensor, probe)
+            parameters = _with_electrodes(films.prior, sensor).parameters_of(sensor, probe)
         except SensorError as error:
             reasons.append(f"{folder.parent.name}: {error}")
             continue
@@ -179,6 +208,14 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
         f"({'; '.join(reasons) or 'none is installed'}); train one first, once for a layout: "
         f"isocharge train fit --films --sensor SENSOR -o models/{sensor.name}-films"
     )
+
+
+def _with_electrodes(prior: FilmPrior, sensor: Sensor) -> FilmPrior:
+    """The prior with a sensor's electrodes if their pads are its own: they may have traces and patterned backs."""
+    own, pads = ({e.name: np.round(e.corners, 6).tolist() for e in each.electrodes} for each in (prior.sensor, sensor))
+    if own != pads or prior.sensor.electrodes == sensor.electrodes:
+        return prior
+    return replace(prior, sensor=replace(prior.sensor, electrodes=sensor.electrodes))
 
 
 def _folders(models: Path | None, name: str) -> list[Path]:
