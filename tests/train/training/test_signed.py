@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.serve import Predictor
-from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, read_dataset
+from isocharge.serve import MeasuredPresses, Predictor
+from isocharge.simulate import Circle, Domain, ForwardMap, Sweep, load_sensor, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train import BayesProblem, FitConfig, NetworkConfig, TrainingConfig, bayes_estimate, fit, release
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
+from isocharge.train.rig.rig_film import corrected_film
 from kept import kept
 
 RADIUS, FORCES = 1.5, (0.1, 0.3)
@@ -71,6 +72,18 @@ def test_the_series_of_charges_of_both_signs(film):
     inner = contact[np.hypot(*contact[:, :2].T) < 0.95 * RADIUS][:200]
     slopes = film.derivatives(inner)
     assert np.abs(field.derivatives(inner) - slopes).max() < 5e-3 * np.abs(slopes).max()
+
+
+def test_measured_presses_correct_charges_of_both_signs(film):
+    """An amplifier that gives 4 % too much, seen through noise."""
+    contact = draw_contacts(np.random.default_rng(1), Domain(1.4, (0.11, 0.28)), 300)
+    charge = noise_model("reference").add(1.04 * film.charges(contact), np.random.default_rng(2))
+    std = np.full(300, 1e-4), np.full(300, 1e-4)
+    presses = MeasuredPresses(contact, charge, *std, film.electrodes, tuple(range(2, 302)))
+    corrected = corrected_film(presses, film, film.domain, noise_model("reference"))
+    truth = 1.04 * film.charges(contact)
+    assert rms((corrected.charges(contact) - truth) / noise_model("reference").sigma(truth)) < 0.3
+    assert corrected.scatter == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.slow

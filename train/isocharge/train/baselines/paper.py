@@ -73,7 +73,7 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         """Slopes from the presses of the band: ln(Q / F) as Chebyshev polynomials of x and y up to a total degree.
 
         Raises:
-            DatasetError: If there are too few presses of small force.
+            DatasetError: If there are too few presses of small force, or charges that are not positive.
         """
         band = contact[:, 2] <= BAND
         if np.count_nonzero(band) < FEWEST:
@@ -81,6 +81,8 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
                 f"linear band: expected at least {FEWEST} presses of at most {BAND} N, got {np.count_nonzero(band)}; "
                 "sweep smaller forces"
             )
+        if (charge[band] <= 0.0).any():
+            raise DatasetError("linear band: expected positive charges, for it interpolates their logarithms")
         slope = np.log(charge[band] / contact[band, 2:])
         series = np.linalg.lstsq(self._terms(contact[band, :2] / self.radius), slope, rcond=1e-9)[0]
         axis = np.linspace(-1.0, 1.0, STEPS)

@@ -329,7 +329,7 @@ def _known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
 
 
 def _measured_known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
-    """Measured presses with positive charges within the model's working area and forces.
+    """Measured presses within the model's working area and forces.
 
     Raises:
         ModelError: If the model has other electrodes.
@@ -341,6 +341,6 @@ def _measured_known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
             f"{model.electrodes}; choose their own model with --model, or train one"
         )
     presses = LabelledPresses.of(dataset)
-    inside = ~outside(presses.contact, model_domain(model)) & (presses.charge > 0.0).all(axis=1)
+    inside = ~outside(presses.contact, model_domain(model))
     check_enough(int(inside.sum()), len(presses), dataset.sensor.name)
     return replace(_rows(dataset, inside), manifest={})

@@ -112,12 +112,11 @@ def _domain(rig: Rig, problem: CalibrationProblem | None) -> Domain:
 
 
 def _usable(rig: Rig, domain: Domain) -> MeasuredPresses:
-    """Complete presses with positive charges within the domain; what is left out is said."""
+    """Complete presses within the domain; what is left out is said."""
     presses = rig.presses.of_electrodes(rig.sensor.electrode_names, rig.sensor.name)
     (x, y, force), (low, high) = presses.contact.T, domain.force_range
     rules: dict[str, Booleans] = {
         "with an unknown place, force or charge": ~complete(presses),
-        "with a charge that is not positive": np.asarray((presses.charge_pC <= 0.0).any(axis=1)),
         f"beyond {domain.radius:g} mm from the centre, or outside {low:.3g} to {high:.3g} N": (
             np.asarray((np.hypot(x, y) > domain.radius) | (force < low) | (force > high))
         ),

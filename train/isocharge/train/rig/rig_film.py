@@ -24,6 +24,9 @@ from isocharge.train.calibration.problem import CalibrationProblem
 SIZES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Sizes that are weighed, dimensionless: a sensor that is not calibrated may be far off."""
 
+LEAST_RATIO = 0.5
+"""Measured charge over that of the map, below which its logarithm goes on straight."""
+
 CHUNK = 2048
 """Presses whose equations are held at once."""
 
@@ -34,7 +37,7 @@ class Residuals:
 
     Attributes:
         contact: As the rig read them, (x, y, F), shape (n, 3), mm and N.
-        log_ratio: ln(measured charge / charge of the map), shape (n, n_electrode).
+        log_ratio: ln(measured charge / charge of the map), shape (n, n_electrode); see `_log_ratio`.
         covariance: Of the log ratios by noise and rig, shape (n, n_electrode, n_electrode).
     """
 
@@ -202,9 +205,14 @@ def corrected_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Do
 def residuals_of(presses: MeasuredPresses, charge_map: ChargeMap, noise: NoiseModel) -> Residuals:
     """What a map leaves unexplained, with the covariance by noise of the charges and by the rig."""
     charge = charge_map.charges(presses.contact)
-    slopes = differences(lambda contact: np.log(charge_map.charges(contact)), presses.contact, CONTACT_STEPS)
+    slopes = differences(charge_map.charges, presses.contact, CONTACT_STEPS) / charge[:, :, None]
     rig = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std]) ** 2
     of_rig = np.einsum("nei,ni,nfi->nef", slopes, rig, slopes)
     of_noise = (noise.sigma(charge) / charge) ** 2
     covariance = of_rig + of_noise[:, :, None] * np.eye(charge.shape[1])
-    return Residuals(presses.contact, np.log(presses.charge_pC / charge), covariance)
+    return Residuals(presses.contact, _log_ratio(presses.charge_pC / charge), covariance)
+
+
+def _log_ratio(ratio: Array) -> Array:
+    """ln of ratios of any sign: below `LEAST_RATIO`, where a charge is mostly noise, the tangent."""
+    return np.asarray(np.log(np.maximum(ratio, LEAST_RATIO)) + np.minimum(ratio / LEAST_RATIO - 1.0, 0.0))
