@@ -140,6 +140,7 @@ class PageFeed:
             counters=self._touch.totals()._asdict() | more,
             rate_Hz=rate_Hz,
             model=record.model,
+            film=record.film,
             tare_pC=record.tare_pC,
             recording=None if recorder is None else str(recorder.path.name),
             recording_failed=recorder is not None and recorder.failed,

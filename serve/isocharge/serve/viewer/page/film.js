@@ -126,14 +126,16 @@ export class FilmView {
   }
 
   showHealth() {
-    const { counters, rate_Hz: rate, note, recording_failed: failed } = this.state, now_s = Date.now() / 1000;
+    const { counters, rate_Hz: rate, note, recording_failed: failed, film } = this.state, now_s = Date.now() / 1000;
     setText(this.find(".rate"), rate ? `${rate.toFixed(0)} Hz` : "–");
     setText(this.find(".latency"), this.latencies.length ? `${percentile(this.latencies, 0.5).toFixed(0)} µs` : "–");
     setText(this.find(".age"), this.isReplay || !this.ages.length ? "–" : `${percentile(this.ages, 0.5).toFixed(0)} ms`);
     setText(this.find(".lost"), counters ? String(counters.lost) : "–");
     if (this.latencies.length > 2000) this.latencies.splice(0, this.latencies.length - 1000);
     const fresh = note && Math.abs(now_s - note.at) < NOTE_S ? note.text : "";
-    setText(this.find(".note"), failed ? "recording stopped: the disk is full" : fresh || (this.state.recording ? `recording ${this.state.recording}` : ""));
+    const followed = film ? `film at ${film.pretension_MPa.toFixed(2)} ± ${film.pretension_std_MPa.toFixed(2)} MPa` : "";
+    const recording = this.state.recording ? `recording ${this.state.recording}` : followed;
+    setText(this.find(".note"), failed ? "recording stopped: the disk is full" : fresh || recording);
     if (counters && this.find("details").open) this.showCounters({ ...counters, not_shown: counters.not_shown + this.missed });
   }
 
