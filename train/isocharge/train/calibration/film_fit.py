@@ -229,8 +229,9 @@ class _Fit:
 
     def _before(self, hypothesis: Hypothesis) -> Array:
         """Covariance of the unknowns before the presses."""
-        counts = len(self.charges.prior.names), len(self.charges.modes), len(self.mean)
-        return self.covariance + np.diag(hypothesis.variances(*counts))
+        prior = self.charges.prior
+        counts = len(prior.names), len(self.charges.modes), len(prior.sensor.electrodes)
+        return self.covariance + hypothesis.covariance(*counts)
 
     def _film(self, unit: Array) -> Array:
         n = len(self.charges.prior.names)
