@@ -106,7 +106,7 @@ def study(job: tuple[str, int, bool]) -> dict[str, Any]:
         began = time.perf_counter()
         result = calibrate(presses[:count], problem)
         seconds = time.perf_counter() - began
-        answer = films.fold(result.posterior.parameters).predict(test)[0]
+        answer = result.fitted.predict(test)[0]
         row = {
             "left": errors(answer, at_truth),
             "limit": limit(problem, truth, real[:count]),

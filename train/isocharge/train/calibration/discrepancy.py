@@ -7,9 +7,9 @@ O'Hagan 2001), of finite rank: products of Chebyshev polynomials in place and lo
 
 whose coefficients have mean zero and the standard deviation s FADING^(i + j + m), and besides a part that all
 electrodes share, COMMON times as large: where a film is stiffer than its parameters say, all charges are smaller. The
-size s is not known. Neither is whether the whole session had a common offset of the charges (a bad tare), or charges that drifted.
-Every combination is a hypothesis; the presses weigh them by how well each predicts them (the evidence of a linear
-Gaussian model, MacKay 1992), and what is known is the mixture.
+size s is not known. Neither is whether the whole session had a common offset of the charges (a bad tare), or charges
+that drifted. Every combination is a hypothesis; the presses weigh them by how well each predicts them (the evidence of
+a linear Gaussian model, MacKay 1992), and what is known is the mixture.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -33,9 +33,9 @@ FADING = 0.5
 """Ratio of the standard deviations of terms of successive degrees: what is unexplained is smooth."""
 
 COMMON = 2.0
-"""Ratio of the standard deviation of what electrodes share to that of what each has alone. To second order, what has two
-axes acts alike all round: of imperfect films, solved in full, first-order modes leave 0.3 to 0.45 % in common and 0.13
-to 0.21 % of the electrodes' own. Forces are wrong by what is in common."""
+"""Ratio of the standard deviation of what electrodes share to that of what each has alone. To second order, what has
+two axes acts alike all round: of imperfect films, solved in full, first-order modes leave 0.3 to 0.45 % in common and
+0.13 to 0.21 % of the electrodes' own. Forces are wrong by what is in common."""
 
 IMPERFECT = {0.0: 0.5, 1.0: 0.5}
 """Sizes of the modes of imperfections that are weighed, with what each is believed to beforehand."""
