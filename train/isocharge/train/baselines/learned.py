@@ -9,7 +9,7 @@ from typing import Any
 from warnings import catch_warnings, simplefilter
 
 import numpy as np
-from sklearn.base import BaseEstimator, RegressorMixin, clone
+from sklearn.base import BaseEstimator, RegressorMixin, TransformerMixin, clone
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.decomposition import PCA
 from sklearn.exceptions import ConvergenceWarning
@@ -17,10 +17,10 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import Pipeline
-from sklearn.preprocessing import FunctionTransformer
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import Domain
+from isocharge.train.data.channel_noise import BOTH_SIGNS, LEAST_BEND, usual_size
 from isocharge.train.data.presses import LOWEST_CHARGE
 
 BATCH = 256
@@ -46,12 +46,24 @@ def on_logarithms(domain: Domain, **steps: Any) -> TransformedTargetRegressor:
 
 def whitening() -> Pipeline:
     """From charges (n, n_electrode), pC, to logarithms along their principal axes, each of variance 1."""
-    return Pipeline([("logarithms", FunctionTransformer(logarithms)), ("whitening", PCA(whiten=True))])
+    return Pipeline([("logarithms", Logarithms()), ("whitening", PCA(whiten=True))])
 
 
-def logarithms(charge: Array) -> Array:
-    """ln(max(Q, 1 pC)), the same shape."""
-    return np.asarray(np.log(np.maximum(charge, LOWEST_CHARGE)))
+class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+    """ln(max(Q, 1 pC)) of charges, shape (n, n_electrode); asinh(2 Q / usual size) if they have both signs."""
+
+    def fit(self, charge: Array, target: object = None) -> "Logarithms":
+        """Noise alone does not make a sign."""
+        del target
+        signed = (np.mean(charge <= 0.0, axis=0) > BOTH_SIGNS).any()
+        self.bend_ = LEAST_BEND * usual_size(charge) if signed else None
+        return self
+
+    def transform(self, charge: Array) -> Array:
+        """The same shape."""
+        if self.bend_ is None:
+            return np.asarray(np.log(np.maximum(charge, LOWEST_CHARGE)))
+        return np.asarray(np.arcsinh(charge / self.bend_))
 
 
 def stretched(values: Array, force: float, rest: float) -> Array:
