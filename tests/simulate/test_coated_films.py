@@ -42,6 +42,7 @@ def by_scikit_fem(coating):
     return (2.0 * fine - coarse) / charges(0.0)
 
 
+@pytest.mark.slow
 def test_charges_of_stiffer_electrodes_agree_with_another_code():
     stiff, bare = (touch_charge(s, press(s.coated_film, PROBE, AT, FORCE)) for s in (INK, TAUT))
     np.testing.assert_allclose(stiff / bare, kept(by_scikit_fem, 0.3), rtol=1.5e-3)
