@@ -102,11 +102,12 @@ def test_an_unfinished_sweep_of_other_settings_is_kept_unless_fresh(command, tmp
     assert not part.exists()
 
 
-def test_a_progress_bar_says_how_far_and_how_long(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
 
+
+def test_a_progress_bar_says_how_far_and_how_long(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     monkeypatch.setenv("COLUMNS", "160")
     monkeypatch.setenv("TERM", "xterm")
@@ -119,6 +120,16 @@ def test_a_progress_bar_says_how_far_and_how_long(monkeypatch):
     shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", sys.stderr.getvalue())
     assert "solving" in shown
     assert re.search(r"pressing .*50/100 .*0:00:0.*slowly", shown)
+
+
+def test_the_clock_of_a_bar_begins_again_only_with_the_same_work_once_more(monkeypatch):
+    resets = []
+    monkeypatch.setattr("rich.progress.Progress.reset", lambda _, row, **__: resets.append(row))
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with shown_progress():
+        for done, expected in ((1, 0), (2, 0), (2, 0), (1, 1), (2, 1)):
+            report("solving", done, 3)
+            assert len(resets) == expected
 
 
 def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys):

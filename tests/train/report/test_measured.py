@@ -1,6 +1,7 @@
 """Measured presses are judged as they are: by held-out presses of the film, never by simulated ones."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from isocharge.train.report import QUICK, write_report
 
 NAME, PROBE = "three-25um-biaxial", Circle(1.0)
 
-pytestmark = pytest.mark.slow  # it measures every method; `serve check` on measured presses is tested in every run
+slow = pytest.mark.slow  # it measures every method; `serve check` on measured presses is tested in every run
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,7 @@ def section(presses, tmp_path_factory):
     return record["datasets"][0], (out / "report.md").read_text("utf-8")
 
 
+@slow
 def test_the_figures_are_those_of_serve_check_on_the_held_out_presses(section, presses):
     record, _ = section
     held = presses[held_out(presses.contact)]
@@ -54,6 +56,7 @@ def test_the_figures_are_those_of_serve_check_on_the_held_out_presses(section, p
     assert released["position_median_mm"] > 0.3  # 0.07 mm by the simulator of the described film
 
 
+@slow
 def test_what_cannot_be_judged_is_left_out_with_a_word(section):
     record, page = section
     methods = {method["name"]: method["errors"]["position_rms_mm"] for method in record["methods"]}
@@ -68,6 +71,7 @@ def test_what_cannot_be_judged_is_left_out_with_a_word(section):
     assert methods["Gaussian process"] < methods["released network"]  # it learnt from this film
 
 
+@slow
 def test_a_file_of_presses_through_the_command(presses, tmp_path, command):
     write_presses(tmp_path / "rig.csv", presses)
     words = ("train", "report", tmp_path / "rig.csv", "-o", tmp_path / "out", "--quick", "--json")
@@ -78,10 +82,10 @@ def test_a_file_of_presses_through_the_command(presses, tmp_path, command):
     assert json.loads(out)["datasets"][0]["measured"]
 
 
-def test_too_few_presses_and_another_layout(presses, tmp_path):
-    contact = presses.contact.copy()
-    contact[:260, 2] = 30.0
-    strong = MeasuredPresses(**(vars(presses) | {"contact": contact}))
+def test_too_few_presses_and_another_layout(tmp_path):
+    contact, stds = draw_contacts(np.random.default_rng(6), Domain(7.8, (0.06, 1.9)), 300), [np.full(300, 0.01)] * 2
+    presses = MeasuredPresses(contact, np.full((300, 3), 500.0), *stds, ("A", "B", "C"), tuple(range(2, 302)))
+    strong = replace(presses, contact=np.where(np.arange(300)[:, None] < 260, [1.0, 1.0, 30.0], contact))
     sensor = load_sensor(NAME)
     with pytest.raises(PressError, match=r"at least 50 presses .* got 40 of 300"):
         write_report(tmp_path / "out", [(dataset_of(strong, sensor, PROBE), find_model(NAME))], QUICK)
