@@ -5,7 +5,8 @@
 The model's sensor is pressed with a circle of 1 mm and 1 N at random places of its working area; the frames of the
 amplifier `bench` go through the whole path, bytes to records, without a port. The device file knows tau to 0.5 % and
 the gains to 0.2 % (and once not at all). `--warm` adds a temperature step of 0.5 K of the air while 0.5 N press, for a
-model of four electrodes, and says where temperature can be told from force; `--unplug N` pulls a terminal N times.
+model of four electrodes, and says where temperature can be told from force; `--memory` holds presses on a film that
+creeps, and lays a hand over it; `--unplug N` pulls a terminal N times.
 """
 
 import time
@@ -53,7 +54,7 @@ def charges(film, script):
     return charge
 
 
-def feel(predictor, charge, part, gain_error, seed, *, warm=False):
+def feel(predictor, charge, part, gain_error, seed, sections=None):
     """Records of touch charges behind an amplifier, with the device file of somebody who has calibrated."""
     names, rng = predictor.metadata.electrodes, np.random.default_rng(seed + 1)
     process = part.start(len(names), RATE_HZ, np.random.default_rng(seed))
@@ -63,12 +64,13 @@ def feel(predictor, charge, part, gain_error, seed, *, warm=False):
         "gain": {"pC_per_unit": dict(zip(names, (1 / gain).tolist(), strict=True))},
         "saturation": {"limit_pC": 1499.9},
         "hum": {"frequency_Hz": 50.0},
-        "leak": {"tau_s": dict(zip(names, tau.tolist(), strict=True))},
+        "leak": {"tau_s": dict(zip(names, tau.tolist(), strict=True)), "settle_s": 60.0 if sections else 3.0},
     }
-    path, records = (
-        TouchStream(predictor, device_from_table(table | ({"common_mode": {}} if warm else {}), "bench")),
-        [],
-    )
+    if np.isinf(tau).any():
+        del table["leak"], table["hum"]
+    pyro = dict(zip(names, process.pyro.tolist(), strict=True))
+    known = {"common_mode": {"pC_per_K": pyro}} if "memory" in (sections or {}) and len(names) > 3 else {}
+    path, records = TouchStream(predictor, device_from_table(table | known | (sections or {}), "bench")), []
     for k, row in enumerate(process(charge).tolist()):
         frame = Frame(k % 65536, round(1e6 * k / RATE_HZ) % 2**32, tuple(row))
         records += path.feed(Chunk(encode_frame(frame), 1e9 + k / RATE_HZ, time.perf_counter_ns()))
@@ -132,7 +134,7 @@ def warming(predictor, film, part, seed):
         for k in range(6):
             pressed = charges(film, script_of([radius_mm * np.exp(2j * np.pi * rng.uniform())], 0.5, 14.0))
             for warm, changes in moved.items():
-                records = feel(predictor, pressed, part, 0.002, seed + k, warm=warm)
+                records = feel(predictor, pressed, part, 0.002, seed + k, {"common_mode": {}} if warm else None)
                 force = [np.mean([r.force_N for r in records[at - 100 : at]]) for at in (before, after)]
                 changes.append(round(100 * abs(float(force[1] / force[0]) - 1), 1))
                 flags += records[after].flags if warm else ()
@@ -141,6 +143,60 @@ def warming(predictor, film, part, seed):
             "force_moves_percent": moved[True],
             "without_the_stage_percent": moved[False],
         } | counts
+    return out
+
+
+KNOWN = {"no memory": None} | {
+    f"creep {creep:+.0%}, step {step:+.0%}": {
+        "memory": {"creep": 0.08 + 0.08 * creep, "thermoelastic": 0.06 + 0.06 * step}
+    }
+    for creep, step in ((0.0, 0.0), (0.2, 0.2), (-0.2, -0.2), (0.2, -0.2), (-0.2, 0.2))
+}
+"""What a device file says of a film that creeps by 8 % in a decade, with a thermoelastic step of 6 %."""
+
+
+def memory(predictor, film, level, seed):
+    """Presses of 60 s and, after a release, of 10 s: largest errors of the force; and a hand 2 K warmer for 10 s."""
+    part = replace(load_amplifier(level), creep=0.08, thermoelastic=0.06, film_time=2.5, limit=3000.0)
+    t, out = np.arange(round(118.0 * RATE_HZ)) / RATE_HZ, {}
+
+    def scene(place, *presses):
+        rise = sum(np.clip(np.minimum(t - a, b - t) / RAMP_S, 0.0, 1.0) for a, b in presses) + 0.0 * t
+        force = np.where(rise > 0, np.maximum(rise, 0.05), 0.0)
+        where = np.where(force > 0, place, np.nan)
+        return Script(where.real, where.imag, force, RATE_HZ)
+
+    def errors(script, records, begin, end):
+        at = range(round((begin + 0.12) * RATE_HZ), round((end - 0.12) * RATE_HZ), 20)
+        force = [np.mean([r.force_N or np.nan for r in records[k : k + 20]]) for k in at]
+        apart = [np.mean([complex(r.x_mm or np.nan, r.y_mm or np.nan) for r in records[k : k + 20]]) for k in at]
+        away = np.abs(np.array(apart) - (script.x_mm + 1j * script.y_mm)[at[0]])
+        return {
+            "force_percent": round(100 * float(np.max(np.abs(np.array(force) - 1))), 1),
+            "mm": round(float(away.max()), 2),
+        }
+
+    def false(script, records):
+        return sum(record.contact for record, touches in zip(records, script.touching, strict=True) if not touches)
+
+    held = scene(2.0 - 1.0j, (30.0, 90.0), (100.0, 110.0))
+    for name, sections in KNOWN.items():
+        records = feel(predictor, charges(film, held), part, 0.0, seed, sections)
+        first, second = errors(held, records, 30.0, 90.0), errors(held, records, 100.0, 110.0)
+        out[f"{level}, held, {name}"] = first, second, false(held, records)
+    warm = replace(part, step=2.0, step_at=30.0, step_for=10.0, pyro_mismatch=0.2)
+    for place in (0.5 + 0.3j, 4.0 - 2.0j):
+        for name, press in {
+            "no press": (),
+            "under it": (33.0, 38.0),
+            "it comes": (27.0, 37.0),
+            "it goes": (35.0, 47.0),
+        }.items():
+            script = scene(place, *[press] if press else [])
+            records = feel(predictor, charges(film, script), warm, 0.0, seed, KNOWN["creep +0%, step +0%"])
+            blind = sum("blind" in record.flags for record in records)
+            found = errors(script, records, *press) if press else {}
+            out[f"{level}, hand, {name}, {place} mm"] = found, false(script, records), f"blind {blind}"
     return out
 
 
@@ -170,12 +226,17 @@ def main():
     parser = options(__doc__)
     parser.add_argument("--presses", type=int, default=100)
     parser.add_argument("--warm", action="store_true")
+    parser.add_argument("--memory", action="store_true")
     parser.add_argument("--unplug", type=int, default=0)
     asked = parser.parse_args()
     predictor, part = Predictor(asked.model), load_amplifier("bench")
     corners = np.array(predictor.metadata.working_area_mm) @ [1.0, 1j]
     radius_mm = float(np.abs(0.5 * (corners + np.roll(corners, 1))).min())
     film = ForwardMap.build(sensor_from_dict(dict(predictor.metadata.sensor)), Circle(1.0), radius_mm)
+    if asked.memory:
+        results = [memory(predictor, film, level, asked.seed) for level in ("reference", "bench")]
+        print_results("memory", asked, results[0] | results[1])
+        return
     result = {
         "gains to 0.2 %": accuracy(predictor, film, part, asked.presses, 0.002, asked.seed),
         "gains off by 1 % rms": accuracy(predictor, film, part, asked.presses, 0.0, asked.seed),

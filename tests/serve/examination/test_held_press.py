@@ -33,20 +33,36 @@ def still(t):
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3, 20.0])
 @pytest.mark.parametrize(
-    ("law", "drift", "tau_s", "said"),
+    ("law", "drift", "sections", "said"),
     [
-        (still, 0.0, None, "keeps its charge for 13 s"),
-        (lambda t: np.exp(-t / 10.0), 0.0, 10.0, r"leaks: \[leak\] tau_s"),
-        (lambda t: np.exp(-t / 40.0), 0.0, 40.0, r"leaks: \[leak\] tau_s"),
-        (lambda t: t**-0.03, 0.0, None, "creeps by 6.[5-9] % in each decade .* set no"),  # 1 - 10^-0.03 is 6.7 %
-        (still, -8.0, LEARNS_S, r"the rest drifts, by -1.6 % .*keeps its charge .*\[leak\] tau_s = 100000"),
-        (lambda t: 1.0 + 0.1 * np.sin(t), 0.0, None, "by no law that is clear"),
+        (still, 0.0, {}, "keeps its charge for 13 s"),
+        (lambda t: np.exp(-t / 10.0), 0.0, {"leak": {"tau_s": 10.0}}, r"leaks: \[leak\] tau_s"),
+        (lambda t: np.exp(-t / 40.0), 0.0, {"leak": {"tau_s": 40.0}}, r"leaks: \[leak\] tau_s"),
+        (
+            lambda t: t**-0.03,
+            0.0,
+            {"memory": {"creep": 0.067}},
+            "creeps by 6.[5-9] % in each decade .* set no",
+        ),  # 1 - 10^-0.03 is 6.7 %
+        (
+            lambda t: 1.0 - 0.05 * np.log10(t) + 0.06 * np.exp(-t / 2.5),
+            0.0,
+            {"memory": {"creep": 0.05, "thermoelastic": 0.06}},
+            r"creeps by .* wait longer .* \[memory\] creep = .*, thermoelastic = ",
+        ),
+        (
+            still,
+            -8.0,
+            {"leak": {"tau_s": LEARNS_S}},
+            r"the rest drifts, by -1.6 % .*keeps its charge .*\[leak\] tau_s = 100000",
+        ),
+        (lambda t: 1.0 + 0.1 * np.sin(t), 0.0, {}, "by no law that is clear"),
     ],
 )
-def test_what_a_held_press_says(law, drift, tau_s, said, scale):
+def test_what_a_held_press_says(law, drift, sections, said, scale):
     held = held_press(board(law, drift, scale=scale), T_S)
     assert held.begin_s == pytest.approx(5.0, abs=0.2)
-    assert held.tau_s == (None if tau_s is None else pytest.approx(tau_s, rel=0.05))
+    assert held.sections == {name: pytest.approx(keys, rel=0.15) for name, keys in sections.items()}
     assert re.search(said, held.says)
 
 

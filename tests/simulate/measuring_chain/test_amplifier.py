@@ -79,6 +79,24 @@ def test_temperature_step_gives_its_pyroelectric_charge():
     np.testing.assert_allclose(readings, expected[:, None] * np.ones(3), atol=0.3)
 
 
+@pytest.mark.parametrize("blocks", [1, 41])
+def test_a_held_step_creeps_with_the_logarithm_of_time_and_cools(blocks):
+    part = Amplifier(noise=CLEAN, creep=0.08, thermoelastic=0.06, film_time=2.5)
+    readings, _ = measure(part, step(n=40_000), blocks=blocks)
+    t = np.arange(1, 39_800) / RATE
+    expected = 400.0 * (1.0 - 0.08 * np.log10(t) + 0.06 * np.exp(-t / 2.5))
+    np.testing.assert_allclose(readings[201:, 0], expected, rtol=1e-3)
+
+
+def test_a_hand_goes_again_and_electrodes_are_not_alike():
+    part = Amplifier(noise=CLEAN, step=2.0, step_at=2.0, step_time=0.005, step_for=10.0, pyro_mismatch=0.2)
+    readings, process = measure(part, np.zeros((5000, 4)))
+    warmest = 1.0 - np.exp(-10.0 / 2.67)
+    np.testing.assert_allclose(readings[2400], 2.0 * process.pyro * warmest, rtol=0.01)
+    np.testing.assert_allclose(readings[4999], 2.0 * process.pyro * warmest * np.exp(-13.0 / 2.67), rtol=0.05)
+    assert np.ptp(process.pyro) > 20.0
+
+
 def test_converter_clips_and_has_steps_of_16_bits():
     part = Amplifier(noise=CLEAN, limit=1500.0, bits=16)
     readings, _ = measure(part, np.linspace(-2000.0, 2000.0, 5000)[:, None])

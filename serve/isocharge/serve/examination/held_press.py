@@ -37,12 +37,12 @@ class HeldPress:
 
     Attributes:
         begin_s: When it began, s since the first frame.
-        tau_s: What to put into `[leak]`, s; None for no such section.
+        sections: What to put into a device file.
         says: A sentence.
     """
 
     begin_s: float
-    tau_s: float | None
+    sections: dict[str, dict[str, float]]
     says: str
 
 
@@ -75,33 +75,33 @@ def held_press(values: Array, t_s: Array) -> HeldPress | None:
     (slope, level), spread = np.polyfit(at_s[:first], along[:first], 1, cov=True)
     drifts = abs(slope) > DRIFT_SIGMAS * np.sqrt(spread[0, 0]) and abs(slope) * LEAST_HELD_S > STEADY * size[first]
     rest = level + slope * at_s if drifts else np.full(len(along), along[:first].mean())
-    says, tau_s = _words(at_s[held] - BLOCK_S * begin, (along - rest)[held])
+    says, sections = _words(at_s[held] - BLOCK_S * begin, (along - rest)[held])
     if drifts:
         remedy = f"[leak] tau_s = {LEARNS_S:g} in a device file lets the drift be learned at rest and taken off"
-        if tau_s is not None:
+        if "leak" in sections:
             remedy = "leave the board alone until the rest stands still, and measure again"
         says = f"the rest drifts, by {100.0 * slope / size[first]:.2g} % of the press in a second; {says}; {remedy}"
-        tau_s = tau_s or LEARNS_S
-    return HeldPress(BLOCK_S * begin, tau_s, says)
+        sections = {"leak": {"tau_s": LEARNS_S}} | sections
+    return HeldPress(BLOCK_S * begin, sections, says)
 
 
-def _words(held_s: Reals, size: Reals) -> tuple[str, float | None]:
-    """What a press does beside any drift, and the time constant of its leak, s."""
+def _words(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, float]]]:
+    """What a press does beside any drift, and what to put into a device file."""
     lost = 1.0 - float(size[-5:].mean() / size[:5].mean())
     if abs(lost) < STEADY:
-        return f"a held press keeps its charge for {held_s[-1]:.0f} s", None
+        return f"a held press keeps its charge for {held_s[-1]:.0f} s", {}
     law = law_of_fading(list(zip(held_s.tolist(), np.maximum(size, 1e-9).tolist(), strict=True)))
     if law.tau_s is not None:
         tau_s = float(f"{law.tau_s:.2g}")
-        return f"a held press leaks: [leak] tau_s = {tau_s:g} in a device file undoes it", tau_s
+        return f"a held press leaks: [leak] tau_s = {tau_s:g} in a device file undoes it", {"leak": {"tau_s": tau_s}}
     if law.creep is not None:
         return (
             f"a held press creeps by {100.0 * law.creep:.2g} % in each decade of time: the film does, so set no [leak] "
-            "for it, and wait longer before each reading",
-            None,
+            f"for it, and {law.remedy}",
+            {} if law.memory is None else {"memory": law.memory},
         )
     return (
         f"a held press changes by {-100.0 * lost:.2g} % in {held_s[-1]:.0f} s, by no law that is clear: hold one "
         "longer, with a weight",
-        None,
+        {},
     )

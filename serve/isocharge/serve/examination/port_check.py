@@ -212,8 +212,8 @@ def findings(
     unit = "pC" if device.gain is not None else unit_of(capture)
     used = _used(capture, device)
     held = held_press(*capture.values()) if capture.frames else None
-    if held is not None and held.tau_s is not None:
-        proposal.table.setdefault("leak", {"tau_s": held.tau_s})
+    for name, section in (held.sections if held is not None else {}).items():
+        proposal.table.setdefault(name, section)
     channels = tuple(_channels(capture, device, used, math.inf if held is None else held.begin_s))
     first = capture.frames[0] if capture.frames else Frame(None, None, ())
     counts, is_numbered = capture.parser.counts, first.seq is not None
@@ -320,8 +320,10 @@ def _missing(
             "the amplifier's time constants ([leak] tau_s in a device file), of its circuit: without them held presses "
             "fade. To measure them, listen for 20 s (--seconds 20), and from the third on hold a press with a weight"
         )
-    elif device.leak is None and held is not None and held.tau_s is not None:
-        yield f"[leak] tau_s = {held.tau_s:g} in a device file"
+    elif held is not None:
+        for name, section in held.sections.items():
+            if name not in device.table:
+                yield f"[{name}] {', '.join(f'{key} = {value:g}' for key, value in section.items())} in a device file"
 
 
 def _missing_in(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:

@@ -22,7 +22,7 @@
     [leak]
     tau_s = {A = 10.0, B = 10.2, C = 9.9}
 
-`[hum]`, `[tare]`, `[leak]`, `[touch]` and `[common_mode]` take the settings of their rules (see
+`[hum]`, `[tare]`, `[leak]`, `[memory]`, `[touch]` and `[common_mode]` take the settings of their rules (see
 `isocharge.serve.signal_chain`), `[track]` and `[follow]` those of `isocharge.serve.tracking`, and every stage
 `on = false`, which switches it off. Tare and touch are on without a section. An unknown key is an error.
 """
@@ -45,6 +45,7 @@ from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.signal_chain.contact import TouchRule
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve.signal_chain.memory import MemoryRule
 from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
@@ -111,6 +112,12 @@ class LeakSection(LeakRule, frozen=True, kw_only=True):
     tau_s: Positive | dict[str, Positive]
 
 
+class CommonMode(ThermalRule, frozen=True, kw_only=True):
+    """How warming is followed, and its charge on each electrode, pC/K, whose ratios and signs count; None for alike."""
+
+    pC_per_K: dict[str, Finite] | None = None
+
+
 class DeviceSections(Settings, frozen=True):
     """The content of a device file."""
 
@@ -122,8 +129,9 @@ class DeviceSections(Settings, frozen=True):
     hum: HumRule | None = None
     tare: TareRule | None = TareRule()
     leak: LeakSection | None = None
+    memory: MemoryRule | None = None
     touch: TouchRule | None = TouchRule()
-    common_mode: ThermalRule | None = None
+    common_mode: CommonMode | None = None
     track: TrackRule | None = None
     follow: FollowRule | None = None
 
@@ -170,9 +178,22 @@ class Device(DeviceSections, frozen=True):
             tare=self.tare,
             tau_s=None if leak is None else self._of_each("leak.tau_s", leak.tau_s, electrodes),
             leak=leak or LeakRule(),
+            memory=self.memory,
             touch=self.touch,
             thermal=self.common_mode,
+            pyro=self._pyro(electrodes),
         )
+
+    def _pyro(self, electrodes: tuple[str, ...]) -> Array | float:
+        """Charges of warming over their mean magnitude, shape (electrodes,), dimensionless."""
+        per_K = None if self.common_mode is None else self.common_mode.pC_per_K
+        charges = self._of_each("common_mode.pC_per_K", per_K, electrodes)
+        if charges is None:
+            return 1.0
+        size = float(np.abs(charges).mean())
+        if not size > 0.0:
+            raise DeviceError(f"{self.where}: common_mode.pC_per_K: expected a number other than 0, got {per_K}")
+        return charges / size
 
     def check_gain(self, electrodes: tuple[str, ...]) -> None:
         """Raise DeviceError if the gain is for other electrodes than these."""

@@ -249,6 +249,10 @@ class TouchStream:
         tracked, event = None, None
         if self._tracker is not None:
             tracked, event = self._tracker.update(contact, when.clock_s, flags)
+        if contact is not None and reading.doubt > 0.0 and reading.charge_pC is not None:
+            likely = self.predictor.predict(reading.charge_pC * (1.0 + reading.doubt))
+            shift = likely.x_mm - contact.x_mm, likely.y_mm - contact.y_mm, likely.force_N - contact.force_N
+            contact, tracked = contact.widened(shift), tracked and tracked.widened(shift)
         return PredictionRecord(
             timestamp=when.host_s,
             t_device_us=when.device_us,

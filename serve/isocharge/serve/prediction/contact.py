@@ -44,6 +44,15 @@ class Contact(NamedTuple):
     xF_correlation: float = math.nan
     yF_correlation: float = math.nan
 
+    def widened(self, shift: tuple[float, float, float]) -> "Contact":
+        """With an error more, a standard deviation of which moves x and y, mm, and force, N, by so much together."""
+        x_std, y_std, force_std = stds = [math.hypot(std, by) for std, by in zip(self[3:6], shift, strict=True)]
+        xy, xF, yF = (
+            (correlation * self[3 + i] * self[3 + j] + shift[i] * shift[j]) / (stds[i] * stds[j])
+            for correlation, (i, j) in zip(self[SEVEN:], ((0, 1), (0, 2), (1, 2)), strict=True)
+        )
+        return Contact(self.x_mm, self.y_mm, self.force_N, x_std, y_std, force_std, self.misfit, xy, xF, yF)
+
     def fields(self) -> dict[str, Any]:
         """As fields of a record: correlations that the model does not give are None."""
         fields = self._asdict()

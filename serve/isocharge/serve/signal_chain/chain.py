@@ -7,7 +7,8 @@ stage whose rule is None is switched off.
 2. saturation: a charge at the converter's limit, flagged until the press is over;
 3. hum: mains hum, followed and subtracted (`isocharge.serve.signal_chain.hum`);
 4. tare: mean and noise of quiet frames, subtracted from everything after (`isocharge.serve.signal_chain.tare`);
-5. leak: the amplifier's decay undone, its offset learned (`isocharge.serve.signal_chain.leak`);
+5. leak: the amplifier's decay undone, its offset learned (`isocharge.serve.signal_chain.leak`); with it, where the
+   film's memory is known, creep, the thermoelastic step and warmth (`isocharge.serve.signal_chain.memory`);
 6. touch: contact with hysteresis (`isocharge.serve.signal_chain.contact`);
 7. thermal: the common charge of a warming film, estimated with the model and subtracted
    (`isocharge.serve.signal_chain.thermal`).
@@ -25,6 +26,7 @@ from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THE
 from isocharge.serve.signal_chain.contact import Touch, TouchRule, update_contact
 from isocharge.serve.signal_chain.hum import Hum, HumRule, remove_hum
 from isocharge.serve.signal_chain.leak import Leak, LeakRule, undo_leak
+from isocharge.serve.signal_chain.memory import Memory, MemoryRule, begin_touch, doubt, undo_memory, warmer
 from isocharge.serve.signal_chain.tare import Tare, TareRule, look_for_tare
 from isocharge.serve.signal_chain.thermal import NO_DRIFT, Misfit, ThermalDrift, ThermalRule, track_thermal_drift
 
@@ -44,8 +46,11 @@ class Chain:
         tare: Which frames are quiet enough for a tare.
         tau_s: Time constant of each amplifier, shape (electrodes,), s; None where charges do not leak.
         leak: How the amplifiers' offset is learned.
+        memory: What a held press does to the film's charges.
         touch: When something touches; without it, every tared frame is in contact.
         thermal: How warming of the film is followed.
+        pyro: Charge of each electrode over the mean magnitude of all when the film warms, shape (electrodes,),
+            dimensionless; 1.0 where all are alike.
         largest: Largest value of a valid reading, in the device's unit.
     """
 
@@ -56,8 +61,10 @@ class Chain:
     tare: TareRule | None = field(default_factory=TareRule)
     tau_s: Array | None = None
     leak: LeakRule = field(default_factory=LeakRule)
+    memory: MemoryRule | None = None
     touch: TouchRule | None = field(default_factory=TouchRule)
     thermal: ThermalRule | None = None
+    pyro: Array | float = 1.0
     largest: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -81,6 +88,7 @@ class ChainState:
         patient: Whether the search for a tare never gives up.
         tare: None until enough quiet frames have come.
         leak: Charge and inflow; None before the tare.
+        memory: The film's memory, which has a leak of its own; None before the tare.
         touch: Contact and its thresholds.
         saturated: Whether a charge was at the limit in this press.
         drift: Warming in this press.
@@ -93,6 +101,7 @@ class ChainState:
     patient: bool = False
     tare: Tare | None = None
     leak: Leak | None = None
+    memory: Memory | None = None
     touch: Touch = field(default_factory=Touch)
     saturated: bool = False
     drift: ThermalDrift = NO_DRIFT
@@ -119,6 +128,7 @@ class Reading:
         tare: What was subtracted.
         contact: Whether something touches.
         flags: Words from `isocharge.serve.flags`: those that the frame had before the chain, and the chain's.
+        doubt: Relative standard deviation of all touch charges together, for what is not known of the film's memory.
     """
 
     raw_pC: Array
@@ -126,6 +136,7 @@ class Reading:
     tare: Tare | None
     contact: bool
     flags: tuple[str, ...] = ()
+    doubt: float = 0.0
 
 
 def advance(
@@ -165,21 +176,28 @@ def advance(
         untared = Reading(raw_pC, None, None, contact=False, flags=(*flags, TARE) + (SATURATED,) * limited)
         return _look_for_tare(chain, state, hum, quiet_pC), untared
     tare, output_pC = state.tare, quiet_pC - state.tare.charge_pC
-    leak, charge_pC = _charge(chain, state, tare, output_pC, dt_s)
-    touch = _touch(chain, state, charge_pC, tare, dt_s)
+    leak, memory, charge_pC = _charge(chain, state, tare, output_pC, dt_s)
+    unknown = 0.0 if memory is None else doubt(memory)
+    touch = _touch(chain, state, charge_pC, tare, dt_s, unknown)
+    if chain.memory is not None and memory is not None and touch.contact and not state.touch.contact:
+        memory = begin_touch(chain.memory, memory)
+        charge_pC, unknown = memory.leak.charge_pC, doubt(memory)
     saturated = limited or (state.saturated and touch.contact)
     drift = NO_DRIFT
     if chain.thermal is not None and touch.contact:
-        drift = _drift(chain.thermal, state.drift, charge_pC, misfit, dt_s, saturated=saturated)
+        drift = _drift(chain, state.drift, charge_pC, misfit, dt_s, saturated=saturated)
     if touch.contact and drift.charge_pC != state.drift.charge_pC:
-        change_pC = drift.charge_pC - state.drift.charge_pC
+        change_pC = (drift.charge_pC - state.drift.charge_pC) * chain.pyro
         charge_pC = charge_pC - change_pC
-        leak, tare = _without_common_charge(leak, tare, change_pC)
-    after = ChainState(state.waiting_pC, hum, state.frames, state.patient, tare, leak, touch, saturated, drift)
+        if memory is not None:
+            memory = warmer(memory, change_pC, drift.rate_pC_per_s * chain.pyro)
+        else:
+            leak, tare = _without_warmth(leak, tare, change_pC)
+    after = ChainState(state.waiting_pC, hum, state.frames, state.patient, tare, leak, memory, touch, saturated, drift)
     flags += (SATURATED,) * saturated + (NEGATIVE,) * touch.below
     if chain.thermal is not None and not saturated:
         flags += (THERMAL,) * (abs(drift.charge_pC) >= chain.thermal.tell_pC) + (BLIND,) * drift.blind
-    return after, Reading(raw_pC, charge_pC, tare, touch.contact, flags)
+    return after, Reading(raw_pC, charge_pC, tare, touch.contact, flags, unknown)
 
 
 def _invalid(chain: Chain, values: Array, flags: tuple[str, ...]) -> Reading:
@@ -197,37 +215,52 @@ def _look_for_tare(chain: Chain, state: ChainState, hum: Hum, quiet_pC: Array) -
     return ChainState(waiting if tare is None else waiting[:0], hum, frames, state.patient, tare)
 
 
-def _charge(chain: Chain, state: ChainState, tare: Tare, output_pC: Array, dt_s: float) -> tuple[Leak | None, Array]:
-    """Touch charges: the output above tare, its leak undone if there is one."""
+def _charge(
+    chain: Chain, state: ChainState, tare: Tare, output_pC: Array, dt_s: float
+) -> tuple[Leak | None, Memory | None, Array]:
+    """Touch charges: the output above tare, its leak and the film's memory undone if there are any."""
+    contact = state.touch.contact
+    if chain.memory is not None:
+        memory = state.memory
+        if memory is None:
+            memory = Memory.start(chain.memory, output_pC)
+        else:
+            rules = chain.memory, chain.leak, chain.tau_s
+            memory = undo_memory(*rules, memory, output_pC, tare.noise_pC, dt_s, contact=contact)
+        return None, memory, memory.leak.charge_pC
     if chain.tau_s is None:
-        return None, output_pC
+        return None, None, output_pC
     if state.leak is None:
         leak = Leak.start(output_pC)
     else:
-        contact = state.touch.contact
         leak = undo_leak(chain.leak, chain.tau_s, state.leak, output_pC, tare.noise_pC, dt_s, contact=contact)
-    return leak, leak.charge_pC
+    return leak, None, leak.charge_pC
 
 
-def _touch(chain: Chain, state: ChainState, charge_pC: Array, tare: Tare, dt_s: float) -> Touch:
+def _touch(chain: Chain, state: ChainState, charge_pC: Array, tare: Tare, dt_s: float, unknown: float) -> Touch:
     if chain.touch is None:
         return Touch(contact=True)
-    decay = 1.0 if chain.tau_s is None else math.exp(-dt_s / chain.leak.relax_s)
-    return update_contact(chain.touch, state.touch, float(charge_pC.sum()), tare.noise_pC, decay)
+    relax_s = math.inf if chain.tau_s is None else chain.leak.relax_s
+    if chain.memory is not None:
+        leaves = state.memory is not None and state.memory.lingers and state.touch.base_pC > 0.0
+        relax_s = math.inf if leaves else 0.5 * chain.memory.settle_s
+    decay = math.exp(-dt_s / relax_s)
+    return update_contact(chain.touch, state.touch, float(charge_pC.sum()), tare.noise_pC, decay, unknown)
 
 
 def _drift(
-    rule: ThermalRule, drift: ThermalDrift, charge_pC: Array, misfit: Misfit | None, dt_s: float, *, saturated: bool
+    chain: Chain, drift: ThermalDrift, charge_pC: Array, misfit: Misfit | None, dt_s: float, *, saturated: bool
 ) -> ThermalDrift:
     if misfit is None:
         raise ValueError("the thermal stage needs the misfit of a model, got None")
     if saturated:  # a clipped charge fits no contact, whatever the temperature
         return drift
-    return track_thermal_drift(rule, drift, charge_pC, misfit, dt_s)
+    assert chain.thermal is not None
+    return track_thermal_drift(chain.thermal, drift, charge_pC, misfit, dt_s, chain.pyro)
 
 
-def _without_common_charge(leak: Leak | None, tare: Tare, change_pC: float) -> tuple[Leak | None, Tare]:
-    """Lower every charge from here on by the same amount: in the leak's charge if there is a leak, else in the tare."""
+def _without_warmth(leak: Leak | None, tare: Tare, change_pC: Array | float) -> tuple[Leak | None, Tare]:
+    """Lower the charges from here on: in the leak's charge if there is a leak, else in the tare."""
     if leak is not None:
         return leak._replace(charge_pC=leak.charge_pC - change_pC), tare
     return None, replace(tare, charge_pC=tare.charge_pC + change_pC)

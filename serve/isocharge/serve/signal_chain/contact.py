@@ -49,7 +49,13 @@ class Touch:
     below: bool = False
 
 
-def update_contact(rule: TouchRule, touch: Touch, total_pC: float, noise_pC: Array, decay: float = 1.0) -> Touch:
+UNKNOWN_SIGMAS = 2.0
+"""Deviations of what is not known of the film's memory by which a press is released earlier."""
+
+
+def update_contact(
+    rule: TouchRule, touch: Touch, total_pC: float, noise_pC: Array, decay: float = 1.0, unknown: float = 0.0
+) -> Touch:
     """Contact with hysteresis.
 
     Args:
@@ -58,11 +64,13 @@ def update_contact(rule: TouchRule, touch: Touch, total_pC: float, noise_pC: Arr
         total_pC: Total touch charge of this frame, pC; a press makes it positive.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
         decay: Factor of the base from frame to frame; below 1 where the charge itself relaxes to zero.
+        unknown: Relative standard deviation of this charge, for what the film remembers.
     """
     threshold = rule.floor_pC + rule.sigmas * math.sqrt(float(np.dot(noise_pC, noise_pC)))
     if touch.contact:
         peak = max(touch.peak_pC, min(total_pC, touch.last_pC))
-        released = total_pC < max(rule.release_share * peak, 0.5 * threshold)
+        rest_pC = rule.release_share * peak + UNKNOWN_SIGMAS * unknown * total_pC
+        released = total_pC < max(rest_pC, 0.5 * threshold)
         return Touch(last_pC=total_pC, base_pC=total_pC) if released else Touch(True, peak, total_pC)
     base_pC = decay * touch.base_pC
     if total_pC > base_pC + threshold:

@@ -98,10 +98,10 @@ def undo_leak(
     charge_pC = charge_pC * math.exp(-dt_s / rule.relax_s)
     if leak.hold_s > 0.0 or not rule.learn:
         return leak._replace(charge_pC=charge_pC, output_pC=output_pC, hold_s=leak.hold_s - dt_s)
-    return _learn(rule, leak, surplus_pC, noise_pC, dt_s)._replace(charge_pC=charge_pC, output_pC=output_pC)
+    return learn_inflow(rule, leak, surplus_pC, noise_pC, dt_s)._replace(charge_pC=charge_pC, output_pC=output_pC)
 
 
-def _learn(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array, dt_s: float) -> Leak:
+def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array, dt_s: float) -> Leak:
     """Correct the inflow by the clipped surplus; every `look_back_s` the candidate becomes the trusted inflow."""
     limit_pC = np.maximum(rule.clip_pC, rule.clip_sigmas * math.sqrt(2.0) * noise_pC)
     clipped_pC = np.minimum(np.maximum(surplus_pC, -limit_pC), limit_pC)

@@ -1,10 +1,10 @@
 """Warming of the film during a press, separated from force by the model where that is possible.
 
-A change of temperature gives every electrode the same charge (pyroelectricity), and during a touch the charge at rest
-cannot be measured. A contact has three unknowns, so four electrodes leave one charge over: the common charge p is
-estimated as the one without which the charges fit a single contact best. The squared misfit is a parabola in p, and its
-curvature gives the variance of that estimate. A Kalman filter follows p as a random walk from 0 at the start of every
-touch.
+A change of temperature gives every electrode a charge (pyroelectricity), the same one or in ratios that are known, and
+during a touch the charge at rest cannot be measured. A contact has three unknowns, so four electrodes leave one charge
+over: the common charge p is estimated as the one without which the charges fit a single contact best. The squared
+misfit is a parabola in p, and its curvature gives the variance of that estimate. A Kalman filter follows p as a random
+walk from 0 at the start of every touch.
 
 Where a press raises all charges alike, warming looks like force and the curvature vanishes: everywhere with three
 electrodes, and near the centre of a biaxial film. There p stays as it is, and the record is flagged `blind`.
@@ -56,19 +56,21 @@ class ThermalDrift:
         variance_pC2: Its variance, pC^2.
         waited_s: Time since the last estimate, s.
         blind: Whether temperature was inseparable from force at the last estimate.
+        rate_pC_per_s: By how much p's slope, if it is predicted, has to change with this estimate, pC/s.
     """
 
     charge_pC: float = 0.0
     variance_pC2: float = 0.0
     waited_s: float = 0.0
     blind: bool = False
+    rate_pC_per_s: float = 0.0
 
 
 NO_DRIFT = ThermalDrift()
 
 
 def track_thermal_drift(
-    rule: ThermalRule, state: ThermalDrift, charge_pC: Array, misfit: Misfit, dt_s: float
+    rule: ThermalRule, state: ThermalDrift, charge_pC: Array, misfit: Misfit, dt_s: float, ratios: Array | float = 1.0
 ) -> ThermalDrift:
     """The warming after the next frame in contact.
 
@@ -78,16 +80,18 @@ def track_thermal_drift(
         charge_pC: Touch charges without the warming so far, shape (electrodes,), pC.
         misfit: Of the model.
         dt_s: Since the frame before, s.
+        ratios: Charge of each electrode over p, shape (electrodes,), dimensionless.
     """
     waited_s = state.waited_s + dt_s
     if waited_s < rule.every_s:
         return ThermalDrift(state.charge_pC, state.variance_pC2, waited_s, state.blind)
     predicted_pC2 = state.variance_pC2 + rule.wander_pC**2 * waited_s
-    tried_pC = charge_pC - TRIED_PC[:, np.newaxis]
+    tried_pC = charge_pC - TRIED_PC[:, np.newaxis] * ratios
     _, slope, curvature = (_PARABOLA_FIT @ np.square(misfit(tried_pC), dtype=float)).tolist()
     estimate_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
     if estimate_pC2 > rule.blind_pC**2:
         return ThermalDrift(state.charge_pC, state.variance_pC2, 0.0, blind=True)
     change_pC = min(max(-slope / (2.0 * curvature), float(TRIED_PC[0])), float(TRIED_PC[-1]))
     gain = predicted_pC2 / (predicted_pC2 + estimate_pC2)
-    return ThermalDrift(state.charge_pC + gain * change_pC, (1.0 - gain) * predicted_pC2)
+    rate = gain * gain / (2.0 - gain) * change_pC / waited_s  # of an alpha-beta filter (Kalata 1984)
+    return ThermalDrift(state.charge_pC + gain * change_pC, (1.0 - gain) * predicted_pC2, rate_pC_per_s=rate)

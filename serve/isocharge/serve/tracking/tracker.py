@@ -67,6 +67,11 @@ class Tracked(NamedTuple):
     vy_mm_s: float
     moving: float
 
+    def widened(self, shift: tuple[float, float, float]) -> "Tracked":
+        """With an error more, which moves x and y, mm, and force, N, by so much, and is the same in every frame."""
+        stds = (math.hypot(std, by) for std, by in zip(self[3:6], shift, strict=True))
+        return self._replace(**dict(zip(self._fields[3:6], stds, strict=True)))
+
 
 class Tracker:
     """Follows one contact at a time; belongs to one thread. The same frames give the same answers, bit for bit."""

@@ -4,10 +4,15 @@ A charge amplifier is a leaky integrator, tau = R C: a step of charge decays by 
 
     v[n] = exp(-dt / tau) v[n-1] + g (q[n] - q[n-1]) + b dt,
 
-with q the film's charge (touch, and pyroelectricity, common to all electrodes), g the gain and b the bias current; then
-come offset, hum, white noise, clipping and the converter's steps. The sizes in the levels that the film does not give -
-hum, offset, bias, mismatch - are engineering choices for a tidy and a bad electric neighbourhood, not measurements.
-The memoryless part is `measuring_chain.noise`, and the levels `clean` and `reference` are nothing else.
+with q the film's charge (touch, and pyroelectricity), g the gain and b the bias current; then come offset, hum, white
+noise, clipping and the converter's steps. A film that creeps answers a step of touch charge with that step times
+
+    h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / film_time):
+
+the logarithm from some milliseconds to days (Boltzmann's superposition, a Prony series with two terms in each decade),
+and what is stretched cools, until the film has its temperature again. The sizes in the levels that the film does not
+give - hum, offset, bias, mismatch - are engineering choices for a tidy and a bad electric neighbourhood, not
+measurements. The memoryless part is `measuring_chain.noise`, and the levels `clean` and `reference` are nothing else.
 """
 
 import math
@@ -32,6 +37,10 @@ Density times specific heat times thickness over twice the heat transfer: 1.78 g
 free convection and radiation."""
 
 
+CREEP_TIMES = 10.0 ** np.arange(-3.0, 6.1, 0.5)
+"""Time constants of creep, s; the ripple of their sum about the logarithm is below 1e-5 of a decade."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Amplifier:
     """A measuring chain of any number of channels.
@@ -45,10 +54,14 @@ class Amplifier:
         offset: Standard deviation of a channel's constant output, pC.
         bias: Current that every channel integrates, pC/s; its sign differs.
         pyro: Charge of warming, pC/K, on every electrode; negative for PVDF with d31 > 0.
+        pyro_mismatch: Standard deviation of that charge on a channel, relative.
+        creep: Share of a charge that is lost in each decade of time.
+        thermoelastic: Share that a touch has more at first.
         temperature_rms: Root mean square of the film's temperature drift, K.
         temperature_time: Time constant of the air's drift, s: a calm room wanders over minutes.
         step: Temperature step of the air, K.
-        step_at, step_time: Start and duration of the temperature step, s.
+        step_at, step_time: Start of the temperature step, and time that it takes, s.
+        step_for: Time from its start after which the temperature goes back, s.
         film_time: Time constant with which the film follows the air, s.
         limit: Largest charge that can be read, pC; infinite for any.
         bits: Resolution of the converter between both limits; 0 for no converter.
@@ -63,11 +76,15 @@ class Amplifier:
     offset: float = 0.0
     bias: float = 0.0
     pyro: float = PVDF_PYRO
+    pyro_mismatch: float = 0.0
+    creep: float = 0.0
+    thermoelastic: float = 0.0
     temperature_rms: float = 0.0
     temperature_time: float = 120.0
     step: float = 0.0
     step_at: float = 10.0
     step_time: float = 1.0
+    step_for: float = math.inf
     film_time: float = FILM_TIME
     limit: float = math.inf
     bits: int = 0
@@ -92,7 +109,8 @@ class Amplifier:
         bias = self.bias * rng.choice([-1.0, 1.0], electrodes)
         offset = self.offset * rng.standard_normal(electrodes)
         phase = rng.uniform(0.0, 2.0 * np.pi, electrodes)
-        return Measurement(self, rate, rng, tau, gain, bias, offset, phase)
+        spread = self.pyro_mismatch * rng.standard_normal(electrodes) if self.pyro_mismatch else np.zeros(electrodes)
+        return Measurement(self, rate, rng, tau, gain, bias, offset, phase, self.pyro * (1.0 + spread))
 
 
 @dataclass
@@ -101,7 +119,7 @@ class Measurement:
 
     Attributes:
         amplifier, rate, rng: As given to `Amplifier.start`.
-        tau, gain, bias, offset, phase: Values drawn for each channel, shape (electrodes,).
+        tau, gain, bias, offset, phase, pyro: Values drawn for each channel, shape (electrodes,).
     """
 
     amplifier: Amplifier
@@ -112,16 +130,21 @@ class Measurement:
     bias: Array
     offset: Array
     phase: Array
+    pyro: Array
     _readings: int = 0
     _charge: Array = field(init=False)
     _output: Array = field(init=False)
     _warmth: tuple[float, float] = field(init=False)
+    _memory: Array = field(init=False)
+    _touch: Array = field(init=False)
 
     def __post_init__(self) -> None:
         first, second = self.amplifier.temperature_rms * self.rng.standard_normal(2)
         share = self._share_of_air
         self._warmth = first / math.sqrt(share), math.sqrt(share) * first + math.sqrt(1.0 - share) * second
-        self._charge = np.full_like(self.gain, self.amplifier.pyro * self._warmth[1])
+        self._charge = self.pyro * self._warmth[1]
+        self._touch = np.zeros_like(self.gain)
+        self._memory = np.zeros((CREEP_TIMES.size + 1, 1, self.gain.size))
         self._output = np.zeros_like(self.gain)
         if math.isfinite(self.amplifier.tau):
             self._output = self.bias / (1.0 - np.exp(-1.0 / (self.rate * self.tau))) / self.rate
@@ -130,11 +153,26 @@ class Measurement:
         """Readings of the next touch charges, both of shape (n, electrodes), pC."""
         time = (self._readings + np.arange(len(charge))) / self.rate
         self._readings += len(charge)
-        film = charge + (self.amplifier.pyro * self._temperature(time))[:, np.newaxis]
+        film = self._remembered(charge) + self.pyro * self._temperature(time)[:, np.newaxis]
         output = self._integrate(film) + self.offset
         turn = 2.0 * np.pi * self.amplifier.hum_frequency * time[:, np.newaxis] + self.phase
         noisy = self.amplifier.noise.add(output + self.amplifier.hum * np.sin(turn), self.rng)
         return self._convert(noisy)
+
+    def _remembered(self, charge: Array) -> Array:
+        """What creep and the thermoelastic step make of touch charges, shape (n, electrodes), pC."""
+        part = self.amplifier
+        if not part.creep and not part.thermoelastic:
+            return charge
+        steps = np.diff(charge, axis=0, prepend=self._touch[np.newaxis])
+        self._touch = charge[-1]
+        film: Array = (1.0 - 0.5 * part.creep * np.exp(-1.0 / CREEP_TIMES).sum()) * charge
+        shares = np.append(np.full(CREEP_TIMES.size, 0.5 * part.creep), part.thermoelastic)
+        for k, (lag, share) in enumerate(zip(np.append(CREEP_TIMES, part.film_time), shares, strict=True)):
+            keep = math.exp(-1.0 / (self.rate * lag))
+            term, self._memory[k] = lfilter([share], [1.0, -keep], steps, axis=0, zi=self._memory[k])
+            film = film + term
+        return film
 
     @property
     def _share_of_air(self) -> float:
@@ -148,7 +186,9 @@ class Measurement:
         kick = math.sqrt((1.0 - of_air * of_air) / self._share_of_air) * part.temperature_rms
         kicks = kick * self.rng.standard_normal(time.size)
         drift = lfilter([1.0], [1.0, -of_air], kicks, zi=[of_air * self._warmth[0]])[0]
-        air = drift + part.step * np.clip((time - part.step_at) / part.step_time, 0.0, 1.0)
+        since = time - part.step_at
+        rise = np.clip(np.minimum(since, part.step_for - since) / part.step_time, 0.0, 1.0)
+        air = drift + part.step * rise
         film: Array = lfilter([1.0 - of_film], [1.0, -of_film], air, zi=[of_film * self._warmth[1]])[0]
         self._warmth = float(drift[-1]), float(film[-1])
         return film

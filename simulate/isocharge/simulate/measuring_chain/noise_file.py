@@ -54,6 +54,7 @@ KEYS = {
     "step": "temperature_step_K",
     "step_at": "temperature_step_at_s",
     "step_time": "temperature_step_time_s",
+    "step_for": "temperature_step_for_s",
     "film_time": "film_time_s",
     "limit": "limit_pC",
 }
@@ -74,11 +75,15 @@ class AmplifierFile(Settings, frozen=True, rename=KEYS):
     offset: NotNegative | None = None
     bias: NotNegative | None = None
     pyro: Finite | None = None
+    pyro_mismatch: NotNegative | None = None
+    creep: Annotated[float, Meta(ge=0.0, lt=0.2)] | None = None
+    thermoelastic: NotNegative | None = None
     temperature_rms: NotNegative | None = None
     temperature_time: Positive | None = None
     step: Finite | None = None
     step_at: Finite | None = None
     step_time: Positive | None = None
+    step_for: PositiveOrInfinite | None = None
     film_time: Positive | None = None
     limit: PositiveOrInfinite | None = None
     bits: Annotated[int, Meta(ge=0, le=32)] | None = None

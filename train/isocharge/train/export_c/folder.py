@@ -29,13 +29,20 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     """The text of `isocharge_device.h`.
 
     Raises:
-        DeviceError: If the device file is for other electrodes, or has a tare that is too long for a state in C.
+        DeviceError: If the device file is for other electrodes, has a tare that is too long for a state in C, or what a
+            chain in C cannot do.
     """
     chain = device.chain(electrodes)
     if chain.tare is not None and not 1 <= chain.tare.frames <= MOST_TARE_FRAMES:
         raise DeviceError(
             f"{device.where}: tare.frames: expected a whole number from 1 to {MOST_TARE_FRAMES} for a signal chain in "
             f"C, which holds them all, got {chain.tare.frames}"
+        )
+    pyro = isinstance(chain.pyro, np.ndarray)
+    if chain.memory is not None or pyro:
+        raise DeviceError(
+            f"{device.where}: {'common_mode.pC_per_K' if pyro else 'memory'}: a signal chain in C does not know it; "
+            "remove it from the device file, or run `isocharge serve stream` on a host"
         )
     numbers = {
         "ZERO": c_doubles(np.zeros(len(electrodes)) if chain.zero is None else chain.zero),
@@ -50,6 +57,7 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     rules = {"HUM": chain.hum, "TARE": chain.tare, "LEAK": leak, "TOUCH": chain.touch, "THERMAL": chain.thermal}
     for prefix, rule in rules.items():
         settings: dict[str, Any] = {} if rule is None else asdict(rule)
+        settings.pop("pC_per_K", None)
         numbers[SWITCHES[prefix]] = str(int(settings.pop("on", False)))
         if rule is leak and leak is not None:
             settings = {"tau_s": None} | settings | {"tau_s": chain.tau_s}  # first, and one for each electrode
