@@ -181,7 +181,7 @@ def memory(predictor, film, level, seed):
 
     held = scene(2.0 - 1.0j, (30.0, 90.0), (100.0, 110.0))
     for name, sections in KNOWN.items():
-        records = feel(predictor, charges(film, held), part, 0.0, seed, sections)
+        records = feel(predictor, charges(film, held), part, 0.002, seed, sections)
         first, second = errors(held, records, 30.0, 90.0), errors(held, records, 100.0, 110.0)
         out[f"{level}, held, {name}"] = first, second, false(held, records)
     warm = replace(part, step=2.0, step_at=30.0, step_for=10.0, pyro_mismatch=0.2)
@@ -193,7 +193,7 @@ def memory(predictor, film, level, seed):
             "it goes": (35.0, 47.0),
         }.items():
             script = scene(place, *[press] if press else [])
-            records = feel(predictor, charges(film, script), warm, 0.0, seed, KNOWN["creep +0%, step +0%"])
+            records = feel(predictor, charges(film, script), warm, 0.002, seed, KNOWN["creep +0%, step +0%"])
             blind = sum("blind" in record.flags for record in records)
             found = errors(script, records, *press) if press else {}
             out[f"{level}, hand, {name}, {place} mm"] = found, false(script, records), f"blind {blind}"

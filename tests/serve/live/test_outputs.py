@@ -9,6 +9,7 @@ import pytest
 
 from isocharge.common.errors import InputError
 from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
+from isocharge.serve.tracking.tracker import Tracked
 
 ELECTRODES = ("A", "B")
 
@@ -40,6 +41,16 @@ def test_csv_has_no_quotes_in_an_ordinary_row(record):
     assert csv_line(record(charge_pC={"A": 1.0, "B": 2.0}), ELECTRODES) == (
         "1763600000.123457,,,1.234568,,,,,,,,,,true,1.000000,2.000000,,,,,gap,,linear/1,linear-film"
     )
+
+
+def test_contacts_that_are_followed_are_the_last_columns(record):
+    followed = record(follows=True, event="tap", tracked=dict(zip(Tracked._fields, map(float, range(9)), strict=True)))
+    header = csv_header(ELECTRODES, follows=True)
+    (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_line(followed, ELECTRODES) + "\n"))
+    assert header.removeprefix(csv_header(ELECTRODES)).startswith(",tracked.x_mm,tracked.y_mm,")
+    assert (row["tracked.vy_mm_s"], row["tracked.moving"], row["event"]) == ("7.000000", "8.000000", "tap")
+    (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_line(record(follows=True), ELECTRODES) + "\n"))
+    assert (row["tracked.x_mm"], row["event"]) == ("", "")
 
 
 def test_datagrams_to_nobody_are_dropped():

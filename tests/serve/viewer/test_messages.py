@@ -110,6 +110,13 @@ def test_what_no_float32_holds_is_clipped(record):
     assert sample["misfit"] == np.finfo(np.float32).max
 
 
+def test_a_contact_that_is_followed_is_shown_in_place_of_the_frames(record):
+    followed = record(x_mm=1.0, misfit=0.5, xy_correlation=0.25, follows=True, tracked={"x_mm": 2.0, "x_std_mm": 0.01})
+    sample = np.frombuffer(FORM.pack(followed), FORM.dtype)[0]
+    assert (sample["x_mm"], sample["misfit"], sample["xy_correlation"]) == (2.0, 0.5, 0.25)
+    assert sample["x_std_mm"] == np.float32(0.01)
+
+
 def test_electrodes_are_drawn_where_they_lie(film):
     """Squares of a released model; a polygon and its trace, turned by a right angle and shifted."""
     described = describe_film("left", load_model(find_model("three-25um-biaxial")).metadata, None)

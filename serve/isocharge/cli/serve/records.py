@@ -90,12 +90,18 @@ def write_records(records: Iterable[tuple[PredictionRecord, str]], write: Lines,
 
 
 def record_writer(
-    stack: ExitStack, output: Output, udp: str | None, electrodes: tuple[str, ...], put: Callable[[str], object]
+    stack: ExitStack,
+    output: Output,
+    udp: str | None,
+    electrodes: tuple[str, ...],
+    put: Callable[[str], object],
+    *,
+    follows: bool,
 ) -> Lines:
     """The function that gives each record to `put` as a line, and sends it to the network."""
     sink = stack.enter_context(closing(UdpSink(udp))) if udp else None
     if output is Output.csv:
-        put(csv_header(electrodes) + "\n")
+        put(csv_header(electrodes, follows=follows) + "\n")
 
     def write(record: PredictionRecord, line: str) -> None:
         if sink:

@@ -20,28 +20,36 @@ from types import TracebackType
 from typing import Any, Self
 
 from isocharge.common.errors import InputError
-from isocharge.serve.prediction.record import FIELDS, PredictionRecord
+from isocharge.serve.prediction.record import FIELDS, OF_TRACKING, PredictionRecord
+from isocharge.serve.tracking.tracker import Tracked
 
 BY_ELECTRODE = ("charge_pC", "charge_raw_pC", "tare_pC")
 """Fields of a record that have a value for each electrode."""
 
 
-def csv_header(electrodes: tuple[str, ...]) -> str:
-    """The columns of `csv_line`: charges have one for each electrode, `charge_pC.A`."""
-    return _row(column for name in FIELDS for column in _columns(name, electrodes))
+def csv_header(electrodes: tuple[str, ...], *, follows: bool = False) -> str:
+    """The columns of `csv_line`: `charge_pC.A` and so on; with `follows` also those of contacts that are followed."""
+    parts = _parts(electrodes)
+    return _row(
+        column
+        for name in FIELDS + OF_TRACKING * follows
+        for column in ([f"{name}.{part}" for part in parts[name]] if name in parts else [name])
+    )
 
 
-def _columns(name: str, electrodes: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(f"{name}.{electrode}" for electrode in electrodes) if name in BY_ELECTRODE else (name,)
+def _parts(electrodes: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """Fields of a record that have several columns, with the names of their parts."""
+    return dict.fromkeys(BY_ELECTRODE, electrodes) | {"tracked": Tracked._fields}
 
 
 def csv_line(record: PredictionRecord, electrodes: tuple[str, ...]) -> str:
     """A record as a row, numbers to six decimals, flags with blanks between; what is not known is empty."""
     cells: list[str] = []
-    for name in FIELDS:
+    parts = _parts(electrodes)
+    for name in FIELDS + OF_TRACKING * record.follows:
         value = getattr(record, name)
-        if name in BY_ELECTRODE:
-            cells += [_cell(None if value is None else value[electrode]) for electrode in electrodes]
+        if name in parts:
+            cells += [_cell(None if value is None else value[part]) for part in parts[name]]
         else:
             cells.append(_cell(value))
     return _row(cells)

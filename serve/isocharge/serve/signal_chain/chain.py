@@ -190,7 +190,8 @@ def advance(
         change_pC = (drift.charge_pC - state.drift.charge_pC) * chain.pyro
         charge_pC = charge_pC - change_pC
         if memory is not None:
-            memory = warmer(memory, change_pC, drift.rate_pC_per_s * chain.pyro)
+            told = chain.thermal is not None and abs(drift.charge_pC) >= chain.thermal.tell_pC
+            memory = warmer(memory, change_pC, drift.rate_pC_per_s * chain.pyro, learns=not told)
         else:
             leak, tare = _without_warmth(leak, tare, change_pC)
     after = ChainState(state.waiting_pC, hum, state.frames, state.patient, tare, leak, memory, touch, saturated, drift)
@@ -256,7 +257,8 @@ def _drift(
     if saturated:  # a clipped charge fits no contact, whatever the temperature
         return drift
     assert chain.thermal is not None
-    return track_thermal_drift(chain.thermal, drift, charge_pC, misfit, dt_s, chain.pyro)
+    warmth_s = None if chain.memory is None else chain.memory.warmth_s
+    return track_thermal_drift(chain.thermal, drift, charge_pC, misfit, dt_s, chain.pyro, warmth_s)
 
 
 def _without_warmth(leak: Leak | None, tare: Tare, change_pC: Array | float) -> tuple[Leak | None, Tare]:

@@ -288,8 +288,11 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
     )
 
 
-def warmer(memory: Memory, change_pC: Array | float, rate_pC_per_s: Array | float) -> Memory:
-    """The state if so much more of the touch charge, shape (electrodes,), pC, and of its slope, pC/s, is warmth."""
+def warmer(memory: Memory, change_pC: Array | float, rate_pC_per_s: Array | float, *, learns: bool = True) -> Memory:
+    """The state if so much more of the touch charge, shape (electrodes,), pC, and of its slope, pC/s, is warmth.
+
+    With `learns` false, nothing is learned of the film after this touch: its warmth is not known well enough.
+    """
     film, charge_pC, warmth = memory.film, memory.leak.charge_pC - change_pC, memory.warmth
     return memory._replace(
         leak=memory.leak._replace(charge_pC=charge_pC),
@@ -298,6 +301,7 @@ def warmer(memory: Memory, change_pC: Array | float, rate_pC_per_s: Array | floa
         warmth=Warmth(
             warmth.charge_pC + film.at_once * change_pC, warmth.slope_pC_per_s + film.at_once * rate_pC_per_s
         ),
+        unseen_s=memory.unseen_s if learns else math.inf,
     )
 
 

@@ -4,7 +4,7 @@ A change of temperature gives every electrode a charge (pyroelectricity), the sa
 during a touch the charge at rest cannot be measured. A contact has three unknowns, so four electrodes leave one charge
 over: the common charge p is estimated as the one without which the charges fit a single contact best. The squared
 misfit is a parabola in p, and its curvature gives the variance of that estimate. A Kalman filter follows p as a random
-walk from 0 at the start of every touch.
+walk from 0 at the start of every touch; where the film's memory predicts its warmth, the walk is that of p's slope.
 
 Where a press raises all charges alike, warming looks like force and the curvature vanishes: everywhere with three
 electrodes, and near the centre of a biaxial film. There p stays as it is, and the record is flagged `blind`.
@@ -12,7 +12,7 @@ electrodes, and near the centre of a biaxial film. There p stays as it is, and t
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,6 +57,7 @@ class ThermalDrift:
         waited_s: Time since the last estimate, s.
         blind: Whether temperature was inseparable from force at the last estimate.
         rate_pC_per_s: By how much p's slope, if it is predicted, has to change with this estimate, pC/s.
+        covariance, rate_variance: Of p and its slope, pC^2/s, and of the slope, pC^2/s^2.
     """
 
     charge_pC: float = 0.0
@@ -64,13 +65,21 @@ class ThermalDrift:
     waited_s: float = 0.0
     blind: bool = False
     rate_pC_per_s: float = 0.0
+    covariance: float = 0.0
+    rate_variance: float = 0.0
 
 
 NO_DRIFT = ThermalDrift()
 
 
 def track_thermal_drift(
-    rule: ThermalRule, state: ThermalDrift, charge_pC: Array, misfit: Misfit, dt_s: float, ratios: Array | float = 1.0
+    rule: ThermalRule,
+    state: ThermalDrift,
+    charge_pC: Array,
+    misfit: Misfit,
+    dt_s: float,
+    ratios: Array | float = 1.0,
+    warmth_s: float | None = None,
 ) -> ThermalDrift:
     """The warming after the next frame in contact.
 
@@ -81,17 +90,37 @@ def track_thermal_drift(
         misfit: Of the model.
         dt_s: Since the frame before, s.
         ratios: Charge of each electrode over p, shape (electrodes,), dimensionless.
+        warmth_s: Time in which the slope of p decays, s, if it is predicted.
     """
     waited_s = state.waited_s + dt_s
     if waited_s < rule.every_s:
-        return ThermalDrift(state.charge_pC, state.variance_pC2, waited_s, state.blind)
-    predicted_pC2 = state.variance_pC2 + rule.wander_pC**2 * waited_s
+        return replace(state, waited_s=waited_s, rate_pC_per_s=0.0)
+    predicted_pC2, covariance, rate_variance = _predicted(rule, state, waited_s, warmth_s)
     tried_pC = charge_pC - TRIED_PC[:, np.newaxis] * ratios
     _, slope, curvature = (_PARABOLA_FIT @ np.square(misfit(tried_pC), dtype=float)).tolist()
     estimate_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
     if estimate_pC2 > rule.blind_pC**2:
-        return ThermalDrift(state.charge_pC, state.variance_pC2, 0.0, blind=True)
+        return replace(state, waited_s=0.0, blind=True, rate_pC_per_s=0.0)
     change_pC = min(max(-slope / (2.0 * curvature), float(TRIED_PC[0])), float(TRIED_PC[-1]))
     gain = predicted_pC2 / (predicted_pC2 + estimate_pC2)
-    rate = gain * gain / (2.0 - gain) * change_pC / waited_s  # of an alpha-beta filter (Kalata 1984)
-    return ThermalDrift(state.charge_pC + gain * change_pC, (1.0 - gain) * predicted_pC2, rate_pC_per_s=rate)
+    turn = covariance / (predicted_pC2 + estimate_pC2)
+    return ThermalDrift(
+        state.charge_pC + gain * change_pC,
+        (1.0 - gain) * predicted_pC2,
+        rate_pC_per_s=turn * change_pC,
+        covariance=(1.0 - gain) * covariance,
+        rate_variance=rate_variance - turn * covariance,
+    )
+
+
+def _predicted(
+    rule: ThermalRule, state: ThermalDrift, waited_s: float, warmth_s: float | None
+) -> tuple[float, float, float]:
+    """Variance of p, its covariance with its slope, and that one's variance, after a while."""
+    walk = rule.wander_pC**2 * waited_s
+    if warmth_s is None:
+        return state.variance_pC2 + walk, 0.0, 0.0
+    left = math.exp(-waited_s / warmth_s)
+    reach_s, both, rate = warmth_s * (1.0 - left), state.covariance, state.rate_variance
+    variance_pC2 = state.variance_pC2 + reach_s * (2.0 * both + reach_s * rate) + walk * waited_s**2 / 3.0
+    return variance_pC2, left * (both + reach_s * rate) + 0.5 * walk * waited_s, left * left * rate + walk

@@ -9,7 +9,8 @@ A binary message to the page, little-endian: kind (u8, 1), zero (u8), number of 
 forget what was shown before); then the samples. The page confirms what it has drawn: the number of the message (u32),
 as a binary message of its own.
 
-A sample is a prediction record of fixed size; many are coalesced to as few as a browser can show:
+A sample is a prediction record of fixed size, with the tracked contact in place of the frame's where contacts are
+followed; many are coalesced to as few as a browser can show:
 
     offset 0   timestamp, unix seconds, f64
            8   x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_std_N, misfit, latency_us, xy_correlation, f32 each
@@ -89,7 +90,8 @@ class SampleFormat:
         for word in record.flags:
             bits |= FLAG_BITS[word]
         charges = record.charge_pC or {}
-        values = [getattr(record, name) for name in NUMBERS]
+        followed = record.tracked or {}
+        values = [followed[name] if name in followed else getattr(record, name) for name in NUMBERS]
         numbers = [math.nan if value is None else value for value in values]
         charge_pC = [math.nan if (q := charges.get(name)) is None else q for name in self.electrodes]
         timestamp = math.nan if record.timestamp is None else record.timestamp
