@@ -16,14 +16,16 @@ from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame, device_from_table, encode_frame, flags
 from isocharge.serve.frames.stuffing import cobs_decode
 from isocharge.serve.frames.text import TextParser
+from isocharge.serve.live.device import CommonMode
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.signal_chain.contact import TouchRule
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve.signal_chain.memory import MemoryRule
 from isocharge.serve.signal_chain.tare import TareRule
-from isocharge.serve.signal_chain.thermal import ThermalRule
+from isocharge.serve.tracking.tracker import TrackRule
 
 SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
@@ -157,8 +159,10 @@ def test_every_key_of_the_device_file_is_explained_and_exists():
 
 def test_every_default_of_a_stage_is_the_rule_s():
     """Numbers in the tables are those of the code."""
-    rules = {"hum": HumRule, "tare": TareRule, "leak": LeakRule, "touch": TouchRule, "common_mode": ThermalRule}
-    section = PAGES["device_file.md"].partition("The stages; what")[2].partition("`name` stands")[0]
+    rules = {"hum": HumRule, "tare": TareRule, "leak": LeakRule, "memory": MemoryRule, "touch": TouchRule}
+    rules |= {"track": TrackRule, "common_mode": CommonMode}
+    section = PAGES["device_file.md"].partition("The stages.")[2].partition("\n#")[0]
+    assert section.count("| `") > 15
     for line in section.splitlines():
         if not line.startswith("| `"):
             continue
@@ -167,7 +171,8 @@ def test_every_default_of_a_stage_is_the_rule_s():
             stage, name = key.split(".")
             if value.strip() != "required":
                 default = {item.name: item.default for item in fields(rules[stage])}[name]
-                assert value.strip() == (str(default).lower() if default is True else f"{default:g}"), key
+                words = "true" if default is True else "alike" if default is None else f"{default:g}"
+                assert value.strip() == words, key
 
 
 @pytest.mark.parametrize("row", re.findall(r"^\| .*? \| `(.*)` \|$", PAGES["frames.md"], re.MULTILINE))

@@ -12,8 +12,8 @@ time constant in each decade (a Prony series; its ripple is 2 % of `creep`), so 
 
 is solved for q frame by frame, y being the amplifier's output with its leak undone (`signal_chain.leak`). d is the
 pyroelectric charge of each electrode. The film follows the air within warmth_s, so d's slope decays with that time. Out
-of contact q is 0 and d is what is seen: a fading memory filter of second order (Brookner 1998, table 1.3.1) follows
-both. In a touch they are predicted, from `look_back_s` before it.
+of contact q is 0 and d is what is seen: a fading memory filter (g = 1 - f^2, h = (1 - f)^2; Brookner 1998, chapter 1)
+follows both. In a touch they are predicted, from `look_back_s` before it.
 
 What is left on the film after a release says how well creep and step are known: a Kalman filter of their two scales
 takes it in, as far as it is more than warmth may have done since the touch began.
