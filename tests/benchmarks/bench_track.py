@@ -1,9 +1,10 @@
 """Contacts followed in time, and what others make of the same frames: tables and picture of serve/docs/tracking.md.
 
-    python tests/benchmarks/bench_track.py [--model NAME|PATH] [--paths 40] [--rate-hz 1000] [--plot FILE] [--json]
+    python tests/benchmarks/bench_track.py [--model NAME|PATH] [--paths 40] [--rate-hz 1000] [--noise reference]
+        [--force 1] [--plot FILE] [--json]
 
 A contact at rest, then at a speed for 0.3 s or 8 mm, then at rest, at random places of the inner working area; charges
-of the simulator with `reference` noise, answers of the model. Moving average, 1 euro filter (Casiez et al. 2012; its
+of the simulator with noise, answers of the model. Moving average, 1 euro filter (Casiez et al. 2012; its
 authors' rule: the cutoff at rest first, then beta, each scene of its own) and plain Kalman filter (constant velocity,
 the best white acceleration of each scene) get their best setting for each scene; ours has one for all.
 """
@@ -102,7 +103,7 @@ def scene(asked: argparse.Namespace, touch: Predictor, film: ForwardMap, speed: 
     dt, rng = 1.0 / asked.rate_hz, np.random.default_rng([asked.seed, int(speed)])
     true, moves = paths(speed, asked.paths, dt, rng)
     contact = np.stack([true.real, true.imag, np.full(true.shape, asked.force)], axis=-1).reshape(-1, 3)
-    columns = np.stack(touch.predict_batch(noise_model("reference").add(film.charges(contact), rng)), axis=1)
+    columns = np.stack(touch.predict_batch(noise_model(asked.noise).add(film.charges(contact), rng)), axis=1)
     table = columns.astype(float).reshape(*true.shape, -1)
     answers = [[Contact(*row) for row in path] for path in table.tolist()]
     raw, std = table[..., 0] + 1j * table[..., 1], float(np.median(table[..., 3:5]))
@@ -156,6 +157,7 @@ def main() -> None:
     parser.add_argument("--paths", type=int, default=40)
     parser.add_argument("--rate-hz", type=float, default=1000.0)
     parser.add_argument("--force", type=float, default=1.0, help="N")
+    parser.add_argument("--noise", default="reference")
     parser.add_argument("--plot", type=Path)
     asked = parser.parse_args()
     touch = Predictor(asked.model)
