@@ -62,12 +62,14 @@ def feel(predictor, charge, part, gain_error, seed, sections=None):
     gain = process.gain * (1 + gain_error * rng.uniform(-1, 1, len(names))) if gain_error else np.ones(len(names))
     table = {
         "gain": {"pC_per_unit": dict(zip(names, (1 / gain).tolist(), strict=True))},
-        "saturation": {"limit_pC": 1499.9},
+        "saturation": {"limit_pC": part.limit - 0.1},
         "hum": {"frequency_Hz": 50.0},
         "leak": {"tau_s": dict(zip(names, tau.tolist(), strict=True)), "settle_s": 60.0 if sections else 3.0},
     }
     if np.isinf(tau).any():
         del table["leak"], table["hum"]
+    if np.isinf(part.limit):
+        del table["saturation"]
     pyro = dict(zip(names, process.pyro.tolist(), strict=True))
     known = {"common_mode": {"pC_per_K": pyro}} if "memory" in (sections or {}) and len(names) > 3 else {}
     path, records = TouchStream(predictor, device_from_table(table | known | (sections or {}), "bench")), []

@@ -86,6 +86,13 @@ def test_lifted_and_pressed_elsewhere_it_follows_within_three_frames():
     assert np.abs(found[102:, 0] + 1j * found[102:, 1] - (4.0 - 3.0j)).max() < 4.0 * STD
 
 
+def test_a_slide_of_a_millimetre_in_a_frame_is_followed_at_once():
+    """200 mm/s at 200 Hz: what begins to move is no frame far off."""
+    path, t = slide(200.0, rate_Hz=200.0)
+    found, _ = followed(path, rate_Hz=200.0)
+    assert np.abs(found[:, 0] + 1j * found[:, 1] - path).max() < 4.0 * STD
+
+
 def test_one_frame_far_off_does_not_count():
     found, _ = followed(np.where(np.arange(200) == 100, 3.0, 0.0))
     assert np.abs(found[50:, :2]).max() < 2.0 * STD

@@ -250,7 +250,7 @@ class TouchStream:
         if self._tracker is not None:
             tracked, event = self._tracker.update(contact, when.clock_s, flags)
         if contact is not None and reading.doubt > 0.0 and reading.charge_pC is not None:
-            likely = self.predictor.predict(reading.charge_pC * (1.0 + reading.doubt))
+            likely = self._answers.predict(reading.charge_pC * (1.0 + reading.doubt))
             shift = likely.x_mm - contact.x_mm, likely.y_mm - contact.y_mm, likely.force_N - contact.force_N
             contact, tracked = contact.widened(shift), tracked and tracked.widened(shift)
         return PredictionRecord(
@@ -272,13 +272,17 @@ class TouchStream:
             film=film,
         )
 
+    @property
+    def _answers(self) -> Predictor:
+        """The model of the film as it is by now."""
+        return self.predictor if self._follower is None else self._follower.predictor
+
     def _contact(self, reading: Reading) -> tuple[Contact | None, tuple[str, ...]]:
         """The contact, None without one, and the reading's flags with those of the contact."""
         flags = reading.flags
         if INVALID in flags or not reading.contact or reading.charge_pC is None:
             return None, flags
-        predictor = self.predictor if self._follower is None else self._follower.predictor
-        contact = predictor.predict(reading.charge_pC)
+        contact = self._answers.predict(reading.charge_pC)
         return contact, flags + self._validity.flags(contact)
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:

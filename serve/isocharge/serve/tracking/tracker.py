@@ -26,6 +26,9 @@ DOUBTS = {SATURATED: 100.0, BEYOND: 100.0, MISFIT: 10.0}
 FAR_FRAMES = 2
 """Frames in a row that are none of this contact, after which it is another one."""
 
+FASTEST_MM_S = 300.0
+"""Speed up to which a contact that moves suddenly is the same one, followed from there, and no frame far off."""
+
 LONGEST_STEP_S = 1.0
 """Time without a frame after which nothing of the contact is known any more, s."""
 
@@ -130,9 +133,11 @@ class Tracker:
         dt_s, steps = t_s - self._t_s, None
         if self._modes is not None and 0.0 < dt_s <= LONGEST_STEP_S:
             steps = self._steps(self._modes, place, log_force, dt_s, units, white)
-            self._far = 0 if steps else self._far + 1
-            if self._last is not None and 0 < self._far < FAR_FRAMES:
-                return self._last
+            if self._last is not None:
+                way_mm = abs(place - complex(self._last.x_mm, self._last.y_mm))
+                self._far = 0 if steps or way_mm < FASTEST_MM_S * dt_s else self._far + 1
+                if 0 < self._far < FAR_FRAMES:
+                    return self._last
         if steps is None:
             start = Modes.start(place, units[0], white, PLACE), Modes.start(log_force, units[1], white, FORCE)
             steps = (start[0], place, white), (start[1], log_force, white)
