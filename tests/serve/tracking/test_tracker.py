@@ -88,7 +88,7 @@ def test_lifted_and_pressed_elsewhere_it_follows_within_three_frames():
 
 def test_a_slide_of_a_millimetre_in_a_frame_is_followed_at_once():
     """200 mm/s at 200 Hz: what begins to move is no frame far off."""
-    path, t = slide(200.0, rate_Hz=200.0)
+    path, _ = slide(200.0, rate_Hz=200.0)
     found, _ = followed(path, rate_Hz=200.0)
     assert np.abs(found[:, 0] + 1j * found[:, 1] - path).max() < 4.0 * STD
 
