@@ -25,6 +25,7 @@ from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.memory import MemoryRule
 from isocharge.serve.signal_chain.tare import TareRule
+from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule
 
 SERVE = Path(__file__).parents[2] / "serve"
@@ -160,7 +161,7 @@ def test_every_key_of_the_device_file_is_explained_and_exists():
 def test_every_default_of_a_stage_is_the_rule_s():
     """Numbers in the tables are those of the code."""
     rules = {"hum": HumRule, "tare": TareRule, "leak": LeakRule, "memory": MemoryRule, "touch": TouchRule}
-    rules |= {"track": TrackRule, "common_mode": CommonMode}
+    rules |= {"track": TrackRule, "follow": FollowRule, "common_mode": CommonMode}
     section = PAGES["device_file.md"].partition("The stages.")[2].partition("\n#")[0]
     assert section.count("| `") > 15
     for line in section.splitlines():
