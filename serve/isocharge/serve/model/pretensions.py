@@ -24,6 +24,7 @@ from msgspec import Meta, Struct
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ModelError, cut
 from isocharge.common.files import read_whole
+from isocharge.common.npz import npz_arrays
 from isocharge.common.structs import NotNegative, Positive, Text, parse_json
 
 FILE = "pretensions.npz"
@@ -135,12 +136,12 @@ def read_pretensions(version_folder: Path) -> Pretensions:
             "calibrate` made of presses on it, with four electrodes or more: calibrate it, or again with this version"
         ) from error
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            about = parse_json(str(file["about"][()]), "about", ModelError, _About)
-            if about.format_version != FORMAT:
-                _refuse(path, f"format {about.format_version} is not supported (this version reads {FORMAT})")
-            node, typical = file["node_MPa"].astype(float), file["typical_pC"].astype(float)
-            weights = {name: file[name].astype(np.float32) for name in about.constants}
+        file = npz_arrays(data)
+        about = parse_json(str(file["about"][()]), "about", ModelError, _About)
+        if about.format_version != FORMAT:
+            _refuse(path, f"format {about.format_version} is not supported (this version reads {FORMAT})")
+        node, typical = file["node_MPa"].astype(float), file["typical_pC"].astype(float)
+        weights = {name: file[name].astype(np.float32) for name in about.constants}
     except ModelError as error:
         _refuse(path, str(error))
     except DAMAGED as error:
