@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.stats import chi2, multivariate_normal
 from tests.train.calibration.conftest import presses_of, rig
@@ -86,6 +87,20 @@ def test_hypotheses_are_weighed_by_their_evidence():
     np.testing.assert_allclose(covariance, before - gain @ design @ before, atol=1e-12)
 
 
+def test_scatter_of_forces_is_noise_along_one_direction_of_each_press():
+    """Three presses of four residuals, against SciPy's density with the widened covariance of the data."""
+    rng = np.random.default_rng(5)
+    design, data, direction = rng.normal(size=(3, 4, 2)), rng.normal(size=(3, 4)), rng.normal(size=(3, 4))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    variance, none = np.array([0.0, 0.5, 9.0]), np.zeros(2)
+    along = np.einsum("nk,nku->nu", direction, design), (direction * data).sum(axis=1)
+    linearised = discrepancy.Linearised.of(design.reshape(12, 2), data.ravel(), none).less(*along, none, variance)
+    noise = block_diag(*(np.eye(4) + v * np.outer(d, d) for v, d in zip(variance, direction, strict=True)))
+    of_data = noise + design.reshape(12, 2) @ design.reshape(12, 2).T
+    density = multivariate_normal(np.zeros(12), of_data).logpdf(data.ravel()) + 6.0 * np.log(2.0 * np.pi)
+    assert linearised.given(np.eye(2))[0] == pytest.approx(density, rel=1e-9)
+
+
 def test_electrodes_share_what_no_parameter_describes_as_films_do():
     """Beyond their modes, films solved in full have 0.3 to 0.45 % in common, 0.13 to 0.21 % of an electrode alone."""
     of_a_term = discrepancy.Hypothesis(size=0.01).covariance(3, 2, 4)[5:9, 5:9]
@@ -165,6 +180,18 @@ def test_what_a_session_had_is_taken_off_and_said(problem, change, caution):
     assert any(re.search(caution, sentence) for sentence in result.cautions)
     error = error_of(problem.films.fold(result.posterior.parameters), problem, truth)
     assert error < 2.0 * result.left.position_mm < 0.4
+
+
+def test_a_leak_at_random_is_said_and_widens_the_force(problem):
+    """0 to 10 % of the charge of each press: 5 % of it are in all of them, and look like a gain."""
+    leak = np.exp(-0.1 * np.random.default_rng(4).random((10, 1)))
+    truth, result = on_a_film(problem, lambda _, charge: leak * charge, 10, seed=44)
+    assert any(re.search(r"forces scatter [2-9](\.\d)? % about", sentence) for sentence in result.cautions)
+    at = draw_contacts(np.random.default_rng(8), problem.domain.within(6.0), 200)
+    charge = problem.charges.charges(truth, at)
+    force = problem.films.fold(result.posterior.parameters).predict(charge)[0][:, 2]
+    error = 100.0 * np.sqrt(np.mean((force / at[:, 2] - 1.0) ** 2))
+    assert 2.0 < error < 2.5 * result.left.force_percent
 
 
 @pytest.mark.first_cases(1)

@@ -252,6 +252,12 @@ def _cautions(presses: MeasuredPresses, posterior: FilmPosterior) -> Iterator[st
     ):
         if posterior.probability(what) > PROBABLE:
             yield f"the charges are {value:.2g} +- {std:.2g} {unit} {meaning}? It is taken off"
+    if posterior.probability("scatter") > PROBABLE:
+        yield (
+            f"forces scatter {100.0 * posterior.scatter:.2g} % about those of the charges, over what they are said to: "
+            "are both read at the same moment, or does charge leak in between? What lowers charges at random lowers "
+            "them on average as well: the errors allow for as much"
+        )
     places = good.contact[np.isfinite(good.contact[:, 0]), :2]
     if len(places) > 1 and np.ptp(places, axis=0).max() < CLOSE_MM:
         yield (

@@ -73,6 +73,18 @@ class PressData:
         offset, drift = nuisances
         return replace(self, charge=self.charge - offset - drift * self.turn[:, None] * self.charge)
 
+    def scattered(self, share: float) -> "PressData":
+        """The presses with forces that are known less well than they are said to, by a share."""
+        weight = self.contact_weight.copy()
+        weight[:, 2] = 1.0 / np.hypot(1.0 / weight[:, 2], share)
+        return replace(self, contact_weight=weight)
+
+    def by_force(self) -> Array:
+        """Derivative of the residual by the logarithm of the stated force, shape (n, n_electrode + 3)."""
+        rows = np.zeros(self.known.shape)
+        rows[:, -1] = -self.contact_weight[:, 2]
+        return rows
+
     def by_nuisance(self) -> Array:
         """Derivatives of the residual by offset and drift, shape (n, n_electrode + 3, 2)."""
         by_charge = np.stack([np.ones_like(self.charge), self.turn[:, None] * self.charge], axis=2)

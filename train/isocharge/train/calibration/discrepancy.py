@@ -7,12 +7,13 @@ O'Hagan 2001), of finite rank: products of Chebyshev polynomials in place and lo
 
 whose coefficients have mean zero and the standard deviation s FADING^(i + j + m), and besides a part that all
 electrodes share, COMMON times as large: where a film is stiffer than its parameters say, all charges are smaller. The
-size s is not known. Neither is whether the whole session had a common offset of the charges (a bad tare), or charges
-that drifted. Every combination is a hypothesis; the presses weigh them by how well each predicts them (the evidence of
-a linear Gaussian model, MacKay 1992), and what is known is the mixture.
+size s is not known. Neither is whether the whole session had a common offset of the charges (a bad tare), charges that
+drifted, or charges and forces that were not read together (a leak between them, a load cell that lags). Every
+combination is a hypothesis; the presses weigh them by how well each predicts them (the evidence of a linear Gaussian
+model, MacKay 1992), and what is known is the mixture.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -48,6 +49,10 @@ OFFSETS_PC = {0.0: 0.9, 30.0: 0.1}
 
 DRIFTS = {0.0: 0.95, 0.15: 0.05}
 """The same for the standard deviation of a drift of all charges from the first press to the last, a share."""
+
+SCATTERS = {0.0: 0.95, 0.03: 0.03, 0.1: 0.02}
+"""The same for the standard deviation of a press's force about the one that its charges show, a share, over what the
+rig is said to have."""
 
 
 def terms(contact: Array, domain: Domain) -> Array:
@@ -85,6 +90,7 @@ class Hypothesis:
         size: Of the discrepancy, dimensionless.
         offset: Standard deviation of a common offset of the charges, pC.
         drift: Standard deviation of a drift of the charges, a share.
+        scatter: Standard deviation of stated forces besides what they are said to have, a share.
         belief: Probability before the presses.
     """
 
@@ -92,6 +98,7 @@ class Hypothesis:
     size: float = 0.0
     offset: float = 0.0
     drift: float = 0.0
+    scatter: float = 0.0
     belief: float = 1.0
 
     def covariance(self, n_parameter: int, n_mode: int, n_electrode: int) -> Array:
@@ -104,15 +111,17 @@ class Hypothesis:
 
 def hypotheses() -> Iterator[Hypothesis]:
     """All that are weighed."""
-    for (modes, a), (size, b), (offset, c), (drift, d) in product(
-        IMPERFECT.items(), SIZES.items(), OFFSETS_PC.items(), DRIFTS.items()
+    for (modes, a), (size, b), (offset, c), (drift, d), (scatter, e) in product(
+        IMPERFECT.items(), SIZES.items(), OFFSETS_PC.items(), DRIFTS.items(), SCATTERS.items()
     ):
         if modes == 0.0 or size > 0.0:  # to first order modes are never the whole
-            yield Hypothesis(modes, size, offset, drift, a * b * c * d)
+            yield Hypothesis(modes, size, offset, drift, scatter, a * b * c * d * e)
 
 
 class Linearised(NamedTuple):
     """Residuals of presses about a film, linear in the unknowns: |r|^2 = square + 2 moment u + u normal u.
+
+    The logarithm of the determinant of the residuals' covariance is part of the square.
 
     Attributes:
         normal: Shape (n_unknown, n_unknown).
@@ -129,6 +138,20 @@ class Linearised(NamedTuple):
         """From a residual and its derivatives at unknowns that differ by `at` from their mean."""
         at_mean = residual - jacobian @ at
         return cls(jacobian.T @ jacobian, jacobian.T @ at_mean, float(at_mean @ at_mean))
+
+    def less(self, jacobian: Array, residual: Array, at: Array, variance: Array) -> "Linearised":
+        """With residuals that have more noise, along directions at right angles to each other.
+
+        Args:
+            jacobian: Derivatives along each direction, shape (n, n_unknown).
+            residual: Along each, shape (n,).
+            at: As in `of`, shape (n_unknown,).
+            variance: Of the noise that comes in along each, over the residual's, shape (n,).
+        """
+        share = np.sqrt(variance / (1.0 + variance))
+        own = Linearised.of(share[:, None] * jacobian, share * residual, at)
+        square = self.square - own.square + float(np.log1p(variance).sum())
+        return Linearised(self.normal - own.normal, self.moment - own.moment, square)
 
     def given(self, covariance: Array) -> tuple[float, Array, Array]:
         """Logarithm of the evidence, mean and covariance of the unknowns, for a covariance before the presses."""
@@ -165,11 +188,19 @@ class Mixture(NamedTuple):
 
 
 def weigh(
-    linearised: Linearised, before: Callable[[Hypothesis], Array], tried: Iterable[Hypothesis] | None = None
+    linearised: Mapping[float, Linearised],
+    before: Callable[[Hypothesis], Array],
+    tried: Iterable[Hypothesis] | None = None,
 ) -> Mixture:
-    """Weigh hypotheses, all if absent; `before` gives the covariance of the unknowns before the presses by each."""
+    """Weigh hypotheses, all if absent.
+
+    Args:
+        linearised: The presses, by the scatter of their forces.
+        before: The covariance of the unknowns before the presses by a hypothesis.
+        tried: The hypotheses.
+    """
     tried = list(tried or hypotheses())
-    answers = [linearised.given(before(each)) for each in tried]
+    answers = [linearised[each.scatter].given(before(each)) for each in tried]
     logs = np.array([answer[0] + np.log(each.belief) for answer, each in zip(answers, tried, strict=True)])
     evidence = float(logsumexp(logs))
     weight = np.exp(logs - evidence)

@@ -27,7 +27,7 @@ from isocharge.train.calibration.contacts import (
     search_places,
     with_force,
 )
-from isocharge.train.calibration.discrepancy import Hypothesis, Linearised, Mixture, weigh
+from isocharge.train.calibration.discrepancy import SCATTERS, Hypothesis, Linearised, Mixture, weigh
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.problem import FilmEstimate
 
@@ -65,8 +65,15 @@ noise: anything up to twenty times as far off."""
 PROBABLE = 0.5
 """Probability above which something is said to be."""
 
+ONE_SIDED = 1.7
+"""Mean of what makes forces scatter, over its standard deviation, as of a share that is uniform from none upwards: what
+lowers charges at random, a leak, lowers all of them on average, which presses cannot tell from a gain."""
+
 LINEAR = 0.2
 """Largest step of a parameter, in standard deviations of its prior, for which derivatives are not taken again."""
+
+TINY = 1e-12
+"""Derivative of a residual by the force that counts as none."""
 
 MARGIN = 1e-3
 """Distance of a start from the bounds, in standard deviations: the trust region begins inside."""
@@ -83,6 +90,7 @@ class FilmPosterior(FilmEstimate):
         bad: Which presses were left out, shape (n,).
         offset_pC: Common offset of the charges and its standard deviation, pC.
         drift: Drift of the charges from the first press to the last and its standard deviation, a share.
+        scatter: Standard deviation of the forces over what they are said to have, a share.
         weights: Probability of each hypothesis of what there is besides a film of the prior.
     """
 
@@ -92,6 +100,7 @@ class FilmPosterior(FilmEstimate):
     bad: Booleans = field(kw_only=True)
     offset_pC: tuple[float, float] = field(kw_only=True)
     drift: tuple[float, float] = field(kw_only=True)
+    scatter: float = field(kw_only=True)
     weights: dict[Hypothesis, float] = field(kw_only=True)
 
     @property
@@ -115,7 +124,7 @@ class FilmPosterior(FilmEstimate):
         return FilmEstimate(self.parameters, self.covariance).drifted(prior)
 
     def probability(self, what: str) -> float:
-        """Of the hypotheses with a "size", an "offset" or a "drift"."""
+        """Of the hypotheses with a "size", an "offset", a "drift" or a "scatter"."""
         return sum(weight for hypothesis, weight in self.weights.items() if getattr(hypothesis, what) > 0.0)
 
 
@@ -138,10 +147,12 @@ def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate) -> Fil
     keep, mixture = known.keep, known.mixture
     unit = np.clip(problem.mean + mixture.mean, *problem.bounds)
     begin = known.solved.contacts.contact if keep.all() else None
-    contacts, n = problem.adjusted(unit, data, begin), len(before.parameters)
+    scatter = float(np.sqrt(sum(weight * each.scatter**2 for each, weight in mixture.weights.items())))
+    contacts, n = problem.adjusted(unit, data.scattered(mixture.best.scatter), begin), len(before.parameters)
     offset, drift = zip(unit[-2:].tolist(), np.sqrt(np.diag(mixture.covariance)[-2:]).tolist(), strict=True)
     drifting = np.zeros(len(unit) - 2)  # nobody knows what the drift was when the film is used
-    drifting[len(SHARED) : n] = np.hypot(*drift) / np.sqrt(12.0) / charges.prior.spread.gain
+    drifting[len(SHARED) : n] = np.hypot(np.hypot(*drift) / np.sqrt(12.0), ONE_SIDED * scatter)
+    drifting /= charges.prior.spread.gain
     joint = mixture.covariance[:-2, :-2] + np.outer(drifting, drifting)
     return FilmPosterior(
         parameters=unit[:n] * charges.prior.std,
@@ -154,6 +165,7 @@ def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate) -> Fil
         bad=~keep,
         offset_pC=offset,
         drift=drift,
+        scatter=scatter,
         weights=mixture.weights,
     )
 
@@ -258,6 +270,7 @@ class _Fit:
 
     def solve(self, data: PressData, weight: Array | Booleans, start: Array, hypothesis: Hypothesis) -> _Solved:
         """The film that explains weighted presses best, from a start; what a hypothesis excludes stays."""
+        data = data.scattered(hypothesis.scatter)
         covariance, root = self._before(hypothesis), np.sqrt(weight)
         active = np.diag(covariance) > 0.0
         besides = bool(active[len(self.charges.prior.names) : -2].any())
@@ -307,6 +320,7 @@ class _Fit:
 
     def fits(self, data: PressData, solved: _Solved, mixture: Mixture, freedom: Array) -> Booleans:
         """Which presses are as a film predicts them, with all that is uncertain of it, shape (n,)."""
+        data = data.scattered(mixture.best.scatter)
         contacts = self.adjusted(solved.unit, data)
         rows = self.slopes(solved.unit, data, contacts)
         residual = contacts.residual + rows @ (self.mean + mixture.mean - solved.unit)
@@ -316,7 +330,14 @@ class _Fit:
 
     def weigh(self, data: PressData, solved: _Solved) -> Mixture:
         """What the presses say of the unknowns, and of the hypotheses."""
-        unit, contacts = solved
-        jacobian = self.slopes(unit, data, contacts).reshape(-1, unit.size)
-        linearised = Linearised.of(jacobian, contacts.residual.ravel(), unit - self.mean)
-        return weigh(linearised, self._before)
+        unit = solved.unit
+        contacts = self.adjusted(unit, data, solved.contacts.contact)
+        jacobian = self.slopes(unit, data, contacts)
+        by_contact = self.charges.by_contact(self._film(unit), with_force(contacts.contact))
+        by_force = projected(data.by_force()[:, :, None], data.slopes(by_contact))[:, :, 0]
+        size = np.linalg.norm(by_force, axis=1)
+        direction = by_force / np.maximum(size, TINY)[:, None]
+        along = np.einsum("nk,nku->nu", direction, jacobian), (direction * contacts.residual).sum(axis=1)
+        at = unit - self.mean
+        good = Linearised.of(jacobian.reshape(-1, unit.size), contacts.residual.ravel(), at)
+        return weigh({each: good.less(*along, at, (each * size) ** 2) for each in SCATTERS}, self._before)

@@ -97,7 +97,7 @@ def fit_correction(residuals: Residuals) -> Correction:
             linearised.normal + own.normal, linearised.moment + own.moment, linearised.square + own.square
         )
     tried = [Hypothesis(size=each) for each in SIZES]
-    mixture = weigh(linearised, lambda hypothesis: hypothesis.size**2 * np.eye(size), tried)
+    mixture = weigh({0.0: linearised}, lambda hypothesis: hypothesis.size**2 * np.eye(size), tried)
     if mixture.best.size == 0.0:
         return Correction(domain, np.zeros((term_count(), n_electrode)), 0.0)
     freedom = float(np.einsum("pq,qp->", mixture.covariance, linearised.normal))
