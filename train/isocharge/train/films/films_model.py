@@ -87,7 +87,7 @@ class FilmsModel:
             factor: Contacts (x, y, F), shape (n, 3), mm and N, to factors on the charges, shape (n, n_electrode), if
                 they differ by some percent from those of the parameters: the network's last layer is changed
                 accordingly.
-            correlation: Whether it learns how errors go together; that takes seconds.
+            correlation: Whether it learns how errors go together; that takes a second or two.
 
         Raises:
             InputError: If there are not as many finite parameters as the prior names.

@@ -40,12 +40,15 @@ LEAST_SPREAD = 0.02
 """Deviation of a combination of features, over the largest, below which it counts for less: its coefficient would be
 large and be lost in the digits of a float32."""
 
-SMALL_GRADIENT, LARGE_GRADIENT = 2e-3, 0.01
-"""Largest derivative of the loss at its minimum, and that from which the search begins anew."""
+SPARSE = 7
+"""One example in so many is enough for the mean and the axes of the features."""
 
-STARTS, STEPS = 5, 200
-"""How often the search may begin anew, as a line search may find no step where two unit vectors nearly meet; and the
-steps of each."""
+SMALL_GRADIENT = 2e-3
+"""Largest derivative of the loss at its minimum."""
+
+STARTS, STEPS, REMEMBERED = 5, 90, 20
+"""How often the search may begin anew, as a line search may find no step where two unit vectors nearly meet; the steps
+of each, more of which change no coverage, and those that its idea of the curvature is made of."""
 
 FARTHEST = 5.0
 """Deviations up to which an error counts: beyond it is none of a Gaussian."""
@@ -85,7 +88,7 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
 
 def _fit_angles(features: Array, deviation: Array) -> tuple[Array, Array]:
     """Slopes (k, 3) and shift (3,) of the angles, from features (n, k) and errors over their deviations (n, 3)."""
-    mean, matrix = whitening(features, LEAST_SPREAD)
+    mean, matrix = whitening(features[::SPARSE], LEAST_SPREAD)
     inputs = torch.from_numpy((features - mean) @ matrix)
     targets = torch.from_numpy(np.clip(deviation, -FARTHEST, FARTHEST))
 
@@ -98,11 +101,11 @@ def _fit_angles(features: Array, deviation: Array) -> tuple[Array, Array]:
 
     start = np.zeros((1 + features.shape[1], 3))
     start[0] = 0.5 * np.pi  # no correlation
-    found, options = start.ravel(), {"ftol": 0.0, "gtol": SMALL_GRADIENT, "maxiter": STEPS}
+    found, options = start.ravel(), {"ftol": 0.0, "gtol": SMALL_GRADIENT, "maxiter": STEPS, "maxcor": REMEMBERED}
     for _ in range(STARTS):
         result = minimize(loss, found, jac=True, method="L-BFGS-B", options=options)
         found = result.x
-        if np.abs(result.jac).max() <= LARGE_GRADIENT:
+        if result.status < 2:  # at its minimum or after its steps
             break
     else:
         _log.warning("the correlations are not learned to the end: the gradient is %.1g", np.abs(result.jac).max())
