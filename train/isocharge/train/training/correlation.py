@@ -48,7 +48,7 @@ SMALL_GRADIENT = 2e-3
 
 STARTS, STEPS, REMEMBERED = 5, 90, 20
 """How often the search may begin anew, as a line search may find no step where two unit vectors nearly meet; the steps
-of each, more of which change no coverage, and those that its idea of the curvature is made of."""
+of each (more change the coverage by less than 0.005), and those that its idea of the curvature is made of."""
 
 FARTHEST = 5.0
 """Deviations up to which an error counts: beyond it is none of a Gaussian."""
