@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
+from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
@@ -185,7 +186,8 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
         presses = presses[~far]
     if misfit(presses, problem.charges) > MISLED and find_mistakes(presses, problem.charges):
         raise explain(presses, problem.charges, np.nan)
-    posterior = fit_film(problem.charges, PressData.of(presses, problem.noise, problem.charges), problem.before)
+    with threadpool_limits(1):  # many small matrices: a second thread only waits
+        posterior = fit_film(problem.charges, PressData.of(presses, problem.noise, problem.charges), problem.before)
     _refuse_unexplained(presses, problem, posterior)
     chi2, freedom = posterior.total
     if freedom and chi2_distribution.sf(chi2, freedom) < UNCERTAIN:  # larger errors, by Birge's ratio (1932)

@@ -20,6 +20,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from scipy.optimize import minimize
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from isocharge.common.arrays import Array
@@ -74,7 +75,9 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
     weight, bias = network.layers.last
     of_contact = weight[:, :KNOWN].any(axis=1)
     features = np.hstack([network.layers.features(logs)[:, of_contact], logs])
-    slopes, angles = _fit_angles(features, errors / np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]]))
+    deviation = errors / np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]])
+    with threadpool_limits(1):  # many small steps: two threads take three times as long
+        slopes, angles = _fit_angles(features, deviation)
     head = np.zeros((len(weight), 3))
     head[of_contact] = slopes[: -logs.shape[1]]
 
