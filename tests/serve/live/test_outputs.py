@@ -9,6 +9,8 @@ import pytest
 
 from isocharge.common.errors import InputError
 from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
+from isocharge.serve.prediction.record import FIELDS, OF_FILM, OF_TRACKING
+from isocharge.serve.tracking.film_follower import FollowedFilm
 from isocharge.serve.tracking.tracker import Tracked
 
 ELECTRODES = ("A", "B")
@@ -43,14 +45,17 @@ def test_csv_has_no_quotes_in_an_ordinary_row(record):
     )
 
 
-def test_contacts_that_are_followed_are_the_last_columns(record):
-    followed = record(follows=True, event="tap", tracked=dict(zip(Tracked._fields, map(float, range(9)), strict=True)))
-    header = csv_header(ELECTRODES, follows=True)
+def test_contacts_and_films_that_are_followed_are_the_last_columns(record):
+    tracked, film = Tracked(*map(float, range(9)))._asdict(), FollowedFilm(0.7, 0.05, 12)._asdict()
+    followed = record(follows=True, event="tap", tracked=tracked, film=film)
+    header = csv_header(ELECTRODES, FIELDS + OF_TRACKING + OF_FILM)
     (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_line(followed, ELECTRODES) + "\n"))
     assert header.removeprefix(csv_header(ELECTRODES)).startswith(",tracked.x_mm,tracked.y_mm,")
     assert (row["tracked.vy_mm_s"], row["tracked.moving"], row["event"]) == ("7.000000", "8.000000", "tap")
-    (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_line(record(follows=True), ELECTRODES) + "\n"))
-    assert (row["tracked.x_mm"], row["event"]) == ("", "")
+    assert (row["film.pretension_MPa"], row["film.touches"]) == ("0.700000", "12")
+    untouched = record(follows=True, film=film)
+    (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_line(untouched, ELECTRODES) + "\n"), strict=True)
+    assert (row["tracked.x_mm"], row["event"], row["film.pretension_std_MPa"]) == ("", "", "0.050000")
 
 
 def test_datagrams_to_nobody_are_dropped():

@@ -205,7 +205,7 @@ def test_touches_that_do_not_count(mine, flags, counted):
     for frame in (("outside", "misfit"), (), flags):
         follower.see(charge, contact, frame, 0.0)
     follower.see(charge, None, (), 0.1)
-    assert follower.film["touches"] == counted
+    assert follower.film.touches == counted
 
 
 @pytest.mark.parametrize("change", ["gone", "damaged", "another model"])

@@ -95,13 +95,12 @@ def record_writer(
     udp: str | None,
     electrodes: tuple[str, ...],
     put: Callable[[str], object],
-    *,
-    follows: bool,
+    fields: tuple[str, ...],
 ) -> Lines:
     """The function that gives each record to `put` as a line, and sends it to the network."""
     sink = stack.enter_context(closing(UdpSink(udp))) if udp else None
     if output is Output.csv:
-        put(csv_header(electrodes, follows=follows) + "\n")
+        put(csv_header(electrodes, fields) + "\n")
 
     def write(record: PredictionRecord, line: str) -> None:
         if sink:

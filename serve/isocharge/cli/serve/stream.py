@@ -175,7 +175,7 @@ def stream_command(
         stack.enter_context(stop_after(seconds))
         lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
         put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
-        write = record_writer(stack, output, udp, predictor.metadata.electrodes, put, follows=board.track is not None)
+        write = record_writer(stack, output, udp, predictor.metadata.electrodes, put, path.fields)
         if page is not None:
             header = None if recorder else (policy.value, board.table, name or "")
             stack.enter_context(answering(page, recorded, header))
@@ -243,9 +243,7 @@ def replay_command(
     latencies: deque[float] = deque(maxlen=LATENCIES)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
-        write = record_writer(
-            stack, output, None, predictor.metadata.electrodes, stdout_writer(), follows=board.track is not None
-        )
+        write = record_writer(stack, output, None, predictor.metadata.electrodes, stdout_writer(), path.fields)
         file_output = stack.enter_context(ExitStack())
         if mcap is not None:
             write = in_turn(_mcap_writer(file_output, mcap, mcap_records, predictor.metadata.electrodes), write)

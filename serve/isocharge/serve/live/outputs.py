@@ -20,33 +20,34 @@ from types import TracebackType
 from typing import Any, Self
 
 from isocharge.common.errors import InputError
-from isocharge.serve.prediction.record import FIELDS, OF_TRACKING, PredictionRecord
+from isocharge.serve.prediction.record import FIELDS, PredictionRecord
+from isocharge.serve.tracking.film_follower import FollowedFilm
 from isocharge.serve.tracking.tracker import Tracked
 
 BY_ELECTRODE = ("charge_pC", "charge_raw_pC", "tare_pC")
 """Fields of a record that have a value for each electrode."""
 
 
-def csv_header(electrodes: tuple[str, ...], *, follows: bool = False) -> str:
-    """The columns of `csv_line`: `charge_pC.A` and so on; with `follows` also those of contacts that are followed."""
+def csv_header(electrodes: tuple[str, ...], fields: tuple[str, ...] = FIELDS) -> str:
+    """The columns of `csv_line` for records with these fields: `charge_pC.A` and so on."""
     parts = _parts(electrodes)
     return _row(
         column
-        for name in FIELDS + OF_TRACKING * follows
+        for name in fields
         for column in ([f"{name}.{part}" for part in parts[name]] if name in parts else [name])
     )
 
 
 def _parts(electrodes: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
     """Fields of a record that have several columns, with the names of their parts."""
-    return dict.fromkeys(BY_ELECTRODE, electrodes) | {"tracked": Tracked._fields}
+    return dict.fromkeys(BY_ELECTRODE, electrodes) | {"tracked": Tracked._fields, "film": FollowedFilm._fields}
 
 
 def csv_line(record: PredictionRecord, electrodes: tuple[str, ...]) -> str:
     """A record as a row, numbers to six decimals, flags with blanks between; what is not known is empty."""
     cells: list[str] = []
     parts = _parts(electrodes)
-    for name in FIELDS + OF_TRACKING * record.follows:
+    for name in record.written:
         value = getattr(record, name)
         if name in parts:
             cells += [_cell(None if value is None else value[part]) for part in parts[name]]

@@ -16,7 +16,15 @@ from isocharge.serve.live.reading_stream import ReadingStream, TimedReading
 from isocharge.serve.port.source import Chunk
 from isocharge.serve.prediction.contact import Contact
 from isocharge.serve.prediction.predictor import Predictor
-from isocharge.serve.prediction.record import OUT_OF_CONTACT, UNKNOWN, Charges, PredictionRecord
+from isocharge.serve.prediction.record import (
+    FIELDS,
+    OF_FILM,
+    OF_TRACKING,
+    OUT_OF_CONTACT,
+    UNKNOWN,
+    Charges,
+    PredictionRecord,
+)
 from isocharge.serve.signal_chain.chain import Chain, Reading
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.serve.tracking.tracker import Tracker
@@ -167,6 +175,11 @@ class TouchStream:
             )
         self._use(predictor)
 
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the fields that its records are written with."""
+        return FIELDS + OF_TRACKING * (self._tracker is not None) + OF_FILM * (self._follow is not None)
+
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
         self._readings.tare()
@@ -243,7 +256,7 @@ class TouchStream:
         contact, flags = self._contact(reading)
         film = None
         if self._follower is not None:
-            film = self._follower.film
+            film = self._follower.film._asdict()
             self._follower.see(reading.charge_pC, contact, flags, when.clock_s)
             flags += (FILM,) * (contact is not None and self._follower.is_lost)
         tracked, event = None, None

@@ -84,20 +84,27 @@ class PredictionRecord:
     film: dict[str, float] | None = None
     follows: bool = False
 
+    @property
+    def written(self) -> tuple[str, ...]:
+        """Names of the fields that it is written with, in the order above."""
+        return FIELDS + OF_TRACKING * self.follows + OF_FILM * (self.film is not None)
+
     def to_json(self) -> str:
         """One line of strictly valid JSON, keys in the order above, numbers to six decimals.
 
         Raises:
             ValueError: If a number is not finite.
         """
-        names = FIELDS + OF_TRACKING * self.follows + ("film",) * (self.film is not None)
-        return _ENCODE({name: _plain(getattr(self, name)) for name in names})
+        return _ENCODE({name: _plain(getattr(self, name)) for name in self.written})
 
 
 OF_TRACKING = ("tracked", "event")
 """Fields that a record has where contacts are followed."""
 
-FIELDS = tuple(field.name for field in fields(PredictionRecord) if field.name not in (*OF_TRACKING, "film", "follows"))
+OF_FILM = ("film",)
+"""Those where the film is followed."""
+
+FIELDS = tuple(f.name for f in fields(PredictionRecord) if f.name not in (*OF_TRACKING, *OF_FILM, "follows"))
 
 UNKNOWN: dict[str, Any] = dict.fromkeys(Contact._fields)
 """The fields of the contact where nothing was computed."""

@@ -10,6 +10,7 @@ any farther: the model answers for the film as it was before them.
 
 import math
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
@@ -67,6 +68,14 @@ class FollowRule(Rule, frozen=True, kw_only=True):
     """
 
     drift_MPa_per_root_hour: Setting = 0.35
+
+
+class FollowedFilm(NamedTuple):
+    """For the record: the pretension for which the model answers, its deviation, and the touches that told it."""
+
+    pretension_MPa: float
+    pretension_std_MPa: float
+    touches: int
 
 
 class FilmFollower:
@@ -130,13 +139,9 @@ class FilmFollower:
         self._spoiled = False
 
     @property
-    def film(self) -> dict[str, float]:
-        """For the record: the pretension for which the model answers, its deviation, and the touches that told it."""
-        return {
-            "pretension_MPa": self._answered_MPa,
-            "pretension_std_MPa": self._answered_std,
-            "touches": self._touches,
-        }
+    def film(self) -> FollowedFilm:
+        """The film by now."""
+        return FollowedFilm(self._answered_MPa, self._answered_std, self._touches)
 
     def see(self, charge_pC: Array | None, contact: Contact | None, flags: tuple[str, ...], clock_s: float) -> None:
         """Take in a frame; a touch counts when it is over.
