@@ -38,6 +38,8 @@ from isocharge.serve.export.record_messages import (
 )
 from isocharge.serve.prediction.contact import NO_CORRELATION
 from isocharge.serve.prediction.record import FIELDS
+from isocharge.serve.tracking.film_follower import FollowedFilm
+from isocharge.serve.tracking.tracker import Tracked
 
 ELECTRODES = ("A", "B", "C")
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -238,6 +240,28 @@ def test_the_schema_refuses_what_is_no_record():
     for name in FIELDS:
         assert not valid({key: value for key, value in record.items() if key != name}), name
         assert not valid(record | {name: [1.0] if name != "contact" else None}), name
+
+
+def test_a_contact_that_is_followed_is_wrench_and_pose_and_the_record_says_both(tmp_path):
+    tracked = Tracked(1.0, -4.0, 0.25, 0.01, 0.02, 0.001, 5.0, 0.0, 0.9)._asdict()
+    film = FollowedFilm(0.7, 0.05, 12)._asdict()
+    records = [press(0, follows=True, tracked=tracked, event="slide", film=film, xy_correlation=0.5)]
+    records.append(press(1, follows=True, tracked=tracked, film=film, x_mm=None, force_N=None, flags=("invalid",)))
+    topics = read_with_rosbags(write(tmp_path / "a.mcap", [one.to_json() for one in records], RecordEncoding.ros2))
+    ((_, wrench),), ((_, pose),) = topics["/isocharge/wrench"], topics["/isocharge/pose"]
+    assert (wrench.wrench.force.z, wrench.wrench.torque.x) == pytest.approx((-0.25, 1e-3))
+    assert (pose.pose.pose.position.x, pose.pose.pose.position.y) == (1e-3, -4e-3)
+    assert pose.pose.covariance[[0, 1, 7]] == pytest.approx([1e-10, 1e-10, 4e-10])
+    line = json.loads(topics["/isocharge/record"][0][1])
+    assert (line["x_mm"], line["tracked"]["x_mm"], line["event"]) == (3.0, 1.0, "slide")
+    of_record = record_schema(ELECTRODES)["properties"]
+    assert {name: tuple(of_record[name]["properties"]) for name in ("tracked", "film")} == {
+        "tracked": Tracked._fields,
+        "film": FollowedFilm._fields,
+    }
+    valid = jsonschema_rs.Draft7Validator(record_schema(ELECTRODES)).is_valid
+    assert valid(line)
+    assert not valid(line | {"event": 1.0})
 
 
 def whole_messages(data):

@@ -10,6 +10,9 @@ the drawn direction, y transverse, z towards the probe, right-handed. The wrench
 that a press of F at (x, y) has the force (0, 0, -F) and, about the origin, the torque (-y F, x F, 0). The pose is the
 point of contact in the plane, unturned, with the model's standard deviations.
 
+Where contacts are followed, wrench and pose are those of the contact by all frames up to now, as on the live page; what
+the frame alone says is in the record.
+
 ROS messages are a header and doubles. They are packed here because `mcap-ros2-support` offers its encoder only inside a
 writer of its own, which writes no JSON, and takes 15 times as long; tests read them with it and with rosbags.
 """
@@ -94,8 +97,15 @@ def time_of(record: Mapping[str, Any]) -> int:
     return round(seconds * 1e6) * 1000
 
 
+def contact_of(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The record with the contact that is followed in the place of the frame's, where the frame says anything."""
+    tracked = record.get("tracked")
+    return record if tracked is None or record["force_N"] is None else {**record, **tracked}
+
+
 def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
     """The record as WrenchStamped, N and N m; zeros out of contact, None where the force is unknown."""
+    record = contact_of(record)
     force = record["force_N"]
     if force is None:
         return None
@@ -105,6 +115,7 @@ def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
 
 def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
     """The record as PoseWithCovarianceStamped, m, m^2 and rad^2; None where nothing touches."""
+    record = contact_of(record)
     x, y, x_std, y_std = (record[name] for name in ("x_mm", "y_mm", "x_std_mm", "y_std_mm"))
     xy_correlation = record.get("xy_correlation") or 0.0  # a record of an earlier version has none
     if None in (x, y, x_std, y_std):
@@ -166,6 +177,20 @@ CHARGES = {
 }
 """Fields that are an object of charges or null."""
 
+FOLLOWED = {
+    "tracked": (
+        "The contact by all frames up to now, where contacts are followed.",
+        ("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "vx_mm_s", "vy_mm_s", "moving"),
+    ),
+    "film": (
+        "The film for which the model answered, where it is followed.",
+        ("pretension_MPa", "pretension_std_MPa", "touches"),
+    ),
+}
+"""Objects of numbers that only records of what is followed have, with what they mean and their parts."""
+
+EVENT = "What begins with this record: press, hold, slide, tap or release."
+
 OTHERS: dict[str, dict[str, Any]] = {
     "contact": {"type": "boolean", "description": "Whether something touches."},
     "flags": {"type": "array", "items": {"type": "string"}, "description": "Words, each one a reason for care."},
@@ -202,14 +227,19 @@ def _object(electrodes: tuple[str, ...], *, or_null: bool) -> dict[str, Any]:
     def kind(name: str) -> Any:
         return [name, "null"] if or_null else name
 
-    charge = {"type": kind("number")}
+    number = {"type": kind("number")}
     properties: dict[str, dict[str, Any]] = {
         **{name: {"type": kind("number"), "description": text} for name, text in NUMBERS.items()},
         **{name: {"type": kind("integer"), "description": text} for name, text in WHOLES.items()},
         **{
-            name: {"type": kind("object"), "properties": dict.fromkeys(electrodes, charge), "description": text}
+            name: {"type": kind("object"), "properties": dict.fromkeys(electrodes, number), "description": text}
             for name, text in CHARGES.items()
         },
         **OTHERS,
     }
-    return {"type": "object", "properties": properties, "required": sorted(properties)}
+    followed: dict[str, dict[str, Any]] = {
+        name: {"type": kind("object"), "properties": dict.fromkeys(parts, number), "description": text}
+        for name, (text, parts) in FOLLOWED.items()
+    }
+    followed["event"] = {"type": kind("string"), "description": EVENT}
+    return {"type": "object", "properties": properties | followed, "required": sorted(properties)}

@@ -6,7 +6,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 
 from isocharge.serve import Port, Predictor, load_device, stream
-from isocharge.serve.export.record_messages import DEFLECTION_STD, TURN_VARIANCE, time_of
+from isocharge.serve.export.record_messages import DEFLECTION_STD, TURN_VARIANCE, contact_of, time_of
 
 
 class TouchNode(Node):
@@ -23,18 +23,18 @@ class TouchNode(Node):
     def publish(self, record):
         if record.force_N is None:  # the board sent something that is no number
             return
-        x, y = 1e-3 * (record.x_mm or 0.0), 1e-3 * (record.y_mm or 0.0)
+        touch = contact_of({name: getattr(record, name) for name in record.written})
+        force, x, y = touch["force_N"], 1e-3 * (touch["x_mm"] or 0.0), 1e-3 * (touch["y_mm"] or 0.0)
         message = self.stamped(WrenchStamped(), record)
-        message.wrench.force.z = -record.force_N
-        message.wrench.torque.x, message.wrench.torque.y = -y * record.force_N, x * record.force_N
+        message.wrench.force.z = -force
+        message.wrench.torque.x, message.wrench.torque.y = -y * force, x * force
         self.wrench.publish(message)
         if record.contact:
             message = self.stamped(PoseWithCovarianceStamped(), record)
             message.pose.pose.position.x, message.pose.pose.position.y = x, y
-            variances = (1e-3 * record.x_std_mm) ** 2, (1e-3 * record.y_std_mm) ** 2, DEFLECTION_STD**2
-            message.pose.covariance[::7] = [*variances, TURN_VARIANCE, TURN_VARIANCE, TURN_VARIANCE]
-            covariance = 1e-6 * record.x_std_mm * record.y_std_mm * (record.xy_correlation or 0.0)
-            message.pose.covariance[1] = message.pose.covariance[6] = covariance
+            x_std, y_std = 1e-3 * touch["x_std_mm"], 1e-3 * touch["y_std_mm"]
+            message.pose.covariance[::7] = [x_std**2, y_std**2, DEFLECTION_STD**2, *[TURN_VARIANCE] * 3]
+            message.pose.covariance[1] = message.pose.covariance[6] = x_std * y_std * (record.xy_correlation or 0.0)
             self.pose.publish(message)
 
 
