@@ -194,9 +194,10 @@ def undo_memory(
     if tau_s is not None:
         surplus_pC = output_pC - np.exp(-dt_s / tau_s) * leak.output_pC - leak.inflow_pC_per_s * dt_s
         film_pC = memory.film_pC + surplus_pC
-    terms_pC = memory.terms_pC * np.exp(-dt_s / rule.times_s)[:, np.newaxis]
+    left = np.exp(-dt_s / rule.times_s)
+    terms_pC, remembered_pC = memory.terms_pC * left[:, np.newaxis], left.dot(memory.terms_pC)
     warmth = memory.warmth.after(dt_s, rule.warmth_s)
-    apart_pC = film_pC - warmth.charge_pC - terms_pC.sum(axis=0) + film.extra * memory.held_pC
+    apart_pC = film_pC - warmth.charge_pC - remembered_pC + film.extra * memory.held_pC
     charge_pC = apart_pC / film.at_once
     unseen_s = memory.unseen_s + dt_s
     if contact or memory.lingers:
@@ -213,22 +214,19 @@ def undo_memory(
         leak = leak._replace(hold_s=leak.hold_s - dt_s)
     else:
         slope = slope + ((1.0 - fading) ** 2 / max(dt_s, 1e-9)) * apart_pC
-        calm = leak.learned_s < leak_rule.settle_s or float(np.abs(slope).max()) < CALM_PC_PER_S
+        calm = leak.learned_s < leak_rule.settle_s or max(map(abs, slope.tolist())) < CALM_PC_PER_S
         if tau_s is not None and leak_rule.learn and calm:
-            recovery_pC = terms_pC.sum(axis=0) - memory.terms_pC.sum(axis=0)
+            recovery_pC = (terms_pC - memory.terms_pC).sum(axis=0)
             leak = learn_inflow(leak_rule, leak, surplus_pC - recovery_pC, noise_pC, dt_s)
-    after = memory._replace(
-        leak=leak._replace(charge_pC=charge_pC, output_pC=output_pC),
-        film_pC=film_pC,
-        terms_pC=terms_pC,
-        held_pC=np.zeros_like(charge_pC),
-        warmth=Warmth(warm_pC, slope),
-    )
-    if memory.learn_s > 0.0:
-        expected = memory.expected.after(dt_s, rule.warmth_s)
-        after = after._replace(expected=expected, unseen_s=unseen_s, learn_s=memory.learn_s - dt_s)
-        if leak.hold_s <= 0.0:
-            after = _learn_film(after, dt_s)
+    leak = leak._replace(charge_pC=charge_pC, output_pC=output_pC)
+    learn_s, expected = memory.learn_s, memory.expected
+    learns = learn_s > 0.0
+    if learns:
+        learn_s, expected = learn_s - dt_s, expected.after(dt_s, rule.warmth_s)
+    warmths = (Warmth(warm_pC, slope), memory.trusted, memory.candidate, expected)
+    after = Memory(film, leak, film_pC, terms_pC, np.zeros_like(charge_pC), *warmths, unseen_s, learn_s)
+    if learns and leak.hold_s <= 0.0:
+        after = _learn_film(after, dt_s)
     return _grown_older(after, dt_s, leak_rule.look_back_s)
 
 
@@ -266,10 +264,12 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
 
 def _grown_older(memory: Memory, dt_s: float, look_back_s: float) -> Memory:
     """A frame later; every `look_back_s` the candidate becomes the trusted warmth."""
-    trusted, candidate = (one._replace(age_s=one.age_s + dt_s) for one in (memory.trusted, memory.candidate))
-    if candidate.age_s < look_back_s:
-        return memory._replace(trusted=trusted, candidate=candidate)
-    return memory._replace(trusted=candidate, candidate=memory.warmth)
+    (charge_pC, slope, age_s), before = memory.trusted, memory.candidate
+    trusted = Warmth(charge_pC, slope, age_s + dt_s)
+    candidate = Warmth(before.charge_pC, before.slope_pC_per_s, before.age_s + dt_s)
+    if candidate.age_s >= look_back_s:
+        trusted, candidate = candidate, memory.warmth
+    return memory._replace(trusted=trusted, candidate=candidate)
 
 
 def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
@@ -307,11 +307,10 @@ def warmer(memory: Memory, change_pC: Array | float, rate_pC_per_s: Array | floa
 
 def doubt(memory: Memory) -> float:
     """Relative standard deviation of all touch charges together, because creep and step are not known better."""
-    total_pC = float(memory.held_pC.sum())
+    total_pC = sum(memory.held_pC.tolist())
     if total_pC <= 0.0:
         return 0.0
-    terms_pC = memory.terms_pC.sum(axis=1)
-    crept = float(terms_pC[:-1].sum()) / total_pC - memory.film.crept
-    cooled = float(terms_pC[-1]) / total_pC
+    *crept_pC, cooled_pC = memory.terms_pC.sum(axis=1).tolist()
+    crept, cooled = sum(crept_pC) / total_pC - memory.film.crept, cooled_pC / total_pC
     of_creep, of_step, both = memory.film.variances
     return math.sqrt(max(crept * crept * of_creep + cooled * cooled * of_step + 2.0 * crept * cooled * both, 0.0))
