@@ -138,11 +138,20 @@ def test_other_electrodes_need_another_name(film, make_film, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "data", [b"", b"\x00" * 100, b"PK\x03\x04 not ONNX", None], ids=["empty", "zeros", "zip", "half"]
+    "spoilt",
+    [
+        lambda _: b"",
+        lambda _: b"\x00" * 100,
+        lambda _: b"PK\x03\x04 not ONNX",
+        lambda data: data[:200],
+        lambda data: data.replace(b'["A"', b'[\xff\xff"'),
+        lambda data: data.replace(b"misfit", b"misfi\xff"),
+    ],
+    ids=["empty", "zeros", "zip", "half", "metadata are no text", "a name is no text"],
 )
-def test_not_a_model_is_chained_from_its_cause(own_model, data):
+def test_not_a_model_is_chained_from_its_cause(own_model, spoilt):
     path, golden = own_model / "model.onnx", own_model / "golden.json"
-    data = path.read_bytes()[:200] if data is None else data
+    data = spoilt(path.read_bytes())
     golden.write_text(golden.read_text().replace(sha256_of(path.read_bytes()), sha256_of(data)))
     path.write_bytes(data)
     with pytest.raises(ModelError, match=f"these {len(data)} bytes") as caught:

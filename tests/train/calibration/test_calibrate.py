@@ -163,6 +163,16 @@ def test_what_no_parameter_describes_is_corrected_and_its_error_is_said(problem)
     )
 
 
+def test_a_turned_stage_is_named(problem):
+    """By 8 degrees beside what the electrodes are turned by; that is two degrees or less."""
+    truth, presses = rig(problem, 8, seed=43)
+    angle = np.copysign(np.deg2rad(8.0), truth[problem.prior.names.index("rotation")])
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = presses.contact @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    cautions = calibrate(presses_of(problem, turned, presses.charge_pC), problem).cautions
+    assert any(re.search(r"as a film may be: rotation; .* axes of the stage", said) for said in cautions)
+
+
 @pytest.mark.parametrize(
     ("change", "caution"),
     [

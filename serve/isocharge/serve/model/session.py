@@ -56,7 +56,10 @@ def open_session(
         held = {name: ort.OrtValue.ortvalue_from_numpy(values) for name, values in constants.items()}
         for name, value in held.items():
             options.add_initializer(name, value)
-        return ort.InferenceSession(onnx_model, options, providers=["CPUExecutionProvider"])
+        session = ort.InferenceSession(onnx_model, options, providers=["CPUExecutionProvider"])
+        _ = session.get_modelmeta().custom_metadata_map  # raises here, not later, if it is no text
+        _ = [tensor.name for tensor in (*session.get_inputs(), *session.get_outputs())]
+        return session
     except Exception as error:  # onnxruntime's exceptions have no common base of their own
         raise ModelError(
             f"{where}: onnxruntime {ort.__version__} cannot read these {len(onnx_model)} bytes as a model "

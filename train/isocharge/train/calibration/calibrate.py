@@ -42,6 +42,9 @@ MISLED = 8.0
 FEW = 3
 """With so few presses a wrong one cannot be seen: said, not refused."""
 
+EDGE = 0.1
+"""Standard deviations before the presses from its bound, within which a parameter counts as held by it: said."""
+
 MORE = 30
 """Presses of which it is said what they would reach, where a film has what no parameter describes."""
 
@@ -136,8 +139,8 @@ class CalibrationResult:
             f"{before.force_percent:.2g} %. Noise alone leaves {noise.position_mm:.2g} mm and "
             f"{noise.force_percent:.2g} %.",
             *summarise(self.quantities),
-            "Forces are as right as the load cell, and places as the origin of the stage: an error of theirs is in "
-            "every answer, beside these.",
+            "Forces are as right as the load cell, and places as the origin and the axes of the stage: an error of "
+            "theirs is in every answer, beside these.",
             *self._unexplained,
             *self.cautions,
         )
@@ -197,7 +200,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
             "are given larger by this factor: are places and forces as certain as assumed?"
         )
     posterior = _with_unseen_mistakes(posterior, problem.before)
-    return CalibrationResult(problem, presses, posterior, (*cautions, *_cautions(presses, posterior)))
+    return CalibrationResult(problem, presses, posterior, (*cautions, *_cautions(presses, problem, posterior)))
 
 
 def _check_enough_known(presses: MeasuredPresses, problem: CalibrationProblem) -> None:
@@ -238,7 +241,7 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
     return replace(posterior, joint=joint, covariance=joint[: len(before.parameters), : len(before.parameters)])
 
 
-def _cautions(presses: MeasuredPresses, posterior: FilmPosterior) -> Iterator[str]:
+def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> Iterator[str]:
     if posterior.bad.any():
         lines = _lines(presses[posterior.bad])
         yield f"{lines}: left out, since no film fits them and all others; look at them again"
@@ -259,6 +262,14 @@ def _cautions(presses: MeasuredPresses, posterior: FilmPosterior) -> Iterator[st
             f"forces scatter {100.0 * posterior.scatter:.2g} % about those of the charges, over what they are said to: "
             "are both read at the same moment, or does charge leak in between? What lowers charges at random lowers "
             "them on average as well: the errors allow for as much"
+        )
+    prior, parameters = problem.prior, posterior.parameters
+    low, high = prior.bounds
+    held = (parameters < low + EDGE * prior.std) & (low < 0.0) | (parameters > high - EDGE * prior.std)
+    if held.any():
+        yield (
+            f"as far from their description as a film may be: {', '.join(np.array(prior.names)[held])}; the errors may "
+            "be larger than is said. Are the sensor file, and the origin and axes of the stage, those of this film?"
         )
     places = good.contact[np.isfinite(good.contact[:, 0]), :2]
     if len(places) > 1 and np.ptp(places, axis=0).max() < CLOSE_MM:
