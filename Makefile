@@ -22,9 +22,8 @@ test: $(VENV)/installed
 test-all: docs
 	$(BIN)/python -m pytest -m "slow or not slow"
 
-# More than a million bad inputs for every reader, and a good client beside each attack; ten minutes on two cores.
+# More than a million bad inputs for every reader; ten minutes on two cores.
 attack: $(VENV)/installed
-	$(BIN)/python -m pytest tests/attacks -m slow -rP
 	$(ONE_THREAD) $(BIN)/python -m pytest tests/attacks --all-attacks -n 2 --timeout 900
 
 # The site: pages, gallery and the reference of all modules, in build/docs/index.html. A warning is an error.

@@ -45,14 +45,6 @@ def test_a_thicker_and_a_tauter_film_give_less_charge(run):
     assert (np.diff(by_thickness, axis=1) < 0.0).all()
 
 
-@pytest.mark.slow  # tests/test_pages.py calibrates the same film by the command
-def test_a_film_is_calibrated(run, tmp_path):
-    said = run("train/examples/calibrate.py", tmp_path)
-    released, calibrated = (numbers(line)[0] for line in said.splitlines()[-2:])
-    assert calibrated < 0.1 * released
-    assert (tmp_path / "film/sensor.toml").is_file()
-
-
 def test_a_lamp_is_switched_by_each_hard_press(run, monkeypatch):
     monkeypatch.setattr(ForwardMap, "build", partial(kept, ForwardMap.build))
     lines = run("serve/examples/lamp.py").splitlines()
@@ -62,13 +54,3 @@ def test_a_lamp_is_switched_by_each_hard_press(run, monkeypatch):
 
 def test_frames_that_nobody_described_are_read(run):
     assert "400 of 400 frames are read" in run("serve/examples/foreign_board.py")
-
-
-@pytest.mark.slow  # tests of executors compare the same in every run
-def test_any_executor_gives_the_same_dataset(tmp_path, monkeypatch, capsys):
-    distributed = pytest.importorskip("distributed")
-    script = ROOT / "simulate/examples/sweep_on_executors.py"
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
-        monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path), cluster.scheduler_address])
-        runpy.run_path(str(script), run_name="__main__")
-    assert "the same charges: True" in capsys.readouterr().out

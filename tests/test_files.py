@@ -4,15 +4,11 @@ import io
 import os
 import signal
 
-import numpy as np
 import pytest
 
 from isocharge.common.errors import OutputError, OutputExists
 from isocharge.common.files import WholeWrites, bounded_lines, new_file, read_whole
 from isocharge.common.number_text import number_of
-from isocharge.common.resumable_run import resume_folder
-from isocharge.simulate.execution.workers import in_order
-from isocharge.train.training.descent import tensors
 
 
 def test_a_file_is_read_whole(tmp_path):
@@ -78,30 +74,3 @@ def test_what_is_no_number(text):
 
 def test_what_is_a_number():
     assert [number_of(text) for text in ("10", " 1e3 ", "-.5", "+7.")] == [10.0, 1000.0, -0.5, 7.0]
-
-
-GARBAGE = [b"", b"\x93NUMPY\x01\x00", b"PK\x03\x04", b"\x80\x02."]
-
-
-@pytest.mark.parametrize("data", GARBAGE)
-def test_a_part_that_is_garbage_is_computed_again(tmp_path, data, caplog):
-    """Its checksum fits: somebody else wrote it."""
-    with resume_folder(tmp_path / "target", {"a": 1}) as run:
-        run.save("solve-0000.npy", data)
-        results = list(in_order(run.keeping("solve"), lambda job: np.full(2, job), [1.0, 2.0]))
-        np.testing.assert_array_equal(results, [[1.0, 1.0], [2.0, 2.0]])
-        run.save("weights", data)
-        assert run.load("weights", tensors) is None
-    assert ["computed again" in record.message for record in caplog.records] == [True, True]
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, "", "\xff", '{"a": ' * 500])
-def test_a_run_whose_settings_are_garbage_is_left_alone(tmp_path, text):
-    draft = tmp_path / "target.part"
-    draft.mkdir()
-    (draft / "run.json").write_text(text, encoding="latin-1")
-    with (
-        pytest.raises(OutputExists, match=r"holds no run\.json"),
-        resume_folder(tmp_path / "target", {}),
-    ):
-        pass

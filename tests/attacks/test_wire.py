@@ -1,20 +1,13 @@
-"""What clients send: requests with faults, thousands at once, other protocols, calls without words.
-
-The server is a process of its own. While each attack goes on, a client that means well asks one press after another:
-its answers are right, and 99 of 100 come within ten times of what they take when nobody attacks.
-"""
+"""What clients send to a server process: requests, bodies and gRPC messages with faults, other protocols."""
 
 import json
-import random
 import re
 import select
 import signal
 import socket
 import subprocess
 import sys
-import threading
-import time
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import grpc
@@ -41,23 +34,6 @@ REQUEST = b"POST %s HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nCon
     BODY,
 )
 
-GOOD_CLIENT = """
-import socket, sys, time
-host, port, seconds, request = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), sys.stdin.buffer.read()
-connection = socket.create_connection((host, port), timeout=20)
-connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-waits, first, end = [], None, time.perf_counter() + seconds
-while time.perf_counter() < end:
-    began = time.perf_counter()
-    connection.sendall(request)
-    answer = connection.recv(1 << 16)
-    waits.append(time.perf_counter() - began)
-    first = first or answer
-    assert answer == first and answer.startswith(b"HTTP/1.1 200"), answer
-    time.sleep(0.001)
-print(sorted(waits)[int(0.99 * len(waits))])
-"""
-
 
 class Server:
     """A server process, its ports, and what it says on stderr."""
@@ -73,13 +49,6 @@ class Server:
 
     def resident_bytes(self):
         return int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]) * 4096
-
-    def p99(self, seconds):
-        """Of a good client, s."""
-        words = [sys.executable, "-c", GOOD_CLIENT, self.http[0], str(self.http[1]), str(seconds)]
-        done = subprocess.run(words, input=REQUEST, capture_output=True, check=False, timeout=60)
-        assert done.returncode == 0, done.stderr.decode()
-        return float(done.stdout)
 
     def end(self):
         self.process.send_signal(signal.SIGTERM)
@@ -226,66 +195,3 @@ def test_grpc_messages_with_faults(server, attack):
 
         attack("wire grpc messages", read, cases, 20_000)
     assert is_live(server)
-
-
-def flood(server, over, _):
-    """Thousands of good requests in one connection, and somebody who reads the answers."""
-    with socket.create_connection(server.http) as connection:
-        connection.setblocking(False)
-        data, at = REQUEST * 2_000, 0
-        while not over.is_set():
-            readable, writable, _ = select.select([connection], [connection], [], 0.1)
-            if writable:
-                at = (at + connection.send(data[at : at + (1 << 18)])) % len(data)
-            if readable and not connection.recv(1 << 18):
-                return
-
-
-def connections(server, over, rng):
-    """Connections that begin a request and stop."""
-    with ExitStack() as stack:
-        while not over.is_set():
-            for _ in range(50):
-                held = stack.enter_context(socket.create_connection(server.http))
-                with suppress(ConnectionError):
-                    held.sendall(REQUEST[: rng.randrange(len(REQUEST))])
-            time.sleep(0.1)
-            if rng.random() < 0.1:
-                stack.close()
-
-
-def silent_calls(server, over, _):
-    """gRPC calls that say nothing, from some connections."""
-    with ExitStack() as stack:
-        options = [("grpc.use_local_subchannel_pool", 1)]
-        channels = [
-            stack.enter_context(grpc.insecure_channel(f"127.0.0.1:{server.grpc[1]}", options)) for _ in range(4)
-        ]
-        silent = [
-            channel.stream_stream(f"/{SERVICE}/ModelStreamInfer")(iter(lambda: over.wait() and None, None))
-            for channel in channels
-            for _ in range(50)
-        ]
-        over.wait()
-        for call in silent:
-            call.cancel()
-
-
-ATTACKS = (flood, connections, silent_calls)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ATTACKS, ids=lambda kind: kind.__name__)
-def test_a_good_client_beside(server, kind):
-    """Its p99 stays within ten times of its quiet value, which is taken just before."""
-    quiet = min(server.p99(2.0) for _ in range(2))
-    over = threading.Event()
-    attacker = threading.Thread(target=kind, args=(server, over, random.Random(0)))
-    attacker.start()
-    try:
-        beside = min(server.p99(3.0) for _ in range(2))  # another program may have had the cores
-    finally:
-        over.set()
-        attacker.join()
-    print(f"{kind.__name__}: p99 {1e6 * beside:.0f} us, quiet {1e6 * quiet:.0f} us, {beside / quiet:.1f} times")
-    assert beside < 10.0 * quiet

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 SOURCES = Path(__file__).parents[1] / "train" / "export_c" / "board"
-TOOLS = ("arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm")
 
 OPTIONS = (
     "-mthumb -mfloat-abi=hard -std=c99 -O2 -ffp-contract=fast -fno-math-errno -ffunction-sections -fdata-sections "

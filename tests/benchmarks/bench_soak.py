@@ -2,20 +2,19 @@
 
     python tests/benchmarks/bench_soak.py [--requests 1000000] [--model NAME|PATH] [--seed 0] [--json]
 
-Requests are JSON and binary, of one press and of three, drawn from 1000 that were made before; a quarter of them goes
-over gRPC. An answer must equal, bit for bit, what `Predictor` says of the same charges. Ten times the model
-is loaded anew while the others go on. Memory is the server's resident set, from the end of a warm-up (a twentieth of
-the requests) to the end.
+Requests are JSON and binary, of one press and of three, drawn from 1000 that were made before; six of sixteen go over
+gRPC. An answer must equal, bit for bit, what `Predictor` says of the same charges. Ten times the model is loaded anew
+while all ask. Memory is the server's resident set, from the end of the first tenth to the end.
 """
 
 import argparse
 import itertools
 import os
-import selectors
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +28,8 @@ from isocharge.serve import Predictor, find_model
 from isocharge.serve.network.grpc.service import METHODS, SERVICE
 
 KINDS = 1000
-RELOADS = 10
-HTTP_CLIENTS, GRPC_CLIENTS, GRPC_SHARE = 10, 6, 0.25
+ROUNDS = 10
+HTTP_CLIENTS, GRPC_CLIENTS = 10, 6
 
 
 def presses(predictor: Predictor, seed: int) -> list[np.ndarray]:
@@ -75,26 +74,13 @@ def resident_bytes(process: int) -> int:
     return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def soak(address: tuple[str, int], made: list[tuple[bytes, bytes]], count: int) -> Iterator[int]:
-    """Send and compare; yields after each thousand of answers how many there were."""
-    asked, answers = itertools.cycle(made), 0
-    with selectors.DefaultSelector() as waiting:
-        for _ in range(HTTP_CLIENTS):
-            connection = Connection(address)
-            request, expected = next(asked)
-            waiting.register(connection.socket, selectors.EVENT_READ, [connection, expected])
-            connection.socket.sendall(request)
-        while answers < count:
-            for key, _ in waiting.select(10.0):
-                connection, expected = key.data
-                got = numbers_in(connection.receive())
-                if got != expected:
-                    raise RuntimeError(f"answer {answers}: expected {expected!r}, got {got!r}")
-                request, key.data[1] = next(asked)
-                connection.socket.sendall(request)
-                answers += 1
-                if answers % 1000 == 0:
-                    yield answers
+def ask_over_http(address: tuple[str, int], made: list[tuple[bytes, bytes]], count: int) -> None:
+    """Ask and compare over an HTTP connection of its own."""
+    with closing(Connection(address)) as connection:
+        for request, expected in itertools.islice(itertools.cycle(made), count):
+            got = numbers_in(connection.ask(request))
+            if got != expected:
+                raise RuntimeError(f"HTTP: expected {expected!r}, got {got!r}")
 
 
 def ask_over_grpc(address: tuple[str, int], predictor: Predictor, count: int, seed: int) -> None:
@@ -118,49 +104,35 @@ def ask_over_grpc(address: tuple[str, int], predictor: Predictor, count: int, se
                 raise RuntimeError(f"gRPC: expected {expected!r}, got {got!r}")
 
 
-def load_again(address: tuple[str, int], name: str) -> None:
-    connection = Connection(address)
-    connection.ask(http_request(f"/v2/repository/models/{name}/load", b""))
-    connection.close()
-
-
 def measure(asked: argparse.Namespace) -> dict[str, Any]:
-    """Run it all."""
-    folder, address = find_model(asked.model).resolve(), ("127.0.0.1", free_port())
-    predictor = Predictor(folder)
-    name = predictor.metadata.name
-    made = exchanges(predictor, f"/v2/models/{name}/infer", asked.seed)
-    ours: list[str | Path] = [Path(sys.executable).with_name("isocharge"), "serve", "http"]
-    over_grpc = round(GRPC_SHARE * asked.requests / GRPC_CLIENTS)
-    over_http = asked.requests - GRPC_CLIENTS * over_grpc
-    loads, warm, grpc_address = 0, 0, ("127.0.0.1", free_port())
-    ports = ["--port", str(address[1]), "--grpc-port", str(grpc_address[1])]
-    command = [*ours, "--models", folder.parents[1], *ports]
-    with ThreadPoolExecutor(GRPC_CLIENTS) as threads, running(command, address) as process:
+    """Run it all, in rounds."""
+    folder, address, grpc_address = find_model(asked.model).resolve(), *(("127.0.0.1", free_port()) for _ in range(2))
+    predictor, memory = Predictor(folder), []
+    path, name = f"/v2/models/{predictor.metadata.name}/infer", predictor.metadata.name
+    count, made = asked.requests // (ROUNDS * (HTTP_CLIENTS + GRPC_CLIENTS)), exchanges(predictor, path, asked.seed)
+    clients = [partial(ask_over_http, address, made[first:] + made[:first], count) for first in range(HTTP_CLIENTS)]
+    clients += [partial(ask_over_grpc, grpc_address, Predictor(folder), count, seed) for seed in range(GRPC_CLIENTS)]
+    command = [Path(sys.executable).with_name("isocharge"), "serve", "http", "--models", folder.parents[1]]
+    command += ["--port", str(address[1]), "--grpc-port", str(grpc_address[1])]
+    with ThreadPoolExecutor(len(clients)) as threads, running(command, address) as process:
         begin = time.perf_counter()
-        clients = [
-            threads.submit(ask_over_grpc, grpc_address, Predictor(folder), over_grpc, number)
-            for number in range(GRPC_CLIENTS)
-        ]
-        for answers in soak(address, made, over_http):
-            if answers * RELOADS // over_http > loads:
-                load_again(address, name)
-                loads += 1
-            if not warm and answers >= over_http / 20:
-                load_again(address, name)
-                warm = resident_bytes(process.pid)
-        for client in clients:
-            client.result()
-        seconds, end = time.perf_counter() - begin, resident_bytes(process.pid)
+        for _ in range(ROUNDS):
+            asking = [threads.submit(client) for client in clients]
+            with closing(Connection(address)) as connection:
+                connection.ask(http_request(f"/v2/repository/models/{name}/load", b""))
+            for one in asking:
+                one.result()
+            memory.append(resident_bytes(process.pid))
+        seconds = time.perf_counter() - begin
     return {
-        "requests": asked.requests,
-        "over_grpc": GRPC_CLIENTS * over_grpc,
-        "clients": HTTP_CLIENTS + GRPC_CLIENTS,
+        "requests": count * ROUNDS * len(clients),
+        "over_grpc": count * ROUNDS * GRPC_CLIENTS,
+        "clients": len(clients),
         "answers_equal": "all, bit for bit",
-        "loads_meanwhile": loads + 1,  # and the one that ends the warm-up
+        "loads_meanwhile": ROUNDS,
         "seconds": round(seconds, 1),
-        "memory_MB": round(end / 1e6, 2),
-        "memory_growth_MB": round((end - warm) / 1e6, 2),
+        "memory_MB": round(memory[-1] / 1e6, 2),
+        "memory_growth_MB": round((memory[-1] - memory[0]) / 1e6, 2),
     }
 
 

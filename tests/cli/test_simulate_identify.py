@@ -42,16 +42,6 @@ def test_wrong_words_are_refused_at_once(command, words, message):
     assert message in err
 
 
-@pytest.mark.slow
-def test_a_sweep_over_the_working_area(command, tmp_path):
-    sweep = ("--radius", "auto", "--force", "0.5", "1", "--samples", "200", "--workers", "1")
-    code, _, err = command("simulate", "sweep", "three-25um-biaxial", *sweep, "-o", tmp_path / "presses")
-    assert code == 0
-    radius = json.loads((tmp_path / "presses" / "manifest.json").read_text())["ranges"]["radius_mm"]
-    assert 8.0 < radius < 9.9
-    assert f"circle:1.0: Working area: up to {radius:g} mm" in err
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

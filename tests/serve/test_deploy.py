@@ -1,11 +1,8 @@
 """What serve/deploy ships: units, images, manifests and hosts, each tried as far as this machine allows."""
 
-import ctypes
 import json
 import os
 import re
-import resource
-import shlex
 import shutil
 import subprocess
 import sys
@@ -29,7 +26,6 @@ DEPLOY = ROOT / "serve/deploy"
 UNIT = DEPLOY / "systemd/isocharge.service"
 ENVIRONMENTS = Path(os.environ.get("ISOCHARGE_BENCH_ENVIRONMENTS", ROOT / "build/bench-environments"))
 MODELS = find_model("three-25um-biaxial").parents[1]
-PR_SET_NO_NEW_PRIVS, PR_SET_MDWE = 38, 65
 
 
 @contextmanager
@@ -109,40 +105,6 @@ def test_systemd_finds_nothing_wrong_with_the_unit(unit):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
-def test_systemd_calls_the_unit_safe(unit):
-    """Below 1.5 of 10; the same unit without its hardening is above 9."""
-    words = ["systemd-analyze", "security", "--offline=true", "--no-pager", "--threshold=15"]
-    done = subprocess.run([*words, unit], capture_output=True, text=True, timeout=60, check=False)
-    if "unrecognized option" in done.stderr or "Unknown" in done.stderr:
-        pytest.skip("this systemd-analyze cannot judge a file")
-    assert done.returncode == 0, done.stdout[-500:]
-    bare = [line for line in unit.read_text().splitlines() if line.startswith(("[", "ExecStart", "Type"))]
-    unit.write_text("\n".join(bare) + "\n")
-    assert subprocess.run([*words, unit], capture_output=True, timeout=60, check=False).returncode != 0
-
-
-def test_the_server_runs_within_what_the_unit_allows(unit, models):
-    """As far as a process can restrict itself: no new rights, no writable code, few descriptors, a read-only folder."""
-    text = unit.read_text()
-    words = shlex.split(re.search(r"^ExecStart=(.+)$", text, re.MULTILINE)[1].replace("--port 8000", "--port 0"))
-    descriptors = int(re.search(r"^LimitNOFILE=(\d+)$", text, re.MULTILINE)[1])
-    libc = ctypes.CDLL(None, use_errno=True)
-
-    def restrict():
-        resource.setrlimit(resource.RLIMIT_NOFILE, (descriptors, descriptors))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        for option in (PR_SET_NO_NEW_PRIVS, PR_SET_MDWE):  # an older kernel knows not the second
-            libc.prctl(option, 1, 0, 0, 0)
-
-    named = dict(pair.split("=") for pair in re.search(r"^Environment=(.+)$", text, re.MULTILINE)[1].split())
-    command = [*words, "--models", str(models)]
-    with running(command, preexec_fn=restrict, env=os.environ | named, cwd="/") as (process, url):
-        assert url, process.communicate(timeout=20)[1]
-        assert status_of(f"{url}/v2/health/ready") == 200
-        assert status_of(f"{url}/metrics") == 200
-
-
 # Prometheus
 
 
@@ -190,51 +152,3 @@ def test_the_manifest_starts_our_server_as_it_says(predictor_of_kserve, models, 
 
 
 # Containers
-
-
-def steps(stage):
-    """Instructions of one stage of the Containerfile, with their arguments."""
-    text = (DEPLOY / "Containerfile").read_text()
-    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
-    starts = [number for number, line in enumerate(lines) if line.startswith("FROM")] + [len(lines)]
-    return [tuple(line.split(" ", 1)) for line in lines[starts[stage] : starts[stage + 1]]]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_the_steps_of_the_containerfile_make_a_server(tmp_path):
-    """Its steps in a clean folder, as no container engine is here: COPY copies what git tracks, RUN runs."""
-    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
-    source, image = tmp_path / "src", tmp_path / "opt/isocharge"
-    environment = {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin", "HOME": str(tmp_path)}
-    environment |= {name: value for name, value in os.environ.items() if name.lower().startswith(("pip_", "https_"))}
-    for instruction, words in steps(0):
-        if instruction == "COPY":
-            for name in words.split()[:-1]:
-                for path in tracked:
-                    if path == name or path.startswith(f"{name}/"):
-                        (source / path).parent.mkdir(parents=True, exist_ok=True)
-                        shutil.copy2(ROOT / path, source / path)
-        elif instruction == "RUN":
-            words = words.replace("/opt/isocharge", str(image))
-            subprocess.run(["sh", "-ec", words], cwd=source, env=environment, check=True, timeout=600)
-        else:
-            assert instruction in ("FROM", "WORKDIR")
-    packages = {path.name.split("-")[0].lower() for path in image.glob("lib/python3*/site-packages/*.dist-info")}
-    assert {"isocharge", "onnxruntime", "uvloop", "prometheus_client"} <= packages
-    assert not packages & {"pip", "torch", "scipy", "scikit_learn", "matplotlib", "onnx", "pytest"}
-    shutil.rmtree(source)
-
-    final = dict(steps(1))
-    words = json.loads(final["ENTRYPOINT"]) + json.loads(final["CMD"])
-    words = [word.replace("/opt/isocharge", str(image)) if word != "8000" else "0" for word in words]
-    refused = subprocess.run(words, env=environment, cwd="/", capture_output=True, text=True, timeout=60, check=False)
-    assert (refused.returncode, "--token" in refused.stderr) == (2, True)
-    with running(words, env=environment | {"ISOCHARGE_TOKEN": "yes"}, cwd="/") as (_, url):
-        url = url.replace("0.0.0.0", "127.0.0.1")
-        health = json.loads(final["HEALTHCHECK"].removeprefix("CMD "))
-        health = [word.replace("/opt/isocharge", str(image)).replace("http://127.0.0.1:8000", url) for word in health]
-        assert subprocess.run(health, env=environment, timeout=60, check=False).returncode == 0
-        assert status_of(f"{url}/v2/models/four-25um-biaxial", "yes") == 200
-        assert status_of(f"{url}/v2/models/four-25um-biaxial") == 401
-    assert subprocess.run(health, env=environment, stderr=subprocess.DEVNULL, timeout=60, check=False).returncode != 0

@@ -1,4 +1,8 @@
-"""A missing extra says how to get it; any other failed import is not dressed up as one."""
+"""A missing extra says how to get it; any other failed import is not dressed up as one; serving needs none."""
+
+import json
+import subprocess
+import sys
 
 import pytest
 
@@ -39,3 +43,12 @@ def test_other_missing_package_passes():
 def test_nothing_missing():
     with require("train"):
         pass
+
+
+def test_serving_loads_nothing_heavy():
+    code = "import json, sys; import isocharge.serve; isocharge.serve.Predictor; print(json.dumps([*sys.modules]))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(json.loads(done.stdout))
+    assert "onnxruntime" in loaded
+    assert not loaded & {"torch", "scipy", "sklearn", "onnx", "matplotlib", "typer", "rich"}
+    assert not loaded & {"isocharge.simulate", "isocharge.train", "isocharge.cli"}

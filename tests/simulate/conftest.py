@@ -26,7 +26,6 @@ from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template
 from kept import kept
 
-DATA = Path(__file__).parents[1] / "data"
 TURNED = Polygon.rectangle(4.0, 2.0, 0.3)
 FULL = Theory(stretching=True, bending=True, pretensioned=False)
 

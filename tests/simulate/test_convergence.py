@@ -65,13 +65,6 @@ def test_charge_converges_exponentially_with_the_order(solves, name, readout):
     check(solves, partial(touch_charge, sensor), 0.3, 1e-4)
 
 
-def test_charge_of_a_surface_converges(solves):
-    """Second derivatives: two orders behind."""
-    sensor = replace(load_sensor("four-25um-uniaxial"), film=solves[0].film, surface="top")
-    if solves[0].theory.bending:
-        check(solves, partial(touch_charge, sensor), 0.3, 5e-3)
-
-
 # Every element in half, and half again; the block round the footprint keeps its depth, so not for ever
 
 

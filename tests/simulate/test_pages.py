@@ -8,8 +8,7 @@ from textwrap import dedent
 import numpy as np
 
 import isocharge.simulate
-from isocharge.simulate import built_in_sensors, load_amplifier, noise_model
-from isocharge.simulate.dataset.shards import COLUMNS
+from isocharge.simulate import load_amplifier, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
 DOCS = Path(__file__).parents[2] / "simulate" / "docs"
@@ -26,11 +25,6 @@ def test_example_of_the_package():
     assert np.all((scope["charge"] > 500.0) & (scope["charge"] < 1600.0))
 
 
-def test_everything_public_exists():
-    for name in isocharge.simulate.__all__:
-        assert hasattr(isocharge.simulate, name)
-
-
 def test_sensor_file_can_be_read():
     (text,) = (block for block in TABLES if "[film]" in block)
     sensor = sensor_from_dict(tomllib.loads(text))
@@ -38,13 +32,6 @@ def test_sensor_file_can_be_read():
     assert sensor.calibration.gain == {"A": 1.02}
     keys = {"name", "readout", "surface", "radius_mm", "pretension_MPa", "d33", "pyro_uC_per_m2_K", "rotation_deg"}
     assert keys <= set(re.findall(r"^(\w+) =", text, re.MULTILINE))
-
-
-def test_names_are_complete():
-    for name in built_in_sensors():
-        assert f"`{name}`" in FILES
-    for column in COLUMNS:
-        assert f"`{column}`" in DATASETS
 
 
 def test_noise_file_can_be_read(tmp_path):

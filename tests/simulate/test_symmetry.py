@@ -10,11 +10,9 @@ from isocharge.simulate import (
     Film,
     Polygon,
     Probe,
-    Resolution,
     Sensor,
     SolveSettings,
     Theory,
-    deflection,
     load_sensor,
     press,
     touch_charge,
@@ -59,15 +57,6 @@ def mirrored(probe: Probe) -> Probe:
 AT = (6.0, 2.5)
 
 
-@pytest.mark.parametrize(("film", "readout"), list(zip(FILMS, ["edge", "area"], strict=True)))
-def test_half_turn_swaps_opposite_electrodes(probe, film, readout):
-    """Of an uniaxial film too."""
-    sensor = sensor_of("four-25um-uniaxial", film, readout)
-    first = charges(sensor, probe, AT)
-    second = charges(sensor, probe.rotated(np.pi), turned(AT, 180.0))
-    np.testing.assert_allclose(second, first[[2, 3, 0, 1]], **EXACT)
-
-
 def test_quarter_turn_of_an_uniaxial_film_swaps_the_coefficients(probe):
     """What s11 was is s22 now: turning the press and exchanging d31 and d32 passes the charges on."""
     sensor = sensor_of("four-25um-uniaxial")
@@ -94,34 +83,6 @@ def test_mirror(probe, film):
     sensor, order = sensor_of("three-25um-uniaxial", film), [0, 2, 1]
     second = charges(sensor, mirrored(probe), (-AT[0], AT[1]))
     np.testing.assert_allclose(second, charges(sensor, probe, AT)[order], rtol=2e-5)
-
-
-@pytest.mark.parametrize("probe", [RECTANGLE, TRIANGLE, Polygon.rectangle(3.0, 3.0, 0.1)], ids=["2", "3", "4"])
-def test_turn_by_the_period_changes_nothing(probe):
-    sensor = sensor_of("three-25um-uniaxial")
-    second = charges(sensor, probe.rotated(probe.period), AT)
-    np.testing.assert_allclose(second, charges(sensor, probe, AT), rtol=2e-5)
-    half = charges(sensor, probe.rotated(0.5 * probe.period), AT)
-    assert np.abs(half / second - 1.0).max() > 1e-4
-
-
-@pytest.mark.first_cases(1)
-@pytest.mark.parametrize("film", FILMS)
-def test_polygon_of_many_corners_is_a_circle(film):
-    """24 corners and the same area: what is left is the 24th harmonic and a second moment off by 5e-6.
-
-    The bounds are twice what the polygon's mesh leaves: 3e-3, 2e-4 and 2e-5 of a charge at orders 3, 4 and 5.
-    """
-    sensor, count, radius = sensor_of("four-25um-uniaxial", film), 24, 2.0
-    angle = 2.0 * np.pi * np.arange(count) / count
-    reach = radius * np.sqrt(2.0 * np.pi / count / np.sin(2.0 * np.pi / count))
-    polygon = Polygon.of(reach * np.stack([np.cos(angle), np.sin(angle)], axis=1))
-    at, theory = (8.0, 1.0), Theory(stretching=True, bending=False, pretensioned=sensor.film.pretension > 0.0)
-    one = press(sensor.film, polygon, at, 1.0, SolveSettings(theory=theory, resolution=Resolution(5, 48, 4)))
-    two = press(sensor.film, Circle(radius), at, 1.0, SolveSettings(theory=theory, resolution=Resolution(7, 8, 6)))
-    np.testing.assert_allclose(touch_charge(sensor, one), touch_charge(sensor, two), rtol=4e-5)
-    points = np.array([at, (0.0, 0.0), (-20.0, 5.0)])
-    np.testing.assert_allclose(deflection(one, points), deflection(two, points), rtol=3e-6)
 
 
 SCALES = {

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 import time
-from itertools import chain, islice, pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from boards import TcpBoard, interrupt, taps
-from isocharge.common.errors import ChargeError, InputError, ModelError, PortLost
+from isocharge.common.errors import InputError
 from isocharge.serve import Recording, Script, VirtualSensor
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
 
@@ -39,14 +39,6 @@ def test_predict_to_csv(presses, models, run):
     assert (result.exit_code, result.stderr) == (0, "")
 
 
-def test_predict_to_records(presses, models, run):
-    records = records_of(run("predict", "linear", presses, "--json", "--models", models).stdout)
-    assert [(round(r["x_mm"], 4), r["contact"], r["timestamp"], r["model"]) for r in records] == [
-        (1.0, True, None, "linear/1"),
-        (-2.0, True, None, "linear/1"),
-    ]
-
-
 def test_predict_from_stdin_and_from_a_file_of_measured_presses(presses, models, run):
     """A byte order mark and the line ends of Windows are passed over; further columns are named on stderr."""
     expected = run("predict", "linear", presses, "--models", models).stdout
@@ -56,21 +48,6 @@ def test_predict_from_stdin_and_from_a_file_of_measured_presses(presses, models,
     presses.write_text("\n".join(["x_mm,y_mm,force_N," + header, *(f"1,,2,{row}" for row in rows)]))
     result = run("predict", "linear", presses, "--models", models)
     assert (result.stdout, "ignored columns" in result.stderr) == (expected, True)
-
-
-@pytest.mark.parametrize(
-    ("model", "file", "text", "error", "said"),
-    [
-        ("linear", "-", "A,B\n1,2\n", ChargeError, "stdin: expected a header with one column for each .*missing: 'C'"),
-        ("linear", "-", "A,B,C\n1,2,\n", ChargeError, "stdin, line 2, column 'C'"),
-        ("linear", "-", "", ChargeError, "stdin: empty"),
-        ("cubic", "-", "A,B,C\n", ModelError, "no model 'cubic'"),
-        ("linear", ".", "", InputError, r"cannot be read .*expected a CSV file, or - for stdin"),
-    ],
-)
-def test_predict_refuses_with_the_reason(models, model, file, text, error, said, run):
-    with pytest.raises(error, match=said):
-        run("predict", model, file, "--models", models, stdin=text)
 
 
 @pytest.fixture
@@ -171,11 +148,6 @@ def test_stream_ends_cleanly_when_the_pipe_closes(board, models, start):
     assert "Error" not in process.stderr.read()
 
 
-def test_stream_of_a_port_that_vanishes(film, models, run):
-    with TcpBoard(islice(taps(film), 300)) as board, pytest.raises(PortLost):
-        run("stream", "linear", "--port", board.url, "--models", models, "--no-reconnect")
-
-
 def test_stream_to_csv_and_udp(frames, models, run):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
@@ -214,18 +186,6 @@ def test_stream_keeps_the_policy_the_name_and_the_limit_of_the_tare(board, model
 def test_a_name_that_is_none(models, run, name):
     with pytest.raises(InputError, match="--name: expected 1 to 100 printable characters"):
         run("stream", "linear", "--port", "p", "--models", models, "--name", name)
-
-
-def test_a_recording_that_was_killed_is_readable(board, models, start, tmp_path, run):
-    """It lacks at most the records of the chunk that was being made."""
-    path = tmp_path / "touch.rec"
-    process = start("stream", "linear", "--port", board.url, "--record", path, "--models", models)
-    lines = [process.stdout.readline() for _ in range(1000)]
-    process.kill()
-    process.wait()
-    replayed = run("replay", path, "--models", models).stdout.splitlines(keepends=True)
-    assert replayed
-    assert replayed[:1000] == lines[: len(replayed)]
 
 
 def test_a_new_tare_is_asked_for_by_a_signal(models, run):
@@ -340,12 +300,6 @@ def test_a_server_whose_streams_are_full_serves(models, tmp_path, streams):
     finally:
         process.kill()
         process.wait()
-
-
-def test_an_empty_token_is_refused(models):
-    """As `--token ''` is: whoever sets it means to have one."""
-    done = bash(f"{ISOCHARGE} serve http --models {models} --port 0", ISOCHARGE_TOKEN="")
-    assert (done.returncode, "token: expected printable ASCII" in done.stderr) == (2, True)
 
 
 def test_a_slow_reader_stops_neither_chain_nor_recording(models, film, tmp_path, start):

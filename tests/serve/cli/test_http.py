@@ -124,12 +124,3 @@ def test_a_log_that_nobody_reads_holds_up_no_request(start):
     client.close()
     process.terminate()
     assert process.wait(timeout=20) == 0
-
-
-def test_a_log_whose_reader_went_away_ends_no_server(start):
-    process = start("--port", 0, "--log", "json")
-    url = process.stdout.readline().strip()
-    process.stderr.close()
-    assert [ask(url)[0] for _ in range(5)] == [200] * 5
-    process.terminate()
-    assert process.wait(timeout=20) == 0

@@ -72,18 +72,6 @@ def played(run, tmp_path):
     return play
 
 
-def test_the_port_is_there_before_the_film_is_solved(played, monkeypatch, tmp_path):
-    build, there = ForwardMap.build, []
-
-    def look(*film, **domain):
-        there.append((tmp_path / "film").exists())
-        return build(*film, **domain)
-
-    monkeypatch.setattr(ForwardMap, "build", look)
-    played(1)
-    assert there == [True]
-
-
 def test_random_presses_come_after_a_second_of_rest(played, asked):
     values, result = played(300, "--noise", "clean", "--force-max", 0.5)
     total = values.sum(axis=1)

@@ -222,19 +222,6 @@ def test_number_in_text_that_wraps(modulus):
     assert (gaps.lost, gaps.repeated, gaps.restarts) == (0, 0, 0)
 
 
-def test_other_names_of_number_and_clock():
-    meanings = {"n": "seq", "millis": "t_ms"}
-    for lines in (['{"n": 7, "millis": 12.5, "A": 1}'] * 3, ["n,millis,A", *["7,12.5,1"] * 3]):
-        assert feed(*lines, parser=TextParser(meanings=meanings))[-1] == Frame(7, 12500, (1.0,), names=("A",))
-
-
-def test_echo_between_lines_hinders_nothing():
-    parser = TextParser()
-    frames = feed(*["?", "1,2,3"] * 4, parser=parser)
-    assert [frame.values for frame in frames] == [(1.0, 2.0, 3.0)] * 4
-    assert parser.counts.malformed == 4
-
-
 ENCODERS = {"binary": encode_frame} | {name: partial(encode_text, notation=name) for name in TEXT_FORMATS}
 
 

@@ -28,12 +28,6 @@ def test_released_models_ship_in_the_wheel(name):
     assert shipped[f"models/{name}"] == f"isocharge/serve/released/{name}"
 
 
-@pytest.mark.parametrize("name", RELEASED)
-def test_the_makefile_and_the_table_name_it(name):
-    assert f"models/{name}" in (MODELS.parent / "Makefile").read_text()
-    assert f"({name}/1/card.md)" in (MODELS / "README.md").read_text()
-
-
 @pytest.fixture(params=NAMES)
 def model(request):
     return load_model(find_model(MODELS / request.param))

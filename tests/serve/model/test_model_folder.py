@@ -16,36 +16,12 @@ from isocharge.common.errors import ChargeError, ModelError, OutputExists
 from isocharge.common.files import sha256_of
 from isocharge.serve import ModelMetadata, check_golden, find_model, load_model, write_model
 from isocharge.serve.model.golden import make_golden
-from isocharge.serve.model.model_folder import model_names
 
 
 @pytest.fixture
 def own_model(models, tmp_path):
     """A copy of the model's version folder, to be damaged."""
     return shutil.copytree(models / "linear" / "1", tmp_path / "linear" / "1")
-
-
-def test_files_of_a_model(models):
-    folder = models / "linear"
-    assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} == {
-        "config.pbtxt",
-        "1/model.onnx",
-        "1/golden.json",
-        "1/card.md",
-    }
-
-
-def test_golden_file_has_all_it_needs(film, models):
-    golden = json.loads((models / "linear/1/golden.json").read_text())
-    assert golden["sha256"] == sha256_of((models / "linear/1/model.onnx").read_bytes())
-    assert golden["tolerance"]["relative"] == 1e-5
-    assert golden["tolerance"]["floor"]["contact"] == [1.0, 1.0, 0.1]
-    np.testing.assert_array_equal(np.float32(golden["inputs"]["charge_pC"]), film.golden_pC())
-    assert {name: np.shape(rows) for name, rows in golden["outputs"].items()} == {
-        "contact": (8, 3),
-        "contact_std": (8, 3),
-        "misfit": (8, 1),
-    }
 
 
 def test_existing_version_is_not_overwritten(film, tmp_path):
@@ -102,16 +78,6 @@ def test_unusable_model_leaves_nothing_behind(film, tmp_path, wrong, error, said
     with pytest.raises(error, match=said):
         write(film, tmp_path / "linear", **spoilt(film)[wrong])
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_interrupted_writing_leaves_nothing_behind(film, tmp_path, monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("isocharge.serve.model.model_folder.check_golden", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        write(film, tmp_path / "linear")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_golden_vectors_are_checked_before_a_version_appears(film, tmp_path, monkeypatch):
@@ -259,13 +225,6 @@ def test_path_beside_us_is_found_when_no_model_has_the_name(roots):
     assert find_model("mine").resolve() == shadow
     assert find_model("./mine").resolve() == folder
     assert find_model(Path("mine")).resolve() == folder
-
-
-def test_what_is_no_model_is_ignored(roots):
-    put(roots["given"])
-    (roots["given"] / "README.md").touch()
-    (roots["given"] / "notes").mkdir()
-    assert model_names(roots["given"]) == ["m"]
 
 
 def test_missing_name_says_where_and_what(roots):

@@ -2,18 +2,14 @@
 
 import json
 import math
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import tritonclient.grpc
-import tritonclient.http
 from prometheus_client.parser import text_string_to_metric_families
 
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.flags import MISFIT
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.network.address import Token
-from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.traffic import LATENCY_NS, Statistics
@@ -116,41 +112,6 @@ def test_misfit_alarms_are_the_flags_of_records():
     assert value(samples, "presses_total", **of) == 700
     assert value(samples, "misfit_checked_total", **of) == 400
     assert value(samples, "misfit_alarms_total", **of) == sum(alarms) + 2 * sum(alarms[:50])
-
-
-def test_counts_are_exact_with_many_clients(handler, start_http):
-    """Eight clients over HTTP and four over gRPC at once, good requests and bad."""
-    url = start_http(handler).url
-
-    def ask(module, address, first, count):
-        with module.InferenceServerClient(address.rpartition("/")[2]) as client:
-            return [infer(client, module, first + number) for number in range(count)]
-
-    def infer(client, module, number):
-        charges = np.ones((1 + number % 3, 3 if number % 5 else 2), np.float32)
-        tensor = module.InferInput("charge_pC", list(charges.shape), "FP32")
-        tensor.set_data_from_numpy(charges)
-        try:
-            client.infer("linear", [tensor])
-        except tritonclient.http.InferenceServerException:
-            return 0
-        return len(charges)
-
-    with grpc_server(handler, "127.0.0.1", 0) as grpc_url, ThreadPoolExecutor(12) as pool:
-        jobs = [pool.submit(ask, tritonclient.http, url, n, 60) for n in range(8)]
-        jobs += [pool.submit(ask, tritonclient.grpc, grpc_url, n, 30) for n in range(4)]
-        presses = [n for job in jobs for n in job.result()]
-    samples, of = scrape(handler), {"model": "linear", "version": "2"}
-    good, bad = sum(n > 0 for n in presses), presses.count(0)
-    assert (good, bad) == (480, 120)
-    assert value(samples, "presses_total", **of) == sum(presses)
-    assert value(samples, "inference_seconds_count", **of) == good
-    assert value(samples, "inferences_refused_total", **of) == bad
-    http = {"transport": "http", "route": "/v2/models/{model}/infer"}
-    assert [value(samples, "requests_total", **http, status=s) for s in ("200", "400")] == [384, 96]
-    over = {"transport": "grpc", "route": "ModelInfer"}
-    assert [value(samples, "requests_total", **over, status=s) for s in ("OK", "INVALID_ARGUMENT")] == [96, 24]
-    assert value(samples, "open", transport="grpc") == 0
 
 
 def test_counters_do_not_fall_when_a_model_is_loaded_again(handler):

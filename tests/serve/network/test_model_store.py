@@ -8,9 +8,7 @@ import logging
 import os
 import shutil
 import socket
-from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
-from threading import Event
 
 import grpc
 import numpy as np
@@ -27,7 +25,6 @@ from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.describe import page
-from isocharge.serve.network.protocol.inference import infer
 from isocharge.serve.network.traffic import LONGEST_TEXT, RequestLog, Traffic
 
 
@@ -120,15 +117,6 @@ def test_a_broken_version_takes_no_other_with_it(film, store, folder, how):
         store.get("linear", "2")
 
 
-def test_latest_is_by_number(film, tmp_path):
-    for version in (2, 10, 9):
-        film.write(tmp_path, version=version)
-    store = open_model_store(tmp_path)
-    assert store.get("linear").version == "10"
-    assert store.get("linear", "9").version == "9"
-    assert [loaded.version for loaded in store.named("linear")] == ["2", "9", "10"]
-
-
 def test_a_model_in_another_ones_folder_is_refused(film, tmp_path):
     film.write(tmp_path)
     shutil.copytree(tmp_path / "linear", tmp_path / "other")
@@ -170,28 +158,6 @@ def test_a_name_is_no_path(store, name):
     for call in (store.get, store.load, store.unload):
         with pytest.raises(ModelNotFound):
             call(name)
-
-
-def test_swaps_neither_drop_nor_mix_answers(film, store, folder):
-    """Two models of one name whose answers differ take turns on disk while threads ask without pause."""
-    turned = type(film)(1.5 * film.directions @ np.array([[0.0, 1.0], [-1.0, 0.0]]))
-    stop, seen = Event(), set()
-
-    def ask():
-        while not stop.is_set():
-            contact = infer(store.get("linear", "2"), film.golden_pC(), ("contact",))[0]["contact"]
-            seen.add((contact[0, 0], contact[7, 1]))
-
-    with ThreadPoolExecutor(2) as threads:
-        asking = [threads.submit(ask) for _ in range(2)]
-        for source in (turned, film) * 4:
-            shutil.rmtree(folder / "2")
-            source.write(folder.parent, version=2)
-            store.load("linear")
-        stop.set()
-        for asked in asking:
-            asked.result()
-    assert len(seen) == 2  # both numbers of the one model, or both of the other
 
 
 def test_names_that_no_model_has(film, tmp_path):

@@ -1,6 +1,5 @@
 """The stock Triton clients - HTTP, HTTP with asyncio, gRPC - with their defaults, against our servers."""
 
-import asyncio
 import json
 
 import numpy as np
@@ -63,19 +62,6 @@ def test_health(client):
     assert not client.is_model_ready("cubic")
 
 
-def test_metadata(client):
-    server, model = plain(client.get_server_metadata()), plain(client.get_model_metadata("linear"))
-    assert server["name"] == "isocharge"
-    assert {"binary_tensor_data", "model_repository", "statistics"} <= set(server["extensions"])
-    assert (model["name"], model["versions"], model["platform"]) == ("linear", ["1", "2"], "onnxruntime_onnx")
-    assert [(t["name"], t["datatype"], [int(n) for n in t["shape"]]) for t in model["inputs"] + model["outputs"]] == [
-        ("charge_pC", "FP32", [-1, 3]),
-        ("contact", "FP32", [-1, 3]),
-        ("contact_std", "FP32", [-1, 3]),
-        ("misfit", "FP32", [-1, 1]),
-    ]
-
-
 def test_infer_with_defaults(client, module, film, tmp_path):
     values = charges(film)
     answer = client.infer("linear", [tensor(module, values)], request_id="press 7")
@@ -102,41 +88,6 @@ def test_flags_on_request(client, module, tmp_path, n, binary):
     assert flags == expected_words
     assert any(flags)
     np.testing.assert_array_equal(answer.as_numpy("contact"), expected(tmp_path, values)["contact"])
-
-
-@pytest.mark.parametrize("way", ["gzip", "deflate"])
-@pytest.mark.parametrize("n", [1, 200])
-def test_compressed_both_ways(client, module, film, tmp_path, way, n):
-    values = charges(film, n)
-    if module is tritonclient.grpc:
-        answer = client.infer("linear", [tensor(module, values)], compression_algorithm=way)
-    else:
-        answer = client.infer(
-            "linear",
-            [tensor(module, values)],
-            request_compression_algorithm=way,
-            response_compression_algorithm=way,
-        )
-    for name, rows in expected(tmp_path, values).items():
-        np.testing.assert_array_equal(answer.as_numpy(name), rows)
-
-
-@pytest.mark.parametrize("way", [None, "gzip"])
-def test_the_client_for_asyncio(handler, start_http, film, tmp_path, way):
-    values = charges(film, 200)
-
-    async def ask():
-        async with tritonclient.http.aio.InferenceServerClient(
-            start_http(handler).url.removeprefix("http://")
-        ) as stock:
-            inputs = [tensor(tritonclient.http, values)]
-            return await stock.infer(
-                "linear", inputs, request_compression_algorithm=way, response_compression_algorithm=way
-            )
-
-    answer = asyncio.run(ask())
-    for name, rows in expected(tmp_path, values).items():
-        np.testing.assert_array_equal(answer.as_numpy(name), rows)
 
 
 def test_index_unload_load(client, module, film):

@@ -7,7 +7,6 @@ UDP sockets as ports: datagrams are chunks, and lines without an end get one.
 Boards that are asked: when, and what comes back.
 """
 
-import itertools
 import os
 import socket
 import threading
@@ -87,13 +86,6 @@ def test_port_that_is_silent(board):
             next(iter(port))
 
 
-def test_a_board_that_answers_no_request_is_silent():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = Port(f"tcp://127.0.0.1:{server.getsockname()[1]}", request=Request(b"?\n", 100.0), silence_s=0.05)
-        with port, pytest.raises(PortLost, match=r"no data for 0.05 s"):
-            next(iter(port))
-
-
 def test_port_that_is_not_open(board):
     with pytest.raises(PortError, match="not open"):
         next(iter(Port(board.url)))
@@ -130,24 +122,6 @@ def test_socket_gives_all_that_is_there_until_it_is_closed(server, scheme):
             assert next(iter(port)).data == b"x" * 1000
         with pytest.raises(PortLost, match="the other end has closed"):
             next(iter(port))
-
-
-def test_socket_that_comes_back(server, caplog):
-    def send_one_by_one():
-        for message in (b"one", b"two", b"three"):
-            with server.accept()[0] as client:
-                time.sleep(0.05)  # until the port has dropped what it found at opening
-                client.sendall(message)
-                time.sleep(0.05)
-
-    serving = threading.Thread(target=send_one_by_one)
-    serving.start()
-    with Port(f"tcp://127.0.0.1:{server.getsockname()[1]}", silence_s=5.0, reconnect=True) as port:
-        assert [chunk.data for chunk in itertools.islice(port, 3)] == [b"one", b"two", b"three"]
-    serving.join()
-    assert port.outages == 2
-    assert [record.levelname for record in caplog.records] == ["WARNING"] * 2
-    assert "went away while it was read" in caplog.text
 
 
 def talk(board, word, heard):
@@ -205,14 +179,6 @@ def test_file_is_read_to_its_end(tmp_path):
     assert {chunk.outage_s for chunk in chunks} == {0.0}
 
 
-def test_named_pipe_is_read_as_it_comes(tmp_path):
-    path = tmp_path / "pipe"
-    os.mkfifo(path)
-    threading.Thread(target=path.write_bytes, args=(b"hello",)).start()
-    with open_source(str(path)) as source:
-        assert [chunk.data for chunk in source] == [b"hello"]
-
-
 def test_source_is_stdin(monkeypatch):
     reader, writer = os.pipe()
     os.write(writer, b"hello")
@@ -221,11 +187,6 @@ def test_source_is_stdin(monkeypatch):
         monkeypatch.setattr("sys.stdin", stdin)
         with open_source("-") as source:
             assert [chunk.data for chunk in source] == [b"hello"]
-
-
-@pytest.mark.parametrize("url", ["/dev/ttyNone", "socket://127.0.0.1:1", "loop://"])
-def test_source_of_any_other_name_is_a_port(url):
-    assert isinstance(open_source(url, reconnect=True), Port)
 
 
 def test_file_that_may_not_be_read(tmp_path, monkeypatch):
@@ -268,13 +229,6 @@ def test_lines_without_an_end_get_one(address):
 
 def test_a_board_that_ends_its_lines_gets_no_more_ends(address):
     assert received(address, b"1,2\n", b"3,", b"4\n") == [b"1,2\n", b"3,", b"4\n"]
-
-
-def test_silence(address):
-    with Port(f"udp://127.0.0.1:{address[1]}", silence_s=0.05) as port:
-        assert port.read(0.01) is None
-        with pytest.raises(PortError, match=r"no data for 0\.05 s"):
-            next(iter(port))
 
 
 def test_an_empty_datagram_is_no_silence(address):

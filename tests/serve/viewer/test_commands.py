@@ -21,8 +21,7 @@ from websockets.asyncio.client import connect
 
 from boards import taps
 from isocharge.cli.shared import live_page as live_page_module
-from isocharge.serve import Frame, Recording, TouchStream, encode_frame
-from isocharge.serve.port.recording import Marker
+from isocharge.serve import Frame, TouchStream, encode_frame
 from isocharge.serve.viewer.messages import CONTACT_BIT, HEADER, SampleFormat
 
 FORM = SampleFormat(("A", "B", "C"))
@@ -86,24 +85,6 @@ def test_a_press_is_on_the_page_where_it_is_and_the_stream_goes_on_without_it(bo
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, "Traceback" in err) == (0, False)
-
-
-def test_a_recording_begun_on_the_page_is_repeated_bit_for_bit(board, start, models, command, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    process, url = start("stream", "linear", "--port", board.url)
-    follow(url, lambda _, state: state.get("recording"), {"do": "record", "on": True})
-    follow(url, touched, {"do": "marker", "text": "here"})
-    follow(url, lambda _, state: state and not state["recording"], {"do": "record", "on": False})
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert (process.returncode, "Traceback" in err) == (0, False)
-    (path,) = tmp_path.glob("linear-1-*.rec")
-    written = [line for line in path.read_text().splitlines() if line.startswith('{"timestamp"')]
-    assert "\n".join(written) in out
-    code, replayed, _ = command("serve", "replay", path, "--models", models)
-    assert (code, replayed.splitlines()) == (0, written)
-    assert any(json.loads(line)["contact"] for line in written)
-    assert [event.text for event in Recording(path).events() if isinstance(event, Marker)] == ["here"]
 
 
 def listens(place):

@@ -6,7 +6,6 @@ The files of the page: small, whole, and of one mind with the server about what 
 """
 
 import json
-import re
 import shutil
 import subprocess
 from importlib.resources import files
@@ -184,14 +183,6 @@ def test_the_newest_contact_counts():
 
 
 VIEWER = Path(str(files("isocharge.serve.viewer")))
-FILES = [path for folder in ("page", "fields") for path in (VIEWER / folder).rglob("*") if path.is_file()]
-OWN = [path for path in FILES if "vendor" not in path.parts and path.suffix in (".js", ".html", ".css")]
-
-
-@pytest.mark.parametrize("path", OWN, ids=lambda path: path.name)
-def test_nothing_is_fetched_from_elsewhere(path):
-    text = path.read_text("utf-8").replace("http://www.w3.org", "")
-    assert not re.search(r"https?://|//[a-z]+\.[a-z]|@import|url\([\"']", text)
 
 
 def node(script):

@@ -1,7 +1,5 @@
 """Scripts stay in their area and their range of forces, and are smooth."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -107,15 +105,6 @@ def test_script_from_a_file(tmp_path):
     assert load_script(path).script(100.0) is None
     with pytest.raises(SceneError, match=r"expected at most 2000000 frames, got 2\.2 s at 1e"):
         play.script(1e6)
-
-
-def test_the_script_of_the_page_is_one(tmp_path):
-    page = Path(__file__).parents[3] / "serve" / "docs" / "virtual_sensor.md"
-    path = tmp_path / "play.toml"
-    path.write_text(page.read_text("utf-8").partition("```toml\n")[2].partition("```")[0], "utf-8")
-    play = load_script(path)
-    assert play.script(200.0).touching.any()
-    assert (play.faults.clock_ppm, play.limit_pC) == (50.0, 1500.0)
 
 
 @pytest.mark.parametrize(

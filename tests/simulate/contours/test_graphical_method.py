@@ -7,7 +7,7 @@ from isocharge.common.errors import ChargeError, SensorError
 from isocharge.simulate import load_sensor
 from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from isocharge.simulate.contours.fix import Meeting
-from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTriangulation, draw_contour
+from isocharge.simulate.contours.graphical_method import DrawnTriangulation, draw_contour
 
 LAYOUTS = {name: load_sensor(f"{name}-25um-biaxial") for name in ("three", "four")}
 
@@ -47,13 +47,6 @@ def test_roots_lie_on_the_circle():
 
 def test_lines_that_do_not_reach_the_charge_give_no_contour():
     assert draw_contour(curves_of(LAYOUTS["three"], "A"), 5e3) is None
-
-
-def test_straight_contours_cross_where_lines_do():
-    one = DrawnContour("A", 1.0, np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))
-    other = DrawnContour("B", 1.0, np.array([[0.0, 1.0], [2.0, 0.0]]))
-    np.testing.assert_allclose(one.crossings(other), [[2.0 / 3.0, 2.0 / 3.0]])
-    assert one.crossings(DrawnContour("B", 1.0, np.array([[3.0, 0.0], [4.0, 0.0]]))).shape == (0, 2)
 
 
 def test_presses_are_found(layout):

@@ -21,7 +21,6 @@ from isocharge.simulate import (
     load_sensor,
     noise_model,
 )
-from isocharge.simulate.contours.candidates import NODE_SPACING, SeedGrid
 from isocharge.simulate.contours.fix import Meeting
 from kept import kept
 
@@ -94,15 +93,6 @@ def test_the_mean_of_three_crossings_is_the_textbooks():
         assert fix.spread[i] == pytest.approx(np.linalg.norm(crossings - mean, axis=1).max(), abs=1e-4)
 
 
-def test_four_electrodes_average_four_triples():
-    charge_map, centres, contact = round_map(CENTRES["four"]), CENTRES["four"], np.array([[1.5, 2.5, 1.0]])
-    charge = charge_map.charges(contact) * (1.0 + 0.003 * np.array([1.0, -1.0, 0.5, -0.5]))
-    fix = Triangulation(charge_map).locate(charge, 1.0)
-    radii = distances(charge, 1.0)[0]
-    triples = [corners(centres[[*three]], radii[[*three]], contact[0, :2]) for three in combinations(range(4), 3)]
-    np.testing.assert_allclose(fix.contact[0, :2], np.mean(triples, axis=(0, 1)), atol=1e-4)
-
-
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_force_is_found_with_the_position(layout):
     charge_map, contact = round_map(CENTRES[layout]), draw(200, seed=4)
@@ -126,15 +116,6 @@ def test_closest_to_meeting_is_scipys_least_squares():
     best = least_squares(away, [2.0, -1.0, np.log(0.8)], xtol=1e-12, ftol=1e-12)
     np.testing.assert_allclose(fix.contact[0, :2], best.x[:2], atol=5e-3)
     assert fix.spread[0] == pytest.approx(np.sqrt(np.mean(best.fun**2)), rel=1e-2)
-
-
-def test_a_search_begins_within_a_cell_of_the_press():
-    charge_map, contact = round_map(CENTRES["four"]), draw(100, seed=11)
-    grid = SeedGrid.of(charge_map)
-    distance = grid.distance(charge_map.charges(contact), contact[:, 2:])
-    off = np.hypot(*(grid.at[np.argmin(distance, axis=1)] - contact[:, :2]).T)
-    assert off.max() < NODE_SPACING
-    assert distance.min(axis=1) == pytest.approx(off, abs=0.5 * NODE_SPACING)
 
 
 @pytest.fixture(scope="module")

@@ -102,17 +102,6 @@ def test_a_draft_of_other_settings_is_left_alone(stopped, whole, changes, messag
     assert files(sweep_to(stopped)) == whole[0]
 
 
-def test_a_draft_of_another_sensor_or_version_is_left_alone(stopped):
-    with pytest.raises(
-        OutputExists, match=r"sensor\.electrodes\.D is None there, \[-?0\.0, -10\.0\] here; sensor.name is"
-    ):
-        run_sweep(stopped, load_sensor("four-25um-biaxial"), (Circle(1.0),), SWEEP, QUICK, shard=10)
-    run = draft_of(stopped) / "run.json"
-    run.write_text(run.read_text().replace('"made_by": "isocharge 0', '"made_by": "isocharge 9'))
-    with pytest.raises(OutputExists, match=r"made_by is isocharge 9\..* there, isocharge 0\..* here; .*--fresh"):
-        sweep_to(stopped)
-
-
 def test_fresh_throws_the_draft_away(stopped, whole):
     executor = Counting()
     sweep_to(stopped, shard=20, fresh=True, executor=executor)

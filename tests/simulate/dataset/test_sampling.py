@@ -56,14 +56,6 @@ def test_presses_are_uniform_over_the_disk_and_in_the_logarithm_of_the_force(sam
     assert stats.chisquare(counts.ravel()).pvalue > 0.05
 
 
-def test_force_place_and_rotation_are_independent():
-    presses = Sweep(samples=4000, seed=3, orientation="random").over(PROBES[:1])
-    x, y, force = presses.contact.T
-    assert stats.kstest(presses.rotation, "uniform", args=(0.0, 2 * np.pi)).pvalue > 0.05
-    correlation = np.corrcoef([x, y, np.hypot(x, y), np.log(force), presses.rotation])
-    assert np.abs(np.triu(correlation, 1)[:, 3:]).max() < 0.05
-
-
 def test_sobol_presses_fill_gaps_better_than_chance():
     """What the Sobol points are for: a tenth of the discrepancy of independent draws, for every probe by itself."""
     probes = 3

@@ -198,17 +198,6 @@ def test_wrong_columns(dataset, columns, message):
 # Writing: whole or not at all
 
 
-def broken_shards():
-    yield samples()
-    raise ZeroDivisionError("half-way")
-
-
-def test_an_exception_half_way_leaves_nothing(tmp_path):
-    with pytest.raises(ZeroDivisionError):
-        write_dataset(tmp_path / "presses", SENSOR, broken_shards(), ABOUT)
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

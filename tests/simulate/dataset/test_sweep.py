@@ -88,13 +88,6 @@ def test_manifest_of_a_sweep(small_dataset, three_map):
     }
 
 
-def test_same_seed_same_bytes(small_dataset, three_map, tmp_path):
-    again = write_sweep(tmp_path / small_dataset.name, (three_map,), Sweep(samples=500, seed=7))
-    assert files(again) == files(small_dataset)
-    other = write_sweep(tmp_path / "other", (three_map,), Sweep(samples=500, seed=8))
-    assert read_dataset(other).sha256 != read_dataset(again).sha256
-
-
 def test_a_run_writes_what_its_maps_write_and_reports_both_phases(tmp_path):
     """Whether or not a draft is kept on the way."""
     reports: dict[str, list] = {}
@@ -135,20 +128,6 @@ def test_shards_and_tasks_keep_the_order(tmp_path):
     np.testing.assert_array_equal(read.samples.x_mm, presses.contact[:, 0])
     np.testing.assert_array_equal(read.samples.charge_pC[:, :2], presses.contact[:, :2])
     np.testing.assert_allclose(read.samples.charge_pC[:, 2], np.rad2deg(presses.rotation))
-
-
-def test_probes_take_turns(tmp_path):
-    """Each with its own charges; an odd number of samples, and a probe that gets none."""
-    probes, sweep = (Circle(1.0), Circle(2.0)), small(5)
-    read = read_dataset(run_sweep(tmp_path / "two", SENSOR, probes, sweep, QUICK))
-    assert read.samples.probe.tolist() == ["circle:1.0", "circle:2.0", "circle:1.0", "circle:2.0", "circle:1.0"]
-    assert read.manifest["probes"] == ["circle:1.0", "circle:2.0"]
-    for i in (0, 3):
-        at = (read.samples.x_mm[i], read.samples.y_mm[i])
-        solved = press(SENSOR.film, probes[i % 2], at, read.samples.force_N[i], SolveSettings(theory=MEMBRANE))
-        np.testing.assert_allclose(read.samples.charge_pC[i], touch_charge(SENSOR, solved), rtol=1e-3)
-    one = read_dataset(write_sweep(tmp_path / "one", [Spy(probe) for probe in probes], small(1)))
-    assert one.samples.probe.tolist() == ["circle:1.0"]
 
 
 # Refused, and failed

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Resolution, SolveSettings, Theory, load_sensor
+from isocharge.simulate import ChargeSpline
 from isocharge.simulate.numerics.disk import sunflower
 from kept import kept
 
@@ -49,22 +49,6 @@ def test_first_order_is_charges_and_derivatives_and_beyond_the_edge_those_of_the
     out, edge = (near_spline.first_order(np.array([[0.0, y]]), 1.0) for y in (1.2 * RADIUS, RADIUS))
     for beyond, expected in zip(out, edge, strict=True):
         np.testing.assert_allclose(beyond, expected, rtol=1e-13)
-
-
-@pytest.mark.slow
-def test_of_the_whole_working_area():
-    """By default, out to where the probe comes close to the electrodes, forces over a decade."""
-    settings = SolveSettings(
-        theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(5, 8, 5)
-    )
-    forward_map = ForwardMap.build(load_sensor("four-25um-uniaxial"), Circle(1.0), 10.0, (0.1, 1.0), settings)
-    rng, table = np.random.default_rng(1), ChargeSpline.of(forward_map)
-    at = np.concatenate([10.0 * np.sqrt(rng.random(800)), np.full(200, 10.0)]) * np.exp(2j * np.pi * rng.random(1000))
-    contact = np.stack([at.real, at.imag, np.exp(rng.uniform(np.log(0.1), 0.0, 1000))], axis=1)
-    error = np.abs(table.charges(contact) / forward_map.charges(contact) - 1.0).max(axis=1)
-    assert np.median(error) < 3e-5
-    assert error.max() < 5e-3
-    assert table.error < 5e-4
 
 
 @pytest.mark.parametrize("radius", [0.0, 5.1, np.nan])

@@ -80,15 +80,6 @@ def test_random_orientations(oriented_map):
     assert np.abs(oriented_map.charges(contact, rotation + 0.5 * period) / charge - 1.0).max() > 1e-2
 
 
-def test_orientation_adds_to_the_probes_own_angle(oriented_map, near_electrodes):
-    probe = oriented_map.probe.rotated(0.6)
-    rotated = kept(ForwardMap.build, near_electrodes, probe, **{**QUICK, "radius": 2.0})
-    contact, rotation = draw(rotated, 20, seed=12)
-    np.testing.assert_allclose(
-        rotated.charges(contact, rotation), oriented_map.charges(contact, rotation + 0.6), rtol=2e-3
-    )
-
-
 def test_ends_of_the_domain_and_the_error_that_the_map_states(near_map):
     radius, (low, high) = near_map.domain.radius, near_map.domain.force_range
     ends = np.array([[radius, 0.0, low], [-radius, 0.0, high], [0.0, 0.0, low], [0.0, 0.0, high]])
@@ -190,23 +181,6 @@ def test_an_error_that_cannot_be_reached_is_not_passed_over(monkeypatch):
     settings = replace(QUICK_SETTINGS, resolution=Resolution(3, 8, 2))
     with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to .* only, expected 1e-13"):
         ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0), **{**QUICK, "settings": settings})
-
-
-@pytest.mark.slow
-def test_map_over_most_of_the_film():
-    """Far out the mesh is finer, and the electrodes are still met."""
-    forward_map = ForwardMap.build(load_sensor("four-25um-biaxial"), Circle(1.0), radius=22.0, force_range=(0.5, 1.0))
-    assert errors(forward_map, draw(forward_map, 20, seed=9)[0]).max() < 5e-3
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("probe", [Polygon.triangle(2.5), Polygon.rectangle(4.0, 2.0, 0.5)], ids=["3", "4"])
-def test_the_usual_ranges(probe):
-    """0.05 to 2 N, r <= 10 mm, random orientation, with bending: 95 % within 0.1 %, all within 0.5 %."""
-    forward_map = ForwardMap.build(load_sensor("four-25um-uniaxial"), probe, radius=10.0)
-    error = errors(forward_map, *draw(forward_map, 40, seed=13))
-    assert np.quantile(error, 0.95) < 1e-3
-    assert error.max() < 5e-3
 
 
 # Where a family is solved

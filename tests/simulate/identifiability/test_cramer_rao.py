@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.optimize import least_squares
 from scipy.stats import norm
 
 from isocharge.simulate import ChargeSpline, Domain, Electrode, FunctionMap, NoiseModel, limits_at, noise_model
@@ -62,26 +61,6 @@ def test_nuisances_are_noise_that_the_electrodes_share():
         noise = np.diag(1.0 / REFERENCE.information(charge[i])) + nuisance[i] @ nuisance[i].T
         expected = np.linalg.inv(jacobian[i].T @ np.linalg.inv(noise) @ jacobian[i])
         np.testing.assert_allclose(limits.covariance[i, :3, :3], expected, rtol=1e-6)
-
-
-def test_an_efficient_estimator_scatters_as_much():
-    """Least squares with weights, on a thousand noisy readings of two contacts."""
-    rng = np.random.default_rng(1)
-    limits = limits_at(MAP, CONTACT, REFERENCE)
-    for number, contact in enumerate(CONTACT):
-        charge = far_field(contact[None])
-        sigma = REFERENCE.sigma(charge)[0]
-
-        def residual(unit, reading, sigma=sigma):
-            x, y, log_force = unit
-            return (far_field(np.array([[x, y, np.exp(log_force)]]))[0] - reading) / sigma
-
-        start = np.append(contact[:2], np.log(contact[2]))
-        readings = REFERENCE.add(np.repeat(charge, 1000, axis=0), rng)
-        estimates = np.array([least_squares(residual, start, args=(row,), method="lm").x for row in readings])
-        position = np.sqrt(np.sum(estimates[:, :2].var(axis=0)))
-        assert position == pytest.approx(limits.position[number], rel=0.06)
-        assert estimates[:, 2].std() == pytest.approx(limits.force[number], rel=0.08)
 
 
 def test_what_the_charges_cannot_determine_has_a_huge_limit():

@@ -191,21 +191,6 @@ def test_the_nearest_fold_is_that_of_a_grid_of_a_tenth_of_a_millimetre(charges):
     assert np.hypot(*folds[0]) == pytest.approx(np.hypot(x, y)[turned].min(), abs=0.1)
 
 
-def test_six_electrodes_on_a_circle_fold_there_and_one_in_the_middle_unfolds_three(film):
-    circle = [(10.0 * np.cos(a), 10.0 * np.sin(a)) for a in np.pi / 3.0 * np.arange(6)]
-    six, middle = (
-        folds_of(ChargeSpline.of(squares(film, *places), spacing=0.4))
-        for places in (circle, [(0.0, 0.0), *circle[::2]])
-    )
-    assert 9.7 < np.hypot(*six[0]) < 10.1
-    assert len(middle) == 0
-
-
-def test_a_third_electrode_in_the_middle_folds_at_once(film):
-    charges = ChargeSpline.of(squares(film, (0.0, 0.0), (8.66, 5.0), (-8.66, 5.0)), 3.0)
-    assert 0.1 < np.hypot(*folds_of(charges)[0]) < 0.3
-
-
 def test_ambiguous_pairs_are_mirror_images_in_the_crease():
     pairs = find_ambiguous_pairs(creased(), REFERENCE, 0.5, places=400)
     assert len(pairs) > 20
@@ -249,11 +234,3 @@ def test_where_nothing_ends_it_the_search_does():
     working = working_area(creased(radius=1.0), REFERENCE, error=1000.0)
     assert (working.radius, working.bound) == (1.0, "search")
     assert working.summary.endswith("The search ended at 1 mm.")
-
-
-def test_pairs_of_a_biaxial_film_are_mirror_images_in_the_electrodes_circle(charges):
-    """Inversion: the product of their distances from the centre is the square of the circle's radius, 10 mm."""
-    pairs = find_ambiguous_pairs(charges("four-25um-biaxial"), REFERENCE, 1.0, places=400)
-    product = np.hypot(*pairs.first[:, :2].T) * np.hypot(*pairs.second[:, :2].T)
-    assert len(pairs) > 10
-    assert np.median(product) == pytest.approx(100.0, rel=0.05)

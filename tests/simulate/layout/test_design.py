@@ -1,6 +1,5 @@
 """A whole search, a small one: three electrodes over 4 mm."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -121,9 +120,3 @@ def test_what_is_ambiguous_is_said(sensor, monkeypatch):
 
     monkeypatch.setattr(ForwardMap, "build", refuse)
     assert "could not be looked for" in ambiguities(case_of(sensor), sensor)
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_design_on_any_executor(sensor, found):
-    with ThreadPoolExecutor(2) as executor:
-        assert design(case_of(sensor), executor=executor).to_dict() == found.to_dict()

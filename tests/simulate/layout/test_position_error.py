@@ -25,16 +25,6 @@ def test_with_everything_known_they_are_cramer_rao_limits(rows):
     assert np.sqrt(ErrorModel.of(REFERENCE, KNOWN).squared(rows)) == pytest.approx(limits.position, rel=1e-3)
 
 
-def test_nuisances_are_marginalised(rows):
-    """The covariance of the charges grows by what nobody knows; that is the same as the Schur complement."""
-    squared = ErrorModel.of(REFERENCE, UNKNOWN).squared(rows)
-    for row, value in zip(rows, squared, strict=True):
-        unknown = row[:, 4:] * [0.3, 0.1]
-        covariance = np.diag(1.0 / REFERENCE.information(row[:, 0])) + unknown @ unknown.T
-        information = row[:, 1:4].T @ np.linalg.solve(covariance, row[:, 1:4])
-        assert value == pytest.approx(np.linalg.inv(information)[:2, :2].trace(), rel=1e-2)
-
-
 def test_one_more_electrode_is_as_if_it_had_been_there(rows):
     model = ErrorModel.of(REFERENCE, UNKNOWN)
     sensitivity = model.sensitivity(rows)

@@ -16,7 +16,6 @@ from isocharge.simulate.mechanics.theory import (
     theory_by_name,
     theory_for,
 )
-from isocharge.simulate.solver.error_estimate import estimated_error
 
 PROBE, AT = Circle(1.0), (3.0, -2.0)
 
@@ -48,12 +47,6 @@ def test_theory_has_the_name_of_its_terms_and_is_found_by_it(film, terms, name):
     else:
         assert theory_by_name(name, film) == Theory(*terms)
         assert theory_by_name(name.removeprefix("pre-tensioned "), film) == Theory(*terms)
-
-
-@pytest.mark.parametrize("name", ["shell", "pre-tensioned linear plate"])
-def test_unknown_name_is_shown(film, name):
-    with pytest.raises(SceneError, match=rf"theory: expected one of \['linear membrane', .*\], got '{name}'"):
-        theory_by_name(name, film)
 
 
 @pytest.mark.parametrize(
@@ -121,18 +114,6 @@ def test_theory_for_a_sensor_serves_all_forces_and_the_surface(film):
     assert theory_for(replace(thin, surface="top"), PROBE, (1.0, 1.0)).name == "nonlinear membrane + bending"
 
 
-@pytest.mark.parametrize(
-    ("name", "low", "high"),
-    [("nonlinear membrane", np.inf, np.inf), ("linear plate", 0.005, 0.5), ("nonlinear membrane + bending", 0.0, 1e-3)],
-)
-def test_theory_can_be_overridden(film, name, low, high):
-    """The wrong one too: it says how wrong."""
-    film = thick(film, 1.0)
-    solved = press(film, PROBE, AT, 1.0, SolveSettings(theory=theory_by_name(name, film)))
-    assert solved.theory.name == name
-    assert low <= estimated_error(solved) <= high
-
-
 def draw(rng: np.random.Generator) -> tuple[Film, Circle | Polygon, tuple[float, float], float]:
     """A press for one of the simpler theories: thin, thick or taut; the probe off the electrodes or on them."""
 
@@ -173,9 +154,3 @@ def check_presses(seed: int, count: int, accuracy: float) -> None:
 
 def test_modelling_error_bounds_the_real_difference():
     check_presses(5, 4, 1e-2)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("accuracy", [1e-3, 1e-2, 0.1])
-def test_modelling_error_bounds_the_real_difference_of_many_presses(accuracy):
-    check_presses(6, 150, accuracy)

@@ -149,14 +149,3 @@ def test_load_is_uniform_over_a_disk(distance, radius):
     assert abs(load @ about.real) < 1e-8 * radius
     assert load @ about.real**2 == pytest.approx(0.25 * radius**2, rel=1e-7)
     assert load @ about.imag**2 == pytest.approx(0.25 * radius**2, rel=1e-7)
-
-
-@pytest.mark.parametrize(("distance", "radius"), [(0.0, 0.02), (0.5, 0.002), (0.3, 0.5), (0.9, 0.05), (0.96, 0.03)])
-def test_footprint_edge_is_the_right_circle(distance, radius):
-    """The template's ring |z| = rho lands on the circle with the footprint's radius and centre, the rim on the rim."""
-    placement = place(FILM, Circle(radius * RADIUS), (distance * RADIUS, 0.0), Resolution(), 0.05).placement
-    ring = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 50))
-    np.testing.assert_allclose(np.abs(placement.to_film(placement.rho * ring) - distance), radius, atol=1e-13)
-    np.testing.assert_allclose(np.abs(placement.to_film(ring)), 1.0, atol=1e-13)
-    film = np.sqrt(np.linspace(0.0, 1.0, 99)) * np.exp(1j * np.arange(99.0))
-    np.testing.assert_allclose(placement.to_film(placement.to_template(film)), film, atol=1e-10)

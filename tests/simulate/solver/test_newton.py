@@ -1,6 +1,5 @@
 """A flat film converges for every force, thin or thick; failures are stated, never hidden."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -109,14 +108,6 @@ def test_wrinkling_film_is_an_error(film, monkeypatch):
         press(film, Circle(1.0), (0.0, 42.0), 5.0, mesh)
     with pytest.raises(SolveError, match=r"after 6 steps$"):
         press(film, Circle(1.0), (0.0, 0.0), 5.0, mesh)
-
-
-@pytest.mark.slow
-def test_wrinkling_of_a_thinner_film_is_an_error_before_the_limit_of_steps(film):
-    began = time.process_time()
-    with pytest.raises(SolveError, match=WRINKLES):
-        press(replace(film, thickness=0.007), Polygon.rectangle(0.4, 0.12), (44.3, 0.0), 3.5)
-    assert time.process_time() - began < 60.0
 
 
 def test_press_too_near_the_rim_is_refused(film):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import least_squares
-from sklearn.linear_model import LinearRegression
 from tests.train.baselines.conftest import DOMAIN, KnownMap
 
 from isocharge.common.errors import DatasetError
@@ -14,7 +13,6 @@ from isocharge.serve import find_model
 from isocharge.simulate import Domain, FunctionMap, noise_model
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines.gauss_newton import GaussNewton
-from isocharge.train.baselines.learned import stretched, whitening
 from isocharge.train.baselines.networks import OnnxContact, ReleasedModel, contact_graph
 from isocharge.train.baselines.paper import Triangulate
 from isocharge.train.baselines.rivals import polynomial_ridge, rivals
@@ -62,20 +60,6 @@ def test_every_method_is_tested(fitted):
 def test_force_follows(name, limit, fitted, test_presses):
     force = fitted[name].regressor.predict(test_presses.charge)[:, 2]
     assert rms(force / test_presses.contact[:, 2] - 1.0) < limit
-
-
-def test_nearest_neighbours_by_brute_force(fitted, task, test_presses):
-    """The mean of the nearest sixteen residuals about a linear fit, with the rulers of the quick choice."""
-    noisy, charge = task.presses(5), test_presses.charge[:40]
-    features = whitening().fit(noisy.charge)
-    known, asked = (stretched(features.transform(each), 0.1, 0.03) for each in (noisy.charge, charge))
-    unit = task.domain.to_unit(noisy.contact)
-    plane = LinearRegression().fit(known, unit)
-    rows = np.argsort(np.linalg.norm(asked[:, None] - known[None], axis=2), axis=1)[:, :16]
-    found = plane.predict(asked) + (unit - plane.predict(known))[rows].mean(axis=1)
-    expected = np.column_stack([8.0 * found[:, :2], np.exp(np.log(np.sqrt(0.1)) + 0.5 * np.log(40.0) * found[:, 2])])
-    answers = fitted["k-nearest neighbours"].regressor.predict(charge)
-    np.testing.assert_allclose(answers, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_a_polynomial_does_not_explode_outside_of_what_it_saw(fitted, task):

@@ -103,21 +103,6 @@ def test_a_press_at_another_place_than_said_is_named(problem, plan):
     assert bench.session.summary[1].startswith("Press 6, 1.00 N at (5.0, 0.0) mm, fits no film that the others fit")
 
 
-@pytest.mark.slow
-def test_presses_that_no_film_explains_end_no_session(problem, plan):
-    """Columns swapped: said, the presses stay, others are proposed, and undo helps."""
-    bench = Bench(problem, plan)
-    contact = np.array([press.contact for press in plan[:7]])
-    swapped = np.array([bench.charge(row) for row in contact])[:, [2, 1, 0, 3]]
-    session = PressSession(problem, save=bench.saved.append, presses=presses_of(problem, contact, swapped))
-    assert (session.result, session.enough) == (None, False)
-    assert "swapped" in session.refusal
-    assert session.summary[0].startswith("No film explains these presses")
-    np.testing.assert_allclose(session.proposed.contact, plan[7].contact)  # as if the presses had been good
-    assert session.undo() == 7
-    assert len(bench.saved[-1]) == 6
-
-
 @pytest.mark.parametrize(
     ("contact", "message"),
     [

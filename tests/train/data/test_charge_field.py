@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from isocharge.common.errors import DatasetError, TrainingError
-from isocharge.simulate import Domain, Electrode, Sweep, load_sensor, noise_model, read_dataset
+from isocharge.simulate import Domain, Electrode, Sweep, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.identifiability.nearest_contact import search
@@ -131,15 +131,6 @@ def test_a_fit_across_a_fold_is_in_log_card_and_metadata(film, sensor, tmp_path,
     assert "seems to fold about 0." in caution or "seems to fold about 1." in caution
     assert model.metadata.made_with["cautions"] == [caution]
     assert f"- {caution}." in (model.folder / "card.md").read_text("utf-8")
-
-
-def test_three_uniaxial_electrodes_fold_inside_five_mm(film, tmp_path, caplog):
-    uniaxial = load_sensor("three-25um-uniaxial")
-    fitted = fit(swept(tmp_path, film, 6_000, uniaxial, radius=6.0), TINY)
-    assert 1.0 < fitted.domain.radius < 5.0
-    assert fitted.asked.radius == 6.0
-    assert np.hypot(*fitted.test.contact[:, :2].T).max() <= fitted.domain.radius
-    assert fitted.cautions[0] == caplog.messages[0]
 
 
 NOISE = noise_model("reference")

@@ -135,22 +135,6 @@ def test_a_recording_gives_our_records_frame_by_frame(host, film, tmp_path):
     assert sum(record["contact"] for record in records) > 100
 
 
-@pytest.mark.slow
-def test_host_example_follows_a_port(exports, compile_c, start_command, tmp_path):
-    """Contacts of the virtual sensor at the place of its script."""
-    rows = [[0, 3, -2, 0], [0.8, 3, -2, 0], [0.801, 3, -2, 0.5], [60, 3, -2, 0.5]]
-    (tmp_path / "script.toml").write_text(f"presses = {rows}\n")
-    program = compile_c("gcc", exports[0], tmp_path / "host", *EXAMPLE)
-    sensor = start_command(
-        "serve", "virtual", "three-25um-biaxial", "--noise", "clean", "--script", tmp_path / "script.toml"
-    )
-    code, records, err = played(program, sensor.stdout.readline().strip(), 300)
-    assert (code, err, len(records)) == (0, "", 300)
-    press = [[record["x_mm"], record["y_mm"], record["force_N"]] for record in records if record["contact"]]
-    assert len(press) > 80
-    np.testing.assert_allclose(np.median(press, axis=0), [3.0, -2.0, 0.5], atol=0.3)
-
-
 def test_host_example_says_what_is_wrong(host, tmp_path):
     program, _ = host
     (tmp_path / "text").write_text("801.2,799.5,803.3\n" * 1000)

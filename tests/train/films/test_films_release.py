@@ -57,15 +57,6 @@ def test_a_missing_file_says_what_it_belongs_to(tmp_path):
         read_films(tmp_path)
 
 
-def test_an_array_that_no_memory_holds_is_damaged():
-    buffer, header = io.BytesIO(), io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 50,)})
-    with zipfile.ZipFile(buffer, "w") as file:
-        file.writestr("mean.npy", header.getvalue())
-    with pytest.raises(ModelError, match=r"films\.npz: damaged \(.*MemoryError"):
-        films_from_bytes(buffer.getvalue(), "films.npz")
-
-
 def test_a_small_file_that_unpacks_to_very_much_is_refused_before_it_is_unpacked():
     zeros = np.zeros(1 << 26, np.uint8)
     bomb = _npz({"mean": zeros, "whitening": zeros, "contact": zeros})

@@ -10,7 +10,7 @@ import yaml
 from msgspec import structs
 from scipy.stats import chi2, halfnorm
 
-from isocharge.common.errors import DatasetError, ModelError, OutputExists
+from isocharge.common.errors import DatasetError, ModelError
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.model.model_folder import model_names
 from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor, noise_model, press
@@ -140,13 +140,6 @@ def test_what_is_evaluated_is_what_is_served(fitted, released):
     assert evaluate(fitted, half)["position_rms_mm"] < errors["position_rms_mm"]
 
 
-def test_versions_go_side_by_side_and_none_is_replaced(released, fitted):
-    with pytest.raises(OutputExists, match="is already there"):
-        release(fitted, released.folder.parent)
-    assert release(fitted, released.folder.parent, version=2).folder.name == "2"
-    assert Predictor(released.folder.parent).metadata.version == 2
-
-
 def test_the_card_holds_on_other_presses_and_is_good_enough(truth, touch):
     errors = simulated_errors(predict(touch), truth[:6000], REFERENCE, seed=6)
     for name in ("position_median_mm", "position_rms_mm", "force_rms_percent", "misfit_p99"):
@@ -199,15 +192,6 @@ def test_the_joint_deviations_are_honest(whitened, touch):
                 level = chi2.cdf(np.sum(errors[rows, :dimensions] ** 2, axis=1), dimensions)
                 assert np.mean(level < 0.68) == pytest.approx(0.68, abs=within)
                 assert np.mean(level < 0.95) == pytest.approx(0.95, abs=0.02)
-
-
-def test_the_joint_posterior_passes_a_rank_test(whitened):
-    """Simulation-based calibration (Talts et al. 2018): ranks of the truth among 99 draws, along random directions."""
-    rng, (_, errors) = np.random.default_rng(9), whitened
-    direction, draws = rng.standard_normal(errors.shape), rng.standard_normal((99, *errors.shape))
-    ranks = np.sum(np.sum(draws * direction, axis=2) < np.sum(errors * direction, axis=1), axis=0)
-    shares = np.bincount(ranks // 10, minlength=10) / len(ranks)
-    np.testing.assert_allclose(shares, 0.1, atol=0.01)
 
 
 def test_four_electrodes_have_one_check_to_spare(known, truth, touch):

@@ -1,13 +1,12 @@
 """Measured presses are judged as they are: by held-out presses of the film, never by simulated ones."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from isocharge.common.errors import ModelError, PressError
-from isocharge.serve import MeasuredPresses, Predictor, check_presses, find_model, write_presses
+from isocharge.serve import MeasuredPresses, Predictor, check_presses, find_model
 from isocharge.simulate import (
     Circle,
     Domain,
@@ -69,17 +68,6 @@ def test_what_cannot_be_judged_is_left_out_with_a_word(section):
     for name, reason in record["left_out"].items():
         assert f"- {name}: left out; {reason}" in page
     assert methods["Gaussian process"] < methods["released network"]  # it learnt from this film
-
-
-@slow
-def test_a_file_of_presses_through_the_command(presses, tmp_path, command):
-    write_presses(tmp_path / "rig.csv", presses)
-    words = ("train", "report", tmp_path / "rig.csv", "-o", tmp_path / "out", "--quick", "--json")
-    code, _, err = command(*words)
-    assert (code, "needs --sensor SENSOR" in err) == (2, True)
-    code, out, _ = command(*words, "--sensor", NAME)
-    assert code == 0
-    assert json.loads(out)["datasets"][0]["measured"]
 
 
 def test_too_few_presses_and_another_layout(tmp_path):

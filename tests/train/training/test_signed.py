@@ -4,15 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sklearn.linear_model import LinearRegression
-from sklearn.preprocessing import PolynomialFeatures
 
 from isocharge.serve import MeasuredPresses, Predictor
 from isocharge.simulate import Circle, Domain, ForwardMap, Sweep, load_sensor, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train import BayesProblem, FitConfig, NetworkConfig, TrainingConfig, bayes_estimate, fit, release
-from isocharge.train.baselines.learned import on_logarithms
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.rig.rig_film import corrected_film
@@ -87,21 +84,3 @@ def test_measured_presses_correct_charges_of_both_signs(film):
     truth = 1.04 * film.charges(contact)
     assert rms((corrected.charges(contact) - truth) / noise_model("reference").sigma(truth)) < 0.3
     assert corrected.scatter == pytest.approx(1.0, abs=0.1)
-
-
-def test_rival_methods_see_what_is_below_zero(film):
-    """Given the same charges without it, they err more."""
-    contact = draw_contacts(np.random.default_rng(3), film.domain, 4_000)
-    charge = noise_model("reference").add(film.charges(contact), np.random.default_rng(4))
-    negative, errors = (charge[3_000:] < 0.0).any(axis=1), []
-    for given in (charge, np.maximum(charge, 1.0)):
-        cubes = on_logarithms(film.domain, cubes=PolynomialFeatures(4), fit=LinearRegression())
-        off = cubes.fit(given[:3_000], contact[:3_000]).predict(given[3_000:]) - contact[3_000:]
-        errors.append(rms(np.hypot(*off[negative, :2].T)))
-    assert errors[0] < 0.95 * errors[1]
-
-
-@pytest.mark.slow
-def test_a_very_taut_film_has_a_forward_map():
-    """From 0.05 to 2 N its charges pass from the square of the force to the power 2/3."""
-    assert ForwardMap.build(taut(6.0), Circle(1.0)).error < 1e-4

@@ -203,16 +203,6 @@ def test_no_token_no_stream(serve, silent_call):
     assert [refusal(silent_call(channel, "ModelInfer")) for _ in range(8)] == ["UNAUTHENTICATED"] * 8
 
 
-@pytest.mark.parametrize("name", ["ModelStreamInfer", "ModelInfer", "ServerLive", "RepositoryModelLoad"])
-def test_silent_calls_hold_nobody_up(serve, silent_call, name):
-    connect = serve()
-    channel = connect()
-    calls = [silent_call(channel, name) for _ in range(50)]
-    assert is_served(channel)
-    assert is_served(connect())
-    assert not any(call.done() for call in calls)
-
-
 @pytest.mark.parametrize(("name", "messages"), [("ModelInfer", 0), ("ModelStreamInfer", 0), ("ModelStreamInfer", 1)])
 def test_silent_calls_are_closed(serve, silent_call, name, messages):
     """Within the time for headers if no message came, and within that between requests if one did."""

@@ -206,31 +206,6 @@ def test_a_client_that_does_not_read(limited):
     assert is_well(server)
 
 
-@pytest.mark.parametrize("piece", [1 << 30, 70_000, 1000])
-def test_many_requests_at_once(server, piece):
-    """However they are cut into pieces, each is answered."""
-    count = 2000 if piece > 4096 else 300
-    with connect(server) as connection, ThreadPoolExecutor(1) as threads:
-        threads.submit(send, connection, infer() * (count - 1) + infer(LAST), piece)
-        assert statuses(everything(connection)) == [200] * count
-
-
-def test_a_client_that_sends_thousands_lets_others_go_first(server):
-    """Another's ten requests wait for turns, not for all of them."""
-    count = 8000
-    with connect(server) as greedy, connect(server) as patient, ThreadPoolExecutor(2) as threads:
-        threads.submit(send, greedy, infer() * (count - 1) + infer(LAST))
-        greedy.recv(1, socket.MSG_PEEK)  # it has begun
-        answers = threads.submit(lambda: (everything(greedy), time.monotonic()))
-        for _ in range(10):
-            patient.sendall(infer())
-            assert statuses(patient.recv(1 << 16)) == [200]
-        was_served = time.monotonic()
-        data, ended = answers.result()
-    assert was_served < ended
-    assert statuses(data) == [200] * count
-
-
 @pytest.mark.parametrize("protocol", ["h2c", "websocket"])
 @pytest.mark.parametrize("piece", [1 << 20, 7])
 def test_an_upgrade_is_ignored(server, protocol, piece):
