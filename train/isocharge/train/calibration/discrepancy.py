@@ -33,10 +33,10 @@ DEGREE, FORCE_DEGREE = 4, 2
 FADING = 0.5
 """Ratio of the standard deviations of terms of successive degrees: what is unexplained is smooth."""
 
-COMMON = 2.0
-"""Ratio of the standard deviation of what electrodes share to that of what each has alone. To second order, what has
-two axes acts alike all round: of imperfect films, solved in full, first-order modes leave 0.3 to 0.45 % in common and
-0.13 to 0.21 % of the electrodes' own. Forces are wrong by what is in common."""
+COMMON = 1.0
+"""Ratio of the standard deviation of what electrodes share to that of what each has alone. Of imperfect films, solved
+in full, modes leave 0.05 to 0.25 % in common and 0.1 to 0.35 % of the electrodes' own; coats and load cells that are
+not straight add to the first. Forces are wrong by what is in common."""
 
 IMPERFECT = {0.0: 0.5, 1.0: 0.5}
 """Sizes of the modes of imperfections that are weighed, with what each is believed to beforehand."""
