@@ -18,7 +18,8 @@ def test_a_map_that_folds_is_reported_drawn_and_written(command, tmp_path):
     assert 1.5 < numbers["working_area"]["fold_radius_mm"] < 5.0
     assert numbers["working_area"]["radius_mm"] < numbers["working_area"]["fold_radius_mm"]
     assert numbers["folds_mm"]
-    assert "no method can tell them apart" in err
+    assert "no method can tell them apart by one reading" in err
+    assert f"on {100.0 * numbers['working_area']['determined_share']:.0f} % of the 3.5 mm searched" in err
     picture = imread(tmp_path / "out" / "identify.png")
     assert picture.shape[0] > 400
     assert picture.std() > 0.1

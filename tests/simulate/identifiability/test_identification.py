@@ -15,6 +15,7 @@ from isocharge.simulate import (
     SolveSettings,
     Theory,
     identify,
+    limits_at,
     load_sensor,
     noise_model,
 )
@@ -44,6 +45,16 @@ def test_numbers_are_ready_for_json(identification):
     area = numbers["working_area"]
     assert (area["radius_mm"], area["why"], area["fold_radius_mm"]) == (5.0, "searched", None)
     assert len(numbers["by_distance"]["distance_mm"]) == len(numbers["by_distance"]["worst_position_mm_at_1_N"])
+
+
+def test_the_share_on_whichever_side_of_folds_is_that_of_random_places(film):
+    """Of 2,000 places drawn at random, those where the limits at all three forces are within the allowed error."""
+    found, rng = Identification.of(film, REFERENCE, error=0.1), np.random.default_rng(0)
+    at = 5.0 * np.sqrt(rng.random(2000)) * np.exp(2j * np.pi * rng.random(2000))
+    contacts = (np.column_stack([at.real, at.imag, np.full(2000, force)]) for force in (0.05, 1.0, 2.0))
+    worst = np.max([limits_at(film, contact, REFERENCE).position for contact in contacts], axis=0)
+    assert 0.1 < found.determined_share < 0.9
+    assert found.determined_share == pytest.approx(np.mean(worst <= 0.1), abs=0.04)
 
 
 def test_errors_are_ordered_and_fall_with_the_force(identification):

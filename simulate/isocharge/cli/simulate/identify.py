@@ -64,7 +64,7 @@ def identify_command(
             (folder / PICTURE).write_bytes(picture_bytes(identification_picture(identified)))
             (folder / NUMBERS).write_bytes(json_module.dumps(numbers, indent=1).encode())
     typer.echo(json_module.dumps(numbers) if json else _table(numbers))
-    say(identified.area.summary)
+    say(identified.summary)
 
 
 def _table(numbers: dict[str, Any]) -> str:

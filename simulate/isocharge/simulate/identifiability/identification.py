@@ -125,6 +125,29 @@ class Identification:
         )
         return cls(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inside)
 
+    @property
+    def determined_share(self) -> float:
+        """Share of the searched disk in which the error is at most the allowed one at every force, dimensionless.
+
+        That is on either side of the folds: where contacts are determined once it is known which of those with the same
+        charges it is, as from the frames before.
+        """
+        good = np.all([limits.position <= self.area.error for limits in self.maps], axis=0)
+        return float(np.average(good.mean(axis=1), weights=self.maps[0].rings.distance))
+
+    @property
+    def summary(self) -> str:
+        """The working area in a few sentences."""
+        area = self.area
+        if not (len(area.folds) or len(area.pairs)):
+            return area.summary
+        return (
+            f"{area.summary} If the frames before tell which of the contacts with the same charges it is, the position "
+            f"error is at most {area.error:.3g} mm on {100.0 * self.determined_share:.0f} % of the "
+            f"{area.searched:.3g} mm searched, of which the working area is "
+            f"{100.0 * (area.radius / area.searched) ** 2:.0f} %."
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON; infinite radii are None."""
         area = self.area
@@ -143,7 +166,8 @@ class Identification:
                 "unfolded_radius_mm": area.unambiguous_radius,
                 "error_mm": area.error,
                 "searched_mm": area.searched,
-                "words": area.summary,
+                "determined_share": self.determined_share,
+                "words": self.summary,
             },
             "limits_in_working_area": [limits.statistics() for limits in self.inside],
             "by_distance": {

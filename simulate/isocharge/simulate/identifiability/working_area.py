@@ -74,7 +74,7 @@ class WorkingArea:
             sides = "the fold" if self.electrodes == 3 else "the points where it loses rank"
             parts.append(
                 f"The map folds {self.fold_radius:.1f} mm from the centre: contacts on both sides of {sides} give the "
-                "same charges, and no method can tell them apart."
+                "same charges, and no method can tell them apart by one reading."
             )
         if len(self.pairs):
             parts.append(self.pairs.summary)
