@@ -122,6 +122,21 @@ def test_a_wrong_graph_is_not_released(trained, held, graph, change, exported, m
         check_graph(export_onnx(exact, {}) if exported else graph, exact.outputs, held, REFERENCE)
 
 
+def test_file_and_network_may_differ_by_a_thousandth_of_what_charges_tell(trained, held, graph):
+    exact = turned(trained.network, trained)
+
+    def beside(deviations):
+        def outputs(charge):
+            contact, std, *others = exact.outputs(charge)
+            return contact + deviations * std, std, *others
+
+        return outputs
+
+    check_graph(graph, beside(8e-4), held, REFERENCE)
+    with pytest.raises(TrainingError, match="disagrees with the network on contact"):
+        check_graph(graph, beside(2e-3), held, REFERENCE)
+
+
 def test_the_file_is_plain_onnx_that_another_runtime_computes(held, graph, session):
     """onnx's own reference implementation, in plain NumPy."""
     from onnx.reference import ReferenceEvaluator
