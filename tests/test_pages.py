@@ -1,13 +1,10 @@
 """What README.md and the pages show is true: every example runs and prints what it says, links lead somewhere."""
 
 import re
-import shlex
 from pathlib import Path
 
 import pytest
-import typer
 
-from isocharge.cli.main import app
 from isocharge.simulate import Circle, Sweep, load_sensor, run_sweep
 
 ROOT = Path(__file__).parents[1]
@@ -89,23 +86,6 @@ def test_an_example_does_what_it_says(page_example, desk, installed, run_example
     if page_example.page == "README.md" and "simulate point" in text:
         assert '"charge_pC"' in printed
         assert printed.count('"frame_id": "three-25um-biaxial"') > 800  # 5 s at 200 Hz
-
-
-def shown_commands():
-    """Commands in blocks that are no examples, because they take too long or need what a test has not."""
-    for page, text in PAGES.items():
-        for block in re.findall(r"^```text\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
-            for line in re.findall(r"^(?:\$ )?isocharge (.+)$", block, re.MULTILINE):
-                yield pytest.param(line, id=f"{page}: {line[:60]}")
-
-
-@pytest.mark.parametrize("line", [*shown_commands()])
-def test_a_command_that_is_only_shown_is_one(line):
-    """Its options are those of the command; a comment may follow."""
-    words, group = shlex.split(line, comments=True), typer.main.get_command(app)
-    while hasattr(group, "list_commands"):
-        _, group, words = group.resolve_command(None, words)
-    group.make_context("isocharge", words)
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -2,7 +2,6 @@
 
 import json
 import re
-import select
 import signal
 import socket
 import subprocess
@@ -141,20 +140,6 @@ def test_bodies_with_faults(attack):
         assert response.status < 500, response
 
     attack("wire bodies", read, bodies, 200_000)
-
-
-def test_grpc_bytes_with_faults(server, attack):
-    """On the port, instead of HTTP/2; the preface is right in half of them."""
-    preface = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
-    frames = b"\0\0\0\4\0\0\0\0\0" + b"\0\0\5\1\4\0\0\0\1\x82\x86\x84\x41\0" + b"\0\0\4\3\0\0\0\0\1\0\0\0\2"
-
-    def read(data):
-        with socket.create_connection(server.grpc, timeout=60.0) as connection, suppress(ConnectionError):
-            connection.sendall(data)
-            select.select([connection], [], [], 0.005)
-
-    attack("wire grpc bytes", read, lambda rng: preface * (rng.random() < 0.7) + mutated(rng, frames * 3), 2_000)
-    assert is_live(server)
 
 
 def is_live(server):

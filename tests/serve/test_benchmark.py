@@ -51,13 +51,6 @@ def test_durations_are_those_of_the_clock():
     assert batch.presses_per_s == pytest.approx(100 * 1e6 / 50.0)
 
 
-def test_a_turn_lasts_as_long_as_it_should():
-    clock = Clock()
-    (timing,) = take_turns([Contender("one", 1, clock.takes(10))], 1e-2, clock=clock)
-    assert timing.calls == pytest.approx((ROUNDS - 1) * 100, abs=ROUNDS)
-    assert clock.now == pytest.approx(1e7, rel=0.02)
-
-
 def test_ways_predict_what_the_model_does():
     folder = find_model("three-25um-biaxial")
     model, predictor = load_model(folder), Predictor(folder)

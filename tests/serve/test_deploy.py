@@ -124,31 +124,3 @@ def test_dashboard_and_alerts_ask_for_metrics_that_there_are(start_http):
     there = {sample.name for family in families for sample in family.samples}
     assert set(re.findall(r"\b(?:isocharge|process)_\w+", asked)) <= there
 
-
-# Kubernetes
-
-
-@pytest.fixture(scope="module")
-def predictor_of_kserve():
-    return yaml.safe_load((DEPLOY / "kserve/inference_service.yaml").read_text())["spec"]["predictor"]
-
-
-def test_the_manifest_starts_our_server_as_it_says(predictor_of_kserve, models, tmp_path):
-    """Its arguments start a server that answers its probes, and nothing else without the token."""
-    (container,) = predictor_of_kserve["containers"]
-    (port,) = (entry["containerPort"] for entry in container["ports"])
-    arguments = [word if word != str(port) else "0" for word in container["args"]]
-    assert str(port) in container["args"]
-    assert [entry["name"] for entry in container["env"]] == ["ISOCHARGE_TOKEN"]
-    words = [sys.executable, "-m", "isocharge.cli", *arguments, "--models", str(models)]
-    with running(words, env=os.environ | {"ISOCHARGE_TOKEN": "yes"}, cwd=tmp_path) as (_, url):
-        url = url.replace("0.0.0.0", "127.0.0.1")
-        for probe in ("readinessProbe", "livenessProbe"):
-            assert container[probe]["httpGet"]["port"] == port
-            assert status_of(url + container[probe]["httpGet"]["path"]) == 200
-        assert (status_of(f"{url}/metrics"), status_of(f"{url}/metrics", "yes")) == (401, 200)
-    assert predictor_of_kserve["scaleMetric"] == "cpu"
-    assert container["resources"]["requests"]["cpu"] == "1"
-
-
-# Containers

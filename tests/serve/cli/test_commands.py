@@ -284,24 +284,6 @@ def test_a_closed_stderr_changes_nothing(models, presses):
     assert (done.returncode, done.stdout.count("\n")) == (0, 3)
 
 
-@pytest.mark.parametrize("streams", [">/dev/full 2>/dev/full", ">&- 2>&-"])
-def test_a_server_whose_streams_are_full_serves(models, tmp_path, streams):
-    path = tmp_path / "touch.sock"
-    process = subprocess.Popen(["bash", "-c", f"exec {ISOCHARGE} serve http --models {models} --uds {path} {streams}"])
-    try:
-        end = time.monotonic() + 60
-        answer = ""
-        while answer != '{"live":true}' and time.monotonic() < end:
-            time.sleep(0.1)
-            answer = bash(f"curl -s --unix-socket {path} http://x/v2/health/live").stdout
-        assert answer == '{"live":true}'
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 0
-    finally:
-        process.kill()
-        process.wait()
-
-
 def test_a_slow_reader_stops_neither_chain_nor_recording(models, film, tmp_path, start):
     """It takes nothing at first: what it missed is counted, and the recording has everything."""
     recording, count = tmp_path / "touch.rec", 16_000

@@ -158,18 +158,6 @@ def test_outage_is_measured_and_logged_once(tmp_path, caplog):
     assert (port.outages, len(caplog.records)) == (1, 1)
 
 
-def test_silence_is_an_outage(board, caplog):
-    heard = threading.Event()
-    with Port(board.url, silence_s=0.2, reconnect=True) as port:
-        talking = threading.Timer(0.5, talk, (board, b"late", heard))
-        talking.start()
-        chunk = next(iter(port))
-    heard.set()
-    talking.join()
-    assert (chunk.data[:4], port.outages, len(caplog.records)) == (b"late", 1, 1)
-    assert 0.4 < chunk.outage_s < 30.0
-
-
 def test_file_is_read_to_its_end(tmp_path):
     path = tmp_path / "frames.bin"
     path.write_bytes(bytes(range(256)) * 40)

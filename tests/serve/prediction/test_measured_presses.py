@@ -162,15 +162,6 @@ def test_presses_that_are_refused(read, text, said):
     assert len(str(caught.value)) < 600
 
 
-def test_the_command_of_the_message_repairs_the_file(read, tmp_path, shell):
-    text = f"{HEADER}\n1,5;2;0,5;4;5;6".replace(HEADER, HEADER.replace(",", ";"))
-    with pytest.raises(PressError) as caught:
-        read(text)
-    words = str(caught.value).partition("as with: ")[2].replace("FILE", "presses.csv").replace("NEW.csv", "new.csv")
-    shell(words, cwd=tmp_path)
-    assert read_presses(tmp_path / "new.csv", NAMES) == read(f"{HEADER}\n1.5,2,0.5,4,5,6\n")
-
-
 def test_too_many_presses(monkeypatch, read):
     monkeypatch.setattr(measured_presses, "MOST_ROWS", 3)
     assert len(read(HEADER + "\n1,2,3,4,5,6" * 3)) == 3

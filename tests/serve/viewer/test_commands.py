@@ -5,14 +5,11 @@ import json
 import os
 import re
 import signal
-import socket
 import struct
-import time
 import urllib.request
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
-from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -85,27 +82,6 @@ def test_a_press_is_on_the_page_where_it_is_and_the_stream_goes_on_without_it(bo
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, "Traceback" in err) == (0, False)
-
-
-def listens(place):
-    with socket.socket() as client:
-        return not client.connect_ex((place.hostname, place.port))
-
-
-def test_a_silent_port(start, tmp_path, monkeypatch):
-    """Its recording waits, once; and a killed reader takes its page along."""
-    monkeypatch.chdir(tmp_path)
-    ends = os.openpty()
-    process, url = start("stream", "linear", "--port", os.ttyname(ends[1]))
-    asked = [{"do": "record", "on": True}] * 6
-    follow(url, lambda _, state: "waits for data" in (state.get("recording") or ""), *asked)
-    assert list(tmp_path.glob("*.rec")) == []
-    process.kill()
-    process.wait(60)
-    while listens(urlsplit(url)):
-        time.sleep(0.1)
-    for end in ends:
-        os.close(end)
 
 
 def test_the_rate_is_that_of_the_board_however_fast_a_recording_is_read(predictor, record, monkeypatch):

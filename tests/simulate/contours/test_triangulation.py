@@ -1,7 +1,5 @@
 """Triangulation against circles (trilateration is classical), against presses, and in its refusals."""
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -40,11 +38,6 @@ def round_map(centres: np.ndarray) -> FunctionMap:
     return FunctionMap(charges, tuple("ABCD"[: len(centres)]), Domain(RADIUS, FORCES))
 
 
-def distances(charge: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """The inverse: distance from each electrode."""
-    return 12.0 * np.sqrt(1e3 * np.reshape(force, (-1, 1)) ** (2.0 / 3.0) / charge - 1.0)
-
-
 def errors(fix, contact: np.ndarray) -> np.ndarray:
     """Distances of the positions that were found from the true ones."""
     return np.hypot(*(fix.contact - contact)[fix.found, :2].T)
@@ -57,19 +50,6 @@ def draw(count: int, seed: int, radius: float = 7.0, forces: tuple[float, float]
     return np.stack([r * np.cos(angle), r * np.sin(angle), np.exp(rng.uniform(*np.log(forces), count))], axis=1)
 
 
-def corners(centres: np.ndarray, radii: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Where each pair of three circles meets, nearest to `at`, by the textbook formula; shape (3, 2), mm."""
-    nearest = []
-    for (first, r1), (second, r2) in combinations(zip(centres, radii, strict=True), 2):
-        between = np.linalg.norm(second - first)
-        along = (between**2 + r1**2 - r2**2) / (2.0 * between)
-        unit = (second - first) / between
-        aside = np.sqrt(r1**2 - along**2) * np.array([-unit[1], unit[0]])
-        both = first + along * unit + np.array([aside, -aside])
-        nearest.append(both[np.argmin(np.linalg.norm(both - at, axis=1))])
-    return np.array(nearest)
-
-
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_circles_are_trilaterated(layout):
     charge_map, contact = round_map(CENTRES[layout]), draw(300, seed=1)
@@ -77,20 +57,6 @@ def test_circles_are_trilaterated(layout):
     assert fix.found.mean() > 0.98  # two contours touch on the line between their electrodes
     assert errors(fix, contact).max() < 1e-3
     assert np.median(fix.spread[fix.found]) < 1e-5
-
-
-def test_the_mean_of_three_crossings_is_the_textbooks():
-    """With charges that fit no single press: three circles, three crossings apart from each other, their mean."""
-    charge_map, centres, contact = round_map(CENTRES["three"]), CENTRES["three"], draw(60, seed=2, radius=3.0)
-    charge = charge_map.charges(contact) * (1.0 + 0.01 * np.random.default_rng(3).standard_normal((60, 3)))
-    fix = Triangulation(charge_map).locate(charge, contact[:, 2])
-    assert fix.found.sum() > 50
-    radii = distances(charge, contact[:, 2])
-    for i in np.flatnonzero(fix.found):
-        crossings = corners(centres, radii[i], contact[i, :2])
-        mean = crossings.mean(axis=0)
-        np.testing.assert_allclose(fix.contact[i, :2], mean, atol=1e-4)
-        assert fix.spread[i] == pytest.approx(np.linalg.norm(crossings - mean, axis=1).max(), abs=1e-4)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -58,22 +58,6 @@ def test_worker_process_that_dies_is_an_error_and_the_run_can_go_on(tmp_path, ex
     assert sweep_with(None, tmp_path / "presses") == expected
 
 
-def test_workers_end_with_an_interrupt_even_in_the_middle_of_a_task():
-    """Far from the end of the task, which takes longer than this test may."""
-    with pytest.raises(KeyboardInterrupt):
-        interrupt_workers()
-
-
-def interrupt_workers() -> None:
-    with local_workers(2) as executor:
-        assert executor is not None
-        assert executor.submit(os.getpid).result() != os.getpid()
-        task = executor.submit(time.sleep, 600.0)
-        while not task.running():
-            time.sleep(0.01)
-        raise KeyboardInterrupt
-
-
 def test_results_come_in_order_and_tasks_are_drawn_as_they_are_needed():
     drawn = []
 

@@ -114,12 +114,6 @@ def test_mismatch_is_drawn_once_for_each_channel():
     assert set(np.abs(process.bias)) == {0.5}
 
 
-def test_surgery_is_bench_but_worse():
-    bench, surgery = load_amplifier("bench"), load_amplifier("surgery")
-    assert (surgery.noise.white, surgery.hum, surgery.step) == (1.0, 5.0, 0.5)
-    assert replace(surgery, noise=bench.noise, hum=bench.hum, step=0.0) == bench
-
-
 def test_file_changes_what_it_says(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('like = "bench"\nwhite_pC = 0.5\ntau_s = 1\ngain_mismatch = 0.002\nbits = 12\npyro_pC_per_K = 90\n')

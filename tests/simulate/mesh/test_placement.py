@@ -137,15 +137,3 @@ def test_load_is_uniform_over_a_polygon(probe, distance):
     mixed = 0.5 * np.sum(cross * (x * v + 2 * x * y + 2 * u * v + u * y))
     assert load @ (about.real * about.imag) == pytest.approx(mixed, abs=1e-12 * (probe.reach / RADIUS) ** 2)
     assert not load[~np.isin(np.arange(mesh.n_node), mesh.nodes[mesh.footprint])].any()
-
-
-@pytest.mark.parametrize(("distance", "radius"), [(0.0, 0.02), (0.4, 0.11), (0.1, 0.6)])
-def test_load_is_uniform_over_a_disk(distance, radius):
-    """1, the centre, R^2/4 along each axis."""
-    resolution = Resolution(8, 8, 4)
-    placed = place(FILM, Circle(radius * RADIUS), (distance * RADIUS, 0.0), resolution, 0.05)
-    load, about = 2.0 * placed.geometry.load, placed.node_points - distance
-    assert load.sum() == pytest.approx(1.0, rel=1e-13)
-    assert abs(load @ about.real) < 1e-8 * radius
-    assert load @ about.real**2 == pytest.approx(0.25 * radius**2, rel=1e-7)
-    assert load @ about.imag**2 == pytest.approx(0.25 * radius**2, rel=1e-7)

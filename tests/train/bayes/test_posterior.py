@@ -1,6 +1,5 @@
 """The posterior against closed forms, brute force, and itself; the Bayes limit from it."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,10 +7,8 @@ import pytest
 from scipy import stats
 
 from isocharge.common.errors import ChargeError, InputError
-from isocharge.common.resumable_run import resume_parts
 from isocharge.simulate import Circle, Domain, NoiseModel, noise_model
 from isocharge.train import BayesLimit, BayesProblem, bayes_estimate, bayes_limit
-from isocharge.train.bayes import posterior
 from isocharge.train.bayes.posterior import Posterior
 from isocharge.train.data.presses import draw_contacts
 
@@ -168,18 +165,6 @@ def test_errors_by_hand():
     assert limit.force_rms_percent == pytest.approx(1.0 / np.sqrt(2.0))
     assert limit.position_p95_mm == pytest.approx(0.475)
     assert limit.force_median_percent == pytest.approx(0.5)
-
-
-def test_who_computes_does_not_matter_and_a_run_keeps_it(problem, film, spline, tmp_path, monkeypatch):
-    monkeypatch.setattr(posterior, "CHUNK", 2)
-    charge = film.charges(np.array([[3.0, -2.0, 1.5], [0.0, 1.0, 0.2], [-5.0, 5.0, 0.7]]))
-    here = bayes_estimate(problem, charge, charge_map=spline)
-    assert here[0] == pytest.approx(np.array([[3.0, -2.0, 1.5], [0.0, 1.0, 0.2], [-5.0, 5.0, 0.7]]), abs=0.05)
-    with ThreadPoolExecutor(2) as pool, resume_parts(tmp_path / "it", {}) as run:
-        there = bayes_estimate(problem, charge, charge_map=spline, executor=run.keeping("bayes", pool))
-        kept = bayes_estimate(problem, 0.0 * charge, charge_map=spline, executor=run.keeping("bayes", pool))
-    np.testing.assert_array_equal(here, there)
-    np.testing.assert_array_equal(here, kept)  # loaded, whatever the charges are now
 
 
 def test_a_map_of_other_forces_is_refused(sensor, spline):

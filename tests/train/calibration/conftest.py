@@ -6,7 +6,17 @@ import pytest
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem
+from isocharge.train.calibration import contact_error
 from isocharge.train.data.presses import draw_contacts
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _coarse():
+    """Errors over fewer contacts, and fewer places to press: a fourth of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(contact_error, "CONTACTS", 50)
+        patch.setattr(contact_error, "PLACES", 30)
+        yield
 
 
 @pytest.fixture(scope="session", params=["four-25um-biaxial", "three-25um-biaxial"])

@@ -4,7 +4,6 @@ import http.client
 import json
 import re
 import socket
-import ssl
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
@@ -332,25 +331,3 @@ def test_half_handshakes_are_bounded(store, start_http, tls_files, trusted):
         assert not any(b"HTTP" in everything(connection) for connection in half)
         assert is_answered()
     wait_until(lambda: open_files() <= before)
-
-
-def test_a_request_with_the_last_byte_of_the_handshake(handler, start_http, tls_files, trusted):
-    """It comes before the connection is known to be up, and is not lost."""
-    server = start_http(handler, tls=Tls(tls_files / "both.pem"))
-    incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
-    client = trusted.wrap_bio(incoming, outgoing, server_hostname="127.0.0.1")
-    with connect(server) as connection:
-        is_done, data = False, b""
-        while not is_done:
-            try:
-                client.do_handshake()
-                is_done = True
-            except ssl.SSLWantReadError:
-                connection.sendall(outgoing.read())
-                incoming.write(connection.recv(1 << 16))
-        client.write(infer(LAST))
-        connection.sendall(outgoing.read())  # the end of the handshake and the request in one piece
-        while b"200 OK" not in data:
-            incoming.write(connection.recv(1 << 16) or pytest.fail("the server hung up"))
-            with suppress(ssl.SSLWantReadError):
-                data += client.read(1 << 16)
