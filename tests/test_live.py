@@ -59,10 +59,10 @@ def test_two_held_presses(tau):
         assert np.abs(got[round(34.0 * RATE_HZ) :].mean(axis=0)).max() < 1.0
 
 
-def test_ten_minutes_of_rest_give_no_touch():
+def test_three_minutes_of_rest_give_no_touch():
     """The whole of `bench`, film temperature wandering included."""
     part = load_amplifier("bench").start(3, RATE_HZ, np.random.default_rng(0))
-    _, contact = undo(part, np.zeros((120_000, 3)), 0)
+    _, contact = undo(part, np.zeros((36_000, 3)), 0)
     assert not contact.any()
 
 

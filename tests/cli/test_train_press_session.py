@@ -17,6 +17,7 @@ from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration import contact_error
 from isocharge.train.calibration.folder import SESSION
+from isocharge.train.training import correlation
 
 NAMES = ("A", "B", "C", "D")
 RATE_HZ = 200.0
@@ -157,10 +158,11 @@ def test_a_port_that_goes_away_under_a_machine_ends_the_session():
 
 @pytest.fixture(scope="module", autouse=True)
 def _coarse():
-    """Errors over fewer contacts, and fewer places to press: a fourth of the time."""
+    """Errors over fewer contacts, fewer places to press, correlations from fewer examples: a fourth of the time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contact_error, "CONTACTS", 50)
         patch.setattr(contact_error, "PLACES", 30)
+        patch.setattr(correlation, "EXAMPLES", 3_000)
         yield
 
 

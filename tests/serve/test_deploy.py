@@ -123,4 +123,3 @@ def test_dashboard_and_alerts_ask_for_metrics_that_there_are(start_http):
         families = text_string_to_metric_families(answer.read().decode())
     there = {sample.name for family in families for sample in family.samples}
     assert set(re.findall(r"\b(?:isocharge|process)_\w+", asked)) <= there
-

@@ -8,14 +8,16 @@ from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem
 from isocharge.train.calibration import contact_error
 from isocharge.train.data.presses import draw_contacts
+from isocharge.train.training import correlation
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _coarse():
-    """Errors over fewer contacts, and fewer places to press: a fourth of the time."""
+    """Errors over fewer contacts, fewer places to press, correlations from fewer examples: a fourth of the time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contact_error, "CONTACTS", 50)
         patch.setattr(contact_error, "PLACES", 30)
+        patch.setattr(correlation, "EXAMPLES", 3_000)
         yield
 
 
