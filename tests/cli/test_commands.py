@@ -1,5 +1,6 @@
 """The command line as a user meets it: help, exit codes, data on stdout, words on stderr, nothing half-written."""
 
+import csv
 import io
 import json
 import os
@@ -10,12 +11,14 @@ import time
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
+from pyarrow.parquet import read_table
 
 from isocharge.cli.shared.terminal import shown_progress
 from isocharge.common.progress import report
 from isocharge.common.toml_text import to_toml
-from isocharge.simulate import load_sensor
+from isocharge.simulate import load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import solve_maps
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from kept import kept
@@ -51,6 +54,23 @@ def test_a_point(command):
 
 SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1"]
 """A sweep of a small family."""
+
+
+def test_a_sweep_as_tables_for_other_programs(command, tmp_path):
+    """Read by pyarrow and by Python's csv, against the dataset beside them."""
+    tables = tmp_path / "a.parquet", tmp_path / "b.csv"
+    for table in tables:
+        assert command(*SMALL, "--samples", "5", "-o", table)[0] == 0
+    samples = read_dataset(tmp_path / "a").samples
+    parquet = read_table(tables[0]).to_pydict()
+    with tables[1].open(newline="") as lines:
+        text = {name: [float(row[name]) for row in rows] for rows in [list(csv.DictReader(lines))] for name in rows[0]}
+    for columns in (parquet, text):
+        assert columns["x_mm"] == samples.x_mm.tolist()
+        assert np.column_stack([columns[name] for name in "ABC"]).tolist() == samples.charge_pC.tolist()
+    code, _, err = command(*SMALL, "--probe", "circle:1.0", "--probe", "circle:2.0", "-o", tmp_path / "c.csv")
+    assert code == 2
+    assert "a table of presses has one probe" in err
 
 
 def test_a_stopped_sweep_says_how_to_go_on_and_leaves_no_process(tmp_path):

@@ -2,8 +2,10 @@
 
 import json as json_module
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from isocharge.cli.shared.forward_maps import caution_of_stress, executor_for, shown_run, sweep_radius
@@ -12,7 +14,6 @@ from isocharge.cli.shared.options import (
     ClusterOption,
     ForceRangeOption,
     FreshOption,
-    NewFolderOption,
     RadiusOption,
     SensorArgument,
     StressLimitOption,
@@ -20,8 +21,18 @@ from isocharge.cli.shared.options import (
 )
 from isocharge.cli.shared.terminal import say
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
+from isocharge.common.errors import InputError
+from isocharge.common.extras import require
+from isocharge.common.files import refuse_existing
 from isocharge.common.resumable_run import refuse_finished
-from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
+from isocharge.serve import MeasuredPresses, write_presses
+from isocharge.simulate import Dataset, Sweep, load_sensor, parse_probe, read_dataset, run_sweep
+
+TABLES = (".csv", ".parquet")
+"""Ends of the names of tables of presses."""
+
+SOLVER_MM, SOLVER_FORCE = 0.01, 1e-3
+"""What a solver's error of 0.06 % of a charge is, as an error of place, mm, and as a share of force."""
 
 
 class Orientation(StrEnum):
@@ -41,7 +52,16 @@ class Sampling(StrEnum):
 
 def sweep_command(
     sensor: SensorArgument,
-    output: NewFolderOption,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DIR",
+            help="Folder to make for the dataset; it must not exist yet. NAME.csv or NAME.parquet: the folder NAME and "
+            "beside it this table of its presses, for other programs.",
+        ),
+    ],
     probe: Annotated[
         list[str] | None,
         typer.Option("--probe", metavar="SHAPE", help=f"{PROBE_HELP} May be repeated. (default: circle:1.0)"),
@@ -71,10 +91,37 @@ def sweep_command(
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
     film_sensor, probes = load_sensor(sensor), [parse_probe(text) for text in probe or ["circle:1.0"]]
+    table = output if output.suffix in TABLES else None
+    if table:
+        refuse_existing(table)
+        output = output.with_suffix("")
+        if len(probes) > 1 or orientation is Orientation.random:
+            raise InputError(
+                f"{table}: a table of presses has one probe in one orientation; give a folder, -o {output}"
+            )
+        if table.suffix == ".parquet":
+            with require("parquet"):  # missed now, not after the sweep
+                import pyarrow  # noqa: F401
     refuse_finished(output)
     caution_of_stress(film_sensor.film, probes, force[1], stress_limit)
     with shown_run(output), executor_for(workers, cluster) as executor:
         reach = sweep_radius(radius, film_sensor, probes, force)
         sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)
         run_sweep(output, film_sensor, probes, sweep, executor=executor, fresh=fresh)
-    say(f"{json_module.loads((output / 'manifest.json').read_text())['samples']} presses in {output}")
+    if table:
+        write_presses(table, _presses(read_dataset(output)))
+    count = json_module.loads((output / "manifest.json").read_text())["samples"]
+    say(f"{count} presses in {output}{f' and {table}' if table else ''}")
+
+
+def _presses(dataset: Dataset) -> MeasuredPresses:
+    """The presses of a dataset as measured ones are written."""
+    samples, count = dataset.samples, len(dataset.samples)
+    return MeasuredPresses(
+        np.column_stack([samples.x_mm, samples.y_mm, samples.force_N]),
+        samples.charge_pC,
+        np.full(count, SOLVER_MM),
+        np.full(count, SOLVER_FORCE),
+        dataset.sensor.electrode_names,
+        tuple(range(1, count + 1)),
+    )
