@@ -1,9 +1,9 @@
 """Measured presses: charges of a film under presses whose place or force, or both, are known. Their CSV file.
 
 The header has `x_mm, y_mm, force_N` and the electrodes' names (pC), in any order. An empty cell is unknown. Optional
-columns `position_std_mm` and `force_std` (a share: 0.01 is 1 %) say how well the rig knows place and force. Further
-columns are ignored where the electrodes are named. `isocharge serve predict` reads the file too. Parquet with the same
-columns will do as well.
+columns `position_std_mm` and `force_std` (a share: 0.01 is 1 %) say how well the rig knows place and force, and
+`temperature_C` how warm the film's ring was. Further columns are ignored where the electrodes are named. `isocharge
+serve predict` reads the file too. Parquet with the same columns will do as well.
 """
 
 import csv
@@ -34,8 +34,9 @@ MOST_ROWS = 1_000_000
 CONTACT = ("x_mm", "y_mm", "force_N")
 UNCERTAINTY = ("position_std_mm", "force_std")
 
-NOT_READ = ("temperature_C",)
-"""Columns with a meaning that nothing here needs; they are no electrodes."""
+TEMPERATURE = "temperature_C"
+COLDEST_C, WARMEST_C = -100.0, 200.0
+"""Temperatures that a film of PVDF may have."""
 
 KINDS = {
     "x_mm": "a position in mm, or an empty cell if it is unknown",
@@ -43,6 +44,7 @@ KINDS = {
     "force_N": "a positive force in N, or an empty cell if it is unknown",
     "position_std_mm": "a positive standard deviation in mm",
     "force_std": "a positive share of the force up to 1 (0.01 is 1 %)",
+    TEMPERATURE: f"a temperature of {COLDEST_C:g} to {WARMEST_C:g} degrees Celsius, or an empty cell if it is unknown",
 }
 
 
@@ -58,6 +60,7 @@ class MeasuredPresses:
         electrodes: Names, in the order of the charges.
         lines: Line of each press in its file, for messages; its number from 1 where there is no file.
         ignored: Columns of the file that were not read.
+        temperature_C: Of the film's ring, shape (n,), degrees Celsius; NaN where unknown, None if it nowhere is known.
 
     Raises:
         PressError: If shapes disagree or a value is impossible; the line and the column are named.
@@ -70,11 +73,14 @@ class MeasuredPresses:
     electrodes: tuple[str, ...]
     lines: tuple[int, ...]
     ignored: tuple[str, ...] = ()
+    temperature_C: Array | None = None
 
     def __post_init__(self) -> None:
         _check_electrodes(self.electrodes)
         n = len(self.lines)
         shapes = {"contact": (n, 3), "charge_pC": (n, len(self.electrodes)), "position_std_mm": (n,), "force_std": (n,)}
+        if self.temperature_C is not None:
+            shapes[TEMPERATURE] = (n,)
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise PressError(f"{name}: expected an array of shape {shape}, got {getattr(self, name).shape}")
@@ -88,6 +94,8 @@ class MeasuredPresses:
         chosen = np.atleast_1d(np.arange(len(self))[rows])
         names = ("contact", "charge_pC", "position_std_mm", "force_std")
         columns = {name: getattr(self, name)[chosen] for name in names}
+        if self.temperature_C is not None:
+            columns[TEMPERATURE] = self.temperature_C[chosen]
         return replace(self, **columns, lines=tuple(self.lines[row] for row in chosen))
 
     @property
@@ -98,8 +106,10 @@ class MeasuredPresses:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, MeasuredPresses):
             return NotImplemented
-        numbers, others = self._columns(), other._columns()
-        return self.electrodes == other.electrodes and np.array_equal(numbers, others, equal_nan=True)
+        numbers, others = self.columns, other.columns
+        return [*numbers] == [*others] and all(
+            np.array_equal(column, others[name], equal_nan=True) for name, column in numbers.items()
+        )
 
     def of_electrodes(self, electrodes: Sequence[str], whose: str) -> "MeasuredPresses":
         """The same presses with the charges of these electrodes, in this order.
@@ -116,20 +126,25 @@ class MeasuredPresses:
         order = [self.electrodes.index(name) for name in names]
         return replace(self, charge_pC=self.charge_pC[:, order], electrodes=names)
 
-    def _columns(self) -> Array:
-        """All numbers, in the columns of the file, shape (n, 5 + electrodes)."""
-        return np.column_stack([self.contact, self.charge_pC, self.position_std_mm, self.force_std])
+    @property
+    def columns(self) -> dict[str, Array]:
+        """All numbers, in the columns of the file, each of shape (n,)."""
+        numbers = [*self.contact.T, *self.charge_pC.T, self.position_std_mm, self.force_std]
+        columns = dict(zip((*CONTACT, *self.electrodes, *UNCERTAINTY), numbers, strict=True))
+        return columns if self.temperature_C is None else columns | {TEMPERATURE: self.temperature_C}
 
     def _check_values(self) -> None:
-        names, values = (*CONTACT, *self.electrodes, *UNCERTAINTY), self._columns()
-        force, place = self.contact[:, 2], np.isnan(self.contact[:, :2])
-        wrong = np.isinf(values)
-        wrong[:, 2] |= force <= 0.0
-        wrong[:, -2] |= ~(self.position_std_mm > 0.0)
-        wrong[:, -1] |= ~((self.force_std > 0.0) & (self.force_std <= 1.0))
-        for row, column in np.argwhere(wrong)[:1]:
-            kind = KINDS.get(names[column], CHARGE)
-            self._refuse(row, f", column {shown(names[column])}: expected {kind}, got {values[row, column]:.6g}")
+        columns, place = self.columns, np.isnan(self.contact[:, :2])
+        wrong = {name: np.isinf(column) for name, column in columns.items()}
+        wrong["force_N"] |= self.contact[:, 2] <= 0.0
+        wrong["position_std_mm"] |= ~(self.position_std_mm > 0.0)
+        wrong["force_std"] |= ~((self.force_std > 0.0) & (self.force_std <= 1.0))
+        if self.temperature_C is not None:
+            wrong[TEMPERATURE] |= (self.temperature_C < COLDEST_C) | (self.temperature_C > WARMEST_C)
+        for row, number in np.argwhere(np.column_stack([*wrong.values()]))[:1]:
+            name = [*columns][number]
+            expected = KINDS.get(name, CHARGE)
+            self._refuse(row, f", column {shown(name)}: expected {expected}, got {columns[name][row]:.6g}")
         for row in np.flatnonzero(place[:, 0] != place[:, 1])[:1]:
             self._refuse(row, ": expected both x_mm and y_mm, or two empty cells, got one of them; give the other")
         for row in np.flatnonzero(np.isnan(self.charge_pC).all(axis=1))[:1]:
@@ -164,7 +179,7 @@ def read_presses(
     named = f"the electrodes {tuple(electrodes)}" if electrodes is not None else "the electrodes' names"
     with _open_table(path, (*(electrodes or ()), *KINDS), f"{', '.join(CONTACT)} and {named} (charges in pC)") as table:
         if electrodes is None:
-            electrodes = [name for name in table.header if name and name not in KINDS and name not in NOT_READ]
+            electrodes = [name for name in table.header if name and name not in KINDS]
         electrodes = tuple(electrodes)
         _check_electrodes(electrodes)
         columns = table.columns(electrodes, KINDS)
@@ -183,6 +198,7 @@ def read_presses(
             electrodes,
             lines,
             tuple(name for name in table.header if name not in columns),
+            None if np.isnan(column[TEMPERATURE]).all() else column[TEMPERATURE],
         )
     except PressError as error:
         raise PressError(f"{path}, {error}") from error
@@ -211,17 +227,15 @@ def write_presses(path: Path, presses: MeasuredPresses) -> None:
 
     Its name decides: Parquet if it ends in `.parquet`, else CSV.
     """
-    names = (*CONTACT, *presses.electrodes, *UNCERTAINTY)
-    columns = dict(zip(names, presses._columns().T, strict=True))
-    write_whole(path, parquet_bytes(columns) if path.suffix == SUFFIX else presses_text(presses).encode())
+    write_whole(path, parquet_bytes(presses.columns) if path.suffix == SUFFIX else presses_text(presses).encode())
 
 
 def presses_text(presses: MeasuredPresses) -> str:
     """What `write_presses` writes."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow((*CONTACT, *presses.electrodes, *UNCERTAINTY))
-    for row in presses._columns().tolist():
+    writer.writerow(presses.columns)
+    for row in np.column_stack([*presses.columns.values()]).tolist():
         writer.writerow("" if value != value else repr(value) for value in row)
     return text.getvalue()
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
@@ -24,6 +25,7 @@ from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.json_values import plain_values
 from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, ProposedPress, calibrate, next_presses
+from isocharge.train.calibration.calibrate import film_without_presses
 from isocharge.train.calibration.folder import (
     SESSION,
     calibration_folder,
@@ -70,6 +72,15 @@ def calibrate_command(
             "--from",
             metavar="FOLDER",
             help="Start from the calibration in this folder, allowing for drift since then. (default: the sensor file)",
+        ),
+    ] = None,
+    temperature_C: Annotated[
+        float | None,
+        typer.Option(
+            "--temperature",
+            metavar="C",
+            help="How warm the film's ring is, degrees Celsius: at presses without a column temperature_C; without "
+            "presses the film of --from is written as it is at this temperature. (default: not known)",
         ),
     ] = None,
     models: ModelsOption = None,
@@ -122,17 +133,27 @@ def calibrate_command(
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
-    _check_usage(file, output, next_count, port, of_port=yes or press_list is not None or fresh or device is not None)
+    warmed = temperature_C is not None and earlier is not None and file is None and port is None
+    of_port = yes or press_list is not None or fresh or device is not None
+    _check_usage(file, output, next_count, port, temperature_C, of_port=of_port, warmed=warmed)
     problem = replace(CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models), stress_limit=stress_limit)
+    presses = None
+    if file is not None:
+        presses = read_presses_of(file, problem.electrodes, position_std_mm, force_std)
+        if presses.temperature_C is None and temperature_C is not None:
+            presses = replace(presses, temperature_C=np.full(len(presses), temperature_C))
     if earlier is not None:
-        problem = replace(problem, earlier=read_earlier(earlier, problem))
+        thermometer = presses is not None and presses.temperature_C is not None
+        at_C = temperature_C if warmed else None
+        problem = replace(problem, earlier=read_earlier(earlier, problem, thermometer=thermometer, at_C=at_C))
     result = None
     with calibration_folder(output, problem) if output is not None else nullcontext():
         if port is not None and output is not None:
             where = PressPort(port, device, baud, yes, press_list, until, fresh, position_std_mm, force_std)
             result = calibrate_at_port(where, problem, output, json_lines=json)
-        elif file is not None:
-            presses = read_presses_of(file, problem.electrodes, position_std_mm, force_std)
+        elif warmed:
+            result = film_without_presses(problem, f"no presses: {earlier} at {temperature_C:g} C")
+        elif presses is not None:
             say(f"fitting the film to {len(presses)} presses")
             result = calibrate(presses, problem)
         for caution in result.cautions if result else ():
@@ -160,7 +181,16 @@ def calibrate_command(
         )
 
 
-def _check_usage(file: Path | None, output: Path | None, next_count: int, port: str | None, *, of_port: bool) -> None:
+def _check_usage(
+    file: Path | None,
+    output: Path | None,
+    next_count: int,
+    port: str | None,
+    temperature_C: float | None,
+    *,
+    of_port: bool,
+    warmed: bool,
+) -> None:
     """Refuse arguments that contradict each other."""
     file_alone, nothing = port is None, port is None and file is None
     refuse(
@@ -173,10 +203,13 @@ def _check_usage(file: Path | None, output: Path | None, next_count: int, port: 
                 file_alone and of_port
             ),
             "expected PRESSES.csv, or --next K for presses to begin with, or --port URL, got none of them": (
-                nothing and not next_count
+                nothing and not next_count and not warmed
+            ),
+            "--temperature: expected PRESSES.csv that were made at it, or --from FOLDER for it, got neither": (
+                temperature_C is not None and file is None and not warmed
             ),
             "--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out": (
-                nothing and output
+                nothing and output and not warmed
             ),
         }
     )

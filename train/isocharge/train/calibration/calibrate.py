@@ -14,11 +14,12 @@ from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.simulate import Circle, Sensor
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
-from isocharge.train.calibration.contacts import PressData
+from isocharge.train.calibration.contacts import PressData, temperatures
 from isocharge.train.calibration.diagnosis import check_before, explain, find_mistakes, misfit, outside
-from isocharge.train.calibration.film_fit import MISTAKEN, PROBABLE, FilmPosterior, fit_film
+from isocharge.train.calibration.discrepancy import Hypothesis
+from isocharge.train.calibration.film_fit import MISTAKEN, PER_KELVIN, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
-from isocharge.train.calibration.quantities import Quantity, quantities, summarise
+from isocharge.train.calibration.quantities import IDENTIFIED, Quantity, quantities, summarise
 from isocharge.train.training.fit import Fitted
 
 UNEXPLAINED = 1e-6
@@ -139,11 +140,25 @@ class CalibrationResult:
             f"{before.force_percent:.2g} %. Noise alone leaves {noise.position_mm:.2g} mm and "
             f"{noise.force_percent:.2g} %.",
             *summarise(self.quantities),
+            *self._of_temperature,
             "Forces are as right as the load cell, and places as the origin and the axes of the stage: an error of "
             "theirs is in every answer, beside these.",
             *self._unexplained,
             *self.cautions,
         )
+
+    @property
+    def _of_temperature(self) -> Iterator[str]:
+        """What a kelvin does to the film, if that is known."""
+        if (known := self.posterior.warming) is None:
+            return
+        if known.std > IDENTIFIED * PER_KELVIN:
+            yield f"The presses were made at {known.at_C:.1f} C; over more degrees they would tell what a kelvin does."
+        else:
+            yield (
+                f"A kelvin more changes the pretension by {known.MPa_per_K:.3g} +- {known.std:.2g} MPa. This is the "
+                f"film at {known.at_C:.1f} C; --from with --temperature gives it at another."
+            )
 
     @property
     def _unexplained(self) -> Iterator[str]:
@@ -189,8 +204,12 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
         presses = presses[~far]
     if misfit(presses, problem.charges) > MISLED and find_mistakes(presses, problem.charges):
         raise explain(presses, problem.charges, np.nan)
+    at_C = None if presses.temperature_C is None else float(temperatures(presses).mean())
+    if at_C is not None and problem.before.warming:
+        problem = replace(problem, earlier=problem.before.at_temperature(at_C, problem.prior))
+    data = PressData.of(presses, problem.noise, problem.charges)
     with threadpool_limits(1):  # many small matrices: a second thread only waits
-        posterior = fit_film(problem.charges, PressData.of(presses, problem.noise, problem.charges), problem.before)
+        posterior = fit_film(problem.charges, data, problem.before, at_C)
     _refuse_unexplained(presses, problem, posterior)
     chi2, freedom = posterior.total
     if freedom and chi2_distribution.sf(chi2, freedom) < UNCERTAIN:  # larger errors, by Birge's ratio (1932)
@@ -201,6 +220,31 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
         )
     posterior = _with_unseen_mistakes(posterior, problem.before)
     return CalibrationResult(problem, presses, posterior, (*cautions, *_cautions(presses, problem, posterior)))
+
+
+def film_without_presses(problem: CalibrationProblem, why: str) -> CalibrationResult:
+    """The film as it is known beforehand, as a calibration; `why` is said as a caution."""
+    film, none, count = problem.before, np.empty(0), problem.charges.n_coefficient
+    joint = np.zeros((film.parameters.size + count,) * 2)
+    joint[: len(film.of_unknowns), : len(film.of_unknowns)] = film.of_unknowns
+    posterior = FilmPosterior(
+        parameters=film.parameters,
+        covariance=film.covariance,
+        coefficients=film.coefficients if film.coefficients.size else np.zeros(count),
+        joint=joint,
+        warming=film.warming,
+        contact=np.empty((0, 3)),
+        chi2=none,
+        freedom=none,
+        bad=none.astype(bool),
+        offset_pC=(0.0, 0.0),
+        drift=(0.0, 0.0),
+        scatter=0.0,
+        weights={Hypothesis(modes=float(film.coefficients.size > 0)): 1.0},
+    )
+    electrodes = problem.electrodes
+    presses = MeasuredPresses(np.empty((0, 3)), np.empty((0, len(electrodes))), none, none, electrodes, ())
+    return CalibrationResult(problem, presses, posterior, (why,))
 
 
 def _check_enough_known(presses: MeasuredPresses, problem: CalibrationProblem) -> None:

@@ -4,7 +4,7 @@ A rig knows place and force of a press to its own uncertainty, or one of them no
 is the one that fits charges and rig best; the residuals of both speak about the film.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -16,6 +16,7 @@ from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.numerics.disk_least_squares import minimise
+from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.train.calibration.film_charges import CONTACT_STEPS, FilmCharges
 
 PLACES = 300
@@ -23,6 +24,13 @@ PLACES = 300
 
 VAGUE_FORCE = 1.5
 """Standard deviation of the logarithm of a force that nobody knows, about the middle of the forces."""
+
+
+NUISANCES = 3
+"""What a session has besides a film: change of the pretension with temperature, offset and drift of the charges."""
+
+APART_MPa = 0.5
+"""Distance of the pretensions between which charges are interpolated where the film's differs from press to press."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +44,8 @@ class PressData:
         contact_weight: One over the standard deviation of each, shape (n, 3); small where unknown.
         known: Which charges and coordinates were measured, shape (n, n_electrode + 3).
         turn: When each press was made, from -1/2, the first, to 1/2, the last, shape (n,).
+        warmer: How much warmer each was than their mean, K, shape (n,).
+        tauter: Pretension of each over that of the film, MPa, shape (n,).
     """
 
     charge: Array
@@ -44,6 +54,8 @@ class PressData:
     contact_weight: Array
     known: Booleans
     turn: Array
+    warmer: Array
+    tauter: Array
 
     @classmethod
     def of(cls, presses: MeasuredPresses, noise: NoiseModel, charges: FilmCharges) -> "PressData":
@@ -52,7 +64,7 @@ class PressData:
         charge = np.where(seen, presses.charge_pC, 0.0)
         logs = np.column_stack([presses.contact[:, :2], np.log(presses.contact[:, 2])])
         rig_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
-        known = ~np.isnan(logs)
+        known, temperature = ~np.isnan(logs), temperatures(presses)
         return cls(
             charge=charge,
             weight=np.where(seen, 1.0 / noise.sigma(charge), 0.0),
@@ -60,6 +72,8 @@ class PressData:
             contact_weight=1.0 / np.where(known, rig_std, [domain.radius, domain.radius, VAGUE_FORCE]),
             known=np.column_stack([seen, known]),
             turn=np.linspace(-0.5, 0.5, len(presses)) if len(presses) > 1 else np.zeros(1),
+            warmer=temperature - temperature.mean(),
+            tauter=np.zeros(len(presses)),
         )
 
     def __getitem__(self, rows: Integers | Booleans) -> "PressData":
@@ -69,9 +83,14 @@ class PressData:
         return len(self.contact)
 
     def without(self, nuisances: Array) -> "PressData":
-        """The presses without a common offset of the charges, pC, and without their drift over the session, a share."""
-        offset, drift = nuisances
-        return replace(self, charge=self.charge - offset - drift * self.turn[:, None] * self.charge)
+        """The presses as on a film of one temperature, without offset and drift of the charges.
+
+        Args:
+            nuisances: Change of the pretension, MPa/K, common offset, pC, drift over the session, a share.
+        """
+        per_kelvin, offset, drift = nuisances
+        charge = self.charge - offset - drift * self.turn[:, None] * self.charge
+        return replace(self, charge=charge, tauter=per_kelvin * self.warmer)
 
     def scattered(self, share: float) -> "PressData":
         """The presses with forces that are known less well than they are said to, by a share."""
@@ -84,6 +103,15 @@ class PressData:
         rows = np.zeros(self.known.shape)
         rows[:, -1] = -self.contact_weight[:, 2]
         return rows
+
+    def of_films(self, pretension: float, bounds: tuple[float, float]) -> tuple[Array, Array]:
+        """Pretensions (k,) between which the charges of presses are interpolated, and the shares of each, (n, k)."""
+        own = np.clip(pretension + self.tauter, *bounds)
+        low, high = float(own.min(initial=np.inf)), float(own.max(initial=-np.inf))
+        if high <= low:
+            return np.array([low]), np.ones((len(self), 1))
+        nodes = chebyshev_nodes(2 + int(np.ceil((high - low) / APART_MPa)), low, high)
+        return nodes, lagrange_values(nodes, barycentric_weights(nodes), own)
 
     def by_nuisance(self) -> Array:
         """Derivatives of the residual by offset and drift, shape (n, n_electrode + 3, 2)."""
@@ -99,6 +127,14 @@ class PressData:
         """Derivatives of the residual by the contact, from those of the charges, (n, n_electrode, 3)."""
         of_rig = self.contact_weight[:, :, None] * np.eye(3)
         return np.concatenate([self.weight[:, :, None] * by_contact, of_rig], axis=1)
+
+
+def temperatures(presses: MeasuredPresses) -> Array:
+    """Of every press, shape (n,), degrees Celsius: between readings in the order of the presses; 0 without any."""
+    if presses.temperature_C is None:
+        return np.zeros(len(presses))
+    number, seen = np.arange(len(presses)), np.isfinite(presses.temperature_C)
+    return np.interp(number, number[seen], presses.temperature_C[seen]) if seen.any() else np.zeros(len(presses))
 
 
 class AdjustedContacts(NamedTuple):
@@ -144,22 +180,44 @@ def adjust_contacts(charges: FilmCharges, parameters: Array, data: PressData, st
         data: The presses.
         start: Contacts (x, y, ln F), shape (n, 3).
     """
-    forward_map, domain = charges.forward_map(parameters[: len(charges.prior.names)]), charges.domain
-    begin, besides = with_force(start), parameters[len(charges.prior.names) :].any()
+    count, domain, begin = len(charges.prior.names), charges.domain, with_force(start)
+    films, shares = films_of(charges, parameters, data)
+    maps = [charges.forward_map(film[:count]) for film in films]
     factor, steeper = np.ones_like(data.charge), np.zeros((*data.charge.shape, 3))
-    if besides:  # what a film has besides its parameters is smooth: linear about the start
-        factor, steeper = _linearised(partial(charges.factor, parameters), begin)
+    if parameters[count:].any():  # what a film has besides its parameters is smooth: linear about the start
+        factor, steeper = _between([_linearised(partial(charges.factor, film), begin) for film in films], shares)
 
     def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
         contact, presses = unit * domain.scale + domain.centre, data[rows]
         at, change = with_force(contact), (contact - start[rows])[:, None]
         share = factor[rows] + (steeper[rows] * change).sum(axis=2)
-        charge, by_contact = _linearised(forward_map.charges, at)
+        charge, by_contact = _between([_linearised(forward_map.charges, at) for forward_map in maps], shares[rows])
         slopes = presses.slopes(share[:, :, None] * by_contact + charge[:, :, None] * steeper[rows])
         return presses.residual(share * charge, contact), (slopes * domain.scale).swapaxes(1, 2)
 
     unit, residual = minimise(residuals, (start - domain.centre) / domain.scale)
     return AdjustedContacts(unit * domain.scale + domain.centre, residual)
+
+
+def films_of(charges: FilmCharges, parameters: Array, data: PressData) -> tuple[list[Array], Array]:
+    """The films of other pretensions between which every press is, and the shares of each, shape (n, k)."""
+    low, high = charges.prior.bounds
+    nodes, shares = data.of_films(float(parameters[0]), (float(low[0]), float(high[0])))
+    return [np.append(node, parameters[1:]) for node in nodes], shares
+
+
+def _between(of_films: list[tuple[Array, Array]], shares: Array) -> tuple[Array, Array]:
+    """Values (n, n_electrode) and derivatives of presses on their own films from those on the films beside them."""
+    values, slopes = (sum_over(parts, shares) for parts in zip(*of_films, strict=True))
+    return values, slopes
+
+
+def sum_over(of_films: Sequence[Array], shares: Array) -> Array:
+    """Weighted sum of arrays (n, ...) with shares (n, k)."""
+    total = np.zeros_like(of_films[0])
+    for part, share in zip(of_films, shares.T, strict=True):
+        total += part * share.reshape(-1, *(1,) * (part.ndim - 1))
+    return total
 
 
 def _linearised(function: Callable[[Array], Array], contact: Array) -> tuple[Array, Array]:

@@ -102,11 +102,11 @@ class Hypothesis:
     belief: float = 1.0
 
     def covariance(self, n_parameter: int, n_mode: int, n_electrode: int) -> Array:
-        """What it adds to the covariance of parameters, coefficients, offset and drift, (n_unknown, n_unknown)."""
+        """What it adds to the covariance of parameters, coefficients and `NUISANCES`, (n_unknown, n_unknown)."""
         together = np.eye(n_electrode) + COMMON**2
         of_terms = self.size**2 * np.kron(np.eye(term_count()), together)
         known, of_modes = np.zeros((n_parameter, n_parameter)), self.modes**2 * np.eye(n_mode)
-        return np.asarray(block_diag(known, of_modes, of_terms, self.offset**2, self.drift**2))
+        return np.asarray(block_diag(known, of_modes, of_terms, 0.0, self.offset**2, self.drift**2))
 
 
 def hypotheses() -> Iterator[Hypothesis]:

@@ -20,16 +20,19 @@ from scipy.stats import chi2 as chi2_distribution
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 from isocharge.train.calibration.contacts import (
+    NUISANCES,
     AdjustedContacts,
     PressData,
     adjust_contacts,
+    films_of,
     projected,
     search_places,
+    sum_over,
     with_force,
 )
 from isocharge.train.calibration.discrepancy import SCATTERS, Hypothesis, Linearised, Mixture, weigh
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.problem import FilmEstimate
+from isocharge.train.calibration.problem import FilmEstimate, Warming
 
 HEAVY_TAILS = 4.0
 """Degrees of freedom of Student's t by which presses are weighted while bad ones may be among them."""
@@ -72,6 +75,9 @@ lowers charges at random, a leak, lowers all of them on average, which presses c
 LINEAR = 0.2
 """Largest step of a parameter, in standard deviations of its prior, for which derivatives are not taken again."""
 
+PER_KELVIN = 0.4
+"""Standard deviation of the pretension's change with temperature, MPa/K: E da / (1 - nu), 0.3 to 0.44 on aluminium."""
+
 TINY = 1e-12
 """Derivative of a residual by the force that counts as none."""
 
@@ -110,27 +116,36 @@ class FilmPosterior(FilmEstimate):
 
     def scaled(self, factor: float) -> "FilmPosterior":
         """With all variances larger by a factor."""
-        return replace(self, covariance=self.covariance * factor, joint=self.joint * factor)
+        warming = self.warming and self.warming._replace(std=self.warming.std * float(np.sqrt(factor)))
+        return replace(self, covariance=self.covariance * factor, joint=self.joint * factor, warming=warming)
 
     @property
     def imperfect(self) -> bool:
         """Whether the film probably has what its parameters do not describe."""
         return sum(weight for each, weight in self.weights.items() if each.modes or each.size) > PROBABLE
 
-    def drifted(self, prior: FilmPrior) -> FilmEstimate:
+    def drifted(self, prior: FilmPrior, *, thermometer: bool = False) -> FilmEstimate:
         """See `FilmEstimate`; what the film has besides its parameters is known only if it probably has something."""
         if self.imperfect:
-            return super().drifted(prior)
-        return FilmEstimate(self.parameters, self.covariance).drifted(prior)
+            return super().drifted(prior, thermometer=thermometer)
+        known = FilmEstimate(self.parameters, self.covariance, warming=self.warming)
+        return known.drifted(prior, thermometer=thermometer)
 
     def probability(self, what: str) -> float:
         """Of the hypotheses with a "size", an "offset", a "drift" or a "scatter"."""
         return sum(weight for hypothesis, weight in self.weights.items() if getattr(hypothesis, what) > 0.0)
 
 
-def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate) -> FilmPosterior:
-    """The film that explains presses; `before` is what is known of it without them."""
-    problem = _Fit.of(charges, before)
+def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate, at_C: float | None = None) -> FilmPosterior:
+    """The film that explains presses; `before` is what is known of it without them.
+
+    Args:
+        charges: The films.
+        data: The presses.
+        before: What is known beforehand.
+        at_C: Temperature of the film before and after, degrees Celsius, if it is known.
+    """
+    problem = _Fit.of(charges, before, warmed=at_C is not None)
     keep, freedom = np.ones(len(data), dtype=bool), np.maximum(data.known.sum(axis=1) - 3.0, 0.0)
     solved = problem.solve(data, keep, problem.mean, Hypothesis())
     if len(data) >= FEWEST_TO_JUDGE and _suspicious(solved.contacts.chi2, freedom):
@@ -149,16 +164,18 @@ def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate) -> Fil
     begin = known.solved.contacts.contact if keep.all() else None
     scatter = float(np.sqrt(sum(weight * each.scatter**2 for each, weight in mixture.weights.items())))
     contacts, n = problem.adjusted(unit, data.scattered(mixture.best.scatter), begin), len(before.parameters)
-    offset, drift = zip(unit[-2:].tolist(), np.sqrt(np.diag(mixture.covariance)[-2:]).tolist(), strict=True)
-    drifting = np.zeros(len(unit) - 2)  # nobody knows what the drift was when the film is used
+    nuisances = zip(unit[-NUISANCES:].tolist(), np.sqrt(np.diag(mixture.covariance)[-NUISANCES:]).tolist(), strict=True)
+    per_kelvin, offset, drift = nuisances
+    drifting = np.zeros(len(unit) - NUISANCES)  # nobody knows what the drift was when the film is used
     drifting[len(SHARED) : n] = np.hypot(np.hypot(*drift) / np.sqrt(12.0), ONE_SIDED * scatter)
     drifting /= charges.prior.spread.gain
-    joint = mixture.covariance[:-2, :-2] + np.outer(drifting, drifting)
+    joint = mixture.covariance[:-NUISANCES, :-NUISANCES] + np.outer(drifting, drifting)
     return FilmPosterior(
         parameters=unit[:n] * charges.prior.std,
         covariance=joint[:n, :n],
-        coefficients=unit[n:-2],
+        coefficients=unit[n:-NUISANCES],
         joint=joint,
+        warming=None if at_C is None else Warming(*per_kelvin, at_C),
         contact=with_force(contacts.contact),
         chi2=contacts.chi2,
         freedom=freedom,
@@ -223,13 +240,17 @@ class _Fit:
     covariance: Array
 
     @classmethod
-    def of(cls, charges: FilmCharges, before: FilmEstimate) -> "_Fit":
-        """The coefficients are zero, if nothing is known of them."""
+    def of(cls, charges: FilmCharges, before: FilmEstimate, *, warmed: bool = False) -> "_Fit":
+        """The coefficients are zero, if nothing is known of them; temperature counts if it is known."""
         n, known = len(before.parameters), before.unknowns.size
-        size = n + charges.n_coefficient + 2
+        size = n + charges.n_coefficient + NUISANCES
         mean, covariance = np.zeros(size), np.zeros((size, size))
         mean[:known] = np.concatenate([before.parameters / charges.prior.std, before.coefficients])
         covariance[:known, :known] = before.of_unknowns
+        if warmed:
+            warming = before.warming or Warming(0.0, PER_KELVIN)
+            mean[-NUISANCES], covariance[-NUISANCES, -NUISANCES] = warming.MPa_per_K, warming.std**2
+            covariance[0, -NUISANCES] = covariance[-NUISANCES, 0] = warming.shared / charges.prior.std[0]
         return cls(charges, mean, covariance)
 
     @property
@@ -247,11 +268,11 @@ class _Fit:
 
     def _film(self, unit: Array) -> Array:
         n = len(self.charges.prior.names)
-        return np.concatenate([unit[:n] * self.charges.prior.std, unit[n:-2]])
+        return np.concatenate([unit[:n] * self.charges.prior.std, unit[n:-NUISANCES]])
 
     def adjusted(self, unit: Array, data: PressData, start: Array | None = None) -> AdjustedContacts:
         """The contacts that fit best on a film, searched for from a start."""
-        film, data = self._film(unit), data.without(unit[-2:])
+        film, data = self._film(unit), data.without(unit[-NUISANCES:])
         begin = search_places(self.charges, film, data) if start is None else start
         return adjust_contacts(self.charges, film, data, begin)
 
@@ -260,20 +281,30 @@ class _Fit:
 
         Those by what a film has besides its parameters take time; they are zero if they are not wanted.
         """
-        film, at, n = self._film(unit), with_force(contacts.contact), len(self.charges.prior.names)
-        by_contact = self.charges.by_contact(film, at)
-        by_film = self.charges.by_parameter(film if besides else film[:n], at, by_contact)
+        at, n = with_force(contacts.contact), len(self.charges.prior.names)
+        films, shares = self._films(unit, data)
+        parts = [self.charges.by_contact(film, at) for film in films]
+        by_contact, wanted = sum_over(parts, shares), None if besides else n
+        by_film = sum_over(
+            [self.charges.by_parameter(film[:wanted], at, part) for film, part in zip(films, parts, strict=True)],
+            shares,
+        )
         by_unknown = np.zeros((*data.known.shape, unit.size))
         by_unknown[:, :-3, : by_film.shape[2]] = data.weight[:, :, None] * by_film
-        by_unknown[:, :, -2:] = data.by_nuisance()
+        by_unknown[:, :, -NUISANCES] = by_unknown[:, :, 0] * data.warmer[:, None] / self.charges.prior.std[0]
+        by_unknown[:, :, 1 - NUISANCES :] = data.by_nuisance()
         return projected(by_unknown, data.slopes(by_contact))
+
+    def _films(self, unit: Array, data: PressData) -> tuple[list[Array], Array]:
+        """As `films_of`, of presses as they were made."""
+        return films_of(self.charges, self._film(unit), data.without(unit[-NUISANCES:]))
 
     def solve(self, data: PressData, weight: Array | Booleans, start: Array, hypothesis: Hypothesis) -> _Solved:
         """The film that explains weighted presses best, from a start; what a hypothesis excludes stays."""
         data = data.scattered(hypothesis.scatter)
         covariance, root = self._before(hypothesis), np.sqrt(weight)
         active = np.diag(covariance) > 0.0
-        besides = bool(active[len(self.charges.prior.names) : -2].any())
+        besides = bool(active[len(self.charges.prior.names) : -NUISANCES].any())
         of_prior = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(active, active)]))
         low, high = (bound[active] for bound in self.bounds)
         last: list[tuple[Array, _Solved]] = []
@@ -333,11 +364,12 @@ class _Fit:
         unit = solved.unit
         contacts = self.adjusted(unit, data, solved.contacts.contact)
         jacobian = self.slopes(unit, data, contacts)
-        by_contact = self.charges.by_contact(self._film(unit), with_force(contacts.contact))
+        (films, shares), at = self._films(unit, data), with_force(contacts.contact)
+        by_contact = sum_over([self.charges.by_contact(film, at) for film in films], shares)
         by_force = projected(data.by_force()[:, :, None], data.slopes(by_contact))[:, :, 0]
         size = np.linalg.norm(by_force, axis=1)
         direction = by_force / np.maximum(size, TINY)[:, None]
         along = np.einsum("nk,nku->nu", direction, jacobian), (direction * contacts.residual).sum(axis=1)
-        at = unit - self.mean
-        good = Linearised.of(jacobian.reshape(-1, unit.size), contacts.residual.ravel(), at)
-        return weigh({each: good.less(*along, at, (each * size) ** 2) for each in SCATTERS}, self._before)
+        off = unit - self.mean
+        good = Linearised.of(jacobian.reshape(-1, unit.size), contacts.residual.ravel(), off)
+        return weigh({each: good.less(*along, off, (each * size) ** 2) for each in SCATTERS}, self._before)

@@ -45,7 +45,7 @@ from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.film_fit import FilmPosterior
 from isocharge.train.calibration.following import pretensions_of
 from isocharge.train.calibration.picture import calibration_picture
-from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
+from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate, Warming
 from isocharge.train.model_release.release import release
 from isocharge.train.training.source import Provenance
 
@@ -199,8 +199,17 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
         "parameters": {name: {"value": float(value), "std": float(error)} for name, value, error in parameters},
         "correlations": np.round(posterior.covariance / np.outer(std, std), 6).tolist(),
         "discrepancy": _discrepancy(posterior),
+        "temperature": _temperature(posterior),
         "words": list(result.summary),
     }
+
+
+def _temperature(posterior: FilmPosterior) -> dict[str, Any] | None:
+    """What temperature does to the pretension, in C and Pa/K, if that of the presses is known."""
+    if (known := posterior.warming) is None:
+        return None
+    units = FILE_UNITS["pretension"]
+    return {"at_C": known.at_C, "pretension_per_K": {"value": units * known.MPa_per_K, "std": units * known.std}}
 
 
 def _discrepancy(posterior: FilmPosterior) -> dict[str, Any] | None:
@@ -225,6 +234,11 @@ class _Parameter(Struct, frozen=True):
     std: float
 
 
+class _Temperature(Struct, frozen=True):
+    at_C: float
+    pretension_per_K: _Parameter
+
+
 class _Discrepancy(Struct, frozen=True):
     coefficients: list[float]
     std: list[float]
@@ -238,17 +252,22 @@ class _Earlier(Struct, frozen=True):
     parameters: dict[str, _Parameter]
     correlations: list[list[float]]
     discrepancy: _Discrepancy | None = None
+    temperature: _Temperature | None = None
 
 
-def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
+def read_earlier(
+    folder: Path, problem: CalibrationProblem, *, thermometer: bool = False, at_C: float | None = None
+) -> FilmEstimate:
     """The film of an earlier calibration, with what may have drifted since.
 
     Args:
         folder: As `write_calibration` made it, or one of its version folders.
         problem: The new calibration.
+        thermometer: Whether the temperatures of the new presses are known.
+        at_C: Gives the film as it was calibrated, at this temperature, degrees Celsius, and without drift.
 
     Raises:
-        PressError: If the folder has no calibration, or one of other parameters.
+        PressError: If the folder has no calibration, or one of other parameters, or does not know the temperature.
     """
     calibrated = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
     path, prior = [folder, *calibrated][-1] / RESULT, problem.prior
@@ -260,14 +279,23 @@ def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
             f"{prior.sensor.name!r} with {', '.join(prior.names)}"
         )
     value, std = np.array([[entry.value, entry.std] for entry in table.parameters.values()]).T / _units(prior)
-    covariance = _covariance(path, table.correlations, std / prior.std)
-    if (known := table.discrepancy) is None:
-        return FilmEstimate(value, covariance).drifted(prior)
-    size, count = len(names) + problem.charges.n_coefficient, len(known.coefficients)
-    if len(names) + count != size or len(known.std) != size:
-        raise PressError(f"{path}: discrepancy: expected {size - len(names)} coefficients, got {count}; calibrate anew")
-    joint = _covariance(path, known.correlations, np.array(known.std))
-    return FilmEstimate(value, covariance, np.array(known.coefficients), joint).drifted(prior)
+    film = FilmEstimate(value, _covariance(path, table.correlations, std / prior.std), warming=_warming(table))
+    if (known := table.discrepancy) is not None:
+        size, count = len(names) + problem.charges.n_coefficient, len(known.coefficients)
+        if len(names) + count != size or len(known.std) != size:
+            raise PressError(
+                f"{path}: discrepancy: expected {size - len(names)} coefficients, got {count}; calibrate anew"
+            )
+        joint = _covariance(path, known.correlations, np.array(known.std))
+        film = replace(film, coefficients=np.array(known.coefficients), joint=joint)
+    return film.drifted(prior, thermometer=thermometer) if at_C is None else film.at_temperature(at_C, prior)
+
+
+def _warming(table: _Earlier) -> Warming | None:
+    if (room := table.temperature) is None:
+        return None
+    unit = FILE_UNITS["pretension"]
+    return Warming(room.pretension_per_K.value / unit, room.pretension_per_K.std / unit, room.at_C)
 
 
 def _covariance(path: Path, correlations: list[list[float]], std: Array) -> Array:

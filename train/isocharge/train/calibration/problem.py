@@ -1,15 +1,17 @@
 """What a calibration is about: the film as it is described, and the network for all films that fits its layout."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
-from isocharge.common.errors import ModelError, SceneError, SensorError
+from isocharge.common.errors import ModelError, PressError, SceneError, SensorError
 from isocharge.serve.model.model_folder import find_model, model_names, repositories
 from isocharge.simulate import Circle, Domain, FilmPrior, NoiseModel, Probe, Sensor
 from isocharge.simulate.sensor.film_prior import SHARED
@@ -32,6 +34,26 @@ UNSTEADY = 0.002
 """Standard deviation by which coefficients of a discrepancy may have changed."""
 
 
+THERMOMETER = 0.1
+"""Standard deviation of the same for the pretension where the temperatures of both days are known: creep."""
+
+
+class Warming(NamedTuple):
+    """What temperature does to the pretension of a film.
+
+    Attributes:
+        MPa_per_K: Change of the pretension.
+        std: Its standard deviation, MPa/K.
+        at_C: Temperature at which the film is given, degrees Celsius.
+        shared: Covariance of this change and the pretension, MPa^2/K, where the film was moved to that temperature.
+    """
+
+    MPa_per_K: float
+    std: float
+    at_C: float = math.nan
+    shared: float = 0.0
+
+
 @dataclass(frozen=True)
 class FilmEstimate:
     """What is known of a film: a Gaussian about its best parameters.
@@ -42,12 +64,14 @@ class FilmEstimate:
         coefficients: Of the discrepancy, shape (n_coefficient,); empty if there is none.
         joint: Covariance of parameters and coefficients, shape (n_parameter + n_coefficient,) twice; empty if there is
             no discrepancy.
+        warming: What temperature does to it, if that of its presses is known.
     """
 
     parameters: Array
     covariance: Array
     coefficients: Array = field(default_factory=lambda: np.empty(0))
     joint: Array = field(default_factory=lambda: np.empty((0, 0)))
+    warming: Warming | None = None
 
     @property
     def unknowns(self) -> Array:
@@ -59,13 +83,44 @@ class FilmEstimate:
         """Their covariance."""
         return self.joint if self.coefficients.size else self.covariance
 
-    def drifted(self, prior: FilmPrior) -> "FilmEstimate":
-        """What is left of an earlier estimate after the film may have drifted (`DRIFT`)."""
+    def drifted(self, prior: FilmPrior, *, thermometer: bool = False) -> "FilmEstimate":
+        """What is left of an earlier estimate after the film may have drifted (`DRIFT`).
+
+        `thermometer` says that temperatures are known since as well.
+        """
         drift = np.array([DRIFT.get(name.partition(" ")[0], REMOUNTED) for name in prior.names])
+        if thermometer and self.warming:
+            drift[0] = THERMOMETER
         wider, joint = self.covariance + np.diag(drift**2), self.joint
         if joint.size:
             joint = joint + np.diag(np.concatenate([drift, np.full(len(joint) - drift.size, UNSTEADY)]) ** 2)
-        return FilmEstimate(np.clip(self.parameters, *prior.bounds), wider, self.coefficients, joint)
+        return FilmEstimate(np.clip(self.parameters, *prior.bounds), wider, self.coefficients, joint, self.warming)
+
+    def at_temperature(self, at_C: float, prior: FilmPrior) -> "FilmEstimate":
+        """The film at another temperature.
+
+        Raises:
+            PressError: If it is not known what temperature does to this film, or a film is not followed so far.
+        """
+        if self.warming is None:
+            raise PressError(
+                "this calibration does not know what temperature does to the film: it takes presses with a column "
+                "temperature_C, over a few degrees"
+            )
+        warmer = at_C - self.warming.at_C
+        parameters, wider = self.parameters.copy(), np.zeros_like(self.of_unknowns)
+        parameters[0] += warmer * self.warming.MPa_per_K
+        wider[0, 0] = (warmer * self.warming.std / prior.std[0]) ** 2
+        low, high = (float(bound[0]) for bound in prior.bounds)
+        if not low <= parameters[0] <= high:
+            raise PressError(
+                f"at {at_C:g} C the pretension would be {parameters[0]:.2f} MPa; expected {low:g} to {high:g} MPa: a "
+                "temperature nearer to that of the presses"
+            )
+        joint = self.joint + wider if self.joint.size else self.joint
+        covariance = self.covariance + wider[: len(parameters), : len(parameters)]
+        warming = self.warming._replace(at_C=at_C, shared=warmer * self.warming.std**2)
+        return FilmEstimate(parameters, covariance, self.coefficients, joint, warming)
 
 
 @dataclass(frozen=True)

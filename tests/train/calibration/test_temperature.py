@@ -1,0 +1,108 @@
+"""A film in a room that warms: what a kelvin does, learned by presses, and the film at another temperature."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.train.calibration.conftest import presses_of
+
+from isocharge.common.errors import PressError
+from isocharge.common.json_values import plain_values
+from isocharge.serve import Predictor, check_presses, read_presses, write_presses
+from isocharge.simulate import Circle, load_sensor, press, touch_charge
+from isocharge.train import calibrate, read_earlier, write_calibration
+from isocharge.train.calibration.contacts import temperatures
+from isocharge.train.calibration.folder import result_table
+from isocharge.train.data.presses import draw_contacts
+from kept import kept
+
+PER_K = 3000.0 * 7.7e-5 / (1.0 - 0.34)
+"""E da / (1 - nu): what a kelvin takes of the tension of a film that grows by 7.7e-5 more than its ring, MPa."""
+
+CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial")
+
+DAY = np.random.default_rng(2).permutation(np.linspace(20.0, 23.0, 12))
+
+
+def charges_at(contacts, pretensions):
+    """By a direct solve for each press."""
+    sensor, solved = load_sensor("four-25um-biaxial"), []
+    for (x, y, force), pretension in zip(contacts, pretensions, strict=True):
+        film = replace(sensor.film, pretension=pretension)
+        solved.append(touch_charge(replace(sensor, film=film), press(film, Circle(1.0), (x, y), force)))
+    return np.array(solved)
+
+
+def pressed(problem, seed, temperature_C):
+    """Presses on the film of 1.1 MPa at 21.5 C, as a rig reads them."""
+    rng, count = np.random.default_rng(seed), len(temperature_C)
+    contact = draw_contacts(rng, problem.domain.within(7.5), count)
+    charge = problem.noise.add(kept(charges_at, contact, 1.1 - PER_K * (temperature_C - 21.5)), rng)
+    contact[:, :2] += 0.1 * rng.standard_normal((count, 2))
+    contact[:, 2] *= np.exp(0.01 * rng.standard_normal(count))
+    return replace(presses_of(problem, contact, charge), temperature_C=temperature_C)
+
+
+@pytest.fixture(scope="module")
+def day(problem):
+    return calibrate(pressed(problem, 5, DAY), problem)
+
+
+@pytest.fixture
+def folder(day, tmp_path):
+    """What the next calibration reads of the folder of this one."""
+    (tmp_path / "calibration.json").write_text(json.dumps(plain_values(result_table(day))))
+    return tmp_path
+
+
+def test_what_a_kelvin_does_is_learned_and_said(day):
+    """The closed form of the ring, on charges of direct solves."""
+    known = day.posterior.warming
+    assert known.MPa_per_K == pytest.approx(-PER_K, abs=2.5 * known.std)
+    assert known.std < 0.06
+    assert known.at_C == pytest.approx(21.5)
+    assert day.posterior.parameters[0] == pytest.approx(1.1, abs=0.2)
+    assert f"A kelvin more changes the pretension by {known.MPa_per_K:.3g}" in " ".join(day.summary)
+
+
+def test_the_film_at_another_temperature(day, folder, command):
+    code, out, _ = command(*CALIBRATE, "--from", folder, "--temperature", "20.5", "--json")
+    table, known = json.loads(out), day.posterior.warming
+    change = 1e-6 * table["parameters"]["pretension"]["value"] - day.posterior.parameters[0]
+    assert code == 0
+    assert change == pytest.approx(-known.MPa_per_K * (known.at_C - 20.5))
+    assert table["temperature"]["at_C"] == 20.5
+    assert table["error_left"]["force_percent"] > day.left.force_percent  # by what is not known of a kelvin
+    code, _, error = command(*CALIBRATE, "--from", folder, "--temperature", "60", "--json")
+    assert (code, "a temperature nearer to that of the presses" in " ".join(error.split())) == (2, True)
+
+
+def test_another_morning_tells_more(day, folder, problem):
+    """Three presses two degrees on: the film is given at their temperature, and a kelvin is known better."""
+    earlier = read_earlier(folder, problem, thermometer=True)
+    later = calibrate(pressed(problem, 6, np.full(3, 23.5)), replace(problem, earlier=earlier)).posterior
+    assert later.warming.at_C == pytest.approx(23.5)
+    assert later.warming.std < day.posterior.warming.std
+    assert later.parameters[0] == pytest.approx(1.1 - 2.0 * PER_K, abs=0.2)
+
+
+def test_temperatures_in_a_file(tmp_path, problem):
+    """Unknown ones lie between those before and after; what none can be is named."""
+    presses = replace(pressed(problem, 5, DAY)[:4], temperature_C=np.array([20.0, np.nan, 22.0, np.nan]))
+    write_presses(tmp_path / "presses.csv", presses)
+    again = read_presses(tmp_path / "presses.csv", problem.electrodes)
+    assert again == presses
+    np.testing.assert_allclose(temperatures(again), [20.0, 21.0, 22.0, 22.0])
+    with pytest.raises(PressError, match=r"line 3, column 'temperature_C': expected a temperature of -100 to 200"):
+        replace(presses, temperature_C=np.array([20.0, 295.0, 20.0, 20.0]))
+
+
+@pytest.mark.slow
+def test_the_folder_at_another_temperature_fits(day, problem, tmp_path, command):
+    """Presses at 20.5 C fit the film of that temperature, and not that of the day."""
+    write_calibration(day, tmp_path / "day")
+    assert command(*CALIBRATE, "--from", tmp_path / "day", "--temperature", "20.5", "-o", tmp_path / "cold")[0] == 0
+    presses = replace(pressed(problem, 7, np.full(10, 20.5)), temperature_C=None)
+    checks = [check_presses(Predictor(tmp_path / name), presses) for name in ("day", "cold")]
+    assert [check.fits for check in checks] == [False, True]
