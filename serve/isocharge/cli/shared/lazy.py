@@ -18,7 +18,7 @@ def lazy_group(summary: str, commands: Commands) -> typer.Typer:
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
             for name, (_, sentence) in commands.items():
-                self.add_command(TyperCommand(name, help=sentence))
+                self.add_command(TyperCommand(name, help=sentence, short_help=sentence))
 
         def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
             return list(self.commands)
@@ -27,13 +27,20 @@ def lazy_group(summary: str, commands: Commands) -> typer.Typer:
             name, command, rest = super().resolve_command(ctx, args)
             return name, load_command(commands[str(name)][0]) if name in commands else command, rest
 
-    return typer.Typer(cls=LazyGroup, no_args_is_help=True, pretty_exceptions_enable=False, help=summary)
+    return typer.Typer(
+        cls=LazyGroup,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        help=summary,
+        short_help=summary,
+    )
 
 
 def load_command(place: str) -> TyperCommand:
     """The command of a function, "package.module:function"."""
     module, _, function = place.partition(":")
-    one = typer.Typer(add_completion=False)
+    one = typer.Typer(add_completion=False, rich_markup_mode=None)
     one.command()(getattr(import_module(module), function))
     command = typer.main.get_command(one)
     command.name = None
