@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.patches import Circle as Disk
 from matplotlib.patches import Polygon as Patch
+from matplotlib.patheffects import withStroke
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap
@@ -18,16 +19,17 @@ INNER = 0.999999
 
 
 def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool = True, ink: str = INK) -> None:
-    """Outlines of the electrodes at their calibrated positions, with their names."""
+    """Outlines of the electrodes at their calibrated positions, with their names, legible on any shade."""
+    halo = [withStroke(linewidth=3.0, foreground="white", alpha=0.8)]
     for electrode in sensor.electrodes:
         colour = FELT if electrode.name == highlight else ink
         for polygons, style in ((electrode.front, "-"), (electrode.back, "--")):
             for polygon in polygons:
                 corners = sensor.calibration.place(np.array(polygon))
-                axes.add_patch(Patch(corners, fill=False, ec=colour, lw=1.6, ls=style, zorder=3))
+                axes.add_patch(Patch(corners, fill=False, ec=colour, lw=1.6, ls=style, zorder=3, path_effects=halo))
         if names:
             centre = sensor.calibration.place(np.array(electrode.centre))
-            axes.annotate(electrode.name, centre, ha="center", va="center", color=colour, fontsize=9)
+            axes.annotate(electrode.name, centre, ha="center", va="center", color=colour, fontsize=9, path_effects=halo)
 
 
 def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "", colour: str = FELT) -> None:
