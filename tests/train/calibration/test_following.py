@@ -130,6 +130,8 @@ def test_it_follows_a_degree_and_goes_back_when_asked(mine, problem, film):
     assert change == pytest.approx(DEGREE_MPa, abs=2.0 * after["pretension_std_MPa"])
     assert after["pretension_std_MPa"] < 0.09  # computed limit after 30 touches on this layout
     assert (after["touches"], before["touches"]) == (pytest.approx(95, abs=15), 0)
+    force_std = [record.force_std_N / record.force_N for record in records[60:110]]
+    assert np.mean(np.abs(errors[60:110, 1]) < 2.0 * np.array(force_std)) > 0.9  # without the pretension's 0.6
     assert last == before | {"touches": last["touches"]}
     assert rms(errors[111:])[1] > 10.0
 
@@ -143,7 +145,7 @@ def test_a_film_that_stays_is_left_as_it_is(mine, problem, film):
     _, errors = follow(mine, problem, film, [1.0] * 80)
     _, alone = follow(mine, problem, film, [1.0] * 80, ask=lambda stream, _: stream.back())
     followed, alone = rms(errors), rms(alone)
-    np.testing.assert_array_less(followed, 1.05 * alone + [0.0, 0.1])
+    np.testing.assert_array_less(followed, 1.05 * alone + [0.0, 0.4])  # gains may have drifted by 1 %
 
 
 def test_a_replay_follows_and_goes_back_as_the_stream_did(mine, problem, film, tmp_path):
@@ -167,12 +169,13 @@ def test_a_replay_follows_and_goes_back_as_the_stream_did(mine, problem, film, t
     assert [line for _, line in recorded_stream.replay(recording, again, clock)] == lines
 
 
-@pytest.mark.parametrize("electrode", [0, 3])
-def test_a_gain_that_is_wrong_is_not_followed(mine, problem, film, electrode):
-    """The charges could nearly be those of a film 0.3 MPa slacker, and the force wrong by 14 %."""
-    records, _ = follow(mine, problem, film, [1.0] * 80, gain=1.0 - 0.03 * np.eye(4)[electrode])
-    assert records[-1].film["pretension_MPa"] == pytest.approx(records[0].film["pretension_MPa"], abs=0.02)
-    assert FILM in records[-1].flags
+@pytest.mark.parametrize(("electrode", "change", "flagged"), [(0, -0.03, True), (3, 0.015, False)])
+def test_a_gain_that_is_wrong_is_not_followed(mine, problem, film, electrode, change, flagged):
+    """The charges could nearly be those of a film 0.2 to 0.3 MPa from this one, and the force wrong by 8 to 14 %."""
+    records, _ = follow(mine, problem, film, [1.0] * 80, gain=1.0 + change * np.eye(4)[electrode])
+    apart = [record.film["pretension_MPa"] - records[0].film["pretension_MPa"] for record in records]
+    assert max(map(abs, apart[40:])) < 0.06
+    assert (FILM in records[-1].flags) == flagged
 
 
 def test_between_its_pretensions_it_is_the_network_for_all_films(mine, problem):

@@ -296,7 +296,8 @@ class TouchStream:
         if INVALID in flags or not reading.contact or reading.charge_pC is None:
             return None, flags
         contact = self._answers.predict(reading.charge_pC)
-        return contact, flags + self._validity.flags(contact)
+        flags += self._validity.flags(contact)
+        return contact if self._follower is None else self._follower.widened(contact, reading.charge_pC), flags
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
         """Charges by electrode name; None for one that is not a number."""

@@ -33,6 +33,9 @@ FILE = "pretensions.npz"
 FORMAT = 1
 """Version of the file's format."""
 
+TINY = 1e-12
+"""Length that counts as none."""
+
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """What NumPy and zipfile raise over damaged files."""
 
@@ -96,18 +99,33 @@ class Pretensions:
         return {name: rows[0] for name, rows in self.at(np.array([pretension_MPa])).weights.items()}
 
     def misfits(self, charge_pC: Array, pretension_MPa: Array) -> Array:
-        """Misfits of one press, shape (n,), from charges of shape (n_electrode,), at pretensions of shape (n,).
+        """Misfits of one press, shape (n,), from charges of shape (n_electrode,), at pretensions of shape (n,)."""
+        return np.asarray(np.linalg.norm(self.vectors(charge_pC[None], pretension_MPa)[0], axis=1))
 
-        The vectors whose lengths they are are interpolated linearly: `at` gives weights at pretensions close enough.
+    def vectors(self, charge_pC: Array, pretension_MPa: Array) -> Array:
+        """The vectors whose lengths the misfits are, in units of the noise.
+
+        They are interpolated linearly: `at` gives weights at pretensions close enough.
+
+        Args:
+            charge_pC: Shape (m, n_electrode), pC.
+            pretension_MPa: Shape (n,).
+
+        Returns:
+            Shape (m, n, n_electrode).
         """
         *hidden, skip, bias, last = self.weights.values()
         logs = np.log(np.clip(charge_pC, *self.limits_pC) / self.typical_pC).astype(np.float32)
         value = logs
         for weight, shift in zip(hidden[::2], hidden[1::2], strict=True):
-            value = np.tanh((value[..., None, :] @ weight)[:, 0] + shift)
-        vectors = ((value[:, None] @ last)[:, 0] + logs @ skip + bias)[:, -logs.size :]
-        between = [np.interp(pretension_MPa, self.node_MPa, column) for column in vectors.T]
-        return np.asarray(self.misfit_unit * np.sinh(np.linalg.norm(between, axis=0)))
+            value = np.tanh(value @ weight + shift[:, None])
+        nodes = (value @ last + logs @ skip + bias[:, None])[..., -logs.shape[1] :]
+        after = np.clip(np.searchsorted(self.node_MPa, pretension_MPa), 1, self.node_MPa.size - 1)
+        gap = self.node_MPa[after] - self.node_MPa[after - 1]
+        share = np.clip((pretension_MPa - self.node_MPa[after - 1]) / gap, 0.0, 1.0)[:, None, None]
+        between = (1.0 - share) * nodes[after - 1] + share * nodes[after]
+        length = np.maximum(np.linalg.norm(between, axis=2, keepdims=True), TINY)
+        return np.asarray((between * (self.misfit_unit * np.sinh(length) / length)).swapaxes(0, 1))
 
 
 class _About(Struct):

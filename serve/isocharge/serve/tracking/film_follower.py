@@ -3,9 +3,11 @@
 Four charges have one number to spare for three unknowns: the misfit. A film that has become tauter or slacker, as by a
 degree of the room, lets the misfits of all touches grow, and the pretension at which they are least is the film's. It
 is estimated by Bayes' rule on a fixed set of pretensions, with a random walk between touches; one touch gives one
-number, by its hardest frame. A touch that no pretension explains says next to nothing. When the last ones are of that
-kind (two contacts, the warmth of a hand), or are explained far better by a gain that is wrong, the film is not followed
-any farther: the model answers for the film as it was before them.
+number, by its hardest frame. Gains drift as well, those of each electrode by 1 %, and the misfits of touches are linear
+in them: at every pretension there is a Kalman filter for the gains (Rao and Blackwell's way, Doucet et al. 2000), so
+that what gains explain as well is not taken for a change of the film. A touch that no pretension explains says next to
+nothing. When the last ones are of that kind (two contacts, the warmth of a hand), or are explained far better by a gain
+that is wrong, the film is not followed any farther: the model answers for the film as it was before them.
 """
 
 import math
@@ -49,11 +51,17 @@ LARGEST_SQUARE = 9.0
 EXPLAINED, SCATTER = 1.25, 5.0
 """Mean square up to which touches are explained, for very many of them, and what is added over the root of theirs."""
 
-GAINS = np.outer([-1.0, 1.0], [0.01, 0.02, 0.03, 0.04, 0.06, 0.09]).ravel()
+GAIN = 0.01
+"""Standard deviation of the drift of a gain, and step of the differences by it."""
+
+GAINS = np.outer([-1.0, 1.0], [0.03, 0.04, 0.06, 0.09]).ravel()
 """Wrong gains that are tried on each electrode in the place of another pretension."""
 
 BETTER = 9.0
-"""Sum of squares by which one of them must be better to be believed."""
+"""Sum of squares by which one of them must be better than any pretension to be believed."""
+
+BESIDE_MPa = 0.05
+"""Distance of the pretension by which it is told how contacts depend on it."""
 
 NEWS_MPa = 0.01
 """Change of the pretension from which the model's weights are made anew."""
@@ -103,6 +111,7 @@ class FilmFollower:
         self._grid = np.linspace(low, high, max(round((high - low) / STEP_MPa), 1) + 1)
         self._films = self._known.at(np.linspace(low, high, max(round((high - low) / COARSE_MPa), 1) + 1))
         self._gains = 1.0 + np.kron(np.eye(len(electrodes)), GAINS[:, None])
+        self._beside: Predictor | None = None
         self._drift = (rule or FollowRule()).drift_MPa_per_root_hour
         self._check()
         self.back()
@@ -127,6 +136,9 @@ class FilmFollower:
         self.predictor, self.is_lost = self._calibrated, False
         self._answered_MPa, self._answered_std = known.calibrated_MPa, known.std_MPa
         self._probability = _normal(self._grid - known.calibrated_MPa, known.std_MPa)
+        self._gain = np.zeros((self._grid.size, known.typical_pC.size))
+        self._spread = np.tile(np.eye(known.typical_pC.size), (self._grid.size, 1, 1))
+        self._beside = None
         self._when_s: float | None = None
         self._touches, self._walked = 0, 0.0
         self._recent: deque[tuple[Array, ...]] = deque(maxlen=RECENT)
@@ -164,41 +176,66 @@ class FilmFollower:
                 self.take(self._hardest[1], clock_s)
             self.forget()
 
+    def widened(self, contact: Contact, charge_pC: Array) -> Contact:
+        """A contact of the model with what is not known of the pretension in its deviations, once it is followed."""
+        if self._beside is None:
+            return contact
+        other, share = self._beside.predict(charge_pC), self._answered_std / BESIDE_MPa
+        x, y, force = (share * (moved - own) for moved, own in zip(other[:3], contact[:3], strict=True))
+        return contact.widened((x, y, force))
+
     def take(self, charge_pC: Array, clock_s: float) -> None:
         """Take in a touch, charges of shape (n_electrode,), pC."""
         self._walk(clock_s)
-        squares = (self._films.misfits(charge_pC, self._grid) / self._known.misfit_rms) ** 2
-        models, scaled = (self._calibrated, self.predictor), charge_pC * self._gains
-        misfits = np.concatenate([model.predict_batch(scaled).misfit for model in models])
-        rivals = (misfits.astype(float) / self._known.misfit_rms) ** 2
-        before = (1.0 - JUMP) * self._probability + JUMP / self._grid.size
-        posterior = before * ((1.0 - STRAY) * np.exp(-0.5 * squares) + STRAY * STRAY_DENSITY)
+        nudged = np.vstack([np.ones_like(charge_pC), 1.0 + GAIN * np.eye(charge_pC.size)])
+        vectors = self._films.vectors(charge_pC * nudged, self._grid) / self._known.misfit_rms
+        by_gain = np.moveaxis(vectors[1:] - vectors[0], 0, 2)  # for each pretension (n_electrode, n_gain)
+        reached = by_gain @ self._spread
+        expected = np.eye(charge_pC.size) + reached @ by_gain.swapaxes(1, 2)
+        surprise = vectors[0] - (by_gain @ self._gain[:, :, None])[:, :, 0]
+        weighed = np.linalg.solve(expected, np.concatenate([surprise[:, :, None], reached], axis=2))
+        square = (surprise * weighed[:, :, 0]).sum(axis=1)
+        good = (1.0 - STRAY) * np.exp(-0.5 * square) / np.sqrt(np.linalg.det(expected))
+        believed = good / (good + STRAY * STRAY_DENSITY)
+        self._gain = self._gain + believed[:, None] * (reached.swapaxes(1, 2) @ weighed[:, :, :1])[:, :, 0]
+        self._spread = self._spread - believed[:, None, None] * (reached.swapaxes(1, 2) @ weighed[:, :, 1:])
+        posterior = self._probability * (good + STRAY * STRAY_DENSITY)
         self._probability = posterior / posterior.sum()
         self._touches += 1
         mean = float(self._probability @ self._grid)
         nearest = np.abs(self._grid - mean).argmin()
-        bounded = (np.minimum(column, LARGEST_SQUARE) for column in (squares, rivals, squares[nearest]))
-        self._recent.append(tuple(bounded))
+        left = vectors[0] - (by_gain @ self._gain[:, :, None])[:, :, 0]
+        models, scaled = (self._calibrated, self.predictor), charge_pC * self._gains
+        rivals = np.concatenate([model.predict_batch(scaled).misfit for model in models]) / self._known.misfit_rms
+        vectors_of = (left, vectors[0], rivals[:, None].astype(float), left[nearest, None])
+        self._recent.append(tuple(np.minimum((each**2).sum(axis=1), LARGEST_SQUARE) for each in vectors_of))
         self._judge(mean, nearest)
 
     def _walk(self, clock_s: float) -> None:
-        """Widen the distribution by the drift since the touch before."""
+        """Widen the distribution by the drift since the touch before, and by what may have changed at once."""
         hours = 0.0 if self._when_s is None else max(clock_s - self._when_s, 0.0) / 3600.0
         self._when_s, self._walked = clock_s, self._walked + self._drift**2 * hours
+        gains = np.concatenate([self._gain, self._spread.reshape(self._grid.size, -1)], axis=1)
+        mass = self._probability[:, None] * np.column_stack([np.ones(self._grid.size), gains])
         if (std := float(np.sqrt(self._walked))) >= STEP_MPa:
             reach = min(round(4.0 * std / STEP_MPa), self._grid.size)
             kernel = _normal(STEP_MPa * np.arange(-reach, reach + 1.0), std)
-            wider = np.convolve(np.pad(self._probability, reach, mode="edge"), kernel, mode="valid")
-            self._probability, self._walked = wider / wider.sum(), 0.0
+            padded = np.pad(mass, ((reach, reach), (0, 0)), mode="edge")
+            mass = sum(share * padded[n : n + self._grid.size] for n, share in enumerate(kernel))
+            mass, self._walked = mass / mass[:, 0].sum(), 0.0
+        mass = (1.0 - JUMP) * mass + JUMP / self._grid.size * mass.sum(axis=0)
+        self._probability, gains = mass[:, 0], mass[:, 1:] / mass[:, :1]
+        self._gain, spread = np.split(gains, [self._gain.shape[1]], axis=1)
+        self._spread = spread.reshape(self._spread.shape)
 
     def _judge(self, mean: float, nearest: np.intp) -> None:
         """Answer for the film that the last touches tell if it explains them, else for that before them."""
         if (count := len(self._recent)) < FEWEST:
             return
-        squares, rivals, drifting = (sum(column) for column in zip(*self._recent, strict=True))
-        square = float(min(squares[nearest], drifting))
+        squares, alone, rivals, drifting = (sum(column) for column in zip(*self._recent, strict=True))
+        square = min(squares[nearest], drifting[0])
         unexplained = square > EXPLAINED * count + SCATTER * math.sqrt(count)
-        was_lost, self.is_lost = self.is_lost, bool(unexplained or rivals.min() < square - BETTER)
+        was_lost, self.is_lost = self.is_lost, bool(unexplained or rivals.min() < alone.min() - BETTER)
         if not self.is_lost:
             self._earlier.append(self._changed(mean))
             self._answer(*self._earlier[-1])
@@ -222,7 +259,14 @@ class FilmFollower:
         self._answered_std = std
         if abs(pretension_MPa - self._answered_MPa) >= NEWS_MPa:
             self._answered_MPa = pretension_MPa
-            self.predictor = self._calibrated.with_constants(self._known.constants(pretension_MPa))
+            self.predictor = self._at(pretension_MPa)
+        elif self._beside is not None:
+            return
+        side = -BESIDE_MPa if self._answered_MPa + BESIDE_MPa > self._grid[-1] else BESIDE_MPa
+        self._beside = self._at(self._answered_MPa + side)
+
+    def _at(self, pretension_MPa: float) -> Predictor:
+        return self._calibrated.with_constants(self._known.constants(pretension_MPa))
 
 
 def _normal(deviation: Reals, std: float) -> Array:
