@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all attack docs bench soak release report paper proto clean
+.PHONY: demo test types tests test-all attack docs bench soak release report paper proto clean
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 COMPILED_ONCE := PYTHONDONTWRITEBYTECODE=
@@ -11,12 +11,18 @@ COMPILED_ONCE := PYTHONDONTWRITEBYTECODE=
 demo: $(VENV)/installed
 	$(BIN)/isocharge demo
 
-# Some tests wait for a clock or a process, so there is a worker more than the two cores that we count on.
+# Lint, then types and architecture beside the tests.
 test: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(MAKE) -j 2 types tests
+
+types: $(VENV)/installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Some tests wait for a clock or a process, so there is a worker more than the two cores that we count on.
+tests: $(VENV)/installed
 	$(ONE_THREAD) $(COMPILED_ONCE) $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 test-all: docs
