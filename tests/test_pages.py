@@ -105,17 +105,3 @@ def test_figures_of_the_released_models_are_their_cards():
         patterns = (r"position, median \| (\S+) mm", r"position, rms \| (\S+) mm", r"force, rms \| (\S+) %")
         figures = [float(re.search(pattern, card)[1]) for pattern in patterns]
         assert figures == pytest.approx([float(median), float(rms), float(force)], abs=0.005, rel=0.01)
-
-
-def test_figures_of_the_models_for_all_films_are_their_cards():
-    rows = re.findall(
-        r"^\| \[?`([\w-]+)`\S* \| (\S+) mm \| (\S+) mm, (\S+) % \| (\S+) mm, (\S+) % \|",
-        PAGES["models/README.md"],
-        re.M,
-    )
-    assert len(rows) == 3
-    for name, radius, *figures in rows:
-        card = (ROOT / "models" / name / "1" / "card.md").read_text("utf-8")
-        assert f"within {radius} mm" in card
-        position, force = (re.search(rf"{key}, rms \| (\S+) \S+ \| (\S+) ", card) for key in ("position", "force"))
-        assert [position[1], force[1], position[2], force[2]] == figures

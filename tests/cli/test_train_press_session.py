@@ -74,7 +74,7 @@ class Script:
 
 STEADY = Watched(Phase.taken, press=SteadyPress(np.full(4, 500.0), np.ones(4), np.ones(4), 0.7, 0.5, 100, ()))
 TARED = Watched(Phase.waiting, np.zeros(4))
-HELD = Watched(Phase.settling, np.full(4, 400.0), 0.3)
+HELD, LATER, LATE = (Watched(Phase.settling, np.full(4, 400.0), held_s) for held_s in (0.3, 0.8, 1.4))
 
 
 def refused(reason):
@@ -94,13 +94,14 @@ def dialogue(*events, asks=True, contacts=None):
 
 
 def test_enter_takes_a_press_as_proposed(capsys):
-    session, _, taken = dialogue(HELD, STEADY, "", STEADY, "1.5 2 0.9", STEADY, "? ? 0.5")
+    session, _, taken = dialogue(HELD, LATER, LATE, STEADY, "", STEADY, "1.5 2 0.9", STEADY, "? ? 0.5")
     assert session.taken[:2] == [(0.0, 0.0, 1.0), (1.5, 2.0, 0.9)]
     assert np.isnan(session.taken[2][:2]).all()
     assert taken == [1, 2, 3]
     said = capsys.readouterr().err
     assert "1. Press 1.00 N at (0.0, 0.0) mm and hold." in said
     assert "hold it, 0.3 s: A 400.0, B 400.0, C 400.0, D 400.0 pC" in said
+    assert ("0.8 s" in said, "hold it, 1.4 s" in said) == (False, True)  # one line a second
     assert "steady after 0.7 s: A 500.0" in said
     assert said.count("so much is known") == 3
     assert said.endswith("The film is known well enough; --until 0 goes on.\n")

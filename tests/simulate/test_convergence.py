@@ -21,7 +21,6 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.mechanics.energy import ElasticFilm
 
 ORDERS = (3, 4, 5, 6)
 RECTANGLE = Polygon.rectangle(4.0, 2.0, 0.5)
@@ -93,18 +92,3 @@ def test_charge_converges_with_the_order_of_the_elements(film, probe, order, nam
         np.abs(touch_charge(sensor, refined(film, probe, theory, order, k)) - reference).max() for k in (1, 2)
     )
     assert np.log2(coarse / fine) > order
-
-
-@pytest.mark.parametrize("order", [2, 3])
-def test_energy_converges_with_twice_the_order_of_the_elements(film, order):
-    """The known rate of a smooth problem, for the membrane."""
-    theory = THEORIES["membrane"][1]
-
-    def energy(solved: Equilibrium) -> float:
-        return ElasticFilm(solved.mesh.geometry, solved.groups).energy(solved.field)
-
-    reference = energy(
-        press(film, Circle(1.0), (6.0, 3.0), 1.0, SolveSettings(theory=theory, resolution=Resolution(8, 8, 6)))
-    )
-    coarse, fine = (abs(energy(refined(film, Circle(1.0), theory, order, k)) - reference) for k in (1, 2))
-    assert np.log2(coarse / fine) == pytest.approx(2 * order, abs=0.8)

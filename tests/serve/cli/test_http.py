@@ -2,7 +2,6 @@
 
 import http.client
 import json
-import os
 import shutil
 import signal
 import socket
@@ -72,27 +71,6 @@ def test_bad_starts(command, models, tmp_path):
         for folder, words, code, said in cases:
             got, out, error = command("serve", "http", "--models", folder, *words)
             assert (got, out, error[: len(said)]) == (code, "", said)
-
-
-def test_the_log_in_json_is_json_line_by_line(film, start, tmp_path, monkeypatch):
-    """From the first line to the last, with a refused model, a stream of requests, and a token that it never says."""
-    monkeypatch.setitem(os.environ, "ISOCHARGE_TOKEN", "open sesame")
-    film.write(tmp_path)
-    film.write(tmp_path, version=2)
-    (tmp_path / "linear/2/golden.json").unlink()
-    process = start("--port", 0, "--grpc-port", 0, "--log", "json", folder=tmp_path)
-    url, grpc_url = process.stdout.readline().strip(), process.stdout.readline()
-    for path in ("/v2/models/linear/infer", "/open%20sesame", "/v2/health/ready?token=open%20sesame"):
-        ask(url, "GET" if "health" in path else "POST", path)
-    process.terminate()
-    err = process.communicate(timeout=20)[1]
-    assert grpc_url.startswith("grpc://")
-    lines = [json.loads(line) for line in err.splitlines()]
-    assert [line["event"] for line in lines] == ["refused", "serving", "request", "request", "request"]
-    assert [line.get("status") for line in lines[2:]] == [401, 401, 200]
-    assert "golden.json: missing" in lines[0]["message"]
-    assert lines[1]["message"] == "linear/1"
-    assert "sesame" not in err
 
 
 def test_a_log_that_nobody_reads_holds_up_no_request(start):

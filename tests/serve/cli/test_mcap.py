@@ -52,15 +52,6 @@ def test_replay_converts_an_old_recording(command, recorded, models, tmp_path, r
     assert path.read_bytes() == before
 
 
-def test_a_damaged_recording_leaves_no_file(command, recorded, models, tmp_path):
-    recording, _ = recorded
-    lines = recording.read_text().splitlines()
-    recording.write_text("\n".join([*lines[:50], "damaged", *lines[50:], ""]))
-    code, _, err = command("serve", "replay", recording, "--models", models, "--mcap", tmp_path / "touch.mcap")
-    assert (code, "line 51: damaged" in err) == (2, True)
-    assert list(tmp_path.iterdir()) == [recording]
-
-
 def test_a_live_stream_that_is_stopped_ends_its_file(board_until, models, run, tmp_path):
     path = tmp_path / "touch.mcap"
     with board_until(400) as board:

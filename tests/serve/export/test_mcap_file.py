@@ -329,6 +329,15 @@ def test_times_that_ros_has_not(tmp_path, timestamp, caplog):
     assert file.records == 1
 
 
+def test_numbers_of_messages_begin_again_after_32_bits(tmp_path):
+    with McapFile(tmp_path / "touch.mcap", ELECTRODES) as file:
+        file.records = (1 << 32) - 1
+        file.write(press(0).to_json())
+        file.write(press(1).to_json())
+    records = StreamReader(BytesIO((tmp_path / "touch.mcap").read_bytes())).records
+    assert {each.sequence for each in records if isinstance(each, Message)} == {(1 << 32) - 1, 0}
+
+
 def test_nothing_is_overwritten(tmp_path):
     path = tmp_path / "touch.mcap"
     path.write_text("mine")

@@ -117,15 +117,6 @@ def test_every_checksum_is_that_of_its_name(name):
             assert compute(data) == OTHERS[name](data)
 
 
-FRAMES = st.builds(
-    Frame,
-    seq=st.integers(0, 2**16 - 1),
-    t_us=st.integers(0, 2**32 - 1),
-    values=st.lists(st.floats(width=32, allow_nan=False), max_size=8).map(tuple),
-    flags=st.integers(0, 255),
-)
-
-
 def piece(body):
     """The bytes of a frame around its content: CRC-16/CCITT-FALSE and COBS by others."""
     return cobs.encode(body + struct.pack("<H", binascii.crc_hqx(body, 0xFFFF))) + b"\0"
@@ -143,18 +134,6 @@ def test_round_trip_of_any_number_of_charges(n):
     frame = Frame(1, 2, tuple(k + 0.5 for k in range(n)))
     assert len(encode_frame(frame)) <= LONGEST_PIECE + 1
     assert BinaryParser().feed(encode_frame(frame)) == [frame]
-
-
-@settings(derandomize=True)
-@given(FRAMES, st.data())
-def test_every_flipped_bit_is_noticed(frame, data):
-    """A CRC catches every single error; one that makes or removes a zero shifts the frame's edges instead."""
-    good = encode_frame(frame)
-    at, bit = data.draw(st.integers(0, len(good) - 2)), data.draw(st.integers(0, 7))
-    bad = good[:at] + bytes([good[at] ^ 1 << bit]) + good[at + 1 :]
-    parser = BinaryParser()
-    assert parser.feed(bad + b"\0" + good) == [frame]
-    assert parser.counts.crc_errors + parser.counts.malformed >= 1
 
 
 @pytest.mark.parametrize(

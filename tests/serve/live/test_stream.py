@@ -125,15 +125,6 @@ def test_flags_of_the_frame_are_in_the_record(film, play):
     assert (gaps.lost, gaps.repeated, gaps.restarts) == (2, 1, 1)
 
 
-def test_charge_that_is_no_number_invalidates_its_frame(film, play):
-    good = tuple((pressed(film) + OFFSET).tolist())
-    records = play(Frame(10, 0, good), Frame(11, 0, (good[0], math.nan, good[2])), Frame(12, 0, good))
-    assert [r.contact for r in records] == [True, False, True]
-    assert (records[1].flags, records[1].force_N, records[1].charge_pC) == (("invalid",), None, None)
-    assert records[1].charge_raw_pC["B"] is None
-    assert "NaN" not in records[1].to_json()
-
-
 @pytest.mark.parametrize("damaged", [1.01e9, -1e38, 1e300, -1.7e308, math.inf])
 def test_absurd_number_costs_its_frame_only(film, predictor, damaged):
     """Text has no checksum: a digit more in the exponent must stop neither the stream nor the sums of the chain."""

@@ -53,15 +53,6 @@ def expected(tmp_path, values):
     return {"contact": columns[:, :3], "contact_std": columns[:, 3:6], "misfit": columns[:, 6:7]}
 
 
-def test_health(client):
-    assert client.is_server_live()
-    assert client.is_server_ready()
-    assert client.is_model_ready("linear")
-    assert client.is_model_ready("linear", "1")
-    assert not client.is_model_ready("linear", "3")
-    assert not client.is_model_ready("cubic")
-
-
 def test_infer_with_defaults(client, module, film, tmp_path):
     values = charges(film)
     answer = client.infer("linear", [tensor(module, values)], request_id="press 7")

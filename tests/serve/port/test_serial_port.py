@@ -158,15 +158,6 @@ def test_outage_is_measured_and_logged_once(tmp_path, caplog):
     assert (port.outages, len(caplog.records)) == (1, 1)
 
 
-def test_file_is_read_to_its_end(tmp_path):
-    path = tmp_path / "frames.bin"
-    path.write_bytes(bytes(range(256)) * 40)
-    with open_source(str(path)) as source:
-        chunks = list(source)
-    assert b"".join(chunk.data for chunk in chunks) == path.read_bytes()
-    assert {chunk.outage_s for chunk in chunks} == {0.0}
-
-
 def test_source_is_stdin(monkeypatch):
     reader, writer = os.pipe()
     os.write(writer, b"hello")

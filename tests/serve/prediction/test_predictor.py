@@ -29,13 +29,6 @@ def bare_answer(session, charge_pC):
     return np.concatenate(session.run(None, {"charge_pC": np.atleast_2d(np.float32(charge_pC))}), axis=1)
 
 
-def test_predict_gives_back_the_press(film, predictor):
-    contact = predictor.predict(film.charge_pC(np.array([3.0]), np.array([-4.0]), np.array([0.5]))[0])
-    assert contact[:3] == pytest.approx((3.0, -4.0, 0.5), rel=1e-5)
-    assert contact.x_std_mm == pytest.approx(50.0 / 1200.0)
-    assert contact.misfit == 0.0
-
-
 @settings(derandomize=True)
 @given(PRESSES)
 def test_answers_equal_a_bare_session(bare, predictor, charge_pC):

@@ -62,6 +62,7 @@ def test_a_held_contact_is_quiet_and_its_deviations_hold():
     errors = np.concatenate(errors)
     assert np.sqrt(np.mean(errors[:, :2] ** 2)) < 0.2 * STD
     assert np.mean(np.abs(errors[:, 0]) < 1.96 * errors[:, 3]) > 0.93
+    np.testing.assert_array_equal(errors[:, 4], errors[:, 3])  # of y as of x, as those of the frames
 
 
 @pytest.mark.parametrize("speed", [5.0, 20.0, 50.0, 200.0])

@@ -211,3 +211,9 @@ def test_nodes_interpolate_what_charges_look_like(period):
         grid = np.meshgrid(family.distance, family.force, family.rotation, indexing="ij")
         found = family.weights(distance, force, rotation) @ smooth(*grid).ravel()
         np.testing.assert_allclose(found, smooth(distance, force, rotation), rtol=expected)
+
+
+def test_presses_between_have_forces_of_the_whole_range():
+    force = np.array([force for _, _, force, _ in Family.spread(DOMAIN, (3, 2), 0.0).probes_between(7)])
+    assert len(set(force)) == 7
+    assert (0.05 <= force.min() < 0.1, 1.0 < force.max() <= 2.0) == (True, True)

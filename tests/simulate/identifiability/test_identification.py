@@ -66,6 +66,18 @@ def test_errors_are_ordered_and_fall_with_the_force(identification):
     assert rows[0]["position_rms_mm"] > 2.0 * rows[1]["position_rms_mm"] > rows[2]["position_rms_mm"]
 
 
+def test_the_condition_is_that_of_the_position_s_deviations(identification):
+    limits = identification.maps[1]
+    covariance = limits_at(identification.charges, limits.rings.contacts(limits.force), REFERENCE).covariance
+    np.testing.assert_allclose(limits.condition.ravel(), np.sqrt(np.linalg.cond(covariance[:, :2, :2])), rtol=0.02)
+
+
+def test_what_frames_before_would_tell_is_said_where_the_map_folds(identification):
+    folded = replace(identification.area, folds=np.ones((1, 2)))
+    said = [replace(identification, area=area).summary for area in (identification.area, folded)]
+    assert ["If the frames before tell" in text for text in said] == [False, True]
+
+
 def test_an_electrode_at_the_centre_leaves_a_small_area(film):
     """The area is smaller than the distance of the rings of the whole film."""
     places = ((0.0, 0.0), (8.66, 5.0), (-8.66, 5.0))

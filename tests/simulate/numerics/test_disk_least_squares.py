@@ -28,16 +28,6 @@ def test_the_nearest_point_of_the_domain():
     np.testing.assert_allclose(residual, unit - TARGETS, rtol=1e-12, atol=1e-12)
 
 
-def test_the_nearest_point_of_the_circle_takes_few_steps_however_far_the_target_lies():
-    """Along the circle only its own curvature says where the nearest point is: the start is a right angle away."""
-    angle = np.linspace(0.3, 1.5, 7)
-    far = 1e4 * np.stack([np.cos(angle), np.sin(angle), np.zeros(7)], axis=1)
-    start = np.tile([1.0, 0.0, 0.0], (7, 1))
-    identity = np.broadcast_to(np.eye(3), (7, 3, 3))
-    unit, _ = minimise(lambda rows, at: (at - far[rows], identity[rows]), start, steps=8)
-    np.testing.assert_allclose(unit, far / 1e4, atol=1e-6)
-
-
 def test_no_point_is_nearer_by_scipy():
     starts = into_domain(RNG.uniform(-0.7, 0.7, (12, 3)))
     unit, residual = minimise(bent, starts)

@@ -55,21 +55,6 @@ def test_the_figures_are_those_of_serve_check_on_the_held_out_presses(section, p
     assert released["position_median_mm"] > 0.3  # 0.07 mm by the simulator of the described film
 
 
-@slow
-def test_what_cannot_be_judged_is_left_out_with_a_word(section):
-    record, page = section
-    methods = {method["name"]: method["errors"]["position_rms_mm"] for method in record["methods"]}
-    assert record["measured"]
-    assert record["limits"] == {"bayes": None, "cramer_rao": None}
-    assert not any("triangulation" in name for name in methods)
-    assert "Left out, because it needs a simulator of this very film" in page
-    assert set(record["pictures"]) == {"latency", "throughput", "memory"}
-    assert "Gauss-Newton" in record["left_out"]  # so few presses cannot teach it
-    for name, reason in record["left_out"].items():
-        assert f"- {name}: left out; {reason}" in page
-    assert methods["Gaussian process"] < methods["released network"]  # it learnt from this film
-
-
 def test_too_few_presses_and_another_layout(tmp_path):
     contact, stds = draw_contacts(np.random.default_rng(6), Domain(7.8, (0.06, 1.9)), 300), [np.full(300, 0.01)] * 2
     presses = MeasuredPresses(contact, np.full((300, 3), 500.0), *stds, ("A", "B", "C"), tuple(range(2, 302)))

@@ -4,6 +4,7 @@ Clients that open calls and say nothing: refused or bounded by what their metada
 """
 
 import itertools
+import socket
 import subprocess
 import sys
 import time
@@ -211,6 +212,15 @@ def test_silent_calls_are_closed(serve, silent_call, name, messages):
     for _ in range(messages):
         assert "is not found" in next(call).error_message
     assert refusal(call) == "DEADLINE_EXCEEDED"
+
+
+def test_a_connection_that_says_nothing_is_closed(store):
+    """Within the time for headers, not gRPC's own two minutes."""
+    with grpc_server(Handler(store, ServerLimits(header_seconds=0.1)), "127.0.0.1", 0) as url:
+        host, port = url.removeprefix("grpc://").split(":")
+        with socket.create_connection((host, int(port)), timeout=6.0) as silent:
+            while silent.recv(1000):
+                pass
 
 
 def test_whoever_waits_longest_gives_its_place(serve, silent_call):
