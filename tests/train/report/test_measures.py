@@ -13,12 +13,17 @@ from isocharge.train.baselines.rivals import GivenMethod, Rival
 from isocharge.train.data.presses import draw_contacts
 from isocharge.train.report.case import EvaluationCase
 from isocharge.train.report.measures import Errors, MethodRecord, coverage, pareto, verdict
+from isocharge.train.report.page import table
 from isocharge.train.report.studies import by_force
 
 
 def contacts(count, seed):
     rng = np.random.default_rng(seed)
     return np.column_stack([rng.normal(0.0, 4.0, (count, 2)), rng.uniform(0.1, 2.0, count)])
+
+
+def test_a_table_has_a_rule_for_each_column():
+    assert table(("a", "b", "c"), [("1", "2", "3")], 2) == "| a | b | c |\n|---|---|--:|\n| 1 | 2 | 3 |"
 
 
 def test_errors_by_scikit_learn():
