@@ -115,19 +115,6 @@ def test_described_frames_with_the_faults_of_a_script(played, tmp_path):
     assert unplugged >= 1
 
 
-def test_the_amplifier_of_a_script(played, tmp_path):
-    """Its converter reads no more than it says, and the bias current fills it while nothing touches."""
-    script = tmp_path / "play.toml"
-    script.write_text(
-        "limit_pC = 50\ndrift_pC_per_s = 100.0\n"
-        "presses = [[0, 0, 0, 0], [0.2, 0, 0, 0], [0.3, 0, 0, 0.5], [2, 0, 0, 0.5]]\n"
-    )
-    values, _ = played(400, "--script", script, "--noise", "clean")
-    change = values - values[0]
-    assert (np.abs(change[150]) > 5.0).all()
-    assert 40.0 < np.abs(change).max() <= 100.0
-
-
 def test_a_film_is_solved_as_far_as_it_is_pressed(tmp_path, run, asked):
     (tmp_path / "far.toml").write_text("presses = [[0, 0, 0, 0], [1, 0, 0, 0], [2, 5, 12, 1], [4, 5, 12, 0]]\n")
     for words in ((), ("--radius", 15), ("--script", tmp_path / "far.toml")):

@@ -59,13 +59,6 @@ def test_check_of_a_healthy_board():
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]
 
 
-def test_check_of_text_in_counts():
-    device = device_from_table({"gain": {"pC_per_unit": {"A": 2.0, "B": -1.0, "C": 1.0}}}, "test")
-    report = findings(heard(charges(encode=partial(encode_text, notation="pairs"))), device=device)
-    assert "name:value: seq, t_us, A, B, C" in report.format
-    assert [(channel.name, round(channel.offset_pC)) for channel in report.channels] == [("A", 10), ("B", 6), ("C", 7)]
-
-
 def test_check_uses_no_stage_that_is_switched_off():
     """A gain that is off multiplies nothing, and a leak that is off is missing."""
     off = {"gain": {"on": False, "pC_per_unit": 2.0}, "leak": {"on": False, "tau_s": 10.0}}
