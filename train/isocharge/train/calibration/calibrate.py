@@ -99,12 +99,12 @@ class CalibrationResult:
     @property
     def fitted(self) -> Fitted:
         """The network of this film, for `evaluate` and `release`; what the film leaves is in its deviations."""
-        return self.fitted_film(self.posterior.parameters, correlation=True)
+        return self.fitted_film(self.posterior.parameters, whole=True)
 
-    def fitted_film(self, parameters: Array, *, correlation: bool = False) -> Fitted:
+    def fitted_film(self, parameters: Array, *, whole: bool = False) -> Fitted:
         """The network of a film near it, of these parameters; all else that is known of this film holds for it."""
         left = self.sensitivity.contact, np.einsum("nii->ni", self.sensitivity.covariance(self.posterior.joint))
-        return self.problem.fitted(parameters, left, self._factor, correlation=correlation)
+        return self.problem.fitted(parameters, left, self._factor, whole=whole)
 
     @cached_property
     def _factor(self) -> Callable[[Array], Array]:

@@ -53,6 +53,9 @@ itself stretches it: ln Q grows by (1 - sqrt(1 - (e / T)^2)) x (1 - (1 - x / 2)^
 SLACKENING = 1.75
 """Fitted to full solves of 0.6 to 2 MPa, 0.05 to 1.6 N, two places, which it meets to 5 % where x is above 0.1."""
 
+NEGLIGIBLE = 1e-3
+"""Largest coefficient of the modes that counts as none: it changes charges by some 3e-5, and they take long."""
+
 LEAST_TENSION = 1e-3
 """Least pretension over which the uneven part is taken, MPa."""
 
@@ -146,7 +149,7 @@ class FilmCharges:
         n = len(self.prior.names)
         of_modes, shares = np.split(unknowns[n:], [len(self.modes)])
         factor = np.ones((len(contact), len(self.prior.sensor.electrodes)))
-        if of_modes.any():
+        if np.abs(of_modes).max(initial=0.0) > NEGLIGIBLE:
             charge = self.forward_map(unknowns[:n]).charges(contact) if charge is None else charge
             modes = self._by_mode(unknowns[:n], contact, charge)
             factor += modes.by_mode @ of_modes / charge

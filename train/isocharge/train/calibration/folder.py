@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 from msgspec import Struct
+from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, PressError
@@ -159,6 +160,13 @@ def write_calibration(result: CalibrationResult, folder: Path, command: str = ""
         OutputError: If the file system refuses.
     """
     check_calibration_folder(folder, result.problem.electrodes)
+    with threadpool_limits(1):  # many small matrices: a second thread only waits
+        version = _release(result, folder, command)
+    _publish(folder)
+    return version
+
+
+def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
     files = {
         RESULT: json.dumps(plain_values(result_table(result)), indent=1, allow_nan=False).encode(),
         SENSOR: sensor_to_toml(result.film[0]).encode(),
@@ -168,15 +176,13 @@ def write_calibration(result: CalibrationResult, folder: Path, command: str = ""
     fitted = result.fitted
     if (pretensions := pretensions_of(result, fitted.network)) is not None:
         files[PRETENSIONS] = pretensions.to_bytes()
-    version = release(
+    return release(
         replace(fitted, provenance=Provenance(files=files)),
         folder,
         version=max(version_folders(folder), default=0) + 1,
         command=command,
         card=lambda about, _: _card(result, about),
     ).folder
-    _publish(folder)
-    return version
 
 
 def result_table(result: CalibrationResult) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -182,15 +182,16 @@ class CalibrationProblem:
         left: tuple[Array, Array],
         besides: Callable[[Array], Array],
         *,
-        correlation: bool = True,
+        whole: bool = True,
     ) -> Fitted:
         """The network of a film, arguments as `FilmsModel.film` takes them, `besides` its factor.
 
         What the described electrodes have that the network's do not have is one more factor: its mean counts as gains,
-        and the network's last layer is changed for the rest.
+        and the network's last layer is changed for the rest. Only a `whole` one learns correlations and is judged.
         """
+        about: dict[str, Any] = {} if whole else {"correlation": False, "fresh": 0}
         if self.prior is self.films.prior:
-            return self.films.film(parameters, left=left, factor=besides, correlation=correlation)
+            return self.films.film(parameters, left=left, factor=besides, **about)
         described, own = self.charges.forward_map(parameters), self.films.forward_map(parameters)
         scaled = parameters.copy()
         scaled[len(SHARED) :] += np.log(described.charges(left[0]) / own.charges(left[0])).mean(axis=0)
@@ -199,7 +200,7 @@ class CalibrationProblem:
             of_network = self.films.forward_map(scaled).charges(contact)
             return np.asarray(besides(contact) * described.charges(contact) / of_network)
 
-        fitted = self.films.film(scaled, left=left, factor=factor, correlation=correlation)
+        fitted = self.films.film(scaled, left=left, factor=factor, **about)
         return replace(fitted, sensor=described.sensor)
 
     @property

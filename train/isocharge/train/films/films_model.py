@@ -76,6 +76,7 @@ class FilmsModel:
         provenance: Provenance | None = None,
         factor: Callable[[Array], Array] | None = None,
         correlation: bool = True,
+        fresh: int = PRESSES,
     ) -> Fitted:
         """The network of one film, as `fit` gives it for one: to predict, to evaluate on fresh presses, to release.
 
@@ -88,6 +89,7 @@ class FilmsModel:
                 they differ by some percent from those of the parameters: the network's last layer is changed
                 accordingly.
             correlation: Whether it learns how errors go together; that takes a second or two.
+            fresh: How many presses it has to be judged on.
 
         Raises:
             InputError: If there are not as many finite parameters as the prior names.
@@ -96,19 +98,20 @@ class FilmsModel:
         network, (sensor, probe) = self.fold(parameters), self.prior.film(parameters)
         rng, (known, variance) = np.random.default_rng(SEED), left or (np.empty((0, 3)), np.empty((0, 3)))
         contact = np.concatenate([draw_contacts(rng, self.domain, PRESSES + TAUGHT), known])
+        ratio = np.ones((len(contact), self.mean.size)) if factor is None else factor(contact)
+        contact, ratio = contact[PRESSES - fresh :], ratio[PRESSES - fresh :]
         charge = self.forward_map(parameters).charges(contact)
-        ratio = np.ones_like(charge) if factor is None else factor(contact)
-        presses = LabelledPresses(contact[:PRESSES], (charge * ratio)[:PRESSES])
+        presses = LabelledPresses(contact[:fresh], (charge * ratio)[:fresh])
         if factor is not None:
-            taught = np.arange(PRESSES, PRESSES + TAUGHT).repeat(COPIES)
+            taught = np.arange(fresh, fresh + TAUGHT).repeat(COPIES)
             as_if = self.noise.add(charge[taught], rng)
             network = network.corrected(as_if * ratio[taught], as_if)
         if correlation:
-            learned = slice(PRESSES, PRESSES + TAUGHT)
+            learned = slice(fresh, fresh + TAUGHT)
             examples = LabelledPresses(contact[learned], (charge * ratio)[learned])
             network = with_correlation(network, examples, self.noise, SEED)
         if left is not None:
-            taught = np.arange(PRESSES + TAUGHT, len(contact)).repeat(COPIES)
+            taught = np.arange(fresh + TAUGHT, len(contact)).repeat(COPIES)
             noisy = self.noise.add((charge * ratio)[taught], rng)
             network = network.widened_at(noisy, variance.repeat(COPIES, axis=0))
         return Fitted(

@@ -4,7 +4,7 @@ At batch one a node of a graph costs more than its arithmetic, so the layers are
 units into the last, and perceptrons that share their inputs run as one with block-diagonal weights.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,7 +77,10 @@ class FoldedLayers:
 
     def answers(self, logs: Array) -> Array:
         """Logarithms of the charges (n, n_electrode) to (n, n_answer), in double precision."""
-        return np.asarray(self.features(logs) @ self.last[0] + self.last[1] + logs @ self.skip)
+        return self._from_features(self.features(logs), logs)
+
+    def _from_features(self, features: Array, logs: Array) -> Array:
+        return np.asarray(features @ self.last[0] + self.last[1] + logs @ self.skip)
 
     def features(self, logs: Array) -> Array:
         """Logarithms of the charges (n, n_electrode) to what the last hidden layer gives, in double precision."""
@@ -86,16 +89,18 @@ class FoldedLayers:
             value = np.tanh(value @ weight + bias)
         return value
 
-    def taught(self, logs: Array, answers: Array) -> "FoldedLayers":
+    def taught(self, logs: Array, wanted: Callable[[Array], Array]) -> "FoldedLayers":
         """The same layers but for the last, which is changed by as little as gives these answers (ridge regression).
 
         Each answer keeps the features that it was made of.
 
         Args:
             logs: Logarithms of charges, shape (n, n_electrode).
-            answers: Shape (n, n_answer).
+            wanted: From the present answers to these, both of shape (n, n_answer).
         """
-        features, change = self.features(logs), answers - self.answers(logs)
+        features = self.features(logs)
+        before = self._from_features(features, logs)
+        change = wanted(before) - before
         design = np.column_stack([features, logs, np.ones(len(logs))])
         weights = np.vstack([self.last[0], self.skip, self.last[1]])
         for column in np.flatnonzero(change.any(axis=0)):
@@ -136,10 +141,12 @@ class FoldedNetwork:
 
     def corrected(self, charge: Array, as_if: Array) -> "FoldedNetwork":
         """The network that answers charges as this one answers others, both (n, n_electrode), pC."""
-        logs = self.inputs(charge)
-        answers, before = self.layers.answers(self.inputs(as_if)), self.layers.answers(logs)
-        answers[:, 3:6] = before[:, 3:6]  # deviations stay
-        return replace(self, layers=self.layers.taught(logs, answers))
+        answers = self.layers.answers(self.inputs(as_if))
+
+        def wanted(before: Array) -> Array:  # deviations stay
+            return np.concatenate([answers[:, :3], before[:, 3:6], answers[:, 6:]], axis=1)
+
+        return replace(self, layers=self.layers.taught(self.inputs(charge), wanted))
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
@@ -174,11 +181,13 @@ class FoldedNetwork:
             charge: Shape (n, n_electrode), pC.
             variance: What is added to the variances of (x, y, ln F) at these charges, shape (n, 3).
         """
-        logs = self.inputs(charge)
-        answers = self.layers.answers(logs)
-        relative = answers[:, 3:6] - answers[:, 2:3] * [0.0, 0.0, 1.0]  # of the force: to a deviation of ln F
-        answers[:, 3:6] += 0.5 * np.log1p(variance * np.exp(-2.0 * relative))
-        return replace(self, layers=self.layers.taught(logs, answers))
+
+        def wanted(before: Array) -> Array:
+            relative = before[:, 3:6] - before[:, 2:3] * [0.0, 0.0, 1.0]  # of the force: to a deviation of ln F
+            wider = before[:, 3:6] + 0.5 * np.log1p(variance * np.exp(-2.0 * relative))
+            return np.concatenate([before[:, :3], wider, before[:, 6:]], axis=1)
+
+        return replace(self, layers=self.layers.taught(self.inputs(charge), wanted))
 
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
