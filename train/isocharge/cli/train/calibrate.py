@@ -137,17 +137,16 @@ def calibrate_command(
     of_port = yes or press_list is not None or fresh or device is not None
     _check_usage(file, output, next_count, port, temperature_C, of_port=of_port, warmed=warmed)
     problem = replace(CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models), stress_limit=stress_limit)
-    presses = None
-    if file is not None:
-        presses = read_presses_of(file, problem.electrodes, position_std_mm, force_std)
-        if presses.temperature_C is None and temperature_C is not None:
-            presses = replace(presses, temperature_C=np.full(len(presses), temperature_C))
-    if earlier is not None:
-        thermometer = presses is not None and presses.temperature_C is not None
-        at_C = temperature_C if warmed else None
-        problem = replace(problem, earlier=read_earlier(earlier, problem, thermometer=thermometer, at_C=at_C))
-    result = None
+    result, presses = None, None
     with calibration_folder(output, problem) if output is not None else nullcontext():
+        if file is not None:
+            presses = read_presses_of(file, problem.electrodes, position_std_mm, force_std)
+            if presses.temperature_C is None and temperature_C is not None:
+                presses = replace(presses, temperature_C=np.full(len(presses), temperature_C))
+        if earlier is not None:
+            thermometer = presses is not None and presses.temperature_C is not None
+            at_C = temperature_C if warmed else None
+            problem = replace(problem, earlier=read_earlier(earlier, problem, thermometer=thermometer, at_C=at_C))
         if port is not None and output is not None:
             where = PressPort(port, device, baud, yes, press_list, until, fresh, position_std_mm, force_std)
             result = calibrate_at_port(where, problem, output, json_lines=json)
