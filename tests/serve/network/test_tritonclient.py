@@ -126,7 +126,7 @@ def test_statistics(client, module, film):
         "fail": 1,
         "computeinfer": 2,
     }
-    assert int(spent["success"]["ns"]) >= int(spent["computeinfer"]["ns"]) > 0
+    assert 60e9 > int(spent["success"]["ns"]) >= int(spent["computeinfer"]["ns"]) > 0
     assert int(first.get("inference_count", first.get("inferenceCount", 0))) == 0
     assert len(plain(client.get_inference_statistics()).popitem()[1]) == 2
 

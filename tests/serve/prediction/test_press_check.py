@@ -95,6 +95,7 @@ def test_a_scale_of_the_force_is_recognised(predictor, measure):
     assert check.agreement.force.mean == pytest.approx(0.05, abs=4 * check.agreement.force.std)
     assert check.force_percent.beyond == pytest.approx(5.0, abs=0.5)
     assert check.position_mm.beyond < 0.05
+    assert float(check.notes[0].split("--force-std ")[1]) == pytest.approx(0.05, abs=0.01)
     assert check.notes[1] == "this model is of the film as described: calibrate it (isocharge train calibrate)"
     assert "forces are 1.0" in check.notes[2]
 

@@ -10,7 +10,7 @@ import torch
 from isocharge.common.errors import ConfigError, InputError, OutputExists, TrainingError
 from isocharge.common.progress import listening
 from isocharge.common.resumable_run import resume_parts
-from isocharge.simulate import NoiseModel
+from isocharge.simulate import Domain, NoiseModel
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config
 from isocharge.train.training import descent
 from isocharge.train.training.descent import Descent, TrainingStage
@@ -24,6 +24,13 @@ REPORT_EVERY = 20
 def _short_reports(monkeypatch):
     monkeypatch.setattr(descent, "REPORT_EVERY", REPORT_EVERY)
     monkeypatch.setattr(descent, "SAVE_EVERY_S", 0.0)
+
+
+def test_a_teacher_answers_in_the_coordinates_of_the_network():
+    teacher = Teacher("linear/1", "", lambda _: (np.array([[4.0, -8.0, 0.5]]), np.array([[0.8, 0.4, 0.05]])))
+    mean, log_std = teacher.posterior(torch.ones(1, 3), Domain(8.0, (0.1, 2.5)))
+    np.testing.assert_allclose(mean, [[0.5, -1.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(log_std, np.log([[0.1, 0.05, 0.1 / np.log(5.0)]]), rtol=1e-6)
 
 
 def stage(scores, steps=20 * REPORT_EVERY, warm_up_steps=0):
