@@ -55,10 +55,11 @@ def presses(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def desks(tmp_path_factory):
-    """A folder for each page, with what its reader has already: `train/` of a checkout, and a small configuration."""
+    """A folder for each page, with what its reader has already: a checkout's folders, and a small configuration."""
     folders = {page: tmp_path_factory.mktemp("desk") for page in EXAMPLE_PAGES}
     for folder in folders.values():
-        (folder / "train").symlink_to(ROOT / "train")
+        for name in FOLDERS:
+            (folder / name).symlink_to(ROOT / name)
         (folder / "quick.toml").write_text(QUICK)
     return folders
 

@@ -44,8 +44,18 @@ LARGEST = {
 }
 """By model: median and rms of the position, 95 % of clean ones, mm, and rms of the force, %."""
 
-NOT_GAUSSIAN = {"four-25um-biaxial": 0.055, "four-25um-biaxial-student": 0.09, "three-25um-biaxial-student": 0.04}
-"""By model: how far 68 % may be off. The first map nearly folds at its edge, and small networks do not know all."""
+NOT_GAUSSIAN = {
+    "four-25um-biaxial": 0.055,  # its map nearly folds at its edge
+    "four-25um-biaxial-student": 0.09,  # small networks do not know all
+    "three-25um-biaxial-student": 0.04,
+    "four-25um-biaxial-films": 0.05,  # those for all films know correlations of their middle film less well
+    "four-25um-uniaxial-films": 0.05,
+    "three-25um-biaxial-films": 0.05,
+}
+"""By model: how far 68 % of the ellipses may be off."""
+
+BESIDE_FOLDS = {"four-25um-uniaxial-films": 0.25}
+"""By model: how far its figures may be off where few presses beside a fold make most of the rms; else 0.15."""
 
 
 @pytest.fixture(scope="module")
@@ -141,9 +151,12 @@ def test_what_is_evaluated_is_what_is_served(fitted, released):
 
 
 def test_the_card_holds_on_other_presses_and_is_good_enough(truth, touch):
-    errors = simulated_errors(predict(touch), truth[:6000], REFERENCE, seed=6)
+    errors, off = (
+        simulated_errors(predict(touch), truth[:6000], REFERENCE, seed=6),
+        BESIDE_FOLDS.get(touch.metadata.name, 0.15),
+    )
     for name in ("position_median_mm", "position_rms_mm", "force_rms_percent", "misfit_p99"):
-        assert errors[name] == pytest.approx(touch.metadata.errors[name], rel=0.15, abs=0.02 * (name == "misfit_p99"))
+        assert errors[name] == pytest.approx(touch.metadata.errors[name], rel=off, abs=0.02 * (name == "misfit_p99"))
     largest_median, largest_rms, largest_clean, percent = LARGEST.get(touch.metadata.name, (0.10, 0.20, 0.18, 0.8))
     assert errors["position_median_mm"] <= largest_median
     assert errors["position_rms_mm"] <= largest_rms
